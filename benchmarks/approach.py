@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ns_abstract.geometry.views import look_at
+from ns_abstract.geometry.keyframe_cameras import look_at
 from ns_abstract.io.atomic import write_atomic, write_json
 
 Float64 = NDArray[np.float64]

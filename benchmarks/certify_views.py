@@ -183,7 +183,7 @@ def attack(pictures: FramePictures, question: Question, found: nsa.Certificate, 
         return model.outputs(pictures.image(pictures.box.middle)[None])[0]
 
     claim, wrong = question.property.bind(pictures.pose_set, nominal), 0
-    others = [None, *itertools.islice(pictures.members(1), _MEMBERS)]
+    others = [None, *itertools.islice(pictures.scene_samples(1), _MEMBERS)]
     for k in range(count):
         cell = certified[rng.integers(len(certified))]
         values = rng.uniform(cell.lower, cell.upper)
@@ -197,7 +197,8 @@ def margins(pictures: FramePictures, question: Question, parts: int, every: int)
     """Of each ``every``-th of equal parts of a set of one parameter: the margin proved at once, and the least found.
 
     Found: at the part's middle, for the scene as stored, the set's first members, and the member to which one step
-    along the signs of the margin's slope leads, towards smaller margins. Unlike `nsa.certify` nothing more is tried
+    along the signs of the margin's slope leads, towards smaller margins. Unlike `ns_abstract.certify` nothing more is
+    tried
     where a proof fails, so many networks can be compared.
     """
     model = NetworkModel(question.network, question.property.preprocess, 1 << 30)
@@ -205,13 +206,13 @@ def margins(pictures: FramePictures, question: Question, parts: int, every: int)
     ends = np.linspace(box.lower[0], box.upper[0], parts + 1)
     boxes = [box.replace(0, float(ends[k]), float(ends[k + 1])) for k in range(0, parts, every)]
     claim = question.property.bind(pictures.pose_set, lambda: model.outputs(pictures.image(box.middle)[None])[0])
-    some = list(itertools.islice(pictures.members(1), _MEMBERS))
+    some = list(itertools.islice(pictures.scene_samples(1), _MEMBERS))
 
     def loss(picture: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
         return -claim.margin(model.differentiable(picture[None]), values[None])[0]
 
     for part in boxes:
-        tried = [None, *some, *(one.nearest.pushed(part, part.middle, loss, 2.0)[1] for one in some[:1])]
+        tried = [None, *some, *(one.nearest.signed_gradient_step(part, part.middle, loss, 2.0)[1] for one in some[:1])]
         linear, lower, upper, _ = pictures.sets(part)
         sets.append((*linear, lower, upper))
         outputs = model.outputs(np.stack([pictures.image(part.middle, member) for member in tried])).astype(np.float64)

@@ -431,17 +431,17 @@ class Cells:
 
 def sets_of_poses(header: dict[str, Any]) -> list[Any]:
     """The sets of a file, as this package has them."""
-    from ns_abstract.geometry.camera_path import Camera
-    from ns_abstract.geometry.poses import PoseSet
+    from ns_abstract.geometry.camera_path import PinholeCamera
+    from ns_abstract.geometry.poses import PoseBox
     from ns_abstract.perturbation.specification import parse_perturbation
 
     def camera(entry: dict[str, Any] | None) -> Any:
         if entry is None:
             return None
-        return Camera(np.array(entry["camera_to_world"]), *(entry[name] for name in CAMERA))
+        return PinholeCamera(np.array(entry["camera_to_world"]), *(entry[name] for name in CAMERA))
 
     return [
-        PoseSet.around(camera(entry["camera"]), parse_perturbation(entry["perturbation"]), camera(entry["following"]))
+        PoseBox.around(camera(entry["camera"]), parse_perturbation(entry["perturbation"]), camera(entry["following"]))
         for entry in header["sets"]
     ]
 

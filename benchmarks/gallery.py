@@ -29,7 +29,7 @@ import numpy as np
 from approach import FOV, rotation
 from PIL import Image
 
-from ns_abstract.geometry.views import View, path_json
+from ns_abstract.geometry.keyframe_cameras import KeyframeCamera, path_json
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.refine.result import gap
 from ns_abstract.report.files import load_frame
@@ -53,7 +53,7 @@ def gate_camera(*places: tuple[float, float, float]) -> dict[str, Any]:
     for place in places or ((0.5, 0.0, 0.0),):
         pose = rotation()
         pose[:3, 3] = place
-        views.append(View(pose, FOV, 8, 8))
+        views.append(KeyframeCamera(pose, FOV, 8, 8))
     return path_json(views)
 
 
@@ -204,13 +204,13 @@ def loop_picture(work: Path) -> Image.Image:
     from ns_abstract.api.scenes import load_scene
     from ns_abstract.reach.loop import load_loop
     from ns_abstract.reach.planes import region, views
-    from ns_abstract.report.outside import Outside
+    from ns_abstract.report.outside import SceneDrawing
 
     document = json.loads((work / "out/loop/report.json").read_text())
     loop = load_loop(work / "demo/gate/LOOP.json")
     elements = load_scene(work / GATE).method().elements()
     assert elements is not None
-    outside = Outside(elements)
+    outside = SceneDrawing(elements)
     figure = figure_of(8.2, 8.6)
     for axes, view in zip(figure.subplots(2, 1), views(document, [], loop, outside, 900), strict=True):
         window = view.window

@@ -19,7 +19,7 @@ from airfield import write_scene
 from approach import FOV, SIZE, rotation, write_approach
 from numpy.typing import ArrayLike, NDArray
 
-from ns_abstract.geometry.camera_path import Camera, focal_length
+from ns_abstract.geometry.camera_path import PinholeCamera, focal_length
 from ns_abstract.methods.splat.activate import SH_C0, activate
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.render import Renderer
@@ -119,7 +119,9 @@ def main(folder: Path) -> None:
 
     def render(place: Array) -> NDArray[np.float32]:
         pose[:3, 3] = place
-        camera = Camera(camera_to_world=pose, fx=focal, fy=focal, cx=0.5 * SIZE, cy=0.5 * SIZE, width=SIZE, height=SIZE)
+        camera = PinholeCamera(
+            camera_to_world=pose, fx=focal, fy=focal, cx=0.5 * SIZE, cy=0.5 * SIZE, width=SIZE, height=SIZE
+        )
         return renderer.image(camera, turn, np.ascontiguousarray(place)).astype(np.float32)
 
     write_approach(folder, render)

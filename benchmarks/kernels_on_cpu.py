@@ -37,7 +37,7 @@ from ns_abstract.bench.soundness import bounded_both_ways
 from ns_abstract.bench.stiff import all_cases
 from ns_abstract.bench.tables import markdown, write
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.bounds import SplatBounds
@@ -62,7 +62,7 @@ def cell_about(box: ParameterBox, values: np.ndarray, width: float) -> Parameter
 
 
 def attack(
-    scene: SplatScene, poses: PoseSet, cells: list[ParameterBox], renders: int, version: str, rules: Rasteriser,
+    scene: SplatScene, poses: PoseBox, cells: list[ParameterBox], renders: int, version: str, rules: Rasteriser,
     seed: int, layers: bool,
 ) -> dict[str, Any]:  # fmt: skip
     """Bound each cell and compare ``renders`` renders with it; the numbers of a row."""
@@ -127,7 +127,7 @@ def main() -> int:
         rules = replace(rules, alpha_max=0.98)
     rows: list[dict[str, Any]] = []
 
-    def add(scene: SplatScene, poses: PoseSet, name: str, width: float, cells: list[ParameterBox]) -> None:
+    def add(scene: SplatScene, poses: PoseBox, name: str, width: float, cells: list[ParameterBox]) -> None:
         began = time.perf_counter()
         found = attack(
             scene, poses, cells, options.renders, options.gsplat_version, rules, options.seed + len(rows),

@@ -16,9 +16,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ns_abstract.geometry.camera_path import Camera, load_camera_path
-from ns_abstract.geometry.poses import PoseSet
-from ns_abstract.geometry.views import look_at
+from ns_abstract.geometry.camera_path import PinholeCamera, load_camera_path
+from ns_abstract.geometry.keyframe_cameras import look_at
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.load import load_scene
@@ -60,8 +60,8 @@ def main() -> None:
         tilt, far = height + rng.uniform(-_TILT, _TILT), distance * (1.0 + rng.uniform(-_NEAR, _NEAR))
         out = np.cos(tilt) * (np.cos(angle) * flat + np.sin(angle) * other) + np.sin(tilt) * up
         pose = look_at(target + far * out, target, up)
-        camera = Camera(pose[:3], focal, focal, 0.5 * side, 0.5 * side, side, side)
-        matrices = PoseSet.around(camera, Perturbation()).world_to_camera(np.zeros(0))
+        camera = PinholeCamera(pose[:3], focal, focal, 0.5 * side, 0.5 * side, side, side)
+        matrices = PoseBox.around(camera, Perturbation()).world_to_camera(np.zeros(0))
         black, white = (renderer.image(camera, *matrices) for renderer in renderers)
         alpha = np.clip(1.0 - (white - black).mean(axis=-1, keepdims=True), 0.0, 1.0)
         images.append(np.round(255.0 * np.concatenate([np.minimum(black, alpha), alpha], axis=-1)).astype(np.uint8))

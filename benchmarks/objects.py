@@ -20,7 +20,7 @@ from nerf_network import NerfNetwork
 from numpy.typing import ArrayLike, NDArray
 
 from ns_abstract.demo.writing import TIMESTAMP
-from ns_abstract.geometry.views import View, around, look_at, path_json
+from ns_abstract.geometry.keyframe_cameras import KeyframeCamera, around, look_at, path_json
 from ns_abstract.io.atomic import write_json
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.nerf.write import write_nerf_run
@@ -203,7 +203,7 @@ _HEIGHT, _AZIMUTH, _PIXELS = 0.1, 25.0, 32
 _EYE, _FOV, _FAR, _STEPS = (2.0, -1.4, 1.0), 40.0, 4.0, 1000
 
 
-def _path(folder: Path, name: str, view: View, target: tuple[float, float, float]) -> Path:
+def _path(folder: Path, name: str, view: KeyframeCamera, target: tuple[float, float, float]) -> Path:
     orbit = {"target": list(target), "axis": [0.0, 0.0, 1.0], "azimuth": [0.0, 2.0 * np.pi]}
     value = path_json([view], perturbation={"version": 1, "sweep": "keyframes", "orbit": orbit})
     return write_json(folder / f"{name}.json", value)
@@ -228,7 +228,7 @@ def write_nerf(folder: Path, steps: int = _STEPS) -> tuple[Path, Path]:
     weights = network.weights()
     field = NerfScene(weights, weights, 0.0, _FAR, background=np.ones(3, np.float32), name="buoy")
     target = (0.0, 0.0, _HEIGHT)
-    view = View(look_at(_EYE, target), _FOV, _PIXELS, _PIXELS)
+    view = KeyframeCamera(look_at(_EYE, target), _FOV, _PIXELS, _PIXELS)
     config = write_nerf_run(field, folder, timestamp=TIMESTAMP, experiment_name="buoy")
     return config, _path(folder, "buoy", view, target)
 

@@ -23,7 +23,7 @@ import numpy as np
 from ns_abstract.bench.sets import open_jobs, pose_set, splat_of
 from ns_abstract.bench.tables import markdown, write
 from ns_abstract.execution.threads import threads
-from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.ply import write_ply
 from ns_abstract.methods.splat.scene import SplatScene
@@ -32,7 +32,7 @@ from ns_abstract.methods.splat.scene import SplatScene
 class Open3DRenderer:
     """A scene in Open3D's offscreen renderer."""
 
-    def __init__(self, scene: SplatScene, camera: Camera) -> None:
+    def __init__(self, scene: SplatScene, camera: PinholeCamera) -> None:
         import open3d as o3d
 
         with tempfile.TemporaryDirectory() as folder:

@@ -210,7 +210,7 @@ def inputs(folder: Path, frames: int, parts: int) -> dict[str, list[str]]:
     from certifying import linear  # pyright: ignore[reportMissingImports]
     from conftest import blob_scene, ring  # pyright: ignore[reportMissingImports]
 
-    from ns_abstract.geometry.views import path_json
+    from ns_abstract.geometry.keyframe_cameras import path_json
     from ns_abstract.io.atomic import write_json
     from ns_abstract.methods.splat.write import write_splatfacto_run
 

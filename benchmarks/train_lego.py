@@ -22,7 +22,7 @@ import torch
 from nerf_network import NerfNetwork
 from torch.nn import functional
 
-from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling, camera_rays
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.nerf.smoothness import log_lipschitz
@@ -50,8 +50,8 @@ def hull(images: np.ndarray, poses: np.ndarray, focal: float, reach: float) -> t
     return functional.max_pool3d(grid, 3, 1, 1)[0, 0] > 0
 
 
-def camera(pose: np.ndarray, focal: float, side: int) -> Camera:
-    return Camera(pose[:3].astype(np.float64), focal, focal, 0.5 * side, 0.5 * side, side, side)
+def camera(pose: np.ndarray, focal: float, side: int) -> PinholeCamera:
+    return PinholeCamera(pose[:3].astype(np.float64), focal, focal, 0.5 * side, 0.5 * side, side, side)
 
 
 def psnr(scene: NerfScene, far: float, images: np.ndarray, poses: np.ndarray, focal: float) -> float:

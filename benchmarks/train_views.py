@@ -33,12 +33,12 @@ from views import HELD, Cells, cells, export, fit, head, joined, pictures
 import ns_abstract as nsa
 from ns_abstract.api.certification import FramePictures
 from ns_abstract.api.files import resized
-from ns_abstract.geometry.camera_path import Camera, load_camera_path
-from ns_abstract.geometry.poses import PoseSet
-from ns_abstract.geometry.views import around
+from ns_abstract.geometry.camera_path import PinholeCamera, load_camera_path
+from ns_abstract.geometry.keyframe_cameras import around
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.splat.method import SplatMethod
 from ns_abstract.perturbation.specification import parse_perturbation
-from ns_abstract.verify.properties import ANCHORS, Truth, decode
+from ns_abstract.verify.properties import ANCHORS, TrueValues, decode
 
 #: Radians by which an estimator's camera is turned in training.
 _TURN = 0.02
@@ -85,9 +85,9 @@ def target_of(path: Path) -> list[float]:
     return orbit_of(path)["target"]
 
 
-def truths(origin: list[float], poses: PoseSet, values: np.ndarray) -> Tensor:
+def truths(origin: list[float], poses: PoseBox, values: np.ndarray) -> Tensor:
     """[n, 3] where ``origin`` is seen from the camera, at parameter values [n, d]."""
-    truth = Truth(("object.x", "object.y", "object.z"), (origin[0], origin[1], origin[2]))
+    truth = TrueValues(("object.x", "object.y", "object.z"), (origin[0], origin[1], origin[2]))
     return torch.stack([truth.at(torch.from_numpy(poses.pose(v))) for v in values]).float()
 
 
@@ -142,7 +142,7 @@ def estimator(options: argparse.Namespace) -> None:
     print(f"mean relative error {float(error.mean()):.4f}, {steps} steps, {time.process_time():.0f} CPU s")
 
 
-def regression_loss(sets: Cells, poses: PoseSet, origin: list[float], tolerance: float) -> Any:
+def regression_loss(sets: Cells, poses: PoseBox, origin: list[float], tolerance: float) -> Any:
     """Loss of the largest error over a cell, which should stay below ``tolerance`` times the distance."""
     middle = truths(origin, poses, sets.values)
     slopes = []
@@ -167,15 +167,15 @@ def photographed(
     side: int,
     more: Mapping[str, Any] | None = None,
     background: np.ndarray | None = None,
-) -> tuple[SplatMethod, PoseSet]:
+) -> tuple[SplatMethod, PoseBox]:
     """Things and a camera somewhere around, with ``more`` of a perturbation file about it; see `scene`."""
     view = around((0.0, 0.0, _HEIGHT), rng.uniform(0.0, 360.0), rng.uniform(*stand.elevation), rng.uniform(*stand.far))
     camera = nsa.Camera(view.camera_to_world, view.fov, side, side)
-    poses = PoseSet.around(camera, parse_perturbation({"version": 1, **(more or {})}))
+    poses = PoseBox.around(camera, parse_perturbation({"version": 1, **(more or {})}))
     return SplatMethod(scene(things, int(rng.integers(1 << 30)), background), None, None), poses
 
 
-def photo(things: Sequence[Thing], rng: np.random.Generator, kind: str, side: int) -> tuple[Tensor, PoseSet]:
+def photo(things: Sequence[Thing], rng: np.random.Generator, kind: str, side: int) -> tuple[Tensor, PoseBox]:
     """The picture [3, side, side] of things from somewhere around, and its pose."""
     method, poses = photographed(things, rng, _STANDS[kind], side)
     return pictures(method, poses, np.zeros((1, 0)))[0], poses
@@ -210,7 +210,7 @@ def whole_head(used: nn.Conv2d) -> nn.Conv2d:
 Marked = tuple[list[Tensor], list[Tensor], list[Tensor]]
 
 
-def box_of(corners: np.ndarray, pose: np.ndarray, camera: Camera) -> Tensor:
+def box_of(corners: np.ndarray, pose: np.ndarray, camera: PinholeCamera) -> Tensor:
     """x0, y0, x1, y1 in pixels around points [n, 3], seen from a pose [3, 4]."""
     x, y, z = pose[:, :3].T @ (corners - pose[:, 3]).T
     across, down = camera.cx - camera.fx * x / z, camera.cy + camera.fy * y / z
@@ -325,10 +325,10 @@ def detector(options: argparse.Namespace) -> None:
 # ---------------------------------------------------------------- classifier
 
 
-def shown_member(method: SplatMethod, poses: PoseSet, values: np.ndarray, rng: np.random.Generator) -> Tensor:
+def shown_member(method: SplatMethod, poses: PoseBox, values: np.ndarray, rng: np.random.Generator) -> Tensor:
     """[3, H, W] one of the scenes of a set, at parameter values [d]."""
     shown = FramePictures(method, poses)
-    members = shown.members(int(rng.integers(1 << 30)))
+    members = shown.scene_samples(int(rng.integers(1 << 30)))
     image = shown.image(values, next(itertools.islice(members, int(rng.integers(_MEMBERS)), None), None))
     return torch.from_numpy(image[..., :3]).permute(2, 0, 1).float()
 
@@ -362,7 +362,7 @@ class Turning:
         far = float(np.linalg.norm(out))
         elevation = math.degrees(math.asin(abs(float(out @ np.array(orbit["axis"]))) / far))
 
-        def set_of(about: Mapping[str, Any]) -> PoseSet:
+        def set_of(about: Mapping[str, Any]) -> PoseBox:
             value = {"version": 1, **about, **more}
             return resized(nsa.PoseSet.from_json(camera, value).of(given), side, side)
 

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ns_abstract.api.certification import FramePictures
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.refine.protocol import Method
 
@@ -31,7 +31,7 @@ _RATE, _DECAY, _BATCH, _CELL_BATCH = 3e-3, 2e-2, 64, 32
 _WARM, _RAMP = 0.2, 0.6
 
 
-def pictures(method: Method, poses: PoseSet, values: np.ndarray) -> Tensor:
+def pictures(method: Method, poses: PoseBox, values: np.ndarray) -> Tensor:
     """Renders [n, 3, H, W] at parameter values [n, d]."""
     frame = method.frame(poses)
     found = [assemble(frame.render(v), frame.camera)[..., :3] for v in values]
@@ -83,12 +83,12 @@ class Cells:
     half: np.ndarray
 
 
-def cells(method: Method, poses: PoseSet, values: np.ndarray, half: np.ndarray, slanted: bool = False) -> Cells:
+def cells(method: Method, poses: PoseBox, values: np.ndarray, half: np.ndarray, sheared: bool = False) -> Cells:
     """Bounded cells of half-widths [d] around parameter values [n, d], cut off at the ends of the set.
 
     ``slanted``: the cells' parameters, but not ``values``, are counted as certificates count them (docs/design.md, P2).
     """
-    shown = FramePictures(method, poses, slanted=slanted)
+    shown = FramePictures(method, poses, sheared=sheared)
     whole, found, boxes = shown.box, [], []
     for v in counted(shown.pose_set, values):
         box = whole
@@ -113,8 +113,8 @@ def cells(method: Method, poses: PoseSet, values: np.ndarray, half: np.ndarray, 
     return Cells(middle, slopes, radius, np.array([centre for centre, _ in boxes]), np.array(sizes))
 
 
-def counted(poses: PoseSet, values: np.ndarray) -> np.ndarray:
-    """Parameters [n, d] of a set as a slanted one counts them (`PoseSet.sheared`)."""
+def counted(poses: PoseBox, values: np.ndarray) -> np.ndarray:
+    """Parameters [n, d] of a set as a slanted one counts them (`PoseBox.sheared`)."""
     found, names = np.array(values, np.float64), poses.box.names
     for name, factors in poses.shear.items():
         found[:, names.index(name)] -= sum(factor * values[:, names.index(other)] for other, factor in factors.items())

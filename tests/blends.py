@@ -6,7 +6,7 @@ from numba import njit
 
 from ns_abstract.arithmetic.simd.intrinsics import pointer
 from ns_abstract.methods.splat.blend import blend_quadratic, blend_several
-from ns_abstract.methods.splat.block import Fragments, Palette, bends_of, fragment_width, jump_column
+from ns_abstract.methods.splat.pixel_block import Fragments, Palette, bends_of, crossing_column, fragment_width
 
 #: Fragments that there is room for.
 CAPACITY = 64
@@ -20,7 +20,7 @@ def blended(values_, lists_, colors_, background_, shape, forms, count, t, jumps
         values,
         fragment_width(shape),
         bends_of(shape),
-        jump_column(shape),
+        crossing_column(shape),
         shape.parts,
         lists,
         values,

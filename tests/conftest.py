@@ -17,7 +17,7 @@ import pytest
 
 from ns_abstract.arithmetic.kernel_cache import store
 from ns_abstract.execution.engine_options import EngineOptions
-from ns_abstract.geometry.views import View, look_at, path_json
+from ns_abstract.geometry.keyframe_cameras import KeyframeCamera, look_at, path_json
 from ns_abstract.io.atomic import write_json
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.program_options import ProgramOptions
@@ -124,10 +124,13 @@ def blob_scene(count: int = 50, seed: int = 7, degree: int = 1) -> SplatScene:
     )
 
 
-def ring(count: int = 3, size: int = 32) -> list[View]:
+def ring(count: int = 3, size: int = 32) -> list[KeyframeCamera]:
     """``count`` views of the origin from a quarter of a circle."""
     angles = np.linspace(0.0, 0.5 * np.pi, count)
-    return [View(look_at((1.6 * np.cos(a), 1.6 * np.sin(a), 0.4), (0.0, 0.0, 0.0)), 45.0, size, size) for a in angles]
+    return [
+        KeyframeCamera(look_at((1.6 * np.cos(a), 1.6 * np.sin(a), 0.4), (0.0, 0.0, 0.0)), 45.0, size, size)
+        for a in angles
+    ]
 
 
 @dataclass(frozen=True)
@@ -173,7 +176,9 @@ def make_blobs(tmp_path: Path) -> Callable[..., Inputs]:
     return lambda **changes: _write(tmp_path / "inputs", **changes)
 
 
-def _write(folder: Path, scene: SplatScene | None = None, views: list[View] | None = None, spec: Any = None) -> Inputs:
+def _write(
+    folder: Path, scene: SplatScene | None = None, views: list[KeyframeCamera] | None = None, spec: Any = None
+) -> Inputs:
     folder.mkdir(exist_ok=True)
     config = write_splatfacto_run(
         blob_scene() if scene is None else scene, folder, timestamp=TIMESTAMP, experiment_name="blobs"

@@ -9,9 +9,9 @@ import torch
 from benchmark_scripts import script
 from torch.nn import functional
 
-from ns_abstract.geometry.camera_path import Camera
-from ns_abstract.geometry.poses import PoseSet
-from ns_abstract.geometry.views import look_at
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.keyframe_cameras import look_at
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.nerf.bounds import RayBounds
 from ns_abstract.methods.nerf.field import Field, encode
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
@@ -59,26 +59,26 @@ def tiny_scene(seed: int = 0, **changes: float) -> NerfScene:
     return NerfScene(weights, tiny_weights(seed + 100, **changes), 0.0, 4.0, name="tiny")
 
 
-def view(width: int = 4, height: int = 3) -> Camera:
+def view(width: int = 4, height: int = 3) -> PinholeCamera:
     pose = look_at((1.6, 0.4, 0.5), (0.0, 0.0, 0.0))[:3]
-    return Camera(pose, 5.0, 5.0, 0.5 * width, 0.5 * height, width, height)
+    return PinholeCamera(pose, 5.0, 5.0, 0.5 * width, 0.5 * height, width, height)
 
 
-def other_view(width: int = 4, height: int = 3) -> Camera:
+def other_view(width: int = 4, height: int = 3) -> PinholeCamera:
     pose = look_at((1.5, 0.6, 0.3), (0.1, 0.0, 0.0))[:3]
-    return Camera(pose, 5.0, 5.0, 0.5 * width, 0.5 * height, width, height)
+    return PinholeCamera(pose, 5.0, 5.0, 0.5 * width, 0.5 * height, width, height)
 
 
-def poses(spec: dict, camera: Camera | None = None) -> PoseSet:
+def poses(spec: dict, camera: PinholeCamera | None = None) -> PoseBox:
     """The set of ``spec`` around `view`, towards `other_view` where the sweep is over segments."""
-    return PoseSet.around(camera or view(), parse_perturbation(spec), other_view())
+    return PoseBox.around(camera or view(), parse_perturbation(spec), other_view())
 
 
-def pixels_of(camera: Camera) -> np.ndarray:
+def pixels_of(camera: PinholeCamera) -> np.ndarray:
     return np.stack(np.mgrid[: camera.height, : camera.width], axis=-1).reshape(-1, 2)
 
 
-def images(scene: NerfScene, pose_set: PoseSet, values: np.ndarray, sampling: Sampling = UNIFORM) -> np.ndarray:
+def images(scene: NerfScene, pose_set: PoseBox, values: np.ndarray, sampling: Sampling = UNIFORM) -> np.ndarray:
     """[n, pixels, 3] concrete renders at ``values`` [n, d]."""
     renderer = NerfRenderer(scene, sampling)
     grid = pixels_of(pose_set.camera)
@@ -99,7 +99,7 @@ def raw_outputs(weights: FieldWeights, x: torch.Tensor, direction: torch.Tensor)
     return density, functional.linear(h, *field._color)
 
 
-def attack_first_rays(scene: NerfScene, pose_set: PoseSet, found: RayBounds) -> tuple[int, int]:
+def attack_first_rays(scene: NerfScene, pose_set: PoseBox, found: RayBounds) -> tuple[int, int]:
     """Comparisons and violations of bounds of the first rays, sampled as `BINS` says.
 
     By random poses, corners, gradient ascent and jumps.

@@ -20,16 +20,16 @@ from ns_abstract.arithmetic.outward import outward
 from ns_abstract.arithmetic.rounding import arithmetic as arithmetic_of
 from ns_abstract.geometry.box import Float64Array, ParameterBox
 from ns_abstract.geometry.camera_path import load_camera_path
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.methods.splat.activate import Splats, activate
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, Rasteriser
-from ns_abstract.methods.splat.descent import pushed
 from ns_abstract.methods.splat.load import load_scene
 from ns_abstract.methods.splat.reference import Reference
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.scene import SplatScene
+from ns_abstract.methods.splat.signed_steps import signed_gradient_step
 from ns_abstract.methods.splat.variations import VariedSplats, vary
 from ns_abstract.perturbation.specification import parse_perturbation
 
@@ -59,12 +59,12 @@ class VariedAttack:
     amount: float = 0.0
 
 
-def show_compiled(renderer: Renderer, poses: PoseSet) -> Show:
+def show_compiled(renderer: Renderer, poses: PoseBox) -> Show:
     """Pictures of the compiled renderer."""
     return lambda values, member: renderer.image(poses.camera, *poses.world_to_camera(values), member)
 
 
-def show_reference(reference: Reference, poses: PoseSet) -> Show:
+def show_reference(reference: Reference, poses: PoseBox) -> Show:
     """Pictures of the reference renderer, in its own precision: a member's values are rounded to it."""
 
     def show(values: Float64Array, member: Splats) -> np.ndarray:
@@ -87,7 +87,7 @@ def attack_varied(
     varied: VariedSplats,
     shows: list[Show],
     scene: SplatScene,
-    poses: PoseSet,
+    poses: PoseBox,
     rasteriser: Rasteriser,
     *,
     members: int = 40,
@@ -128,7 +128,7 @@ def attack_varied(
             record.least, record.most = np.fmin(record.least, picture), np.fmax(record.most, picture)
 
     corners = box.corners() if box.dimensions else np.empty((0, 0))
-    for k, member in enumerate(itertools.islice(varied.members(generator), members)):
+    for k, member in enumerate(itertools.islice(varied.scene_samples(generator), members)):
         at_corner = k % 3 == 1 and len(corners)
         values = corners[generator.integers(len(corners))] if at_corner else box.sample(1, generator)[0]
         compare(box.middle if k % 3 == 0 else values, member, "members")
@@ -139,7 +139,7 @@ def attack_varied(
         values, member = seen[(most_at if sign > 0.0 else least_at)[row, column, channel]]
         for step in range(_STEPS):
             # a full step to the ends first, then steps of half the rest
-            values, member = pushed(
+            values, member = signed_gradient_step(
                 slow, poses, varied, box, values, member,
                 lambda show, values, place=(row, column, channel), sign=sign: (
                     sign * show(torch.tensor([place[:2]]))[0, place[2]]
@@ -177,7 +177,7 @@ def equal_cells(box: ParameterBox, parts: int | Sequence[int]) -> list[Parameter
 
 def bound_cells(
     scene: SplatScene,
-    pose_set: PoseSet,
+    pose_set: PoseBox,
     cells: Sequence[ParameterBox],
     *,
     rasteriser: Rasteriser = GSPLAT_1_4_0,
@@ -239,7 +239,7 @@ def check_varied(
     scene = load_scene(load_config)
     path = load_camera_path(camera_path, downscale_factor)
     perturbation = parse_perturbation(dict(spec))
-    poses = PoseSet.around(path.cameras[frame], perturbation, path.following(frame))
+    poses = PoseBox.around(path.cameras[frame], perturbation, path.following(frame))
     splats = activate(scene, rasteriser)
     varied = vary(scene, splats, perturbation.scene)
     boxes = equal_cells(poses.box, cells) if poses.box.dimensions else [poses.box]

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement
 
 import ns_abstract as nsa
-from ns_abstract.geometry.camera_path import Camera
-from ns_abstract.geometry.views import look_at
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.keyframe_cameras import look_at
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.load import load_any
@@ -31,7 +31,7 @@ from ns_abstract.methods.splat.write import write_splatfacto_run
 
 torch.set_num_threads(1)
 NAN, INF = float("nan"), float("inf")
-CAMERA = Camera(np.asarray(look_at((1.6, 0.3, 0.4), (0.0, 0.0, 0.0)))[:3], 30.0, 30.0, 16.0, 12.0, 32, 24)
+CAMERA = PinholeCamera(np.asarray(look_at((1.6, 0.3, 0.4), (0.0, 0.0, 0.0)))[:3], 30.0, 30.0, 16.0, 12.0, 32, 24)
 SHIFT = {"x": 0.01}
 
 

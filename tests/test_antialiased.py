@@ -12,14 +12,14 @@ import torch
 from ns_abstract.arithmetic.rounding import FLOAT32, REAL, UNIT32
 from ns_abstract.bench.sets import open_jobs, pose_set, splat_of
 from ns_abstract.bench.soundness import attack
-from ns_abstract.geometry.camera_path import Camera
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.methods.splat.activate import activate, rotation_matrices
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.frame import SplatFrame
-from ns_abstract.methods.splat.records import FORMS, OPACITY_HIGH, OPACITY_LOW, UNBOUNDED, columns
+from ns_abstract.methods.splat.projection_errors import FORMS, OPACITY_HIGH, OPACITY_LOW, UNBOUNDED, columns
 from ns_abstract.methods.splat.reference import Reference
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.scene import SplatScene
@@ -28,7 +28,7 @@ from ns_abstract.perturbation.specification import Perturbation
 torch.set_num_threads(1)
 RUNS = Path(__file__).resolve().parents[2] / "shared" / "runs"
 FOCAL, SIDE = 80.0, 24
-CAMERA = Camera(np.concatenate([np.eye(3), np.zeros((3, 1))], 1), FOCAL, FOCAL, SIDE / 2, SIDE / 2, SIDE, SIDE)
+CAMERA = PinholeCamera(np.concatenate([np.eye(3), np.zeros((3, 1))], 1), FOCAL, FOCAL, SIDE / 2, SIDE / 2, SIDE, SIDE)
 #: Powers of ten of the standard deviations in pixels, least and most by axis.
 SHAPES = {
     "thin": ((0.0, 1.3), (-4.0, -1.0), (-4.0, -1.0)),
@@ -149,7 +149,7 @@ def compensations(scene: SplatScene, number) -> np.ndarray:
     return (before / after).root().value.astype(np.float64)
 
 
-def records(scene: SplatScene, poses: PoseSet, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def records(scene: SplatScene, poses: PoseBox, order: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """Bounds [n] of the compensated opacity in float32, whether each Gaussian is unbounded, and whether it is drawn."""
     bounds = SplatBounds(activate(scene, GSPLAT_1_4_0), GSPLAT_1_4_0, FLOAT32)
     forms = poses.enclosure(poses.box, order)
@@ -172,9 +172,9 @@ def test_computed_factor(shape: str, name: str) -> None:
     """What float32 finds for each Gaussian's opacity, in IEEE arithmetic and with errors as large as they may be."""
     scene = scene_of((shape,), 150, seed=len(shape))
     perturbation, order = SETS[name]
-    low, high, unbounded, shown = records(scene, PoseSet.around(CAMERA, perturbation), order)
+    low, high, unbounded, shown = records(scene, PoseBox.around(CAMERA, perturbation), order)
     _, _, unbounded_without, _ = records(
-        replace(scene, rasterize_mode="classic"), PoseSet.around(CAMERA, perturbation), order
+        replace(scene, rasterize_mode="classic"), PoseBox.around(CAMERA, perturbation), order
     )
     assert (unbounded & shown).sum() <= unbounded_without.sum()
     opacity = 1.0 / (1.0 + np.exp(-scene.opacity_logits.astype(np.float64)))
@@ -195,7 +195,7 @@ def test_pictures(name: str) -> None:
     """Pictures in float64 and float32 lie inside; float32's bounds are hardly wider than those of exact evaluation."""
     scene = scene_of(tuple(SHAPES), 20)
     perturbation, order = SETS[name]
-    poses = PoseSet.around(CAMERA, perturbation)
+    poses = PoseBox.around(CAMERA, perturbation)
     splats = activate(scene, GSPLAT_1_4_0)
     box = poses.box
     if box.dimensions:

@@ -23,8 +23,8 @@ from wall import WALL, write_wall
 
 import ns_abstract as nsa
 from ns_abstract.cli import render as render_command
-from ns_abstract.geometry.camera_path import Camera as PinholeCamera
-from ns_abstract.geometry.views import look_at
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.keyframe_cameras import look_at
 from ns_abstract.methods import load
 from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.methods.splat import bounds

@@ -20,7 +20,7 @@ from ns_abstract.api.files import Settings, open_job
 from ns_abstract.api.reaching import open_loop
 from ns_abstract.cli import render as render_command
 from ns_abstract.demo.writing import write_loop_demo
-from ns_abstract.geometry.views import View, path_json
+from ns_abstract.geometry.keyframe_cameras import KeyframeCamera, path_json
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.atomic import write_json
 from ns_abstract.methods.nerf.write import write_nerf_run
@@ -28,7 +28,7 @@ from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.methods.splat.ply import write_ply
 from ns_abstract.report.page import render_page
-from ns_abstract.report.record import Report, Run
+from ns_abstract.report.record import Report, RunRecord
 
 EVIL = "<script>alert(1)</script>"
 
@@ -132,7 +132,7 @@ def test_reports_and_results_have_them(blobs: Inputs, tmp_path: Path, in_process
 
 def test_page_escapes(tmp_path: Path) -> None:
     entry = Assumption(EVIL, EVIL, EVIL)
-    run = Run("real-sound", {"name": "gsplat", "version": "1"}, {}, (0,), {}, {}, assumptions=(entry,))
+    run = RunRecord("real-sound", {"name": "gsplat", "version": "1"}, {}, (0,), {}, {}, assumptions=(entry,))
     document = Report(tmp_path, run).document()
     assert document["assumptions"] == [{"name": EVIL, "value": EVIL, "origin": EVIL}]
     text = render_page(document, {})
@@ -144,7 +144,7 @@ def test_nerf(sampling: str | None, tmp_path: Path) -> None:
     config = write_nerf_run(tiny_scene(1), tmp_path / "runs", timestamp="t", experiment_name="tiny")
     pose = np.eye(4)
     pose[:3] = view().camera_to_world
-    path = write_json(tmp_path / "path.json", path_json([View(pose, 40.0, 3, 4)]))
+    path = write_json(tmp_path / "path.json", path_json([KeyframeCamera(pose, 40.0, 3, 4)]))
     spec = write_json(tmp_path / "spec.json", {"version": 1, "rotation": {"yaw": 0.002}})
     found = table(open_job(Settings(config, path, spec, program=ProgramOptions(sampling=sampling))).assumptions)
     samples = ("num_samples", "default") if sampling is None else (

@@ -18,7 +18,7 @@ from ns_abstract.api.files import PathJob
 from ns_abstract.bench import certificates, plan, rules, scale
 from ns_abstract.bench import paper as paper_tables
 from ns_abstract.bench.sets import open_jobs, pose_set, splat_of
-from ns_abstract.cli.bench import Certificates, Plan, Rules, Scale, Tightness, bench
+from ns_abstract.cli.bench import Certificates, PlanBenchmark, RulesBenchmark, ScaleBenchmark, Tightness, bench
 from ns_abstract.cli.common import DONE
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.program_options import ProgramOptions
@@ -101,8 +101,11 @@ def test_a_plan_that_loses_something_is_noticed(job: PathJob, monkeypatch: pytes
 @pytest.mark.slow
 def test_commands(blobs, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files = {"load_config": (blobs.config,), "camera_path_filename": blobs.path}
-    assert bench(Plan(**files, output_dir=tmp_path, sets=("x",), cells=4)) == DONE
-    assert bench(Rules(**files, output_dir=tmp_path, sets=("x", "roll"), parts=(8,), pixels=1, gaussians=5)) == DONE
+    assert bench(PlanBenchmark(**files, output_dir=tmp_path, sets=("x",), cells=4)) == DONE
+    assert (
+        bench(RulesBenchmark(**files, output_dir=tmp_path, sets=("x", "roll"), parts=(8,), pixels=1, gaussians=5))
+        == DONE
+    )
     printed = capsys.readouterr().out
     assert printed.count("every Gaussian in every cell") == 1 and printed.count("MATRIXINV, sorting") == 2
     for name, count in (("plan", 3), ("rules", 10)):
@@ -146,7 +149,9 @@ def test_resampled_scenes_cover_as_much(job: PathJob, count: int) -> None:
 
 @pytest.mark.slow
 def test_cost_by_scale(blobs, tmp_path: Path) -> None:
-    options = Scale((blobs.config,), blobs.path, tmp_path, gaussians=(10, 60), widths=(24,), repeats=1, seconds=1.0)
+    options = ScaleBenchmark(
+        (blobs.config,), blobs.path, tmp_path, gaussians=(10, 60), widths=(24,), repeats=1, seconds=1.0
+    )
     assert bench(options) == DONE
     with open(tmp_path / "scale.csv", newline="") as stream:
         small, large = csv.DictReader(stream)
@@ -156,7 +161,7 @@ def test_cost_by_scale(blobs, tmp_path: Path) -> None:
 
 def test_scale_needs_one_run(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="found 0 runs"):
-        bench(Scale(output_dir=tmp_path))
+        bench(ScaleBenchmark(output_dir=tmp_path))
 
 
 @pytest.mark.parametrize(("label", "verdict"), [(0, "certified"), (1, "falsified")])

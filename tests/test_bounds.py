@@ -15,14 +15,14 @@ import pytest
 
 from ns_abstract.arithmetic.rounding import FLOAT32, REAL
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.camera_path import Camera
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.methods.splat.activate import Splats, rotation_matrices
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, PAPER
 from ns_abstract.methods.splat.frame import SplatFrame
-from ns_abstract.methods.splat.records import FORMS, SPREAD, UNBOUNDED, columns
+from ns_abstract.methods.splat.projection_errors import FORMS, SPREAD, UNBOUNDED, columns
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.reordering import _sort as sort_group
 from ns_abstract.methods.splat.stage_data import shared_out
@@ -48,10 +48,10 @@ def scene(*gaussians: dict, background=(0.0, 0.0, 0.0), antialiased: bool = Fals
     )
 
 
-def camera(width: int = 16, height: int = 16, focal: float = 16.0, position=(0.0, 0.0, 0.0)) -> Camera:
+def camera(width: int = 16, height: int = 16, focal: float = 16.0, position=(0.0, 0.0, 0.0)) -> PinholeCamera:
     """A camera at ``position`` that looks along -z of the world."""
     pose = np.concatenate([np.eye(3), np.array(position, np.float64)[:, None]], axis=1)
-    return Camera(pose, focal, focal, width / 2, height / 2, width, height)
+    return PinholeCamera(pose, focal, focal, width / 2, height / 2, width, height)
 
 
 def moves(**limits) -> Perturbation:
@@ -66,10 +66,10 @@ def moves(**limits) -> Perturbation:
 class Case:
     """A scene, a camera and a set of poses."""
 
-    def __init__(self, splats: Splats, perturbation: Perturbation, view: Camera | None = None) -> None:
+    def __init__(self, splats: Splats, perturbation: Perturbation, view: PinholeCamera | None = None) -> None:
         self.camera = view or camera()
         self.splats = splats
-        self.poses = PoseSet.around(self.camera, perturbation)
+        self.poses = PoseBox.around(self.camera, perturbation)
         self.renderer = Renderer(splats, GSPLAT_1_4_0)
 
     def image(self, values: np.ndarray) -> np.ndarray:
@@ -170,7 +170,7 @@ def test_three_layers_swap(order):
 def test_order_by_pitch_and_roll():
     """Several rotations at once."""
     case = swap_case()
-    case.poses = PoseSet.around(case.camera, moves(yaw=0.02, pitch=0.03, roll=0.05))
+    case.poses = PoseBox.around(case.camera, moves(yaw=0.02, pitch=0.03, roll=0.05))
     case.check(1, parts=2, count=6)
 
 
@@ -431,7 +431,7 @@ def test_colors_are_shared_by_cells_that_turn_and_not_by_others():
     sh = np.random.default_rng(1).normal(0.0, 0.4, (6, 4, 3))
     splats = scene(*({"mean": (0.3 * k - 0.8, 0.0, -4.0), "scale": 0.3, "opacity": 0.7, "sh": sh[k]} for k in range(6)))
     here, there = (
-        PoseSet.around(camera(position=place), moves(yaw=0.05)) for place in ((0.0, 0.0, 0.0), (0.5, 0.2, -1.0))
+        PoseBox.around(camera(position=place), moves(yaw=0.05)) for place in ((0.0, 0.0, 0.0), (0.5, 0.2, -1.0))
     )
     kept = SplatBounds(splats, GSPLAT_1_4_0, FLOAT32)
     for poses in (here, here, there, here):
@@ -569,7 +569,7 @@ def test_needle(order):
     case = Case(splats, moves(x=0.02))
     case.check(order, parts=2)
     for motion in (moves(y=0.02), moves(roll=0.05)):
-        case.poses = PoseSet.around(case.camera, motion)
+        case.poses = PoseBox.around(case.camera, motion)
         case.check(order, parts=2)
 
 

@@ -14,7 +14,7 @@ import ns_abstract as nsa
 from ns_abstract.api.files import Settings, open_job
 from ns_abstract.geometry.camera_files import RunFrame
 from ns_abstract.geometry.camera_path import load_camera_path
-from ns_abstract.geometry.views import look_at
+from ns_abstract.geometry.keyframe_cameras import look_at
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.write import write_splatfacto_run
 

@@ -14,14 +14,14 @@ import pytest
 from waves import Waves
 
 from ns_abstract.api.cell_search import CellQuestion, CellSearch, Request, cell_place
-from ns_abstract.execution.ending import AbandonedError, Deadline, checkpoint
-from ns_abstract.execution.engines import Here
-from ns_abstract.execution.opening import Recipe
+from ns_abstract.execution.cancellation import Deadline, WorkCancelledError, check_cancelled
+from ns_abstract.execution.engines import SerialEngine
 from ns_abstract.execution.stopping import StopRequest
+from ns_abstract.execution.worker_cache import Recipe
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
-from ns_abstract.verify.cells import Cell, Grid
-from ns_abstract.verify.search import Findings, Leaf
+from ns_abstract.verify.cells import Cell, CellGrid
+from ns_abstract.verify.search import BlockResult, FinishedCell
 from ns_abstract.verify.store import Store, fractions
 
 BOX = ParameterBox(("x", "y"), ("m", "rad"), (-1.5, -1.0), (1.5, 1.0))
@@ -52,24 +52,24 @@ class Brightness:
         slope = slopes[1:3, 1:3].mean(axis=(0, 1, 2))
         return float(offsets[1:3, 1:3].mean() - np.abs(slope).sum()) - self.least - 1e-6, np.abs(slope)
 
-    def examine(self, number: int, grid: Grid, cells: tuple[Cell, ...]) -> Findings:
+    def examine(self, number: int, grid: CellGrid, cells: tuple[Cell, ...]) -> BlockResult:
         leaves, children = [], []
         for cell in cells:
-            checkpoint()
+            check_cancelled()
             self.examined.append(cell)
             box = grid.box_of(cell)
             bound, slopes = self.proved(box)
             parts = grid.divide(cell, slopes, 0.5, 4)
             pose = min((box.middle, *box.corners()), key=self.margin)
             if bound > 0.0:
-                leaves.append(Leaf(cell, "certified", bound, 0.0))
+                leaves.append(FinishedCell(cell, "certified", bound, 0.0))
             elif max(map(self.margin, box.corners())) <= 0.0 or (not parts and self.margin(pose) <= 0.0):
-                leaves.append(Leaf(cell, "falsified", self.margin(pose), 0.0, tuple(pose.tolist())))
+                leaves.append(FinishedCell(cell, "falsified", self.margin(pose), 0.0, tuple(pose.tolist())))
             elif parts:
                 children += [(part,) for part in parts]
             else:
-                leaves.append(Leaf(cell, "unknown", None, 0.0, reason="the finest cell"))
-        return Findings(tuple(leaves), tuple(children), (), len(cells), 0.0)
+                leaves.append(FinishedCell(cell, "unknown", None, 0.0, reason="the finest cell"))
+        return BlockResult(tuple(leaves), tuple(children), (), len(cells), 0.0)
 
 
 class BrightnessQuestion(CellQuestion[float]):
@@ -81,13 +81,13 @@ class BrightnessQuestion(CellQuestion[float]):
         super().__init__(examiner, [("x", "m"), ("y", "rad")], {n: self.all[n] for n in numbers}, {})
         self.states: list[str] = []
 
-    def grid(self, number: int) -> Grid:
-        return Grid.fixed(self.sets[number], (32, 32), (2, 1))
+    def grid(self, number: int) -> CellGrid:
+        return CellGrid.fixed(self.sets[number], (32, 32), (2, 1))
 
     def stored_set(self, number: int) -> ParameterBox | None:
         return self.all[number]
 
-    def counterexamples(self, number: int, grid: Grid, findings: Any) -> Iterator[tuple[str, dict[str, Any]]]:
+    def counterexamples(self, number: int, grid: CellGrid, findings: Any) -> Iterator[tuple[str, dict[str, Any]]]:
         for leaf in findings.leaves:
             if leaf.counterexample is not None:
                 yield f"set_{number}_{cell_place(leaf.cell, 'pose')}", {"values": np.array(leaf.counterexample)}
@@ -106,7 +106,7 @@ class BrightnessQuestion(CellQuestion[float]):
 
 def run(question: BrightnessQuestion, folder: Path, stop: StopRequest | None = None, **more: Any) -> CellSearch[float]:
     search = CellSearch(question, folder)
-    search.run(lambda stack: Here(), stop or StopRequest(), Request(**{"budget": 600.0} | more))
+    search.run(lambda stack: SerialEngine(), stop or StopRequest(), Request(**{"budget": 600.0} | more))
     return search
 
 
@@ -145,7 +145,7 @@ def test_an_ended_search_loses_nothing(tmp_path: Path, blocks: int) -> None:
     question = BrightnessQuestion(examiner)
     examine, calls = examiner.examine, []
 
-    def ends(number: int, grid: Grid, cells: tuple[Cell, ...]) -> Findings:
+    def ends(number: int, grid: CellGrid, cells: tuple[Cell, ...]) -> BlockResult:
         calls.append(cells)
         if len(calls) > blocks:
             stop.ask()
@@ -183,11 +183,11 @@ def test_deadlines_divide_time_and_hear_requests() -> None:
     parts = [whole, whole.within(1.0), whole.before(1.0), whole.extended(1.0)]
     assert not any(part() for part in parts)
     with whole.enforced():
-        checkpoint()
+        check_cancelled()
     stop.ask()
     assert all(part() for part in parts) and not whole.late
-    with pytest.raises(AbandonedError), parts[1].enforced():
-        checkpoint()
+    with pytest.raises(WorkCancelledError), parts[1].enforced():
+        check_cancelled()
     begin = time.perf_counter()
     late = Deadline(0.01)
     while not late():

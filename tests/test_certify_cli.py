@@ -41,18 +41,18 @@ from ns_abstract.api.showing import look_closer
 from ns_abstract.cli import certify as certify_command
 from ns_abstract.cli.certify import Certify, certify
 from ns_abstract.demo.writing import write_demo
-from ns_abstract.execution.engines import Here, Processes
-from ns_abstract.execution.opening import forget
+from ns_abstract.execution.engines import Processes, SerialEngine
+from ns_abstract.execution.worker_cache import clear_cache
 from ns_abstract.io.atomic import write_json
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.method import SplatMethod
 from ns_abstract.methods.splat.reference import Reference
 from ns_abstract.perturbation.variations import SceneVariation, Selection
 from ns_abstract.verify import model
+from ns_abstract.verify.camera_response import CameraResponse
 from ns_abstract.verify.eight_bit import rounded
 from ns_abstract.verify.network import OutputBounds
-from ns_abstract.verify.registration import RegisteredScene
-from ns_abstract.verify.response import Response
+from ns_abstract.verify.registration import RegisteredImages
 from ns_abstract.verify.scene_margin import CAMERA_KINDS, KINDS, PLACES
 
 MODULE = "ns_abstract.cli.certify"
@@ -327,7 +327,7 @@ def test_unsound_network_bounds_are_caught_by_the_attack(
         return OutputBounds(found.lower + 2e-2, found.a, found.b + 2e-2)
 
     monkeypatch.setattr(model, "bound_outputs", raised)
-    forget()
+    clear_cache()
     try:
         assert certify(command_options(Certify, **planted.values(tmp_path / "out"))) == 0
     except RuntimeError as error:
@@ -335,7 +335,7 @@ def test_unsound_network_bounds_are_caught_by_the_attack(
         assert "internal error" in str(error)
         return
     finally:
-        forget()
+        clear_cache()
     assert attack(planted, tmp_path / "out")[1] > 0
 
 
@@ -355,9 +355,9 @@ def test_broken_bounds_never_certify(kind: str, planted: Case, tmp_path: Path, m
         return OutputBounds(np.full_like(found.lower, value), found.a * value, found.b * value)
 
     monkeypatch.setattr(model, "bound_outputs", broken)
-    forget()
+    clear_cache()
     assert certify(command_options(Certify, **planted.values(tmp_path / "out", time_budget=5.0))) == 0
-    forget()
+    clear_cache()
     document = report(tmp_path / "out")
     assert document["coverage"]["certified"] == 0.0
     assert {row[3] for row in cells(tmp_path / "out")} <= {"falsified", "unknown"}
@@ -600,7 +600,7 @@ def test_worker_that_always_dies_is_an_error() -> None:
 
 
 def test_engine_here() -> None:
-    engine = Here()
+    engine = SerialEngine()
     engine.submit(1, divmod, 7, 2)
     assert engine.collect(0.0) == [(1, (3, 1))] and engine.collect(0.0) == []
 
@@ -907,10 +907,10 @@ def test_scene_variations(
         box = pictures.box
         for axis, ends in enumerate(zip(json.loads(lower), json.loads(upper), strict=True)):
             box = box.replace(axis, *ends)
-        for member in itertools.islice(pictures.members(5), 0, 26, 5):
+        for member in itertools.islice(pictures.scene_samples(5), 0, 26, 5):
             values = box.sample(1, rng)[0] if box.dimensions else box.middle
             assert margin(pictures.image(values, member), values) >= proved
-        values, member = member.pushed(box, values, loss, 2.0)
+        values, member = member.signed_gradient_step(box, values, loss, 2.0)
         assert box.contains(values) and margin(pictures.image(values, member), values) >= proved
     for file in (tmp_path / "out" / "counterexamples").glob("*.npz"):
         with np.load(file) as stored:
@@ -958,12 +958,12 @@ def test_scene_margin(blobs: Inputs, bright: tuple[Path, float, float], tmp_path
         # it was bisected to the end, and what was found to break the property lies beyond
         assert radius < entry["not_certified"]["radius"] <= 1.2 * radius or radius == KINDS_BY_NAME[name].most
         assert broken is None or broken["radius"] > radius
-        pictures: FramePictures | RegisteredScene
+        pictures: FramePictures | RegisteredImages
         if place := KINDS_BY_NAME[name].place:
             shown = FramePictures(job.job.method, job.job.pose_sets[0].registered(place, radius))
-            pictures = RegisteredScene(shown, shown.frame)
+            pictures = RegisteredImages(shown, shown.frame)
         elif (response := KINDS_BY_NAME[name].response) is not None:
-            set_ = Response(response, radius)
+            set_ = CameraResponse(response, radius)
             pictures = FramePictures(job.job.method, job.job.pose_sets[0], "float", set_)
         else:
             ends: dict[str, Any] = {name: (-radius, radius)}
@@ -973,10 +973,10 @@ def test_scene_margin(blobs: Inputs, bright: tuple[Path, float, float], tmp_path
         def loss(picture: torch.Tensor, values: torch.Tensor, claim: Any = claim) -> torch.Tensor:
             return -claim.margin(job.model.differentiable(picture[None]), values[None])[0]
 
-        for number, member in enumerate(itertools.islice(pictures.members(2), 0, 24, 2)):
+        for number, member in enumerate(itertools.islice(pictures.scene_samples(2), 0, 24, 2)):
             values = pictures.box.sample(1, rng)[0]
             if number % 4 == 0:
-                values, member = member.pushed(pictures.box, values, loss, 2.0)
+                values, member = member.signed_gradient_step(pictures.box, values, loss, 2.0)
             outputs = job.model.outputs(pictures.image(values, member)[None])
             assert (
                 float(claim.margin(torch.from_numpy(np.asarray(outputs, np.float64)), torch.from_numpy(values)[None]))

@@ -12,27 +12,27 @@ import pytest
 import torch
 
 from ns_abstract.api.certification import PropertySource
-from ns_abstract.geometry.camera_path import Camera
-from ns_abstract.geometry.poses import PoseSet
-from ns_abstract.geometry.views import look_at
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.keyframe_cameras import look_at
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.atomic import write_json
 from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.specification import parse_perturbation
 from ns_abstract.verify.network import OutputBounds
 from ns_abstract.verify.preprocess import Preprocess, parse_preprocess
-from ns_abstract.verify.properties import Claim, DetectionClaim, Truth, decode, parse_property
+from ns_abstract.verify.properties import Claim, DetectionClaim, TrueValues, decode, parse_property
 from ns_abstract.verify.vnnlib import load_vnnlib
 
 SHAPE = (3, 16, 16)
 HEAD = (3, 12, 12), (125, 3, 3)
 
 
-def camera() -> Camera:
-    return Camera(look_at((1.5, 0.4, 0.6), (0.0, 0.0, 0.0))[:3], 20.0, 20.0, 8.0, 8.0, 16, 16)
+def camera() -> PinholeCamera:
+    return PinholeCamera(look_at((1.5, 0.4, 0.6), (0.0, 0.0, 0.0))[:3], 20.0, 20.0, 8.0, 8.0, 16, 16)
 
 
-def poses(spec: dict[str, Any] | None = None) -> PoseSet:
-    return PoseSet.around(camera(), parse_perturbation(spec or {"translation": {"x": 0.1}, "rotation": {"yaw": 0.05}}))
+def poses(spec: dict[str, Any] | None = None) -> PoseBox:
+    return PoseBox.around(camera(), parse_perturbation(spec or {"translation": {"x": 0.1}, "rotation": {"yaw": 0.05}}))
 
 
 def parsed(tmp_path: Path, value: Any, shapes: Any = (SHAPE, (10,))) -> Any:
@@ -142,7 +142,7 @@ def test_broken_json(text: str, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- linear properties
 
 
-def boxed(claim: Claim, low: np.ndarray, high: np.ndarray, pose_set: PoseSet, seen: np.ndarray) -> float:
+def boxed(claim: Claim, low: np.ndarray, high: np.ndarray, pose_set: PoseBox, seen: np.ndarray) -> float:
     """What the claim proves of outputs in [low, high]."""
     query = claim.query(seen[None])
     plus, minus = query.rows.clip(min=0.0), query.rows.clip(max=0.0)
@@ -151,7 +151,7 @@ def boxed(claim: Claim, low: np.ndarray, high: np.ndarray, pose_set: PoseSet, se
     return float(claim.proved(query, bounds, [pose_set.box])[0])
 
 
-def attacked(claim: Claim, low: np.ndarray, high: np.ndarray, pose_set: PoseSet, count: int = 4000) -> float:
+def attacked(claim: Claim, low: np.ndarray, high: np.ndarray, pose_set: PoseBox, count: int = 4000) -> float:
     """The smallest margin of random and extreme outputs and poses."""
     rng = np.random.default_rng(1)
     weight = rng.random((count, len(low)))
@@ -300,7 +300,7 @@ def test_regression_uses_correlation(tmp_path: Path) -> None:
     pose_set = poses({"translation": {"x": 0.5}})
     value = {"type": "regression", "target": "camera", "tolerance": {"absolute": 0.01}}
     claim = parsed(tmp_path, value, (SHAPE, (3,))).bind(pose_set, lambda: np.zeros(3))
-    truth = Truth(("camera.x", "camera.y", "camera.z")).forms(pose_set, pose_set.box)
+    truth = TrueValues(("camera.x", "camera.y", "camera.z")).forms(pose_set, pose_set.box)
     slope, centre = truth.linear.T, truth.center
     query = claim.query(np.zeros((1, 3)))
     a, b = np.concatenate([slope, -slope])[None], np.concatenate([centre, -centre])[None]
@@ -325,7 +325,7 @@ def test_truth_forms_contain_the_truth(components: tuple[str, ...]) -> None:
         "orbit": {"target": [0, 0, 0], "axis": [0, 0, 1], "azimuth": [0.0, 0.4]},
     }  # fmt: skip
     pose_set = poses(spec)
-    truth = Truth(components, (0.2, -0.1, 0.3), 2.0)
+    truth = TrueValues(components, (0.2, -0.1, 0.3), 2.0)
     low, high = truth.forms(pose_set, pose_set.box).bounds()
     rng = np.random.default_rng(0)
     for values in (*pose_set.box.corners(), *pose_set.box.sample(500, rng)):

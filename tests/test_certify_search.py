@@ -17,11 +17,11 @@ import torch
 
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
-from ns_abstract.verify.cells import HALVINGS, Cell, Grid, coarse_parts
+from ns_abstract.verify.cells import HALVINGS, Cell, CellGrid, initial_divisions
 from ns_abstract.verify.network import ImageSets, OutputBounds
 from ns_abstract.verify.properties import LinearClaim, Query
-from ns_abstract.verify.search import BLOCK, ContradictionError, Findings, Leaf, Search
-from ns_abstract.verify.store import Block, Store, fractions
+from ns_abstract.verify.search import BLOCK, BlockResult, ContradictionError, FinishedCell, Search
+from ns_abstract.verify.store import CellBlock, Store, fractions
 
 CLAIM = LinearClaim(np.array([[1.0, -1.0]]), np.zeros(1), ((0,),))
 FINGERPRINT = {"scene": "a", "rules": 1}
@@ -54,7 +54,7 @@ class Ramp:
     def differentiable(self, values: torch.Tensor) -> torch.Tensor:
         return (0.5 + (torch.from_numpy(self.gains) * values).sum()).expand(2, 2, 3)
 
-    def members(self, seed: int) -> Iterator[Any]:
+    def scene_samples(self, seed: int) -> Iterator[Any]:
         return iter(())
 
 
@@ -87,12 +87,12 @@ class Threshold:
         return -np.inf
 
 
-def drive(search: Search, limit: int = 100_000, shuffle: int | None = None) -> tuple[list[Leaf], int]:
+def drive(search: Search, limit: int = 100_000, shuffle: int | None = None) -> tuple[list[FinishedCell], int]:
     """Examine all blocks, in order or at random; leaves by cell, and the number of blocks."""
     roots = search.grid.roots()
     blocks = [tuple(roots[i : i + BLOCK]) for i in range(0, len(roots), BLOCK)]
     rng = np.random.default_rng(shuffle)
-    leaves: list[Leaf] = []
+    leaves: list[FinishedCell] = []
     count = 0
     while blocks and count < limit:
         block = blocks.pop(0 if shuffle is None else int(rng.integers(len(blocks))))
@@ -103,16 +103,16 @@ def drive(search: Search, limit: int = 100_000, shuffle: int | None = None) -> t
     return sorted(leaves, key=lambda leaf: leaf.cell.first), count
 
 
-def volume(leaves: list[Leaf], verdict: str | None = None) -> int:
+def volume(leaves: list[FinishedCell], verdict: str | None = None) -> int:
     return sum(leaf.cell.volume for leaf in leaves if verdict in (None, leaf.verdict))
 
 
 def search_of(scene: Any = None, model: Any = None, coarse: tuple[int, ...] = (5,), **more: Any) -> Search:
     scene = scene or Ramp()
-    return Search(scene, model or Threshold(0.43), CLAIM, Grid.adaptive(scene.box, coarse), **more)
+    return Search(scene, model or Threshold(0.43), CLAIM, CellGrid.adaptive(scene.box, coarse), **more)
 
 
-def same(first: list[Leaf], second: list[Leaf]) -> None:
+def same(first: list[FinishedCell], second: list[FinishedCell]) -> None:
     assert [(x.cell, x.verdict, x.margin, x.counterexample) for x in first] == [
         (x.cell, x.verdict, x.margin, x.counterexample) for x in second
     ]
@@ -196,7 +196,7 @@ def test_gradient_finds_what_samples_miss() -> None:
         def sets(self, box: ParameterBox) -> Any:
             raise ValueError("no bounds")
 
-    search = Search(Spot(2), Threshold(0.2004), CLAIM, Grid(interval(2), (1, 1), (1, 1)))
+    search = Search(Spot(2), Threshold(0.2004), CLAIM, CellGrid(interval(2), (1, 1), (1, 1)))
     leaves, _ = drive(search)
     assert [leaf.verdict for leaf in leaves] == ["falsified"]
     assert np.linalg.norm(np.array(leaves[0].counterexample) - spot) < 0.07
@@ -231,7 +231,7 @@ SPOILT_IMAGES: dict[str, Callable[[Any], Any]] = {
 @pytest.mark.parametrize("name", SPOILT_IMAGES)
 def test_bad_image_bounds_certify_nothing(name: str) -> None:
     scene = spoilt(SPOILT_IMAGES[name])()
-    search = Search(scene, Threshold(0.1), CLAIM, Grid(scene.box, (8,), (2,)))
+    search = Search(scene, Threshold(0.1), CLAIM, CellGrid(scene.box, (8,), (2,)))
     leaves, _ = drive(search)
     assert {leaf.verdict for leaf in leaves} == {"unknown"}
     # told as what it is: the network is not even asked
@@ -253,7 +253,7 @@ def test_bad_network_bounds_certify_nothing(name: str) -> None:
         def bound(self, images: ImageSets, query: Query) -> OutputBounds:
             return SPOILT_BOUNDS[name](super().bound(images, query))
 
-    search = Search(Ramp(), Spoilt(0.1), CLAIM, Grid(interval(), (8,), (2,)))
+    search = Search(Ramp(), Spoilt(0.1), CLAIM, CellGrid(interval(), (8,), (2,)))
     leaves, _ = drive(search)
     assert {leaf.verdict for leaf in leaves} == {"unknown"}
 
@@ -264,7 +264,7 @@ def test_network_without_a_number_decides_nothing(value: float) -> None:
         def outputs(self, images: np.ndarray) -> np.ndarray:
             return super().outputs(images) * value
 
-    search = Search(Ramp(), Broken(0.1), CLAIM, Grid(interval(), (8,), (2,)))
+    search = Search(Ramp(), Broken(0.1), CLAIM, CellGrid(interval(), (8,), (2,)))
     leaves, _ = drive(search)
     assert {leaf.verdict for leaf in leaves} == {"unknown"}
     assert {leaf.reason for leaf in leaves} == {"the margin of a picture is no finite number"}
@@ -280,7 +280,7 @@ def test_number_that_is_lost_after_a_proof_takes_it_back(value: float) -> None:
         def image(self, values: np.ndarray) -> np.ndarray:
             return super().image(values) * np.float32(1.0 if float(values[0]) in known else value)
 
-    leaves, _ = drive(Search(Gap(), Threshold(-0.5), CLAIM, Grid(interval(), (1,), (1,))))
+    leaves, _ = drive(Search(Gap(), Threshold(-0.5), CLAIM, CellGrid(interval(), (1,), (1,))))
     assert [leaf.verdict for leaf in leaves] == ["unknown"]
 
 
@@ -300,7 +300,7 @@ def test_false_proof_is_noticed() -> None:
             return OutputBounds(np.ones_like(found.lower), found.a, found.b)
 
     with pytest.raises(ContradictionError, match="internal error"):
-        drive(Search(Hidden(), Liar(0.5), CLAIM, Grid(interval(), (1,), (1,))))
+        drive(Search(Hidden(), Liar(0.5), CLAIM, CellGrid(interval(), (1,), (1,))))
 
 
 def test_users_mistakes_and_lack_of_memory_end_the_run() -> None:
@@ -322,7 +322,7 @@ def test_unconfirmed_counterexample_is_unknown() -> None:
             Moody.calls += 1
             return np.full((2, 2, 3), 0.1 if Moody.calls <= 3 else 0.9, np.float32)
 
-    leaves, _ = drive(Search(Moody(), Threshold(0.5), CLAIM, Grid(interval(), (1,), (1,))))
+    leaves, _ = drive(Search(Moody(), Threshold(0.5), CLAIM, CellGrid(interval(), (1,), (1,))))
     assert [(leaf.verdict, leaf.reason) for leaf in leaves] == [("unknown", "a counterexample was not confirmed")]
 
 
@@ -331,7 +331,7 @@ def test_unconfirmed_counterexample_is_unknown() -> None:
 
 def test_fixed_partition_gives_every_part_that_fails_its_own_verdict() -> None:
     scene = Ramp()
-    grid = Grid.fixed(scene.box, (1000,), (7,))
+    grid = CellGrid.fixed(scene.box, (1000,), (7,))
     leaves, _ = drive(Search(scene, Threshold(0.43), CLAIM, grid, every_unit=True))
     assert volume(leaves) == 1000
     # x = -0.35 is the end of part 325
@@ -344,7 +344,7 @@ def test_fixed_partition_gives_every_part_that_fails_its_own_verdict() -> None:
 def test_partition_that_does_not_fit(partitions: tuple[int, ...]) -> None:
     d = 2 if len(partitions) == 2 and partitions[0] > 10 else 1
     with pytest.raises(InputError, match="partitions"):
-        Grid.fixed(interval(d), partitions, (1,) * d)
+        CellGrid.fixed(interval(d), partitions, (1,) * d)
 
 
 class Shade:
@@ -356,7 +356,9 @@ class Shade:
     def __call__(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
         return self.owner.image(values, self)
 
-    def pushed(self, box: ParameterBox, values: np.ndarray, score: Any, size: float) -> tuple[np.ndarray, Shade]:
+    def signed_gradient_step(
+        self, box: ParameterBox, values: np.ndarray, score: Any, size: float
+    ) -> tuple[np.ndarray, Shade]:
         shift = torch.tensor(self.shift, requires_grad=True)
         place = torch.from_numpy(values)
         (slope,) = torch.autograd.grad(score(self.owner.differentiable(place) + shift, place), shift)
@@ -384,7 +386,7 @@ class Shaded(Ramp):
     def image(self, values: np.ndarray, member: Any = None) -> np.ndarray:
         return super().image(values) + np.float32(0.0 if member is None else member.shift)
 
-    def members(self, seed: int) -> Iterator[Any]:
+    def scene_samples(self, seed: int) -> Iterator[Any]:
         return itertools.repeat(Shade(self, 0.0))
 
     def sets(self, box: ParameterBox) -> Any:
@@ -396,7 +398,7 @@ class Shaded(Ramp):
 def test_scenes_of_a_set() -> None:
     """Where some scene is too dark the cell is falsified by it, although the stored scene is bright enough there."""
     scene = Shaded()
-    leaves, _ = drive(Search(scene, Threshold(0.5), CLAIM, Grid.adaptive(scene.box, (5,))), 3000)
+    leaves, _ = drive(Search(scene, Threshold(0.5), CLAIM, CellGrid.adaptive(scene.box, (5,))), 3000)
     # 0.5 + 0.2 x - 0.05 > 0.5 from x = 0.25 on
     for leaf in leaves:
         low, high = leaf.cell.first[0], leaf.cell.past[0]
@@ -413,7 +415,7 @@ def test_scenes_of_a_set() -> None:
     # beyond x = 0 the stored scene holds
     dark = [leaf for leaf in leaves if leaf.verdict == "falsified" and leaf.counterexample[0] > 0.0]
     assert dark and all(leaf.scene is not None for leaf in dark)
-    single = Search(Shaded(0), Threshold(0.48), CLAIM, Grid(interval(0), (), ()))
+    single = Search(Shaded(0), Threshold(0.48), CLAIM, CellGrid(interval(0), (), ()))
     (leaf,), _ = drive(single)
     assert leaf.verdict == "falsified" and leaf.scene is not None and leaf.scene["color"][0] == pytest.approx(-0.05)
 
@@ -430,7 +432,7 @@ def test_networks_are_asked_only_where_that_may_prove() -> None:
             return (a, low - more, a, high + more), lower - more, upper + more, slopes
 
     scene = Wide(2, slack=0.0)
-    search = Search(scene, Threshold(0.1), CLAIM, Grid.adaptive(scene.box, (1, 1)))
+    search = Search(scene, Threshold(0.1), CLAIM, CellGrid.adaptive(scene.box, (1, 1)))
     first = search.examine(search.grid.roots())
     assert first.bounded == 0 and sum(map(len, first.blocks)) >= 4
     assert sum(cell.volume for block in first.blocks for cell in block) == search.grid.volume
@@ -440,7 +442,7 @@ def test_networks_are_asked_only_where_that_may_prove() -> None:
 
 
 def test_grid() -> None:
-    grid = Grid.adaptive(interval(2), (3, 2))
+    grid = CellGrid.adaptive(interval(2), (3, 2))
     assert grid.units == (3 << HALVINGS, 2 << HALVINGS) and len(grid.roots()) == 6
     assert sum(cell.volume for cell in grid.roots()) == grid.volume
     cell = Cell((0, 0), (1, 5))
@@ -454,8 +456,8 @@ def test_grid() -> None:
     assert len(grid.divide(Cell((0, 0), (8, 8)), np.array([1.0, 1.0]), 0.01, 20)) == 16
     found = grid.divide(Cell((0, 0), (7, 5)), np.array([3.0, 1.0]), 0.2, 64)
     assert sum(part.volume for part in found) == 35 and len(set(found)) == len(found)
-    assert coarse_parts(np.array([10.0, 0.0, np.inf]), 2.0) == (5, 1, 1)
-    assert math.prod(coarse_parts(np.array([1e4, 1e4]), 0.1)) <= 1 << 16
+    assert initial_divisions(np.array([10.0, 0.0, np.inf]), 2.0) == (5, 1, 1)
+    assert math.prod(initial_divisions(np.array([1e4, 1e4]), 0.1)) <= 1 << 16
 
 
 # ---------------------------------------------------------------- store
@@ -557,13 +559,13 @@ def test_impossible_leaves_are_refused_and_nothing_is_stored(tmp_path: Path) -> 
     fill(store, search, 0)
     block = store.pending(set(), 1)[0]
     for leaf in (
-        Leaf(block.cells[0], "certified", None, 0.0),
-        Leaf(block.cells[0], "certified", -1.0, 0.0),
-        Leaf(block.cells[0], "certified", math.nan, 0.0),
-        Leaf(block.cells[0], "falsified", -1.0, 0.0),
+        FinishedCell(block.cells[0], "certified", None, 0.0),
+        FinishedCell(block.cells[0], "certified", -1.0, 0.0),
+        FinishedCell(block.cells[0], "certified", math.nan, 0.0),
+        FinishedCell(block.cells[0], "falsified", -1.0, 0.0),
     ):
         with pytest.raises(ValueError, match=r"certified|falsified"):
-            store.close_block(block, Findings((leaf,), (), (), 0, 0.0), search.grid)
+            store.close_block(block, BlockResult((leaf,), (), (), 0, 0.0), search.grid)
         assert store.count == 0 and store.pending(set(), 1) == [block]
 
 
@@ -573,7 +575,7 @@ def test_pending_takes_what_is_nearest_to_a_proof_and_now_and_then_the_largest(t
     blocks = store.pending(set(), 3)
     assert [b.number for b in blocks] == [1, 2, 3]
     parts = tuple((Cell((k,), (k + 1,)),) for k in range(3))
-    store.close_block(blocks[0], Findings((), parts, (), 0, 0.0, ranks=(5.0, 2.0, 1e9)), search.grid)
+    store.close_block(blocks[0], BlockResult((), parts, (), 0, 0.0, ranks=(5.0, 2.0, 1e9)), search.grid)
     # the fourth is the largest, the part with the last rank comes behind all first cells
     assert [b.number for b in store.pending({2}, 10)] == [3, 7, 6, 4, 5, 8]
     assert store.pending({2, 3, 4, 5, 6, 7, 8}, 10) == []
@@ -673,6 +675,6 @@ def test_blocks_survive_as_they_are(tmp_path: Path) -> None:
     store, search = open_store(tmp_path), search_of(Ramp(2), coarse=(3, 3))
     fill(store, search, 0)
     assert [dataclasses.astuple(b) for b in store.pending(set(), 9)] == [
-        dataclasses.astuple(Block(k + 1, 0, 0, tuple(search.grid.roots()[i : i + BLOCK])))
+        dataclasses.astuple(CellBlock(k + 1, 0, 0, tuple(search.grid.roots()[i : i + BLOCK])))
         for k, i in enumerate(range(0, 9, BLOCK))
     ]

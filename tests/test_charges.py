@@ -9,8 +9,8 @@ import pytest
 from benchmark_scripts import script
 
 from ns_abstract.arithmetic.rounding import FLOAT32, REAL, Arithmetic, Charges, charges
-from ns_abstract.geometry.camera_path import Camera
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
@@ -22,7 +22,7 @@ ledger = script("ledger")
 MEASURED = [name for name in Charges._fields if name not in ledger.UNMEASURED]
 #: Values that matter where twice as much is too little to be seen.
 CHANGED = {"flush": 1.0, "overflow": 1.0}
-CAMERA = Camera(np.concatenate([np.eye(3), np.zeros((3, 1))], 1), 20.0, 20.0, 8.0, 8.0, 16, 16)
+CAMERA = PinholeCamera(np.concatenate([np.eye(3), np.zeros((3, 1))], 1), 20.0, 20.0, 8.0, 8.0, 16, 16)
 
 
 @pytest.mark.slow
@@ -56,7 +56,7 @@ def scene() -> SplatScene:
 
 
 def bounds_of(arithmetic: Arithmetic) -> bytes:
-    poses = PoseSet.around(CAMERA, Perturbation(translation={"x": (-0.01, 0.01)}))
+    poses = PoseBox.around(CAMERA, Perturbation(translation={"x": (-0.01, 0.01)}))
     cell = SplatBounds(activate(scene(), GSPLAT_1_4_0), GSPLAT_1_4_0, arithmetic).cell(
         CAMERA, poses.enclosure(poses.box, 2)
     )

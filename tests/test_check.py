@@ -22,15 +22,15 @@ from conftest import InProcess, Inputs, blob_scene, environment, ring
 import ns_abstract as nsa
 from ns_abstract.api.checking import check
 from ns_abstract.check import audit
-from ns_abstract.check.forms import Form, parameters
+from ns_abstract.check.forms import FirstOrderForm, parameters
 from ns_abstract.check.inputs import BadInput, read_poses
-from ns_abstract.check.pictures import Bounds
-from ns_abstract.check.poses import Camera, Poses
+from ns_abstract.check.pictures import ClaimedBounds
+from ns_abstract.check.poses import CheckedCamera, Poses
 from ns_abstract.check.results import partition, read_cells
-from ns_abstract.check.splats import Splats, activated, meeting, pixels, reaches
+from ns_abstract.check.splats import ActivatedScene, activated, meeting, pixels, reaches
 from ns_abstract.cli import check as check_command
-from ns_abstract.geometry.camera_path import Camera as PathCamera
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.camera_path import PinholeCamera as PathCamera
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.splat.constants import VERSIONS
 from ns_abstract.methods.splat.reference import Reference
 from ns_abstract.methods.splat.scene import SplatScene
@@ -62,7 +62,7 @@ def test_it_shares_no_code_and_stays_small() -> None:
 
 # ---------------------------------------------------------------- enclosures
 
-OPERATIONS: dict[str, tuple[Callable[[Form], Form], Callable[[Any], Any]]] = {
+OPERATIONS: dict[str, tuple[Callable[[FirstOrderForm], FirstOrderForm], Callable[[Any], Any]]] = {
     "square": (lambda f: f.square(), lambda x: x * x),
     "product": (lambda f: f * (f + 1.5), lambda x: x * (x + mpmath.mpf(1.5))),
     "reciprocal": (lambda f: f.reciprocal(), lambda x: 1 / x),
@@ -96,7 +96,7 @@ def test_forms_contain_exact_values(name: str) -> None:
 
 
 def test_what_is_not_defined_is_not_bounded() -> None:
-    form = Form(np.array([0.1, -1.0]), np.array([[0.2, 0.1]]), np.array([0.0, 0.0]))
+    form = FirstOrderForm(np.array([0.1, -1.0]), np.array([[0.2, 0.1]]), np.array([0.0, 0.0]))
     assert np.isinf(form.reciprocal().r).all() and np.isinf(form.root().r).all()
 
 
@@ -106,7 +106,7 @@ SPEC = {
 }  # fmt: skip
 
 
-def splats_of(scene: SplatScene, version: str = "1.4.0") -> Splats:
+def splats_of(scene: SplatScene, version: str = "1.4.0") -> ActivatedScene:
     return activated(
         scene.means, scene.log_scales, scene.quats, scene.opacity_logits, scene.sh, sigmoid=False,
         degree=scene.sh_degree, antialiased=scene.rasterize_mode == "antialiased", background=scene.background,
@@ -114,21 +114,29 @@ def splats_of(scene: SplatScene, version: str = "1.4.0") -> Splats:
     )  # fmt: skip
 
 
-def cameras(pose: np.ndarray, focal: float) -> tuple[Camera, PathCamera]:
+def cameras(pose: np.ndarray, focal: float) -> tuple[CheckedCamera, PathCamera]:
     """One camera of 32 x 32 pixels, for both programs."""
     values = (pose, focal, focal, 16.0, 16.0, 32, 32)
-    return Camera(*values), PathCamera(*values)
+    return CheckedCamera(*values), PathCamera(*values)
 
 
-def candidates(splats: Splats, poses: Poses, low: np.ndarray, high: np.ndarray, pixel: tuple[int, int]) -> np.ndarray:
+def candidates(
+    splats: ActivatedScene, poses: Poses, low: np.ndarray, high: np.ndarray, pixel: tuple[int, int]
+) -> np.ndarray:
     view = poses.view(low[None], high[None])
     return meeting(reaches(splats, poses.camera, view, 0.0), *pixel)
 
 
 def pixel_form(
-    splats: Splats, poses: Poses, low: np.ndarray, high: np.ndarray, index: np.ndarray, pixel: tuple[int, int],
-    channel: int, unit: float = 0.0,
-) -> tuple[Form, np.ndarray, np.ndarray]:  # fmt: skip
+    splats: ActivatedScene,
+    poses: Poses,
+    low: np.ndarray,
+    high: np.ndarray,
+    index: np.ndarray,
+    pixel: tuple[int, int],
+    channel: int,
+    unit: float = 0.0,
+) -> tuple[FirstOrderForm, np.ndarray, np.ndarray]:
     """One channel of a pixel over boxes [B, d]."""
     at, place = np.broadcast_to(index, (len(low), len(index))), tuple(np.full(len(low), v) for v in pixel)
     form, kept, motion = pixels(splats, poses.camera, poses.view(low, high), at, place, unit)  # pyright: ignore[reportArgumentType]
@@ -148,7 +156,7 @@ def test_pixels_contain_pictures_of_another_renderer(mode: str, version: str) ->
     pose = np.asarray(ring()[1].camera_to_world, np.float64)[:3]
     focal = 16.0 / np.tan(np.radians(45.0) / 2.0)
     ours, theirs = cameras(pose, focal)
-    pose_set = PoseSet.around(theirs, parse_perturbation(SPEC))
+    pose_set = PoseBox.around(theirs, parse_perturbation(SPEC))
     poses = Poses(ours, pose_set.box.names, {}, False, (np.array([0, 0, 0.1]), np.array([0, 0.2, 1.0])))
     splats, reference, rng = splats_of(scene, version), Reference(scene, VERSIONS[version]), np.random.default_rng(3)
     narrow = 0
@@ -188,7 +196,7 @@ def test_a_change_of_order_is_enclosed() -> None:
     pose = np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2.0]])
     ours, theirs = cameras(pose, 40.0)
     # far enough off the axis for the order to change by a small turn
-    pose_set = PoseSet.around(theirs, parse_perturbation({"version": 1, "rotation": {"yaw": 0.01}}))
+    pose_set = PoseBox.around(theirs, parse_perturbation({"version": 1, "rotation": {"yaw": 0.01}}))
     poses, splats, reference = Poses(ours, ("yaw",)), splats_of(scene), Reference(scene)
     low, high = np.array([[-0.01]]), np.array([[0.01]])
     index = candidates(splats, poses, low[0], high[0], (16, 16))
@@ -231,7 +239,7 @@ def test_a_stop_that_is_open_is_enclosed() -> None:
         background=np.ones(3, np.float32),
     )
     ours, theirs = cameras(np.array([[1.0, 0, 0, -0.0125], [0, 1, 0, 0.0125], [0, 0, 1, 2.0]]), 40.0)
-    pose_set = PoseSet.around(theirs, parse_perturbation({"version": 1, "translation": {"x": 0.06}}))
+    pose_set = PoseBox.around(theirs, parse_perturbation({"version": 1, "translation": {"x": 0.06}}))
     poses, splats, reference = Poses(ours, ("x",)), splats_of(scene), Reference(scene)
     low, high = np.array([[-0.06]]), np.array([[0.06]])
     seen = [
@@ -251,8 +259,8 @@ def test_a_stop_that_is_open_is_enclosed() -> None:
 def test_a_claim_is_about_both_bounds() -> None:
     def excess(most: float, plane: float) -> tuple[float, float]:
         slope, low, high = np.zeros(1), np.zeros(1), np.ones(1)
-        bounds = Bounds(0.2, most, low, high, ((slope, 0.3), (slope, plane)))
-        half, form = np.full((1, 1), 0.5), Form(np.full(1, 0.5), np.full((1, 1), 0.01), np.zeros(1))
+        bounds = ClaimedBounds(0.2, most, low, high, ((slope, 0.3), (slope, plane)))
+        half, form = np.full((1, 1), 0.5), FirstOrderForm(np.full(1, 0.5), np.full((1, 1), 0.01), np.zeros(1))
         below, above = bounds.excess(half, half, form)
         return float(below[0]), float(above[0])
 
@@ -463,7 +471,7 @@ def test_another_set_of_poses_is_refused(copy: Path, blobs: Inputs, tmp_path: Pa
 def test_poses_are_those_of_the_perturbation_file(blobs: Inputs, spec: dict[str, Any]) -> None:
     poses, free = read_poses(blobs.path, spec, 0, {}, 0.25)
     path = nsa.load_camera_path(blobs.path)
-    theirs = PoseSet.around(path.cameras[0], parse_perturbation(spec, dataset_scale=0.25), path.cameras[1])
+    theirs = PoseBox.around(path.cameras[0], parse_perturbation(spec, dataset_scale=0.25), path.cameras[1])
     assert free == list(zip(theirs.box.names, theirs.box.lower, theirs.box.upper, strict=True))
     rng = np.random.default_rng(1)
     low, high = (np.array([[e[k] for e in free]]) for k in (1, 2))

@@ -22,15 +22,15 @@ from scene_files import ply
 
 import ns_abstract as nsa
 from ns_abstract.api.checking import check
-from ns_abstract.check.fields import Field
-from ns_abstract.check.forms import Form
+from ns_abstract.check.fields import CheckedField
+from ns_abstract.check.forms import FirstOrderForm
 from ns_abstract.check.inputs import BadInput, read_poses, read_scene
-from ns_abstract.check.networks import Network
-from ns_abstract.check.poses import Camera, Poses
+from ns_abstract.check.networks import CheckedNetwork
+from ns_abstract.check.poses import CheckedCamera, Poses
 from ns_abstract.check.splats import FLOAT, activated, meeting, picture, pixels, reaches
 from ns_abstract.cli import check as check_command
 from ns_abstract.demo.writing import write_loop_demo
-from ns_abstract.geometry.camera_path import Camera as PathCamera
+from ns_abstract.geometry.camera_path import PinholeCamera as PathCamera
 from ns_abstract.io.atomic import write_json
 from ns_abstract.methods.nerf.render import NerfRenderer
 from ns_abstract.methods.nerf.scene import NerfScene
@@ -52,7 +52,7 @@ def test_float32_pictures_are_enclosed_and_need_their_charges(mode: str) -> None
         scene.means, scene.log_scales, scene.quats, scene.opacity_logits, scene.sh, sigmoid=False, degree=2,
         antialiased=mode == "antialiased", background=scene.background, version="1.4.0",
     )  # fmt: skip
-    cam, none = Camera(*values), np.zeros((1, 0))
+    cam, none = CheckedCamera(*values), np.zeros((1, 0))
     seen = Poses(cam, ()).view(none, none)
     for unit, holds in ((FLOAT, True), (0.0, False)):
         form = picture(splats, cam, seen, unit)
@@ -99,8 +99,8 @@ def test_networks_are_enclosed(radius: float, tmp_path: Path) -> None:
     session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
     c, g = rng.random((1, 3, 8, 8), np.float32).astype(np.float64), radius * rng.normal(size=(2, 1, 3, 8, 8))
     # what rounding the input to float32 moves it by is part of the set
-    form = Form(c, g, np.full(c.shape, 0.1 * radius + 4e-7))
-    network, exact = Network(file, None, FLOAT), Network(file, None, 0.0)
+    form = FirstOrderForm(c, g, np.full(c.shape, 0.1 * radius + 4e-7))
+    network, exact = CheckedNetwork(file, None, FLOAT), CheckedNetwork(file, None, 0.0)
     rows = torch.tensor([[1.0, -1.0, 0.0], [0.0, 0.5, 2.0]], dtype=torch.float64)
     outputs, least, most = network.outputs(form), network.least(form, rows), -network.least(form, -rows)
     found = []
@@ -122,9 +122,9 @@ def test_a_float32_network_leaves_the_exact_one(tmp_path: Path) -> None:
     file, c = pooled(tmp_path / "net.onnx"), np.random.default_rng(3).random((64, 3, 8, 8)).astype(np.float32)
     session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
     y = np.asarray(session.run(None, {"image": c})[0], np.float64)
-    form = Form(c.astype(np.float64), np.zeros((0, *c.shape)), np.zeros(c.shape))
+    form = FirstOrderForm(c.astype(np.float64), np.zeros((0, *c.shape)), np.zeros(c.shape))
     for unit, holds in ((FLOAT, True), (0.0, False)):
-        low, high = Network(file, None, unit).outputs(form).range()
+        low, high = CheckedNetwork(file, None, unit).outputs(form).range()
         assert bool(((low <= y) & (y <= high)).all()) == holds
 
 
@@ -279,7 +279,7 @@ def test_a_loop_is_proved_again_and_other_sets_are_not(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- NeRFs
 
 
-def nerf(seed: int = 0) -> tuple[NerfScene, Field]:
+def nerf(seed: int = 0) -> tuple[NerfScene, CheckedField]:
     scene = NerfScene(tiny_weights(seed), tiny_weights(seed + 1), 0.0, 4.0)
     fine, found = scene.fine, {}
     parts = {f"mlp_base.layers.{k}": layer for k, layer in enumerate(fine.base)}
@@ -287,7 +287,7 @@ def nerf(seed: int = 0) -> tuple[NerfScene, Field]:
     parts |= {"field_output_density.net": fine.density, "field_heads.0.net": fine.color}
     for name, layer in parts.items():
         found |= {f"field_fine.{name}.weight": layer.weight, f"field_fine.{name}.bias": layer.bias}
-    field = Field(found)
+    field = CheckedField(found)
     field.near, field.far, field.samples, field.background = 0.0, UNIFORM.far, UNIFORM.samples, UNIFORM.background
     return scene, field
 
@@ -296,7 +296,7 @@ def nerf(seed: int = 0) -> tuple[NerfScene, Field]:
 def test_rays_contain_pictures_of_another_renderer(half: float) -> None:
     scene, field = nerf()
     theirs = view()
-    ours = Camera(*(getattr(theirs, n) for n in ("camera_to_world", "fx", "fy", "cx", "cy", "width", "height")))
+    ours = CheckedCamera(*(getattr(theirs, n) for n in ("camera_to_world", "fx", "fy", "cx", "cy", "width", "height")))
     renderer, poses = NerfRenderer(scene, UNIFORM), Poses(ours, ("x", "yaw"))
     low, high = np.full((1, 2), -half), np.full((1, 2), half)
     rng, widths = np.random.default_rng(0), []
@@ -318,7 +318,7 @@ def test_neurons_that_bend_are_enclosed() -> None:
     from ns_abstract.check.fields import _Zonotope
 
     rng = np.random.default_rng(0)
-    form = Form(rng.normal(size=(1, 2, 5)), 0.3 * rng.normal(size=(2, 1, 2, 5)), 0.1 * rng.random((1, 2, 5)))
+    form = FirstOrderForm(rng.normal(size=(1, 2, 5)), 0.3 * rng.normal(size=(2, 1, 2, 5)), 0.1 * rng.random((1, 2, 5)))
     weight, bias = rng.normal(size=(6, 5)), rng.normal(size=6)
     found = _Zonotope.of(form).layer(weight, bias).bent().layer(weight[:, :5].T @ np.eye(6)[:6, :6], bias[:5]).form(2)
     for _ in range(200):

@@ -26,7 +26,7 @@ from ns_abstract.api.files import Settings, open_job
 from ns_abstract.cli import demo as demo_command
 from ns_abstract.cli import render as render_command
 from ns_abstract.cli.common import complaint
-from ns_abstract.geometry.views import View, path_json
+from ns_abstract.geometry.keyframe_cameras import KeyframeCamera, path_json
 from ns_abstract.io.atomic import write_json
 from ns_abstract.io.folder import MARK
 from ns_abstract.methods.program_options import ProgramOptions
@@ -510,7 +510,7 @@ def test_stored_cells_cover_the_set_and_hold_renders(
     make_blobs: Callable[..., Inputs], tmp_path: Path, call: Callable[..., tuple[int, str]], spec: dict[str, Any]
 ) -> None:
     # no multiple of the tile's side, so that tiles reach beyond the picture
-    inputs = make_blobs(views=[View(view.camera_to_world, view.fov, 24, 40) for view in ring(1)], spec=spec)
+    inputs = make_blobs(views=[KeyframeCamera(view.camera_to_world, view.fov, 24, 40) for view in ring(1)], spec=spec)
     assert call(inputs.options(tmp_path / "out", save_cells=True, time_budget=5))[0] == 0
     result = frame(tmp_path / "out", 0).result
     leaves, box = result.leaves, result.box
@@ -708,15 +708,15 @@ def test_cluster_on_this_machine_gives_the_same(blobs: Inputs, finished: Path, t
 
 @needs_dask
 def test_worker_with_other_files_is_refused(blobs: Inputs, tmp_path: Path) -> None:
-    from ns_abstract.api.bounding import Part, bound_part
+    from ns_abstract.api.bounding import TileTask, bound_part
     from ns_abstract.io.errors import InputError
 
     job = open_job(Settings(blobs.config, blobs.path, blobs.spec))
     goal = job.goal(1.5, 1.0, 2)
-    assert bound_part(job.recipe, Part(0, None), goal, False).index == 0
+    assert bound_part(job.recipe, TileTask(0, None), goal, False).index == 0
     with pytest.raises(InputError, match="other content"):
         other = dataclasses.replace(job.recipe, fingerprint=job.fingerprint | {"scene": "another"})
-        bound_part(other, Part(0, None), goal, False)
+        bound_part(other, TileTask(0, None), goal, False)
 
 
 @needs_dask

@@ -40,7 +40,7 @@ from ns_abstract.api.cell_search import CellSearch
 from ns_abstract.api.certification import CertifySettings, open_certification
 from ns_abstract.api.certifying import CertificateQuestion
 from ns_abstract.api.files import Settings, open_job
-from ns_abstract.geometry.views import path_json
+from ns_abstract.geometry.keyframe_cameras import path_json
 from ns_abstract.io.atomic import write_json
 from ns_abstract.io.folder import MARK, claim
 from ns_abstract.methods.nerf.occupancy import OccupancyGrid
@@ -50,8 +50,8 @@ from ns_abstract.methods.splat.ply import write_ply
 from ns_abstract.methods.splat.write import write_splatfacto_run
 from ns_abstract.refine.result import FrameResult, TracePoint
 from ns_abstract.report.certificate import write_certificate
-from ns_abstract.report.record import Report, Run, file_stamp
-from ns_abstract.verify.search import Findings, Leaf
+from ns_abstract.report.record import Report, RunRecord, file_stamp
+from ns_abstract.verify.search import BlockResult, FinishedCell
 
 SIZE = 16
 PREPROCESS = {"resize": [SIZE, SIZE], "mean": [0.4, 0.45, 0.5], "std": [0.25, 0.25, 0.3]}
@@ -112,7 +112,7 @@ def bench(tmp_path_factory: pytest.TempPathFactory, request: pytest.FixtureReque
 def write_results(files: dict[str, Path]) -> None:
     """What ns-abstract-render leaves, without the work: two frames of bounds that say nothing new."""
     job = open_job(Settings(files["config"], files["path"], files["spec"]))
-    run = Run(
+    run = RunRecord(
         guarantee="float32-sound", renderer=job.method.program, scene=job.describe(), frames=(0, 1),
         fingerprint=job.fingerprint, settings={"target_ratio": 1.05},
     )  # fmt: skip
@@ -136,8 +136,8 @@ def write_search(files: dict[str, Path]) -> None:
     search = CellSearch(question, files["search"])
     store = search.open(resume=False)
     for block in store.pending(set(), 3):
-        leaves = tuple(Leaf(cell, "unknown", None, 0.1, reason="the finest cell") for cell in block.cells)
-        store.close_block(block, Findings(leaves, (), (), 0, 0.1), search.grids[block.frame])
+        leaves = tuple(FinishedCell(cell, "unknown", None, 0.1, reason="the finest cell") for cell in block.cells)
+        store.close_block(block, BlockResult(leaves, (), (), 0, 0.1), search.grids[block.frame])
     document, _ = question.reports(search).document(store, "interrupted")
     write_certificate(files["search"], document, "<html></html>")
     store.close()
@@ -372,7 +372,13 @@ RUNS = [
     row("render", "config binary", "UTF-8", yml=b"\xff\xfe\x00\x01"),
     row("render", "config runs a command", "config.yml", yml="!!python/object/apply:os.system ['touch hacked']"),
     row("render", "config nested", "levels deep", yml="a: " + "[" * 100 + "]" * 100),
-    row("render", "config of aliases", "alias", yml="a: &a [1]\nb: &b [*a,*a,*a,*a,*a,*a,*a,*a]\n" + "".join(f"{chr(c + 1)}: &{chr(c + 1)} [{','.join(['*' + chr(c)] * 8)}]\n" for c in range(98, 105))),
+    row(
+        "render",
+        "config of aliases",
+        "alias",
+        yml="a: &a [1]\nb: &b [*a,*a,*a,*a,*a,*a,*a,*a]\n"
+        + "".join(f"{chr(c + 1)}: &{chr(c + 1)} [{','.join(['*' + chr(c)] * 8)}]\n" for c in range(98, 105)),
+    ),
     row("render", "config with a key twice", "twice", yml="a: 1\na: 2\n"),
     row("render", "config without a model", "pipeline", yml="method_name: splatfacto\n"),
     row("render", "degree 99", "sh_degree", yml=replaced("sh_degree: 3", "sh_degree: 99")),
@@ -382,16 +388,26 @@ RUNS = [
     row("render", "checkpoint is a pipe", "checkpoint", ckpt=fifo),
     row("render", "transforms empty", "empty", transforms=b""),
     row("render", "transforms singular", "determinant", transforms={"transform": [[0, 0, 0, 0]] * 3, "scale": 1}),
-    row("render", "transforms scale 0", "scale", transforms={"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": 0}),
+    row(
+        "render",
+        "transforms scale 0",
+        "scale",
+        transforms={"transform": [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]], "scale": 0},
+    ),
     row("certify", "config absent", "no such", options="--load-config {here}/none.yml"),
     row("ply", "config absent", "no such", options="--load-config {here}/none.yml"),
     row("ply", "NeRF as splat", "splat", options="--load-config {here}/../base/tiny/vanilla-nerf/run/config.yml"),
     row("occupancy", "splat as NeRF", "splat", options="--load-config {here}/../base/blobs/splatfacto/run/config.yml"),
     row("render", "ply empty", "header", scene=b""),
     row("render", "ply cut off", "cut off", scene=ply(lambda data: data[:-50])),
-    row("render", "ply of 10^12 rows", "claims", scene=ply(lambda data: data.replace(b"element vertex 4", b"element vertex 100000000000"))),
+    row(
+        "render",
+        "ply of 10^12 rows",
+        "claims",
+        scene=ply(lambda data: data.replace(b"element vertex 4", b"element vertex 100000000000")),
+    ),
     row("render", "ply without opacity", "opacity", scene=ply(lambda data: data.replace(b"opacity", b"opaciti"))),
-]  # fmt: skip
+]
 
 PATHS = [
     row("render", "path absent", "no such", options="--camera-path-filename {here}/none.json"),
@@ -412,10 +428,21 @@ PATHS = [
     row("render", "matrix of zeros", "camera_to_world", path=entry(camera_to_world=[0] * 16)),
     row("render", "matrix of 15 numbers", "camera_to_world", path=entry(camera_to_world=[0] * 15)),
     row("render", "matrix of 1e300", "camera_to_world", path=entry(camera_to_world=[1e300] * 16)),
-    row("render", "matrix that mirrors", "mirrors", path=entry(camera_to_world=[-1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1])),
-    row("render", "picture beyond memory", "--memory-limit", path=edited(render_height=16000, render_width=16000), options="--memory-limit 0.5"),
+    row(
+        "render",
+        "matrix that mirrors",
+        "mirrors",
+        path=entry(camera_to_world=[-1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]),
+    ),
+    row(
+        "render",
+        "picture beyond memory",
+        "--memory-limit",
+        path=edited(render_height=16000, render_width=16000),
+        options="--memory-limit 0.5",
+    ),
     row("certify", "path empty", "empty", path=b""),
-]  # fmt: skip
+]
 
 SETS = [
     row("render", "set absent", "no such", options="--perturbation-filename {here}/none.json"),
@@ -427,12 +454,22 @@ SETS = [
     row("render", "set with 1e999", "too large", spec='{"translation": {"x": 1e999}}'),
     row("render", "set with a negative radius", "negative", spec={"translation": {"x": -1}}),
     row("render", "orbit without axis", "orbit.axis", spec={"orbit": {"target": [0, 0, 0], "azimuth": [0, 1]}}),
-    row("render", "orbit about nothing", "orbit.axis", spec={"orbit": {"target": [0, 0, 0], "axis": [0, 0, 0], "azimuth": [0, 1]}}),
+    row(
+        "render",
+        "orbit about nothing",
+        "orbit.axis",
+        spec={"orbit": {"target": [0, 0, 0], "axis": [0, 0, 0], "azimuth": [0, 1]}},
+    ),
     row("render", "hue of a splat", "hue", spec={"hue": 0.1}),
-    row("render", "variation that selects nothing", "scene[0]", spec={"scene": [{"select": {"opacity": [2, 3]}, "mean": 1}]}),
+    row(
+        "render",
+        "variation that selects nothing",
+        "scene[0]",
+        spec={"scene": [{"select": {"opacity": [2, 3]}, "mean": 1}]},
+    ),
     row("render", "variation of index 10^9", "scene[0]", spec={"scene": [{"select": {"indices": [10**9]}, "mean": 1}]}),
     row("nerf", "variation of a NeRF", "scene", spec={"scene": [{"select": {}, "mean": 1}]}),
-]  # fmt: skip
+]
 
 PROPERTIES = [
     row("certify", "property absent", "no such", options="--property {here}/none.json"),
@@ -445,26 +482,79 @@ PROPERTIES = [
     row("certify", "std 0", "preprocess.std", prop=edited(preprocess=PREPROCESS | {"std": [0, 1, 1]})),
     row("certify", "mean 1e300", "preprocess.mean", prop=edited(preprocess=PREPROCESS | {"mean": [1e300, 1, 1]})),
     row("certify", "resize other than the network", "preprocess.resize", prop=edited(preprocess={"resize": [8, 8]})),
-    row("certify", "tolerance 1e308", "tolerance", prop={"type": "regression", "target": [0, 0, 0], "tolerance": {"absolute": 1e308}, "preprocess": PREPROCESS}),
-    row("certify", "scale 1e308", "scale", prop={"type": "regression", "target": "camera", "scale": 1e308, "tolerance": {"relative": 1}, "preprocess": PREPROCESS}),
+    row(
+        "certify",
+        "tolerance 1e308",
+        "tolerance",
+        prop={"type": "regression", "target": [0, 0, 0], "tolerance": {"absolute": 1e308}, "preprocess": PREPROCESS},
+    ),
+    row(
+        "certify",
+        "scale 1e308",
+        "scale",
+        prop={
+            "type": "regression",
+            "target": "camera",
+            "scale": 1e308,
+            "tolerance": {"relative": 1},
+            "preprocess": PREPROCESS,
+        },
+    ),
     row("certify", "VNN-LIB with an open bracket", "closed", lib="(assert (<= Y_0 1)"),
     row("certify", "VNN-LIB nested", "deep", lib="(" * 5000),
-    row("certify", "VNN-LIB with factors that overflow", "overflow", lib="(declare-const Y_0 Real)(assert (<= (* 1e300 (* 1e300 Y_0)) 1))"),
+    row(
+        "certify",
+        "VNN-LIB with factors that overflow",
+        "overflow",
+        lib="(declare-const Y_0 Real)(assert (<= (* 1e300 (* 1e300 Y_0)) 1))",
+    ),
     row("certify", "VNN-LIB of another network", "Y_9", lib="(declare-const Y_9 Real)(assert (<= Y_9 1))"),
-    row("certify", "VNN-LIB of many cases", "combinations", lib="(declare-const Y_0 Real)" + "(assert (or (<= Y_0 1) (<= Y_0 2) (<= Y_0 3)))" * 30),
-    row("vnnlib", "property of type regression", "linear", prop={"type": "regression", "target": [0, 0, 0], "tolerance": {"absolute": 1}, "preprocess": PREPROCESS}, memory=WORK),
-]  # fmt: skip
+    row(
+        "certify",
+        "VNN-LIB of many cases",
+        "combinations",
+        lib="(declare-const Y_0 Real)" + "(assert (or (<= Y_0 1) (<= Y_0 2) (<= Y_0 3)))" * 30,
+    ),
+    row(
+        "vnnlib",
+        "property of type regression",
+        "linear",
+        prop={"type": "regression", "target": [0, 0, 0], "tolerance": {"absolute": 1}, "preprocess": PREPROCESS},
+        memory=WORK,
+    ),
+]
 
 RESULTS = [
     row("npz", "results absent", "cannot be listed", options="--input-dir {here}/none"),
     row("npz", "results of no frames", "no frame", results=lambda f: [x.unlink() for x in f.glob("frame_*.npz")]),
     row("npz", "frame cut off", "frame_00000.npz", results=frame_file(cut(500))),
     row("png", "frame empty", "frame_00001.npz", results=frame_file(lambda f: f.write_bytes(b""), 1)),
-    row("png", "frame of another number", "not as report.json", results=frame_file(lambda f: shutil.copy(f, f.with_name("frame_00007.npz")))),
+    row(
+        "png",
+        "frame of another number",
+        "not as report.json",
+        results=frame_file(lambda f: shutil.copy(f, f.with_name("frame_00007.npz"))),
+    ),
     row("npz", "output is a folder", "written", options="--output-filename {here}"),
-    row("render", "frame damaged, resumed", "not used: frame_00000.npz", results=frame_file(cut(500)), options=f"{RESUME} --frames 1", code=0, memory=WORK),
-    row("render", "results of another set, resumed", "fingerprint", results=lambda f: None, spec={"translation": {"x": 0.5}}, options=RESUME, memory=WORK),
-]  # fmt: skip
+    row(
+        "render",
+        "frame damaged, resumed",
+        "not used: frame_00000.npz",
+        results=frame_file(cut(500)),
+        options=f"{RESUME} --frames 1",
+        code=0,
+        memory=WORK,
+    ),
+    row(
+        "render",
+        "results of another set, resumed",
+        "fingerprint",
+        results=lambda f: None,
+        spec={"translation": {"x": 0.5}},
+        options=RESUME,
+        memory=WORK,
+    ),
+]
 
 
 def _strangers(**files: str) -> Any:
@@ -487,12 +577,35 @@ OUTPUTS = [
     row("render", "output of no name", "is empty", options=("--output-dir", "")),
     row("render", "output of no name, joined", "is empty", options=("--output-dir=",)),
     row("render", "output of a long name", "shorter name", options="--output-dir {here}/" + 300 * "x"),
-    row("render", "report of others", "report.json stands there", results=_strangers(report__json='{"mine": 1}'), options=INTO),
+    row(
+        "render",
+        "report of others",
+        "report.json stands there",
+        results=_strangers(report__json='{"mine": 1}'),
+        options=INTO,
+    ),
     row("render", "page of others", "report.html stands there", results=_strangers(report__html="mine"), options=INTO),
-    row("render", "frame of others, resumed", "frame_00000.npz stands there", results=_strangers(frame_00000__npz="mine"), options=RESUME),
-    row("certify", "database of others", "cells.sqlite stands there", results=_strangers(cells__sqlite="mine"), options=INTO),
-    row("certify", "authority without its fellows", "--tls-cert", options="--engine dask --workers 1 --scheduler-address h:1 --tls-ca-file {spec}"),
-]  # fmt: skip
+    row(
+        "render",
+        "frame of others, resumed",
+        "frame_00000.npz stands there",
+        results=_strangers(frame_00000__npz="mine"),
+        options=RESUME,
+    ),
+    row(
+        "certify",
+        "database of others",
+        "cells.sqlite stands there",
+        results=_strangers(cells__sqlite="mine"),
+        options=INTO,
+    ),
+    row(
+        "certify",
+        "authority without its fellows",
+        "--tls-cert",
+        options="--engine dask --workers 1 --scheduler-address h:1 --tls-ca-file {spec}",
+    ),
+]
 
 ON = "--resume --output-dir {here}/search --workers 1 --time-budget 1"
 
@@ -562,44 +675,194 @@ def another_database(file: Path) -> None:
 
 
 SEARCHES = [
-    row("certify", "search continued", "3 cells kept from before", search=lambda f: None, options=ON, code=0, memory=WORK),
+    row(
+        "certify",
+        "search continued",
+        "3 cells kept from before",
+        search=lambda f: None,
+        options=ON,
+        code=0,
+        memory=WORK,
+    ),
     row("certify", "search held by another program", "is locked", search=database(_kept_busy), options=ON),
     row("certify", "search held by another command", "still running", search=_locked, options=ON),
-    row("certify", "search of another version", "another version", search=database("UPDATE search_state SET value = '1' WHERE key = 'version'"), options=ON),
-    row("certify", "search of another network", "model", search=lambda f: None, options=ON, net=onnx_file(lambda m: setattr(m, "producer_name", "x"))),
+    row(
+        "certify",
+        "search of another version",
+        "another version",
+        search=database("UPDATE search_state SET value = '1' WHERE key = 'version'"),
+        options=ON,
+    ),
+    row(
+        "certify",
+        "search of another network",
+        "model",
+        search=lambda f: None,
+        options=ON,
+        net=onnx_file(lambda m: setattr(m, "producer_name", "x")),
+    ),
     row("certify", "search of another property", "property", search=lambda f: None, options=ON, prop=edited(label=1)),
-    row("certify", "search of another set", "poses", search=lambda f: None, options=ON, spec={"version": 1, "translation": {"x": 0.2}}),
+    row(
+        "certify",
+        "search of another set",
+        "poses",
+        search=lambda f: None,
+        options=ON,
+        spec={"version": 1, "translation": {"x": 0.2}},
+    ),
     row("certify", "database empty", "cannot be used", search=database(replaced_by(b"")), options=ON),
     row("certify", "database of zeros", "cannot be used", search=database(replaced_by(bytes(20000))), options=ON),
-    row("certify", "database of noise", "cannot be used", search=database(replaced_by(bytes(range(256)) * 80)), options=ON),
-    row("certify", "database of a text", "cannot be used", search=database(replaced_by(b"SQLite format 3\0" + b"x" * 5000)), options=ON),
+    row(
+        "certify",
+        "database of noise",
+        "cannot be used",
+        search=database(replaced_by(bytes(range(256)) * 80)),
+        options=ON,
+    ),
+    row(
+        "certify",
+        "database of a text",
+        "cannot be used",
+        search=database(replaced_by(b"SQLite format 3\0" + b"x" * 5000)),
+        options=ON,
+    ),
     row("certify", "database cut off", "cannot be used", search=database(cut(9000)), options=ON),
-    row("certify", "database cut to its head", "cannot be used", search=database(lambda f: f.write_bytes(f.read_bytes()[:100])), options=ON),
+    row(
+        "certify",
+        "database cut to its head",
+        "cannot be used",
+        search=database(lambda f: f.write_bytes(f.read_bytes()[:100])),
+        options=ON,
+    ),
     row("certify", "database with a spoilt head", "cannot be used", search=database(spoilt(0, 16)), options=ON),
     row("certify", "database with a spoilt page size", "cannot be used", search=database(spoilt(16, 2)), options=ON),
     row("certify", "database with a spoilt schema", "cannot be used", search=database(spoilt(100, 400)), options=ON),
     row("certify", "database with spoilt pages", "cannot be used", search=database(spoilt(4096, 16000)), options=ON),
-    row("certify", "database is a folder", "no regular file", search=database(lambda f: (f.unlink(), f.mkdir())), options=ON),
+    row(
+        "certify",
+        "database is a folder",
+        "no regular file",
+        search=database(lambda f: (f.unlink(), f.mkdir())),
+        options=ON,
+    ),
     row("certify", "database is a pipe", "no regular file", search=database(fifo), options=ON),
-    row("certify", "database is a link", "no regular file", search=database(lambda f: (f.rename(f.with_name("elsewhere")), f.symlink_to("elsewhere"))), options=ON),
-    row("certify", "database is a link to nowhere", "no regular file", search=database(lambda f: (f.unlink(), f.symlink_to("nowhere"))), options=ON),
+    row(
+        "certify",
+        "database is a link",
+        "no regular file",
+        search=database(lambda f: (f.rename(f.with_name("elsewhere")), f.symlink_to("elsewhere"))),
+        options=ON,
+    ),
+    row(
+        "certify",
+        "database is a link to nowhere",
+        "no regular file",
+        search=database(lambda f: (f.unlink(), f.symlink_to("nowhere"))),
+        options=ON,
+    ),
     row("certify", "database of another program", "another version", search=database(another_database), options=ON),
-    row("certify", "log is a folder", "cannot be used", search=database(beside("-wal", lambda f: f.mkdir())), options=ON),
-    row("certify", "log of noise", "cells kept from before", search=database(beside("-wal", lambda f: f.write_bytes(bytes(range(256)) * 40))), options=ON, code=0, memory=WORK),
+    row(
+        "certify", "log is a folder", "cannot be used", search=database(beside("-wal", lambda f: f.mkdir())), options=ON
+    ),
+    row(
+        "certify",
+        "log of noise",
+        "cells kept from before",
+        search=database(beside("-wal", lambda f: f.write_bytes(bytes(range(256)) * 40))),
+        options=ON,
+        code=0,
+        memory=WORK,
+    ),
     row("certify", "cells dropped", "cannot be used", search=database("DROP TABLE cells"), options=ON),
-    row("certify", "cells made certified", "changed since", search=database("UPDATE cells SET verdict = 'certified', margin = 1.0"), options=ON),
-    row("certify", "cells doubled", "changed since", search=database("INSERT INTO cells SELECT * FROM cells"), options=ON),
+    row(
+        "certify",
+        "cells made certified",
+        "changed since",
+        search=database("UPDATE cells SET verdict = 'certified', margin = 1.0"),
+        options=ON,
+    ),
+    row(
+        "certify",
+        "cells doubled",
+        "changed since",
+        search=database("INSERT INTO cells SELECT * FROM cells"),
+        options=ON,
+    ),
     row("certify", "cells without open blocks", "changed", search=database("DELETE FROM search_blocks"), options=ON),
-    row("certify", "cells that a view stands for", "tables", search=database("ALTER TABLE cells RENAME TO other; CREATE VIEW cells AS SELECT * FROM other"), options=ON),
-    row("certify", "cells with a trigger", "tables", search=database("CREATE TRIGGER t AFTER INSERT ON cells BEGIN UPDATE cells SET verdict = 'certified'; END"), options=ON),
-    row("certify", "blocks of cells outside", "changed", search=database("UPDATE search_blocks SET cells = '[[[99999999], [999999999]]]'"), options=ON),
-    row("certify", "state nested", "cannot be used", search=database("UPDATE search_state SET value = replace(hex(zeroblob(50000)), '0', '[') WHERE key = 'seals'"), options=ON),
-    row("certify", "state of NULL", "cannot be used", search=database("UPDATE search_state SET value = NULL WHERE key = 'fingerprint'"), options=ON),
-    row("certify", "state of bytes", "cannot be used", search=database("UPDATE search_state SET value = x'ff00' WHERE key = 'fingerprint'"), options=ON),
-    row("certify", "search without its report", "cells kept from before", search=lambda f: (f / "report.json").unlink(), options=ON, code=0, memory=WORK),
-    row("certify", "search with a report of noise", "cells kept from before", search=lambda f: (f / "report.json").write_bytes(bytes(range(256))), options=ON, code=0, memory=WORK),
-    row("certify", "lock is a folder", "cannot be written", search=lambda f: ((f / MARK).unlink(missing_ok=True), (f / MARK).mkdir()), options=ON),
-    row("certify", "lock is a link", "cannot be written", search=lambda f: ((f / MARK).unlink(missing_ok=True), (f / MARK).symlink_to("mine.txt")), options=ON),
+    row(
+        "certify",
+        "cells that a view stands for",
+        "tables",
+        search=database("ALTER TABLE cells RENAME TO other; CREATE VIEW cells AS SELECT * FROM other"),
+        options=ON,
+    ),
+    row(
+        "certify",
+        "cells with a trigger",
+        "tables",
+        search=database("CREATE TRIGGER t AFTER INSERT ON cells BEGIN UPDATE cells SET verdict = 'certified'; END"),
+        options=ON,
+    ),
+    row(
+        "certify",
+        "blocks of cells outside",
+        "changed",
+        search=database("UPDATE search_blocks SET cells = '[[[99999999], [999999999]]]'"),
+        options=ON,
+    ),
+    row(
+        "certify",
+        "state nested",
+        "cannot be used",
+        search=database("UPDATE search_state SET value = replace(hex(zeroblob(50000)), '0', '[') WHERE key = 'seals'"),
+        options=ON,
+    ),
+    row(
+        "certify",
+        "state of NULL",
+        "cannot be used",
+        search=database("UPDATE search_state SET value = NULL WHERE key = 'fingerprint'"),
+        options=ON,
+    ),
+    row(
+        "certify",
+        "state of bytes",
+        "cannot be used",
+        search=database("UPDATE search_state SET value = x'ff00' WHERE key = 'fingerprint'"),
+        options=ON,
+    ),
+    row(
+        "certify",
+        "search without its report",
+        "cells kept from before",
+        search=lambda f: (f / "report.json").unlink(),
+        options=ON,
+        code=0,
+        memory=WORK,
+    ),
+    row(
+        "certify",
+        "search with a report of noise",
+        "cells kept from before",
+        search=lambda f: (f / "report.json").write_bytes(bytes(range(256))),
+        options=ON,
+        code=0,
+        memory=WORK,
+    ),
+    row(
+        "certify",
+        "lock is a folder",
+        "cannot be written",
+        search=lambda f: ((f / MARK).unlink(missing_ok=True), (f / MARK).mkdir()),
+        options=ON,
+    ),
+    row(
+        "certify",
+        "lock is a link",
+        "cannot be written",
+        search=lambda f: ((f / MARK).unlink(missing_ok=True), (f / MARK).symlink_to("mine.txt")),
+        options=ON,
+    ),
     row("certify", "output where nothing can be made", "cannot be written", options="--output-dir /proc/out"),
     row("render", "output where nothing can be made", "cannot be written", options="--output-dir /proc/out"),
     row("certify", "disk full at the beginning", "cannot be", options="--workers 1", room=4096, memory=WORK),
@@ -608,7 +871,7 @@ SEARCHES = [
     row("render", "disk full", "make room", options="--target-ratio 3", room=1 << 10, memory=WORK),
     row("npz", "disk full", "out.npz", room=1 << 10),
     row("ply", "disk full", "out.ply", room=100),
-]  # fmt: skip
+]
 
 
 @contextmanager
@@ -639,10 +902,28 @@ DASK = "--engine dask --workers 1 --scheduler-address "
 
 CLUSTERS = [
     row("certify", "scheduler that is not there", "no scheduler answers", options=DASK + "127.0.0.1:1"),
-    row("render", "scheduler that is not there", "no scheduler answers", options="--engine dask --scheduler-address 127.0.0.1:1"),
-    row("nerf", "scheduler that is not there", "no scheduler answers", options="--engine dask --scheduler-address 127.0.0.1:1"),
-    row("certify", "scheduler that says nothing", "no scheduler answers", options=DASK + "127.0.0.1:{port}", listener=silent),
-    row("certify", "scheduler of another kind", "no scheduler answers", options=DASK + "127.0.0.1:{port}", listener=rude),
+    row(
+        "render",
+        "scheduler that is not there",
+        "no scheduler answers",
+        options="--engine dask --scheduler-address 127.0.0.1:1",
+    ),
+    row(
+        "nerf",
+        "scheduler that is not there",
+        "no scheduler answers",
+        options="--engine dask --scheduler-address 127.0.0.1:1",
+    ),
+    row(
+        "certify",
+        "scheduler that says nothing",
+        "no scheduler answers",
+        options=DASK + "127.0.0.1:{port}",
+        listener=silent,
+    ),
+    row(
+        "certify", "scheduler of another kind", "no scheduler answers", options=DASK + "127.0.0.1:{port}", listener=rude
+    ),
     row("certify", "scheduler without a port", "no scheduler answers", options=DASK + "tcp://"),
     row("certify", "scheduler of a large port", "no scheduler answers", options=DASK + "127.0.0.1:99999999"),
     row("certify", "scheduler of a negative port", "no scheduler answers", options=DASK + "127.0.0.1:-1"),
@@ -652,24 +933,124 @@ CLUSTERS = [
     row("certify", "scheduler of no host", "no scheduler answers", options=DASK + "no.such.host.invalid:8786"),
     row("certify", "scheduler with escapes", "no scheduler answers", options=DASK + "\x1b[31mred:1"),
     row("certify", "scheduler of no name", "is empty", options=("--engine", "dask", "--scheduler-address", "")),
-    row("certify", "authority that is no certificate", "PEM", options=DASK + "127.0.0.1:1 --tls-ca-file {spec} --tls-cert {spec} --tls-key {spec}"),
+    row(
+        "certify",
+        "authority that is no certificate",
+        "PEM",
+        options=DASK + "127.0.0.1:1 --tls-ca-file {spec} --tls-cert {spec} --tls-key {spec}",
+    ),
     row("certify", "engine unknown", "engine", options="--engine spark"),
-]  # fmt: skip
+]
 
 LONG = "--time-budget 600"
 
 SIGNALS = [
-    row("certify", "SIGINT", "", options=f"{LONG} --workers 1", signals=(signal.SIGINT,), after="larger than", code=3, memory=WORK, prop={"type": "classification", "label": 0, "preprocess": PREPROCESS, "partitions": 100000}),
-    row("certify", "SIGTERM", "", options=f"{LONG} --workers 1", signals=(signal.SIGTERM,), after="larger than", code=3, memory=WORK, prop={"type": "classification", "label": 0, "preprocess": PREPROCESS, "partitions": 100000}),
-    row("certify", "SIGINT twice", "", options=f"{LONG} --workers 1", signals=(signal.SIGINT, signal.SIGINT), after="larger than", code=3, memory=WORK, prop={"type": "classification", "label": 0, "preprocess": PREPROCESS, "partitions": 100000}),
-    row("certify", "SIGTERM and SIGINT", "", options=f"{LONG} --workers 2", signals=(signal.SIGTERM, signal.SIGINT), after="larger than", code=3, memory=WORK, prop={"type": "classification", "label": 0, "preprocess": PREPROCESS, "partitions": 100000}),
-    row("certify", "SIGHUP", "", options=f"{LONG} --workers 1", signals=(signal.SIGHUP,), after="larger than", code=-1, memory=WORK, prop={"type": "classification", "label": 0, "preprocess": PREPROCESS, "partitions": 100000}),
-    row("render", "SIGINT", "", options=f"{LONG} --target-ratio 1.00001", signals=(signal.SIGINT,), after="gsplat", code=3, memory=WORK),
-    row("render", "SIGTERM", "", options=f"{LONG} --target-ratio 1.00001", signals=(signal.SIGTERM,), after="gsplat", code=3, memory=WORK),
-    row("render", "SIGINT twice", "", options=f"{LONG} --target-ratio 1.00001", signals=(signal.SIGINT, signal.SIGINT), after="gsplat", code=3, memory=WORK),
-    row("nerf", "SIGINT", "", options=f"{LONG} --target-ratio 1.00001 --workers 1", signals=(signal.SIGINT,), after="vanilla NeRF", code=3, memory=WORK),
-    row("nerf", "SIGTERM, hierarchical", "", options=f"{LONG} --target-ratio 1.00001 --workers 1 --sampling hierarchical", signals=(signal.SIGTERM,), after="vanilla NeRF", code=3, memory=WORK),
-]  # fmt: skip
+    row(
+        "certify",
+        "SIGINT",
+        "",
+        options=f"{LONG} --workers 1",
+        signals=(signal.SIGINT,),
+        after="larger than",
+        code=3,
+        memory=WORK,
+        prop={"type": "classification", "label": 0, "preprocess": PREPROCESS, "partitions": 100000},
+    ),
+    row(
+        "certify",
+        "SIGTERM",
+        "",
+        options=f"{LONG} --workers 1",
+        signals=(signal.SIGTERM,),
+        after="larger than",
+        code=3,
+        memory=WORK,
+        prop={"type": "classification", "label": 0, "preprocess": PREPROCESS, "partitions": 100000},
+    ),
+    row(
+        "certify",
+        "SIGINT twice",
+        "",
+        options=f"{LONG} --workers 1",
+        signals=(signal.SIGINT, signal.SIGINT),
+        after="larger than",
+        code=3,
+        memory=WORK,
+        prop={"type": "classification", "label": 0, "preprocess": PREPROCESS, "partitions": 100000},
+    ),
+    row(
+        "certify",
+        "SIGTERM and SIGINT",
+        "",
+        options=f"{LONG} --workers 2",
+        signals=(signal.SIGTERM, signal.SIGINT),
+        after="larger than",
+        code=3,
+        memory=WORK,
+        prop={"type": "classification", "label": 0, "preprocess": PREPROCESS, "partitions": 100000},
+    ),
+    row(
+        "certify",
+        "SIGHUP",
+        "",
+        options=f"{LONG} --workers 1",
+        signals=(signal.SIGHUP,),
+        after="larger than",
+        code=-1,
+        memory=WORK,
+        prop={"type": "classification", "label": 0, "preprocess": PREPROCESS, "partitions": 100000},
+    ),
+    row(
+        "render",
+        "SIGINT",
+        "",
+        options=f"{LONG} --target-ratio 1.00001",
+        signals=(signal.SIGINT,),
+        after="gsplat",
+        code=3,
+        memory=WORK,
+    ),
+    row(
+        "render",
+        "SIGTERM",
+        "",
+        options=f"{LONG} --target-ratio 1.00001",
+        signals=(signal.SIGTERM,),
+        after="gsplat",
+        code=3,
+        memory=WORK,
+    ),
+    row(
+        "render",
+        "SIGINT twice",
+        "",
+        options=f"{LONG} --target-ratio 1.00001",
+        signals=(signal.SIGINT, signal.SIGINT),
+        after="gsplat",
+        code=3,
+        memory=WORK,
+    ),
+    row(
+        "nerf",
+        "SIGINT",
+        "",
+        options=f"{LONG} --target-ratio 1.00001 --workers 1",
+        signals=(signal.SIGINT,),
+        after="vanilla NeRF",
+        code=3,
+        memory=WORK,
+    ),
+    row(
+        "nerf",
+        "SIGTERM, hierarchical",
+        "",
+        options=f"{LONG} --target-ratio 1.00001 --workers 1 --sampling hierarchical",
+        signals=(signal.SIGTERM,),
+        after="vanilla NeRF",
+        code=3,
+        memory=WORK,
+    ),
+]
 
 LOOPS = [
     row("reach", "good", "safe: certified", code=0, memory=WORK),
@@ -714,12 +1095,20 @@ LOOPS = [
 ]  # fmt: skip
 
 GOOD = [
-    row("render", "resumed, nothing left to do", "kept from before: frames 0, 1", results=lambda f: None, options=RESUME, code=0, memory=WORK),
+    row(
+        "render",
+        "resumed, nothing left to do",
+        "kept from before: frames 0, 1",
+        results=lambda f: None,
+        options=RESUME,
+        code=0,
+        memory=WORK,
+    ),
     row("npz", "good", "out.npz", code=0),
     row("png", "good", "out", code=0),
     row("ply", "good", "out.ply", code=0),
     row("occupancy", "good", "out.npz", options="--resolution 4 --threshold 0.001", code=0),
-]  # fmt: skip
+]
 
 NETWORKS = [
     row("certify", "network absent", "no such", options="--model {here}/none.onnx"),
@@ -736,25 +1125,97 @@ NETWORKS = [
     row("certify", "network of another domain", "domain", net=layers(node("Relu", ["image"], ["y"], domain="evil"))),
     row("certify", "network without nodes", "no network", net=onnx_file(lambda m: m.graph.ClearField("node"))),
     row("certify", "network without outputs", "no network", net=onnx_file(lambda m: m.graph.ClearField("output"))),
-    row("certify", "network of operator set 99", "operator set", net=onnx_file(lambda m: setattr(m.opset_import[0], "version", 99))),
-    row("certify", "network of 2^62 rows", "numbers", net=layers(node("Relu", ["image"], ["y"]), shape=(3, 2**62, 2**62))),
+    row(
+        "certify",
+        "network of operator set 99",
+        "operator set",
+        net=onnx_file(lambda m: setattr(m.opset_import[0], "version", 99)),
+    ),
+    row(
+        "certify",
+        "network of 2^62 rows",
+        "numbers",
+        net=layers(node("Relu", ["image"], ["y"]), shape=(3, 2**62, 2**62)),
+    ),
     row("certify", "network of 10^9 rows", "numbers", net=layers(node("Relu", ["image"], ["y"]), shape=(3, 10**9, 4))),
     row("certify", "network of no rows", "shape", net=layers(node("Relu", ["image"], ["y"]), shape=(3, 0, 4))),
-    row("certify", "network of one channel", "three channels", net=layers(node("Flatten", ["image"], ["y"]), shape=(1, SIZE, SIZE))),
-    row("certify", "network with NaN", "not finite", net=layers(node("Add", ["image", "w"], ["y"]), w=np.full((3, 1, 1), np.nan, np.float32))),
-    row("certify", "network with 1e300", "cannot compute", net=layers(node("Mul", ["image", "w"], ["y"]), w=np.full((3, 1, 1), 1e300))),
+    row(
+        "certify",
+        "network of one channel",
+        "three channels",
+        net=layers(node("Flatten", ["image"], ["y"]), shape=(1, SIZE, SIZE)),
+    ),
+    row(
+        "certify",
+        "network with NaN",
+        "not finite",
+        net=layers(node("Add", ["image", "w"], ["y"]), w=np.full((3, 1, 1), np.nan, np.float32)),
+    ),
+    row(
+        "certify",
+        "network with 1e300",
+        "cannot compute",
+        net=layers(node("Mul", ["image", "w"], ["y"]), w=np.full((3, 1, 1), 1e300)),
+    ),
     row("certify", "network with text", "type", net=layers(node("Add", ["image", "w"], ["y"]), w=np.array(["a", "b"]))),
-    row("certify", "network that claims 2^60 numbers", "numbers", net=onnx_file(lambda m: m.graph.initializer[0].dims.__setitem__(0, 2**60))),
-    row("certify", "network of negative size", "negative", net=onnx_file(lambda m: m.graph.initializer[0].dims.__setitem__(0, -4))),
-    row("certify", "network of other weights", "cannot be read", net=onnx_file(lambda m: m.graph.initializer[0].dims.__setitem__(0, 5))),
+    row(
+        "certify",
+        "network that claims 2^60 numbers",
+        "numbers",
+        net=onnx_file(lambda m: m.graph.initializer[0].dims.__setitem__(0, 2**60)),
+    ),
+    row(
+        "certify",
+        "network of negative size",
+        "negative",
+        net=onnx_file(lambda m: m.graph.initializer[0].dims.__setitem__(0, -4)),
+    ),
+    row(
+        "certify",
+        "network of other weights",
+        "cannot be read",
+        net=onnx_file(lambda m: m.graph.initializer[0].dims.__setitem__(0, 5)),
+    ),
     row("certify", "network whose node reads nothing", "not known", net=layers(node("Relu", ["gone"], ["y"]))),
     row("certify", "network that reads itself", "(y)", net=layers(node("Add", ["image", "y"], ["y"]))),
-    row("certify", "network padded to 2^60", "numbers", net=layers(node("Pad", ["image", "w"], ["y"]), w=np.array([0, 0, 0, 0, 0, 0, 2**60, 2**60]))),
-    row("certify", "network of strides 0", "strides", net=layers(node("MaxPool", ["image"], ["y"], kernel_shape=[2, 2], strides=[0, 0]))),
-    row("certify", "network of negative pads", "pads", net=layers(node("MaxPool", ["image"], ["y"], kernel_shape=[2, 2], pads=[-1, -1, 0, 0]))),
-    row("certify", "network that doubles itself 30 times", "numbers", net=layers(*[node("Concat", ["image" if k == 0 else f"v{k}"] * 2, [f"v{k + 1}"], axis=1) for k in range(30)]), memory=3 << 30),
-    row("certify", "network that doubles its rows 40 times", "numbers", net=layers(*[node("Concat", ["image" if k == 0 else f"v{k}"] * 2, [f"v{k + 1}"], axis=2) for k in range(40)]), memory=3 << 30),
-    row("certify", "network as pt2", "torch.export.load", net=lambda f: (f.with_suffix(".pt2").write_bytes(b"PK"), f.with_suffix(".pt2"))[1]),
+    row(
+        "certify",
+        "network padded to 2^60",
+        "numbers",
+        net=layers(node("Pad", ["image", "w"], ["y"]), w=np.array([0, 0, 0, 0, 0, 0, 2**60, 2**60])),
+    ),
+    row(
+        "certify",
+        "network of strides 0",
+        "strides",
+        net=layers(node("MaxPool", ["image"], ["y"], kernel_shape=[2, 2], strides=[0, 0])),
+    ),
+    row(
+        "certify",
+        "network of negative pads",
+        "pads",
+        net=layers(node("MaxPool", ["image"], ["y"], kernel_shape=[2, 2], pads=[-1, -1, 0, 0])),
+    ),
+    row(
+        "certify",
+        "network that doubles itself 30 times",
+        "numbers",
+        net=layers(*[node("Concat", ["image" if k == 0 else f"v{k}"] * 2, [f"v{k + 1}"], axis=1) for k in range(30)]),
+        memory=3 << 30,
+    ),
+    row(
+        "certify",
+        "network that doubles its rows 40 times",
+        "numbers",
+        net=layers(*[node("Concat", ["image" if k == 0 else f"v{k}"] * 2, [f"v{k + 1}"], axis=2) for k in range(40)]),
+        memory=3 << 30,
+    ),
+    row(
+        "certify",
+        "network as pt2",
+        "torch.export.load",
+        net=lambda f: (f.with_suffix(".pt2").write_bytes(b"PK"), f.with_suffix(".pt2"))[1],
+    ),
     row("certify", "external data on a pipe", "regular file", net=external("data.bin", fifo)),
     row("certify", "external data in a folder", "folder", net=external("data.bin", folder)),
     row("certify", "external data absent", "no such", net=external("data.bin")),
@@ -762,47 +1223,139 @@ NETWORKS = [
     row("certify", "external data at the root", "outside", net=external("/etc/hostname")),
     row("certify", "external data through a link", "outside", net=external("data.bin", link("/etc/hostname"))),
     row("certify", "external data too short", "needs", net=external("data.bin", lambda f: f.write_bytes(bytes(8)))),
-    row("certify", "external data at 10^18", "needs", net=external("data.bin", lambda f: f.write_bytes(bytes(8)), offset=str(10**18))),
-    row("certify", "external data of negative length", "needs", net=external("data.bin", lambda f: f.write_bytes(bytes(8)), length="-5")),
-    row("certify", "external data of a length in words", "cannot read", net=external("data.bin", lambda f: f.write_bytes(bytes(8)), length="all")),
-    row("certify", "external data of 2 GB, sparse", "needs", net=external("data.bin", sparse(2**31), length=str(2**31))),
+    row(
+        "certify",
+        "external data at 10^18",
+        "needs",
+        net=external("data.bin", lambda f: f.write_bytes(bytes(8)), offset=str(10**18)),
+    ),
+    row(
+        "certify",
+        "external data of negative length",
+        "needs",
+        net=external("data.bin", lambda f: f.write_bytes(bytes(8)), length="-5"),
+    ),
+    row(
+        "certify",
+        "external data of a length in words",
+        "cannot read",
+        net=external("data.bin", lambda f: f.write_bytes(bytes(8)), length="all"),
+    ),
+    row(
+        "certify", "external data of 2 GB, sparse", "needs", net=external("data.bin", sparse(2**31), length=str(2**31))
+    ),
     row("certify", "external data named by escapes", "outside", net=external("../\x1b[31mred")),
     row("vnnlib", "network absent", "no such", options="--model {here}/none.onnx"),
-]  # fmt: skip
+]
 
 GRIDS = [
     row("nerf", "grid absent", "no such", options="--occupancy-grid {here}/none.npz"),
     row("nerf", "grid is a folder", "folder", grid=folder),
     row("nerf", "grid is a pipe", "regular file", grid=fifo),
-    row("nerf", "grid as npy", "grid.npy", grid=lambda f: (np.save(f.with_suffix(".npy"), np.ones((2, 2, 2), bool)), f.with_suffix(".npy"))[1]),
+    row(
+        "nerf",
+        "grid as npy",
+        "grid.npy",
+        grid=lambda f: (np.save(f.with_suffix(".npy"), np.ones((2, 2, 2), bool)), f.with_suffix(".npy"))[1],
+    ),
     row("nerf", "grid empty", "cannot be read", grid=b""),
     row("nerf", "grid cut off", "cannot be read", grid=cut(60)),
     row("nerf", "grid without box", "aabb", grid=arrays(occupied=np.ones((2, 2, 2), bool))),
     row("nerf", "grid of numbers", "occupied", grid=arrays(occupied=np.ones((2, 2, 2)), aabb=[[0, 0, 0], [1, 1, 1]])),
-    row("nerf", "grid of 64 MiB deflated", "occupied", grid=arrays(occupied=np.zeros(1 << 23), aabb=[[0, 0, 0], [1, 1, 1]]), memory=96 << 20),
-    row("nerf", "box of 64 MiB deflated", "aabb", grid=arrays(occupied=np.ones((2, 2, 2), bool), aabb=np.zeros(1 << 23)), memory=96 << 20),
-    row("nerf", "grid beyond memory", "--memory-limit", grid=arrays(occupied=np.zeros((256, 256, 512), bool), aabb=[[0.0, 0, 0], [1, 1, 1]]), options="--memory-limit 1.2"),
-    row("nerf", "grid of flat box", "aabb", grid=arrays(occupied=np.ones((2, 2, 2), bool), aabb=[[0, 0, 0], [1, 1, 0]])),
-    row("nerf", "grid of infinite box", "aabb", grid=arrays(occupied=np.ones((2, 2, 2), bool), aabb=[[0, 0, 0], [1, 1, np.inf]])),
-    row("nerf", "grid of objects", "Python objects", grid=lambda f: np.savez(f, occupied=np.array([[[print]]]), aabb=[[0, 0, 0], [1, 1, 1]])),
+    row(
+        "nerf",
+        "grid of 64 MiB deflated",
+        "occupied",
+        grid=arrays(occupied=np.zeros(1 << 23), aabb=[[0, 0, 0], [1, 1, 1]]),
+        memory=96 << 20,
+    ),
+    row(
+        "nerf",
+        "box of 64 MiB deflated",
+        "aabb",
+        grid=arrays(occupied=np.ones((2, 2, 2), bool), aabb=np.zeros(1 << 23)),
+        memory=96 << 20,
+    ),
+    row(
+        "nerf",
+        "grid beyond memory",
+        "--memory-limit",
+        grid=arrays(occupied=np.zeros((256, 256, 512), bool), aabb=[[0.0, 0, 0], [1, 1, 1]]),
+        options="--memory-limit 1.2",
+    ),
+    row(
+        "nerf", "grid of flat box", "aabb", grid=arrays(occupied=np.ones((2, 2, 2), bool), aabb=[[0, 0, 0], [1, 1, 0]])
+    ),
+    row(
+        "nerf",
+        "grid of infinite box",
+        "aabb",
+        grid=arrays(occupied=np.ones((2, 2, 2), bool), aabb=[[0, 0, 0], [1, 1, np.inf]]),
+    ),
+    row(
+        "nerf",
+        "grid of objects",
+        "Python objects",
+        grid=lambda f: np.savez(f, occupied=np.array([[[print]]]), aabb=[[0, 0, 0], [1, 1, 1]]),
+    ),
     row("nerf", "grid by damaged LZMA", "compressed", grid=damaged_lzma),
     row("nerf", "grid of a text", "cannot be read", grid="occupied"),
     row("render", "grid for a splat", "occupancy", options="--occupancy-grid {here}/../base/grid.npz"),
-]  # fmt: skip
+]
 
 MORE = [
-    row("render", "number of 200,000 digits in YAML", "characters", yml=lambda text: text + "\nx: " + "9" * 200000 + "\n"),
-    row("render", "sexagesimal number of 300 kB in YAML", "characters", yml=lambda text: text + "\nx: 1" + ":59" * 100000 + "\n"),
-    row("render", "sexagesimal float of 300 kB in YAML", "characters", yml=lambda text: text + "\nx: 1" + ":59" * 100000 + ".5\n"),
-    row("render", "hexadecimal number of 100 kB in YAML", "characters", yml=lambda text: text + "\nx: 0x" + "f" * 100000 + "\n"),
-    row("render", "tagged number of 10 kB in YAML", "characters", yml=lambda text: text + "\nx: !!python/int '" + "9" * 10000 + "'\n"),
+    row(
+        "render",
+        "number of 200,000 digits in YAML",
+        "characters",
+        yml=lambda text: text + "\nx: " + "9" * 200000 + "\n",
+    ),
+    row(
+        "render",
+        "sexagesimal number of 300 kB in YAML",
+        "characters",
+        yml=lambda text: text + "\nx: 1" + ":59" * 100000 + "\n",
+    ),
+    row(
+        "render",
+        "sexagesimal float of 300 kB in YAML",
+        "characters",
+        yml=lambda text: text + "\nx: 1" + ":59" * 100000 + ".5\n",
+    ),
+    row(
+        "render",
+        "hexadecimal number of 100 kB in YAML",
+        "characters",
+        yml=lambda text: text + "\nx: 0x" + "f" * 100000 + "\n",
+    ),
+    row(
+        "render",
+        "tagged number of 10 kB in YAML",
+        "characters",
+        yml=lambda text: text + "\nx: !!python/int '" + "9" * 10000 + "'\n",
+    ),
     row("render", "merge key in YAML", "merge", yml=lambda text: text + "\nx: {<<: {a: 1}}\n"),
     row("render", "two documents in YAML", "YAML", yml=lambda text: text + "\n---\na: 1\n"),
     row("render", "tab in YAML", "YAML", yml="a:\n\t- 1"),
     row("render", "impossible date in YAML", "YAML", yml="a: 2020-99-99\n"),
     row("render", "NUL in YAML", "YAML", yml="a: \x00\n"),
-    row("ply", "escapes in a scene's name", "out.ply", yml=lambda text: re.sub("experiment_name: .*", r'experiment_name: "\\e[2J\\e]0;owned\\a"', text), code=0),
-    row("render", "escapes in a scene's name, resumed", "\\x1b[2J", results=lambda f: None, yml=lambda text: re.sub("experiment_name: .*", r'experiment_name: "\\e[2J\\e]0;owned\\a"', text), options=RESUME, code=0, memory=WORK),
+    row(
+        "ply",
+        "escapes in a scene's name",
+        "out.ply",
+        yml=lambda text: re.sub("experiment_name: .*", r'experiment_name: "\\e[2J\\e]0;owned\\a"', text),
+        code=0,
+    ),
+    row(
+        "render",
+        "escapes in a scene's name, resumed",
+        "\\x1b[2J",
+        results=lambda f: None,
+        yml=lambda text: re.sub("experiment_name: .*", r'experiment_name: "\\e[2J\\e]0;owned\\a"', text),
+        options=RESUME,
+        code=0,
+        memory=WORK,
+    ),
     row("render", "escapes in a file's name", "no such", options="--load-config \x1b[31m.yml"),
     row("render", "escapes in a path's name", "no such", options="--camera-path-filename \x1b]0;x\x07.json"),
     row("certify", "escapes in a network's name", "no such", options="--model \x1b[2Jnet.onnx"),
@@ -811,49 +1364,229 @@ MORE = [
     row("render", "name of 500 characters", "a" * 50, options="--load-config " + "a" * 500),
     row("render", "field with escapes", "unknown key", spec='{"\\u001b[31m": 1}'),
     row("certify", "VNN-LIB with escapes", "not understood", lib="(assert (\x1b[31m Y_0 1))"),
-    row("certify", "VNN-LIB outside of the folder", "leads out", prop={"type": "vnnlib", "file": "../base/unsafe.vnnlib", "preprocess": PREPROCESS}),
-    row("certify", "VNN-LIB at the root", "leads out", prop={"type": "vnnlib", "file": "/etc/passwd", "preprocess": PREPROCESS}),
+    row(
+        "certify",
+        "VNN-LIB outside of the folder",
+        "leads out",
+        prop={"type": "vnnlib", "file": "../base/unsafe.vnnlib", "preprocess": PREPROCESS},
+    ),
+    row(
+        "certify",
+        "VNN-LIB at the root",
+        "leads out",
+        prop={"type": "vnnlib", "file": "/etc/passwd", "preprocess": PREPROCESS},
+    ),
     row("certify", "VNN-LIB through a link", "leads out", lib=link("/etc/passwd")),
-    row("certify", "VNN-LIB is the folder", "leads out", prop={"type": "vnnlib", "file": ".", "preprocess": PREPROCESS}),
+    row(
+        "certify", "VNN-LIB is the folder", "leads out", prop={"type": "vnnlib", "file": ".", "preprocess": PREPROCESS}
+    ),
     row("certify", "VNN-LIB is a pipe", "regular file", lib=fifo),
     row("certify", "VNN-LIB empty", "empty", lib=b""),
     row("certify", "VNN-LIB of NaN", "not understood", lib="(declare-const Y_0 Real)(assert (<= Y_0 nan))"),
     row("certify", "VNN-LIB of a product", "linear", lib="(declare-const Y_0 Real)(assert (<= (* Y_0 Y_0) 1))"),
     row("certify", "VNN-LIB without assertions", "no assertion", lib="(declare-const Y_0 Real)"),
-    row("certify", "VNN-LIB of 5,000 digits", "float64", lib="(declare-const Y_0 Real)(assert (<= Y_0 " + "9" * 5000 + "))"),
-    row("render", "index file outside of the folder", "leads out", spec={"scene": [{"select": {"indices": "../base/path.json"}, "mean": 1}]}),
-    row("render", "index file at the root", "leads out", spec={"scene": [{"select": {"indices": "/etc/passwd"}, "mean": 1}]}),
-    row("render", "index file with NUL", "leads out", spec='{"scene": [{"select": {"indices": "a\\u0000b"}, "mean": 1}]}'),
-    row("render", "index file is a pipe", "regular file", indices=fifo, spec={"scene": [{"select": {"indices": "chosen.txt"}, "mean": 1}]}),
-    row("render", "index file of words", "whole numbers", indices="one two", spec={"scene": [{"select": {"indices": "chosen.txt"}, "mean": 1}]}),
-    row("render", "index file empty", "empty", indices=b"", spec={"scene": [{"select": {"indices": "chosen.txt"}, "mean": 1}]}),
-    row("render", "index file that claims 2^40 numbers", "damaged .npy", indices=lambda f: f.with_name("many.npy").write_bytes(b"\x93NUMPY\x01\x00v\x00{'descr': '<i8', 'fortran_order': False, 'shape': (1099511627776,), }".ljust(127) + b"\n"), spec={"scene": [{"select": {"indices": "many.npy"}, "mean": 1}]}),
-    row("npz", "frame of other size", "not as report.json", results=frame_file(lambda f: np.savez(f, lower=np.zeros(3)))),
-    row("render", "frame of 64 MiB deflated, resumed", "not used: frame_00000.npz: has 2896 x 2048 pixels", results=resumed(**{k: lambda a: np.full((2048, 2896, 3), a.flat[0], np.float32) for k in ("lower", "upper", "witness_lower", "witness_upper", "image")}), options=f"{RESUME} --frames 1", code=0, memory=WORK),
-    row("render", "record of 80 MiB, resumed", "not used: frame_00000.npz: record has", results=resumed(record=lambda a: np.array("[" * (20 << 20))), options=f"{RESUME} --frames 1", code=0, memory=WORK),
-    row("render", "frame of objects, resumed", "Python objects", results=resumed(record=lambda a: np.array(print)), options=f"{RESUME} --frames 1", code=0, memory=WORK),
-    row("render", "frame with NaN, resumed", "not used: frame_00000.npz", results=resumed(lower=lambda a: a * np.float32(np.nan)), options=f"{RESUME} --frames 1", code=0, memory=WORK),
-    row("render", "frame that crosses, resumed", "not used: frame_00000.npz", results=resumed(lower=lambda a: a + np.float32(0.4)), options=f"{RESUME} --frames 1", code=0, memory=WORK),
-    row("render", "record of a list, resumed", "not used: frame_00000.npz", results=resumed(record=lambda a: np.array("[1]")), options=f"{RESUME} --frames 1", code=0, memory=WORK),
-    row("render", "report of noise, resumed", "frame_00000.npz stands there", results=lambda f: (f / "report.json").write_bytes(bytes(range(256))), options=f"{RESUME} --frames 1", memory=WORK),
-]  # fmt: skip
+    row(
+        "certify",
+        "VNN-LIB of 5,000 digits",
+        "float64",
+        lib="(declare-const Y_0 Real)(assert (<= Y_0 " + "9" * 5000 + "))",
+    ),
+    row(
+        "render",
+        "index file outside of the folder",
+        "leads out",
+        spec={"scene": [{"select": {"indices": "../base/path.json"}, "mean": 1}]},
+    ),
+    row(
+        "render",
+        "index file at the root",
+        "leads out",
+        spec={"scene": [{"select": {"indices": "/etc/passwd"}, "mean": 1}]},
+    ),
+    row(
+        "render",
+        "index file with NUL",
+        "leads out",
+        spec='{"scene": [{"select": {"indices": "a\\u0000b"}, "mean": 1}]}',
+    ),
+    row(
+        "render",
+        "index file is a pipe",
+        "regular file",
+        indices=fifo,
+        spec={"scene": [{"select": {"indices": "chosen.txt"}, "mean": 1}]},
+    ),
+    row(
+        "render",
+        "index file of words",
+        "whole numbers",
+        indices="one two",
+        spec={"scene": [{"select": {"indices": "chosen.txt"}, "mean": 1}]},
+    ),
+    row(
+        "render",
+        "index file empty",
+        "empty",
+        indices=b"",
+        spec={"scene": [{"select": {"indices": "chosen.txt"}, "mean": 1}]},
+    ),
+    row(
+        "render",
+        "index file that claims 2^40 numbers",
+        "damaged .npy",
+        indices=lambda f: f.with_name("many.npy").write_bytes(
+            b"\x93NUMPY\x01\x00v\x00{'descr': '<i8', 'fortran_order': False, 'shape': (1099511627776,), }".ljust(127)
+            + b"\n"
+        ),
+        spec={"scene": [{"select": {"indices": "many.npy"}, "mean": 1}]},
+    ),
+    row(
+        "npz", "frame of other size", "not as report.json", results=frame_file(lambda f: np.savez(f, lower=np.zeros(3)))
+    ),
+    row(
+        "render",
+        "frame of 64 MiB deflated, resumed",
+        "not used: frame_00000.npz: has 2896 x 2048 pixels",
+        results=resumed(
+            **{
+                k: lambda a: np.full((2048, 2896, 3), a.flat[0], np.float32)
+                for k in ("lower", "upper", "witness_lower", "witness_upper", "image")
+            }
+        ),
+        options=f"{RESUME} --frames 1",
+        code=0,
+        memory=WORK,
+    ),
+    row(
+        "render",
+        "record of 80 MiB, resumed",
+        "not used: frame_00000.npz: record has",
+        results=resumed(record=lambda a: np.array("[" * (20 << 20))),
+        options=f"{RESUME} --frames 1",
+        code=0,
+        memory=WORK,
+    ),
+    row(
+        "render",
+        "frame of objects, resumed",
+        "Python objects",
+        results=resumed(record=lambda a: np.array(print)),
+        options=f"{RESUME} --frames 1",
+        code=0,
+        memory=WORK,
+    ),
+    row(
+        "render",
+        "frame with NaN, resumed",
+        "not used: frame_00000.npz",
+        results=resumed(lower=lambda a: a * np.float32(np.nan)),
+        options=f"{RESUME} --frames 1",
+        code=0,
+        memory=WORK,
+    ),
+    row(
+        "render",
+        "frame that crosses, resumed",
+        "not used: frame_00000.npz",
+        results=resumed(lower=lambda a: a + np.float32(0.4)),
+        options=f"{RESUME} --frames 1",
+        code=0,
+        memory=WORK,
+    ),
+    row(
+        "render",
+        "record of a list, resumed",
+        "not used: frame_00000.npz",
+        results=resumed(record=lambda a: np.array("[1]")),
+        options=f"{RESUME} --frames 1",
+        code=0,
+        memory=WORK,
+    ),
+    row(
+        "render",
+        "report of noise, resumed",
+        "frame_00000.npz stands there",
+        results=lambda f: (f / "report.json").write_bytes(bytes(range(256))),
+        options=f"{RESUME} --frames 1",
+        memory=WORK,
+    ),
+]
 
 VIEWER = [
     row("viewer", "config absent", "no such", options="--load-config {here}/none.yml", memory=WORK),
     row("viewer", "config empty", "empty", yml="", memory=WORK),
-    row("viewer", "config that runs a command", "os.system", yml=lambda text: text + "\nx: !!python/object/apply:os.system ['touch hacked']\n", memory=WORK),
-    row("viewer", "config that runs nerfstudio's command", "run_command", yml=lambda text: text + "\nx: !!python/object/apply:nerfstudio.utils.scripts.run_command ['touch hacked']\n", memory=WORK),
-    row("viewer", "config that names a function", "subprocess.call", yml=lambda text: text.replace("!!python/name:nerfstudio.models.splatfacto.SplatfactoModel", "!!python/name:subprocess.call"), memory=WORK),
-    row("viewer", "config that takes an attribute", "builtins.getattr", yml=lambda text: text + "\nx: !!python/object/apply:builtins.getattr [!!python/name:nerfstudio.utils.writer.EventName '', __class__]\n", memory=WORK),
-    row("viewer", "config that names a module", "names the Python object", yml=lambda text: text + "\nx: !!python/module:antigravity\n", memory=WORK),
-    row("viewer", "config that makes an object anew", "names the Python object", yml=lambda text: text + "\nx: !!python/object/new:type ['a', [], {}]\n", memory=WORK),
-    row("viewer", "config that names what is not there", "names the Python object", yml=lambda text: text + "\nx: !!python/name:nerfstudio.nowhere.Nothing ''\n", memory=WORK),
-    row("viewer", "config with a tag as key", "YAML", yml=lambda text: text + "\n? !!python/object/apply:os.system ['touch hacked']\n: 1\n", memory=WORK),
-    row("viewer", "config of another method", "not bounded", yml=lambda text: text.replace("splatfacto.SplatfactoModelConfig", "nerfacto.NerfactoModelConfig"), memory=WORK),
+    row(
+        "viewer",
+        "config that runs a command",
+        "os.system",
+        yml=lambda text: text + "\nx: !!python/object/apply:os.system ['touch hacked']\n",
+        memory=WORK,
+    ),
+    row(
+        "viewer",
+        "config that runs nerfstudio's command",
+        "run_command",
+        yml=lambda text: text + "\nx: !!python/object/apply:nerfstudio.utils.scripts.run_command ['touch hacked']\n",
+        memory=WORK,
+    ),
+    row(
+        "viewer",
+        "config that names a function",
+        "subprocess.call",
+        yml=lambda text: text.replace(
+            "!!python/name:nerfstudio.models.splatfacto.SplatfactoModel", "!!python/name:subprocess.call"
+        ),
+        memory=WORK,
+    ),
+    row(
+        "viewer",
+        "config that takes an attribute",
+        "builtins.getattr",
+        yml=lambda text: (
+            text
+            + "\nx: !!python/object/apply:builtins.getattr [!!python/name:nerfstudio.utils.writer.EventName '', __class__]\n"
+        ),
+        memory=WORK,
+    ),
+    row(
+        "viewer",
+        "config that names a module",
+        "names the Python object",
+        yml=lambda text: text + "\nx: !!python/module:antigravity\n",
+        memory=WORK,
+    ),
+    row(
+        "viewer",
+        "config that makes an object anew",
+        "names the Python object",
+        yml=lambda text: text + "\nx: !!python/object/new:type ['a', [], {}]\n",
+        memory=WORK,
+    ),
+    row(
+        "viewer",
+        "config that names what is not there",
+        "names the Python object",
+        yml=lambda text: text + "\nx: !!python/name:nerfstudio.nowhere.Nothing ''\n",
+        memory=WORK,
+    ),
+    row(
+        "viewer",
+        "config with a tag as key",
+        "YAML",
+        yml=lambda text: text + "\n? !!python/object/apply:os.system ['touch hacked']\n: 1\n",
+        memory=WORK,
+    ),
+    row(
+        "viewer",
+        "config of another method",
+        "not bounded",
+        yml=lambda text: text.replace("splatfacto.SplatfactoModelConfig", "nerfacto.NerfactoModelConfig"),
+        memory=WORK,
+    ),
     row("viewer", "checkpoint empty", "checkpoint", ckpt=b"", memory=WORK),
     row("viewer", "no such option", "--bogus", options="--bogus 1", memory=WORK),
     row("viewer", "ply cut off", "cut off", scene=ply(lambda data: data[:-50]), memory=WORK),
-]  # fmt: skip
+]
 
 ROWS = dict(
     rows_by_name(

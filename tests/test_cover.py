@@ -19,15 +19,22 @@ from test_poses import SETS, camera, random_rotation
 from test_slanted import SHEARS, exact, holds
 
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.poses import PoseSet
-from ns_abstract.verify.cells import Grid
-from ns_abstract.verify.cover import Cover, PictureSets, Weights, divisions, joined
-from ns_abstract.verify.network import Family, ImageSets, Network, bound_outputs, lends_anywhere, load_network
-from ns_abstract.verify.network import family as family_module
-from ns_abstract.verify.network.bounds import _Cells
-from ns_abstract.verify.network.family import _Other, _Said
+from ns_abstract.geometry.poses import PoseBox
+from ns_abstract.verify.cells import CellGrid
+from ns_abstract.verify.network import (
+    ImageSets,
+    Network,
+    SharedCoefficients,
+    bound_outputs,
+    load_network,
+    reusable_anywhere,
+)
+from ns_abstract.verify.network import shared_coefficients as family_module
+from ns_abstract.verify.network.bounds import _NetworkBounds
+from ns_abstract.verify.network.shared_coefficients import _ReusedBounds, _ReusingCells
 from ns_abstract.verify.properties import Query
 from ns_abstract.verify.search import Search
+from ns_abstract.verify.subboxes import PictureSets, PixelWeights, SubBoxProof, divisions, hull_of_sets
 
 SHAPE = (2, 6, 6)
 
@@ -107,10 +114,10 @@ def test_rows_of_one_cell_hold_for_others(
         monkeypatch.setattr(family_module, "_MOST_TRACED", 100)
     for seed in range(2):
         net, run = network(tmp_path, seed, local)
-        assert lends_anywhere(net) is not bool(local)
+        assert reusable_anywhere(net) is not bool(local)
         images = image_sets(SHAPE, 1, 2, radius, slack, seed)
         rows = np.random.default_rng(seed).normal(size=(4, 3))
-        family, cells = Family(net, images), others(images, local)
+        family, cells = SharedCoefficients(net, images), others(images, local)
         found = family.others(cells, rows, np.zeros(4), fresh=fresh)
         assert np.isfinite(found.lower).all()
         for cell in range(cells.count):
@@ -123,25 +130,25 @@ def test_rows_of_one_cell_hold_for_others(
 @pytest.mark.parametrize("local", ["", "product", "maximum", "short"])
 def test_rows_of_one_cell_hold_every_value(local: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the first cell's rows say of every number, against the exact network on images of each other one."""
-    found: dict[int, tuple[_Said, np.ndarray]] = {}
+    found: dict[int, tuple[_ReusedBounds, np.ndarray]] = {}
     if local == "short":
         monkeypatch.setattr(family_module, "_MOST_TRACED", 100)
-    borrowed = _Other._borrowed
+    borrowed = _ReusingCells._borrowed
 
-    def watched(self: _Other, index: int, form: Any) -> Any:
-        if index in self.first.lent:
-            reference = form.reference.flatten(1).numpy()[:, self.first.lent[index].flat]
+    def watched(self: _ReusingCells, index: int, form: Any) -> Any:
+        if index in self.first.stored:
+            reference = form.reference.flatten(1).numpy()[:, self.first.stored[index].flat]
             found[index] = self._said(index), reference
         return borrowed(self, index, form)
 
-    monkeypatch.setattr(_Other, "_borrowed", watched)
+    monkeypatch.setattr(_ReusingCells, "_borrowed", watched)
     for seed in range(2):
         net, _ = network(tmp_path, seed, local)
         images = image_sets(SHAPE, 1, 2, 0.2, 1e-3, seed)
-        family, cells = Family(net, images, arithmetic="real"), others(images, local)
+        family, cells = SharedCoefficients(net, images, arithmetic="real"), others(images, local)
         found.clear()
         family.others(cells, np.eye(3), np.zeros(3))
-        lent = family._first.lent
+        lent = family._first.stored
         assert len(lent) >= 3 and found.keys() == lent.keys()
         rng = np.random.default_rng(seed)
         for cell in range(cells.count):
@@ -163,16 +170,19 @@ def test_products_of_rows_are_charged(local: str, tmp_path: Path) -> None:
     """Beside the same sums in float64, for whatever products of float32 lose."""
     net, _ = network(tmp_path, 0, local)
     images = image_sets(SHAPE, 1, 2, 0.3, 1e-4)
-    family, cells = Family(net, images, arithmetic="real"), others(images, local)
-    other = _Other(family._first, cells, 1 << 30, "real", False)
+    family, cells = SharedCoefficients(net, images, arithmetic="real"), others(images, local)
+    other = _ReusingCells(family._first, cells, 1 << 30, "real", False)
     m, off = cells.count, []
-    slopes, offsets = other.known.image.slopes.reshape(m, 2, -1, 2), other.known.image.offsets.reshape(m, 2, -1)
-    for index, lent in family._first.lent.items():
+    slopes, offsets = (
+        other.intermediate.image.slopes.reshape(m, 2, -1, 2),
+        other.intermediate.image.offsets.reshape(m, 2, -1),
+    )
+    for index, lent in family._first.stored.items():
         said = other._said(index)
-        tilt, noise = np.zeros((m, len(lent.flat), 2)), other.known.flush[:, None]
+        tilt, noise = np.zeros((m, len(lent.flat), 2)), other.intermediate.flush[:, None]
         low, high = (np.repeat(v[None], m, 0) for v in lent.fixed.T)
-        if index in other.known.passages[0].noise:
-            noise = noise + other.known.passages[0].noise[index].reshape(m, -1).numpy()[:, lent.flat]
+        if index in other.intermediate.relaxations[0].noise:
+            noise = noise + other.intermediate.relaxations[0].noise[index].reshape(m, -1).numpy()[:, lent.flat]
         for at, rows in lent.rows.items():
             values = rows.astype(np.float64)
             one, two = np.maximum(values, 0.0), np.minimum(values, 0.0)
@@ -182,13 +192,13 @@ def test_products_of_rows_are_charged(local: str, tmp_path: Path) -> None:
                 half = 0.5 * (offsets[:, 1] - offsets[:, 0]) + 0.5 * np.abs(slopes[:, 1] - slopes[:, 0]).sum(-1)
                 low = low + middle @ values.T - half @ np.abs(values).T
                 high = high + middle @ values.T + half @ np.abs(values).T
-            elif at in other.known.offered:
-                offered = other.known.offered[at]
+            elif at in other.intermediate.reused_relaxations:
+                offered = other.intermediate.reused_relaxations[at]
                 _, below, above, _, top, bottom = offered.lines.reshape(6, m, -1).astype(np.float64)
                 tilt = tilt + one @ np.moveaxis(offered.tilts[0], 1, 2) + two @ np.moveaxis(offered.tilts[1], 1, 2)
                 low, high = low + below @ one.T + top @ two.T, high + above @ one.T + bottom @ two.T
             else:
-                noise = noise + other.known.passages[0].noise[at].reshape(m, -1).numpy() @ np.abs(values).T
+                noise = noise + other.intermediate.relaxations[0].noise[at].reshape(m, -1).numpy() @ np.abs(values).T
         charged = said.half - 0.5 * (high - low) - noise
         for p in ((1.0, 1.0), (-1.0, 1.0), (0.0, 0.0)):
             exactly = (tilt @ p + 0.5 * (low + high)) * lent.sign
@@ -202,12 +212,18 @@ def test_parts_have_the_references_and_winners_of_the_whole(tmp_path: Path) -> N
     """What rows gathered at maxima is relative to them; by themselves parts would follow others."""
     net, _ = network(tmp_path, 0, "maximum")
     images = image_sets(SHAPE, 1, 2, 2.0, 1e-3)
-    family, parts = Family(net, images, arithmetic="real"), halved(images)
-    part = _Other(family._first, parts, 1 << 30, "real", False)
-    alone = _Cells(net, parts, "everywhere", 1 << 30, "real")
-    (at,) = family._first.known.passages[0].maxima
-    assert (part.known.passages[0].maxima[at].winner == family._first.known.passages[0].maxima[at].winner).all()
-    assert (alone.known.passages[0].maxima[at].winner != family._first.known.passages[0].maxima[at].winner).any()
+    family, parts = SharedCoefficients(net, images, arithmetic="real"), halved(images)
+    part = _ReusingCells(family._first, parts, 1 << 30, "real", False)
+    alone = _NetworkBounds(net, parts, "everywhere", 1 << 30, "real")
+    (at,) = family._first.intermediate.relaxations[0].maxima
+    assert (
+        part.intermediate.relaxations[0].maxima[at].winner
+        == family._first.intermediate.relaxations[0].maxima[at].winner
+    ).all()
+    assert (
+        alone.intermediate.relaxations[0].maxima[at].winner
+        != family._first.intermediate.relaxations[0].maxima[at].winner
+    ).any()
     found, whole = part.cells.last.reference, family._first.cells.last.reference
     assert torch.equal(found, whole.expand_as(found))
 
@@ -216,11 +232,11 @@ def test_rounding_is_charged_by_all_parts_at_once(tmp_path: Path, monkeypatch: p
     """At least what each by itself is charged with, and of neighbours hardly more than the one with most."""
     net, _ = network(tmp_path, 0)
     images = image_sets(SHAPE, 1, 2, 0.3, 1e-3)
-    family, cells = Family(net, images), halved(images)
-    together = _Other(family._first, cells, 1 << 30, "float32", False)
-    monkeypatch.setattr(_Other, "sized", lambda self, form: form)
-    alone = _Other(family._first, cells, 1 << 30, "float32", False)
-    charged, singly = together.known.passages[0].noise, alone.known.passages[0].noise
+    family, cells = SharedCoefficients(net, images), halved(images)
+    together = _ReusingCells(family._first, cells, 1 << 30, "float32", False)
+    monkeypatch.setattr(_ReusingCells, "rounding_form", lambda self, form: form)
+    alone = _ReusingCells(family._first, cells, 1 << 30, "float32", False)
+    charged, singly = together.intermediate.relaxations[0].noise, alone.intermediate.relaxations[0].noise
     assert len(charged) > 3
     for k, noise in charged.items():
         each = singly[k]
@@ -228,7 +244,7 @@ def test_rounding_is_charged_by_all_parts_at_once(tmp_path: Path, monkeypatch: p
         # what rounding leaves is read again, further on
         assert (noise >= (1.0 - 1e-5) * each).all()
         assert noise[0].sum() < 1.2 * each.amax(0).sum()
-    assert (together.known.flush >= (1.0 - 1e-5) * alone.known.flush).all()
+    assert (together.intermediate.flush >= (1.0 - 1e-5) * alone.intermediate.flush).all()
 
 
 @pytest.mark.slow
@@ -239,7 +255,7 @@ def test_rows_of_a_cell_say_as_much_of_it_as_its_bounds(tmp_path: Path) -> None:
         net, _ = network(tmp_path, seed)
         images = image_sets(SHAPE, 1, 2, 0.1, 0.02, seed)
         rows, offset = np.random.default_rng(seed).normal(size=(4, 3)), np.zeros(4)
-        family = Family(net, images)
+        family = SharedCoefficients(net, images)
         first = family.first(rows, offset).lower
         assert (first >= bound_outputs(net, images, rows, offset).lower - 1e-6).all()
         mine = family.others(images, rows, offset).lower
@@ -262,7 +278,7 @@ def test_rows_of_a_whole_serve_its_parts_behind_products_and_maxima(local: str, 
         net, _ = network(tmp_path, seed, local)
         images = image_sets(SHAPE, 1, 2, 0.1, 0.02, seed)
         rows, offset = np.random.default_rng(seed).normal(size=(4, 3)), np.zeros(4)
-        family, parts = Family(net, images), halved(images)
+        family, parts = SharedCoefficients(net, images), halved(images)
         whole = family.first(rows, offset).lower
         alone = bound_outputs(net, parts, rows, offset).lower
         gains.append(np.mean(family.others(parts, rows, offset).lower - whole) / np.mean(alone - whole))
@@ -274,7 +290,7 @@ def test_a_cell_without_bounds_helps_nothing(tmp_path: Path) -> None:
     images = image_sets(SHAPE, 1, 2, 0.1, 0.02)
     broken = replace(images, b_upper=np.full_like(images.b_upper, np.nan))
     rows, offset = np.eye(3), np.zeros(3)
-    family, parts = Family(net, broken), halved(images)
+    family, parts = SharedCoefficients(net, broken), halved(images)
     assert (family.first(rows, offset).lower == -np.inf).all()
     assert np.array_equal(family.others(parts, rows, offset).lower, bound_outputs(net, parts, rows, offset).lower)
 
@@ -284,8 +300,8 @@ def test_rows_that_take_too_much_memory_are_not_kept(tmp_path: Path) -> None:
     net, run = network(tmp_path, 0)
     images = image_sets(SHAPE, 1, 2, 0.1, 0.05)
     rows = np.eye(3)
-    family = Family(net, images, memory=1 << 17)
-    assert len(family._first.lent) < len(Family(net, images)._first.lent)
+    family = SharedCoefficients(net, images, memory=1 << 17)
+    assert len(family._first.stored) < len(SharedCoefficients(net, images)._first.stored)
     found = family.others(moved(images, 0.02, 3), rows, np.zeros(3))
     least, _ = attack(net, run, moved(images, 0.02, 3), 0, rows, 32, 5)
     assert (found.lower[0] <= least).all()
@@ -311,7 +327,7 @@ def test_joined_sets_hold_every_part(offset: float) -> None:
     # slanted parts leave something out
     boxes[3] = boxes[3].replace(1, boxes[3].lower[1], boxes[3].middle[1])
     parts = [random_sets(box, rng) for box in boxes]
-    found = joined(parts)
+    found = hull_of_sets(parts)
     assert found.sane
     wide = found.box
     for part in parts:
@@ -343,7 +359,7 @@ def _plane(linear: tuple[np.ndarray, ...], side: int, at: tuple[int, ...], p: li
 def test_joined_sets_of_what_is_linear_are_as_narrow() -> None:
     box = ParameterBox(("x", "y"), ("m",) * 2, (-1.0, -1.0), (1.0, 1.0))
     parts = [_ramp_sets(Ramp(2), part) for part in split(box, [0, 1, 0])]
-    found = joined(parts)
+    found = hull_of_sets(parts)
     assert np.allclose(found.widths, 2e-3, atol=1e-9)
     assert np.allclose(found.linear[0], [0.2, 0.1], atol=1e-9)
 
@@ -358,7 +374,7 @@ def _ramp_sets(scene: Ramp, box: ParameterBox) -> PictureSets:
 
 @pytest.mark.parametrize("name", SHEARS)
 def test_poses_of_a_cell_are_in_its_slanted_parts(name: str) -> None:
-    plain = PoseSet.around(camera(random_rotation(1)), SETS[name])
+    plain = PoseBox.around(camera(random_rotation(1)), SETS[name])
     cell = plain.box
     for axis in range(cell.dimensions):
         cell = cell.split(axis, 4)[1 + axis % 2]
@@ -392,7 +408,7 @@ class Rounded(Threshold):
 
     def __init__(self, threshold: float, lends_anywhere: bool = True) -> None:
         super().__init__(threshold)
-        self.lends_anywhere = lends_anywhere
+        self.reusable_anywhere = lends_anywhere
         self.asked: list[tuple[str, int]] = []
 
     def bound(self, images: ImageSets, query: Query) -> Any:
@@ -404,7 +420,7 @@ class Rounded(Threshold):
         gap = (images.b_upper - images.b_lower + np.abs(images.a_upper - images.a_lower).sum(-1)).mean(1)[:, None]
         return replace(found, lower=found.lower - self.loss * gap, b=found.b - self.loss * gap)
 
-    def family(self, images: ImageSets) -> Any:
+    def shared_bounds(self, images: ImageSets) -> Any:
         return Shared(self, images)
 
 
@@ -431,14 +447,14 @@ class Curved(Ramp):
 
 
 #: A gradient that is the same at every pixel, and a margin.
-EVEN = Weights(np.full((2, 2, 3), 0.5 / 12.0), 0.4)
+EVEN = PixelWeights(np.full((2, 2, 3), 0.5 / 12.0), 0.4)
 
 
 def covered(threshold: float, lends_anywhere: bool = True, **settings: Any) -> tuple[Search, Rounded]:
     scene, model = Curved(2), Rounded(threshold, lends_anywhere)
     pictures: Any = scene
-    cover = Cover(pictures, model, model, CLAIM, **settings)
-    return Search(pictures, model, CLAIM, Grid.adaptive(scene.box, (2, 2)), cover=cover), model
+    cover = SubBoxProof(pictures, model, model, CLAIM, **settings)
+    return Search(pictures, model, CLAIM, CellGrid.adaptive(scene.box, (2, 2)), cover=cover), model
 
 
 @pytest.mark.slow_cases
@@ -493,9 +509,9 @@ def test_the_way_with_fewer_parts_is_taken(first_is_wider: bool) -> None:
         model = Rounded(0.1, True)
         scenes: list[Any] = [Curved(2), Wider(2)]
         first, second = scenes[::-1] if wider else scenes
-        cover = Cover(first, model, model, CLAIM, other=Cover(second, model, model, CLAIM))
+        cover = SubBoxProof(first, model, model, CLAIM, other=SubBoxProof(second, model, model, CLAIM))
         assert cover.other is not None and (cover.parts > cover.other.parts) is wider
-        search = Search(first, model, CLAIM, Grid.adaptive(first.box, (2, 2)), cover=cover)
+        search = Search(first, model, CLAIM, CellGrid.adaptive(first.box, (2, 2)), cover=cover)
         cell = search.grid.box_of(search.grid.roots()[-1])
         found.append(cover.prove(cell, np.array([0.5, 0.1]), EVEN))
         assert found[-1] == replace(cover, other=None, scene=scenes[0]).prove(cell, np.array([0.5, 0.1]), EVEN)
@@ -546,7 +562,7 @@ def test_cells_that_take_too_many_parts_are_cut_where_that_helps() -> None:
     search, _ = covered(0.1, most=4)
     assert search.cover is not None
     box = search.grid.box
-    weights = Weights(np.full((2, 2, 3), 20.0 / 12.0), 0.4)
+    weights = PixelWeights(np.full((2, 2, 3), 20.0 / 12.0), 0.4)
     found = search.cover.prove(box, np.array([0.5, 0.1]), weights)
     assert found.margin is None and found.parts == 0
     assert found.cuts[0] > found.cuts[1] >= 1

@@ -16,9 +16,9 @@ from benchmark_scripts import script
 from conftest import blob_scene
 
 from ns_abstract.arithmetic.rounding import FLOAT32
-from ns_abstract.geometry.camera_path import Camera
-from ns_abstract.geometry.poses import PoseSet
-from ns_abstract.geometry.views import look_at
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.keyframe_cameras import look_at
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
@@ -43,7 +43,7 @@ class ByReference:
         self.reference, self.device = Reference(scene, GSPLAT_1_4_0, torch.float32), device
 
     def images(self, camera: dict[str, Any], poses: np.ndarray) -> tuple[torch.Tensor, None]:
-        seen = Camera(np.array(camera["camera_to_world"]), *(camera[name] for name in list(camera)[:6]))
+        seen = PinholeCamera(np.array(camera["camera_to_world"]), *(camera[name] for name in list(camera)[:6]))
         with torch.no_grad():
             return torch.stack([self.reference.image(seen, torch.from_numpy(pose)) for pose in poses]), None
 
@@ -75,8 +75,8 @@ def prepared(cuda: Any, folder: Path, planted: bool = False, layers: bool = Fals
     scene = blob_scene(12)
     scene = replace(scene, opacity_logits=np.full(12, 9.0, np.float32), name="blobs")
     pose = np.asarray(look_at((1.6, 0.3, 0.4), (0.0, 0.0, 0.0)))[:3]
-    camera = Camera(pose, 12.0, 12.0, SIZE / 2, SIZE / 2, SIZE, SIZE)
-    poses = PoseSet.around(camera, parse_perturbation({"translation": {"x": SHIFT}}))
+    camera = PinholeCamera(pose, 12.0, 12.0, SIZE / 2, SIZE / 2, SIZE, SIZE)
+    poses = PoseBox.around(camera, parse_perturbation({"translation": {"x": SHIFT}}))
     rules = replace(GSPLAT_1_4_0, alpha_max=0.98) if planted else GSPLAT_1_4_0
     bounds = SplatBounds(activate(scene, rules), rules, FLOAT32)
     found = cuda.start(cuda.save_scene(folder, "blobs", scene), scene, rules, planted, stiff=False)

@@ -20,9 +20,9 @@ from ns_abstract.api.job import Job
 from ns_abstract.cli import certify as certify_command
 from ns_abstract.cli import export as export_command
 from ns_abstract.cli import render as render_command
-from ns_abstract.geometry.camera_path import Camera, load_camera_path
-from ns_abstract.geometry.poses import PoseSet
-from ns_abstract.geometry.views import path_json
+from ns_abstract.geometry.camera_path import PinholeCamera, load_camera_path
+from ns_abstract.geometry.keyframe_cameras import path_json
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.report.files import load_frame
@@ -69,7 +69,7 @@ def slerp(ends: list[np.ndarray], s: np.ndarray) -> np.ndarray:
     return np.array(rows).transpose(2, 0, 1)
 
 
-def leg(path: nsa.CameraPath, s: np.ndarray) -> list[Camera]:
+def leg(path: nsa.CameraPath, s: np.ndarray) -> list[PinholeCamera]:
     """Cameras on the way from the last entry to the first; quaternions, unlike the package's axis and angle."""
     last, first = path.cameras[-1], path.cameras[0]
     ends = [camera.camera_to_world for camera in (last, first)]
@@ -139,7 +139,7 @@ def test_the_closing_leg_has_one_field_of_view(tmp_path: Path, inputs: Inputs) -
 def test_poses_of_the_closing_leg(tmp_path: Path, count: int) -> None:
     """Against a slerp of quaternions, and enclosed exactly."""
     path = read(tmp_path, closed(count=count))
-    swept = PoseSet.around(path.cameras[-1], Perturbation(sweep="segments"), path.following(count - 1))
+    swept = PoseBox.around(path.cameras[-1], Perturbation(sweep="segments"), path.following(count - 1))
     assert swept.box.names == ("segment",)
     s = np.linspace(0.0, 1.0, 41)
     for value, camera in zip(s, leg(path, s), strict=True):
@@ -148,7 +148,7 @@ def test_poses_of_the_closing_leg(tmp_path: Path, count: int) -> None:
         assert escapes(swept, swept.box, order) == [] and thin_escapes(swept, order) == []
 
 
-def outside(lower: np.ndarray, upper: np.ndarray, scene: nsa.Scene, cameras: list[Camera]) -> int:
+def outside(lower: np.ndarray, upper: np.ndarray, scene: nsa.Scene, cameras: list[PinholeCamera]) -> int:
     """Numbers of the cameras' pictures that lie outside the bounds."""
     pictures = [nsa.render(scene, camera) for camera in cameras]
     return sum(int(((picture < lower) | (picture > upper)).sum()) for picture in pictures)

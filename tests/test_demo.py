@@ -26,7 +26,7 @@ from ns_abstract.demo.paths import (
     write_airfield_paths,
 )
 from ns_abstract.demo.scenes import DATA, splat_scene
-from ns_abstract.geometry.views import View
+from ns_abstract.geometry.keyframe_cameras import KeyframeCamera
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.scene import DataparserTransform, SplatScene
 from ns_abstract.methods.splat.write import write_splatfacto_run
@@ -324,9 +324,9 @@ def test_other_scenes_keep_their_settings(tmp_path: Path, background: list[float
 def test_dataset_images_come_from_the_renderer(tmp_path: Path) -> None:
     views = [dataclasses.replace(v, height=4, width=6) for v in dataset_views(3)]
     ramp = np.linspace(-0.5, 1.5, 4 * 6 * 3).reshape(4, 6, 3)
-    seen: list[View] = []
+    seen: list[KeyframeCamera] = []
 
-    def render(view: View) -> np.ndarray:
+    def render(view: KeyframeCamera) -> np.ndarray:
         seen.append(view)
         return ramp
 

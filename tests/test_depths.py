@@ -17,10 +17,10 @@ from test_gsplat_kernels import BUILDS, SETS, camera, kernels, scene_of
 import ns_abstract as nsa
 from ns_abstract.arithmetic.rounding import arithmetic as arithmetic_named
 from ns_abstract.cli.render import Render, render
-from ns_abstract.geometry.camera_path import Camera
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.keyframe_cameras import look_at
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
-from ns_abstract.geometry.views import look_at
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.bounds import SplatBounds
@@ -30,8 +30,8 @@ from ns_abstract.methods.splat.reference import Reference
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.perturbation.specification import parse_perturbation
-from ns_abstract.refine.engine import Goal, Refinement
-from ns_abstract.refine.result import Layer, _whole_depth
+from ns_abstract.refine.engine import Refinement, RefinementGoal
+from ns_abstract.refine.result import ExtraOutput, _whole_depth
 from ns_abstract.report.files import load_frame
 
 #: Pose [3, 4] to accumulation and expected depth [H, W, 2], NaN where nothing is drawn.
@@ -41,7 +41,7 @@ ALL = {**SETS, "z": {"translation": {"z": 1e-2}}, "wide": WIDE}
 
 
 def cell(
-    scene: SplatScene, around: PoseSet, arithmetic: str, version: str = "1.4.0", floor: float = -1.0
+    scene: SplatScene, around: PoseBox, arithmetic: str, version: str = "1.4.0", floor: float = -1.0
 ) -> tuple[np.ndarray, np.ndarray]:
     """[H, W, 4] bounds of a whole set, and the bounds of its colours."""
     rules = VERSIONS[version]
@@ -64,7 +64,7 @@ def outside(bounds: np.ndarray, values: np.ndarray) -> int:
     return int(count + (drawn & ~((bounds[..., 2] <= depth) & (depth <= bounds[..., 3]))).sum())
 
 
-def programs(scene: SplatScene, around: PoseSet, version: str, exact: bool) -> list[Program]:
+def programs(scene: SplatScene, around: PoseBox, version: str, exact: bool) -> list[Program]:
     view = around.camera
     reference = Reference(scene, VERSIONS[version])
     found: list[Program] = [lambda pose: reference.layers(view, torch.from_numpy(pose)).numpy()]
@@ -84,7 +84,7 @@ def programs(scene: SplatScene, around: PoseSet, version: str, exact: bool) -> l
      ("x", "antialiased", "1.6.0")],
 )  # fmt: skip
 def test_kernels_and_reference_stay_inside(name: str, mode: str, version: str) -> None:
-    scene, around = scene_of(mode), PoseSet.around(camera(), parse_perturbation(ALL[name]))
+    scene, around = scene_of(mode), PoseBox.around(camera(), parse_perturbation(ALL[name]))
     values = [around.box.middle, *around.box.corners()[:6], *around.box.sample(5, np.random.default_rng(1))]
     bounds, _ = cell(scene, around, "float32", version)
     attackers = programs(scene, around, version, exact=False)
@@ -105,7 +105,7 @@ def test_kernels_and_reference_stay_inside(name: str, mode: str, version: str) -
 
 
 def test_exact_kernels_are_the_reference() -> None:
-    scene, around = scene_of(), PoseSet.around(camera(), parse_perturbation(WIDE))
+    scene, around = scene_of(), PoseBox.around(camera(), parse_perturbation(WIDE))
     for point in (around.box.middle, *around.box.sample(2, np.random.default_rng(0))):
         one, other = (program(around.pose(point)) for program in programs(scene, around, "1.4.0", exact=True))
         np.testing.assert_array_equal(np.isnan(one), np.isnan(other))
@@ -118,7 +118,7 @@ def test_exact_kernels_are_the_reference() -> None:
 
 def test_kernels_leave_bounds_without_rounding() -> None:
     """The attack can fail: bounds of the real-number renderer do not hold float32's depths."""
-    scene, around = scene_of(), PoseSet.around(camera(), parse_perturbation({}))
+    scene, around = scene_of(), PoseBox.around(camera(), parse_perturbation({}))
     bounds, _ = cell(scene, around, "real")
     assert sum(
         outside(bounds, program(around.pose(np.zeros(0)))) for program in programs(scene, around, "1.4.0", False)
@@ -141,7 +141,7 @@ def depth_bounds(
     scene: SplatScene, pose: np.ndarray, middle: float = 4.0, **charges: float
 ) -> tuple[np.ndarray, list[np.ndarray]]:
     """[8, 8, 4] bounds of one pose [3, 4] with some ``charges`` replaced, and what programs draw there."""
-    around = PoseSet.around(Camera(pose, 8.0, 8.0, middle, middle, 8, 8), parse_perturbation({}))
+    around = PoseBox.around(PinholeCamera(pose, 8.0, 8.0, middle, middle, 8, 8), parse_perturbation({}))
     rules = VERSIONS["1.4.0"]
     bounds = SplatBounds(activate(scene, rules), rules, arithmetic_named("float32"))
     bounds.charges = bounds.charges._replace(**charges)
@@ -183,7 +183,7 @@ def test_dim_light_and_tightness(floor: float) -> None:
     """What is missing behind dim light is inside, too; small cells are next to exact."""
     scene = blob_scene(60, degree=1)
     scene = replace(scene, opacity_logits=scene.opacity_logits + np.float32(3.0))
-    around = PoseSet.around(camera(), parse_perturbation({"translation": {"x": 1e-3}}))
+    around = PoseBox.around(camera(), parse_perturbation({"translation": {"x": 1e-3}}))
     bounds, _ = cell(scene, around, "real", floor=floor)
     renderer = Renderer(activate(scene, VERSIONS["1.4.0"]), VERSIONS["1.4.0"])
     drawn = [
@@ -199,16 +199,16 @@ def test_dim_light_and_tightness(floor: float) -> None:
         assert outer[sure].mean() < (1.3 if floor < 0.0 else 5.0) * inner[sure].mean()
 
 
-def refined(around: PoseSet, scene: SplatScene, cells: int) -> Any:
+def refined(around: PoseBox, scene: SplatScene, cells: int) -> Any:
     rules = VERSIONS["1.4.0"]
     frame = SplatFrame(activate(scene, rules), rules, arithmetic_named("float32"), around, layers=True)
-    return Refinement(frame, 0, Goal(1.0, 1e6, cells)).run()
+    return Refinement(frame, 0, RefinementGoal(1.0, 1e6, cells)).run()
 
 
 @pytest.mark.parametrize("cells", [3, 40])
 def test_whole_pictures_hold(cells: int) -> None:
     """Splatfacto's own outputs: where nothing is drawn, the depth is the largest one of the picture."""
-    scene, around = blob_scene(12, degree=0), PoseSet.around(camera(), parse_perturbation(WIDE))
+    scene, around = blob_scene(12, degree=0), PoseBox.around(camera(), parse_perturbation(WIDE))
     result = refined(around, scene, cells)
     depth, total = result.layers["depth"], result.layers["accumulation"]
     renderer = Renderer(activate(scene, VERSIONS["1.4.0"]), VERSIONS["1.4.0"])
@@ -234,8 +234,8 @@ def test_largest_depth_of_the_picture() -> None:
 
     nothing = row(np.inf, np.inf, np.inf), row(-np.inf, -np.inf, -np.inf), row(2.5, 7.5, np.nan)
     depth = _whole_depth(
-        Layer(row(2.0, 7.0, np.inf), row(3.0, 9.0, -np.inf), *nothing),
-        Layer(row(0.5, 0.0, 0.0), row(1.0, 0.4, 0.0), *nothing),
+        ExtraOutput(row(2.0, 7.0, np.inf), row(3.0, 9.0, -np.inf), *nothing),
+        ExtraOutput(row(0.5, 0.0, 0.0), row(1.0, 0.4, 0.0), *nothing),
     )
     np.testing.assert_array_equal(depth.lower, row(2.0, 2.0, 2.0))
     np.testing.assert_array_equal(depth.upper, row(3.0, 9.0, 9.0))
@@ -245,7 +245,7 @@ def test_largest_depth_of_the_picture() -> None:
 def test_nothing_is_drawn_at_all() -> None:
     scene = blob_scene(3)
     away = replace(scene, means=scene.means + np.float32(1e4))
-    result = refined(PoseSet.around(camera(), parse_perturbation(WIDE)), away, 3)
+    result = refined(PoseBox.around(camera(), parse_perturbation(WIDE)), away, 3)
     for layer in result.layers.values():
         assert (layer.lower == 0.0).all() and (layer.upper == 0.0).all()
 

@@ -10,9 +10,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.differentiable_pose import differentiable_pose
-from ns_abstract.geometry.poses import PoseSet, rotation_about
+from ns_abstract.geometry.poses import PoseBox, rotation_about
 from ns_abstract.perturbation.specification import parse_perturbation
 
 torch.set_num_threads(1)
@@ -32,17 +32,17 @@ SPECS: dict[str, dict[str, Any]] = {
 }
 
 
-def keyframe(seed: int) -> Camera:
+def keyframe(seed: int) -> PinholeCamera:
     """A camera at a random pose."""
     rng = np.random.default_rng(seed)
     axis = rng.normal(size=3)
     rotation = rotation_about(axis / np.linalg.norm(axis), rng.uniform(0, np.pi))
     pose = np.concatenate([rotation, rng.uniform(-3, 3, (3, 1))], axis=1)
-    return Camera(pose, 40.0, 40.0, 16.0, 16.0, 32, 32)
+    return PinholeCamera(pose, 40.0, 40.0, 16.0, 16.0, 32, 32)
 
 
-def pose_set(name: str, seed: int) -> PoseSet:
-    return PoseSet.around(keyframe(seed), parse_perturbation(SPECS[name]), keyframe(seed + 1000))
+def pose_set(name: str, seed: int) -> PoseBox:
+    return PoseBox.around(keyframe(seed), parse_perturbation(SPECS[name]), keyframe(seed + 1000))
 
 
 @pytest.mark.slow_cases

@@ -25,7 +25,7 @@ from waiting import until
 
 from ns_abstract.api import bounding
 from ns_abstract.api import job as job_module
-from ns_abstract.api.bounding import Part, bound, bound_frames, bound_part
+from ns_abstract.api.bounding import TileTask, bound, bound_frames, bound_part
 from ns_abstract.api.files import Settings, open_job
 from ns_abstract.api.job import Job
 from ns_abstract.api.poses import PoseSet
@@ -33,20 +33,20 @@ from ns_abstract.api.scenes import load_scene
 from ns_abstract.api.searching import search_blocks
 from ns_abstract.cli import certify as certify_command
 from ns_abstract.cli import render as render_command
-from ns_abstract.cli.common import Stop, run
-from ns_abstract.execution.ending import AbandonedError, Deadline, abandoning, checkpoint
-from ns_abstract.execution.engines import Here, Machine, Processes
+from ns_abstract.cli.common import SignalStop, run
+from ns_abstract.execution.cancellation import Deadline, WorkCancelledError, cancel_when, check_cancelled
+from ns_abstract.execution.engines import Machine, Processes, SerialEngine
 from ns_abstract.execution.stopping import StopRequest
-from ns_abstract.geometry.views import path_json
+from ns_abstract.geometry.keyframe_cameras import path_json
 from ns_abstract.io.atomic import write_json
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.bounds import NerfBounds
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.render import NerfRenderer
 from ns_abstract.methods.nerf.write import write_nerf_run
-from ns_abstract.refine.engine import Goal, Refinement
-from ns_abstract.verify.cells import Grid
-from ns_abstract.verify.search import Findings
+from ns_abstract.refine.engine import Refinement, RefinementGoal
+from ns_abstract.verify.cells import CellGrid
+from ns_abstract.verify.search import BlockResult
 
 YAW = {"rotation": {"yaw": 0.02}}
 #: Long enough for any machine; what is waited for does not come by itself.
@@ -68,15 +68,15 @@ class After:
 
 
 def test_checkpoints_end_what_is_over() -> None:
-    checkpoint()
-    with abandoning(After(2)):
-        checkpoint()
-        with abandoning(lambda: False):
-            checkpoint()
-        checkpoint()
-        with pytest.raises(AbandonedError):
-            checkpoint()
-    checkpoint()
+    check_cancelled()
+    with cancel_when(After(2)):
+        check_cancelled()
+        with cancel_when(lambda: False):
+            check_cancelled()
+        check_cancelled()
+        with pytest.raises(WorkCancelledError):
+            check_cancelled()
+    check_cancelled()
 
 
 @pytest.mark.slow
@@ -94,7 +94,7 @@ def test_rays_without_time_are_left_open(kind: Any, asked: int, monkeypatch: pyt
     bound = NerfBounds.rays
     monkeypatch.setattr(NerfBounds, "rays", lambda self, *rest: rays.append(1) or bound(self, *rest))
     frame.tiles_at_once = 1
-    with abandoning(After(asked)):
+    with cancel_when(After(asked)):
         found = frame.bound(part, np.arange(12))
     assert sum(rays) <= asked + 1
     assert found.lower.shape == (12, 1, 1, 3) and (found.lower[-1] == 0.0).all() and (found.upper[-1] == 1.0).all()
@@ -115,7 +115,7 @@ def test_one_ray_is_given_up_inside(monkeypatch: pytest.MonkeyPatch) -> None:
     frame.bounds.rays(*arguments)
     assert len(steps) >= 4
     steps.clear()
-    with abandoning(lambda: len(steps) >= 2), pytest.raises(AbandonedError):
+    with cancel_when(lambda: len(steps) >= 2), pytest.raises(WorkCancelledError):
         frame.bounds.rays(*arguments)
     assert len(steps) == 2
 
@@ -125,10 +125,10 @@ def test_one_ray_is_given_up_inside(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_refinement_ends_soundly_wherever_it_is_stopped(count: int) -> None:
     scene, pose_set = tiny_scene(0), poses(YAW)
     frame: Any = NerfFrame(scene, UNIFORM, pose_set)
-    refinement = Refinement(frame, 0, Goal(1.0, LONG, 60), keep_leaves=True, stopped=After(count))
+    refinement = Refinement(frame, 0, RefinementGoal(1.0, LONG, 60), keep_leaves=True, stopped=After(count))
     try:
         result = refinement.run()
-    except AbandonedError:
+    except WorkCancelledError:
         assert count < 40
         return
     pictures = images(scene, pose_set, pose_set.box.sample(9, np.random.default_rng(1))).reshape(9, 3, 4, 3)
@@ -162,7 +162,7 @@ def test_a_picture_that_takes_too_long_is_told_at_once(nerf: Settings, monkeypat
     monkeypatch.setattr(NerfFrame, "render", slowly)
     monkeypatch.setattr(job_module, "_LOOK_RAYS", 2)
     with pytest.raises(InputError, match="one picture of 8 x 8 pixels takes about") as caught:
-        list(bound_frames(job, [0], engine=Here(), budget=1.0))
+        list(bound_frames(job, [0], engine=SerialEngine(), budget=1.0))
     assert caught.value.field == "--time-budget"
     scene = load_scene(nerf.load_config)
     with pytest.raises(InputError, match="one picture"):
@@ -180,15 +180,15 @@ def test_only_compiling_comes_on_top_of_the_budget(
     def warm_up(self: Job, index: int) -> None:
         clock.now, clock.compiled = 60.0, clock.compiled + compiles
 
-    def bound_part(self: Job, index: int, goal: Goal, *rest: Any, **more: Any) -> Any:
+    def bound_part(self: Job, index: int, goal: RefinementGoal, *rest: Any, **more: Any) -> Any:
         seen.append(goal.seconds)
-        raise AbandonedError
+        raise WorkCancelledError
 
     monkeypatch.setattr(bounding, "perf_counter", lambda: clock.now)
     monkeypatch.setattr(bounding, "kernels", lambda: clock)
     monkeypatch.setattr(Job, "warm_up", warm_up)
     monkeypatch.setattr(Job, "bound_part", bound_part)
-    assert list(bound_frames(job, [0], engine=Here(), budget=100.0)) == []
+    assert list(bound_frames(job, [0], engine=SerialEngine(), budget=100.0)) == []
     assert seen == [100.0 if compiles else 40.0]
 
 
@@ -202,7 +202,7 @@ def test_a_ray_that_takes_long_is_given_up_when_kernels_are_compiled(
     def endless(self: NerfBounds, *rest: Any) -> Any:
         while True:
             looks.append(1)
-            checkpoint()
+            check_cancelled()
             time.sleep(0.01)
 
     monkeypatch.setattr(job_module, "_WARM_RAY", 0.2)
@@ -223,14 +223,14 @@ def test_a_frame_ends_with_its_time_while_the_first_picture_is_rendered(
     def endless(self: NerfRenderer, camera: Any, pose: Any, rays: np.ndarray, shift: Any = None) -> np.ndarray:
         while len(rays) == 64:
             shown.append(1)
-            checkpoint()
+            check_cancelled()
             time.sleep(0.01)
         return pixels(self, camera, pose, rays, shift)
 
     monkeypatch.setattr(NerfRenderer, "pixels", endless)
     monkeypatch.setattr(Job, "check_time", lambda *rest: None)  # a busy machine may be too slow for half a second
-    assert list(bound_frames(job, [0], engine=Here(), budget=0.5)) == [] and shown
-    assert bound_part(job.recipe, Part(0, None), Goal(1.05, 0.5), False) is None
+    assert list(bound_frames(job, [0], engine=SerialEngine(), budget=0.5)) == [] and shown
+    assert bound_part(job.recipe, TileTask(0, None), RefinementGoal(1.05, 0.5), False) is None
     with pytest.raises(InputError, match="before one picture") as caught:
         bound(load_scene(nerf.load_config), PoseSet(job.pose_sets[0].camera, {"x": 0.01}), time_budget=3.0)
     assert caught.value.field == "time_budget"
@@ -241,7 +241,7 @@ def count_checkpoints(file: str) -> int:
     Path(file).touch()
     count = 0
     while True:
-        checkpoint()
+        check_cancelled()
         count += 1
         time.sleep(0.01)
 
@@ -262,7 +262,7 @@ def test_workers_are_asked_to_end_and_work_on(tmp_path: Path) -> None:
         found: list[tuple[int, Any]] = []
         while engine.unfinished:
             found += engine.collect(1.0)
-        assert [key for key, _ in found] == [0] and isinstance(found[0][1], AbandonedError)
+        assert [key for key, _ in found] == [0] and isinstance(found[0][1], WorkCancelledError)
         engine.submit(2, square, 4)
         while engine.unfinished:
             found += engine.collect(1.0)
@@ -381,7 +381,7 @@ def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
 
 
 def test_a_signal_ends_at_once_where_nothing_is_to_be_saved() -> None:
-    stop = Stop()
+    stop = SignalStop()
     with stop.installed():
         with pytest.raises(KeyboardInterrupt), stop.at_once():
             os.kill(os.getpid(), signal.SIGTERM)
@@ -411,7 +411,7 @@ def test_a_signal_in_compiled_code(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_signal_is_noted_where_something_is(capfd: pytest.CaptureFixture[str]) -> None:
-    stop = Stop()
+    stop = SignalStop()
     with stop.installed():
         os.kill(os.getpid(), signal.SIGINT)
         assert stop() and "being saved" in capfd.readouterr().err
@@ -434,7 +434,7 @@ def test_a_signal_in_the_middle_of_a_print() -> None:
     buffer = io.BufferedWriter(Stream())
     before, sys.stderr = sys.stderr, io.TextIOWrapper(buffer, write_through=True)
     try:
-        stop = Stop()
+        stop = SignalStop()
         with stop.installed():
             print("told", file=sys.stderr, flush=True)
         assert stop()
@@ -587,7 +587,7 @@ def test_first_blocks_are_small_and_hold_every_cell() -> None:
     box = poses(YAW).box
     for cells in (1, 2, 5, 8, 19, 33):
         for block in (1, 2, 4, 8):
-            grid = Grid.adaptive(box, (cells,))
+            grid = CellGrid.adaptive(box, (cells,))
 
             class Stub:
                 pass
@@ -637,7 +637,7 @@ def test_blocks_are_examined_while_workers_start(looks: int, tmp_path: Path) -> 
     here: list[Any] = []
     there: list[Any] = []
 
-    def told(list_: list[Any]) -> Callable[..., Findings]:
+    def told(list_: list[Any]) -> Callable[..., BlockResult]:
         return lambda *found: (list_.append(found[-1]), search.examine(found[-1]))[1]
 
     store = open_store(tmp_path / "out")
@@ -658,7 +658,7 @@ def test_blocks_are_examined_while_workers_start(looks: int, tmp_path: Path) -> 
     fill(store, search, 0)
     kept.clear()
 
-    def keep(block: Any, findings: Findings) -> None:
+    def keep(block: Any, findings: BlockResult) -> None:
         kept.append(block.number)
         stop.ask()
 

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.refine import engine, initial
-from ns_abstract.refine.engine import Goal, Refinement
+from ns_abstract.refine.engine import Refinement, RefinementGoal
 from ns_abstract.refine.frame_tiles import pixels_inside
 from ns_abstract.refine.result import FrameResult, TracePoint, mean_pixel_gap
 from ns_abstract.refine.tuning import Tuning
@@ -159,7 +159,7 @@ class Waves:
         return self.pace * (np.array(box.upper) - np.array(box.lower))
 
 
-def refine(frame: Any, goal: Goal, **options: Any) -> FrameResult:
+def refine(frame: Any, goal: RefinementGoal, **options: Any) -> FrameResult:
     return Refinement(frame, 0, goal, **options).run()
 
 
@@ -187,7 +187,7 @@ def check(frame: Waves, result: FrameResult) -> None:
 )
 def test_bounds_hold_the_exact_range(**c: Any) -> None:
     frame = Waves(c["dimensions"], width=c["width"], height=5, seed=c["seed"], pace=c["pace"])
-    result = refine(frame, Goal(1.0, FOREVER, c["cells"], c["leaf_bytes"]), seed=c["seed"])
+    result = refine(frame, RefinementGoal(1.0, FOREVER, c["cells"], c["leaf_bytes"]), seed=c["seed"])
     check(frame, result)
     assert result.bounded
     assert 1 <= result.cells <= c["cells"]
@@ -204,7 +204,7 @@ def after_cover(result: FrameResult) -> TracePoint:
 @pytest.mark.parametrize("slack", [0.03, 0.3, 3.0])
 @pytest.mark.parametrize("ratio", [1.05, 1.2])
 def test_first_cover_of_one_parameter_is_what_the_goal_asks_for(ratio: float, slack: float, pace: float) -> None:
-    goal, frame = Goal(ratio, FOREVER), Waves(1, slack=slack, pace=pace)
+    goal, frame = RefinementGoal(ratio, FOREVER), Waves(1, slack=slack, pace=pace)
     first = after_cover(refine(frame, goal))
     assert goal.met(first)
 
@@ -245,7 +245,7 @@ class Watched(Waves):
 def test_first_cover_is_rendered_in_every_other_part_until_the_goal_asks_for_more() -> None:
     for ratio, split in ((1.06, False), (1.002, True)):
         frame = Watched()
-        result = refine(frame, Goal(ratio, FOREVER, 4000))
+        result = refine(frame, RefinementGoal(ratio, FOREVER, 4000))
         check(frame, result)
         assert (frame.before_splits is not None) == split
         rendered = frame.rendered if frame.before_splits is None else frame.before_splits[0]
@@ -259,7 +259,7 @@ def test_only_a_cover_that_may_reach_the_goal_is_allowed_to_be_looser() -> None:
     """Cells that are split had better tell what they hide."""
     for ratio, looser in ((1.2, True), (1.05, True), (1.04, False)):
         frame = Watched()
-        refinement = Refinement(frame, 0, Goal(ratio, FOREVER, 4000))
+        refinement = Refinement(frame, 0, RefinementGoal(ratio, FOREVER, 4000))
         result = refinement.run()
         first, *before, last = frame.allowed
         assert first == last == 0.0 and len(before) == looser
@@ -272,7 +272,7 @@ def test_only_a_cover_that_may_reach_the_goal_is_allowed_to_be_looser() -> None:
 def test_trace_begins_with_the_first_cells(dimensions: int) -> None:
     """A set that is not covered yet has nothing but [0, 1], however tight the cells so far are."""
     frame = Waves(dimensions, pace=4.0)
-    trace = refine(frame, Goal(1.002, FOREVER, 4000)).trace
+    trace = refine(frame, RefinementGoal(1.002, FOREVER, 4000)).trace
     cover = [point for point in trace if point.covered < 1.0]
     assert [point.covered for point in trace] == sorted(point.covered for point in trace)
     assert (trace[0].seconds >= 0.0, trace[0].cells, trace[0].covered) == (True, 0, 0.0)
@@ -286,20 +286,20 @@ def test_trace_begins_with_the_first_cells(dimensions: int) -> None:
 def test_views_of_kept_leaves_are_renders_across_the_set() -> None:
     for dimensions, count in ((1, 9), (2, 9), (3, 13)):
         frame = Waves(dimensions)
-        result = refine(frame, Goal(1.5, FOREVER, 40), keep_leaves=True)
+        result = refine(frame, RefinementGoal(1.5, FOREVER, 40), keep_leaves=True)
         assert result.views is not None and result.views.values.shape == (count, dimensions)
         ends = result.views.values.min(axis=0), result.views.values.max(axis=0)
         np.testing.assert_allclose(ends, (frame.box.lower, frame.box.upper), rtol=1e-15)
         for values, image in zip(result.views.values, result.views.images, strict=True):
             np.testing.assert_array_equal(image, assemble(frame.render(values), frame.camera))
             assert (result.witness_lower <= image).all() and (image <= result.witness_upper).all()
-        assert refine(frame, Goal(1.5, FOREVER, 40)).views is None
+        assert refine(frame, RefinementGoal(1.5, FOREVER, 40)).views is None
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_first_cover_of_several_parameters_is_halved_for_what_cells_leave_open(axis: int) -> None:
     frame = Waves(3, slack=3.0, weights=np.where(np.arange(3) == axis, 1.0, 0.01))
-    covers = {ratio: after_cover(refine(frame, Goal(ratio, FOREVER, 400))) for ratio in (1.05, 1.2)}
+    covers = {ratio: after_cover(refine(frame, RefinementGoal(ratio, FOREVER, 400))) for ratio in (1.05, 1.2)}
     assert covers[1.05].cells > covers[1.2].cells > 1
     for ratio, cover in covers.items():
         # about three times what the goal allows, and no more cells than that takes
@@ -312,7 +312,7 @@ def test_first_cover_of_several_parameters_is_halved_for_what_cells_leave_open(a
 def test_bounds_of_a_cell_that_was_tried_are_not_those_of_a_wider_one(cells: int) -> None:
     # motion asks for more cells than are allowed
     frame = Waves(2, pace=30.0)
-    result = refine(frame, Goal(1.0, FOREVER, cells))
+    result = refine(frame, RefinementGoal(1.0, FOREVER, cells))
     check(frame, result)
     assert result.bounded
 
@@ -328,14 +328,14 @@ def test_first_cover_stays_coarse_where_smaller_cells_do_not_help(dimensions: in
         return found
 
     frame.bound = loose  # type: ignore[method-assign]
-    result = refine(frame, Goal(1.05, FOREVER, 200))
+    result = refine(frame, RefinementGoal(1.05, FOREVER, 200))
     assert after_cover(result).cells <= (7 if dimensions == 1 else 8)
 
 
 @pytest.mark.parametrize(("dimensions", "ratio", "first"), [(1, 1.002, 1.01), (2, 1.1, 1.15)])
 def test_ratio_falls_to_the_goal(dimensions: int, ratio: float, first: float) -> None:
     frame = Waves(dimensions)
-    result = refine(frame, Goal(ratio, FOREVER, 4000))
+    result = refine(frame, RefinementGoal(ratio, FOREVER, 4000))
     check(frame, result)
     gaps = [point.mpg for point in result.trace]
     assert all(after <= before for before, after in itertools.pairwise(gaps))
@@ -358,7 +358,7 @@ def test_leaves_are_split_for_the_pixels_where_they_leave_much_open(ratio: float
     shares = []
     for keep_leaves in (False, True):
         frame = Waves(2, slack=1.0)
-        result = refine(frame, Goal(ratio, FOREVER, 400), keep_leaves=keep_leaves)
+        result = refine(frame, RefinementGoal(ratio, FOREVER, 400), keep_leaves=keep_leaves)
         check(frame, result)
         assert ratio == 1.0 or result.trace[-1].mpg <= ratio * result.trace[-1].mpg_witness
         splits = [k for k, (_, _, within) in enumerate(frame.calls) if within is not None]
@@ -367,28 +367,28 @@ def test_leaves_are_split_for_the_pixels_where_they_leave_much_open(ratio: float
         shares.append(asked / sum(SIDE**2 * len(frame.calls[k][1]) for k in splits))
     # linear sets are kept of every pixel, and frames need not know better
     frame = Whole(2, slack=1.0)
-    check(frame, refine(frame, Goal(ratio, FOREVER, 400)))
+    check(frame, refine(frame, RefinementGoal(ratio, FOREVER, 400)))
     assert frame.wanted == [SIDE**2 * len(tiles) for _, tiles, _ in frame.calls]
     assert 0.05 < shares[0] < 0.9 and shares[1] == 1.0
 
 
 def test_a_stricter_goal_asks_for_no_pixel_that_was_left_before() -> None:
     frame = Waves(2, slack=1.0)
-    refinement = Refinement(frame, 0, Goal(1.2, FOREVER, 4000))
+    refinement = Refinement(frame, 0, RefinementGoal(1.2, FOREVER, 4000))
     before = refinement.run()
-    after = refinement.proceed(Goal(1.001, FOREVER, before.cells + 300))
+    after = refinement.proceed(RefinementGoal(1.001, FOREVER, before.cells + 300))
     check(frame, after)
     assert after.trace[-1].mpg < before.trace[-1].mpg
 
 
 def test_stops_at_the_goal_and_not_later() -> None:
-    loose, tight = (refine(Waves(1), Goal(ratio, FOREVER, 4000)).cells for ratio in (1.5, 1.02))
+    loose, tight = (refine(Waves(1), RefinementGoal(ratio, FOREVER, 4000)).cells for ratio in (1.5, 1.02))
     assert loose < tight
 
 
 def test_no_time_still_gives_a_sound_cover() -> None:
     frame = Waves(2, pace=5.0)
-    result = refine(frame, Goal(1.01, 0.0))
+    result = refine(frame, RefinementGoal(1.01, 0.0))
     check(frame, result)
     assert (result.bounded, result.cells) == (True, 1)
 
@@ -400,7 +400,7 @@ def test_a_cover_that_takes_too_long_becomes_one_cell(dimensions: int, monkeypat
     clock = SimpleNamespace(perf_counter=lambda: 0.0 if len(frame.calls) < 2 else 3600.0 * next(hours))
     for module in (engine, initial):
         monkeypatch.setattr(module, "time", clock)
-    result = refine(frame, Goal(1.0, 100.0), keep_leaves=True)
+    result = refine(frame, RefinementGoal(1.0, 100.0), keep_leaves=True)
     check(frame, result)
     assert result.bounded
     assert frame.calls[-1][0] == frame.box
@@ -414,7 +414,7 @@ def test_a_cover_that_takes_too_long_becomes_one_cell(dimensions: int, monkeypat
 
 @pytest.mark.parametrize("dimensions", [1, 2, 3])
 def test_same_cells_same_result(dimensions: int) -> None:
-    first, second = (refine(Waves(dimensions), Goal(1.0, FOREVER, 57), seed=3) for _ in range(2))
+    first, second = (refine(Waves(dimensions), RefinementGoal(1.0, FOREVER, 57), seed=3) for _ in range(2))
     for name in ("lower", "upper", "witness_lower", "witness_upper", "image"):
         assert getattr(first, name).tobytes() == getattr(second, name).tobytes(), name
     assert [(p.cells, p.mpg) for p in first.trace] == [(p.cells, p.mpg) for p in second.trace]
@@ -423,8 +423,8 @@ def test_same_cells_same_result(dimensions: int) -> None:
 @pytest.mark.parametrize("dimensions", [1, 2])
 @pytest.mark.parametrize("cells", [20, 41])
 def test_numbering_of_tiles_does_not_matter(dimensions: int, cells: int) -> None:
-    rows = refine(Waves(dimensions), Goal(1.0, FOREVER, cells))
-    columns = refine(Waves(dimensions, transposed=True), Goal(1.0, FOREVER, cells))
+    rows = refine(Waves(dimensions), RefinementGoal(1.0, FOREVER, cells))
+    columns = refine(Waves(dimensions, transposed=True), RefinementGoal(1.0, FOREVER, cells))
     np.testing.assert_array_equal(rows.lower, columns.lower.swapaxes(0, 1))
     np.testing.assert_array_equal(rows.upper, columns.upper.swapaxes(0, 1))
     np.testing.assert_array_equal(rows.witness_upper, columns.witness_upper.swapaxes(0, 1))
@@ -433,7 +433,7 @@ def test_numbering_of_tiles_does_not_matter(dimensions: int, cells: int) -> None
 @pytest.mark.parametrize("dimensions", [1, 2])
 @pytest.mark.parametrize("cells", [1, 2, 3, 4, 5, 6, 7, 30])
 def test_number_of_cells_is_kept_to(dimensions: int, cells: int) -> None:
-    result = refine(Waves(dimensions, pace=3.0), Goal(1.0, FOREVER, cells))
+    result = refine(Waves(dimensions, pace=3.0), RefinementGoal(1.0, FOREVER, cells))
     assert result.cells <= cells
     assert result.cells >= cells - 1 or cells < 4
 
@@ -442,10 +442,10 @@ def test_the_seed_chooses_corners_only_where_there_are_many() -> None:
     small, large = ParameterBox(("a",), ("",), (0.0,), (1.0,)), Waves(1)
     frame = Waves(6, width=4, height=4)
     assert frame.box.dimensions == 6
-    assert Refinement(large, 0, Goal(), seed=1).inner.corners().shape == (2, 1)
-    assert Refinement(frame, 0, Goal(), seed=1).inner.corners().shape == (64, 6)
+    assert Refinement(large, 0, RefinementGoal(), seed=1).inner.corners().shape == (2, 1)
+    assert Refinement(frame, 0, RefinementGoal(), seed=1).inner.corners().shape == (64, 6)
     frame.box = ParameterBox(tuple("abcdefg"), ("",) * 7, (0.0,) * 7, (1.0,) * 7)
-    chosen = [Refinement(frame, 0, Goal(), seed=k).inner.corners() for k in (1, 1, 2)]
+    chosen = [Refinement(frame, 0, RefinementGoal(), seed=k).inner.corners() for k in (1, 1, 2)]
     assert chosen[0].shape == (64, 7)
     assert np.array_equal(chosen[0], chosen[1]) and not np.array_equal(chosen[0], chosen[2])
     assert small.dimensions == 1
@@ -459,11 +459,11 @@ def test_memory_for_leaves_is_kept_to(dimensions: int) -> None:
     tile = 2 * SIDE * SIDE * 3 * 4
     frame = Waves(dimensions, pace=50.0)
     limit = 40 * tile
-    refinement = Refinement(frame, 0, Goal(1.0, FOREVER, 400, limit))
+    refinement = Refinement(frame, 0, RefinementGoal(1.0, FOREVER, 400, limit))
     seen: list[int] = []
     choose = refinement.leaves.next_round
 
-    def watched(goal: Goal) -> Any:
+    def watched(goal: RefinementGoal) -> Any:
         jobs = choose(goal)
         seen.append(sum(0 if t.lower is None else 2 * t.lower.nbytes for t in refinement.leaves.by_tile))
         return jobs
@@ -471,14 +471,14 @@ def test_memory_for_leaves_is_kept_to(dimensions: int) -> None:
     refinement.leaves.next_round = watched  # type: ignore[method-assign]
     check(frame, refinement.run())
     assert seen and max(seen) <= limit
-    free = refine(Waves(dimensions, pace=50.0), Goal(1.0, FOREVER, 400))
+    free = refine(Waves(dimensions, pace=50.0), RefinementGoal(1.0, FOREVER, 400))
     bound = refinement.trace[-1].mpg
     assert free.trace[-1].mpg <= bound
 
 
 def test_kept_sets_end_the_work_when_memory_is_full() -> None:
-    few = refine(Waves(1), Goal(1.0, FOREVER, 300, 20_000), keep_leaves=True)
-    many = refine(Waves(1), Goal(1.0, FOREVER, 300, 1 << 30), keep_leaves=True)
+    few = refine(Waves(1), RefinementGoal(1.0, FOREVER, 300, 20_000), keep_leaves=True)
+    many = refine(Waves(1), RefinementGoal(1.0, FOREVER, 300, 1 << 30), keep_leaves=True)
     assert few.leaves is not None and many.leaves is not None
     assert few.cells < many.cells
     check(Waves(1), few)
@@ -489,7 +489,7 @@ def test_kept_sets_end_the_work_when_memory_is_full() -> None:
 
 def test_stop_during_the_cover_leaves_nothing_known() -> None:
     frame = Waves(1, pace=20.0)
-    result = refine(frame, Goal(1.05, FOREVER), stopped=lambda: len(frame.calls) >= 3)
+    result = refine(frame, RefinementGoal(1.05, FOREVER), stopped=lambda: len(frame.calls) >= 3)
     assert not result.bounded
     assert result.leaves is None
     assert (result.lower == 0.0).all() and (result.upper == 1.0).all()
@@ -499,7 +499,7 @@ def test_stop_during_the_cover_leaves_nothing_known() -> None:
 
 def test_stop_after_the_cover_keeps_it() -> None:
     frame = Waves(1, pace=2.0)
-    result = refine(frame, Goal(1.0, FOREVER), stopped=lambda: len(frame.calls) >= 12)
+    result = refine(frame, RefinementGoal(1.0, FOREVER), stopped=lambda: len(frame.calls) >= 12)
     check(frame, result)
     assert result.bounded
     assert result.cells <= 16
@@ -507,7 +507,11 @@ def test_stop_after_the_cover_keeps_it() -> None:
 
 def test_progress_is_told() -> None:
     told: list[tuple[float, float]] = []
-    refine(Waves(1, pace=4.0), Goal(1.1, FOREVER, 100), progress=lambda point, share: told.append((point.mpg, share)))
+    refine(
+        Waves(1, pace=4.0),
+        RefinementGoal(1.1, FOREVER, 100),
+        progress=lambda point, share: told.append((point.mpg, share)),
+    )
     shares = [share for _, share in told]
     assert shares == sorted(shares)
     assert shares[0] < 1.0 and shares[-1] == 1.0
@@ -518,7 +522,7 @@ def test_progress_is_told() -> None:
 
 def test_single_pose_takes_one_cell() -> None:
     frame = Waves(0)
-    result = refine(frame, Goal(1.0, FOREVER), keep_leaves=True)
+    result = refine(frame, RefinementGoal(1.0, FOREVER), keep_leaves=True)
     check(frame, result)
     assert (result.cells, result.bounded) == (1, True)
     assert result.leaves is not None
@@ -531,7 +535,7 @@ def test_splits_along_the_axis_that_matters(axis: int) -> None:
     weights = np.full(3, 1e-9)
     weights[axis] = 2.0
     frame = Waves(3, weights=weights)
-    result = refine(frame, Goal(1.2, FOREVER, 500), keep_leaves=True)
+    result = refine(frame, RefinementGoal(1.2, FOREVER, 500), keep_leaves=True)
     check(frame, result)
     assert result.trace[-1].mpg <= 1.2 * result.trace[-1].mpg_witness
     assert result.leaves is not None
@@ -553,7 +557,7 @@ def test_axes_without_slope_are_split_by_motion(monkeypatch: pytest.MonkeyPatch)
 
     monkeypatch.setattr(frame, "bound", flat)
     monkeypatch.setattr(frame, "motion", lambda box: np.array([0.0, box.upper[1] - box.lower[1]]))
-    result = refine(frame, Goal(1.1, FOREVER, 300))
+    result = refine(frame, RefinementGoal(1.1, FOREVER, 300))
     check(frame, result)
     assert result.trace[-1].mpg <= 1.1 * result.trace[-1].mpg_witness
 
@@ -568,7 +572,7 @@ def test_an_axis_that_is_used_up_gives_way(monkeypatch: pytest.MonkeyPatch) -> N
         return found
 
     monkeypatch.setattr(frame, "bound", misled)
-    check(frame, refine(frame, Goal(1.0, FOREVER, 200), tuning=Tuning(narrowest=0.3)))
+    check(frame, refine(frame, RefinementGoal(1.0, FOREVER, 200), tuning=Tuning(narrowest=0.3)))
     widths = {(box.upper[0] - box.lower[0], box.upper[1] - box.lower[1]) for box, _, _ in frame.calls}
     assert min(w for w, _ in widths) == pytest.approx(1.7 / 4)
     assert min(h for _, h in widths) == pytest.approx(2.0 / 4)
@@ -577,7 +581,7 @@ def test_an_axis_that_is_used_up_gives_way(monkeypatch: pytest.MonkeyPatch) -> N
 @pytest.mark.parametrize("dimensions", [1, 2])
 def test_contexts_come_from_boxes_around(dimensions: int) -> None:
     frame = Waves(dimensions, pace=1.0)
-    refine(frame, Goal(1.0, FOREVER, 60))
+    refine(frame, RefinementGoal(1.0, FOREVER, 60))
     inner = [(box, within.box) for box, _, within in frame.calls if within is not None]
     assert len(inner) > 20
     for box, around in inner:
@@ -588,7 +592,7 @@ def test_contexts_come_from_boxes_around(dimensions: int) -> None:
 def test_tight_tiles_are_not_bounded_again() -> None:
     frame = Waves(1, width=8, height=4)
     frame.weight[0] = 0.0  # this tile never changes
-    refine(frame, Goal(1.0, FOREVER, 40))
+    refine(frame, RefinementGoal(1.0, FOREVER, 40))
     with_first = [tiles for _, tiles, within in frame.calls if within is not None and 0 in tiles]
     # outward rounding leaves an excess of one unit in the last place, which is never worth a split
     assert len(with_first) == 0
@@ -601,7 +605,7 @@ def test_tight_tiles_are_not_bounded_again() -> None:
 @pytest.mark.parametrize("leaf_bytes", [30_000, 1 << 30])
 def test_leaves_cover_the_set_and_hold_its_pictures(dimensions: int, leaf_bytes: int) -> None:
     frame = Waves(dimensions, pace=1.0)
-    result = refine(frame, Goal(1.0, FOREVER, 40, leaf_bytes), keep_leaves=True)
+    result = refine(frame, RefinementGoal(1.0, FOREVER, 40, leaf_bytes), keep_leaves=True)
     leaves = result.leaves
     assert leaves is not None
     volume = np.prod(leaves.box_upper - leaves.box_lower, axis=1)
@@ -667,7 +671,7 @@ SPOILT = {
 @pytest.mark.parametrize("every", [1, 2, 5])
 def test_bad_bounds_never_end_tight(name: str, every: int) -> None:
     frame = spoilt(Waves(1, width=8, height=8, pace=1.0), SPOILT[name], every)
-    result = refine(frame, Goal(1.0, FOREVER, 40), keep_leaves=True)
+    result = refine(frame, RefinementGoal(1.0, FOREVER, 40), keep_leaves=True)
     check(frame, result)
     assert np.isfinite(result.lower).all() and np.isfinite(result.upper).all()
     if every == 1:
@@ -686,7 +690,7 @@ def test_bad_slopes_and_linear_sets_are_harmless() -> None:
             found.linear[3][:, 2, 2, 2] = np.inf
 
     frame = spoilt(Waves(2, width=8, height=8), spoil)
-    result = refine(frame, Goal(1.05, FOREVER, 60), keep_leaves=True)
+    result = refine(frame, RefinementGoal(1.05, FOREVER, 60), keep_leaves=True)
     check(frame, result)
     leaves = result.leaves
     assert leaves is not None
@@ -699,7 +703,7 @@ def test_bad_slopes_and_linear_sets_are_harmless() -> None:
 def test_bad_motion_is_harmless() -> None:
     frame = Waves(2)
     frame.motion = lambda box: np.array([np.nan, 3.0])  # type: ignore[method-assign]
-    check(frame, refine(frame, Goal(1.0, FOREVER, 30)))
+    check(frame, refine(frame, RefinementGoal(1.0, FOREVER, 30)))
 
 
 def test_children_that_contradict_their_parent_are_not_believed() -> None:
@@ -717,7 +721,7 @@ def test_children_that_contradict_their_parent_are_not_believed() -> None:
     _, upper, radius = (a[0] for a in frame.exact(frame.box))
     forbidden = upper + frame.slack * radius**2 < 0.95
     assert forbidden.any() and not forbidden.all()
-    result = refine(frame, Goal(1.0, FOREVER, 3))
+    result = refine(frame, RefinementGoal(1.0, FOREVER, 3))
     assert (result.lower[forbidden] == 0.0).all() and (result.upper[forbidden] == 1.0).all()
 
 
@@ -745,7 +749,7 @@ class Triangle(Waves):
 def test_parts_without_poses_take_no_work_and_leave_nothing_open(shrinks: bool, pace: float) -> None:
     frame = Triangle(3, pace=pace, slack=0.02, weights=np.array([1.0, 0.3, 0.0]))
     frame.shrinks = shrinks
-    result = refine(frame, Goal(1.0, FOREVER, 1500))
+    result = refine(frame, RefinementGoal(1.0, FOREVER, 1500))
     assert all(box.lower[0] + box.lower[1] <= 0.0 for box, _, _ in frame.calls)
     points = frame.box.sample(4000, np.random.default_rng(3))
     # those beyond the slanted side are taken to it
@@ -762,7 +766,7 @@ def test_parts_without_poses_take_no_work_and_leave_nothing_open(shrinks: bool, 
 
 def test_poses_are_rendered_far_out() -> None:
     """A part that touches an end of the set is looked at there, one that touches both at either."""
-    refinement = Refinement(Waves(3), 0, Goal())
+    refinement = Refinement(Waves(3), 0, RefinementGoal())
     splitter = refinement.splitter
     whole = refinement.frame.box
     part = splitter.cut(splitter.cut(splitter.whole, 0)[0], 1, 4)[1]
@@ -774,7 +778,7 @@ def test_poses_are_rendered_far_out() -> None:
 
 
 def test_ends_beyond_which_there_are_no_poses_are_far_out() -> None:
-    refinement = Refinement(Triangle(2), 0, Goal())
+    refinement = Refinement(Triangle(2), 0, RefinementGoal())
     splitter = refinement.splitter
     # the upper quarter of u allows v below its lower end only, and no u near its own upper end
     part = splitter.cut(splitter.whole, 0, 4)[3]

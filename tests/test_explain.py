@@ -17,16 +17,16 @@ from ns_abstract.api.explaining import Explanation, explain
 from ns_abstract.api.files import Settings, open_job
 from ns_abstract.api.job import Job
 from ns_abstract.cli import render as render_command
-from ns_abstract.geometry.views import View, look_at
+from ns_abstract.geometry.keyframe_cameras import KeyframeCamera, look_at
 from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.scene import SplatScene
-from ns_abstract.refine.engine import Goal
+from ns_abstract.refine.engine import RefinementGoal
 
 Make = Callable[..., Inputs]
 #: From the front, one tile.
-FRONT = [View(look_at((0.0, -2.0, 0.0), (0.0, 0.0, 0.0)), 40.0, 16, 16)]
+FRONT = [KeyframeCamera(look_at((0.0, -2.0, 0.0), (0.0, 0.0, 0.0)), 40.0, 16, 16)]
 SHIFT = {"version": 1, "frame": "camera", "translation": {"x": 0.004}}
 TURN = {"version": 1, "frame": "camera", "rotation": {"yaw": 0.02}}
 
@@ -56,7 +56,7 @@ def plain(*colors: list[float]) -> np.ndarray:
 
 def explained(inputs: Inputs, cells: int = 2) -> tuple[Job, Explanation]:
     job = open_job(Settings(inputs.config, inputs.path, inputs.spec))
-    result = job.bound(0, Goal(1.0, 300.0, cells), keep_leaves=True)
+    result = job.bound(0, RefinementGoal(1.0, 300.0, cells), keep_leaves=True)
     return job, explain(job, 0, result)
 
 
@@ -77,7 +77,7 @@ def test_other_layers_change_nothing(make_blobs: Make) -> None:
     job, found = explained(inputs)
     layered = open_job(Settings(inputs.config, inputs.path, inputs.spec, outputs=("rgb", "depth", "accumulation")))
     assert layered.layers and job.layers == ()
-    assert explain(layered, 0, job.bound(0, Goal(1.0, 300.0, 2), keep_leaves=True)) == found
+    assert explain(layered, 0, job.bound(0, RefinementGoal(1.0, 300.0, 2), keep_leaves=True)) == found
 
 
 def test_versions_without_tiles_to_miss_are_not_told_of_them(make_blobs: Make) -> None:
@@ -87,7 +87,7 @@ def test_versions_without_tiles_to_miss_are_not_told_of_them(make_blobs: Make) -
         job = open_job(
             Settings(inputs.config, inputs.path, inputs.spec, program=ProgramOptions(gsplat_version=version))
         )
-        found = explain(job, 0, job.bound(0, Goal(1.0, 300.0, 2), keep_leaves=True))
+        found = explain(job, 0, job.bound(0, RefinementGoal(1.0, 300.0, 2), keep_leaves=True))
         assert [cause for cause in found.causes if "threshold" in cause] == [name]
 
 

@@ -13,8 +13,8 @@ import torch
 from scene_attacks import bound_cells, equal_cells
 
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.camera_path import Camera
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.perturbation.specification import parse_perturbation
@@ -56,12 +56,12 @@ def scene_of(*balls: dict[str, Any], background: float = 0.0) -> SplatScene:
     )
 
 
-def camera() -> Camera:
-    return Camera(np.eye(3, 4), 30.0, 30.0, SIDE / 2, SIDE / 2, SIDE, SIDE)
+def camera() -> PinholeCamera:
+    return PinholeCamera(np.eye(3, 4), 30.0, 30.0, SIDE / 2, SIDE / 2, SIDE, SIDE)
 
 
-def poses(spec: dict[str, Any]) -> PoseSet:
-    return PoseSet.around(camera(), parse_perturbation(spec))
+def poses(spec: dict[str, Any]) -> PoseBox:
+    return PoseBox.around(camera(), parse_perturbation(spec))
 
 
 def crowd(seed: int = 0) -> SplatScene:
@@ -115,7 +115,7 @@ def test_honest_bounds(spec: dict[str, Any], cells: Any) -> None:
     assert (total.witness_upper - total.witness_lower).max() > 0.5 * (upper - lower).max()
 
 
-def grid_bounds(scene: SplatScene, pose_set: PoseSet, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def grid_bounds(scene: SplatScene, pose_set: PoseBox, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """[count, H, W, 3] images along one parameter, and their range widened by four times the largest step."""
     render, _ = compiled_renderer(scene, pose_set, GSPLAT_1_4_0)
     images = np.array([render(pose_set.box.at(np.array([s]))) for s in np.linspace(-1, 1, count)])

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from ns_abstract.arithmetic.rounding import FLOAT32
-from ns_abstract.geometry.camera_path import Camera
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
@@ -15,7 +15,7 @@ from ns_abstract.perturbation.specification import Perturbation
 f = np.float32
 ONE, TWO, HALF = f(1), f(2), f(0.5)
 SIDE, FOCAL = 32, 100.0
-CAMERA = Camera(np.concatenate([np.eye(3), np.zeros((3, 1))], 1), FOCAL, FOCAL, SIDE / 2, SIDE / 2, SIDE, SIDE)
+CAMERA = PinholeCamera(np.concatenate([np.eye(3), np.zeros((3, 1))], 1), FOCAL, FOCAL, SIDE / 2, SIDE / 2, SIDE, SIDE)
 
 
 def product(a, b):
@@ -76,7 +76,7 @@ SHAPES = {
 @pytest.mark.parametrize("shape", SHAPES)
 def test_single_gaussian(compensated, shape):
     random = np.random.default_rng(3)
-    poses = PoseSet.around(CAMERA, Perturbation())
+    poses = PoseBox.around(CAMERA, Perturbation())
     checked = 0
     for _ in range(150):
         z = random.uniform(1, 4)

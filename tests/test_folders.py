@@ -29,7 +29,7 @@ from ns_abstract.report.files import load_frame, save_frame
 from ns_abstract.report.record import Report
 from ns_abstract.verify import store_file as store_module
 from ns_abstract.verify.store import Store
-from ns_abstract.verify.store_file import IMAGES, Seal
+from ns_abstract.verify.store_file import IMAGES, TableChecksum
 
 FOREIGN = {
     "notes.txt": b"mine",
@@ -262,7 +262,7 @@ def test_the_report_knows_the_cells(tmp_path: Path) -> None:
     open_store(tmp_path, resume=True).close()
     forge(tmp_path / "cells.sqlite", "UPDATE cells SET seconds = seconds + 1 WHERE rowid = 2")
     with sqlite3.connect(tmp_path / "cells.sqlite") as base:
-        whole = Seal()
+        whole = TableChecksum()
         for row in base.execute("SELECT * FROM cells"):
             whole.add(row)
         seals = json.loads(base.execute("SELECT value FROM search_state WHERE key = 'seals'").fetchone()[0])
@@ -343,7 +343,7 @@ def test_no_room_is_no_reason_to_begin_anew(tmp_path: Path, said: str, monkeypat
 
 def test_seals_know_rows_and_no_order() -> None:
     rows = [(0, "[0.0]", 0.5, None), (1, "[0.0]", 0.5, None), (0, "[0.0]", 0.25, None)]
-    one, other, less = Seal(), Seal(), Seal()
+    one, other, less = TableChecksum(), TableChecksum(), TableChecksum()
     for row in rows:
         one.add(row)
     for row in reversed(rows):
@@ -355,7 +355,7 @@ def test_seals_know_rows_and_no_order() -> None:
     assert one == less and len(one.text) == 64
     one.add(rows[1], -1)
     one.add(rows[0], -1)
-    assert one == Seal()
+    assert one == TableChecksum()
 
 
 def test_an_edited_frame_is_computed_again(tmp_path: Path) -> None:

@@ -13,9 +13,9 @@ from gsplat_kernels import Kernels, Unavailable, library
 from scene_attacks import bound_cells
 
 from ns_abstract.bench.stiff import all_cases
-from ns_abstract.geometry.camera_path import Camera
-from ns_abstract.geometry.poses import PoseSet
-from ns_abstract.geometry.views import look_at
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.keyframe_cameras import look_at
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, GSPLAT_1_5_3, GSPLAT_1_6_0, VERSIONS, Rasteriser
 from ns_abstract.methods.splat.reference import Reference
 from ns_abstract.methods.splat.scene import SplatScene
@@ -44,9 +44,9 @@ def kernels(scene: SplatScene, version: str = "1.4.0", **options: Any) -> Kernel
         pytest.skip(str(reason))
 
 
-def camera() -> Camera:
+def camera() -> PinholeCamera:
     pose = look_at((1.6, 0.3, 0.4), (0.0, 0.0, 0.0))
-    return Camera(np.asarray(pose)[:3], FOCAL, FOCAL * 1.1, WIDTH / 2 + 0.3, HEIGHT / 2 - 0.2, WIDTH, HEIGHT)
+    return PinholeCamera(np.asarray(pose)[:3], FOCAL, FOCAL * 1.1, WIDTH / 2 + 0.3, HEIGHT / 2 - 0.2, WIDTH, HEIGHT)
 
 
 def scene_of(mode: str = "classic", model: str = "sh") -> SplatScene:
@@ -87,7 +87,7 @@ def scene_of(mode: str = "classic", model: str = "sh") -> SplatScene:
 
 def poses(count: int = 4) -> list[np.ndarray]:
     """The camera's pose and others about it."""
-    around = PoseSet.around(camera(), parse_perturbation(SIX))
+    around = PoseBox.around(camera(), parse_perturbation(SIX))
     others = around.box.sample(count - 1, np.random.default_rng(0))
     return [around.pose(values) for values in (around.box.middle, *others)]
 
@@ -187,10 +187,10 @@ def outside(bounds: tuple[np.ndarray, np.ndarray], image: np.ndarray) -> int:
 
 
 def violations(
-    scene: SplatScene, view: Camera, spec: dict[str, Any], count: int, version: str = "1.4.0", **options: Any
+    scene: SplatScene, view: PinholeCamera, spec: dict[str, Any], count: int, version: str = "1.4.0", **options: Any
 ) -> tuple[int, float]:
     """What leaves the bounds of a set in ``count`` renders by each build, and the bounds' mean gap."""
-    around = PoseSet.around(view, parse_perturbation(spec))
+    around = PoseBox.around(view, parse_perturbation(spec))
     (bounds,), _ = bound_cells(scene, around, [around.box], **({"rasteriser": VERSIONS[version]} | options))
     rng = np.random.default_rng(1)
     values = [around.box.middle, *around.box.corners(), *around.box.sample(count, rng)]
@@ -245,7 +245,7 @@ def test_rules_of_another_version_are_left(version: str, rules: Rasteriser) -> N
 
 def test_gaussian_beyond_its_tile() -> None:
     """1.4.0's radius ends at a tile's edge, where alpha is above 1/255 still; later versions show it there."""
-    view = Camera(np.eye(3, 4), 32.0, 32.0, 7.9, 8.0, 32, 16)
+    view = PinholeCamera(np.eye(3, 4), 32.0, 32.0, 7.9, 8.0, 32, 16)
     blob = blob_scene(1)
     scene = replace(
         blob, means=np.array([[0.0, 0.0, -1.0]], np.float32), log_scales=np.full((1, 3), np.log(0.0804), np.float32),
@@ -261,7 +261,7 @@ def test_gaussian_beyond_its_tile() -> None:
         assert (found["1.5.3"] == 0) == (version != "1.4.0") == (found["1.6.0"] == 0)
 
 
-def skewed() -> Camera:
+def skewed() -> PinholeCamera:
     """A camera whose matrix is no rotation, as far as camera paths may hold it."""
     plain = camera()
     matrix = plain.camera_to_world.copy()
@@ -277,7 +277,7 @@ def test_colours_are_seen_from_the_view_matrix() -> None:
     assert np.abs(Reference(scene, GSPLAT_1_6_0).image(view, pose).numpy() - exact).max() < 1e-12
     other = Reference(scene, replace(GSPLAT_1_6_0, eye_from_view=False)).image(view, pose).numpy()
     assert np.abs(other - exact).max() > 1e-6
-    around = PoseSet.around(view, parse_perturbation({}))
+    around = PoseBox.around(view, parse_perturbation({}))
     render, _ = compiled_renderer(scene, around, GSPLAT_1_6_0)
     picture = render(around.box.middle)
     assert np.abs(picture - exact).max() < 1e-12

@@ -12,8 +12,8 @@ from conftest import Inputs, blob_scene, ring
 from scene_attacks import bound_cells
 
 from ns_abstract.api.files import PathJob, Settings, open_job
-from ns_abstract.geometry.camera_path import Camera
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.methods.splat.constants import VERSIONS, installed_gsplat, rasteriser_named
@@ -59,16 +59,16 @@ def test_no_gsplat_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
     assert installed_gsplat().version == "1.4.0"
 
 
-def view() -> Camera:
+def view() -> PinholeCamera:
     first = ring()[0]
-    return Camera(np.asarray(first.camera_to_world)[:3], 38.6, 38.6, 16.0, 16.0, 32, 32)
+    return PinholeCamera(np.asarray(first.camera_to_world)[:3], 38.6, 38.6, 16.0, 16.0, 32, 32)
 
 
 @pytest.mark.parametrize("mode", ["classic", "antialiased"])
 @pytest.mark.parametrize("version", VERSIONS)
 def test_real_bounds_hold(version: str, mode: str) -> None:
     scene = replace(blob_scene(30, degree=1), rasterize_mode=mode)
-    around = PoseSet.around(view(), parse_perturbation({"translation": {"x": 2e-3}, "rotation": {"yaw": 1e-3}}))
+    around = PoseBox.around(view(), parse_perturbation({"translation": {"x": 2e-3}, "rotation": {"yaw": 1e-3}}))
     rules = rasteriser_named("gsplat", version)
     (bounds,), _ = bound_cells(scene, around, [around.box], rasteriser=rules, arithmetic="real")
     render, _ = compiled_renderer(scene, around, rules)

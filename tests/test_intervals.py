@@ -12,7 +12,11 @@ from test_bounds import Case, moves, scene
 
 from ns_abstract.arithmetic.rounding import FLOAT32, REAL, UNIT64, charges
 from ns_abstract.arithmetic.simd.intrinsics import pointer
-from ns_abstract.methods.splat.block import (
+from ns_abstract.methods.splat.bounds import SplatBounds
+from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, raster_rules
+from ns_abstract.methods.splat.frame import SplatFrame
+from ns_abstract.methods.splat.intervals import blend_parts
+from ns_abstract.methods.splat.pixel_block import (
     ALPHA_HIGH,
     EXPONENT,
     block_of,
@@ -23,10 +27,6 @@ from ns_abstract.methods.splat.block import (
     new_buffers,
     set_unknown,
 )
-from ns_abstract.methods.splat.bounds import SplatBounds
-from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, raster_rules
-from ns_abstract.methods.splat.frame import SplatFrame
-from ns_abstract.methods.splat.intervals import blend_parts
 from ns_abstract.methods.splat.stage_data import FormShape, Parts, PixelInputs, cell_parts, shared_out
 from ns_abstract.perturbation.specification import Perturbation
 

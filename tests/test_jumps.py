@@ -13,23 +13,23 @@ from numba import njit
 from ns_abstract.arithmetic.simd.intrinsics import advanced, pointer
 from ns_abstract.arithmetic.simd.lanes import load4, store
 from ns_abstract.methods.splat.blend import flattened
-from ns_abstract.methods.splat.block import (
+from ns_abstract.methods.splat.pixel_block import (
     ALPHA_HIGH,
     ALPHA_LOW,
     BEND,
     BEND_SPREAD,
     FORM,
     LISTED,
-    Jumps,
+    ThresholdCrossings,
     bends_of,
     color_ends,
     color_size,
+    crossing_column,
+    crossing_rows,
     fragment_width,
-    jump_column,
-    jump_rows,
 )
-from ns_abstract.methods.splat.jumps import bound_by_parts, gather_jumps, set_blend
 from ns_abstract.methods.splat.stage_data import FormShape
+from ns_abstract.methods.splat.threshold_crossings import bound_by_parts, gather_crossings, set_blend
 
 THRESHOLD = 2.0**-8
 
@@ -39,7 +39,7 @@ def _bounds(values, lists, colors, background, shape, count, limit, jumps_, t_, 
     """Bounds of three channels by parts into the first 8 of ``out_``, then by constants; the number of jumps last."""
     t, out = pointer(t_), pointer(out_)
     entries, distances, rows = jumps_
-    jumps = Jumps(pointer(entries), pointer(distances), pointer(rows), rows.shape[1])
+    jumps = ThresholdCrossings(pointer(entries), pointer(distances), pointer(rows), rows.shape[1])
     d, m = shape.dimensions, shape.monomials
     u = advanced(t, 4 * (m + bends_of(shape)))
     fragments, blend = blended(values, lists, colors, background, shape, 1, count, t, jumps, True)
@@ -47,7 +47,7 @@ def _bounds(values, lists, colors, background, shape, count, limit, jumps_, t_, 
     store(out, 0, blend.radius * up)
     set_blend(t, out, jumps, d)
     store(out, 20, blend.since)
-    gather_jumps(0, count, blend.jumps, advanced(out, 20), fragments, jumps, out, shape)
+    gather_crossings(0, count, blend.jumps, advanced(out, 20), fragments, jumps, out, shape)
     falls, rises = load4(out, 0), load4(out, 4)
     r = blend.radius
     if shape.order == 1:
@@ -74,7 +74,7 @@ def _fragments(shape, alphas, radii, colors):
         low, high = max(0.0, alpha[0] - spread), min(1.0, alpha[0] + spread)
         skips = low < THRESHOLD
         jump = min(THRESHOLD, high) if skips else 0.0
-        values[e, int(jump_column(shape))] = THRESHOLD if skips else 0.0
+        values[e, int(crossing_column(shape))] = THRESHOLD if skips else 0.0
         values[e, ALPHA_LOW], values[e, ALPHA_HIGH] = 0.0 if skips else low, high
         values[e, FORM : FORM + 1 + d] = alpha[: 1 + d]
         values[e, FORM] -= 0.5 * jump
@@ -129,7 +129,7 @@ def _case(d, count, generator, size=0.8, radius=0.0):
 def _bounded(d, order, alphas, radii, colors, background):
     shape = FormShape(d, order, 3 if order == 2 else d + 1)
     values, palette, lists = _fragments(shape, alphas, radii, colors)
-    jumps = np.zeros(CAPACITY, np.int64), np.zeros(8 * CAPACITY), np.zeros((int(jump_rows(shape)), 272))
+    jumps = np.zeros(CAPACITY, np.int64), np.zeros(8 * CAPACITY), np.zeros((int(crossing_rows(shape)), 272))
     t, out = np.zeros(4 * (3 * shape.monomials + 5 + d * (d + 1) // 2)), np.zeros(25)
     _bounds(
         values.ravel(), lists.ravel(), palette.ravel(), background, shape, len(alphas), THRESHOLD * (1.0 - 2.0**-52),

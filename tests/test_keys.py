@@ -24,7 +24,7 @@ import ns_abstract as nsa
 from ns_abstract.api.files import Settings, open_job
 from ns_abstract.geometry import path_keys
 from ns_abstract.geometry.camera_path import load_camera_path
-from ns_abstract.geometry.views import path_json
+from ns_abstract.geometry.keyframe_cameras import path_json
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.keys import Key, KeyTable
 from ns_abstract.methods import config_keys

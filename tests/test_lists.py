@@ -15,7 +15,7 @@ from test_bounds import TURN, camera, moves, scene
 from ns_abstract.arithmetic.rounding import FLOAT32, REAL
 from ns_abstract.arithmetic.simd.intrinsics import pointer, taken
 from ns_abstract.execution.threads import _pool, each, lane, side_by_side, threads, use_threads
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
@@ -23,10 +23,10 @@ from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.lists import (
     depth_order,
     longest_first,
-    marked,
     summed_area,
     tile_lists,
     touching,
+    visible_again,
 )
 
 ACROSS, DOWN = 5, 4
@@ -66,7 +66,7 @@ def test_rectangles_hold_the_pixels_that_are_reached_and_no_others():
     box[::7, 0, 0], box[3::7, 1, 1], box[5::7] = -np.inf, np.nan, np.nan
     box = box.reshape(count, 4)
     marks = (generator.uniform(size=count) < 0.8).astype(np.uint8)
-    numbers, rectangles = marked(marks, np.arange(100, 100 + count), box, tiles, side)
+    numbers, rectangles = visible_again(marks, np.arange(100, 100 + count), box, tiles, side)
     assert (numbers == 100 + np.flatnonzero(marks)).all()
     rows, columns = np.mgrid[: DOWN * side, : ACROSS * side]
     chosen = generator.uniform(size=rows.shape) < 0.1
@@ -213,7 +213,7 @@ def test_cells_that_are_bounded_at_once_have_memory_of_their_own():
 @pytest.mark.usefixtures("four_threads")
 def test_cells_that_are_bounded_at_once_are_those_bounded_one_by_one(radii):
     """Also where cells that turn share their colours, and where there are fewer threads than cells, or more."""
-    poses = PoseSet.around(camera(70, 50, 50.0), moves(**radii))
+    poses = PoseBox.around(camera(70, 50, 50.0), moves(**radii))
     alone, shared = (SplatFrame(many(degree=1), GSPLAT_1_4_0, FLOAT32, poses) for _ in range(2))
     tiles = np.arange(alone.tile_count)
     for count in (2, 9):
@@ -244,7 +244,7 @@ def many(antialiased: bool = False, degree: int = 0) -> Splats:
 
 def test_partial_pictures_are_parts_of_the_whole():
     """Renders and bounds of some tiles are those of the whole picture, bit for bit."""
-    poses = PoseSet.around(camera(70, 50, 50.0), moves(x=0.02, yaw=0.01))
+    poses = PoseBox.around(camera(70, 50, 50.0), moves(x=0.02, yaw=0.01))
     frame = SplatFrame(many(), GSPLAT_1_4_0, REAL, poses)
     every, some = np.arange(frame.tile_count), np.array([3, 7, 8, 19])
     whole = frame.bound(poses.box, every)
@@ -266,7 +266,7 @@ def test_wanted_pixels_are_bounded_as_in_the_whole_picture(radii, order, antiali
     """They hold every picture, are no looser, and the same bit for bit where no order changes; nothing is said else."""
     if order == 2 and len(radii) > 1:
         pytest.skip("order 2 is of one parameter")
-    poses = PoseSet.around(camera(80, 64, 50.0), moves(**radii))
+    poses = PoseBox.around(camera(80, 64, 50.0), moves(**radii))
     frame = SplatFrame(many(antialiased), GSPLAT_1_4_0, arithmetic, poses, order)
     tiles, random = np.array([3, 7, 8, 19]), np.random.default_rng(2)
     pixels = random.random((tiles.size, frame.side, frame.side)) < 0.3
@@ -298,7 +298,7 @@ def test_wanted_pixels_are_bounded_as_in_the_whole_picture(radii, order, antiali
 
 
 def test_layers_of_pixels_that_are_not_wanted_are_unknown():
-    poses = PoseSet.around(camera(80, 64, 50.0), moves(x=0.02))
+    poses = PoseBox.around(camera(80, 64, 50.0), moves(x=0.02))
     bounds, tiles = SplatBounds(many(), GSPLAT_1_4_0, REAL), np.array([3, 7])
     pixels = np.random.default_rng(2).random((2, bounds.side, bounds.side)) < 0.3
     forms = poses.enclosure(poses.box, 2)

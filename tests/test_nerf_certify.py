@@ -17,10 +17,10 @@ from nerfs import UNIFORM, poses, tiny_scene, view
 
 import ns_abstract as nsa
 from ns_abstract.cli import certify as command
-from ns_abstract.execution.ending import AbandonedError, abandoning
+from ns_abstract.execution.cancellation import WorkCancelledError, cancel_when
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.camera_path import Camera
-from ns_abstract.geometry.views import View, look_at, path_json
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.keyframe_cameras import KeyframeCamera, look_at, path_json
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf import planes as planes_module
 from ns_abstract.methods.nerf import strips as strips_module
@@ -93,7 +93,7 @@ def test_stiff_fields_lie_between_the_planes(seed: int) -> None:
 @pytest.mark.slow
 def test_any_choice_of_samples_lies_between_the_planes() -> None:
     sampling = Sampling("hierarchical", 0.0, 4.0, 24, 8, (0.2, 0.6, 1.0))
-    camera = Camera(view().camera_to_world, 5.0, 5.0, 1.0, 0.5, 2, 1)
+    camera = PinholeCamera(view().camera_to_world, 5.0, 5.0, 1.0, 0.5, 2, 1)
     frame = NerfFrame(tiny_scene(3), sampling, poses({"rotation": {"yaw": 1e-4}}, camera))
     for box in cells(frame.box):
         found = frame.sets(box)
@@ -175,7 +175,7 @@ def half_a_part(low: Any, high: Any, ends: Any) -> Any:
     return original_united(low, high, [0.5 * e for e in ends])
 
 
-original_united = planes_module.united
+original_united = planes_module.unite_parts
 
 
 def other_offset(rows: Any, slope: Any, centre: Any, half: Any) -> Any:
@@ -187,7 +187,7 @@ def a_quarter_strip_on(self: Any, axis: int, count: int, first: int, past: int, 
     return lines - 0.25 * (lines[-1] - lines[0])
 
 
-original_ends = strips_module.Strips._part_ends
+original_ends = strips_module.PoseStrips._part_ends
 
 
 @pytest.mark.slow_cases
@@ -196,7 +196,7 @@ original_ends = strips_module.Strips._part_ends
     [
         (planes_module, "united", half_a_part),
         (planes_module, "_offset", other_offset),
-        (strips_module.Strips, "_part_ends", a_quarter_strip_on),
+        (strips_module.PoseStrips, "_part_ends", a_quarter_strip_on),
     ],
 )
 def test_planted_faults_are_found(monkeypatch: pytest.MonkeyPatch, target: Any, name: str, fault: Any) -> None:
@@ -338,7 +338,7 @@ def test_work_is_given_up_inside_a_ray() -> None:
         asked.append(None)
         return len(asked) > 12
 
-    with pytest.raises(AbandonedError), abandoning(over):
+    with pytest.raises(WorkCancelledError), cancel_when(over):
         frame.sets(frame.box)
     assert len(asked) == 13
     assert not frame._strips._known, "a ray that was given up is kept"
@@ -349,7 +349,7 @@ def test_command_line(
 ) -> None:
     path, prop, out = tmp_path / "path.json", claim_above(-15.0, tmp_path), tmp_path / "out"
     spec = {"version": 1, "orbit": {**ARC, "azimuth": [0.3, 0.31]}}
-    path.write_text(json.dumps(path_json([View(EYE, 45.0, SIDE, SIDE)], perturbation=spec)))
+    path.write_text(json.dumps(path_json([KeyframeCamera(EYE, 45.0, SIDE, SIDE)], perturbation=spec)))
 
     def call(*options: str) -> tuple[int, str]:
         given = ["--load-config", run, "--camera-path-filename", path, "--model", net, "--property", prop]

@@ -12,7 +12,7 @@ import torch
 from nerfs import BINS, UNIFORM, images, pixels_of, poses, tiny_scene
 
 from ns_abstract.arithmetic.rounding import UNIT32
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.nerf import bounds as bounds_module
 from ns_abstract.methods.nerf import frame as frame_module
 from ns_abstract.methods.nerf.bounds import NerfBounds, RayBounds
@@ -21,7 +21,7 @@ from ns_abstract.methods.nerf.field import Field
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
-from ns_abstract.refine.engine import Goal, Refinement, groups
+from ns_abstract.refine.engine import Refinement, RefinementGoal, groups
 from ns_abstract.refine.result import FrameResult, joined
 from ns_abstract.verify.attack.falsify import falsify
 from ns_abstract.verify.attack.soundness import nerf_renderer
@@ -48,7 +48,7 @@ FIELDS = {
 }
 
 
-def attack(scene: NerfScene, pose_set: PoseSet, found: RayBounds, poses_tried: int = 60) -> tuple[int, int]:
+def attack(scene: NerfScene, pose_set: PoseBox, found: RayBounds, poses_tried: int = 60) -> tuple[int, int]:
     """Comparisons and violations of random poses, corners, gradient ascent and jumps."""
     camera = pose_set.camera
     shape = (camera.height, camera.width, 3)
@@ -60,7 +60,7 @@ def attack(scene: NerfScene, pose_set: PoseSet, found: RayBounds, poses_tried: i
     return result.comparisons, result.violations
 
 
-def bounded(scene: NerfScene, pose_set: PoseSet, tolerance: float = 0.02) -> RayBounds:
+def bounded(scene: NerfScene, pose_set: PoseBox, tolerance: float = 0.02) -> RayBounds:
     return NerfBounds(scene, UNIFORM, pose_set.box.dimensions).rays(
         pose_set, pose_set.box, pixels_of(pose_set.camera), tolerance
     )
@@ -102,7 +102,7 @@ def test_far_too_wide_boxes_say_nothing() -> None:
 def test_refinement_approaches_the_truth(spec: dict) -> None:
     scene, pose_set = tiny_scene(2, density=30.0), poses(spec)
     frame = NerfFrame(scene, UNIFORM, pose_set)
-    result = Refinement(frame, 0, Goal(ratio=1.2, seconds=120.0, cells=400)).run()
+    result = Refinement(frame, 0, RefinementGoal(ratio=1.2, seconds=120.0, cells=400)).run()
     gaps = [point.mpg for point in result.trace]
     assert gaps == sorted(gaps, reverse=True)
     assert result.trace[-1].mpg <= 1.25 * result.trace[-1].mpg_witness
@@ -115,7 +115,9 @@ def test_refinement_approaches_the_truth(spec: dict) -> None:
 @pytest.mark.parametrize("yaw", [1e-5, 1e-6])
 def test_bounds_of_narrow_sets_are_as_tight_as_their_renders_vary(yaw: float, sampling: Sampling) -> None:
     scene, pose_set = tiny_scene(0), poses({"rotation": {"yaw": yaw}})
-    result = Refinement(NerfFrame(scene, sampling, pose_set), 0, Goal(ratio=1.45, seconds=300.0, cells=128)).run()
+    result = Refinement(
+        NerfFrame(scene, sampling, pose_set), 0, RefinementGoal(ratio=1.45, seconds=300.0, cells=128)
+    ).run()
     assert 0.0 < result.trace[-1].mpg < 1.5 * result.trace[-1].mpg_witness
     for picture in images(scene, pose_set, pose_set.box.sample(40, np.random.default_rng(0)), sampling):
         assert (result.lower.reshape(-1, 3) <= picture).all() and (picture <= result.upper.reshape(-1, 3)).all()
@@ -137,7 +139,7 @@ def test_the_whole_set_costs_nothing_and_rays_come_in_batches() -> None:
     bound = frame.bound_parts
     frame.tiles_at_once = 5
     frame.bound_parts = lambda boxes, tiles, *rest: sizes.append(len(tiles)) or bound(boxes, tiles, *rest)  # type: ignore[method-assign]
-    Refinement(frame, 0, Goal(ratio=1.0, seconds=60.0, cells=9)).run()
+    Refinement(frame, 0, RefinementGoal(ratio=1.0, seconds=60.0, cells=9)).run()
     assert sizes[0] == 12 and max(sizes[1:]) <= 5
 
 
@@ -170,7 +172,7 @@ def test_what_is_known_is_not_begun_anew(parts: int) -> None:
     frame.tiles_at_once = 2
 
     def found(known: FrameResult | None) -> FrameResult:
-        goal = Goal(ratio=1.0, seconds=120.0, cells=12 // parts)
+        goal = RefinementGoal(ratio=1.0, seconds=120.0, cells=12 // parts)
         some = [Refinement(frame, 0, goal, tiles=tiles, known=known).run_part() for tiles in groups(frame, parts)]
         return joined(some, frame.camera)
 
@@ -189,8 +191,8 @@ def test_what_is_known_is_not_begun_anew(parts: int) -> None:
 
 def test_what_is_known_holds_of_a_frame_that_is_stopped_at_once() -> None:
     frame = NerfFrame(tiny_scene(2), UNIFORM, poses(SETS["yaw"]))
-    before = Refinement(frame, 0, Goal(ratio=1.0, seconds=120.0, cells=12)).run()
-    now = Refinement(frame, 0, Goal(ratio=1.0, seconds=0.0), known=before).run()
+    before = Refinement(frame, 0, RefinementGoal(ratio=1.0, seconds=120.0, cells=12)).run()
+    now = Refinement(frame, 0, RefinementGoal(ratio=1.0, seconds=0.0), known=before).run()
     assert now.bounded and np.array_equal(now.lower, before.lower) and np.array_equal(now.upper, before.upper)
 
 
@@ -247,7 +249,7 @@ def composite_without_ends(self) -> tuple[np.ndarray, np.ndarray]:
     return original_composite(self)
 
 
-original_composite = bounds_module._Work._composite
+original_composite = bounds_module._BundleWork._composite
 
 
 def stop_too_early(self) -> float:
@@ -268,16 +270,16 @@ def narrow_pencil(self, *arguments) -> None:
     self.direction[:, 1:] *= 0.9
 
 
-original_pencil = bounds_module.Pencil.__init__
+original_pencil = bounds_module.RayBundle.__init__
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("target", "name", "fault"),
     [
-        (bounds_module._Work, "_composite", composite_without_ends),
+        (bounds_module._BundleWork, "_composite", composite_without_ends),
         (bounds_module, "bounds_by_part", wrong_parts),
-        (bounds_module.Pencil, "__init__", narrow_pencil),
+        (bounds_module.RayBundle, "__init__", narrow_pencil),
     ],
 )
 def test_planted_faults_are_found(monkeypatch: pytest.MonkeyPatch, target, name: str, fault) -> None:
@@ -305,7 +307,7 @@ def test_what_is_known_is_only_replaced_by_bounds() -> None:
     low = np.array([0.3, np.nan, 0.3, -np.inf, 0.6, 0.3, 0.9])
     high = np.array([0.7, 0.7, np.nan, 0.7, 0.4, np.inf, 0.95])
     lower, upper = np.full(7, 0.2), np.full(7, 0.8)
-    bounds_module._Work._keep(lower, upper, (np.arange(7),), low, high)
+    bounds_module._BundleWork._keep(lower, upper, (np.arange(7),), low, high)
     assert lower.tolist() == [0.3] + 6 * [0.2] and upper.tolist() == [0.7] + 6 * [0.8]
 
 
@@ -321,7 +323,7 @@ def test_pieces_that_are_given_up_say_nothing() -> None:
 def test_rays_of_wide_sets_lie_in_their_polynomials() -> None:
     """The Taylor models' own error counts where sets are wide and the degree is 1."""
     pose_set = poses({"rotation": {"yaw": 0.2, "roll": 0.1}, "translation": {"x": 0.1}})
-    pencil = bounds_module.Pencil(pose_set, pose_set.box, pixels_of(pose_set.camera), 1)
+    pencil = bounds_module.RayBundle(pose_set, pose_set.box, pixels_of(pose_set.camera), 1)
     ray, distance = np.repeat(np.arange(12), 2), np.tile([0.3, 3.9], 12)
     lines, radius = pencil.points(ray, distance, 0.0 * distance)
     directions = np.array([[(x + 0.5 - 2.0) / 5.0, -(y + 0.5 - 1.5) / 5.0, -1.0] for y in range(3) for x in range(4)])

@@ -14,7 +14,7 @@ from ns_abstract.methods.nerf import frame as frame_module
 from ns_abstract.methods.nerf import hsv
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.hsv import shifted, shifted_bounds
-from ns_abstract.refine.engine import Goal, Refinement
+from ns_abstract.refine.engine import Refinement, RefinementGoal
 from ns_abstract.verify.attack.falsify import falsify
 from ns_abstract.verify.attack.soundness import nerf_renderer
 
@@ -104,7 +104,7 @@ SETS = {
 def attacked(spec: dict, cells: int) -> tuple[int, int, float]:
     scene, pose_set = tiny_scene(3, density=30.0), poses(spec)
     frame = NerfFrame(scene, UNIFORM, pose_set)
-    result = Refinement(frame, 0, Goal(ratio=1.1, seconds=120.0, cells=cells)).run()
+    result = Refinement(frame, 0, RefinementGoal(ratio=1.1, seconds=120.0, cells=cells)).run()
     render, probe, twin = nerf_renderer(scene, pose_set, UNIFORM)
     found = falsify(result.lower, result.upper, pose_set.box, render, twin, probe=probe, poses=80, seed=1)
     last = result.trace[-1]

@@ -22,7 +22,7 @@ from test_cli import one_line
 
 from ns_abstract.api.files import Settings, open_job
 from ns_abstract.cli import render as render_command
-from ns_abstract.geometry.views import View, path_json
+from ns_abstract.geometry.keyframe_cameras import KeyframeCamera, path_json
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods import runs
 from ns_abstract.methods.load import load_any
@@ -105,7 +105,7 @@ def inputs(run: Path, tmp_path: Path) -> dict[str, Path]:
     pose = np.eye(4)
     pose[:3] = view().camera_to_world
     path, spec = tmp_path / "path.json", tmp_path / "spec.json"
-    path.write_text(json.dumps(path_json([View(pose, 40.0, 3, 4)])))
+    path.write_text(json.dumps(path_json([KeyframeCamera(pose, 40.0, 3, 4)])))
     spec.write_text(json.dumps({"version": 1, "rotation": {"yaw": 0.002}}))
     return {"load_config": run, "camera_path_filename": path, "perturbation_filename": spec}
 
@@ -256,7 +256,7 @@ def test_nerfstudio_shows_the_same_picture(tmp_path: Path) -> None:
     for camera in (view(), other_view()):
         pose = np.eye(4)
         pose[:3] = camera.camera_to_world
-        views.append(View(pose, 50.0, 12, 16))
+        views.append(KeyframeCamera(pose, 50.0, 12, 16))
     path, images = tmp_path / "path.json", tmp_path / "images.npy"
     path.write_text(json.dumps(path_json(views)))
     result = subprocess.run(

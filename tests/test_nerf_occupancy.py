@@ -16,12 +16,12 @@ from nerfs import UNIFORM, images, pixels_of, poses, tiny_scene, view
 
 from ns_abstract.cli import export as export_command
 from ns_abstract.cli import render as render_command
-from ns_abstract.geometry.poses import PoseSet
-from ns_abstract.geometry.views import View, path_json
+from ns_abstract.geometry.keyframe_cameras import KeyframeCamera, path_json
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.bounds import NerfBounds, RayBounds
 from ns_abstract.methods.nerf.occupancy import OccupancyGrid, load_grid
-from ns_abstract.methods.nerf.pencil import Pencil
+from ns_abstract.methods.nerf.ray_bundle import RayBundle
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.verify.attack.falsify import falsify
@@ -95,7 +95,7 @@ def test_extreme_boxes_tell_nothing_wrong() -> None:
 
 def test_ranges_of_points_are_enclosed_and_tight() -> None:
     pose_set = poses(SETS["two"])
-    pencil = Pencil(pose_set, pose_set.box, pixels_of(pose_set.camera), 4)
+    pencil = RayBundle(pose_set, pose_set.box, pixels_of(pose_set.camera), 4)
     ray, distance = np.repeat(np.arange(12), 3), np.tile([0.3, 1.5, 3.9], 12)
     lines, radius = pencil.points(ray, distance, 0.0 * distance)
     low, high = np.array([[-0.5, 0.25]]).repeat(36, 0), np.array([[0.0, 1.0]]).repeat(36, 0)
@@ -109,13 +109,13 @@ def test_ranges_of_points_are_enclosed_and_tight() -> None:
         assert ((bottom <= points) & (points <= top)).all()
 
 
-def bounded(scene: NerfScene, pose_set: PoseSet) -> RayBounds:
+def bounded(scene: NerfScene, pose_set: PoseBox) -> RayBounds:
     return NerfBounds(scene, UNIFORM, pose_set.box.dimensions).rays(
         pose_set, pose_set.box, pixels_of(pose_set.camera), 0.02
     )
 
 
-def violations(scene: NerfScene, pose_set: PoseSet, found: RayBounds) -> int:
+def violations(scene: NerfScene, pose_set: PoseBox, found: RayBounds) -> int:
     shape = (pose_set.camera.height, pose_set.camera.width, 3)
     render, probe, twin = nerf_renderer(scene, pose_set, UNIFORM)
     result = falsify(
@@ -237,7 +237,7 @@ def test_from_the_field_to_the_report(tmp_path: Path, monkeypatch: pytest.Monkey
     pose = np.eye(4)
     pose[:3] = view().camera_to_world
     path, spec, grid = tmp_path / "path.json", tmp_path / "spec.json", tmp_path / "grid.npz"
-    path.write_text(json.dumps(path_json([View(pose, 40.0, 3, 4)])))
+    path.write_text(json.dumps(path_json([KeyframeCamera(pose, 40.0, 3, 4)])))
     spec.write_text(json.dumps({"version": 1, "rotation": {"yaw": 0.002}}))
     made = ["occupancy", "--load-config", run, "--output-filename", grid, "--resolution", 16, "--threshold", 1.0]
     assert call(monkeypatch, export_command.main, made) == 0

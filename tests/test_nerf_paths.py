@@ -11,16 +11,16 @@ import pytest
 import torch
 from nerfs import BINS, attack_first_rays, pixels_of, poses, tiny_scene
 
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.nerf.bounds import NerfBounds, RayBounds
-from ns_abstract.methods.nerf.division import ENDS, Division, regrouped
+from ns_abstract.methods.nerf.division import ENDS, Division, regroup_parts
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.occupancy import OccupancyGrid
-from ns_abstract.methods.nerf.paths import Cells, Following, Lines, Paths, Samples
-from ns_abstract.methods.nerf.pencil import Pencil
+from ns_abstract.methods.nerf.ray_bundle import RayBundle
 from ns_abstract.methods.nerf.render import NerfRenderer, _filled, _weights, camera_rays
+from ns_abstract.methods.nerf.sample_paths import BundleBounds, FollowedSamples, RayCells, SampleLines, SamplePaths
 from ns_abstract.methods.nerf.scene import NerfScene
-from ns_abstract.refine.engine import Goal, Refinement
+from ns_abstract.refine.engine import Refinement, RefinementGoal
 
 SETS = {
     "point": {"rotation": {"yaw": [0.1, 0.1]}},
@@ -45,12 +45,12 @@ TIGHT = {
 }  # fmt: skip
 
 
-def bounded(scene: NerfScene, pose_set: PoseSet, tolerance: float) -> RayBounds:
+def bounded(scene: NerfScene, pose_set: PoseBox, tolerance: float) -> RayBounds:
     pixels = pixels_of(pose_set.camera)[:6]
     return NerfBounds(scene, BINS, pose_set.box.dimensions).rays(pose_set, pose_set.box, pixels, tolerance)
 
 
-def reached(scene: NerfScene, pose_set: PoseSet) -> float:
+def reached(scene: NerfScene, pose_set: PoseBox) -> float:
     """Mean gap of renders of the same rays."""
     box, renderer = pose_set.box, NerfRenderer(scene, BINS)
     values = [box.middle]
@@ -107,7 +107,7 @@ def test_shifted_colours_are_enclosed() -> None:
 def test_refinement_reaches_the_renders() -> None:
     """On a set of which bounds by bins leave 0.2 of the whole range open, and renders reach 0.005."""
     frame = NerfFrame(tiny_scene(3), BINS, poses({"rotation": {"yaw": 5e-4}}))
-    result = Refinement(frame, 0, Goal(ratio=1.2, seconds=200.0, cells=400)).run()
+    result = Refinement(frame, 0, RefinementGoal(ratio=1.2, seconds=200.0, cells=400)).run()
     assert result.trace[-1].mpg <= 1.2 * result.trace[-1].mpg_witness
     for values in frame.box.sample(40, np.random.default_rng(5)):
         picture = frame.render(values)
@@ -128,7 +128,7 @@ def test_lines_hold_the_places_of_every_part(counts: tuple[int, ...], straight: 
     bent = middle[:, None] + np.einsum("pj,ksj->kps", center, slope) + 0.1 * rng.normal(size=(7, parts, 5))
     half = np.einsum("pj,ksj->kps", 0.5 * (ends[1] - ends[0]), np.abs(slope)) + 0.01
     low, high = bent - half, bent + half
-    lines = Lines.around(low, high, counts, straight, 4.0)
+    lines = SampleLines.around(low, high, counts, straight, 4.0)
     assert not straight or not lines.slope.any()
     for part in range(parts):
         for _ in range(20):
@@ -145,7 +145,7 @@ def test_parts_are_regrouped_outward() -> None:
     rng = np.random.default_rng(1)
     for before, after in (((4,), (6,)), ((6,), (4,)), ((1, 5), (3, 2)), ((), ())):
         values = rng.random((2, 3, *before, 3))
-        low, high = (regrouped(values, end, after) for end in ENDS)
+        low, high = (regroup_parts(values, end, after) for end in ENDS)
         assert low.shape == high.shape == (2, 3, *after, 3)
         for place in rng.random((50, len(before))):
             a = tuple(int(x * n) for x, n in zip(place, before, strict=True))
@@ -155,7 +155,7 @@ def test_parts_are_regrouped_outward() -> None:
             assert (inside <= high[(slice(None), slice(None), *b)]).all()
 
 
-def sampled(renderer: NerfRenderer, pose_set: PoseSet, values: np.ndarray, pixels: np.ndarray) -> list[np.ndarray]:
+def sampled(renderer: NerfRenderer, pose_set: PoseBox, values: np.ndarray, pixels: np.ndarray) -> list[np.ndarray]:
     """Edges [n, S + 1], densities [n, S], colours [n, S, 3] and weights [n, S] of a render (`NerfRenderer.rays`)."""
     pose = torch.from_numpy(pose_set.pose(values))
     world = torch.from_numpy(camera_rays(pose_set.camera, pixels)) @ pose[:, :3].T
@@ -179,11 +179,11 @@ def test_samples_are_where_and_what_they_are_said_to_be(kind: str, grid: bool) -
     scene = dataclasses.replace(scene, occupancy=checkered() if grid else None)
     paths, pixels = NerfBounds(scene, BINS, 1).paths, pixels_of(pose_set.camera)[:6]
     assert paths is not None
-    work = Following(
-        paths, Pencil(pose_set, pose_set.box, pixels, paths.degree), Division((), 1, 2), np.zeros(6, np.int64), 1.0,
+    work = BundleBounds(
+        paths, RayBundle(pose_set, pose_set.box, pixels, paths.degree), Division((), 1, 2), np.zeros(6, np.int64), 1.0,
         None, [],
     )  # fmt: skip
-    samples = work.samples(0, Cells(np.arange(6), np.zeros(6, np.int64)))
+    samples = work.samples(0, RayCells(np.arange(6), np.zeros(6, np.int64)))
     parts, renderer, rng = samples.low.shape[1], NerfRenderer(scene, BINS), np.random.default_rng(0)
     dim = samples.color[0, ..., 0] > samples.color[1, ..., 0]
     assert dim.any() and not dim.all() and samples.price.any()
@@ -202,7 +202,7 @@ def test_samples_are_where_and_what_they_are_said_to_be(kind: str, grid: bool) -
 def test_what_is_negligible_is_charged() -> None:
     """Samples that may lie over one another, some of whose colours do not count."""
     rng, rows, count = np.random.default_rng(0), 30, 8
-    samples = Samples.__new__(Samples)
+    samples = FollowedSamples.__new__(FollowedSamples)
     samples.owner = NerfBounds(tiny_scene(0), BINS, 0).paths  # type: ignore[assignment]
     near, far = BINS.near, BINS.far
     middle = np.sort(rng.uniform(near, far, (rows, 1, count + 1)), axis=2)
@@ -246,17 +246,17 @@ def test_parts_hold_their_renders(name: str) -> None:
     assert d > 1 or (found.parts[1] - found.parts[0]).mean() < 0.7 * wide
 
 
-def fixed(self: Paths, *arguments: Any) -> tuple[np.ndarray, np.ndarray]:
-    """`Paths.edges` as if samples stayed where they are in the middle of a cell."""
+def fixed(self: SamplePaths, *arguments: Any) -> tuple[np.ndarray, np.ndarray]:
+    """`SamplePaths.edges` as if samples stayed where they are in the middle of a cell."""
     low, high = EDGES(self, *arguments)
     middle = 0.5 * (low + high).mean(axis=1, keepdims=True)
     return np.broadcast_to(middle, low.shape).copy(), np.broadcast_to(middle, low.shape).copy()
 
 
-EDGES = Paths.edges
+EDGES = SamplePaths.edges
 
 
 def test_planted_faults_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Paths, "edges", fixed)
+    monkeypatch.setattr(SamplePaths, "edges", fixed)
     scene, pose_set = tiny_scene(2, rough=20.0), poses({"rotation": {"yaw": 1e-3}})
     assert attack_first_rays(scene, pose_set, bounded(scene, pose_set, 0.05))[1] > 0

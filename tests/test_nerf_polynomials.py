@@ -14,7 +14,7 @@ from nerfs import poses
 from ns_abstract.arithmetic.chebyshev import ChebyshevBasis, bernstein_matrices, chebyshev_values
 from ns_abstract.arithmetic.rounding import CHEBYSHEV_ROUNDING
 from ns_abstract.arithmetic.taylor import TaylorArray, TaylorBasis, taylor_cos_sin
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.poses import PoseBox
 
 SETS = {
     "yaw": {"rotation": {"yaw": 0.05}},
@@ -36,7 +36,7 @@ def evaluate(model: TaylorArray, scaled: np.ndarray) -> np.ndarray:
     return np.tensordot(np.prod(scaled**exponents, axis=1), model.coefficients, 1)
 
 
-def worst_pose(pose_set: PoseSet, degree: int, shrink: float = 1.0) -> float:
+def worst_pose(pose_set: PoseBox, degree: int, shrink: float = 1.0) -> float:
     """Largest distance of a concrete pose from the model, in units of ``shrink`` times its radius."""
     models = pose_set.taylor(pose_set.box, degree)
     box, rng, worst = pose_set.box, np.random.default_rng(3), 0.0

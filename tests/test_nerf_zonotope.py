@@ -14,10 +14,10 @@ from ns_abstract.arithmetic.simd.lanes import LINE
 from ns_abstract.methods.nerf import relu_kernel, zonotope
 from ns_abstract.methods.nerf.bounds import basis_of
 from ns_abstract.methods.nerf.field_kernel import CHUNK
-from ns_abstract.methods.nerf.layer_kernel import BLOCK, Before, Behind, Weights, linear
+from ns_abstract.methods.nerf.layer_kernel import BLOCK, LayerInput, LayerOutput, LayerWeights, linear
 from ns_abstract.methods.nerf.outputs import greatest, opacity
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer
-from ns_abstract.methods.nerf.zonotope import Affine, FieldBounds
+from ns_abstract.methods.nerf.zonotope import FieldBounds, PreActivation
 
 #: A tolerance of zero: what is compared carries its own rounding.
 FIELDS = {
@@ -137,7 +137,7 @@ def test_a_wave_that_is_wrongly_left_out_is_noticed(monkeypatch: pytest.MonkeyPa
     assert worst(weights, 3e-3)[0] > 0.0
 
 
-def random_batch(field: FieldBounds, width: int, seed: int) -> Affine:
+def random_batch(field: FieldBounds, width: int, seed: int) -> PreActivation:
     """Every unit of a layer before its activation: dead, active and open ones, with and without columns and box."""
     rng, pieces, terms = np.random.default_rng(seed), 16, 3
     monomials = field.basis.evaluation.shape[1]
@@ -151,7 +151,7 @@ def random_batch(field: FieldBounds, width: int, seed: int) -> Affine:
     failed = torch.zeros(pieces, dtype=torch.bool)
     spread = np.abs(columns).reshape(pieces, terms, width).sum(axis=1)
     arrays = [torch.from_numpy(a) for a in (poly, columns, owner, spread, box)]
-    return Affine(arrays[0], arrays[1], arrays[2], arrays[3], arrays[4], failed, count)
+    return PreActivation(arrays[0], arrays[1], arrays[2], arrays[3], arrays[4], failed, count)
 
 
 def moved(columns: torch.Tensor, owner: torch.Tensor, signs: torch.Tensor, pieces: int) -> torch.Tensor:
@@ -159,7 +159,7 @@ def moved(columns: torch.Tensor, owner: torch.Tensor, signs: torch.Tensor, piece
     return torch.zeros(pieces, columns.shape[1], dtype=torch.float64).index_add_(0, owner, columns * signs[:, None])
 
 
-def compiled_relu(field: FieldBounds, z: Affine) -> zonotope.Pieces:
+def compiled_relu(field: FieldBounds, z: PreActivation) -> zonotope.PostActivation:
     """`FieldBounds._relu` by the compiled kernel."""
     assert field._grid is not None
     pieces, _, n = z.poly.shape
@@ -167,18 +167,18 @@ def compiled_relu(field: FieldBounds, z: Affine) -> zonotope.Pieces:
     failed, count = torch.empty_like(z.failed), torch.empty_like(z.count)
     piece, neuron = torch.empty(2, pieces * n, dtype=torch.int64)
     error = torch.empty(pieces * n, dtype=torch.float64)
-    before = relu_kernel.Before(*(a.numpy() for a in (z.poly, z.spread, z.box, z.failed, z.count)))
-    behind = relu_kernel.Behind(*(a.numpy() for a in (slope, size, spread, failed, count, piece, neuron, error)))
+    before = relu_kernel.ReluInput(*(a.numpy() for a in (z.poly, z.spread, z.box, z.failed, z.count)))
+    behind = relu_kernel.ReluOutput(*(a.numpy() for a in (slope, size, spread, failed, count, piece, neuron, error)))
     found = relu_kernel.relu(before, field._grid, field.limit, behind)
     new = piece[:found], neuron[:found], error[:found]
-    return zonotope.Pieces(z.poly, z.columns, z.owner, slope, *new, spread, z.box, size, failed, count)
+    return zonotope.PostActivation(z.poly, z.columns, z.owner, slope, *new, spread, z.box, size, failed, count)
 
 
 #: An encoded vector of no number, for layers that see none.
 NOTHING = torch.zeros(16, 1, 0, dtype=torch.float64), torch.zeros(16, 0, dtype=torch.float64)
 
 
-def hidden_layer(field: FieldBounds) -> zonotope._Linear:
+def hidden_layer(field: FieldBounds) -> zonotope._FieldLayer:
     """A layer of ``field`` all of whose inputs are neurons."""
     return replace(field._base[1], seen=0)
 
@@ -303,13 +303,13 @@ def test_products_leave_out_what_is_off(kind: type, inputs: int, live: int, outp
     sizes = rng.uniform(size=len(neuron))
     wide = rng.normal(size=(inputs, outputs)).astype(np.float32).astype(np.float64)
     total = len(owner) + len(neuron)
-    out = Behind(
+    out = LayerOutput(
         np.full((batch, m, outputs), np.nan), np.full((total, outputs), np.nan, kind), np.full(total, -1),
         *np.full((2, batch, outputs), np.nan),
     )  # fmt: skip
     rest = np.where(off, np.nan, rng.uniform(size=(batch, inputs)))
     failed, none = np.zeros(batch, bool), np.zeros(batch, np.int64)
-    before = Before(
+    before = LayerInput(
         poly, np.where(off, 0.0, 1.0), rest, rest, slope, failed, none, columns, owner, new_owner, neuron, sizes
     )
     # columns and rows of an encoded vector come first
@@ -317,7 +317,9 @@ def test_products_leave_out_what_is_off(kind: type, inputs: int, live: int, outp
     given = rng.normal(size=(2, outputs))
     lines[:, :outputs] = np.concatenate([given, wide])
     encoded, remainder, bias = rng.normal(size=(batch, m, 2)), rng.uniform(size=(batch, 2)), rng.normal(size=outputs)
-    weights = Weights(lines[:2], np.abs(given), lines[2:], lines[2:].astype(kind), np.abs(wide), bias, 0.0, 0.0, 0.0)
+    weights = LayerWeights(
+        lines[:2], np.abs(given), lines[2:], lines[2:].astype(kind), np.abs(wide), bias, 0.0, 0.0, 0.0
+    )
     assert linear(before, encoded, remainder, weights, out) == total
     result = np.where(off[:, None], 0.0, poly) @ wide + encoded @ given
     result[:, 0] += bias
@@ -445,7 +447,7 @@ def faulty_remainder(monkeypatch: pytest.MonkeyPatch) -> None:
 def faulty_columns(monkeypatch: pytest.MonkeyPatch) -> None:
     linear = FieldBounds._linear
 
-    def narrowed(self: FieldBounds, pieces: zonotope.Pieces, *arguments: object) -> Affine:
+    def narrowed(self: FieldBounds, pieces: zonotope.PostActivation, *arguments: object) -> PreActivation:
         return linear(self, replace(pieces, slope=0.1 * pieces.slope), *arguments)  # type: ignore[arg-type]
 
     monkeypatch.setattr(FieldBounds, "_linear", narrowed)
@@ -454,7 +456,7 @@ def faulty_columns(monkeypatch: pytest.MonkeyPatch) -> None:
 def faulty_sums(monkeypatch: pytest.MonkeyPatch) -> None:
     linear = FieldBounds._linear
 
-    def narrowed(self: FieldBounds, *arguments: object) -> Affine:
+    def narrowed(self: FieldBounds, *arguments: object) -> PreActivation:
         found = linear(self, *arguments)  # type: ignore[arg-type]
         return replace(found, spread=0.1 * found.spread)
 
@@ -487,7 +489,7 @@ def test_greatest_values_on_whole_cells() -> None:
     poly[8:12, 0] *= 1e12
     spread, box = rng.uniform(0.0, 2.0, (2, 40, 2)) * (rng.uniform(size=(40, 1)) < 0.7)
     nothing = torch.zeros(40, dtype=torch.int64)
-    value = Affine(
+    value = PreActivation(
         torch.from_numpy(poly), torch.zeros(0, 2), nothing[:0], torch.from_numpy(spread), torch.from_numpy(box),
         nothing > 0, nothing,
     )  # fmt: skip

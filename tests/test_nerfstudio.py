@@ -24,7 +24,7 @@ from waiting import until
 
 from ns_abstract.cli.viewer import Viewer
 from ns_abstract.geometry.camera_path import load_camera_path
-from ns_abstract.geometry.views import path_json
+from ns_abstract.geometry.keyframe_cameras import path_json
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.load import load_any
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
@@ -40,7 +40,7 @@ from ns_abstract.methods.splat.write import write_splatfacto_run
 from ns_abstract.nerfstudio import torchvision_operators
 from ns_abstract.perturbation.specification import load_perturbation
 from ns_abstract.viewer.background import Status
-from ns_abstract.viewer.views import View, perturbation_of
+from ns_abstract.viewer.views import ViewRequest, perturbation_of
 
 pytestmark = [needs_nerfstudio, pytest.mark.filterwarnings("ignore")]
 STAMP = "2026-01-01_000000"
@@ -497,7 +497,7 @@ def test_requests_that_are_lost_are_made_again(nerfstudio: SimpleNamespace) -> N
 
 
 def test_words_for_every_state(nerfstudio: SimpleNamespace) -> None:
-    view = View(nerfstudio.panel.camera_of(cameras(nerfstudio)), perturbation_of({"x": 0.01}))
+    view = ViewRequest(nerfstudio.panel.camera_of(cameras(nerfstudio)), perturbation_of({"x": 0.01}))
     text = nerfstudio.panel.describe(view, None, Status("failed", "out of memory"))
     assert "no bounds yet" in text and "stopped: out of memory" in text
 
@@ -511,7 +511,7 @@ def test_options_are_ns_viewers(nerfstudio: SimpleNamespace) -> None:
     # ours listens on this machine alone
     theirs["websocket_host"] = "127.0.0.1"
     assert {entry.name: entry.default for entry in dataclasses.fields(Viewer)} == theirs
-    from ns_abstract.cli.viewer import View as Command
+    from ns_abstract.cli.viewer import ViewRun as Command
 
     names = [entry.name for entry in dataclasses.fields(RunViewer)]
     own = [entry.name for entry in dataclasses.fields(Command) if entry.name != "overrides"]
@@ -690,7 +690,7 @@ def test_a_nerf_in_the_viewer(nerfstudio: SimpleNamespace, folder: Path, monkeyp
         assert "uniform samples" in text and "real-sound" in text
         source = model.abstract_source()
         assert model.abstract_source() is source
-        small = View(nerfstudio.panel.camera_of(camera), model.abstract.perturbation).at_most(source.most)
+        small = ViewRequest(nerfstudio.panel.camera_of(camera), model.abstract.perturbation).at_most(source.most)
 
         def bounded() -> Any:
             found = model._background.best(small, 20.0)

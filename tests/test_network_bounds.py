@@ -24,22 +24,22 @@ from ns_abstract.verify.network import (
     NetworkArithmetic,
     backward,
     bound_outputs,
+    cost_model,
     forward,
-    intermediate,
-    known,
+    intermediate_bounds,
     load_network,
-    outputs,
-    pooling,
-    schedule,
-    selection,
+    max_pool_propagation,
+    neuron_bounds,
+    neuron_selection,
+    output_bounds,
 )
-from ns_abstract.verify.network.bounds import _Cells
-from ns_abstract.verify.network.forward import Forward
-from ns_abstract.verify.network.intermediate import Intermediate
-from ns_abstract.verify.network.known import Known
+from ns_abstract.verify.network.bounds import _NetworkBounds
+from ns_abstract.verify.network.coefficients import columns_of, concretize
+from ns_abstract.verify.network.forward import ForwardPass
+from ns_abstract.verify.network.intermediate_bounds import IntermediateBounds
 from ns_abstract.verify.network.layers import Convolution
-from ns_abstract.verify.network.reached import Enough, Goal, Reached
-from ns_abstract.verify.network.rows import columns_of, concretize
+from ns_abstract.verify.network.neuron_bounds import NeuronBounds
+from ns_abstract.verify.network.stopping import BackwardBounds, NeuronTarget, StoppingCriterion
 
 Vector = list[Fraction]
 SHAPE = (2, 4, 4)
@@ -183,9 +183,9 @@ def test_deep_networks_are_bounded(allowed: float, tmp_path: Path, monkeypatch: 
     network, rows = load_network(file), np.random.default_rng(0).normal(size=(4, 3))
     images = image_sets((2, 16, 16), 2, 2, 0.01, 0.002)
     plain = bound_outputs(network, images, rows, np.zeros(4))
-    monkeypatch.setattr(schedule, "_DEEP", 0.0)
-    monkeypatch.setattr(schedule, "_ALLOWED", allowed)
-    monkeypatch.setattr(schedule, "_PLANNED", allowed)
+    monkeypatch.setattr(cost_model, "_DEEP", 0.0)
+    monkeypatch.setattr(cost_model, "_ALLOWED", allowed)
+    monkeypatch.setattr(cost_model, "_PLANNED", allowed)
     threads = torch.get_num_threads()
     found = []
     try:
@@ -211,12 +211,12 @@ def test_rows_that_end_on_the_way_lie_below_the_exact_minimum(
     enough: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Rows for all numbers of a layer may end at an earlier one: what they say there holds, and is not for nothing."""
-    monkeypatch.setattr(schedule, "_DEEP", 0.0)
-    monkeypatch.setattr(schedule, "_CHEAP", 0.0)
-    monkeypatch.setattr(schedule, "_RENEW", -1.0)
-    monkeypatch.setattr(schedule, "_ENOUGH", enough)
+    monkeypatch.setattr(cost_model, "_DEEP", 0.0)
+    monkeypatch.setattr(cost_model, "_CHEAP", 0.0)
+    monkeypatch.setattr(cost_model, "_RENEW", -1.0)
+    monkeypatch.setattr(cost_model, "_ENOUGH", enough)
     ended, said, gaps, spans = 0, {}, 0.0, 0.0
-    one_hot, bounded = Intermediate._one_hot, Intermediate.bounded
+    one_hot, bounded = NeuronBounds._one_hot, NeuronBounds.bounded
 
     def watched(*arguments: Any) -> Any:
         nonlocal ended
@@ -224,12 +224,12 @@ def test_rows_that_end_on_the_way_lie_below_the_exact_minimum(
         ended += int((found.ended > 0).sum())
         return found
 
-    def heard(numbers: Intermediate, index: int, *arguments: Any) -> Any:
+    def heard(numbers: NeuronBounds, index: int, *arguments: Any) -> Any:
         said[index] = bounded(numbers, index, *arguments)
         return said[index]
 
-    monkeypatch.setattr(Intermediate, "_one_hot", watched)
-    monkeypatch.setattr(Intermediate, "bounded", heard)
+    monkeypatch.setattr(NeuronBounds, "_one_hot", watched)
+    monkeypatch.setattr(NeuronBounds, "bounded", heard)
     for seed in range(3):
         network, layers, _ = mlp(tmp_path, seed, sizes=(3, 6, 6, 6, 2))
         rng = np.random.default_rng(seed)
@@ -253,26 +253,26 @@ def test_rows_that_end_on_the_way_lie_below_the_exact_minimum(
     assert gaps <= 3.0 * spans
 
 
-def planned(monkeypatch: pytest.MonkeyPatch, which: int | None = None) -> list[schedule.Way]:
+def planned(monkeypatch: pytest.MonkeyPatch, which: int | None = None) -> list[cost_model.BackwardRoute]:
     """Let rows of all networks end by plan, or go the ``which``-th way of theirs; the ways that are gone."""
-    monkeypatch.setattr(schedule, "_DEEP", 0.0)
-    monkeypatch.setattr(schedule, "_OVER", 0.0)
-    monkeypatch.setattr(schedule, "_APART", 0.0)
+    monkeypatch.setattr(cost_model, "_DEEP", 0.0)
+    monkeypatch.setattr(cost_model, "_OVER", 0.0)
+    monkeypatch.setattr(cost_model, "_APART", 0.0)
     if which is not None:
 
-        def ways(run: schedule.Schedule, index: int, _: int) -> tuple[list[schedule.Way], float]:
+        def ways(run: cost_model.WorkBudget, index: int, _: int) -> tuple[list[cost_model.BackwardRoute], float]:
             known = run.costs.ways(index)
             return [known[min(which, len(known) - 1)]], 0.0
 
-        monkeypatch.setattr(schedule.Schedule, "ways", ways)
-    used: list[schedule.Way] = []
-    ready = Known.ready
+        monkeypatch.setattr(cost_model.WorkBudget, "ways", ways)
+    used: list[cost_model.BackwardRoute] = []
+    ready = IntermediateBounds.ready
 
-    def heard(known: Known, way: schedule.Way) -> int:
+    def heard(known: IntermediateBounds, way: cost_model.BackwardRoute) -> int:
         used.append(way)
         return ready(known, way)
 
-    monkeypatch.setattr(Known, "ready", heard)
+    monkeypatch.setattr(IntermediateBounds, "ready", heard)
     return used
 
 
@@ -282,13 +282,13 @@ def test_rows_that_end_by_plan_lie_below_the_exact_minimum(
     which: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     used = planned(monkeypatch, which)
-    bounded, said = Intermediate.bounded, {}
+    bounded, said = NeuronBounds.bounded, {}
 
-    def heard(numbers: Intermediate, index: int, *arguments: Any) -> Any:
+    def heard(numbers: NeuronBounds, index: int, *arguments: Any) -> Any:
         said[index] = bounded(numbers, index, *arguments)
         return said[index]
 
-    monkeypatch.setattr(Intermediate, "bounded", heard)
+    monkeypatch.setattr(NeuronBounds, "bounded", heard)
     gaps = spans = 0.0
     for seed in range(3):
         network, layers, _ = mlp(tmp_path, seed, sizes=(3, 6, 6, 6, 6, 2))
@@ -342,13 +342,13 @@ def test_rows_that_rest_on_several_nodes(
     reach = np.abs(a).sum(-1) + slack
     images = ImageSets(a, b - slack, a, b + slack, b - reach, b + reach)
     forms: dict[int, Any] = {}
-    leave = Forward._leave
+    leave = ForwardPass._leave
 
-    def left(forward: Forward, index: int) -> None:
-        forms[index] = forward.known.forms[index]
+    def left(forward: ForwardPass, index: int) -> None:
+        forms[index] = forward.intermediate.forms[index]
         leave(forward, index)
 
-    monkeypatch.setattr(Forward, "_leave", left)
+    monkeypatch.setattr(ForwardPass, "_leave", left)
     found = []
     threads = torch.get_num_threads()
     try:
@@ -372,7 +372,7 @@ def test_rows_that_rest_on_several_nodes(
     if which in (0, 1):
         assert max(len(way.rests) for way in used) > 1
     middle = rows @ network(torch.from_numpy(0.5 * (images.lower + images.upper)).reshape(1, *shape)).numpy().T
-    monkeypatch.setattr(schedule.Schedule, "ways", lambda *_: ([], 0.0))
+    monkeypatch.setattr(cost_model.WorkBudget, "ways", lambda *_: ([], 0.0))
     none = bound_outputs(network, images, rows, np.zeros(4), arithmetic="real")
     gaps = [(middle.T - one.lower).mean() for one in (found[0], none)]
     assert gaps[0] <= (0.8 if which is None else 1.05) * gaps[1]
@@ -396,14 +396,14 @@ def test_short_rows_keep_deep_networks_bounded(tmp_path: Path, monkeypatch: pyte
     images = image_sets((2, 8, 8), 1, 2, 1e-5, 1e-6)
     middle = rows @ network(torch.from_numpy(0.5 * (images.lower + images.upper)).reshape(1, 2, 8, 8)).numpy().T
     used = planned(monkeypatch)
-    total = schedule.Costs(network).total
+    total = cost_model.CostModel(network).total
     gaps = []
     for part in (10.0, 0.1, 0.03, 0.0):
-        monkeypatch.setattr(schedule, "_PLANNED", part * total)
-        taken: list[schedule.Schedule] = []
-        start = schedule.Schedule.__init__
+        monkeypatch.setattr(cost_model, "_PLANNED", part * total)
+        taken: list[cost_model.WorkBudget] = []
+        start = cost_model.WorkBudget.__init__
         monkeypatch.setattr(
-            schedule.Schedule,
+            cost_model.WorkBudget,
             "__init__",
             lambda run, net, start=start, taken=taken: (taken.append(run), start(run, net))[1],
         )
@@ -471,7 +471,7 @@ def test_rows_that_end_by_plan_keep_within_memory(tmp_path: Path) -> None:
 
 def test_plans_keep_to_what_is_allowed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     network = chain(tmp_path)
-    costs = schedule.Costs(network)
+    costs = cost_model.CostModel(network)
     widest = []
     for part in (10.0, 0.3, 0.1, 0.03):
         plan = costs.plan(part * costs.total, [1e-4], 1.0)
@@ -481,9 +481,9 @@ def test_plans_keep_to_what_is_allowed(tmp_path: Path, monkeypatch: pytest.Monke
     assert sorted(widest) == widest and widest[-1] > 10.0 * widest[0]
     # where bounds are close enough in any case, no rows are worth their price
     assert costs.plan(costs.total, [1e-30], 1.0).products < 0.1 * costs.total
-    monkeypatch.setattr(schedule, "_OVER", 0.0)
-    monkeypatch.setattr(schedule, "_DEEP", 0.0)
-    run = schedule.Schedule(network)
+    monkeypatch.setattr(cost_model, "_OVER", 0.0)
+    monkeypatch.setattr(cost_model, "_DEEP", 0.0)
+    run = cost_model.WorkBudget(network)
     for k in range(4):
         run.learns(k, 1e9, 1.0)
     run.ways(3, 512)
@@ -494,21 +494,21 @@ def test_what_ends_rows() -> None:
     """A sign; or both ends close, and no kink between; what a ReLU cuts off may be as wide as it likes."""
     lower = np.array([-3.0, -3.0, 1.0, 1.0, -1.0, -0.1, 2.0])
     upper = np.array([-1.0, 3.0, 1.1, 3.0, -0.9, 0.1, 2.1])
-    found = Reached(np.zeros((7, 2, 2)), lower, upper, np.zeros(7, np.int64))
+    found = BackwardBounds(np.zeros((7, 2, 2)), lower, upper, np.zeros(7, np.int64))
     every = np.arange(7)
 
-    def done(goal: Goal, negative: bool, zero: float = 0.0) -> list[int]:
-        enough = Enough(goal, np.full(7, zero), np.full(7, negative))
+    def done(goal: NeuronTarget, negative: bool, zero: float = 0.0) -> list[int]:
+        enough = StoppingCriterion(goal, np.full(7, zero), np.full(7, negative))
         return np.flatnonzero(enough.done(found, every)).tolist()
 
-    assert done(Goal(), False) == [2, 3, 6]
-    assert done(Goal(0.2), False) == [0, 2, 4, 6]
-    assert done(Goal(0.2), True) == [2, 3, 4, 6]
-    assert done(Goal(0.2, cut=False), False) == [2, 4, 6]
-    assert done(Goal(0.2, kink=False), False) == [2, 4, 5, 6]
+    assert done(NeuronTarget(), False) == [2, 3, 6]
+    assert done(NeuronTarget(0.2), False) == [0, 2, 4, 6]
+    assert done(NeuronTarget(0.2), True) == [2, 3, 4, 6]
+    assert done(NeuronTarget(0.2, cut=False), False) == [2, 4, 6]
+    assert done(NeuronTarget(0.2, kink=False), False) == [2, 4, 5, 6]
     # relative to references zero is elsewhere
-    assert done(Goal(0.2, cut=False), False, zero=2.05) == [2, 4, 5]
-    enough = Enough(Goal(0.2), np.zeros(7), every > 3)
+    assert done(NeuronTarget(0.2, cut=False), False, zero=2.05) == [2, 4, 5]
+    enough = StoppingCriterion(NeuronTarget(0.2), np.zeros(7), every > 3)
     np.testing.assert_array_equal(enough[4:].done(found, every[:3]), [False, False, True])
 
 
@@ -524,14 +524,14 @@ def test_early_rows_keep_later_ones_exact(tmp_path: Path, monkeypatch: pytest.Mo
     f.gemm(512, 3)
     network, rows = load_network(f.write(tmp_path / "net.onnx")), np.eye(3)
     images = image_sets(shape, 1, 2, 1e-8, 1e-9)
-    monkeypatch.setattr(schedule, "_DEEP", 0.0)
+    monkeypatch.setattr(cost_model, "_DEEP", 0.0)
     middle = rows @ network(torch.from_numpy(0.5 * (images.lower + images.upper)).reshape(1, *shape)).numpy().T
     gaps = []
     for cheap in (0.0, 0.03):
-        monkeypatch.setattr(schedule, "_CHEAP", cheap)
-        cells = _Cells(network, images, "everywhere", 1 << 30, "real")
+        monkeypatch.setattr(cost_model, "_CHEAP", cheap)
+        cells = _NetworkBounds(network, images, "everywhere", 1 << 30, "real")
         # rows of outputs in float64 lose next to nothing of themselves
-        cells.known.passages.pop()
+        cells.intermediate.relaxations.pop()
         gaps.append((middle.T - cells.outputs(rows, np.zeros(3)).lower).mean())
     assert 0.0 < gaps[1] < 0.5 * gaps[0]
 
@@ -623,12 +623,12 @@ def test_curves_are_bounded_by_what_rows_leave(deep: bool, tmp_path: Path, monke
     file = f.write(tmp_path / "net.onnx")
     network, images, rows = load_network(file), image_sets(shape, 2, 2, 1e-3, 1e-4), np.eye(3)
     if deep:
-        monkeypatch.setattr(schedule, "_DEEP", 0.0)
+        monkeypatch.setattr(cost_model, "_DEEP", 0.0)
         # nor are all numbers of a node bounded for another reason
-        monkeypatch.setattr(schedule, "_CHEAP", 0.0)
+        monkeypatch.setattr(cost_model, "_CHEAP", 0.0)
     found = bound_outputs(network, images, rows, np.zeros(3), arithmetic="real").lower
     with monkeypatch.context() as patch:
-        patch.setattr(selection, "_HALF", -1.0)
+        patch.setattr(neuron_selection, "_HALF", -1.0)
         without = bound_outputs(network, images, rows, np.zeros(3), arithmetic="real").lower
     middle = network(torch.from_numpy(0.5 * (images.lower + images.upper)).reshape(2, *shape)).numpy()
     assert (found <= middle).all()
@@ -642,7 +642,7 @@ def test_curves_are_bounded_by_what_rows_leave(deep: bool, tmp_path: Path, monke
 @pytest.mark.slow
 def test_deep_networks_are_given_up_early(tmp_path: Path) -> None:
     network = load_network(residual(tmp_path))
-    run = schedule.Schedule(network)
+    run = cost_model.WorkBudget(network)
     assert run.vain(0.95, 0.0, 0.1) and run.left > 0.0
     assert not run.vain(0.5, 0.5, 0.9) and run.left > 0.0
     assert run.vain(0.5, 0.95, 0.9) and run.left == 0.0
@@ -651,12 +651,12 @@ def test_deep_networks_are_given_up_early(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_rows_cost_what_their_windows_hold(tmp_path: Path) -> None:
     network = load_network(residual(tmp_path))
-    costs = schedule.Costs(network)
+    costs = cost_model.CostModel(network)
     first = next(k for k, node in enumerate(network.nodes, 1) if node.op == "Conv")
     layer = network.nodes[first - 1].layer
     assert isinstance(layer, Convolution)
     # one number of the first convolution: its channels there, the weights, and its window of the image
-    assert costs.row(first) == schedule._PASSING * (6 + 18) + layer.weight.numel()
+    assert costs.row(first) == cost_model._PASSING * (6 + 18) + layer.weight.numel()
     assert costs.row(len(network.nodes)) > 10 * costs.row(first)
 
 
@@ -753,7 +753,7 @@ def test_parts_change_nothing_but_rounding(tmp_path: Path, monkeypatch: pytest.M
     rows[:3] = np.eye(3, network.output_size, 4)
     whole = bound_outputs(network, images, rows, np.zeros(6))
     tiny = bound_outputs(network, images, rows, np.zeros(6), memory=1)
-    for part in (backward, intermediate, outputs, pooling):
+    for part in (backward, neuron_bounds, output_bounds, max_pool_propagation):
         monkeypatch.setattr(part, "ROWS_AT_ONCE", 1)
     single = bound_outputs(network, images, rows, np.zeros(6))
     one = [bound_outputs(network, images[k : k + 1], rows[[0, 4]], np.zeros(2)).lower[0] for k in range(5)]
@@ -818,7 +818,7 @@ def test_float32_rounding_is_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     rows = np.concatenate([np.eye(4), -np.eye(4)])
     for charged in (True, False):
         if not charged:
-            for part in (forward, known, network_charges):
+            for part in (forward, intermediate_bounds, network_charges):
                 monkeypatch.setattr(part, "UNIT", 0.0)
         lower = bound_outputs(network, images, rows, np.zeros(8)).lower
         broken[charged] = int((lower > y @ rows.T).sum())

@@ -32,10 +32,10 @@ from torch.nn import functional
 from ns_abstract.arithmetic.network_charges import gamma
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import ImageSets, Network, bound_outputs
-from ns_abstract.verify.network.build import Builder
+from ns_abstract.verify.network.build import NetworkBuilder
 from ns_abstract.verify.network.layers import Convolution, Matrix
-from ns_abstract.verify.network.maps import TransposedConvolution
 from ns_abstract.verify.network.onnx_file import read_onnx
+from ns_abstract.verify.network.sparse_layers import TransposedConvolution
 
 
 def bounds(network: Network, low: Array, high: Array, arithmetic: Any = "float32") -> tuple[Array, Array]:
@@ -143,7 +143,7 @@ def test_counts_of_dilated_sums(kernel: int, stride: int, dilation: int) -> None
     met = functional.conv_transpose1d(torch.ones((1, 1, 60)), taps, None, stride, 0, 0, 1, dilation)
     most = int(met.max())
     weight = np.ones((1, 1, kernel, kernel))
-    b = Builder(Path("net.onnx"), (1, 200, 200))
+    b = NetworkBuilder(Path("net.onnx"), (1, 200, 200))
     index = b.convolution(0, weight, None, (stride,) * 2, (dilation,) * 2, (0,) * 4, 1)
     layer = b.nodes[index - 1].layer
     assert isinstance(layer, Convolution) and layer.row_terms == most**2
@@ -170,7 +170,7 @@ def test_sums_without_a_digit_are_refused() -> None:
     with pytest.raises(InputError, match="no digit"):
         gamma(torch.tensor([3.0, 2.0**24]))
     assert gamma(2**20) > 0.0 and gamma(2**30, 2.0**-53) > 0.0
-    b = Builder(Path("net.onnx"), (4,))
+    b = NetworkBuilder(Path("net.onnx"), (4,))
     layer = Matrix(((4,),), (1,), 2**23, 1, torch.ones((1, 4), dtype=torch.float64))
     with pytest.raises(InputError, match="no digit"):
         b._add(layer, 0)

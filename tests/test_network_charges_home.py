@@ -22,7 +22,15 @@ import ns_abstract
 from ns_abstract.arithmetic import network_charges
 from ns_abstract.arithmetic.network_table import FUNCTIONS, ROWS, SYMBOLS, Row
 from ns_abstract.io.errors import InputError
-from ns_abstract.verify.network import curves, doubtful, layers, maps, maxima, products, recognised
+from ns_abstract.verify.network import (
+    activations,
+    bilinear,
+    composite_activations,
+    inexact_constants,
+    layers,
+    max_pooling,
+    sparse_layers,
+)
 from ns_abstract.verify.network import rounding as network_rounding
 from ns_abstract.verify.network.layers import Activation
 from ns_abstract.verify.network.load import load_network
@@ -44,10 +52,10 @@ PREFERENCES = re.compile(
 
 
 def found_layers() -> Iterator[type]:
-    for module in (layers, maps, curves, recognised, doubtful, maxima, products):
+    for module in (layers, sparse_layers, activations, composite_activations, inexact_constants, max_pooling, bilinear):
         for name, kind in vars(module).items():
             own = inspect.isclass(kind) and kind.__module__ == module.__name__ and not name.startswith("_")
-            if own and issubclass(kind, (layers.Linear, Activation, maxima.MaxPool, products.Product)):
+            if own and issubclass(kind, (layers.LinearLayer, Activation, max_pooling.MaxPool, bilinear.Product)):
                 yield kind
 
 
@@ -99,34 +107,34 @@ def instances() -> list[tuple[str, Activation]]:
         ("leaky ReLU", layers.LeakyRelu(shape, 0.1)),
         ("sigmoid, tanh", layers.Sigmoid(shape)),
         ("sigmoid, tanh", layers.Tanh(shape)),
-        ("clip", curves.Clip(shape, least=-1.0, most=2.0)),
-        ("hard sigmoid", curves.Clip(shape, factor=0.2, offset=0.5)),
-        ("absolute value", curves.Abs(shape)),
-        ("hard swish", curves.HardSwish(shape)),
-        ("hard swish", recognised.GatedClip(shape, factor=0.17)),
-        ("square", curves.Power(shape)),
-        ("power of a whole number", curves.Power(shape, exponent=5)),
-        ("reciprocal, quotient", curves.Reciprocal(shape)),
-        ("reciprocal, quotient", curves.Share(shape)),
-        ("share of a sum that is cut off", curves.Share(shape)),
-        ("root", curves.Root(shape)),
-        ("reciprocal root", curves.Root(shape, inverse=True)),
-        ("exponential", curves.Exp(shape)),
-        ("softmax's exponentials", curves.CappedExp(shape, count=200)),
-        ("logarithm", curves.Log(shape)),
-        ("softplus", curves.Softplus(shape)),
-        ("softplus", recognised.SwitchedSoftplus(shape, limit=20.0, excess=1e-7)),
-        ("switched softplus", recognised.SwitchedSoftplus(shape, limit=20.0, excess=1e-7)),
-        ("ELU, SELU, CELU", curves.Elu(shape, alpha=1.5, scale=1.1)),
-        ("error function", curves.Erf(shape)),
-        ("SiLU, GELU, Mish", curves.Silu(shape)),
-        ("SiLU, GELU, Mish", curves.Gelu(shape)),
-        ("SiLU, GELU, Mish", curves.GeluTanh(shape)),
-        ("SiLU, GELU, Mish", curves.Mish(shape)),
-        ("SiLU, GELU, Mish", recognised.ScaledGelu(shape, rate=1.001)),
-        ("functions with constants of the file", recognised.ScaledGelu(shape, rate=1.001)),
-        ("functions with constants of the file", recognised.GatedClip(shape)),
-        ("values in steps", recognised.Quantised(shape, least=-128.0, most=127.0, step=0.5)),
+        ("clip", activations.Clip(shape, least=-1.0, most=2.0)),
+        ("hard sigmoid", activations.Clip(shape, factor=0.2, offset=0.5)),
+        ("absolute value", activations.Abs(shape)),
+        ("hard swish", activations.HardSwish(shape)),
+        ("hard swish", composite_activations.GatedClip(shape, factor=0.17)),
+        ("square", activations.Power(shape)),
+        ("power of a whole number", activations.Power(shape, exponent=5)),
+        ("reciprocal, quotient", activations.Reciprocal(shape)),
+        ("reciprocal, quotient", activations.SoftmaxReciprocal(shape)),
+        ("share of a sum that is cut off", activations.SoftmaxReciprocal(shape)),
+        ("root", activations.Root(shape)),
+        ("reciprocal root", activations.Root(shape, inverse=True)),
+        ("exponential", activations.Exp(shape)),
+        ("softmax's exponentials", activations.CappedExp(shape, count=200)),
+        ("logarithm", activations.Log(shape)),
+        ("softplus", activations.Softplus(shape)),
+        ("softplus", composite_activations.SwitchedSoftplus(shape, limit=20.0, excess=1e-7)),
+        ("switched softplus", composite_activations.SwitchedSoftplus(shape, limit=20.0, excess=1e-7)),
+        ("ELU, SELU, CELU", activations.Elu(shape, alpha=1.5, scale=1.1)),
+        ("error function", activations.Erf(shape)),
+        ("SiLU, GELU, Mish", activations.Silu(shape)),
+        ("SiLU, GELU, Mish", activations.Gelu(shape)),
+        ("SiLU, GELU, Mish", activations.GeluTanh(shape)),
+        ("SiLU, GELU, Mish", activations.Mish(shape)),
+        ("SiLU, GELU, Mish", composite_activations.ScaledGelu(shape, rate=1.001)),
+        ("functions with constants of the file", composite_activations.ScaledGelu(shape, rate=1.001)),
+        ("functions with constants of the file", composite_activations.GatedClip(shape)),
+        ("values in steps", composite_activations.Quantised(shape, least=-128.0, most=127.0, step=0.5)),
     ]
 
 

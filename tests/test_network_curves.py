@@ -12,8 +12,8 @@ import torch
 from flint import arb, fmpq
 from oracle import at_most, rational
 
-from ns_abstract.verify.network import curves
-from ns_abstract.verify.network.curves import Curve
+from ns_abstract.verify.network import activations
+from ns_abstract.verify.network.activations import ScalarFunction
 
 ZERO = fmpq(0)
 Exact = Callable[[arb], arb]
@@ -32,36 +32,36 @@ def _elu(z: arb, alpha: float, scale: float, width: float) -> arb:
 
 
 #: A curve, its exact function, and the inputs to try.
-CURVES: dict[str, tuple[Curve, Exact, tuple[float, float]]] = {
-    "clip": (curves.Clip((1,), least=-0.5, most=0.75), lambda z: _clip(z, -0.5, 0.75), (-9, 9)),
+CURVES: dict[str, tuple[ScalarFunction, Exact, tuple[float, float]]] = {
+    "clip": (activations.Clip((1,), least=-0.5, most=0.75), lambda z: _clip(z, -0.5, 0.75), (-9, 9)),
     "hard sigmoid": (
-        curves.Clip((1,), factor=0.2, offset=0.5),
+        activations.Clip((1,), factor=0.2, offset=0.5),
         lambda z: _clip(arb(0.2) * z + arb(0.5), 0, 1),
         (-9, 9),
     ),
-    "abs": (curves.Abs((1,)), abs, (-9, 9)),
-    "hard swish": (curves.HardSwish((1,)), lambda z: z * _clip(z + 3, 0, 6) / 6, (-9, 9)),
-    "square": (curves.Power((1,)), lambda z: z * z, (-30, 30)),
-    "cube": (curves.Power((1,), exponent=3), lambda z: z * z * z, (-9, 9)),
-    "reciprocal": (curves.Reciprocal((1,)), lambda z: 1 / z, (1e-3, 50)),
-    "negative reciprocal": (curves.Reciprocal((1,)), lambda z: 1 / z, (-50, -1e-3)),
-    "root": (curves.Root((1,)), lambda z: z.sqrt(), (1e-6, 50)),
-    "inverse root": (curves.Root((1,), inverse=True), lambda z: z.rsqrt(), (1e-5, 50)),
-    "exp": (curves.Exp((1,)), lambda z: z.exp(), (-30, 30)),
-    "capped exp": (curves.CappedExp((1,)), lambda z: z.min(arb(curves.CAP)).exp(), (-30, 40)),
-    "log": (curves.Log((1,)), lambda z: z.log(), (1e-4, 50)),
-    "softplus": (curves.Softplus((1,)), lambda z: (1 + z.exp()).log(), (-40, 40)),
-    "elu": (curves.Elu((1,), alpha=1.5), lambda z: _elu(z, 1.5, 1, 1), (-20, 20)),
-    "celu": (curves.Elu((1,), alpha=0.5, scale=1.25, width=0.5), lambda z: _elu(z, 0.5, 1.25, 0.5), (-20, 20)),
-    "erf": (curves.Erf((1,)), lambda z: z.erf(), (-8, 8)),
-    "silu": (curves.Silu((1,)), lambda z: z * _logistic(z), (-40, 40)),
-    "gelu": (curves.Gelu((1,)), lambda z: z * (-z / arb(2).sqrt()).erfc() / 2, (-20, 20)),
+    "abs": (activations.Abs((1,)), abs, (-9, 9)),
+    "hard swish": (activations.HardSwish((1,)), lambda z: z * _clip(z + 3, 0, 6) / 6, (-9, 9)),
+    "square": (activations.Power((1,)), lambda z: z * z, (-30, 30)),
+    "cube": (activations.Power((1,), exponent=3), lambda z: z * z * z, (-9, 9)),
+    "reciprocal": (activations.Reciprocal((1,)), lambda z: 1 / z, (1e-3, 50)),
+    "negative reciprocal": (activations.Reciprocal((1,)), lambda z: 1 / z, (-50, -1e-3)),
+    "root": (activations.Root((1,)), lambda z: z.sqrt(), (1e-6, 50)),
+    "inverse root": (activations.Root((1,), inverse=True), lambda z: z.rsqrt(), (1e-5, 50)),
+    "exp": (activations.Exp((1,)), lambda z: z.exp(), (-30, 30)),
+    "capped exp": (activations.CappedExp((1,)), lambda z: z.min(arb(activations.CAP)).exp(), (-30, 40)),
+    "log": (activations.Log((1,)), lambda z: z.log(), (1e-4, 50)),
+    "softplus": (activations.Softplus((1,)), lambda z: (1 + z.exp()).log(), (-40, 40)),
+    "elu": (activations.Elu((1,), alpha=1.5), lambda z: _elu(z, 1.5, 1, 1), (-20, 20)),
+    "celu": (activations.Elu((1,), alpha=0.5, scale=1.25, width=0.5), lambda z: _elu(z, 0.5, 1.25, 0.5), (-20, 20)),
+    "erf": (activations.Erf((1,)), lambda z: z.erf(), (-8, 8)),
+    "silu": (activations.Silu((1,)), lambda z: z * _logistic(z), (-40, 40)),
+    "gelu": (activations.Gelu((1,)), lambda z: z * (-z / arb(2).sqrt()).erfc() / 2, (-20, 20)),
     "gelu tanh": (
-        curves.GeluTanh((1,)),
+        activations.GeluTanh((1,)),
         lambda z: z / 2 * (1 + ((2 / arb.pi()).sqrt() * (z + arb(0.044715) * z * z * z)).tanh()),
         (-12, 12),
     ),
-    "mish": (curves.Mish((1,)), lambda z: z * (1 + z.exp()).log().tanh(), (-40, 40)),
+    "mish": (activations.Mish((1,)), lambda z: z * (1 + z.exp()).log().tanh(), (-40, 40)),
 }
 
 
@@ -96,13 +96,13 @@ def above(slope: float, offset: float, z: float, exact: Exact) -> bool:
     return at_most(lambda: exact(arb(rational(z))) - rational(slope) * rational(z) - rational(offset), ZERO)
 
 
-def broken(curve: Curve, exact: Exact, range_: tuple[float, float]) -> int:
+def broken(curve: ScalarFunction, exact: Exact, range_: tuple[float, float]) -> int:
     """How many of all tried points lie outside lines, bands or ranges."""
     lower, upper = intervals(*range_)
     flat = torch.zeros_like(lower)
     least, most = curve.range(lower, upper)
     found = 0
-    lines = [curve.lines(lower, upper), curve.band(lower, upper), curves.Lines(flat, least, flat, most)]
+    lines = [curve.lines(lower, upper), curve.band(lower, upper), activations.LinearRelaxation(flat, least, flat, most)]
     for k in range(len(lower)):
         for z in points(float(lower[k]), float(upper[k]), curve.breaks):
             for line in lines:
@@ -174,7 +174,7 @@ def test_larger_intervals_have_larger_ranges(name: str) -> None:
     assert (low <= least + room).all() and (high >= most - room).all()
 
 
-class _Chord(curves.Silu):
+class _Chord(activations.Silu):
     """Takes the function to be straight."""
 
     @property
@@ -185,7 +185,7 @@ class _Chord(curves.Silu):
         return self.slope(z)
 
 
-class _Turned(curves.Silu):
+class _Turned(activations.Silu):
     """Takes the wrong parts to be convex."""
 
     @property
@@ -194,7 +194,7 @@ class _Turned(curves.Silu):
 
 
 @pytest.mark.parametrize(("wrong", "name"), [(_Chord, "silu"), (_Turned, "silu")])
-def test_planted_faults_are_found(wrong: type[Curve], name: str) -> None:
+def test_planted_faults_are_found(wrong: type[ScalarFunction], name: str) -> None:
     _, exact, range_ = CURVES[name]
     with flint.ctx.workprec(200):
         assert broken(wrong((1,)), exact, range_) > 0
@@ -202,7 +202,12 @@ def test_planted_faults_are_found(wrong: type[Curve], name: str) -> None:
 
 def test_what_lies_outside_a_domain_is_unknown() -> None:
     lower, upper = torch.tensor([-1.0, 0.0, 0.5]).double(), torch.tensor([1.0, 2.0, 2.0]).double()
-    for curve in (curves.Reciprocal((3,)), curves.Root((3,)), curves.Log((3,)), curves.Root((3,), inverse=True)):
+    for curve in (
+        activations.Reciprocal((3,)),
+        activations.Root((3,)),
+        activations.Log((3,)),
+        activations.Root((3,), inverse=True),
+    ):
         band = curve.band(lower, upper)
         known = torch.isfinite(band.upper_offset - band.lower_offset)
         assert known.tolist() == [False, False, True]

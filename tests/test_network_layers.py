@@ -11,10 +11,10 @@ import pytest
 import torch
 from onnx_files import OnnxFile, attack, image_sets, session
 
-from ns_abstract.verify.network import ImageSets, bound_outputs, load_network, pooling
-from ns_abstract.verify.network.layers import Convolution, LeakyRelu, Matrix, Scale, Sum
-from ns_abstract.verify.network.maxima import Candidates
-from ns_abstract.verify.network.passages import Maxima
+from ns_abstract.verify.network import ImageSets, bound_outputs, load_network, max_pool_propagation
+from ns_abstract.verify.network.layers import Convolution, LeakyRelu, Matrix, ScaleLayer, Sum
+from ns_abstract.verify.network.max_pooling import WindowInputs
+from ns_abstract.verify.network.relaxations import MaxPoolPlanes
 
 Build = Callable[[OnnxFile], object]
 
@@ -373,7 +373,7 @@ def _lines_without_gap(monkeypatch: pytest.MonkeyPatch) -> None:
 def _steep_lower_line(monkeypatch: pytest.MonkeyPatch) -> None:
     def lines(self, lower, upper):
         found = original(self, lower, upper)
-        raised = torch.where(self.open(lower, upper), 0.5 * found.upper_offset, found.lower_offset)
+        raised = torch.where(self.unstable(lower, upper), 0.5 * found.upper_offset, found.lower_offset)
         return type(found)(found.lower_slope, raised, found.upper_slope, found.upper_offset)
 
     original = LeakyRelu.lines
@@ -403,7 +403,7 @@ def _sum_of_signs(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def _unscaled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Scale, "backward", lambda self, rows: [rows])
+    monkeypatch.setattr(ScaleLayer, "backward", lambda self, rows: [rows])
 
 
 def _level_too_low(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -411,24 +411,24 @@ def _level_too_low(monkeypatch: pytest.MonkeyPatch) -> None:
         found = original(window, apart)
         return found._replace(high=found.high - 0.5 * (found.high - found.low))
 
-    original = pooling.upper_planes
-    monkeypatch.setattr(pooling, "upper_planes", planes)
+    original = max_pool_propagation.upper_planes
+    monkeypatch.setattr(max_pool_propagation, "upper_planes", planes)
 
 
 def _rivals_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
     def apart(self):
         return torch.where(self.inside[:, :, None], original(self) - 5.0, original(self))
 
-    original = Candidates.apart
-    monkeypatch.setattr(Candidates, "apart", apart)
+    original = WindowInputs.relaxation_gap
+    monkeypatch.setattr(WindowInputs, "relaxation_gap", apart)
 
 
 def _last_of_a_window(monkeypatch: pytest.MonkeyPatch) -> None:
     def backward(self, rows, layer, cell, total):
         return original(self._replace(winner=0 * self.winner), rows, layer, cell, total)
 
-    original = Maxima.backward
-    monkeypatch.setattr(Maxima, "backward", backward)
+    original = MaxPoolPlanes.backward
+    monkeypatch.setattr(MaxPoolPlanes, "backward", backward)
 
 
 def _narrow_magnitude(monkeypatch: pytest.MonkeyPatch) -> None:

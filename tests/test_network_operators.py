@@ -14,10 +14,10 @@ from onnx import helper
 from onnx_files import OnnxFile, attack, image_sets, session
 
 from ns_abstract.verify.network import ImageSets, bound_outputs, load_network
-from ns_abstract.verify.network import curves as curve_module
-from ns_abstract.verify.network.maps import Differences, Sparse, TransposedConvolution
-from ns_abstract.verify.network.products import Plane, Product
-from ns_abstract.verify.network.rows import Rows, grid
+from ns_abstract.verify.network import activations as curve_module
+from ns_abstract.verify.network.bilinear import Product, ProductPlanes
+from ns_abstract.verify.network.coefficients import Coefficients, grid
+from ns_abstract.verify.network.sparse_layers import PairwiseDifferences, SparseMatrix, TransposedConvolution
 
 SHAPE = (3, 6, 6)
 Build = Callable[[OnnxFile], object]
@@ -355,7 +355,7 @@ def test_narrow_sets_have_tight_bounds(name: str, tmp_path: Path) -> None:
 def _slopes_exchanged(monkeypatch: pytest.MonkeyPatch) -> None:
     def plane(self, x, y):
         found = original(self, x, y)
-        return Plane(found.second, found.first, found.low, found.high)
+        return ProductPlanes(found.second, found.first, found.low, found.high)
 
     original = Product.plane
     monkeypatch.setattr(Product, "plane", plane)
@@ -366,7 +366,7 @@ def _touching_line(monkeypatch: pytest.MonkeyPatch) -> None:
         height = cuts.value - line * cuts.z
         return height[len(height) // 2]
 
-    monkeypatch.setattr(curve_module.Curve, "_extreme", staticmethod(extreme))
+    monkeypatch.setattr(curve_module.ScalarFunction, "_extreme", staticmethod(extreme))
 
 
 def _sparse_not_passed_back(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -374,8 +374,8 @@ def _sparse_not_passed_back(monkeypatch: pytest.MonkeyPatch) -> None:
         found = original(self, rows)
         return [type(found[0])(0.9 * found[0].value, found[0].y, found[0].x), *found[1:]]
 
-    original = Sparse.backward
-    monkeypatch.setattr(Sparse, "backward", backward)
+    original = SparseMatrix.backward
+    monkeypatch.setattr(SparseMatrix, "backward", backward)
 
 
 def _transposed_shifted(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -424,7 +424,7 @@ def test_attack_catches(mutant: str, tmp_path: Path, monkeypatch: pytest.MonkeyP
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
 def test_differences_are_those_of_the_matrix(shape: tuple[int, ...], axis: int, dtype: torch.dtype) -> None:
     count, size = shape[axis], int(np.prod(shape))
-    layer = Differences((shape,), (*shape, count), count + 4, 2 * count, axis)
+    layer = PairwiseDifferences((shape,), (*shape, count), count + 4, 2 * count, axis)
     # by the definition, entry by entry
     matrix = np.zeros((size * count, size))
     for place in np.ndindex(*shape):
@@ -439,7 +439,7 @@ def test_differences_are_those_of_the_matrix(shape: tuple[int, ...], axis: int, 
     value = rng.integers(-9, 9, (3, size * count)).astype(np.float32 if dtype == torch.float32 else np.float64)
     assert (layer.apply([x]).flatten(1).numpy() == x.flatten(1).numpy() @ matrix.T).all()
     assert (layer.magnitude([x.abs()]).flatten(1).numpy() == x.abs().flatten(1).numpy() @ np.abs(matrix).T).all()
-    (found,) = layer.backward(Rows.whole(value.reshape(3, *grid(layer.shape))))
+    (found,) = layer.backward(Coefficients.whole(value.reshape(3, *grid(layer.shape))))
     assert found.value.dtype == value.dtype
     assert (found.value.reshape(3, -1) == value @ matrix).all()
 
@@ -463,7 +463,7 @@ def test_shares_past_the_cap_are_charged(gap: float, tmp_path: Path) -> None:
     # what the layers compute without their roundings, from the side of the smallest number
     cap, gaps = curve_module.CAP, torch.tensor([gap, 0.0, 1.0], dtype=torch.float64)
     total = curve_module.CappedExp((1,)).function(gaps).sum().clamp(max=float(np.exp(cap)))
-    layer = curve_module.Share((1,))
+    layer = curve_module.SoftmaxReciprocal((1,))
     off = abs(arb(float(layer.function(total))) - shares[1])
     assert off <= float(torch.as_tensor(layer.missing(total, total))) + 2.0**-50 * float(layer.function(total))
 

@@ -14,8 +14,8 @@ import torch
 from onnx_files import OnnxFile, image_sets, session
 
 from ns_abstract.verify.network import ImageSets, Network, bound_outputs, load_network
-from ns_abstract.verify.network.bounds import _Cells
-from ns_abstract.verify.network.sums import partial_sums
+from ns_abstract.verify.network.bounds import _NetworkBounds
+from ns_abstract.verify.network.partial_sums import partial_sums
 
 Layers = list[tuple[np.ndarray, np.ndarray]]
 #: A product that is lost when it is added to 1 in float32, and 1 stays.
@@ -302,9 +302,9 @@ def test_rounding_of_rows_over_sets(double: bool, tmp_path: Path) -> None:
         reach = np.abs(a).sum(-1)
         images = ImageSets(a, b, a, b, np.nextafter(-reach, -np.inf), np.nextafter(reach, np.inf))
         for sign in (1.0, -1.0):
-            cells = _Cells(network, images, "everywhere", 1 << 30, "real")
+            cells = _NetworkBounds(network, images, "everywhere", 1 << 30, "real")
             if not double:
-                cells.known.passages.pop()
+                cells.intermediate.relaxations.pop()
             found = cells.outputs(sign * np.eye(5), np.zeros(5))
             corners = [np.array(p) for p in itertools.product([-1.0, 1.0], repeat=3)]
             for k in range(5):
@@ -340,9 +340,9 @@ def test_rows_of_outputs_in_float64_are_tighter(blocks: int, tmp_path: Path) -> 
     rows = np.concatenate([np.eye(3), -np.eye(3)])
     widths = []
     for double in (False, True):
-        cells = _Cells(network, images, "everywhere", 1 << 30, "real")
+        cells = _NetworkBounds(network, images, "everywhere", 1 << 30, "real")
         if not double:
-            cells.known.passages.pop()
+            cells.intermediate.relaxations.pop()
         found = cells.outputs(rows, np.zeros(6))
         rng = np.random.default_rng(0)
         for p in rng.choice([-1.0, 1.0], (50, 2)):

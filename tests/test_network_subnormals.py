@@ -11,7 +11,7 @@ import torch
 from extreme_networks import Extreme, flushing, gemm, plain, scale
 
 from ns_abstract.io.errors import InputError
-from ns_abstract.verify.network import Family, ImageSets, Network, bound_outputs, load_network
+from ns_abstract.verify.network import ImageSets, Network, SharedCoefficients, bound_outputs, load_network
 from ns_abstract.verify.network.subnormals import subnormals_kept
 
 TINY = np.ldexp(1.0, [-130, -140, -127, -149])
@@ -37,7 +37,7 @@ def images() -> ImageSets:
 def bounds(network: Network) -> np.ndarray:
     rows = np.concatenate([np.eye(4), -np.eye(4)])
     real = bound_outputs(network, images(), rows, np.zeros(8), arithmetic="real").lower
-    family = Family(network, images()).first(rows, np.zeros(8)).lower
+    family = SharedCoefficients(network, images()).first(rows, np.zeros(8)).lower
     return np.concatenate([bound_outputs(network, images(), rows, np.zeros(8)).lower, real, family])
 
 

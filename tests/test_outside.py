@@ -15,32 +15,32 @@ import pytest
 from PIL import Image
 from test_reach import specification
 
-from ns_abstract.geometry.camera_path import Camera
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.specification import parse_perturbation
 from ns_abstract.reach.loop import Loop, parse_loop
 from ns_abstract.reach.planes import plane_marks, region, views
-from ns_abstract.refine.protocol import Elements
-from ns_abstract.report.cameras import MOST, Cameras, cameras_entry, cell_cameras, standing
+from ns_abstract.refine.protocol import SceneElements
+from ns_abstract.report.cameras import MOST, CameraDrawings, cameras_entry, cell_cameras, standing
 from ns_abstract.report.export import encode_gif, encode_mp4
-from ns_abstract.report.outside import Outside, Window
+from ns_abstract.report.outside import PlotWindow, SceneDrawing
 from ns_abstract.verify.store import Store
 
 RED, GREEN, BLUE = np.eye(3)
 
 
-def elements(*rows: tuple[Any, Any, float, float]) -> Elements:
+def elements(*rows: tuple[Any, Any, float, float]) -> SceneElements:
     """Balls: place, colour, radius, opacity."""
     places, colors, sizes, opacities = (np.array(column, np.float64) for column in zip(*rows, strict=True))
-    return Elements(places, sizes[:, None, None] * np.eye(3), colors, opacities)
+    return SceneElements(places, sizes[:, None, None] * np.eye(3), colors, opacities)
 
 
 def read(data: bytes) -> np.ndarray:
     return np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).astype(int)
 
 
-def color_at(image: np.ndarray, window: Window, place: tuple[float, float]) -> str:
+def color_at(image: np.ndarray, window: PlotWindow, place: tuple[float, float]) -> str:
     """The strongest channel at a place of the plane, or "none"."""
     part = (np.array(place) - window.low) / (np.array(window.high) - window.low)
     pixel = image[int((1.0 - part[1]) * image.shape[0]), int(part[0] * image.shape[1])]
@@ -57,8 +57,8 @@ def test_elements_are_drawn_where_they_are_and_the_nearest_on_top() -> None:
         # hardly to be seen
         ((0.0, -0.5, 0.0), RED, 0.1, 0.1),
     )
-    outside, low, high = Outside(scene), (-1.0, -0.8), (1.0, 0.8)
-    above = Window((0, 1), low, high, (300, 240))
+    outside, low, high = SceneDrawing(scene), (-1.0, -0.8), (1.0, 0.8)
+    above = PlotWindow((0, 1), low, high, (300, 240))
     image = read(outside.picture(above))
     assert image.shape == (240, 300, 3)
     found = [color_at(image, above, place) for place in ((0.5, 0.5), (-0.5, 0.2), (0.0, 0.2), (0.0, -0.5), (0.8, 0.0))]
@@ -67,43 +67,43 @@ def test_elements_are_drawn_where_they_are_and_the_nearest_on_top() -> None:
     open_top = read(outside.picture(above, nearest=0.2))
     assert color_at(open_top, above, (0.0, 0.2)) == "none" and color_at(open_top, above, (0.5, 0.5)) == "r"
     # from -y, where the green ball at y = -0.4 hides nothing of the blue one at another height
-    side = Window((0, 2), low, high, (300, 240))
+    side = PlotWindow((0, 2), low, high, (300, 240))
     image = read(outside.picture(side))
     assert color_at(image, side, (-0.5, 0.5)) == "g" and color_at(image, side, (-0.5, 0.0)) == "b"
     one_behind_another = elements(((0.0, 1.0, 0.0), RED, 0.2, 0.95), ((0.0, -1.0, 0.0), BLUE, 0.2, 0.95))
-    assert color_at(read(Outside(one_behind_another).picture(side)), side, (0.0, 0.0)) == "b"
-    beside = Window((1, 2), low, high, (300, 240))
+    assert color_at(read(SceneDrawing(one_behind_another).picture(side)), side, (0.0, 0.0)) == "b"
+    beside = PlotWindow((1, 2), low, high, (300, 240))
     turned = elements(((-1.0, 0.0, 0.0), RED, 0.2, 0.95), ((1.0, 0.0, 0.0), BLUE, 0.2, 0.95))
-    assert color_at(read(Outside(turned).picture(beside)), beside, (0.0, 0.0)) == "b"
+    assert color_at(read(SceneDrawing(turned).picture(beside)), beside, (0.0, 0.0)) == "b"
 
 
 def test_a_picture_of_many_elements_is_small_and_always_the_same() -> None:
     rng = np.random.default_rng(2)
     count = 30_000
-    scene = Elements(
+    scene = SceneElements(
         rng.uniform(-1.0, 1.0, (count, 3)),
         0.02 * rng.normal(size=(count, 3, 3)),
         rng.random((count, 3)),
         rng.random(count),
     )
-    window = Window((0, 1), (-1.0, -0.7), (1.0, 0.7), (756, 529))
-    data = Outside(scene).picture(window)
+    window = PlotWindow((0, 1), (-1.0, -0.7), (1.0, 0.7), (756, 529))
+    data = SceneDrawing(scene).picture(window)
     # two of them, as text, are less than 300 kB
-    assert len(data) <= 100_000 and data == Outside(scene).picture(window)
+    assert len(data) <= 100_000 and data == SceneDrawing(scene).picture(window)
     assert read(data).std() > 10.0
 
 
 def test_a_window_holds_what_is_marked_and_some_of_the_scene() -> None:
     low, high = np.array([0.0, -0.1]), np.array([1.0, 0.1])
     scene = elements(*(((3.0, 0.1 * k, 0.0), RED, 0.1, 0.9) for k in range(-20, 21)), ((99.0, 0, 0), RED, 0.1, 0.9))
-    window = Outside(scene).window((0, 1), low, high, np.inf, 400)
+    window = SceneDrawing(scene).window((0, 1), low, high, np.inf, 400)
     assert window.low[0] <= 0.0 and 3.0 <= window.high[0] < 6.0
     across, up = np.subtract(window.high, window.low)
     assert abs(across / up - window.size[0] / window.size[1]) < 0.02
-    outside = Outside(scene)
+    outside = SceneDrawing(scene)
     # what was drawn is not drawn again
     assert outside.picture(window) is outside.picture(outside.window((0, 1), low, high, np.inf, 400))
-    alone = Outside(elements(((0.0, 0.0, 0.0), RED, 0.1, 0.0))).window((0, 1), low, high, np.inf, 400)
+    alone = SceneDrawing(elements(((0.0, 0.0, 0.0), RED, 0.1, 0.0))).window((0, 1), low, high, np.inf, 400)
     assert alone.low[0] <= 0.0 and 1.0 <= alone.high[0] < 1.2
 
 
@@ -121,7 +121,7 @@ def loop(tmp_path: Path, **changes: Any) -> Loop:
     return parse_loop(value, tmp_path)
 
 
-WINDOW = Window((0, 1), (0.0, 0.0), (4.0, 4.0), (100, 100))
+WINDOW = PlotWindow((0, 1), (0.0, 0.0), (4.0, 4.0), (100, 100))
 
 
 def inside(corners: list[tuple[float, float]], point: tuple[float, float]) -> bool:
@@ -200,15 +200,15 @@ KINDS = ("certified", "falsified", "unknown")
 AHEAD = np.array([[0.0, 0.0, 1.0, 1.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.3]])
 
 
-def poses(specification: dict[str, Any] | None = None, pose: np.ndarray = AHEAD) -> PoseSet:
-    return PoseSet.around(Camera(pose, 20.0, 30.0, 16.0, 12.0, 32, 24), parse_perturbation(specification or {}))
+def poses(specification: dict[str, Any] | None = None, pose: np.ndarray = AHEAD) -> PoseBox:
+    return PoseBox.around(PinholeCamera(pose, 20.0, 30.0, 16.0, 12.0, 32, 24), parse_perturbation(specification or {}))
 
 
-def around(low: float = 0.0, high: float = 6.0) -> PoseSet:
+def around(low: float = 0.0, high: float = 6.0) -> PoseBox:
     return poses({"orbit": {"target": [0.0, 0.0, 0.0], "axis": [0.0, 0.0, 1.0], "azimuth": [low, high]}})
 
 
-def shifts() -> PoseSet:
+def shifts() -> PoseBox:
     turned = np.array([[1.0, 0.0, 0.0, 2.0], [0.0, 0.0, -1.0, -1.0], [0.0, 1.0, 0.0, 0.5]])
     return poses({"translation": {"x": 0.3, "y": 0.2}, "rotation": {"yaw": 0.1}}, turned)
 
@@ -263,7 +263,7 @@ def test_cameras_are_drawn_where_the_middles_of_their_cells_are() -> None:
         np.testing.assert_allclose(x / -z, [-0.8, 0.8, 0.8, -0.8])
         np.testing.assert_allclose(y / -z, [0.4, 0.4, -0.4, -0.4])
 
-    page = Cameras(cells, left_out, standing(sets), None).html({(3, 1): 4})
+    page = CameraDrawings(cells, left_out, standing(sets), None).html({(3, 1): 4})
     assert "further" not in page and "cameras alone" in page and page.count('data-cell="4"') == 2
     # well-formed: nothing is left open, and no text is taken for a tag
     plots = ElementTree.fromstring(f"<part>{page}</part>").findall("figure/svg")
@@ -299,7 +299,7 @@ def test_the_widest_cells_have_cameras_and_the_others_are_counted() -> None:
     assert len(drawn) == MOST and left_out == len(rows) - MOST and drawn[-3:] == [1000, 1001, 1002]
     # of equal cells, some from everywhere
     assert drawn[0] < 10 and drawn[-4] > 990 and max(np.diff(drawn[:-3])) < 10
-    assert f"{left_out} further cells" in Cameras(cells, left_out, standing({0: around()}), None).html({})
+    assert f"{left_out} further cells" in CameraDrawings(cells, left_out, standing({0: around()}), None).html({})
 
 
 def test_cameras_that_stand_still_are_drawn() -> None:
@@ -308,19 +308,19 @@ def test_cameras_that_stand_still_are_drawn() -> None:
     for still, row, names in ((poses(), one, NAMES), (poses({"rotation": {"yaw": 0.1}}), turned, ("yaw",))):
         cells, left_out = cell_cameras({0: still}, {0: [row]}, names)
         np.testing.assert_array_equal(cells[0].pose, AHEAD)
-        page = Cameras(cells, left_out, standing({0: still}), None).html({})
+        page = CameraDrawings(cells, left_out, standing({0: still}), None).html({})
         assert page.count(f'<path class="{row["verdict"]}"') == 2 and "nan" not in page
-    assert Cameras([], 0, standing({0: poses()}), None).html({}) == ""
+    assert CameraDrawings([], 0, standing({0: poses()}), None).html({}) == ""
 
 
 def test_the_scene_behind_cameras_is_the_same_in_every_report() -> None:
     rng = np.random.default_rng(5)
     scene = elements(*[(rng.normal(size=3) * 0.3, rng.uniform(size=3), 0.03, 0.9) for _ in range(3000)])
-    outside, sets = Outside(scene), {0: around()}
+    outside, sets = SceneDrawing(scene), {0: around()}
     found = []
     for count in (1, 700):
         cells, left_out = cell_cameras(sets, {0: azimuths(np.linspace(0.0, 6.0, count + 1))}, NAMES)
-        page = Cameras(cells, left_out, standing(sets), outside).html({})
+        page = CameraDrawings(cells, left_out, standing(sets), outside).html({})
         assert page.count("<path") == 2 * len(cells) and len(page) < 310_000
         found.append(re.findall(r'<image [^>]*href="data:image/png;base64,[^"]*"/>', page))
     assert found[0] == found[1] and len(found[0]) == 2 and "Gaussians" in page

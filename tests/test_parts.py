@@ -18,14 +18,14 @@ from conftest import Inputs, command_options
 from nerfs import UNIFORM, images, poses, tiny_scene
 
 from ns_abstract.api import bounding
-from ns_abstract.api.bounding import Part, bound_frames, bound_part
+from ns_abstract.api.bounding import TileTask, bound_frames, bound_part
 from ns_abstract.api.files import PathJob, Settings, open_job
 from ns_abstract.cli.render import Render, render
 from ns_abstract.execution.engines import Cluster, Machine, connected
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.frame import NerfFrame
-from ns_abstract.refine.engine import Goal, Refinement, groups, shared_goal
+from ns_abstract.refine.engine import Refinement, RefinementGoal, groups, shared_goal
 from ns_abstract.refine.result import FrameResult, PartResult, joined, mean_pixel_gap
 
 #: Seconds that no machine needs, however busy: what ends a search here is never the time.
@@ -44,7 +44,9 @@ def job_of(blobs: Inputs) -> PathJob:
     return open_job(Settings(blobs.config.absolute(), blobs.path.absolute(), blobs.spec.absolute()))
 
 
-def in_groups(job: PathJob, count: int, goal: Goal, index: int = 0, keep_leaves: bool = False) -> list[PartResult]:
+def in_groups(
+    job: PathJob, count: int, goal: RefinementGoal, index: int = 0, keep_leaves: bool = False
+) -> list[PartResult]:
     frame = job.frame(index)
     goal = shared_goal(frame, index, goal, job.seed)
     return [job.bound_part(index, goal, tiles, keep_leaves=keep_leaves) for tiles in groups(frame, count)]
@@ -65,7 +67,7 @@ def violations(job: PathJob, result: FrameResult, count: int = 40, index: int = 
     frame = job.frame(index)
     rng = np.random.default_rng(5)
     values = [*frame.box.sample(count, rng), *(frame.box.corners() if frame.box.dimensions else [])]
-    shows = [frame.render, *(show for _, show in zip(range(8), frame.members(11), strict=False))]
+    shows = [frame.render, *(show for _, show in zip(range(8), frame.scene_samples(11), strict=False))]
     found = 0
     for k, v in enumerate(values):
         image = assemble(shows[k % len(shows)](v, None), frame.camera)
@@ -88,7 +90,7 @@ def test_groups_hold_every_tile_once(blobs: Inputs) -> None:
 
 
 def test_one_group_is_the_frame(blobs: Inputs) -> None:
-    job, goal = job_of(blobs), Goal(1.05, FOREVER, 40)
+    job, goal = job_of(blobs), RefinementGoal(1.05, FOREVER, 40)
     whole = job.bound(0, goal, keep_leaves=True)
     everything = np.arange(job.frame(0).tile_count)
     part = job.bound_part(0, goal, everything, keep_leaves=True)
@@ -101,7 +103,7 @@ def test_one_group_is_the_frame(blobs: Inputs) -> None:
 def test_some_tiles_are_no_frame(blobs: Inputs) -> None:
     """A missing group is never taken for bounds."""
     job = job_of(blobs)
-    parts = in_groups(job, 3, Goal(1.5, FOREVER, 4))
+    parts = in_groups(job, 3, RefinementGoal(1.5, FOREVER, 4))
     for wrong in (parts[:2], parts[1:], [*parts, parts[0]], [parts[0], parts[0], parts[2]]):
         with pytest.raises(ValueError, match="missing or there twice"):
             job.joined(wrong)
@@ -112,12 +114,12 @@ def test_some_tiles_are_no_frame(blobs: Inputs) -> None:
     late = job.joined([dataclasses.replace(parts[0], bounded=False), *parts[1:]])
     assert not late.bounded and late.leaves is None
     with pytest.raises(ValueError, match="run_part"):
-        Refinement(job.frame(0), 0, Goal(1.5, FOREVER, 4), tiles=np.arange(2)).run()
+        Refinement(job.frame(0), 0, RefinementGoal(1.5, FOREVER, 4), tiles=np.arange(2)).run()
 
 
 def test_joined_groups_are_sound_and_reach_the_target(blobs: Inputs) -> None:
     job = job_of(blobs)
-    parts = in_groups(job, 4, Goal(1.1, FOREVER, 4000), keep_leaves=True)
+    parts = in_groups(job, 4, RefinementGoal(1.1, FOREVER, 4000), keep_leaves=True)
     result = job.joined(parts)
     assert violations(job, result) == 0
     point = result.trace[-1]
@@ -132,7 +134,7 @@ def test_joined_groups_are_sound_and_reach_the_target(blobs: Inputs) -> None:
     said = [sentence for sentence in dim.plan if sentence not in result.plan]
     assert len(said) == 1 and "at most 0.41% of the light" in said[0]
     # bounds are about as tight as those of the frame as a whole
-    whole = job.bound(0, Goal(1.1, FOREVER, 4000))
+    whole = job.bound(0, RefinementGoal(1.1, FOREVER, 4000))
     assert mean_pixel_gap(result.lower, result.upper) <= 1.1 * mean_pixel_gap(whole.lower, whole.upper)
     # leaves of every tile cover the set and hold its pictures
     assert result.leaves is not None
@@ -156,7 +158,7 @@ def test_joined_groups_are_sound_and_reach_the_target(blobs: Inputs) -> None:
 def test_planted_gap_is_found(blobs: Inputs) -> None:
     """The attack of these tests can fail: one group's tiles put where another's belong."""
     job = job_of(blobs)
-    parts = in_groups(job, 2, Goal(1.1, FOREVER, 200))
+    parts = in_groups(job, 2, RefinementGoal(1.1, FOREVER, 200))
     first, second = parts
     n = min(first.tiles.size, second.tiles.size)
     swapped = dataclasses.replace(first, lower=np.concatenate([second.lower[:n], first.lower[n:]]))
@@ -165,20 +167,20 @@ def test_planted_gap_is_found(blobs: Inputs) -> None:
 
 def test_slack_is_what_the_whole_allows(blobs: Inputs) -> None:
     job = job_of(blobs)
-    goal = shared_goal(job.frame(0), 0, Goal(1.05), 0)
+    goal = shared_goal(job.frame(0), 0, RefinementGoal(1.05), 0)
     assert 1.0 < goal.ratio < 1.05 and goal.slack > 0.0
-    result = job.joined(in_groups(job, 3, Goal(1.05, FOREVER, 60)))
+    result = job.joined(in_groups(job, 3, RefinementGoal(1.05, FOREVER, 60)))
     # the slack comes out of pictures that every group's witnesses hold
     assert (1.05 - goal.ratio) * mean_pixel_gap(result.witness_lower, result.witness_upper) >= goal.slack
     frame = job.frame(0)
-    assert shared_goal(frame, 0, Goal(1.0), 0).slack == 0.0
+    assert shared_goal(frame, 0, RefinementGoal(1.0), 0).slack == 0.0
     still = NerfFrame(tiny_scene(0), UNIFORM, poses({"rotation": {"yaw": 0.01}}))
-    assert shared_goal(still, 0, Goal(1.05), 0) == Goal(1.05)
+    assert shared_goal(still, 0, RefinementGoal(1.05), 0) == RefinementGoal(1.05)
 
 
 def test_scenes_that_vary(make_blobs: Callable[..., Inputs]) -> None:
     job = job_of(make_blobs(spec=VARIED))
-    result = job.joined(in_groups(job, 3, Goal(1.05, FOREVER, 6)))
+    result = job.joined(in_groups(job, 3, RefinementGoal(1.05, FOREVER, 6)))
     assert violations(job, result) == 0
     assert any("scene variations" in sentence for sentence in result.plan)
     assert mean_pixel_gap(result.lower, result.upper) < 0.5
@@ -188,7 +190,9 @@ def test_scenes_that_vary(make_blobs: Callable[..., Inputs]) -> None:
 def test_rays_of_a_nerf() -> None:
     scene, pose_set = tiny_scene(2, density=30.0), poses({"rotation": {"yaw": 0.01}})
     frame = NerfFrame(scene, UNIFORM, pose_set)
-    parts = [Refinement(frame, 0, Goal(1.2, FOREVER, 200), tiles=tiles).run_part() for tiles in groups(frame, 3)]
+    parts = [
+        Refinement(frame, 0, RefinementGoal(1.2, FOREVER, 200), tiles=tiles).run_part() for tiles in groups(frame, 3)
+    ]
     result = joined(parts, frame.camera)
     assert result.bounded and mean_pixel_gap(result.lower, result.upper) < 0.9
     for picture in images(scene, pose_set, pose_set.box.sample(100, np.random.default_rng(0))):
@@ -203,7 +207,7 @@ def test_rays_of_a_nerf() -> None:
 @needs_dask
 def test_two_workers_one_of_them_killed_equal_this_process(blobs: Inputs) -> None:
     job = job_of(blobs)
-    goal = Goal(1.02, FOREVER, 60)
+    goal = RefinementGoal(1.02, FOREVER, 60)
     expected = job.joined(in_groups(job, 4, goal, keep_leaves=True))
     frame = job.frame(0)
     shared = shared_goal(frame, 0, goal, job.seed)
@@ -211,7 +215,7 @@ def test_two_workers_one_of_them_killed_equal_this_process(blobs: Inputs) -> Non
         engine = Cluster(client)
         assert engine.threads == 2
         for key, tiles in enumerate(groups(frame, 4)):
-            engine.submit(key, bound_part, job.recipe, Part(0, tiles), shared, True, 2)
+            engine.submit(key, bound_part, job.recipe, TileTask(0, tiles), shared, True, 2)
         found: dict[int, PartResult] = {}
         # a worker that has begun; as long as it takes, and pytest's own limit ends what hangs
         while not (begun := [address for address, tasks in client.processing().items() if tasks]):
@@ -241,8 +245,8 @@ class Machines:
         self._machines = threads
         self.threads = sum(map(sum, threads))
         self.capacity = 2 * self.threads
-        self.goals: list[Goal] = []
-        self.parts: list[Part] = []
+        self.goals: list[RefinementGoal] = []
+        self.parts: list[TileTask] = []
         self.done: list[int] = []
         self._tasks: list[tuple[int, Any, Any]] = []
 

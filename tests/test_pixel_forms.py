@@ -24,20 +24,20 @@ from ns_abstract.methods.splat.alphas import (
     _set_curvature,
 )
 from ns_abstract.methods.splat.blend import flattened
-from ns_abstract.methods.splat.block import (
+from ns_abstract.methods.splat.pixel_block import (
     ALPHA_HIGH,
     ALPHA_LOW,
     BEND,
     BEND_SPREAD,
     FORM,
     LISTED,
-    Jumps,
+    ThresholdCrossings,
     bends_of,
     color_ends,
     color_size,
     fragment_width,
 )
-from ns_abstract.methods.splat.records import FORMS, columns
+from ns_abstract.methods.splat.projection_errors import FORMS, columns
 from ns_abstract.methods.splat.stage_data import FormShape
 
 
@@ -250,7 +250,7 @@ def test_the_range_of_alpha_s_curvature(d):
 def _blended(values, lists, colors, background, shape, forms, count, t_, out_):
     nothing, t, m = pointer(out_), pointer(t_), shape.monomials
     # fragments are blended as they are, skipped or not
-    unused = Jumps(pointer(np.empty(1, np.int64)), t, t, 0)
+    unused = ThresholdCrossings(pointer(np.empty(1, np.int64)), t, t, 0)
     _, blend = blended(values, lists, colors, background, shape, forms, count, t, unused, False)
     radius, ends = blend.radius, blend.ends
     if shape.order == 1:

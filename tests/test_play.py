@@ -17,15 +17,15 @@ from browser import Browser, chromium, until
 from test_report import Reader, frame, run
 
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.refine.result import FrameResult, Leaves, Views
+from ns_abstract.refine.result import FrameResult, Leaves, SampleImages
 from ns_abstract.report import play
 from ns_abstract.report.certificate import CertifiedRun, certificate_document
-from ns_abstract.report.certificate_page import Closer, certificate_page
+from ns_abstract.report.certificate_page import CertificateDetails, certificate_page
 from ns_abstract.report.files import load_frame, save_frame
 from ns_abstract.report.picture import preview
 from ns_abstract.report.play import play_data
 from ns_abstract.report.record import Report
-from ns_abstract.report.regions import Shown
+from ns_abstract.report.regions import PoseImage
 from ns_abstract.report.walk import stops
 
 SIDE = 16
@@ -59,10 +59,18 @@ def sloped(height: int = 20, width: int = 24, d: int = 2, seed: int = 0) -> Fram
     poses = np.stack([middle + slope @ (values[k] - 0.5) for k in range(3)]).astype(np.float32)
     reach = np.abs(slope).sum(axis=-1)
     return frame(
-        0, height, width, box=box, image=poses[1],
-        lower=(middle - reach - 0.004).astype(np.float32), upper=(middle + reach + 0.003).astype(np.float32),
-        witness_lower=poses.min(axis=0), witness_upper=poses.max(axis=0), leaves=leaves, views=Views(values, poses),
-    )  # fmt: skip
+        0,
+        height,
+        width,
+        box=box,
+        image=poses[1],
+        lower=(middle - reach - 0.004).astype(np.float32),
+        upper=(middle + reach + 0.003).astype(np.float32),
+        witness_lower=poses.min(axis=0),
+        witness_upper=poses.max(axis=0),
+        leaves=leaves,
+        views=SampleImages(values, poses),
+    )
 
 
 def bounds_at(result: FrameResult, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -204,10 +212,10 @@ def test_views_are_kept_and_checked(tmp_path: Path) -> None:
     outside[1, 3, 4, 0] = result.upper[3, 4, 0] + 1e-3
     elsewhere[0, 0] = -0.6
     for views, problem in (
-        (Views(result.views.values, outside), "lies outside the bounds"),
-        (Views(elsewhere, result.views.images), "not one of the set"),
-        (Views(result.views.values, result.views.images[:, 1:]), "images are"),
-        (Views(result.views.values[:, :1], result.views.images), "values are"),
+        (SampleImages(result.views.values, outside), "lies outside the bounds"),
+        (SampleImages(elsewhere, result.views.images), "not one of the set"),
+        (SampleImages(result.views.values, result.views.images[:, 1:]), "images are"),
+        (SampleImages(result.views.values[:, :1], result.views.images), "values are"),
     ):
         with pytest.raises(ValueError, match=problem):
             save_frame(file, replace(result, views=views))
@@ -393,9 +401,9 @@ def certificate(folder: Path) -> Path:
     )  # fmt: skip
     red = preview(np.full((4, 4, 3), (200, 10, 10), np.uint8), 64)
     cells = {0: rows(0.0), 1: rows(4.0)}
-    found = [(stop, Shown(stop.at, stop.values, red, [1.0], 0.5)) for stop in stops(document["frames"], cells, 8)]
+    found = [(stop, PoseImage(stop.at, stop.values, red, [1.0], 0.5)) for stop in stops(document["frames"], cells, 8)]
     seen = {(0, 1): {"png": red, "text": "broken </script>"}}
-    page = certificate_page(document, cells, [], seen, closer=Closer(stops=found))
+    page = certificate_page(document, cells, [], seen, closer=CertificateDetails(stops=found))
     (folder / "certificate.html").write_text(page)
     return folder / "certificate.html"
 

@@ -13,12 +13,12 @@ from oracle import BITS, big, inside, rational, rational_of
 
 from ns_abstract.arithmetic.rounding import UNIT64
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.differentiable_pose import differentiable_pose
 from ns_abstract.geometry.poses import (
     SCENE_SHIFTS,
     SCENE_TURNS,
-    PoseSet,
+    PoseBox,
     axis_angle,
     orthonormal,
     rotation_about,
@@ -60,7 +60,7 @@ def exact_matrix(array: np.ndarray) -> Matrix:
     return Matrix([[big(x) for x in row] for row in np.atleast_2d(array).tolist()])
 
 
-def reference(poses: PoseSet, values: dict[str, fmpq]) -> tuple[Matrix, Matrix]:
+def reference(poses: PoseBox, values: dict[str, fmpq]) -> tuple[Matrix, Matrix]:
     """Camera-to-world rotation and position by definition, from parameter values (missing ones are 0)."""
     names = ("x", "y", "z", "yaw", "pitch", "roll", "segment", "azimuth", *SCENE_SHIFTS, *SCENE_TURNS)
     p = {name: big(values.get(name, fmpq(0))) for name in names}
@@ -96,9 +96,9 @@ def random_rotation(seed: int) -> np.ndarray:
     return q * np.sign(np.linalg.det(q))
 
 
-def camera(rotation: np.ndarray, position=(1.5, -0.5, 0.25), fx: float = 100.0) -> Camera:
+def camera(rotation: np.ndarray, position=(1.5, -0.5, 0.25), fx: float = 100.0) -> PinholeCamera:
     matrix = np.concatenate([rotation, np.array(position, np.float64)[:, None]], axis=1)
-    return Camera(matrix, fx, fx, 16.0, 16.0, 32, 32)
+    return PinholeCamera(matrix, fx, fx, 16.0, 16.0, 32, 32)
 
 
 def turned(rotation: np.ndarray, angle: float, seed: int = 8) -> np.ndarray:
@@ -110,7 +110,7 @@ def turned(rotation: np.ndarray, angle: float, seed: int = 8) -> np.ndarray:
     return np.array(result.tolist(), dtype=np.float64)
 
 
-def escapes(poses: PoseSet, box: ParameterBox, order: int, count: int = 4, seed: int = 0) -> list:
+def escapes(poses: PoseBox, box: ParameterBox, order: int, count: int = 4, seed: int = 0) -> list:
     """Entries of the enclosure over ``box`` that miss the pose of the definition, or the float64 pose."""
     forms = poses.enclosure(box, order)
     generator = np.random.default_rng(seed)
@@ -190,7 +190,7 @@ SETS = {
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("name", SETS)
 def test_enclosure(name, order):
-    poses = PoseSet.around(camera(random_rotation(1)), SETS[name])
+    poses = PoseBox.around(camera(random_rotation(1)), SETS[name])
     assert escapes(poses, poses.box, order) == []
 
 
@@ -198,7 +198,7 @@ def test_enclosure(name, order):
 @pytest.mark.parametrize(("names", "radius"), [(SCENE_SHIFTS, 0.03), (SCENE_TURNS, 0.2), (SCENE_TURNS, 1e-9)])
 @pytest.mark.parametrize("name", ["nothing", "world", "orbit", "rotation"])
 def test_enclosure_of_a_scene_elsewhere(name, names, radius, order):
-    poses = PoseSet.around(camera(random_rotation(6)), SETS[name]).registered(names, radius)
+    poses = PoseBox.around(camera(random_rotation(6)), SETS[name]).registered(names, radius)
     assert poses.box.names[-3:] == names and poses.box.upper[-3:] == (radius,) * 3
     assert escapes(poses, poses.box, order) == []
     point = ParameterBox(poses.box.names, poses.box.units, poses.box.upper, poses.box.upper)
@@ -210,7 +210,7 @@ def test_enclosure_of_a_scene_elsewhere(name, names, radius, order):
 
 def test_a_scene_elsewhere_is_seen_as_it_would_be():
     """Points of a scene that is turned and shifted, and of the stored one by the pose that stands for it."""
-    poses, rng = PoseSet.around(camera(random_rotation(7)), SETS["six"]), np.random.default_rng(1)
+    poses, rng = PoseBox.around(camera(random_rotation(7)), SETS["six"]), np.random.default_rng(1)
     points, turns, shifts = rng.normal(size=(20, 3)), rng.uniform(-0.5, 0.5, 3), rng.uniform(-0.5, 0.5, 3)
     values = poses.box.sample(1, rng)[0]
     pose = poses.pose(values)
@@ -224,7 +224,7 @@ def test_a_scene_elsewhere_is_seen_as_it_would_be():
 @pytest.mark.parametrize("name", ["six", "orbit", "full_turn"])
 def test_enclosure_of_parts(name, order):
     """Cells of a set, and a cell of zero width."""
-    poses = PoseSet.around(camera(random_rotation(2)), SETS[name])
+    poses = PoseBox.around(camera(random_rotation(2)), SETS[name])
     box = poses.box
     for axis in range(box.dimensions):
         box = box.split(axis, 3)[2]
@@ -238,26 +238,26 @@ def test_enclosure_scale(distance):
     """Cameras next to the origin and far from it."""
     rotation = random_rotation(3)
     for name in ("six", "orbit"):
-        poses = PoseSet.around(camera(rotation, (distance, -0.3 * distance, 0.7 * distance)), SETS[name])
+        poses = PoseBox.around(camera(rotation, (distance, -0.3 * distance, 0.7 * distance)), SETS[name])
         assert escapes(poses, poses.box, 2, 2) == []
 
 
 def test_written_rotation():
     """A keyframe's matrix is used as written, within the reader's tolerance of orthonormal."""
     rotation = random_rotation(4) + np.random.default_rng(0).uniform(-2e-4, 2e-4, (3, 3))
-    poses = PoseSet.around(camera(rotation), SETS["six"])
+    poses = PoseBox.around(camera(rotation), SETS["six"])
     assert escapes(poses, poses.box, 1) == []
-    assert np.array_equal(PoseSet.around(camera(rotation), SETS["nothing"]).pose(np.empty(0))[:, :3], rotation)
+    assert np.array_equal(PoseBox.around(camera(rotation), SETS["nothing"]).pose(np.empty(0))[:, :3], rotation)
 
 
-def segment(angle: float, perturbation: Perturbation | None = None, seed: int = 5) -> PoseSet:
+def segment(angle: float, perturbation: Perturbation | None = None, seed: int = 5) -> PoseBox:
     """A segment whose ends differ by a turn of ``angle``."""
     rotation = random_rotation(seed)
     sweep = Perturbation(sweep="segments") if perturbation is None else perturbation
-    return PoseSet.around(camera(rotation), sweep, camera(turned(rotation, angle), (1.0, 0.5, 0.75)))
+    return PoseBox.around(camera(rotation), sweep, camera(turned(rotation, angle), (1.0, 0.5, 0.75)))
 
 
-def thin_escapes(poses: PoseSet, order: int = 1) -> list:
+def thin_escapes(poses: PoseBox, order: int = 1) -> list:
     """`escapes` of cells of zero width along the segment: nothing but the rounding is left."""
     return [
         escape
@@ -303,28 +303,28 @@ def test_segment_half_turn():
     """Both ways round are geodesics; the ends are the keyframes either way."""
     first = np.diag([1.0, 1.0, 1.0])
     for last in (np.diag([1.0, -1.0, -1.0]), np.diag([-1.0, 1.0, -1.0]), np.diag([-1.0, -1.0, 1.0])):
-        poses = PoseSet.around(camera(first), Perturbation(sweep="segments"), camera(last))
+        poses = PoseBox.around(camera(first), Perturbation(sweep="segments"), camera(last))
         assert np.abs(poses.pose(np.array([0.0]))[:, :3] - first).max() < 1e-15
         assert np.abs(poses.pose(np.array([1.0]))[:, :3] - last).max() < 1e-15
 
 
 def test_segment_fields_of_view():
     with pytest.raises(InputError, match="fov"):
-        PoseSet.around(camera(np.eye(3)), Perturbation(sweep="segments"), camera(np.eye(3), fx=99.0))
+        PoseBox.around(camera(np.eye(3)), Perturbation(sweep="segments"), camera(np.eye(3), fx=99.0))
 
 
 def test_keyframes_ignore_the_next():
-    poses = PoseSet.around(camera(np.eye(3)), SETS["x"], camera(random_rotation(6), fx=99.0))
+    poses = PoseBox.around(camera(np.eye(3)), SETS["x"], camera(random_rotation(6), fx=99.0))
     assert poses.target_camera is None and poses.box.names == ("x",)
 
 
 def test_box_order():
     """Free parameters in the documented order; the others are fixed."""
     orbit = Perturbation(translation=ALL, rotation=TURNS, sweep="segments", orbit=ORBIT)
-    poses = PoseSet.around(camera(np.eye(3)), orbit, camera(np.eye(3)))
+    poses = PoseBox.around(camera(np.eye(3)), orbit, camera(np.eye(3)))
     assert poses.box.names == ("x", "y", "z", "yaw", "pitch", "roll", "segment", "azimuth")
     assert poses.fixed == {}
-    assert PoseSet.around(camera(np.eye(3)), SETS["fixed"]).fixed == {
+    assert PoseBox.around(camera(np.eye(3)), SETS["fixed"]).fixed == {
         "x": 0.3, "y": 0.0, "z": 0.0, "yaw": 0.4, "pitch": 0.0, "roll": -2.0,
     }  # fmt: skip
 
@@ -341,13 +341,13 @@ def test_helpers():
 
 def test_translation_only():
     for name, expected in (("translation", True), ("nothing", True), ("fixed", True), ("six", False), ("orbit", False)):
-        poses = PoseSet.around(camera(random_rotation(1)), SETS[name])
+        poses = PoseBox.around(camera(random_rotation(1)), SETS[name])
         assert translation_only(poses.enclosure(poses.box)) == expected
 
 
 def widths(name: str, order: int) -> float:
     """Largest radius of the rotation's and offset's forms."""
-    poses = PoseSet.around(camera(random_rotation(1)), SETS[name])
+    poses = PoseBox.around(camera(random_rotation(1)), SETS[name])
     forms = poses.enclosure(poses.box, order)
     return float(max(forms.rotation.radius.max(), forms.offset.radius.max()))
 

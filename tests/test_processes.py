@@ -23,12 +23,12 @@ from ns_abstract.api.cell_search import examine_block
 from ns_abstract.api.files import Settings, open_job
 from ns_abstract.arithmetic import selfcheck
 from ns_abstract.cli.render import Render, render
-from ns_abstract.execution.engines import Here
-from ns_abstract.execution.opening import forget
+from ns_abstract.execution.engines import SerialEngine
+from ns_abstract.execution.worker_cache import clear_cache
 from ns_abstract.methods.nerf.write import write_nerf_run
 
 
-class FaultyWorker(Here):
+class FaultyWorker(SerialEngine):
     """An engine whose tasks run as on another machine, whose exp errs by an ulp more than bounds are charged."""
 
     shares = False
@@ -50,7 +50,7 @@ def faulty(patch: pytest.MonkeyPatch) -> None:
 
 def sound_again() -> None:
     selfcheck.platform_problems.cache_clear()
-    forget()
+    clear_cache()
 
 
 @pytest.fixture(autouse=True)
@@ -62,7 +62,7 @@ def checked_afresh() -> Iterator[None]:
 def test_a_faulty_worker_takes_the_guarantee_away(blobs: Inputs) -> None:
     job = open_job(Settings(blobs.config, blobs.path, blobs.spec))
     assert job.method.guarantee == "float32-sound"
-    (sound,) = bound_frames(job, [0], engine=Here(), budget=60.0, target_ratio=3.0)
+    (sound,) = bound_frames(job, [0], engine=SerialEngine(), budget=60.0, target_ratio=3.0)
     (unsound,) = bound_frames(job, [0], engine=FaultyWorker(), budget=60.0, target_ratio=3.0)
     assert sound.problems == ()
     (problem,) = unsound.problems

@@ -20,10 +20,10 @@ from ns_abstract.geometry.poses import SCENE_TURNS
 from ns_abstract.io.errors import InputError
 from ns_abstract.reach.dynamics import Dynamics, Floats, affine, double_integrator, fixed_wing, quadrotor, unicycle
 from ns_abstract.reach.learned import LearnedDynamics
-from ns_abstract.reach.loop import Face, Loop, parse_loop
-from ns_abstract.reach.search import LoopSearch, first_outside, pushes, simulate
-from ns_abstract.reach.tubes import AffineSet, Dependence, Linear, Pilot, Reacher, between, clipped
-from ns_abstract.verify.cells import Grid
+from ns_abstract.reach.loop import HalfSpace, Loop, parse_loop
+from ns_abstract.reach.search import LoopSearch, first_outside, sampled_disturbances, simulate
+from ns_abstract.reach.tubes import AffineBounds, AffineSet, ControlBounds, Dependence, TubeBuilder, between, clipped
+from ns_abstract.verify.cells import CellGrid
 from ns_abstract.verify.model import NetworkModel
 from ns_abstract.verify.network import load_network
 
@@ -173,7 +173,7 @@ def test_a_clip_is_enclosed() -> None:
     for _ in range(300):
         slopes, center, radius = rng.normal(size=(1, 2)), rng.normal(size=1), rng.random(1)
         spread = np.abs(slopes).sum() + radius
-        raw = Linear(slopes, center, radius, center - 1.01 * spread, center + 1.01 * spread)
+        raw = AffineBounds(slopes, center, radius, center - 1.01 * spread, center + 1.01 * spread)
         ends = np.sort(2.0 * rng.normal(size=2))
         found = clipped(raw, ends[:1], ends[1:] if rng.random() < 0.8 else np.array([np.inf]))
         for _ in range(10):
@@ -232,7 +232,7 @@ def specification(kind: str, gain: float = -2.0) -> dict[str, Any]:
     }
 
 
-def reacher(folder: Path, value: dict[str, Any], dependence: Dependence = "kept") -> Reacher:
+def reacher(folder: Path, value: dict[str, Any], dependence: Dependence = "kept") -> TubeBuilder:
     if value["dynamics"]["type"] == "onnx" and not (folder / "law.onnx").exists():
         law_file(folder / "law.onnx", "tanh")
     loop = parse_loop(value, folder)
@@ -244,7 +244,7 @@ def reacher(folder: Path, value: dict[str, Any], dependence: Dependence = "kept"
     # pictures are not negative, so that the hidden layer is open
     write_network(folder / "net.onnx", [np.eye(12), np.zeros(12), last[:, :-1], last[:, -1]], SIDE)
     model = NetworkModel(load_network(loop.network), loop.preprocess, 1 << 28)
-    return Reacher(loop, wall, Pilot(model, loop.control), dependence)
+    return TubeBuilder(loop, wall, ControlBounds(model, loop.control), dependence)
 
 
 @pytest.mark.slow
@@ -258,7 +258,9 @@ def test_tubes_hold_every_run(tmp_path: Path, kind: str) -> None:
     tubes = {mode: entry.tube(box, whole=True) for mode, entry in found.items()}
     rng, states = np.random.default_rng(7), 0
     for start in [*box.corners()[:20], *box.sample(60, rng)]:
-        run = simulate(found["kept"], loop.state(box, start), pushes(loop, rng, "ends" if states % 2 else "random"))
+        run = simulate(
+            found["kept"], loop.state(box, start), sampled_disturbances(loop, rng, "ends" if states % 2 else "random")
+        )
         for mode, tube in tubes.items():
             assert first_outside(tube, run) is None, mode
         # not only in the box, but where its initial state says
@@ -307,7 +309,7 @@ def test_tubes_hold_runs_in_a_scene_that_stands_elsewhere(tmp_path: Path) -> Non
     spread = set()
     for number, start in enumerate([*box.corners()[:20], *box.sample(20, rng)]):
         shift = found.shift * (rng.choice([-1.0, 1.0], 4) if number % 3 else rng.uniform(-1.0, 1.0, 4))
-        run = simulate(found, loop.state(box, start), pushes(loop, rng, "ends"), off=shift)
+        run = simulate(found, loop.state(box, start), sampled_disturbances(loop, rng, "ends"), off=shift)
         assert first_outside(tube, run) is None
         still = simulate(found, loop.state(box, start), run.disturbances)
         spread.add(bool((run.states != still.states).any()))
@@ -328,7 +330,7 @@ def test_tubes_hold_runs_in_a_scene_whose_place_the_view_tells(tmp_path: Path) -
     spread = set()
     for number, start in enumerate([*box.corners()[:20], *box.sample(20, rng)]):
         off = found.place * (rng.choice([-1.0, 1.0], 3) if number % 3 else rng.uniform(-1.0, 1.0, 3))
-        run = simulate(found, loop.state(box, start), pushes(loop, rng, "ends"), off=off)
+        run = simulate(found, loop.state(box, start), sampled_disturbances(loop, rng, "ends"), off=off)
         assert first_outside(tube, run) is None
         spread.add(first_outside(still, run) is None)
     assert False in spread
@@ -355,7 +357,7 @@ def test_a_run_sees_the_scene_it_is_given(tmp_path: Path) -> None:
 def examined(search: LoopSearch, number: int, most: int = 60) -> list[Any]:
     """All leaves of a search, in the order of the cells."""
     box = search.loop.box
-    grid = Grid.adaptive(box, [1] * box.dimensions)
+    grid = CellGrid.adaptive(box, [1] * box.dimensions)
     blocks, leaves = [tuple(grid.roots())], []
     while blocks and most:
         found = search.examine(number, grid, blocks.pop(0))
@@ -402,8 +404,8 @@ def test_what_is_not_finite_is_never_safe(tmp_path: Path) -> None:
 
 
 def test_a_face_is_exact() -> None:
-    assert Face((1.0, -1.0), 0.1).exact([0.3, 0.2]) == Fraction(0.3) - Fraction(0.2) - Fraction(0.1)
-    assert Face((1.0,), 0.1).exact([0.1]) == 0
+    assert HalfSpace((1.0, -1.0), 0.1).exact([0.3, 0.2]) == Fraction(0.3) - Fraction(0.2) - Fraction(0.1)
+    assert HalfSpace((1.0,), 0.1).exact([0.1]) == 0
 
 
 # ---------------------------------------------------------------- LOOP.json

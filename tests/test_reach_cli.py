@@ -33,9 +33,9 @@ from ns_abstract.io import memory
 from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.variations import SceneVariation, Selection
 from ns_abstract.reach.film import along
-from ns_abstract.reach.search import Run, first_outside, pushes, simulate
+from ns_abstract.reach.search import SimulatedRun, first_outside, sampled_disturbances, simulate
 from ns_abstract.reach.tubes import Pictures
-from ns_abstract.verify.response import Response
+from ns_abstract.verify.camera_response import CameraResponse
 from ns_abstract.verify.scene_margin import CAMERA_KINDS
 
 MODULE = "ns_abstract.cli.reach"
@@ -137,7 +137,9 @@ def test_a_part_of_the_box_is_certified(course: Course, tmp_path: Path) -> None:
         box = ParameterBox(loop.box.names, loop.box.units, tuple(row["lower"]), tuple(row["upper"]))
         whole = reacher.tube(box)
         for number, start in enumerate([*box.corners(), *box.sample(20, rng)]):
-            run = simulate(reacher, loop.state(box, start), pushes(loop, rng, "ends" if number % 2 else "random"))
+            run = simulate(
+                reacher, loop.state(box, start), sampled_disturbances(loop, rng, "ends" if number % 2 else "random")
+            )
             assert first_outside(whole, run) is None
             compared += len(run.states)
     assert compared > 500
@@ -172,7 +174,9 @@ def test_a_film_encloses_what_runs_see(course: Course) -> None:
     assert [step.index for step in steps] == list(range(11)) and steps[0].image.shape == (24, 16, 3)
     view = Pictures(part.job.method, loop.camera.poses((24, 16)))
     for number, start in enumerate([*box.corners(), *box.sample(4, rng)]):
-        run = simulate(reacher, loop.state(box, start), pushes(loop, rng, "ends" if number % 2 else "random"))
+        run = simulate(
+            reacher, loop.state(box, start), sampled_disturbances(loop, rng, "ends" if number % 2 else "random")
+        )
         for step, x in zip(steps, run.states, strict=True):
             seen = view.image(loop.camera.values(x))
             assert (step.lower <= seen).all() and (seen <= step.upper).all()
@@ -261,18 +265,18 @@ def test_scene_margin(course: Course, tmp_path: Path) -> None:
             reacher = replace(job.reacher(), view=view)
             scenes = [(None, radius * rng.choice([-1.0, 1.0], 3)) for _ in range(24)]
         elif (of_camera := responses.get(name)) is not None:
-            view = Pictures(job.job.method, job.job.pose_sets[0], Response(of_camera, radius))
+            view = Pictures(job.job.method, job.job.pose_sets[0], CameraResponse(of_camera, radius))
             reacher = replace(job.reacher(), view=view)
-            scenes = [(member, None) for member in itertools.islice(view.members(1), 24)]
+            scenes = [(member, None) for member in itertools.islice(view.scene_samples(1), 24)]
         else:
             ends: dict[str, Any] = {name: (-radius, radius)}
             view = Pictures(job.job.method, job.job.varied(0, SceneVariation(Selection(), **ends)))
             reacher = replace(job.reacher(), view=view)
-            scenes = [(member, None) for member in itertools.islice(reacher.view.members(1), 24)]
+            scenes = [(member, None) for member in itertools.islice(reacher.view.scene_samples(1), 24)]
         tube = reacher.tube(box)
         for number, (member, shift) in enumerate(scenes):
             start = box.corners()[number % 2] if number % 2 else box.sample(1, rng)[0]
-            push = pushes(loop, rng, "ends" if number % 3 else "random")
+            push = sampled_disturbances(loop, rng, "ends" if number % 3 else "random")
             run = simulate(reacher, loop.state(box, start), push, member, shift)
             assert run.margin(loop, "safe") > 0.0
             assert first_outside(tube, run) is None
@@ -288,7 +292,7 @@ def test_scene_margin(course: Course, tmp_path: Path) -> None:
         assert bool(files) == bool(broken)
         for file in files:
             with np.load(file) as stored:
-                run = Run(stored["states"], stored["controls"], stored["disturbances"])
+                run = SimulatedRun(stored["states"], stored["controls"], stored["disturbances"])
                 assert (
                     run.margin(loop, "safe") <= 0.0
                     and broken is not None
@@ -419,7 +423,7 @@ def test_dynamics_in_a_file(course: Course, call: Callable[..., tuple[int, str]]
         box = ParameterBox(job.loop.box.names, job.loop.box.units, tuple(row["lower"]), tuple(row["upper"]))
         tube = job.reacher().tube(box)
         for start in [*box.corners(), *box.sample(10, rng)]:
-            run = simulate(job.reacher(), job.loop.state(box, start), pushes(job.loop, rng, "ends"))
+            run = simulate(job.reacher(), job.loop.state(box, start), sampled_disturbances(job.loop, rng, "ends"))
             assert first_outside(tube, run) is None
     file.write_bytes(file.read_bytes().replace(b"network", b"another"))
     code, said = call(part.options(tmp_path / "out", resume=True))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from ns_abstract.geometry.camera_path import Camera, load_camera_path
+from ns_abstract.geometry.camera_path import PinholeCamera, load_camera_path
 from ns_abstract.geometry.poses import rotation_about
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, PAPER, Rasteriser
@@ -36,17 +36,17 @@ KINDS = {
 }
 
 
-def camera_at(seed: int) -> Camera:
+def camera_at(seed: int) -> PinholeCamera:
     """A camera with sides that no tile divides, two focal lengths and its principal point off the centre."""
     rng = np.random.default_rng(seed)
     axis = rng.normal(size=3)
     rotation = rotation_about(axis / np.linalg.norm(axis), rng.uniform(0, np.pi))
     pose = np.concatenate([rotation, rng.uniform(-2, 2, (3, 1))], axis=1)
-    return Camera(pose, 38.0, 43.0, 21.5, 15.25, 44, 35)
+    return PinholeCamera(pose, 38.0, 43.0, 21.5, 15.25, 44, 35)
 
 
 def make_scene(
-    camera: Camera,
+    camera: PinholeCamera,
     seed: int,
     *,
     count: int = 150,
@@ -78,16 +78,16 @@ def make_scene(
     )
 
 
-def pose_of(camera: Camera) -> torch.Tensor:
+def pose_of(camera: PinholeCamera) -> torch.Tensor:
     return torch.from_numpy(np.array(camera.camera_to_world))
 
 
-def compiled(scene: SplatScene, camera: Camera, rasteriser: Rasteriser = GSPLAT_1_4_0) -> np.ndarray:
+def compiled(scene: SplatScene, camera: PinholeCamera, rasteriser: Rasteriser = GSPLAT_1_4_0) -> np.ndarray:
     rotation = np.ascontiguousarray(camera.camera_to_world[:, :3].T * FLIP[:, None])
     return Renderer(activate(scene, rasteriser), rasteriser).image(camera, rotation, camera.camera_to_world[:, 3])
 
 
-def reference(scene: SplatScene, camera: Camera, rasteriser: Rasteriser = GSPLAT_1_4_0) -> np.ndarray:
+def reference(scene: SplatScene, camera: PinholeCamera, rasteriser: Rasteriser = GSPLAT_1_4_0) -> np.ndarray:
     return Reference(scene, rasteriser).image(camera, pose_of(camera)).numpy()
 
 
@@ -141,8 +141,8 @@ def test_depth_ties() -> None:
     assert apart(reference(replace(scene, means=means), camera), reference(tied, camera)) > 1e-3
 
 
-def replace_pose(camera: Camera, pose: np.ndarray) -> Camera:
-    return Camera(pose, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
+def replace_pose(camera: PinholeCamera, pose: np.ndarray) -> PinholeCamera:
+    return PinholeCamera(pose, camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height)
 
 
 ALTERED = {
@@ -178,9 +178,9 @@ def test_every_rule_shows(rule: str) -> None:
     assert worst > 1e-5
 
 
-def one_gaussian(opacity_logit: float, offset: tuple[float, float] = (0.0, 0.0)) -> tuple[SplatScene, Camera]:
+def one_gaussian(opacity_logit: float, offset: tuple[float, float] = (0.0, 0.0)) -> tuple[SplatScene, PinholeCamera]:
     """A red ball of standard deviation 0.1 at distance 2, seen from the origin against blue; 32x32, f 40."""
-    camera = Camera(np.eye(3, 4), 40.0, 40.0, 16.0, 16.0, 32, 32)
+    camera = PinholeCamera(np.eye(3, 4), 40.0, 40.0, 16.0, 16.0, 32, 32)
     band0 = (np.array([1.0, 0.0, 0.0]) - 0.5) / 0.28209479177387814
     scene = SplatScene(
         means=np.array([[offset[0], offset[1], -2.0]], np.float32),
@@ -210,7 +210,7 @@ def test_by_hand() -> None:
 
 def test_by_hand_opaque() -> None:
     scene, camera = one_gaussian(40.0)
-    camera = Camera(np.eye(3, 4), 40.0, 40.0, 16.5, 16.5, 32, 32)
+    camera = PinholeCamera(np.eye(3, 4), 40.0, 40.0, 16.5, 16.5, 32, 32)
     assert reference(scene, camera)[16, 16] == pytest.approx([0.999, 0.0, 0.001], abs=1e-7)
     # without thresholds it hides everything
     black = reference(scene, camera, PAPER)[16, 16]
@@ -306,7 +306,7 @@ def tensor(array: np.ndarray) -> torch.Tensor:
     return torch.from_numpy(np.array(array, np.float64))
 
 
-def view(camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
+def view(camera: PinholeCamera) -> tuple[torch.Tensor, torch.Tensor]:
     """View matrix [1, 4, 4] (splatfacto.py:128-143) and intrinsics [1, 3, 3]."""
     matrix = np.eye(4)
     matrix[:3, :3] = (camera.camera_to_world[:, :3] * FLIP).T
@@ -315,7 +315,7 @@ def view(camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
     return tensor(matrix[None]), tensor(intrinsics[None])
 
 
-def ours(scene: SplatScene, camera: Camera) -> Projection:
+def ours(scene: SplatScene, camera: PinholeCamera) -> Projection:
     return project(scene, camera, pose_of(camera))
 
 

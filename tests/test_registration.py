@@ -17,7 +17,7 @@ from ns_abstract.verify.model import NetworkModel
 from ns_abstract.verify.network import load_network
 from ns_abstract.verify.preprocess import Preprocess
 from ns_abstract.verify.properties import Query
-from ns_abstract.verify.registration import RegisteredModel, RegisteredScene
+from ns_abstract.verify.registration import RegisteredImages, RegisteredModel
 
 SIDE = 2
 
@@ -50,7 +50,7 @@ def test_bounds_hold_for_every_place_of_the_scene(tmp_path: Path, d: int) -> Non
     f.node("Relu")
     f.gemm(8, 3)
     wall = Wall(d, 0.1)
-    scene: Any = RegisteredScene(wall, wall)  # type: ignore[arg-type]
+    scene: Any = RegisteredImages(wall, wall)  # type: ignore[arg-type]
     plain = NetworkModel(load_network(f.write(tmp_path / "net.onnx")), Preprocess(), 1 << 28)
     model = RegisteredModel(plain)
     assert scene.box.dimensions == d
@@ -62,7 +62,7 @@ def test_bounds_hold_for_every_place_of_the_scene(tmp_path: Path, d: int) -> Non
     found = model.bound(images, Query(rows, np.zeros(6)))
     assert found.a.shape == (1, 6, d) and np.isfinite(found.b).all()
     nearest, reached = np.inf, 0.0
-    for member in itertools.islice(scene.members(2), 300):
+    for member in itertools.islice(scene.scene_samples(2), 300):
         p = rng.choice([-1.0, 1.0], d) if rng.random() < 0.5 else rng.uniform(-1.0, 1.0, d)
         outputs = model.outputs(scene.image(box.at(p), member)[None])[0].astype(np.float64)
         room = rows @ outputs - (found.a[0] @ p + found.b[0])
@@ -74,17 +74,19 @@ def test_bounds_hold_for_every_place_of_the_scene(tmp_path: Path, d: int) -> Non
 
 def test_steps_go_uphill_and_stay_in_the_set() -> None:
     wall = Wall(2, 0.1)
-    scene: Any = RegisteredScene(wall, wall)  # type: ignore[arg-type]
-    values, member = scene.box.middle, next(scene.members(0)).nearest
+    scene: Any = RegisteredImages(wall, wall)  # type: ignore[arg-type]
+    values, member = scene.box.middle, next(scene.scene_samples(0)).nearest
     assert (member.offset == 0.0).all() and (scene.image(values) == scene.image(values, member)).all()
 
     def score(picture: torch.Tensor, pose: torch.Tensor) -> torch.Tensor:
         return picture.sum()
 
-    moved, other = member.pushed(scene.box, values, score, 2.0)
+    moved, other = member.signed_gradient_step(scene.box, values, score, 2.0)
     assert scene.box.contains(moved) and (np.abs(other.offset) == 0.1).all()
     assert other(moved).sum() > scene.image(values).sum()
     assert float(scene.image(moved, other).sum()) >= max(
-        float(scene.image(pose, m).sum()) for m in itertools.islice(scene.members(0), 8) for pose in scene.box.corners()
+        float(scene.image(pose, m).sum())
+        for m in itertools.islice(scene.scene_samples(0), 8)
+        for pose in scene.box.corners()
     )
     assert (other.arrays["place"] == other.offset).all()

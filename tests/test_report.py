@@ -27,7 +27,7 @@ from ns_abstract.refine.result import FrameResult, Leaves, TracePoint
 from ns_abstract.report import files, page, picture, record
 from ns_abstract.report.figures import interval, metrics, number
 from ns_abstract.report.files import IMAGES, LEAVES, check_frame, frame_name, load_frame, save_frame
-from ns_abstract.report.record import Report, Run, differences, file_stamp, guarantee_text, merged, plain
+from ns_abstract.report.record import Report, RunRecord, differences, file_stamp, guarantee_text, merged, plain
 
 ROOT = Path(__file__).resolve().parents[1]
 EVIL = '<script>alert("x")</script>&$a_b$'
@@ -70,7 +70,7 @@ def leaves(d: int, count: int = 3, side: int = 4) -> Leaves:
     )  # fmt: skip
 
 
-def run(**changes: Any) -> Run:
+def run(**changes: Any) -> RunRecord:
     given_values: dict[str, Any] = {
         "guarantee": "float32-sound",
         "renderer": {"name": "gsplat", "version": "1.4.0"},
@@ -81,7 +81,7 @@ def run(**changes: Any) -> Run:
         "plan": ("SH bands 1 to 3 are zero",),
         "command": ("ns-abstract-render", "--output-dir", "my out"),
     }
-    return Run(**(given_values | changes))
+    return RunRecord(**(given_values | changes))
 
 
 def read(folder: Path) -> dict[str, Any]:
@@ -659,7 +659,7 @@ def test_page_shows_the_widest():
 @given(low=st.floats(1e-12, 1e6), span=st.floats(1.0, 1e9))
 @settings(deadline=None, max_examples=100)
 def test_log_axis(low, span):
-    axis = page.Axis(low, low * span, 50.0, 400.0, log=True)
+    axis = page.PlotAxis(low, low * span, 50.0, 400.0, log=True)
     ticks = axis.ticks()
     assert ticks == sorted(set(ticks)) and 1 <= len(ticks) <= 16
     assert all(50.0 - 1e-6 <= axis(tick) <= 400.0 + 1e-6 for tick in [*ticks, low, low * span])
@@ -668,6 +668,6 @@ def test_log_axis(low, span):
 @given(high=st.floats(1e-9, 1e9))
 @settings(deadline=None, max_examples=50)
 def test_linear_axis(high):
-    axis = page.Axis(0.0, high, 200.0, 20.0, log=False)
+    axis = page.PlotAxis(0.0, high, 200.0, 20.0, log=False)
     ticks = axis.ticks()
     assert 3 <= len(ticks) <= 8 and ticks[0] == 0.0 and all(20.0 - 1e-6 <= axis(tick) <= 200.0 for tick in ticks)

@@ -10,7 +10,7 @@ import mpmath
 import numpy as np
 import pytest
 
-from ns_abstract.verify.response import Response, ResponseName
+from ns_abstract.verify.camera_response import CameraResponse, ResponseName
 
 NAMES: tuple[ResponseName, ...] = ("brightness", "white balance", "gamma")
 
@@ -28,7 +28,7 @@ def linear_sets(width: float, seed: int) -> tuple[Any, np.ndarray, np.ndarray]:
     return (slope, below, slope, above), lower, upper
 
 
-def exact(response: Response, x: Fraction, value: float) -> Any:
+def exact(response: CameraResponse, x: Fraction, value: float) -> Any:
     """What a camera shows, in 200 bits."""
     number = mpmath.mpf(x.numerator) / x.denominator
     found = mpmath.power(number, mpmath.mpf(value)) if response.name == "gamma" else number * mpmath.mpf(value)
@@ -39,7 +39,7 @@ def exact(response: Response, x: Fraction, value: float) -> Any:
 @pytest.mark.parametrize("radius", [1e-9, 0.01, 0.3, 0.9])
 @pytest.mark.parametrize("width", [0.0, 1e-3, 0.3])
 def test_every_camera_is_contained(name: ResponseName, radius: float, width: float) -> None:
-    response, rng = Response(name, radius), np.random.default_rng(2)
+    response, rng = CameraResponse(name, radius), np.random.default_rng(2)
     linear, lower, upper = linear_sets(width, 1)
     (a, b, c, d), low, high = response.sets(linear, lower, upper)
     compared = 0
@@ -69,7 +69,7 @@ def test_every_camera_is_contained(name: ResponseName, radius: float, width: flo
 @pytest.mark.parametrize("name", NAMES)
 def test_sets_are_tight(name: ResponseName) -> None:
     """No wider than the cameras need, but for rounding."""
-    response = Response(name, 0.1)
+    response = CameraResponse(name, 0.1)
     x = np.full((40, 1, 3), 0.5, np.float32)
     still = np.zeros((*x.shape, 1), np.float32)
     (_, below, _, above), low, high = response.sets((still, x, still, x), x, x)
@@ -79,7 +79,7 @@ def test_sets_are_tight(name: ResponseName) -> None:
 
 
 def test_sets_that_cross_or_are_no_numbers_stay_so() -> None:
-    response = Response("brightness", 0.1)
+    response = CameraResponse("brightness", 0.1)
     still, x = np.zeros((1, 1, 3, 1), np.float32), np.full((1, 1, 3), 0.5, np.float32)
     _, low, _ = response.sets((still, x, still, x), x + np.float32(0.1), x)
     assert np.isnan(low).all()

@@ -30,7 +30,7 @@ KNOWN = {
     "arithmetic/elementary.py": {"1.9082149292705877e-10"},  # the low part of log 2
     "methods/nerf/render.py": {"1e-05"},  # Nerfstudio's least sum of weights
     "methods/splat/constants.py": {"1e-10"},  # gsplat's least accumulation
-    "methods/splat/rows.py": {"np.spacing"},  # a note on how coarse coordinates are
+    "methods/splat/drawable.py": {"np.spacing"},  # a note on how coarse coordinates are
     # an optimiser's settings, which no picture sees
     "methods/nerf/write.py": {"1e-08"},
     "methods/splat/write.py": {"1e-15"},

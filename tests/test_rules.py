@@ -15,8 +15,8 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from ns_abstract.arithmetic.forms import FormArray
-from ns_abstract.geometry.camera_path import Camera
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, PAPER
 from ns_abstract.methods.splat.render import Renderer
@@ -638,12 +638,12 @@ def three_gaussians() -> SplatScene:
     )
 
 
-def views(translation: dict[str, tuple[float, float]], rotation: dict[str, tuple[float, float]]) -> PoseSet:
-    camera = Camera(np.eye(3, 4), 7.0, 7.0, 4.0, 3.0, 8, 6)
-    return PoseSet.around(camera, Perturbation(translation=translation, rotation=rotation))
+def views(translation: dict[str, tuple[float, float]], rotation: dict[str, tuple[float, float]]) -> PoseBox:
+    camera = PinholeCamera(np.eye(3, 4), 7.0, 7.0, 4.0, 3.0, 8, 6)
+    return PoseBox.around(camera, Perturbation(translation=translation, rotation=rotation))
 
 
-def pictures(splats: Any, poses: PoseSet, count: int = 10) -> list[np.ndarray]:
+def pictures(splats: Any, poses: PoseBox, count: int = 10) -> list[np.ndarray]:
     rng = np.random.default_rng(0)
     values = np.concatenate([poses.box.corners(), poses.box.sample(count, rng)])
     return [paper.render(splats, poses.camera, *poses.world_to_camera(v)) for v in values]

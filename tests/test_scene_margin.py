@@ -10,36 +10,37 @@ import numpy as np
 import pytest
 
 from ns_abstract.api.margins import Margins
-from ns_abstract.execution.ending import AbandonedError, Deadline, checkpoint
+from ns_abstract.execution.cancellation import Deadline, WorkCancelledError, check_cancelled
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
-from ns_abstract.verify.scene_margin import Certified, Kind, Settled, check_scenes, widest
+from ns_abstract.verify.scene_margin import CellOutcome, CertifiedBox, VariationKind, check_scenes, largest_radius
 from ns_abstract.verify.store import Store
 
-KIND = Kind("color", "every colour", "of 1", 0.01, 1.0)
+KIND = VariationKind("color", "every colour", "of 1", 0.01, 1.0)
 #: What may vary at x: less where x is large. Bounds lose a quarter of a cell's width.
 TRUTHS = (lambda x: 0.5 - 0.3 * x, lambda x: 0.031 - 0.01 * x, lambda x: 0.2 + 0.0 * x)
 
 
-def cells(count: int = 3) -> list[Certified]:
+def cells(count: int = 3) -> list[CertifiedBox]:
     """Cells of x, the last one first by what was proved of it."""
     return [
-        Certified(k, ParameterBox(("x",), ("m",), (0.0,), (1.0,)), float(count - k), 1.0 / count) for k in range(count)
+        CertifiedBox(k, ParameterBox(("x",), ("m",), (0.0,), (1.0,)), float(count - k), 1.0 / count)
+        for k in range(count)
     ]
 
 
-def settle(radius: float, frame: int, box: ParameterBox) -> Settled:
-    checkpoint()
+def settle(radius: float, frame: int, box: ParameterBox) -> CellOutcome:
+    check_cancelled()
     (low,), (high,) = box.lower, box.upper
     if TRUTHS[frame](high) - radius - 0.25 * TRUTHS[frame](0.0) * (high - low) > 0.0:
-        return Settled("holds", "", np.ones(1))
+        return CellOutcome("holds", "", np.ones(1))
     if TRUTHS[frame](high) <= radius:
-        return Settled("falsified", "", np.ones(1), {"radius": np.array(radius)})
-    return Settled("unknown", "the bound is wide", np.ones(1))
+        return CellOutcome("falsified", "", np.ones(1), {"radius": np.array(radius)})
+    return CellOutcome("unknown", "the bound is wide", np.ones(1))
 
 
 def test_the_margin_is_that_of_the_weakest_cell() -> None:
-    found = widest(KIND, cells(), settle, lambda: False)
+    found = largest_radius(KIND, cells(), settle, lambda: False)
     # of all cells at every x, less what bounds lose even in parts
     assert 0.017 < found.radius < 0.021 and found.state == "done" and found.part == pytest.approx(1.0)
     assert found.failing is not None and found.failing.radius <= 1.15 * found.radius
@@ -56,17 +57,17 @@ def test_the_margin_is_that_of_the_weakest_cell() -> None:
 def test_parts_that_are_not_proved_count() -> None:
     """A cell holds but for its last part, however it is cut."""
 
-    def hole(radius: float, frame: int, box: ParameterBox) -> Settled:
+    def hole(radius: float, frame: int, box: ParameterBox) -> CellOutcome:
         bad = box.upper[0] > 0.999 or box.upper[0] - box.lower[0] > 0.3
-        return Settled("unknown" if bad else "holds", "a hole", np.ones(1))
+        return CellOutcome("unknown" if bad else "holds", "a hole", np.ones(1))
 
-    found = widest(KIND, cells(1), hole, lambda: False)
+    found = largest_radius(KIND, cells(1), hole, lambda: False)
     assert found.radius == 0.0 and found.falsified is None and found.state == "done"
     assert "0: not even" in found.sentence and "a hole" in found.sentence
 
 
 def test_no_radius_beyond_the_largest_is_claimed() -> None:
-    found = widest(KIND, cells(), lambda *_: Settled("holds", "", np.ones(1)), lambda: False)
+    found = largest_radius(KIND, cells(), lambda *_: CellOutcome("holds", "", np.ones(1)), lambda: False)
     assert found.radius == KIND.most and found.failing is None and "no larger one was tried" in found.sentence
 
 
@@ -80,8 +81,8 @@ def test_an_end_claims_no_more_than_was_proved(asked: int) -> None:
         left -= 1
         return left < 0
 
-    found = widest(KIND, cells(), settle, over)
-    whole = widest(KIND, cells(), settle, lambda: False)
+    found = largest_radius(KIND, cells(), settle, over)
+    whole = largest_radius(KIND, cells(), settle, lambda: False)
     assert found.radius in (0.0, whole.radius)
     if found.radius == 0.0:
         assert found.state == "ended" and found.part < 1.0 and "ended first" in found.sentence
@@ -91,16 +92,16 @@ def test_an_end_claims_no_more_than_was_proved(asked: int) -> None:
 
 
 def test_nothing_is_swallowed() -> None:
-    def broken(radius: float, frame: int, box: ParameterBox) -> Settled:
+    def broken(radius: float, frame: int, box: ParameterBox) -> CellOutcome:
         raise RuntimeError("a fault")
 
     with pytest.raises(RuntimeError, match="a fault"):
-        widest(KIND, cells(), broken, lambda: False)
+        largest_radius(KIND, cells(), broken, lambda: False)
 
-    def given_up(radius: float, frame: int, box: ParameterBox) -> Settled:
-        raise AbandonedError
+    def given_up(radius: float, frame: int, box: ParameterBox) -> CellOutcome:
+        raise WorkCancelledError
 
-    found = widest(KIND, cells(), given_up, lambda: False)
+    found = largest_radius(KIND, cells(), given_up, lambda: False)
     assert found.radius == 0.0 and found.state == "ended" and not found.trials
 
 
@@ -111,9 +112,9 @@ def test_a_resumed_command_settles_nothing_twice(tmp_path: Path) -> None:
         fixed: dict[int, dict[str, float]] = {k: {} for k in range(3)}
         return Store(tmp_path, {"scene": 1}, [("x", "m")], fixed, resume=resume)
 
-    whole, asked = widest(KIND, cells(), settle, lambda: False), []
+    whole, asked = largest_radius(KIND, cells(), settle, lambda: False), []
 
-    def counted(radius: float, frame: int, box: ParameterBox) -> Settled:
+    def counted(radius: float, frame: int, box: ParameterBox) -> CellOutcome:
         found = settle(radius, frame, box)
         asked.append((radius, frame, box, found.outcome))
         return found
@@ -153,10 +154,10 @@ def test_sets_without_a_margin_are_refused(varied: bool, rays: bool) -> None:
 
 
 def test_single_poses_have_margins() -> None:
-    one = Certified(0, ParameterBox((), (), (), ()), 0.5, 1.0)
+    one = CertifiedBox(0, ParameterBox((), (), (), ()), 0.5, 1.0)
 
-    def work(radius: float, frame: int, box: ParameterBox) -> Settled:
-        return Settled("holds" if radius < 0.07 else "unknown", "wide", np.zeros(0))
+    def work(radius: float, frame: int, box: ParameterBox) -> CellOutcome:
+        return CellOutcome("holds" if radius < 0.07 else "unknown", "wide", np.zeros(0))
 
-    found = widest(KIND, [one], work, lambda: False)
+    found = largest_radius(KIND, [one], work, lambda: False)
     assert 0.06 < found.radius < 0.07 and len(found.trials) < 20

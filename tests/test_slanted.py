@@ -14,10 +14,10 @@ from test_poses import SETS, camera, escapes, random_rotation
 from ns_abstract.api.files import PathJob
 from ns_abstract.bench.sets import open_jobs, pose_set, splat_of
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.methods.splat.frame import SplatFrame
-from ns_abstract.refine.engine import Goal, Refinement
+from ns_abstract.refine.engine import Refinement, RefinementGoal
 from ns_abstract.refine.result import FrameResult
 
 #: As found for real scenes, and steeper, of both signs.
@@ -29,11 +29,11 @@ SHEARS = {
 }
 
 
-def slanted(name: str) -> PoseSet:
-    return PoseSet.around(camera(random_rotation(1)), SETS[name]).sheared(SHEARS[name])
+def slanted(name: str) -> PoseBox:
+    return PoseBox.around(camera(random_rotation(1)), SETS[name]).sheared(SHEARS[name])
 
 
-def exact(poses: PoseSet, values: dict[str, fmpq]) -> dict[str, fmpq]:
+def exact(poses: PoseBox, values: dict[str, fmpq]) -> dict[str, fmpq]:
     """Slanted parameters of a pose, without rounding."""
     found = dict(values)
     for name, factors in poses.shear.items():
@@ -41,7 +41,7 @@ def exact(poses: PoseSet, values: dict[str, fmpq]) -> dict[str, fmpq]:
     return found
 
 
-def members(poses: PoseSet, plain: ParameterBox, count: int) -> list[dict[str, fmpq]]:
+def members(poses: PoseBox, plain: ParameterBox, count: int) -> list[dict[str, fmpq]]:
     """Slanted parameters of poses of the set: its corners, and inside."""
     random = np.random.default_rng(3)
     inner = random.uniform(-1, 1, (count, plain.dimensions))
@@ -64,14 +64,14 @@ def holds(box: ParameterBox, values: dict[str, fmpq]) -> bool:
 @pytest.mark.parametrize("name", SHEARS)
 def test_every_pose_has_slanted_parameters(name: str) -> None:
     poses = slanted(name)
-    plain = PoseSet.around(poses.camera, poses.perturbation).box
+    plain = PoseBox.around(poses.camera, poses.perturbation).box
     assert all(holds(poses.box, values) for values in members(poses, plain, 100))
 
 
 @pytest.mark.parametrize("name", SHEARS)
 def test_feasible_loses_no_pose(name: str) -> None:
     poses = slanted(name)
-    plain = PoseSet.around(poses.camera, poses.perturbation).box
+    plain = PoseBox.around(poses.camera, poses.perturbation).box
     points = members(poses, plain, 60)
     boxes = [poses.box]
     for axis in (*range(poses.box.dimensions), *range(poses.box.dimensions)):
@@ -95,7 +95,7 @@ def test_feasible_shrinks_and_empties() -> None:
     # at the end of the slanted yaw only one end of x belongs to the set
     assert found is not None and found.upper[x] < box.middle[x]
     assert poses.feasible(end.replace(x, box.middle[x], box.upper[x])) is None
-    plain = PoseSet.around(poses.camera, poses.perturbation)
+    plain = PoseBox.around(poses.camera, poses.perturbation)
     assert plain.feasible(plain.box) == plain.box
 
 
@@ -113,7 +113,7 @@ def test_enclosure(name: str, order: int) -> None:
 def test_concrete_poses_belong_to_the_set() -> None:
     """Witnesses are members: rotations beyond the set's go to its end, corners to corners."""
     poses = slanted("six")
-    plain = PoseSet.around(poses.camera, poses.perturbation)
+    plain = PoseBox.around(poses.camera, poses.perturbation)
     shown = {tuple(np.round(poses.pose(v), 12).ravel()) for v in poses.box.corners()}
     assert shown == {tuple(np.round(plain.pose(v), 12).ravel()) for v in plain.box.corners()}
 
@@ -128,11 +128,11 @@ def program_of(job: PathJob) -> tuple[Any, Any, Any]:
     return splat.splats, splat.rasteriser, splat.arithmetic
 
 
-def refined(job: PathJob, slant: bool, cells: int) -> tuple[PoseSet, FrameResult]:
+def refined(job: PathJob, slant: bool, cells: int) -> tuple[PoseBox, FrameResult]:
     poses = pose_set(job, "six", 0, 8.0)
-    frame = SplatFrame(*program_of(job), poses, slanted=slant)
+    frame = SplatFrame(*program_of(job), poses, sheared=slant)
     assert bool(frame.pose_set.shear) == slant
-    return poses, Refinement(frame, 0, Goal(1.0001, 300.0, cells)).run()
+    return poses, Refinement(frame, 0, RefinementGoal(1.0001, 300.0, cells)).run()
 
 
 def test_slanted_cells_enclose_and_are_tighter(job: PathJob) -> None:
@@ -149,7 +149,7 @@ def test_slanted_cells_enclose_and_are_tighter(job: PathJob) -> None:
 def test_what_turns_undo_does_not_move(job: PathJob) -> None:
     """Motion is that of the slanted parameters, also where the box holds parameters of no pose (R1)."""
     poses = pose_set(job, "six", 0, 8.0)
-    straight, slant = (SplatFrame(*program_of(job), poses, slanted=slanted) for slanted in (False, True))
+    straight, slant = (SplatFrame(*program_of(job), poses, sheared=sheared) for sheared in (False, True))
     shifts = [poses.box.names.index(name) for name in ("x", "y")]
     assert (slant.motion(slant.box)[shifts] < 0.5 * straight.motion(straight.box)[shifts]).all()
     # a pose beyond the set is another one than what is rendered for it
@@ -159,12 +159,12 @@ def test_what_turns_undo_does_not_move(job: PathJob) -> None:
 
 
 def test_a_shear_that_loses_poses_is_noticed(job: PathJob, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = PoseSet.sheared
+    whole = PoseBox.sheared
 
     def narrowed(self, shear):
         return replace(whole(self, shear), box=self.box.replace(3, 0.0, 0.001))
 
-    monkeypatch.setattr(PoseSet, "sheared", narrowed)
+    monkeypatch.setattr(PoseBox, "sheared", narrowed)
     poses, result = refined(job, True, 150)
     frame = SplatFrame(*program_of(job), poses)
     pictures = [assemble(frame.render(values), frame.camera) for values in poses.box.corners()]

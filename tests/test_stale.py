@@ -15,21 +15,21 @@ from conftest import InProcess, Inputs
 
 import ns_abstract as nsa
 from ns_abstract.api import certification, job, loop_job
-from ns_abstract.api.bounding import Part, bound_part
+from ns_abstract.api.bounding import TileTask, bound_part
 from ns_abstract.api.certification import CertifySettings, open_certification
 from ns_abstract.api.files import Settings, open_job
 from ns_abstract.api.reaching import open_loop
 from ns_abstract.cli import export as export_command
 from ns_abstract.cli import render as render_command
 from ns_abstract.demo.writing import write_loop_demo
-from ns_abstract.execution import opening
+from ns_abstract.execution import worker_cache
 from ns_abstract.io import version
 from ns_abstract.io.atomic import write_json
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.version import computed_by, stale
 from ns_abstract.refine.result import FrameResult, TracePoint
 from ns_abstract.report.files import save_frame
-from ns_abstract.report.record import Report, Run
+from ns_abstract.report.record import Report, RunRecord
 from ns_abstract.verify.store import Store
 
 Prints = dict[str, Any]
@@ -54,7 +54,7 @@ def result(opened: Any, index: int = 0) -> FrameResult:
 def write_results(blobs: Inputs, folder: Path, change: Callable[[Prints], Prints] = dict) -> Prints:
     """What ns-abstract-render leaves with a changed fingerprint; returns the unchanged one."""
     opened = open_job(Settings(blobs.config, blobs.path, blobs.spec))
-    run = Run(
+    run = RunRecord(
         guarantee="float32-sound", renderer=opened.method.program, scene=opened.describe(), frames=(0,),
         fingerprint=change(opened.fingerprint), settings={"target_ratio": 1.05},
     )  # fmt: skip
@@ -108,7 +108,7 @@ def test_frame_of_another_version_is_not_kept(blobs: Inputs, tmp_path: Path) -> 
     # the report claims what its frame file does not
     document = json.loads((tmp_path / "report.json").read_text())
     (tmp_path / "report.json").write_text(json.dumps(document | {"fingerprint": now}))
-    run = Run("float32-sound", {"name": "gsplat", "version": "1.4.0"}, {}, (0,), now, {"target_ratio": 1.05})
+    run = RunRecord("float32-sound", {"name": "gsplat", "version": "1.4.0"}, {}, (0,), now, {"target_ratio": 1.05})
     report = Report.resume(tmp_path, run)
     assert report.kept == [] and "ns-abstract 0.1.9" in report.ignored[0]
 
@@ -118,7 +118,7 @@ def test_same_version_is_resumed_and_exported(blobs: Inputs, tmp_path: Path, in_
     export = ["npz", "--input-dir", str(tmp_path / "out"), "--output-filename", str(tmp_path / "all.npz")]
     assert in_process(export_command.main, export)[0] == 0
     now = open_job(Settings(blobs.config, blobs.path, blobs.spec)).fingerprint
-    run = Run("float32-sound", {"name": "gsplat", "version": "1.4.0"}, {}, (0,), now, {"target_ratio": 1.05})
+    run = RunRecord("float32-sound", {"name": "gsplat", "version": "1.4.0"}, {}, (0,), now, {"target_ratio": 1.05})
     assert Report.resume(tmp_path / "out", run).kept == [0]
 
 
@@ -172,15 +172,15 @@ def test_worker_of_another_version_is_refused(blobs: Inputs, monkeypatch: pytest
     """The command's work reaches a process that has another version, which never opens the files."""
     opened = open_job(Settings(blobs.config, blobs.path, blobs.spec))
     recipe, goal = opened.recipe, opened.goal(1.5, 1.0, 2)
-    opening.forget()
+    worker_cache.clear_cache()
 
     def opens(*arguments: Any) -> None:
         raise AssertionError("files are opened")
 
-    monkeypatch.setattr(opening, "VERSION", "9.0.0")
+    monkeypatch.setattr(worker_cache, "VERSION", "9.0.0")
     monkeypatch.setattr(job.Scene, "__init__", opens)
     with pytest.raises(InputError, match=rf"runs ns-abstract 9\.0\.0.*{re.escape(nsa.__version__)}.*same version"):
-        bound_part(recipe, Part(0, None), goal, False)
+        bound_part(recipe, TileTask(0, None), goal, False)
 
 
 @pytest.mark.parametrize("which", ["render", "certify"])
@@ -196,10 +196,10 @@ def test_worker_with_other_rules_is_refused(
         prop = write_json(tmp_path / "prop.json", value)
         recipe = open_certification(CertifySettings(blobs.config, blobs.path, net, prop, blobs.spec)).recipe
         monkeypatch.setattr(certification, "_RULES", certification._RULES - 1)
-    opening.forget()
+    worker_cache.clear_cache()
     with pytest.raises(InputError, match=r"worker's results would be computed by.*same version on all machines"):
-        opening.opened(recipe)
-    opening.forget()
+        worker_cache.load(recipe)
+    worker_cache.clear_cache()
 
 
 def test_what_is_compared() -> None:

@@ -18,7 +18,7 @@ from ns_abstract.bench import stiff
 from ns_abstract.bench.stiff import ARITHMETICS, Case, WatchedFrame, all_cases, run_case
 from ns_abstract.cli.bench import Stiff, bench
 from ns_abstract.cli.common import DONE
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.bounds import CellBounds, SplatBounds
@@ -84,7 +84,7 @@ def test_jumps(name: str, step: float) -> None:
 class Low(WatchedFrame):
     """One pixel's bounds of every cell are too low by 1e-3."""
 
-    def __init__(self, splats: Splats, rasteriser: Rasteriser, arithmetic: Arithmetic, pose_set: PoseSet) -> None:
+    def __init__(self, splats: Splats, rasteriser: Rasteriser, arithmetic: Arithmetic, pose_set: PoseBox) -> None:
         super().__init__(splats, rasteriser, arithmetic, pose_set)
         honest = self.bounds.cell
 
@@ -117,7 +117,7 @@ class Undefined(Low):
 class Forgetful(WatchedFrame):
     """The bounds do not know of the last Gaussian; renders do."""
 
-    def __init__(self, splats: Splats, rasteriser: Rasteriser, arithmetic: Arithmetic, pose_set: PoseSet) -> None:
+    def __init__(self, splats: Splats, rasteriser: Rasteriser, arithmetic: Arithmetic, pose_set: PoseBox) -> None:
         super().__init__(splats, rasteriser, arithmetic, pose_set)
         rest = {name: getattr(splats, name)[:-1] for name in ("means", "axes", "opacity", "sh")}
         self.bounds = SplatBounds(replace(splats, **rest), rasteriser, arithmetic)

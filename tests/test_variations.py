@@ -18,8 +18,8 @@ from ns_abstract.arithmetic.rounding import FLOAT32, REAL, Arithmetic
 from ns_abstract.bench.sets import splat_of
 from ns_abstract.cli import render as render_command
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.camera_path import Camera
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.io.atomic import write_json
 from ns_abstract.io.errors import InputError
@@ -60,10 +60,10 @@ class Case:
 
     def __init__(self, scene: SplatScene, spec: dict, height: float = 0.0, size: int = 16, focal: float = 16.0) -> None:
         pose = np.concatenate([np.eye(3), [[0.0], [0.0], [height]]], axis=1)
-        self.camera = Camera(pose, focal, focal, size / 2, size / 2, size, size)
+        self.camera = PinholeCamera(pose, focal, focal, size / 2, size / 2, size, size)
         perturbation = parse_perturbation(spec)
         self.scene, self.splats = scene, activate(scene, GSPLAT_1_4_0)
-        self.poses = PoseSet.around(self.camera, perturbation)
+        self.poses = PoseBox.around(self.camera, perturbation)
         self.varied = vary(scene, self.splats, perturbation.scene)
 
     def cell(self, bounds: SplatBounds, box: ParameterBox | None = None, candidates=None) -> CellBounds:
@@ -339,7 +339,7 @@ def test_overlapping_ranges() -> None:
 def test_members_lie_in_the_set() -> None:
     case = Case(blob_scene(24, degree=1), {"scene": scene_of(**EVERYTHING)})
     varied, generator = case.varied, np.random.default_rng(0)
-    for member, _ in zip(varied.members(generator), range(40), strict=False):
+    for member, _ in zip(varied.scene_samples(generator), range(40), strict=False):
         assert ((varied.mean_low <= member.means) & (member.means <= varied.mean_high)).all()
         assert ((varied.opacity_low <= member.opacity) & (member.opacity <= varied.opacity_high)).all()
         assert ((varied.color_low <= member.color_shift) & (member.color_shift <= varied.color_high)).all()

@@ -19,13 +19,13 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.report import certificate_page as page
 from ns_abstract.report.regions import (
     MOST,
-    Region,
-    Shown,
+    FailureRegion,
+    PoseImage,
     distances,
     falsified_regions,
     nearest,
     regions_html,
-    told_outputs,
+    reported_outputs,
     touching,
 )
 from ns_abstract.report.verdict_maps import (
@@ -45,7 +45,7 @@ from ns_abstract.report.verdict_maps import (
 from ns_abstract.report.verdict_picture import clear_pictures, write_pictures
 from ns_abstract.report.walk import MOST as STOPS
 from ns_abstract.report.walk import cell_at, coarse_first, direction, stops, walk_html
-from ns_abstract.verify.cells import Grid
+from ns_abstract.verify.cells import CellGrid
 
 KINDS = ("certified", "falsified", "unknown")
 
@@ -56,7 +56,7 @@ def cut(d: int, count: int, seed: int) -> tuple[np.ndarray, np.ndarray, list[str
     low = rng.normal(size=d)
     high = low + rng.uniform(0.1, 3.0, d)
     box = ParameterBox(tuple("abcdefgh"[:d]), ("rad",) * d, tuple(low.tolist()), tuple(high.tolist()))
-    grid = Grid.adaptive(box, rng.integers(1, 4, d).tolist())
+    grid = CellGrid.adaptive(box, rng.integers(1, 4, d).tolist())
     cells = grid.roots()
     while len(cells) < count:
         cell = cells.pop(int(rng.integers(len(cells))))
@@ -381,16 +381,16 @@ def test_the_nearest_certified_pose() -> None:
     assert np.isfinite(distances(lower, low.tolist(), sides)).all()
 
 
-def shown(values: list[float], margin: float | None, outputs: list[float], title: str = "one") -> Shown:
+def shown(values: list[float], margin: float | None, outputs: list[float], title: str = "one") -> PoseImage:
     red = io.BytesIO()
     Image.new("RGB", (4, 4), (200, 10, 10)).save(red, "png")
-    return Shown(title, values, red.getvalue(), outputs, margin)
+    return PoseImage(title, values, red.getvalue(), outputs, margin)
 
 
 def test_regions_on_the_page() -> None:
     frame = entry("x", "<y>")
     regions = [
-        Region(0, (1, 2), 0.5 - 0.01 * k, (1.0, 0.0), (4.0, 6.0), (3.0, 2.0), -1.0) for k in range(MOST + 3)
+        FailureRegion(0, (1, 2), 0.5 - 0.01 * k, (1.0, 0.0), (4.0, 6.0), (3.0, 2.0), -1.0) for k in range(MOST + 3)
     ]  # fmt: skip
     pictures = [
         (shown([3.0, 2.0], -1.0, [0.5, 2.0], "counterexample"), shown([1.0, 2.0], 0.25, [1.5, 2.5], "<right>")),
@@ -410,9 +410,9 @@ def test_outputs_that_differ_most_are_told() -> None:
     broken, right = np.zeros(30), np.zeros(30)
     right[[3, 20]] = 1.0, -2.0
     broken[7] = np.nan
-    assert told_outputs(broken.tolist(), right.tolist(), 3) == [3, 7, 20]
-    assert told_outputs([0.5, 1.5], [0.5, 0.5]) == [0, 1]
-    assert told_outputs([0.5, -3.0, 1.0], None, 2) == [1, 2]
+    assert reported_outputs(broken.tolist(), right.tolist(), 3) == [3, 7, 20]
+    assert reported_outputs([0.5, 1.5], [0.5, 0.5]) == [0, 1]
+    assert reported_outputs([0.5, -3.0, 1.0], None, 2) == [1, 2]
 
 
 # ---------------------------------------------------------------- along a set

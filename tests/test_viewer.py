@@ -21,27 +21,27 @@ from test_cli import call, one_line  # noqa: F401
 from waiting import until
 
 from ns_abstract.cli import viewer as viewer_command
-from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.frame import SplatFrame, TileBounds
 from ns_abstract.perturbation.specification import Perturbation, parse_perturbation, perturbation_object
-from ns_abstract.refine.engine import Goal, Refinement
+from ns_abstract.refine.engine import Refinement, RefinementGoal
 from ns_abstract.viewer.background import Background
-from ns_abstract.viewer.views import NerfSource, Snapshot, Source, SplatSource, View, perturbation_of
+from ns_abstract.viewer.views import NerfSource, Snapshot, Source, SplatSource, ViewRequest, perturbation_of
 
 Call = Callable[..., tuple[int, str]]
 
 
-def camera(width: int = 96, height: int = 80, k: int = 0) -> Camera:
+def camera(width: int = 96, height: int = 80, k: int = 0) -> PinholeCamera:
     pose = ring()[k].camera_to_world[:3]
     focal = 0.5 * height / np.tan(np.radians(22.5))
-    return Camera(pose, focal, focal, 0.5 * width, 0.5 * height, width, height)
+    return PinholeCamera(pose, focal, focal, 0.5 * width, 0.5 * height, width, height)
 
 
-def view(x: float = 0.01, k: int = 0, **size: int) -> View:
-    return View(camera(k=k, **size), perturbation_of({"x": x}))
+def view(x: float = 0.01, k: int = 0, **size: int) -> ViewRequest:
+    return ViewRequest(camera(k=k, **size), perturbation_of({"x": x}))
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +50,7 @@ class Odd(SplatSource):
 
     odd: str = ""
 
-    def frame(self, camera: Camera, perturbation: Perturbation) -> SplatFrame:
+    def frame(self, camera: PinholeCamera, perturbation: Perturbation) -> SplatFrame:
         frame = super().frame(camera, perturbation)
         if "y" not in perturbation.translation:
             return frame
@@ -97,7 +97,9 @@ def background(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Backgr
         one.close()
 
 
-def answer(background: Background, view: View, seconds: float = 1.0, size: tuple[int, int] | None = None) -> Snapshot:
+def answer(
+    background: Background, view: ViewRequest, seconds: float = 1.0, size: tuple[int, int] | None = None
+) -> Snapshot:
     """The last snapshot of the work on ``view``."""
 
     def look() -> Snapshot | None:
@@ -109,7 +111,7 @@ def answer(background: Background, view: View, seconds: float = 1.0, size: tuple
     return until(look, "an abstract image")
 
 
-def violations(snapshot: Snapshot, view: View, count: int = 30) -> int:
+def violations(snapshot: Snapshot, view: ViewRequest, count: int = 30) -> int:
     """Values of real renders outside the bounds, at the snapshot's size, without tolerance."""
     at = view.camera.rescaled(view.side / max(snapshot.size))
     frame = source().frame(at, view.perturbation)
@@ -163,7 +165,7 @@ def test_a_view_is_remembered(background: Callable[..., Background]) -> None:
 @pytest.mark.slow
 def test_more_goes_on_with_the_last_view(background: Callable[..., Background]) -> None:
     # the goal takes hundreds of cells: no machine gets there in the first time
-    one, wide = background(), View(camera(), perturbation_of({"x": 0.05, "y": 0.05}))
+    one, wide = background(), ViewRequest(camera(), perturbation_of({"x": 0.05, "y": 0.05}))
     first = answer(one, wide, 0.01)
     one.more(2.0)
     second = answer(one, wide, 0.01)
@@ -173,8 +175,8 @@ def test_more_goes_on_with_the_last_view(background: Callable[..., Background]) 
     assert violations(second, wide) == 0
 
 
-def odd_view() -> View:
-    return View(camera(), perturbation_of({"y": 0.01}))
+def odd_view() -> ViewRequest:
+    return ViewRequest(camera(), perturbation_of({"y": 0.01}))
 
 
 @pytest.mark.slow
@@ -246,7 +248,7 @@ def test_nothing_to_show() -> None:
 
 def test_key_and_shape() -> None:
     assert view().key == view(width=48, height=40).key
-    for other in (view(x=0.02), view(k=1), View(camera(), perturbation_of({"yaw": 0.01}))):
+    for other in (view(x=0.02), view(k=1), ViewRequest(camera(), perturbation_of({"yaw": 0.01}))):
         assert other.key != view().key
     assert view().fits(40, 48) and view().fits(41, 48) and not view().fits(48, 48)
     assert perturbation_of({"x": 0.0, "roll": 0.1}) == Perturbation(rotation={"roll": (-0.1, 0.1)})
@@ -258,7 +260,7 @@ def test_key_and_shape() -> None:
 def test_refinement_can_be_looked_at_and_continued() -> None:
     found: list[tuple[int, Snapshot]] = []
     frame = source().frame(camera(), perturbation_of({"x": 0.05}))
-    refinement = Refinement(frame, 0, Goal(1.0, 60.0, cells=9))
+    refinement = Refinement(frame, 0, RefinementGoal(1.0, 60.0, cells=9))
 
     def look(point: Any, share: float) -> None:
         if refinement.covered:
@@ -268,10 +270,12 @@ def test_refinement_can_be_looked_at_and_continued() -> None:
     first = refinement.run()
     assert first.cells <= 9 and len(found) > 1
     spent = first.seconds
-    second = refinement.proceed(Goal(1.0, spent + 60.0, cells=30))
+    second = refinement.proceed(RefinementGoal(1.0, spent + 60.0, cells=30))
     assert second.cells > first.cells and second.seconds > spent
     assert (second.lower >= first.lower).all() and (second.upper <= first.upper).all()
-    whole = Refinement(source().frame(camera(), perturbation_of({"x": 0.05})), 0, Goal(1.0, 60.0, cells=9)).run()
+    whole = Refinement(
+        source().frame(camera(), perturbation_of({"x": 0.05})), 0, RefinementGoal(1.0, 60.0, cells=9)
+    ).run()
     np.testing.assert_array_equal(whole.lower, first.lower)
     for _, snapshot in found:
         assert violations(snapshot, view(x=0.05)) == 0
@@ -283,16 +287,16 @@ def test_refinement_can_be_looked_at_and_continued() -> None:
 SELECT = '{"box": [[-9, -9, -9], [0, 9, 9]], "opacity": [0.2, 1]}'
 
 
-def varied_view(select: str = SELECT, **radii: float) -> View:
-    return View(camera(), perturbation_of(radii, select))
+def varied_view(select: str = SELECT, **radii: float) -> ViewRequest:
+    return ViewRequest(camera(), perturbation_of(radii, select))
 
 
-def outside(snapshot: Snapshot, view: View, count: int = 24) -> int:
+def outside(snapshot: Snapshot, view: ViewRequest, count: int = 24) -> int:
     """Values of pictures of members of ``view``'s set outside the bounds."""
     at = view.camera.rescaled(view.side / max(snapshot.size))
     frame = source().frame(at, view.perturbation)
     rng, found = np.random.default_rng(5), 0
-    for member in itertools.islice(frame.varied.members(rng), count):
+    for member in itertools.islice(frame.varied.scene_samples(rng), count):
         values = frame.box.middle if frame.box.dimensions == 0 else frame.box.sample(1, rng)[0]
         picture = frame.renderer.image(at, *frame.pose_set.world_to_camera(values), member)
         found += int(((picture < snapshot.lower) | (picture > snapshot.upper)).sum())
@@ -304,7 +308,7 @@ def outside(snapshot: Snapshot, view: View, count: int = 24) -> int:
 def test_a_variation_slider_widens_the_abstract_image(background: Callable[..., Background], quantity: str) -> None:
     one = background()
     narrow, wide = (varied_view(**{quantity: radius}) for radius in (0.01, 0.04))
-    still = answer(one, View(camera(), perturbation_of({})))
+    still = answer(one, ViewRequest(camera(), perturbation_of({})))
     first, second = answer(one, narrow), answer(one, wide)
     assert outside(first, narrow) == outside(second, wide) == 0
     # what is asked for is what is bounded: the wider set leaves the narrower one's bounds, and the smaller gap's
@@ -313,7 +317,7 @@ def test_a_variation_slider_widens_the_abstract_image(background: Callable[..., 
     assert gaps[0] < gaps[1] < gaps[2]
     assert all(s.figures["mpg_witness"] > 0.0 for s in (first, second))  # type: ignore[operator]
     # and the other way: the slider back at 0 is the picture of before
-    assert one.best(View(camera(), perturbation_of({quantity: 0.0})), 1.0) is still
+    assert one.best(ViewRequest(camera(), perturbation_of({quantity: 0.0})), 1.0) is still
 
 
 @pytest.mark.slow
@@ -367,7 +371,7 @@ def test_an_empty_selection_is_told(background: Callable[..., Background]) -> No
 @pytest.mark.slow
 def test_bounds_of_a_nerf_ray_by_ray(background: Callable[..., Background]) -> None:
     scene = NerfSource(tiny_scene(3))
-    asked = View(nerf_camera(6, 5), perturbation_of({"x": 0.002}))
+    asked = ViewRequest(nerf_camera(6, 5), perturbation_of({"x": 0.002}))
     # compiled kernels are kept, and time is for rays
     scene.frame(asked.camera, asked.perturbation).warm_up()
     one = background(scene=scene)
@@ -398,7 +402,7 @@ def test_bounds_of_a_nerf_ray_by_ray(background: Callable[..., Background]) -> N
 
 def test_nerfs_are_bounded_in_small_pictures() -> None:
     scene = NerfSource(tiny_scene(3))
-    shown = View(camera(512, 384), perturbation_of({"x": 0.01}))
+    shown = ViewRequest(camera(512, 384), perturbation_of({"x": 0.01}))
     small = shown.at_most(scene.most)
     assert (small.camera.width, small.camera.height) == (32, 24)
     assert small.key == shown.key and small.at_most(64) is small and shown.at_most(None) is shown
@@ -414,7 +418,7 @@ def test_a_larger_picture_of_which_less_is_known_waits() -> None:
         lower.reshape(-1, 3)[:untreated], upper.reshape(-1, 3)[:untreated] = 0.0, 1.0
         return Snapshot(lower, upper, lower, upper, {}, 0.0, 1, final, "real-sound")
 
-    one, asked = Background(), View(camera(64, 64), perturbation_of({"x": 0.01}))
+    one, asked = Background(), ViewRequest(camera(64, 64), perturbation_of({"x": 0.01}))
     steps = ((8, 16, True, 8), (16, 200, False, 8), (16, 50, False, 16), (32, 900, True, 32))
     for size, untreated, final, shown in steps:
         one._store(asked.key, asked, snapshot(size, untreated, final=final))

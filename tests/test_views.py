@@ -16,13 +16,13 @@ import ns_abstract as nsa
 from ns_abstract.demo.paths import airfield_orbit
 from ns_abstract.demo.scenes import splat_scene
 from ns_abstract.demo.writing import write_demo
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.splat.method import SplatMethod
 from ns_abstract.perturbation.specification import Perturbation
-from ns_abstract.verify.cover import Cover, Covered
 from ns_abstract.verify.model import NetworkModel
 from ns_abstract.verify.network import load_network
 from ns_abstract.verify.preprocess import Preprocess
+from ns_abstract.verify.subboxes import SubBoxOutcome, SubBoxProof
 
 NETWORKS = BENCHMARKS / "networks"
 
@@ -42,13 +42,13 @@ def judge_of(file: Path) -> NetworkModel:
     return NetworkModel(load_network(file), Preprocess(), 1 << 28)
 
 
-def moving(scripts: Any, side: int = 16) -> tuple[SplatMethod, PoseSet]:
+def moving(scripts: Any, side: int = 16) -> tuple[SplatMethod, PoseBox]:
     """A car on the lawn, and a set of poses of two parameters."""
     things, seed, far, elevation = scripts.objects.RUNS["car"]
     view = scripts.train.around((0.0, 0.0, 0.1), 25.0, elevation, far)
     camera = nsa.Camera(view.camera_to_world, view.fov, side, side)
     perturbation = Perturbation(translation={"x": (-0.2, 0.2), "z": (-0.1, 0.1)})
-    return SplatMethod(scripts.objects.scene(things, seed), None, None), PoseSet.around(camera, perturbation)
+    return SplatMethod(scripts.objects.scene(things, seed), None, None), PoseBox.around(camera, perturbation)
 
 
 @pytest.mark.slow
@@ -295,7 +295,7 @@ def test_estimator_of_the_airfield(scripts: Any) -> None:
     value = airfield_orbit(64)
     camera = nsa.Camera(np.reshape(value["camera_path"][0]["camera_to_world"], (4, 4)), 45.0, 64, 64)
     translation = {"x": (-0.35, 0.35), "y": (-0.1, 0.1), "z": (-0.15, 0.15)}
-    poses = PoseSet.around(camera, Perturbation(translation=translation))
+    poses = PoseBox.around(camera, Perturbation(translation=translation))
     values = poses.box.sample(12, np.random.default_rng(5))
     shown = scripts.views.pictures(SplatMethod(splat_scene("airfield"), None, None), poses, values)
     outputs = judge("estimator_airfield").outputs(shown.permute(0, 2, 3, 1).numpy())
@@ -339,14 +339,14 @@ def test_slanted_parts_of_an_estimator_and_a_detector(
     scripts: Any, name: str, shift: float, turn: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Cells whose parts make up for a shift by a turn are proved, and no attack breaks them."""
-    covered: list[Covered] = []
+    covered: list[SubBoxOutcome] = []
 
-    def watched(self: Cover, *arguments: Any) -> Covered:
+    def watched(self: SubBoxProof, *arguments: Any) -> SubBoxOutcome:
         covered.append(prove(self, *arguments))
         return covered[-1]
 
-    prove = Cover.prove
-    monkeypatch.setattr(Cover, "prove", watched)
+    prove = SubBoxProof.prove
+    monkeypatch.setattr(SubBoxProof, "prove", watched)
     row = scripts.certify.ROWS[name]
     if row.scene == "airfield":
         config, files = write_demo(tmp_path)

@@ -18,7 +18,7 @@ from ns_abstract.bench import vnnlib as module
 from ns_abstract.bench.vnnlib import run_folder
 from ns_abstract.cli import bench
 from ns_abstract.io.errors import InputError
-from ns_abstract.verify import boxes
+from ns_abstract.verify import box_decisions
 from ns_abstract.verify.network import load_network
 from ns_abstract.verify.vnnlib import load_regions
 
@@ -142,7 +142,9 @@ def proved(file: Path, condition: str, asks: int = 45) -> str:
     """What proofs alone say, since no output that the program computes is finite, until time has been asked for."""
     times = itertools.count()
     regions = load_regions(file.parent / "a", 2, 2, text(condition))
-    return boxes.decide(load_network(file), lambda image: np.full(2, np.nan), regions, lambda: next(times) > asks).word
+    return box_decisions.decide(
+        load_network(file), lambda image: np.full(2, np.nan), regions, lambda: next(times) > asks
+    ).word
 
 
 def test_proofs_alone_never_decide_unsafe_instances(tmp_path: Path) -> None:
@@ -165,14 +167,14 @@ def test_planted_faults_are_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     y = grid_outputs(file)
     both = f"(or (<= Y_0 {float(y[:, 0].min()) - 1.0!r}) (<= Y_1 {float(np.median(y[:, 1]))!r}))"
     assert proved(file, both) in ("unknown", "timeout")
-    monkeypatch.setattr(boxes, "proves", lambda bounds, groups: (bounds.lower > 0.0).any(1))
+    monkeypatch.setattr(box_decisions, "proves", lambda bounds, groups: (bounds.lower > 0.0).any(1))
     assert proved(file, both) == "unsat"
 
 
 def test_time_is_kept(tmp_path: Path) -> None:
     file = net(tmp_path, 1)
     regions = load_regions(tmp_path / "a", 2, 2, text("(<= Y_0 -1e9)"))
-    answer = boxes.decide(load_network(file), session(file), regions, lambda: True)
+    answer = box_decisions.decide(load_network(file), session(file), regions, lambda: True)
     assert answer.word == "timeout"
 
 

@@ -16,7 +16,7 @@ import torch
 
 from ns_abstract.arithmetic.outward import outward
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.overrides import Overrides
@@ -58,7 +58,7 @@ class WallFrame:
     witnesses = 1
     stages = ()
 
-    def __init__(self, wall: Wall, pose_set: PoseSet) -> None:
+    def __init__(self, wall: Wall, pose_set: PoseBox) -> None:
         self.wall, self.pose_set = wall, pose_set
         self.box, self.camera, self.side = pose_set.box, pose_set.camera, SIDE
         self.across, self.down = -(-self.camera.width // SIDE), -(-self.camera.height // SIDE)
@@ -86,7 +86,7 @@ class WallFrame:
     def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
         return (0.5 + 0.4 * np.sin(self._angles(self.pose_set.pose(values)[:, 3], tiles))).astype(np.float32)
 
-    def members(self, seed: int) -> Iterator[Render]:
+    def scene_samples(self, seed: int) -> Iterator[Render]:
         return iter(())
 
     def bound(self, box: ParameterBox, tiles: np.ndarray, within: Any = None, keep_linear: bool = False) -> WallBounds:
@@ -152,10 +152,10 @@ class WallMethod:
     def describe(self) -> dict[str, Any]:
         return {"name": self.name, "source": "test"}
 
-    def easier(self, poses: PoseSet) -> Iterator[tuple[str, Any]]:
+    def ablations(self, poses: PoseBox) -> Iterator[tuple[str, Any]]:
         return iter(())
 
-    def holders(self, frame: Any, box: ParameterBox, tile: int, count: int) -> list[tuple[int, float]]:
+    def attribution(self, frame: Any, box: ParameterBox, tile: int, count: int) -> list[tuple[int, float]]:
         return []
 
     def elements(self) -> None:
@@ -169,10 +169,10 @@ class WallMethod:
     def memory(self, pixels: int, threads: int) -> int:
         return 1000 * pixels
 
-    def frame(self, poses: PoseSet, slanted: bool = False, layers: bool = False) -> WallFrame:
+    def frame(self, poses: PoseBox, sheared: bool = False, layers: bool = False) -> WallFrame:
         return WallFrame(self.wall, poses)
 
-    def differentiable(self, poses: PoseSet) -> Callable[[torch.Tensor], torch.Tensor] | None:
+    def differentiable(self, poses: PoseBox) -> Callable[[torch.Tensor], torch.Tensor] | None:
         from ns_abstract.geometry.differentiable_pose import differentiable_pose
 
         pose, camera = differentiable_pose(poses), poses.camera

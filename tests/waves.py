@@ -13,7 +13,7 @@ from ns_abstract.geometry.box import ParameterBox
 class Waves:
     """Pictures that fade with d parameters v: ``0.5 + 0.3 a . sin(v)``, bounded by Taylor's formula.
 
-    See `ns_abstract.verify.protocol.Scene`.
+    See `ns_abstract.verify.protocol.FrameImages`.
     """
 
     def __init__(self, size: tuple[int, int], d: int) -> None:

@@ -24,52 +24,52 @@ _RESUMED = "test_certify_search.py::test_resumed_store_equals_an_uninterrupted_o
 _REGISTRATION = "verify/registration.py"
 _PLACES = "test_registration.py::test_bounds_hold_for_every_place_of_the_scene"
 _ROUNDED = "verify/eight_bit.py"
-_BOXES = "verify/boxes.py"
+_BOXES = "verify/box_decisions.py"
 _EITHER = "test_vnnlib_runner.py::test_proofs_alone_never_decide_unsafe_instances"
-_BRANCHING, _SLOPES = "verify/network/branching.py", "verify/network/slopes.py"
+_BRANCHING, _SLOPES = "verify/network/branching.py", "verify/network/slope_optimisation.py"
 _BRANCHES = "test_network_branching.py::test_claims_next_to_the_exact_minimum"
 _LEVELS = "test_eight_bit.py::test_sets_hold_rounded_pictures"
 
-_FAMILY, _COVER = "verify/network/family.py", "verify/cover.py"
+_FAMILY, _COVER = "verify/network/shared_coefficients.py", "verify/subboxes.py"
 _SHARED = "test_cover.py::test_rows_of_one_cell_hold_every_value"
 
 CERTIFICATES = (
     Fault(
         "families: parts are taken about their own reference",
-        _FAMILY, "_Other.about", "np.repeat(self.first.known.middle, len(middle), axis=0)", "middle",
+        _FAMILY, "_ReusingCells.about", "np.repeat(self.first.intermediate.middle, len(middle), axis=0)", "middle",
         _SHARED + "[product]",
     ),
     Fault(
         "families: parts follow their own winners of windows",
-        _FAMILY, "_Other.winner", "self.first.winners[k].expand_as(winner).contiguous()", "winner",
+        _FAMILY, "_ReusingCells.winner", "self.first.winners[k].expand_as(winner).contiguous()", "winner",
         "test_cover.py::test_parts_have_the_references_and_winners_of_the_whole",
     ),
     Fault(
         "families: rows that were passed back with a negative sign keep it",
-        _FAMILY, "_Other._said", "middle * lent.sign", "middle", _SHARED + "[]",
+        _FAMILY, "_ReusingCells._said", "middle * stored.sign", "middle", _SHARED + "[]",
     ),
     Fault(
         "families: the cell's own width is left out",
-        _FAMILY, "_Other._said", "half[0] + spread", "0.0 * half[0] + spread", _SHARED + "[]",
+        _FAMILY, "_ReusingCells._said", "half[0] + spread", "0.0 * half[0] + spread", _SHARED + "[]",
     ),
     Fault(
         "families: activations are taken to follow the first cell's slopes",
-        _FAMILY, "_Other._said", "spread[here] += sizes[:, -1]", "spread[here] += 0.0 * sizes[:, -1]",
+        _FAMILY, "_ReusingCells._said", "spread[here] += sizes[:, -1]", "spread[here] += 0.0 * sizes[:, -1]",
         _SHARED + "[]",
     ),
     Fault(
         "families: what rows gathered at products is forgotten",
-        _FAMILY, "_Other._said", "middle + 0.5 * (low + high)", "middle",
+        _FAMILY, "_ReusingCells._said", "middle + 0.5 * (low + high)", "middle",
         "test_cover.py::test_products_of_rows_are_charged[product]",
     ),
     Fault(
         "families: what float32 products lose is not charged",
-        _FAMILY, "_Other._said", "loses / (1.0 - loses)", "0.0",
+        _FAMILY, "_ReusingCells._said", "loses / (1.0 - loses)", "0.0",
         "test_cover.py::test_products_of_rows_are_charged[]",
     ),
     Fault(
         "families: rounding is charged by the first part's sizes",
-        _FAMILY, "_Other.sized", "form.upper.amax(0, keepdim=True)", "form.upper[:1]",
+        _FAMILY, "_ReusingCells.rounding_form", "form.upper.amax(0, keepdim=True)", "form.upper[:1]",
         "test_cover.py::test_rounding_is_charged_by_all_parts_at_once",
     ),
     Fault(
@@ -78,30 +78,30 @@ CERTIFICATES = (
     ),
     Fault(
         "families: what follows the parameters has no width",
-        "verify/network/propagation.py", "_tilted", "z.r * UP", "0.0 * z.r", _SHARED + "[]",
+        "verify/network/propagation.py", "_around_slope", "z.r * UP", "0.0 * z.r", _SHARED + "[]",
     ),
     Fault(
         "families: what is between the offsets does not follow the parameters",
-        "verify/network/propagation.py", "_tilted", "t[:, None] * z.a", "0.0 * t[:, None] * z.a", _SHARED + "[]",
+        "verify/network/propagation.py", "_around_slope", "t[:, None] * z.a", "0.0 * t[:, None] * z.a", _SHARED + "[]",
     ),
     Fault(
         "parts: joined sets forget that slopes differ",
-        _COVER, "joined", "np.abs(a_low - by * common).sum(axis=-1)", "0.0",
+        _COVER, "hull_of_sets", "np.abs(a_low - by * common).sum(axis=-1)", "0.0",
         "test_cover.py::test_joined_sets_hold_every_part[0.0]",
     ),
     Fault(
         "parts: ends of boxes are taken to be exact",
-        _COVER, "joined", "(np.abs(lower) + np.abs(upper)).max(axis=0) / reach", "0.0 * reach",
+        _COVER, "hull_of_sets", "(np.abs(lower) + np.abs(upper)).max(axis=0) / reach", "0.0 * reach",
         "test_cover.py::test_joined_sets_hold_every_part[300000.0]",
     ),
     Fault(
         "parts: one without a proof is passed over",
-        _COVER, "Cover._left", "not margins[k] > 0.0", "margins[k] == 0.0",
+        _COVER, "SubBoxProof._left", "not margins[k] > 0.0", "margins[k] == 0.0",
         "test_cover.py::test_one_part_without_a_proof_leaves_the_cell_without",
     ),
     Fault(
         "parts: a cell's slanted box is that of narrower rotations",
-        "geometry/poses.py", "PoseSet.within", "(low, high)", "(low, 0.5 * (low + high))",
+        "geometry/poses.py", "PoseBox.within", "(low, high)", "(low, 0.5 * (low + high))",
         "test_cover.py::test_poses_of_a_cell_are_in_its_slanted_parts[six]",
     ),
     Fault(
@@ -118,23 +118,23 @@ CERTIFICATES = (
     Fault(
         "registration: the worst place of the scene is not taken",
         _REGISTRATION, "RegisteredModel.bound",
-        "found.b - lost - OWN_LINE * (np.abs(found.b) + lost)", "found.b", _PLACES,
+        "output_bounds.b - lost - OWN_LINE * (np.abs(output_bounds.b) + lost)", "output_bounds.b", _PLACES,
     ),
     Fault(
         "registration: pictures of one corner of the places",
-        _REGISTRATION, "RegisteredScene.widened",
+        _REGISTRATION, "RegisteredImages.widened",
         "(*box.upper, *whole.upper[-PLACE:])", "(*box.upper, *whole.lower[-PLACE:])", _PLACES,
     ),
     Fault(
         "scene margin: parts that are not proved are passed over",
-        "verify/scene_margin.py", "_Bisection._examined", 'return "unknown", found.reason, count, None', "continue",
+        "verify/scene_margin.py", "_Bisection._examined", 'return "unknown", outcome.reason, count, None', "continue",
         "test_scene_margin.py::test_parts_that_are_not_proved_count",
     ),
     Fault(
         "scene margin: the largest radius of a cell is told",
-        "verify/scene_margin.py", "widest",
-        "found.reached, found.part = radius, found.part + cells[number].part",
-        "found.reached, found.part = max(radius, found.reached), found.part + cells[number].part",
+        "verify/scene_margin.py", "largest_radius",
+        "margin.reached, margin.part = radius, margin.part + cells[number].part",
+        "margin.reached, margin.part = max(radius, margin.reached), margin.part + cells[number].part",
         "test_scene_margin.py::test_the_margin_is_that_of_the_weakest_cell",
     ),
     Fault(
@@ -218,11 +218,11 @@ CERTIFICATES = (
     ),
     Fault(
         "truth: the object is seen in OpenCV's axes",
-        _PROPERTIES, "Truth.forms", "np.array([1.0, -1.0, -1.0])", "np.array([1.0, 1.0, 1.0])", _TRUTH,
+        _PROPERTIES, "TrueValues.forms", "np.array([1.0, -1.0, -1.0])", "np.array([1.0, 1.0, 1.0])", _TRUTH,
     ),
     Fault(
         "truth: the distance is squared",
-        _PROPERTIES, "Truth.forms", "camera.square().sum(0).sqrt()", "camera.square().sum(0)", _TRUTH,
+        _PROPERTIES, "TrueValues.forms", "camera.square().sum(0).sqrt()", "camera.square().sum(0)", _TRUTH,
     ),
     Fault(
         "detection: other classes are left out of the score",
@@ -273,24 +273,25 @@ CERTIFICATES = (
     ),
     Fault(
         "branching: one sign of a unit is left out",
-        _BRANCHING, "_Branch.halves", "(1.0, -1.0)", "(1.0,)", _BRANCHES,
+        _BRANCHING, "_PhaseBranch.halves", "(1.0, -1.0)", "(1.0,)", _BRANCHES,
     ),
     Fault(
         "branching: multipliers of either sign",
-        _SLOPES, "Ascent.climb", "np.maximum(moved, 0.0).astype(np.float32)", "moved.astype(np.float32)", _BRANCHES,
+        _SLOPES, "DualAscent.climb", "np.maximum(moved, 0.0).astype(np.float32)", "moved.astype(np.float32)", _BRANCHES,
     ),
     Fault(
         "branching: multipliers forget the reference",
-        _SLOPES, "Held.pay", "gained.astype(np.float64) @ self.reference - room", "-room", _BRANCHES,
+        _SLOPES, "SplitNeurons.pay", "gained.astype(np.float64) @ self.reference - room", "-room", _BRANCHES,
     ),
     Fault(
         "branching: signs of the other side are assumed",
-        "verify/network/forward.py", "Forward._assume", "torch.from_numpy(side > 0.0)", "torch.from_numpy(side < 0.0)",
+        "verify/network/forward.py", "ForwardPass._assume", "torch.from_numpy(side > 0.0)",
+        "torch.from_numpy(side < 0.0)",
         _BRANCHES,
     ),
     Fault(
         "branching: what is not a number is proved",
-        _BRANCHING, "_judged", "np.where(np.isnan(found.lower[number]), -np.inf, found.lower[number])",
+        _BRANCHING, "_branch_of", "np.where(np.isnan(found.lower[number]), -np.inf, found.lower[number])",
         "np.where(np.isnan(found.lower[number]), np.inf, found.lower[number])",
         "test_network_branching.py::test_an_end_comes_soon",
     ),
@@ -301,7 +302,7 @@ CERTIFICATES = (
     ),
     Fault(
         "search: a proof need not survive an attack",
-        _SEARCH, "Search.examine", "self._sample([seen[k] for k in sorted(proved)], self._attack)", "pass",
+        _SEARCH, "Search.examine", "self._sample([samples[k] for k in sorted(proved)], self._attack)", "pass",
         "test_certify_search.py::test_number_that_is_lost_after_a_proof_takes_it_back[nan]",
     ),
     Fault(
@@ -319,8 +320,8 @@ CERTIFICATES = (
     ),
     Fault(
         "search: a swallowed error proves",
-        _SEARCH, "Search._bound", "reasons.update(dict.fromkeys(kept, failure_text(error)))",
-        "bounded.update(dict.fromkeys(kept, 1.0))", _NETWORKS + "[exception]",
+        _SEARCH, "Search._bound", "reasons.update(dict.fromkeys(numbers_kept, failure_text(error)))",
+        "bounded.update(dict.fromkeys(numbers_kept, 1.0))", _NETWORKS + "[exception]",
     ),
     Fault(
         "search: counterexamples are not rendered again",
@@ -350,17 +351,18 @@ CERTIFICATES = (
     ),
     Fault(
         "search: cells are given up where one scene breaks one pose",
-        _SEARCH, "_Seen.hopeless", "len(self._where(_spoilt)) == len(self.poses)", "bool(self._where(_spoilt))",
+        _SEARCH, "_CellSamples.hopeless", "len(self._where(_spoilt)) == len(self.poses)", "bool(self._where(_spoilt))",
         _SCENES,
     ),
     Fault(
         "cells: parts of a cut leave a gap",
-        _CELLS, "Grid.cut", "first + (past - first) * i // n", "first + (past - first + 1) * i // n",
+        _CELLS, "CellGrid.cut", "first + (past - first) * i // n", "first + (past - first + 1) * i // n",
         "test_certify_search.py::test_grid",
     ),
     Fault(
         "cells: the last line of the grid is not the set's end",
-        _CELLS, "Grid.end", "high if position == self.units[axis] else low + (high - low) * (position / self.units[axis])",  # noqa: E501
+        _CELLS, "CellGrid.end",
+        "high if position == self.units[axis] else low + (high - low) * (position / self.units[axis])",
         "low + 0.99 * (high - low) * (position / self.units[axis])",
         "test_certify_search.py::test_cells_share_ends_and_cover_the_set",
     ),

@@ -10,7 +10,7 @@ CHECKS = (
     Fault(
         "checker: squares forget what is quadratic",
         _FORMS,
-        "Form.square",
+        "FirstOrderForm.square",
         "0.5 * a * a",
         "0.0 * a",
         "test_check.py::test_forms_contain_exact_values[square]",
@@ -18,7 +18,7 @@ CHECKS = (
     Fault(
         "checker: functions are taken to be straight",
         _FORMS,
-        "Form.composed",
+        "FirstOrderForm.composed",
         "np.maximum(high, 0.0) * (w * w)",
         "0.0 * w",
         "test_check.py::test_forms_contain_exact_values[exponential]",
@@ -74,7 +74,7 @@ CHECKS = (
     Fault(
         "checker: linear sets are not looked at",
         _PICTURES,
-        "Bounds.excess",
+        "ClaimedBounds.excess",
         "np.where(beyond <= 0.0, -1.0, linear)",
         "np.full(len(c), -1.0)",
         "test_check.py::test_a_claim_is_about_both_bounds",
@@ -82,7 +82,7 @@ CHECKS = (
     Fault(
         "checker: a frame's own bounds are not looked at",
         _PICTURES,
-        "Bounds.excess",
+        "ClaimedBounds.excess",
         "np.maximum(linear, -1.0 if side * (fixed - end) <= 0.0 else flat)",
         "linear",
         "test_check.py::test_a_claim_is_about_both_bounds",
@@ -106,7 +106,7 @@ CHECKS = (
     Fault(
         "checker: a network's sums are exact",
         _NETWORKS,
-        "Network._charge",
+        "CheckedNetwork._charge",
         "(layer.terms + 4.0) * self.unit",
         "0.0",
         "test_check_kinds.py::test_a_float32_network_leaves_the_exact_one",

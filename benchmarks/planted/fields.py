@@ -6,8 +6,8 @@ _ZONOTOPE, _BOUNDS = "methods/nerf/zonotope.py", "methods/nerf/bounds.py"
 _HSV, _OCCUPANCY, _RELU = "methods/nerf/hsv.py", "methods/nerf/occupancy.py", "methods/nerf/relu_kernel.py"
 _LAYER = "methods/nerf/layer_kernel.py"
 _PLANES, _STRIPS = "methods/nerf/planes.py", "methods/nerf/strips.py"
-_SAMPLES, _PATHS = "methods/nerf/samples.py", "methods/nerf/paths.py"
-_PENCIL, _DIVISION, _OUTPUTS = "methods/nerf/pencil.py", "methods/nerf/division.py", "methods/nerf/outputs.py"
+_SAMPLES, _PATHS = "methods/nerf/samples.py", "methods/nerf/sample_paths.py"
+_PENCIL, _DIVISION, _OUTPUTS = "methods/nerf/ray_bundle.py", "methods/nerf/division.py", "methods/nerf/outputs.py"
 _PARTS = "test_nerf_certify.py::test_planes_lie_beyond_every_part_exactly"
 _FIELDS = "test_nerf_zonotope.py::test_fields_are_enclosed"
 _LAYERS = "test_nerf_zonotope.py::test_linear_layers_are_enclosed"
@@ -35,7 +35,8 @@ FIELDS = (
     ),
     Fault(
         "fields: a layer forgets the box before it",
-        _ZONOTOPE, "FieldBounds._linear", "radius @ layer.absolute[seen:]", "0.0 * (radius @ layer.absolute[seen:])",
+        _ZONOTOPE, "FieldBounds._linear", "radius @ layer.absolute[seen_inputs:]",
+        "0.0 * (radius @ layer.absolute[seen_inputs:])",
         _LAYERS + "[False-False]",
     ),
     Fault(
@@ -53,7 +54,7 @@ FIELDS = (
     ),
     Fault(
         "layers: the compiled one forgets what it sees of an encoded vector",
-        _LAYER, "linear", "poly[k, j] += given[k, j]", "pass", _PRODUCTS,
+        _LAYER, "linear", "poly[k, j] += bias_absolute[k, j]", "pass", _PRODUCTS,
     ),
     Fault(
         "layers: the compiled one forgets the remainder of an encoded vector",
@@ -192,8 +193,8 @@ FIELDS = (
     ),
     Fault(
         "opacity: an upper bound is rounded down",
-        _OUTPUTS, "opacity", "found * (1.0 + ACTIVATION_ROUNDING) + ACTIVATION_FLOOR",
-        "found * (1.0 - 2.0**-40) + ACTIVATION_FLOOR", _OPACITY,
+        _OUTPUTS, "opacity", "alpha * (1.0 + ACTIVATION_ROUNDING) + ACTIVATION_FLOOR",
+        "alpha * (1.0 - 2.0**-40) + ACTIVATION_FLOOR", _OPACITY,
     ),
     Fault(
         "opacity: torch's threshold of softplus is forgotten",
@@ -201,13 +202,13 @@ FIELDS = (
     ),
     Fault(
         "rays: the error of the pose is not charged to the direction",
-        _PENCIL, "Pencil.points", "self.origin_radius + far[:, None] * self.direction_radius[ray]",
+        _PENCIL, "RayBundle.points", "self.origin_radius + far[:, None] * self.direction_radius[ray]",
         "0.0 * self.origin_radius + 0.0 * far[:, None] * self.direction_radius[ray]",
         "test_nerf_frame.py::test_rays_of_wide_sets_lie_in_their_polynomials",
     ),
     Fault(
         "rays: ranges on a part forget half of its width",
-        _PENCIL, "Pencil.ranges", "0.5 * (high - low)", "0.25 * (high - low)", _POINTS,
+        _PENCIL, "RayBundle.ranges", "0.5 * (high - low)", "0.25 * (high - low)", _POINTS,
     ),
     Fault(
         "rays: parts of a cell change places",
@@ -216,16 +217,16 @@ FIELDS = (
     ),
     Fault(
         "compositing: brighter colours take the lower opacity",
-        _BOUNDS, "_Work._composited", "np.where(rise > 0.0, most, least)", "np.where(rise > 0.0, least, least)",
+        _BOUNDS, "_BundleWork._composited", "np.where(rise > 0.0, most, least)", "np.where(rise > 0.0, least, least)",
         _STIFF + "[rough]", True,
     ),
     Fault(
         "compositing: darker colours take the lower opacity",
-        _BOUNDS, "_Work._composited", "np.where(fall < 0.0, most, least)", "least", _STIFF + "[rough]", True,
+        _BOUNDS, "_BundleWork._composited", "np.where(fall < 0.0, most, least)", "least", _STIFF + "[rough]", True,
     ),
     Fault(
         "colours: a batch that was given up keeps its numbers",
-        _BOUNDS, "_Work._bound_field", "density.failed[:, None]", "density.failed[:, None] & False",
+        _BOUNDS, "_BundleWork._bound_field", "density.failed[:, None]", "density.failed[:, None] & False",
         "test_nerf_frame.py::test_pieces_that_are_given_up_say_nothing", True,
     ),
     Fault(
@@ -234,7 +235,7 @@ FIELDS = (
     ),
     Fault(
         "known bounds: what is no number replaces what is known",
-        _BOUNDS, "_Work._keep", "(low <= high) & np.isfinite(low) & np.isfinite(high)", "low == low",
+        _BOUNDS, "_BundleWork._keep", "(low <= high) & np.isfinite(low) & np.isfinite(high)", "low == low",
         "test_nerf_frame.py::test_what_is_known_is_only_replaced_by_bounds",
     ),
     Fault(
@@ -281,12 +282,12 @@ FIELDS = (
     ),
     Fault(
         "planes: of neighbours that are united one is forgotten",
-        _PLANES, "united", "np.minimum.reduceat(low, starts, axis=axis + 1)",
+        _PLANES, "unite_parts", "np.minimum.reduceat(low, starts, axis=axis + 1)",
         "np.maximum.reduceat(low, starts, axis=axis + 1)", _PARTS + "[counts3]",
     ),
     Fault(
         "strips: parts lie elsewhere in their strip",
-        _STRIPS, "Strips._part_ends", "ends[:-1, None] + (ends[1:] - ends[:-1])[:, None] * inner",
+        _STRIPS, "PoseStrips._part_ends", "ends[:-1, None] + (ends[1:] - ends[:-1])[:, None] * inner",
         "ends[:-1, None] + 0.5 * (ends[1:] - ends[:-1])[:, None] * inner",
         "test_nerf_certify.py::test_planted_faults_are_found", True,
     ),
@@ -302,7 +303,7 @@ FIELDS = (
     ),
     Fault(
         "samples: a middle is looked for where it lies at least",
-        _SAMPLES, "hulls", "far = 0.5 * (edges_high[r, i] + edges_high[r, i + 1])",
+        _SAMPLES, "field_hulls", "far = 0.5 * (edges_high[r, i] + edges_high[r, i + 1])",
         "far = 0.5 * (edges_low[r, i] + edges_low[r, i + 1])",
         "test_nerf_hierarchical.py::test_sampled_parts_are_enclosed[0.003]",
     ),
@@ -313,12 +314,12 @@ FIELDS = (
     ),
     Fault(
         "followed samples: a part's own motion is not in the rest",
-        _PATHS, "Lines.around", "(low - along).min(axis=1) - room", "(low - along).min(axis=1)",
+        _PATHS, "SampleLines.around", "(low - along).min(axis=1) - room", "(low - along).min(axis=1)",
         "test_nerf_paths.py::test_lines_hold_the_places_of_every_part[False-counts2]",
     ),
     Fault(
         "followed samples: what is negligible costs nothing",
-        _PATHS, "Samples.composite", "self.price.reshape(rows, 1) * FOLLOWED_UP",
+        _PATHS, "FollowedSamples.composite", "self.price.reshape(rows, 1) * FOLLOWED_UP",
         "0.0 * self.price.reshape(rows, 1)",
         "test_nerf_paths.py::test_what_is_negligible_is_charged",
     ),
@@ -329,23 +330,23 @@ FIELDS = (
     ),
     Fault(
         "followed samples: the coarse pass is known better than it is",
-        _PATHS, "Paths.edges", "np.where(good, most, 1.0)", "np.where(good, least, 1.0)",
+        _PATHS, "SamplePaths.edges", "np.where(good, most, 1.0)", "np.where(good, least, 1.0)",
         "test_nerf_paths.py::test_samples_are_where_and_what_they_are_said_to_be[soft-False]", True,
     ),
     Fault(
         "followed samples: lengths end where intervals begin at least",
-        _PATHS, "Samples._batch", "self.high[k, :, i + 1] - self.low[k, :, i]",
+        _PATHS, "FollowedSamples._batch", "self.high[k, :, i + 1] - self.low[k, :, i]",
         "self.low[k, :, i + 1] - self.high[k, :, i]",
         "test_nerf_paths.py::test_samples_are_where_and_what_they_are_said_to_be[soft-False]", True,
     ),
     Fault(
         "followed samples: where density is declared 0 in part it is the field's",
-        _PATHS, "Samples._batch", "np.where(good & sure[:, None], least, 0.0)", "np.where(good, least, 0.0)",
+        _PATHS, "FollowedSamples._batch", "np.where(good & sure[:, None], least, 0.0)", "np.where(good, least, 0.0)",
         "test_nerf_paths.py::test_samples_are_where_and_what_they_are_said_to_be[soft-True]", True,
     ),
     Fault(
         "parts are regrouped inward",
-        _DIVISION, "regrouped", "-(-(np.arange(count) + 1) * size // count)",
+        _DIVISION, "regroup_parts", "-(-(np.arange(count) + 1) * size // count)",
         "np.maximum((np.arange(count) + 1) * size // count, starts + 1)",
         "test_nerf_paths.py::test_parts_are_regrouped_outward",
     ),

@@ -187,7 +187,7 @@ FORMS = (
     Fault(
         "camera's translation in world axes",
         _POSES,
-        "PoseSet._enclosed",
+        "PoseBox._enclosed",
         "rotation[:, k] * shift",
         "shift * np.eye(3)[k]",
         "test_poses.py::test_enclosure[translation-1]",
@@ -195,7 +195,7 @@ FORMS = (
     Fault(
         "offset ignores the camera's motion",
         _POSES,
-        "PoseSet.enclosure",
+        "PoseBox.enclosure",
         "origin - position",
         "origin - position.center",
         "test_poses.py::test_enclosure[x-1]",
@@ -203,7 +203,7 @@ FORMS = (
     Fault(
         "orbit about the origin",
         _POSES,
-        "PoseSet._enclosed",
+        "PoseBox._enclosed",
         "turn @ (position - target) + target",
         "turn @ position",
         "test_poses.py::test_enclosure[orbit_six-2]",
@@ -211,7 +211,7 @@ FORMS = (
     Fault(
         "a scene that is shifted takes its camera along",
         _POSES,
-        "PoseSet._enclosed",
+        "PoseBox._enclosed",
         "position - parameter(name) * np.eye(3)[k]",
         "position + parameter(name) * np.eye(3)[k]",
         "test_poses.py::test_enclosure_of_a_scene_elsewhere",
@@ -219,7 +219,7 @@ FORMS = (
     Fault(
         "slanted box loses its ends",
         _POSES,
-        "PoseSet.sheared",
+        "PoseBox.sheared",
         "box.replace(axis, low - sum(b for _, b in ends) - room, high - sum(a for a, _ in ends) + room)",
         "box.replace(axis, low - room, high + room)",
         "test_slanted.py::test_every_pose_has_slanted_parameters[six]",
@@ -227,15 +227,15 @@ FORMS = (
     Fault(
         "slanted cells are bounded upright",
         _POSES,
-        "PoseSet._enclosed.parameter",
-        "found + plain(other) * factor",
-        "found - plain(other) * factor",
+        "PoseBox._enclosed.parameter",
+        "form + plain(other) * factor",
+        "form - plain(other) * factor",
         "test_slanted.py::test_enclosure[six-1]",
     ),
     Fault(
         "feasible part forgets the other terms",
         _POSES,
-        "PoseSet.feasible",
+        "PoseBox.feasible",
         "low - room - (most - ends[i][1]), high + room - (least - ends[i][0])",
         "low - room, high + room",
         "test_slanted.py::test_feasible_loses_no_pose[six]",

@@ -25,7 +25,7 @@ LOOPS = (
     Fault(
         "loops: a scene that stands elsewhere is not charged",
         _TUBES,
-        "Reacher.poses",
+        "TubeBuilder.poses",
         "self.shift + rounding * size",
         "rounding * size",
         "test_reach.py::test_tubes_hold_runs_in_a_scene_that_stands_elsewhere",
@@ -33,7 +33,7 @@ LOOPS = (
     Fault(
         "loops: places of the scene that the view tells are not charged",
         _TUBES,
-        "Reacher._advanced",
+        "TubeBuilder._advanced",
         "AffineSet(np.zeros(place.size), none, place, pose.first)",
         "AffineSet(np.zeros(place.size), none, 0.0 * place, pose.first)",
         "test_reach.py::test_tubes_hold_runs_in_a_scene_whose_place_the_view_tells",
@@ -81,7 +81,7 @@ LOOPS = (
     Fault(
         "loops: the remainder of a file's step is left out",
         _TUBES,
-        "Reacher._driven",
+        "TubeBuilder._driven",
         "AffineSet(lines.center, lines.slopes, lines.radius, both.first)",
         "AffineSet(lines.center, lines.slopes, 0.0 * lines.radius, both.first)",
         f"{_RUNS}[onnx]",
@@ -113,7 +113,7 @@ LOOPS = (
     Fault(
         "loops: disturbances are left out",
         _TUBES,
-        "Reacher._driven",
+        "TubeBuilder._driven",
         "step.radius + wide + added",
         "step.radius + added",
         _RUNS,
@@ -130,7 +130,7 @@ LOOPS = (
     Fault(
         "loops: a run's margin has the wrong side",
         _LOOP,
-        "Face.exact",
+        "HalfSpace.exact",
         "sum(terms, start=Fraction(0)) - Fraction(self.offset)",
         "Fraction(self.offset) - sum(terms, start=Fraction(0))",
         _VERDICTS,

@@ -12,7 +12,7 @@ _SUBNORMALS = "test_network_subnormals.py::"
 _ORDER = "test_network_order.py::test_networks_that_sense_their_program"
 
 
-def _curve(kind: str, place: str, old: str, new: str, test: str, file: str = "curves.py") -> Fault:
+def _curve(kind: str, place: str, old: str, new: str, test: str, file: str = "activations.py") -> Fault:
     return Fault(f"charges: {kind}", _NETWORK + file, place, old, new, f"{_TABLE}[{test}]")
 
 
@@ -45,15 +45,15 @@ NETWORK_ROWS = (
     Fault(
         "charges: a product of values is exact",
         _NETWORK + "propagation.py",
-        "Propagation.product",
+        "ForwardPropagation.product",
         "PRODUCT * size",
         "0.0 * size",
         _PAYS + "[product of two values, matrix product]",
     ),
     Fault(
         "charges: places of resized maps are float32's",
-        _NETWORK + "maps.py",
-        "Resized.spare",
+        _NETWORK + "sparse_layers.py",
+        "Resize.spare",
         "off @ sizes[0] @ (across + apart).T + own @ sizes[0] @ apart.T",
         "0.0 * (off @ sizes[0] @ (across + apart).T)",
         "test_network_operators.py::test_positions_of_resized_maps_are_charged",
@@ -102,15 +102,15 @@ NETWORK_ROWS = (
     _curve("a gate is one function", "_Gated.error", "4.0 * LIBRARY * _size(lower, upper)",
            "LIBRARY * _size(lower, upper)", "SiLU, GELU, Mish-Gelu"),
     _curve("the file's quotients are exact", "ScaledGelu.missing", "OWN_QUOTIENTS * _far(lower, upper)", "0.0",
-           "functions with constants of the file-ScaledGelu", "recognised.py"),
+           "functions with constants of the file-ScaledGelu", "composite_activations.py"),
     _curve("a switch leaves no gap", "SwitchedSoftplus.missing", "math.exp(-self.limit) * SWITCH", "0.0",
-           "switched softplus-SwitchedSoftplus", "recognised.py"),
+           "switched softplus-SwitchedSoftplus", "composite_activations.py"),
     _curve("steps are half as large", "Quantised.missing", "0.5 * self.step * SWITCH", "0.25 * self.step * SWITCH",
-           "values in steps-Quantised", "recognised.py"),
+           "values in steps-Quantised", "composite_activations.py"),
     # constants that are computed
     Fault(
         "constants: sums have one order",
-        _NETWORK + "enclosed.py",
+        _NETWORK + "constant_enclosures.py",
         "_reduced",
         "reach * total + (parts + 1.0) * tiny",
         "0.0 * total",
@@ -118,7 +118,7 @@ NETWORK_ROWS = (
     ),
     Fault(
         "constants: products of few numbers flush nothing on the way",
-        _NETWORK + "enclosed.py",
+        _NETWORK + "constant_enclosures.py",
         "_reduced",
         "ONCE_FLUSHES * count * tiny * most",
         "0.0 * most",
@@ -126,7 +126,7 @@ NETWORK_ROWS = (
     ),
     Fault(
         "constants: squares overflow nowhere",
-        _NETWORK + "enclosed.py",
+        _NETWORK + "constant_enclosures.py",
         "_check_bounded",
         "bool((size < largest).all())",
         "True",

@@ -39,9 +39,9 @@ RESULTS = (
     ),
     Fault(
         "a worker of another version opens the files",
-        "execution/opening.py",
-        "opened.make",
-        "asked != VERSION",
+        "execution/worker_cache.py",
+        "load.make",
+        "version != VERSION",
         "False",
         "test_stale.py::test_worker_of_another_version_is_refused",
     ),
@@ -106,7 +106,7 @@ RESULTS = (
     ),
     Fault(
         "deadlines: a part of the time does not hear requests to stop",
-        "execution/ending.py",
+        "execution/cancellation.py",
         "Deadline.within",
         "Deadline(min(seconds, self.left), self.request)",
         "Deadline(min(seconds, self.left))",

@@ -3,7 +3,7 @@
 from planted.fault import Fault
 
 _RUNS, _HEADER, _READ = "methods/runs.py", "methods/splat/ply_header.py", "methods/splat/ply_read.py"
-_LOAD, _ROWS = "methods/splat/load.py", "methods/splat/rows.py"
+_LOAD, _ROWS = "methods/splat/load.py", "methods/splat/drawable.py"
 _FILES = "test_scene_files.py::"
 
 SCENES = (

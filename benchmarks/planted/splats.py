@@ -2,7 +2,7 @@
 
 from planted.fault import Fault
 
-_RECORDS = "methods/splat/records.py"
+_RECORDS = "methods/splat/projection_errors.py"
 _GAUSSIANS = "methods/splat/gaussians.py"
 _FRAGMENTS = "methods/splat/fragments.py"
 _FORM_PROJECTION = "methods/splat/form_projection.py"
@@ -10,11 +10,11 @@ _LINE_PROJECTION = "methods/splat/line_projection.py"
 _BLEND = "methods/splat/blend.py"
 _BOUNDS = "methods/splat/bounds.py"
 _ALPHAS = "methods/splat/alphas.py"
-_JUMPS = "methods/splat/jumps.py"
+_JUMPS = "methods/splat/threshold_crossings.py"
 _INTERVALS = "methods/splat/intervals.py"
 _REORDERING = "methods/splat/reordering.py"
 _STAGE_DATA = "methods/splat/stage_data.py"
-_BLOCK = "methods/splat/block.py"
+_BLOCK = "methods/splat/pixel_block.py"
 _LISTS = "methods/splat/lists.py"
 _PIXELS = "methods/splat/pixels.py"
 _FORM_COLORS = "methods/splat/form_colors.py"
@@ -275,8 +275,8 @@ SPLATS = (
         "layers that share a pixel are taken for apart",
         _FRAGMENTS,
         "_find_pairs",
-        "shown & int(theirs)",
-        "shown & int(theirs) & 1",
+        "pixel_set & int(theirs)",
+        "pixel_set & int(theirs) & 1",
         "test_bounds.py::test_depth_swap[2]",
     ),
     Fault(
@@ -290,7 +290,7 @@ SPLATS = (
     Fault(
         "what is skipped gets the least light, not the most",
         _JUMPS,
-        "gather_jumps",
+        "gather_crossings",
         "where(nearest < 0.0, -most * grow, -least * (2.0 - grow))",
         "-least * (2.0 - grow)",
         "test_jumps.py::test_skipped_fragments[1-2-0.0]",
@@ -298,7 +298,7 @@ SPLATS = (
     Fault(
         "what is surely skipped gets the most light",
         _JUMPS,
-        "gather_jumps",
+        "gather_crossings",
         "where(farthest > 0.0, most * grow, least * (2.0 - grow))",
         "most * grow",
         "test_jumps.py::test_skipped_fragments[1-2-0.0]",
@@ -306,7 +306,7 @@ SPLATS = (
     Fault(
         "skipping lowers by half of what it may",
         _JUMPS,
-        "gather_jumps",
+        "gather_crossings",
         "fma(maximum(0.0, down), jump, falls)",
         "fma(0.5 * maximum(0.0, down), jump, falls)",
         "test_jumps.py::test_skipped_fragments[1-2-0.0]",
@@ -394,7 +394,7 @@ SPLATS = (
     Fault(
         "1/255 is not a jump",
         _ALPHAS,
-        "_drawn",
+        "_thresholded",
         "where(skips, minimum(limits.alpha_min_high, a_high), 0.0)",
         "0.0 * a_high",
         "test_bounds.py::test_alpha_threshold[2]",
@@ -402,7 +402,7 @@ SPLATS = (
     Fault(
         "1/255 does not make 0 possible",
         _ALPHAS,
-        "_drawn",
+        "_thresholded",
         "where(skips, 0.0, limits.sure * a_low)",
         "limits.sure * a_low",
         "test_bounds.py::test_alpha_threshold[2]",
@@ -410,7 +410,7 @@ SPLATS = (
     Fault(
         "0.999 clamp missing from the interval",
         _ALPHAS,
-        "_drawn",
+        "_thresholded",
         "a_low = minimum(a_low, alpha_max * (1.0 - charges.threshold))",
         "pass",
         "test_bounds.py::test_alpha_clamp[2]",
@@ -418,7 +418,7 @@ SPLATS = (
     Fault(
         "0.999 clamp missing from the form",
         _ALPHAS,
-        "_drawn",
+        "_thresholded",
         "maximum(0.0, a_high - alpha_max)",
         "0.0 * a_high",
         "test_bounds.py::test_alpha_clamp_crossed[2]",
@@ -467,8 +467,8 @@ SPLATS = (
         "colours are kept where the camera moves",
         _BOUNDS,
         "SplatBounds._colors",
-        "seen is None or seen[0] != view",
-        "seen is None",
+        "cached is None or cached[0] != view",
+        "cached is None",
         "test_bounds.py::test_colors_are_shared_by_cells_that_turn_and_not_by_others",
     ),
     Fault(
@@ -786,7 +786,7 @@ SPLATS = (
     Fault(
         "what parts may show ends a pixel early",
         _LISTS,
-        "marked",
+        "visible_again",
         "int(math.floor(max(high, first - 1.0))) + 1",
         "int(math.floor(max(high, first - 1.0)))",
         "test_lists.py::test_rectangles_hold_the_pixels_that_are_reached_and_no_others",

@@ -4,17 +4,17 @@ from planted.fault import Fault
 
 _SEARCH = "verify/search.py"
 _VNNLIB = "verify/vnnlib.py"
-_BACKWARD, _KNOWN = "verify/network/backward.py", "verify/network/known.py"
-_PROPAGATION, _SELECTION = "verify/network/propagation.py", "verify/network/selection.py"
-_REACHED, _ROUNDING = "verify/network/reached.py", "verify/network/rounding.py"
-_RESPONSE = "verify/response.py"
+_BACKWARD, _KNOWN = "verify/network/backward.py", "verify/network/intermediate_bounds.py"
+_PROPAGATION, _SELECTION = "verify/network/propagation.py", "verify/network/neuron_selection.py"
+_REACHED, _ROUNDING = "verify/network/stopping.py", "verify/network/rounding.py"
+_RESPONSE = "verify/camera_response.py"
 _MAPS = "report/verdict_maps.py"
 
 VERDICTS = (
     Fault(
         "differences: rows forget what is taken away",
-        "verify/network/maps.py",
-        "Differences.backward",
+        "verify/network/sparse_layers.py",
+        "PairwiseDifferences.backward",
         "value.sum(-1)",
         "0.5 * value.sum(-1)",
         "test_network_operators.py::test_differences_are_those_of_the_matrix",
@@ -70,7 +70,7 @@ VERDICTS = (
     Fault(
         "network: the first layer's rounding is dropped",
         _PROPAGATION,
-        "Propagation.linear",
+        "ForwardPropagation.linear",
         "moves + tiny + rows * width",
         "(moves if k > 1 else 0.0 * moves) + tiny + rows * width",
         "test_network_rounding.py::test_sums_that_lose_as_much_as_they_can[2]",
@@ -78,7 +78,7 @@ VERDICTS = (
     Fault(
         "network: rounding before an activation is dropped",
         _PROPAGATION,
-        "Propagation.activation",
+        "ForwardPropagation.activation",
         "rounded.abs()",
         "0.0",
         "test_network_rounding.py::test_sums_that_lose_as_much_as_they_can[3]",
@@ -86,7 +86,7 @@ VERDICTS = (
     Fault(
         "network: rounding is charged at the middle of a set alone",
         _PROPAGATION,
-        "Propagation.linear",
+        "ForwardPropagation.linear",
         "torch.maximum(sized.interval.spread, sized.reference.abs())",
         "sized.reference.abs() + 0.0 * sized.interval.spread",
         "test_network_rounding.py::test_rounding_counts_the_largest_image_of_a_set",
@@ -94,7 +94,7 @@ VERDICTS = (
     Fault(
         "network: rows' own rounding is dropped",
         _PROPAGATION,
-        "Propagation.linear",
+        "ForwardPropagation.linear",
         "rows",
         "0.0",
         "test_network_rounding.py::test_rounding_of_rows_over_sets[False]",
@@ -102,9 +102,9 @@ VERDICTS = (
     Fault(
         "network: float32 rows are charged by float64's unit roundoff",
         _KNOWN,
-        "Known.__init__",
-        "Passage(torch.float32, UNIT, sums)",
-        "Passage(torch.float32, DOUBLE_UNIT, sums)",
+        "IntermediateBounds.__init__",
+        "Relaxations(torch.float32, UNIT, sums)",
+        "Relaxations(torch.float32, DOUBLE_UNIT, sums)",
         "test_network_rounding.py::test_rounding_of_rows_over_sets[False]",
     ),
     Fault(
@@ -118,30 +118,30 @@ VERDICTS = (
     Fault(
         "network: references' own rounding is dropped",
         _PROPAGATION,
-        "Propagation.linear",
+        "ForwardPropagation.linear",
         "2.0 * (layer.terms + len(inputs) + 8) * DOUBLE_UNIT",
         "0.0",
         "test_network_rounding.py::test_exact_network_at_single_images[1024.0-False]",
     ),
     Fault(
         "network: lines below ReLUs are steeper than the functions",
-        "verify/network/slopes.py",
-        "Ascent.climb",
+        "verify/network/slope_optimisation.py",
+        "DualAscent.climb",
         "np.clip(moved, units.alpha, 1.0)",
         "np.clip(moved, units.alpha, 1.5)",
         "test_network_bounds.py::test_chosen_slopes_are_never_worse_and_sound[real]",
     ),
     Fault(
         "network: rows take the lower line whatever their sign",
-        "verify/network/rows.py",
-        "_passed",
+        "verify/network/coefficients.py",
+        "_through_activation",
         "l1 if negative else l0",
         "l0",
         "test_network_bounds.py::test_bounds_lie_below_the_exact_minimum[1.0]",
     ),
     Fault(
         "network: half of what slopes are apart is left out where rows are bounded",
-        "verify/network/rows.py",
+        "verify/network/coefficients.py",
         "columns_of",
         "0.5 * apart",
         "0.0 * apart",
@@ -149,7 +149,7 @@ VERDICTS = (
     ),
     Fault(
         "network: sums over windows take in what lies beside them",
-        "verify/network/rows.py",
+        "verify/network/coefficients.py",
         "_add_run",
         "where(a != 0.0, product, 0.0)",
         "product",
@@ -157,7 +157,7 @@ VERDICTS = (
     ),
     Fault(
         "network: rows through a stride are put together row by column",
-        "verify/network/rows.py",
+        "verify/network/coefficients.py",
         "interleave",
         "a * t + b",
         "b * s + a",
@@ -166,15 +166,15 @@ VERDICTS = (
     Fault(
         "network: rows are asked for where forms are good, and not where they are loose",
         _SELECTION,
-        "Selection._bent",
-        "kept > _HALF",
-        "kept < _HALF",
+        "NeuronSelection._bent",
+        "width_ratio > _HALF",
+        "width_ratio < _HALF",
         "test_network_bounds.py::test_curves_are_bounded_by_what_rows_leave[False]",
     ),
     Fault(
         "network: rows that end on the way forget what their stop is not sure of",
         _KNOWN,
-        "Known.stop",
+        "IntermediateBounds.stop",
         "form.c - form.r - room",
         "form.c - room",
         "test_network_bounds.py::test_rows_that_end_on_the_way_lie_below_the_exact_minimum[1000000000.0]",
@@ -182,15 +182,15 @@ VERDICTS = (
     Fault(
         "network: rows of numbers that may have either sign end on the way",
         _REACHED,
-        "Enough.done",
+        "StoppingCriterion.done",
         "tight & ((lower >= zero) | (upper <= zero))",
         "tight",
         "test_network_bounds.py::test_what_ends_rows",
     ),
     Fault(
         "network: forms of cheap nodes stay loose where nothing is open",
-        "verify/network/schedule.py",
-        "Schedule.renews",
+        "verify/network/cost_model.py",
+        "WorkBudget.renews",
         "products < self._cheap",
         "False",
         "test_network_bounds.py::test_early_rows_keep_later_ones_exact",
@@ -198,7 +198,7 @@ VERDICTS = (
     Fault(
         "network: rows that rest on several nodes count the last alone",
         _BACKWARD,
-        "Backward._rest_rows",
+        "BackwardPass._rest_rows",
         "box += two",
         "box = two",
         "test_network_bounds.py::test_rows_that_rest_on_several_nodes[residual-0]",
@@ -206,30 +206,30 @@ VERDICTS = (
     Fault(
         "network: what rows gather on the way is lost where they end by plan",
         _BACKWARD,
-        "Backward._rest_rows",
+        "BackwardPass._rest_rows",
         "batch.total",
         "0.0 * batch.total",
         "test_network_bounds.py::test_rows_that_end_by_plan_lie_below_the_exact_minimum[1]",
     ),
     Fault(
         "network: plans forget what they may take",
-        "verify/network/schedule.py",
-        "Costs.plan",
+        "verify/network/cost_model.py",
+        "CostModel.plan",
         "plan.products <= allowed",
         "True",
         "test_network_bounds.py::test_plans_keep_to_what_is_allowed",
     ),
     Fault(
         "network: rows are passed where nothing will be known in the end",
-        "verify/network/schedule.py",
-        "Schedule.ways",
+        "verify/network/cost_model.py",
+        "WorkBudget.ways",
         "plan.widest > _HOPELESS * self._size",
         "False",
         "test_network_bounds.py::test_plans_keep_to_what_is_allowed",
     ),
     Fault(
         "network: partial sums on the way to a large sum are forgotten",
-        "verify/network/sums.py",
+        "verify/network/partial_sums.py",
         "partial_sums",
         "half * end",
         "0.0 * end",
@@ -246,7 +246,7 @@ VERDICTS = (
     Fault(
         "network: rows under way are never parted",
         _BACKWARD,
-        "Backward.descend",
+        "BackwardPass.descend",
         "batch.bytes > min(ROWS_AT_ONCE, self.memory // 16)",
         "batch.bytes > 1 << 62",
         "test_network_bounds.py::test_rows_that_end_by_plan_keep_within_memory",
@@ -254,16 +254,16 @@ VERDICTS = (
     ),
     Fault(
         "network: sums of a softmax that are cut off are exact",
-        "verify/network/curves.py",
-        "Share.missing",
+        "verify/network/activations.py",
+        "SoftmaxReciprocal.missing",
         "LOST_SHARE",
         "0.0",
         "test_network_operators.py::test_shares_past_the_cap_are_charged",
     ),
     Fault(
         "network: positions in resized maps are exact",
-        "verify/network/maps.py",
-        "Resized.spare",
+        "verify/network/sparse_layers.py",
+        "Resize.spare",
         "off @ sizes[0] @ (across + apart).T + own @ sizes[0] @ apart.T",
         "0.0",
         "test_network_operators.py::test_positions_of_resized_maps_are_charged",
@@ -271,7 +271,7 @@ VERDICTS = (
     Fault(
         "network: units that may be on count as zeros",
         _PROPAGATION,
-        "Propagation.activation",
+        "ForwardPropagation.activation",
         "upper > 0.0",
         "lower > 0.0",
         "test_network_rounding.py::test_units_that_may_be_on_are_terms",
@@ -279,7 +279,7 @@ VERDICTS = (
     Fault(
         "camera: the darkest factor is forgotten",
         _RESPONSE,
-        "Response.sets",
+        "CameraResponse.sets",
         "low * (1.0 - r)",
         "low * 1.0",
         "test_response.py::test_every_camera_is_contained[0.3-0.01-brightness]",
@@ -287,7 +287,7 @@ VERDICTS = (
     Fault(
         "camera: lines are not scaled with the factor",
         _RESPONSE,
-        "Response.sets",
+        "CameraResponse.sets",
         "b_upper * grow",
         "b_upper * 1.0",
         "test_response.py::test_every_camera_is_contained[0.3-0.3-white balance]",
@@ -295,7 +295,7 @@ VERDICTS = (
     Fault(
         "camera: lines do not fall with the power",
         _RESPONSE,
-        "Response.sets",
+        "CameraResponse.sets",
         "b_lower * shrink - fall",
         "b_lower * shrink",
         "test_response.py::test_every_camera_is_contained[0.3-0.3-gamma]",
@@ -303,7 +303,7 @@ VERDICTS = (
     Fault(
         "camera: bounds that cross look like bounds",
         _RESPONSE,
-        "Response.sets",
+        "CameraResponse.sets",
         "np.where(lower <= upper, least, np.nan)",
         "least",
         "test_response.py::test_sets_that_cross_or_are_no_numbers_stay_so",

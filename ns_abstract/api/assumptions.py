@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 from ns_abstract.api.scenes import Scene
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.assumptions import Assumption
-from ns_abstract.methods.overrides import chosen
+from ns_abstract.methods.overrides import assumption_of
 from ns_abstract.refine.protocol import Method
 
 DEFAULT = "default"
@@ -23,24 +23,26 @@ def choice(name: str, value: object, given: object, flag: str, default: str = DE
 def scene_choices(scene: Scene, method: Method, arithmetic: str | None) -> tuple[Assumption, ...]:
     """Return the choices made on reading a scene, and about the program that renders it."""
     options, program = scene.source.options, method.program
-    found = list(scene.assumptions)
+    choices = list(scene.assumptions)
     if options.renderer == "paper":
         # the paper's programs draw on black, whatever a scene says
-        found = [
-            chosen(a.name, (0.0, 0.0, 0.0), "--renderer paper", a.value, a.origin) if a.name == "background" else a
-            for a in found
+        choices = [
+            assumption_of(a.name, (0.0, 0.0, 0.0), "--renderer paper", a.value, a.origin)
+            if a.name == "background"
+            else a
+            for a in choices
         ]
     renderer = "--sampling" if options.renderer is None and options.sampling is not None else "--renderer"
-    found.append(choice("renderer", program["name"], options.renderer or options.sampling, renderer))
+    choices.append(choice("renderer", program["name"], options.renderer or options.sampling, renderer))
     if "sampling" not in program:
         default = "--renderer" if options.renderer == "paper" else DEFAULT
-        found.append(
+        choices.append(
             choice("renderer version", program["version"], options.gsplat_version, "--gsplat-version", default)
         )
     else:
-        found += _ray_choices(scene, program)
-    found.append(choice("arithmetic", method.guarantee.removesuffix("-sound"), arithmetic, "--arithmetic"))
-    return tuple(found)
+        choices += _ray_choices(scene, program)
+    choices.append(choice("arithmetic", method.guarantee.removesuffix("-sound"), arithmetic, "--arithmetic"))
+    return tuple(choices)
 
 
 def _ray_choices(scene: Scene, program: dict[str, Any]) -> list[Assumption]:
@@ -51,18 +53,18 @@ def _ray_choices(scene: Scene, program: dict[str, Any]) -> list[Assumption]:
         )
     else:
         samples = choice("num_samples", program["samples"], options.num_samples, "--num-samples")
-    found = [
+    choices = [
         choice("renderer version", program["version"], options.renderer, "--renderer"),
         samples,
         choice("near_plane", f"{program['near']:.9g}", options.near_plane, "--near-plane"),
         choice("device", options.device or "cpu", options.device, "--device"),
     ]
     if options.occupancy_grid is not None:
-        found.append(Assumption("occupancy_grid", options.occupancy_grid.name, "--occupancy-grid"))
-    return found
+        choices.append(Assumption("occupancy_grid", options.occupancy_grid.name, "--occupancy-grid"))
+    return choices
 
 
-def set_choices(pose_sets: Sequence[PoseSet], size: str, varied: str) -> tuple[Assumption, ...]:
+def set_choices(pose_sets: Sequence[PoseBox], size: str, varied: str) -> tuple[Assumption, ...]:
     """Return the choices about the pictures' size and the varied parameters of the sets.
 
     Args:
@@ -79,7 +81,7 @@ def set_choices(pose_sets: Sequence[PoseSet], size: str, varied: str) -> tuple[A
 
 
 def file_choices(
-    pose_sets: Sequence[PoseSet], path: Path, factor: float, file: Path | None, given: bool, inside: bool
+    pose_sets: Sequence[PoseBox], path: Path, factor: float, file: Path | None, given: bool, inside: bool
 ) -> tuple[Assumption, ...]:
     """The same for the files of a command line.
 

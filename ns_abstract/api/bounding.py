@@ -15,17 +15,17 @@ from ns_abstract.api.job import Job
 from ns_abstract.api.poses import PoseSet
 from ns_abstract.api.scenes import Scene
 from ns_abstract.arithmetic.kernel_cache import store as kernels
-from ns_abstract.execution.ending import AbandonedError
-from ns_abstract.execution.engines import Engine, Here
-from ns_abstract.execution.opening import Recipe, opened
+from ns_abstract.execution.cancellation import WorkCancelledError
+from ns_abstract.execution.engines import Engine, SerialEngine
 from ns_abstract.execution.scheduler import Task, work
 from ns_abstract.execution.stopping import StopRequest, interruptible
 from ns_abstract.execution.threads import use_threads
+from ns_abstract.execution.worker_cache import Recipe, load
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
-from ns_abstract.refine.engine import Goal, groups, shared_goal
-from ns_abstract.refine.result import FrameResult, Layer, Leaves, PartResult, TracePoint
+from ns_abstract.refine.engine import RefinementGoal, groups, shared_goal
+from ns_abstract.refine.result import ExtraOutput, FrameResult, Leaves, PartResult, TracePoint
 from ns_abstract.report.figures import interval, metrics, number, short_guarantee
 from ns_abstract.report.files import save_frame
 from ns_abstract.report.notebook import frame_html
@@ -69,7 +69,7 @@ class Progress:
 OnProgress = Callable[[Progress], object]
 
 
-class Part(NamedTuple):
+class TileTask(NamedTuple):
     """One task.
 
     Attributes:
@@ -83,8 +83,8 @@ class Part(NamedTuple):
 
 def bound_part(
     recipe: Recipe[Job],
-    part: Part,
-    goal: Goal,
+    part: TileTask,
+    goal: RefinementGoal,
     keep_leaves: bool,
     neighbours: int = 1,
     known: FrameResult | None = None,
@@ -103,11 +103,11 @@ def bound_part(
         InputError: The worker reads other files under the same names than the command did.
     """
     use_threads(len(os.sched_getaffinity(0)) // neighbours)
-    job = opened(recipe)
+    job = load(recipe)
     job.warm_up(part.index)
     try:
         return job.bound_part(part.index, goal, part.tiles, keep_leaves=keep_leaves, known=known)
-    except AbandonedError:
+    except WorkCancelledError:
         return None
 
 
@@ -158,11 +158,13 @@ def bound_frames(
     leaf_bytes = _leaf_bytes(job, machine.processes) // machine.threads
     count = -(-_GROUPS_BY_THREAD * engine.threads // len(frames)) if engine.threads > len(frames) else 1
     queue = [
-        Part(index, tiles) for index in frames for tiles in ([None] if count == 1 else groups(job.frame(index), count))
+        TileTask(index, tiles)
+        for index in frames
+        for tiles in ([None] if count == 1 else groups(job.frame(index), count))
     ]
     expected = Counter(part.index for part in queue)
-    goals: dict[int, Goal] = {}
-    found: dict[int, list[PartResult]] = {}
+    goals: dict[int, RefinementGoal] = {}
+    finished_parts: dict[int, list[PartResult]] = {}
     flying = done = number = 0
     recipe = None if engine.shares else job.recipe
     request = StopRequest() if stop is None else stop
@@ -181,7 +183,7 @@ def bound_frames(
         before = found_before(index) if job.rays and not keep_leaves else None
         return before if before is not None and before.bounded else None
 
-    def here(part: Part, goal: Goal) -> PartResult | None:
+    def here(part: TileTask, goal: RefinementGoal) -> PartResult | None:
         def told(point: TracePoint, covered: float) -> None:
             on_progress(
                 Progress(
@@ -194,7 +196,7 @@ def bound_frames(
                 part.index, goal, part.tiles, keep_leaves=keep_leaves, stopped=request, progress=told,
                 known=known(part.index),
             )  # fmt: skip
-        except AbandonedError:
+        except WorkCancelledError:
             # over before there was anything to keep
             return None
 
@@ -223,13 +225,13 @@ def bound_frames(
             flying -= 1
             if result is None:
                 return
-            found.setdefault(index, []).append(result)
-            if len(found[index]) == expected[index]:
+            finished_parts.setdefault(index, []).append(result)
+            if len(finished_parts[index]) == expected[index]:
                 done += 1
-                yield job.joined(found.pop(index))
+                yield job.joined(finished_parts.pop(index))
 
 
-def _goal(job: Job, part: Part, target_ratio: float, leaf_bytes: int) -> Goal:
+def _goal(job: Job, part: TileTask, target_ratio: float, leaf_bytes: int) -> RefinementGoal:
     goal = replace(job.goal(target_ratio, 0.0), leaf_bytes=leaf_bytes)
     return goal if part.tiles is None else shared_goal(job.frame(part.index), part.index, goal, job.seed)
 
@@ -267,7 +269,7 @@ class BoundResult:
         bounded: False while no bound but [0, 1] is known.
         interrupted: Whether the work was ended by Ctrl-C or by ``on_progress``.
         cells: Linear sets of the cells, if they were kept.
-        layers: "depth" and "accumulation", if they were asked for; see `ns_abstract.refine.result.Layer`.
+        layers: "depth" and "accumulation", if they were asked for; see `ns_abstract.refine.result.ExtraOutput`.
         assumptions: What the bounds rest on, and where each choice came from.
     """
 
@@ -287,7 +289,7 @@ class BoundResult:
     cells: Leaves | None = field(default=None, repr=False)
     target_ratio: float = 1.05
     about: dict[str, Any] = field(default_factory=dict, repr=False)
-    layers: Mapping[str, Layer] = field(default_factory=dict, repr=False)
+    layers: Mapping[str, ExtraOutput] = field(default_factory=dict, repr=False)
     assumptions: tuple[Assumption, ...] = field(default=(), repr=False)
 
     @classmethod
@@ -348,8 +350,8 @@ class BoundResult:
         """One of "done", "partial" (the time was over before the target) and "missing" (nothing is known)."""
         if not self.bounded:
             return "missing"
-        reached = self.mpg == 0.0 or (self.ratio is not None and self.ratio <= self.target_ratio)
-        return "done" if reached or not self.parameters.dimensions else "partial"
+        ratio_is_met = self.mpg == 0.0 or (self.ratio is not None and self.ratio <= self.target_ratio)
+        return "done" if ratio_is_met or not self.parameters.dimensions else "partial"
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an npz with the names of the files of ns-abstract-render.
@@ -362,9 +364,9 @@ class BoundResult:
     def _repr_html_(self) -> str:
         box = self.parameters
         sides = [interval(*side) for side in zip(box.names, box.units, box.lower, box.upper, strict=True)]
-        known = f"mean gap {number(self.mpg)}, largest {number(self.xpg)}, ratio to real renders {number(self.ratio)}"
+        summary = f"mean gap {number(self.mpg)}, largest {number(self.xpg)}, ratio to real renders {number(self.ratio)}"
         lines = [
-            known if self.bounded else "no bounds but [0, 1] yet",
+            summary if self.bounded else "no bounds but [0, 1] yet",
             f"{self.guarantee}; {self.cell_count} cells, {self.seconds:.1f} s; {self.status}",
             "; ".join(sides) or "one camera pose",
         ]
@@ -418,7 +420,7 @@ def bound(
     )  # fmt: skip
     with interruptible() as stop:
         results = bound_frames(
-            job, [0], engine=Here(), budget=time_budget, target_ratio=target_ratio, keep_leaves=keep_cells,
+            job, [0], engine=SerialEngine(), budget=time_budget, target_ratio=target_ratio, keep_leaves=keep_cells,
             stop=stop, on_progress=listener(stop, on_progress),
         )  # fmt: skip
         frames = list(results)

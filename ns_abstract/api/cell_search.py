@@ -19,19 +19,19 @@ import numpy as np
 
 from ns_abstract.api.bounding import listener
 from ns_abstract.api.margins import NOT_ASKED, SHARE, Margins, certified_cells
-from ns_abstract.api.searching import paced, search_blocks
-from ns_abstract.execution.ending import Deadline
+from ns_abstract.api.searching import periodic_report, search_blocks
+from ns_abstract.execution.cancellation import Deadline
 from ns_abstract.execution.engines import Engine
-from ns_abstract.execution.opening import Recipe, opened
 from ns_abstract.execution.stopping import StopRequest, interruptible
 from ns_abstract.execution.threads import use_threads
+from ns_abstract.execution.worker_cache import Recipe, load
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.report.certificate import LastReport
-from ns_abstract.verify.cells import Cell, Grid
-from ns_abstract.verify.scene_margin import Kind, SceneMargin, Settle
-from ns_abstract.verify.search import Findings
-from ns_abstract.verify.store import Block, Store
+from ns_abstract.verify.cells import Cell, CellGrid
+from ns_abstract.verify.scene_margin import ProveCell, SceneMargin, VariationKind
+from ns_abstract.verify.search import BlockResult
+from ns_abstract.verify.store import CellBlock, Store
 
 P = TypeVar("P")
 #: A row of ``cells``, JSON read: see `Store.leaves`.
@@ -51,7 +51,7 @@ class Examiner(Protocol):
         """How another process opens it."""
         ...
 
-    def examine(self, number: int, grid: Grid, cells: tuple[Cell, ...]) -> Findings:
+    def examine(self, number: int, grid: CellGrid, cells: tuple[Cell, ...]) -> BlockResult:
         """What becomes of cells of the set with this number: verdicts, and smaller cells where there is none.
 
         Depends on the cells alone. "certified" means a proved lower bound above 0 of the margin of every picture.
@@ -62,7 +62,7 @@ class Examiner(Protocol):
         ...
 
 
-def examine_here(examiner: Examiner, number: int, grid: Grid, cells: tuple[Cell, ...]) -> Findings:
+def examine_here(examiner: Examiner, number: int, grid: CellGrid, cells: tuple[Cell, ...]) -> BlockResult:
     """Examine cells in this process."""
     import torch
 
@@ -72,13 +72,13 @@ def examine_here(examiner: Examiner, number: int, grid: Grid, cells: tuple[Cell,
     return examiner.examine(number, grid, cells)
 
 
-def examine_block(recipe: Recipe[Any], number: int, grid: Grid, cells: tuple[Cell, ...]) -> Findings:
+def examine_block(recipe: Recipe[Any], number: int, grid: CellGrid, cells: tuple[Cell, ...]) -> BlockResult:
     """Examine cells on a worker, which opens the files once and keeps them.
 
     Raises:
         InputError: The worker reads other files under the same names than the command did.
     """
-    return examine_here(opened(recipe), number, grid, cells)
+    return examine_here(load(recipe), number, grid, cells)
 
 
 class CellQuestion(ABC, Generic[P]):
@@ -104,11 +104,11 @@ class CellQuestion(ABC, Generic[P]):
         self.examiner, self.parameters = examiner, list(parameters)
         self.sets, self.fixed = dict(sets), fixed
 
-    def grid(self, number: int) -> Grid:
+    def grid(self, number: int) -> CellGrid:
         """The cells of a set whose search begins: the set as one cell, if nothing else is known."""
-        return Grid.adaptive(self.sets[number], [1] * self.sets[number].dimensions)
+        return CellGrid.adaptive(self.sets[number], [1] * self.sets[number].dimensions)
 
-    def first_blocks(self, grid: Grid) -> list[list[Cell]]:
+    def first_blocks(self, grid: CellGrid) -> list[list[Cell]]:
         """What the search of a set begins with."""
         return [grid.roots()]
 
@@ -116,7 +116,7 @@ class CellQuestion(ABC, Generic[P]):
         """The set of a number that an earlier command asked about, or None."""
         return None
 
-    def counterexamples(self, number: int, grid: Grid, findings: Any) -> Iterator[tuple[str, dict[str, Any]]]:
+    def counterexamples(self, number: int, grid: CellGrid, findings: Any) -> Iterator[tuple[str, dict[str, Any]]]:
         """Names and arrays of the files that show why cells are falsified."""
         return iter(())
 
@@ -145,7 +145,7 @@ class CellQuestion(ABC, Generic[P]):
     def finish(self, search: CellSearch[P]) -> None:
         """Prepare for the last report, also after a failure."""
 
-    def varied_scenes(self) -> tuple[Sequence[Kind], Callable[[Kind], Settle]] | None:
+    def varied_scenes(self) -> tuple[Sequence[VariationKind], Callable[[VariationKind], ProveCell]] | None:
         """What may vary of the scene, and what bounds and attacks cells for all such scenes (V13); None: nothing."""
         return None
 
@@ -206,7 +206,7 @@ class CellSearch(Generic[P]):
 
     question: CellQuestion[P]
     folder: Path
-    grids: dict[int, Grid] = field(default_factory=dict)
+    grids: dict[int, CellGrid] = field(default_factory=dict)
     rows: dict[int, list[Row]] = field(default_factory=dict)
     scene_margin: dict[str, Any] = field(default_factory=lambda: {"skipped": NOT_ASKED, "kinds": []})
     deadline: Deadline = field(default_factory=Deadline)
@@ -226,7 +226,7 @@ class CellSearch(Generic[P]):
         question = self.question
         fingerprint = question.examiner.fingerprint
         self.store = store = Store(self.folder, fingerprint, question.parameters, question.fixed, resume=resume)
-        with store.told():
+        with store.errors_as_input():
             for number, box in question.sets.items():
                 grid = store.grid(number, box)
                 if grid is None:
@@ -275,7 +275,7 @@ class CellSearch(Generic[P]):
             # a signal waits until there is a store to report on
             store = self.open(resume=request.resume)
             stack.callback(store.close)
-            stack.enter_context(store.told())
+            stack.enter_context(store.errors_as_input())
             stack.enter_context(stop.last_words(self.last.interrupted))
             try:
                 with stop.at_once():
@@ -310,7 +310,7 @@ class CellSearch(Generic[P]):
             deadline=deadline,
             stop=stop,
             keep=self._keep_counterexamples,
-            between=paced(
+            between=periodic_report(
                 store,
                 lambda: request.on_progress(question.progress(store)),
                 (lambda: self.report("running")) if request.report else lambda: None,
@@ -319,7 +319,7 @@ class CellSearch(Generic[P]):
         )
         store.trace()
 
-    def _keep_counterexamples(self, block: Block, findings: Findings) -> None:
+    def _keep_counterexamples(self, block: CellBlock, findings: BlockResult) -> None:
         """Store what breaks the claim before the cells are said to be falsified."""
         for name, arrays in self.question.counterexamples(block.frame, self.grids[block.frame], findings):
             buffer = io.BytesIO()

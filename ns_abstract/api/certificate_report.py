@@ -14,11 +14,11 @@ import numpy as np
 from ns_abstract.api.cell_search import CellSearch
 from ns_abstract.api.certification import Certification
 from ns_abstract.api.showing import look_closer
-from ns_abstract.execution.ending import AbandonedError
-from ns_abstract.report.cameras import Cameras, cameras_entry, cell_cameras, standing
+from ns_abstract.execution.cancellation import WorkCancelledError
+from ns_abstract.report.cameras import CameraDrawings, cameras_entry, cell_cameras, standing
 from ns_abstract.report.certificate import CertifiedRun, certificate_document
 from ns_abstract.report.certificate_page import certificate_page
-from ns_abstract.report.outside import Outside
+from ns_abstract.report.outside import SceneDrawing
 from ns_abstract.report.picture import preview, to_bytes
 from ns_abstract.report.verdict_picture import write_pictures
 from ns_abstract.verify.store import Store, Tally, fractions
@@ -44,7 +44,7 @@ class CertificateReport:
         self.job, self.about, self.search = job, about, search
         self.shown: list[dict[str, Any]] = []
         self.seen: dict[tuple[int, int], dict[str, Any]] = {}
-        self.cameras: Cameras | None = None
+        self.cameras: CameraDrawings | None = None
         #: certified cells bounded in weaker ways, too
 
     def document(self, store: Store, state: str) -> tuple[dict[str, Any], dict[int, list[dict[str, Any]]]]:
@@ -53,7 +53,7 @@ class CertificateReport:
         entries = [self._entry(tally, rows[tally.frame]) for tally in store.tallies()]
         sets = {frame: self.job.job.pose_sets[frame] for frame in rows}
         cells, left_out = cell_cameras(sets, rows, [name for name, _ in self.job.parameters])
-        self.cameras = Cameras(cells, left_out, self._standing, self._outside)
+        self.cameras = CameraDrawings(cells, left_out, self._standing, self._outside)
         document = certificate_document(
             self.about,
             entries,
@@ -96,9 +96,9 @@ class CertificateReport:
         return standing({frame: self.job.job.pose_sets[frame] for frame in self.search.grids})
 
     @cached_property
-    def _outside(self) -> Outside | None:
+    def _outside(self) -> SceneDrawing | None:
         elements = self.job.job.method.elements()
-        return None if elements is None else Outside(elements)
+        return None if elements is None else SceneDrawing(elements)
 
     def _kept_image(self, frame: int, pose: np.ndarray) -> np.ndarray | None:
         """The stored image of a counterexample."""
@@ -176,7 +176,7 @@ class CertificateReport:
             text = f"frame {frame}, margin {'not a number' if margin is None else f'{margin:.4g}'}"
             wanted.append(("counterexample", text, frame, row["counterexample"]))
         found = []
-        with suppress(AbandonedError):
+        with suppress(WorkCancelledError):
             for title, text, frame, values in wanted:
                 found.append({"title": title, "text": text, "png": self._drawn(frame, values, _PIXELS)})
         return found
@@ -206,7 +206,7 @@ class CertificateReport:
         share = _SEEN // max(1, sum(map(bool, kinds.values())))
         wanted = [key for keys in kinds.values() for key in keys[:: max(1, -(-len(keys) // share))]]
         found = {}
-        with suppress(AbandonedError):
+        with suppress(WorkCancelledError):
             for frame, k in wanted:
                 row = rows[frame][k]
                 values, text = row["counterexample"], "the counterexample's picture"
@@ -234,5 +234,5 @@ def _depth(row: Mapping[str, Any]) -> float:
 
 def _worst(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Falsified cells, worst first; neighbours may share their counterexample, which counts once."""
-    found = sorted((row for row in rows if row["verdict"] == "falsified"), key=_depth)
-    return list({tuple(row["counterexample"]): row for row in reversed(found)}.values())[::-1]
+    broken = sorted((row for row in rows if row["verdict"] == "falsified"), key=_depth)
+    return list({tuple(row["counterexample"]): row for row in reversed(broken)}.values())[::-1]

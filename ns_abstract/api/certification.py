@@ -20,11 +20,11 @@ from ns_abstract.api.assumptions import choice
 from ns_abstract.api.files import Settings, path_sets, resized
 from ns_abstract.api.job import Job, require_sound_platform, warm_up
 from ns_abstract.arithmetic.forms import MAX_DIMENSIONS
-from ns_abstract.execution.ending import abandoning
-from ns_abstract.execution.opening import Recipe
+from ns_abstract.execution.cancellation import cancel_when
+from ns_abstract.execution.worker_cache import Recipe
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import load_camera_path
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
@@ -32,21 +32,21 @@ from ns_abstract.io.jsonio import load_json
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.perturbation.specification import Perturbation
-from ns_abstract.refine.protocol import Frame, Member, Method, RayFrame
+from ns_abstract.refine.protocol import Frame, Method, RayFrame, SceneSample
 from ns_abstract.report.record import file_stamp
-from ns_abstract.verify.cells import Cell, Grid, coarse_parts
-from ns_abstract.verify.cover import Cover
+from ns_abstract.verify.camera_response import CameraResponse, response_sets
+from ns_abstract.verify.cells import Cell, CellGrid, initial_divisions
 from ns_abstract.verify.eight_bit import Picture, rounded, rounded_sets
 from ns_abstract.verify.model import NetworkModel, parametric
 from ns_abstract.verify.network import NetworkArithmetic, load_network
-from ns_abstract.verify.pixel_costs import pixel_costs
+from ns_abstract.verify.pixel_costs import pixel_weights
 from ns_abstract.verify.properties import Claim, LinearClaim, Property, loading, parse_property
+from ns_abstract.verify.protocol import FrameImages as SearchedScene
 from ns_abstract.verify.protocol import Model as SearchedModel
-from ns_abstract.verify.protocol import Scene as SearchedScene
-from ns_abstract.verify.registration import RegisteredModel, RegisteredScene
-from ns_abstract.verify.response import Response, shown_sets
-from ns_abstract.verify.scene_margin import Kind, Settle, Settled
-from ns_abstract.verify.search import BLOCK, ContradictionError, Findings, Search
+from ns_abstract.verify.registration import RegisteredImages, RegisteredModel
+from ns_abstract.verify.scene_margin import CellOutcome, ProveCell, VariationKind
+from ns_abstract.verify.search import BLOCK, BlockResult, ContradictionError, Search
+from ns_abstract.verify.subboxes import SubBoxProof
 
 if TYPE_CHECKING:
     from ns_abstract.verify.interop import Form
@@ -58,9 +58,9 @@ _MOTION_LINE, _MOTION = 0.08, 0.5
 #: Numbers that a network's layers may have together in a block's cells.
 _BLOCK_NUMBERS = 1 << 18
 #: Slanted parts of a cell at most, about: narrower cells need more of them in all.
-_MOST_SLANTED = 512
+_MOST_SHEARED = 512
 #: What their sets may cost of the margin at first.
-_AIM_SLANTED = 0.32
+_AIM_SHEARED = 0.32
 #: Cells of the first blocks: early results, of which a kill leaves the more.
 _FIRST_BLOCKS = (1, 1, 1, 1, 2, 2, 4, 4)
 #: Frames whose bounds a process keeps at hand.
@@ -124,14 +124,14 @@ class FramePictures:
     def __init__(
         self,
         method: Method,
-        poses: PoseSet,
+        poses: PoseBox,
         picture: Picture = "float",
-        response: Response | None = None,
-        slanted: bool = False,
+        response: CameraResponse | None = None,
+        sheared: bool = False,
     ) -> None:
         self._rounded, self._response = picture == "8-bit", response
-        self.frame: Frame = method.frame(poses, slanted)
-        #: What pixels of a cell cost, where pictures are made ray by ray: see `pixel_costs`.
+        self.frame: Frame = method.frame(poses, sheared)
+        #: What pixels of a cell cost, where pictures are made ray by ray: see `pixel_weights`.
         self.weigh: Callable[[ParameterBox], np.ndarray | None] = lambda box: None
         self._images: dict[bytes, np.ndarray] = {}
         self.box = self.frame.box
@@ -139,11 +139,11 @@ class FramePictures:
         self._tiles = np.arange(self.frame.tile_count)
 
     @property
-    def pose_set(self) -> PoseSet:
+    def pose_set(self) -> PoseBox:
         """The frame's poses."""
         return self.frame.pose_set
 
-    def image(self, values: np.ndarray, member: Member | None = None) -> np.ndarray:
+    def image(self, values: np.ndarray, member: SceneSample | None = None) -> np.ndarray:
         values = np.asarray(values, np.float64)
         if member is not None:
             image = assemble(member(values), self.frame.camera)
@@ -159,24 +159,26 @@ class FramePictures:
                 self._images[key] = image
         return rounded(image) if self._rounded else image
 
-    def members(self, seed: int) -> Iterator[Member]:
-        return self.frame.members(seed) if self._response is None else self._response.members(self.frame, seed)
+    def scene_samples(self, seed: int) -> Iterator[SceneSample]:
+        return (
+            self.frame.scene_samples(seed) if self._response is None else self._response.scene_samples(self.frame, seed)
+        )
 
     def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
         if self.frame.tilewise:
-            found = cast("RayFrame", self.frame).sets(box, partial(self.weigh, box))
+            linear_sets = cast("RayFrame", self.frame).sets(box, partial(self.weigh, box))
         else:
-            found = self.frame.bound(box, self._tiles, keep_linear=True)
-        linear, lower, upper = shown_sets(found, self.frame.camera, self._response)
+            linear_sets = self.frame.bound(box, self._tiles, keep_linear=True)
+        linear, lower, upper = response_sets(linear_sets, self.frame.camera, self._response)
         if self._rounded:
             linear, lower, upper = rounded_sets(linear, lower, upper)
-        return linear, lower, upper, found.slopes
+        return linear, lower, upper, linear_sets.slopes
 
     @cached_property
     def _differentiable(self) -> Callable[[torch.Tensor], torch.Tensor]:
-        found = self._method.differentiable(self.pose_set)
-        assert found is not None
-        return found
+        renderer = self._method.differentiable(self.pose_set)
+        assert renderer is not None
+        return renderer
 
     def differentiable(self, values: torch.Tensor) -> torch.Tensor:
         """The floats before any rounding, which has no slope."""
@@ -197,10 +199,10 @@ class Question:
     def __init__(self, model: Path, source: PropertySource) -> None:
         self.model, self.source = model, source
         try:
-            given = loading(source.value)
+            load_options = loading(source.value)
         except InputError as error:
             raise source.within(error) from None
-        self.network = load_network(model, **given)
+        self.network = load_network(model, **load_options)
         shapes = self.network.input_shape, self.network.output_shape
         try:
             self.property: Property = parse_property(source.value, source.folder, *shapes)
@@ -209,7 +211,7 @@ class Question:
         #: height and width of the network's pictures
         self.size = self.property.preprocess.size(self.network.input_shape)
 
-    def drawn(self, poses: PoseSet) -> PoseSet:
+    def drawn(self, poses: PoseBox) -> PoseBox:
         """A set whose pictures have the size that the property asks for."""
         return poses if self.property.preprocess.resize is None else resized(poses, *self.size)
 
@@ -258,7 +260,7 @@ class Certification:
             )
         require_sound_platform()
         self.model = NetworkModel(self.network, self.property.preprocess, memory, network_arithmetic)
-        self._searches: dict[tuple[int, Grid], Search] = {}
+        self._searches: dict[tuple[int, CellGrid], Search] = {}
 
     @property
     def recipe(self) -> Recipe[Certification]:
@@ -278,10 +280,10 @@ class Certification:
     @property
     def parameters(self) -> list[tuple[str, str]]:
         """Names and units of all frames' parameters, in the order of boxes."""
-        found: dict[str, str] = {}
+        units: dict[str, str] = {}
         for poses in sorted(self.job.pose_sets, key=lambda p: -p.box.dimensions):
-            found |= {n: u for n, u in zip(poses.box.names, poses.box.units, strict=True) if n not in found}
-        return list(found.items())
+            units |= {n: u for n, u in zip(poses.box.names, poses.box.units, strict=True) if n not in units}
+        return list(units.items())
 
     @property
     def scenes(self) -> tuple[str, ...]:
@@ -337,7 +339,7 @@ class Certification:
         """Frame ``index``, ready to be rendered and bounded."""
         return FramePictures(self.job.method, self.job.pose_sets[index], self.picture)
 
-    def claim(self, pictures: FramePictures, poses: PoseSet | None = None) -> Claim:
+    def claim(self, pictures: FramePictures, poses: PoseBox | None = None) -> Claim:
         """What is to hold in a frame.
 
         Args:
@@ -353,7 +355,7 @@ class Certification:
 
         return self.property.bind(pictures.pose_set if poses is None else poses, nominal)
 
-    def grid(self, index: int) -> Grid:
+    def grid(self, index: int) -> CellGrid:
         """The cells of a frame whose search begins.
 
         Raises:
@@ -362,11 +364,11 @@ class Certification:
         pictures = self.pictures(index)
         box = pictures.box
         pixels = _MOTION_LINE if box.dimensions == 1 else _MOTION
-        coarse = coarse_parts(pictures.frame.motion(box), pixels)
+        coarse = initial_divisions(pictures.frame.motion(box), pixels)
         if self.property.partitions is None:
-            return Grid.adaptive(box, coarse)
+            return CellGrid.adaptive(box, coarse)
         try:
-            return Grid.fixed(box, self.property.partitions, coarse)
+            return CellGrid.fixed(box, self.property.partitions, coarse)
         except InputError as error:
             raise self.question.source.within(error) from None
 
@@ -376,14 +378,14 @@ class Certification:
         numbers = sum(math.prod(self.network.shape(k)) for k in range(len(self.network.nodes) + 1))
         return max(1, min(BLOCK, _BLOCK_NUMBERS // numbers))
 
-    def first_blocks(self, grid: Grid) -> list[list[Cell]]:
+    def first_blocks(self, grid: CellGrid) -> list[list[Cell]]:
         """What a frame's search begins with."""
         roots = grid.roots()
         ends = [0, *itertools.accumulate(size for size in _FIRST_BLOCKS if size < self.block)]
         ends += range(ends[-1] + self.block, len(roots) + self.block, self.block)
         return [roots[a:b] for a, b in itertools.pairwise(ends) if a < len(roots)]
 
-    def search(self, index: int, grid: Grid) -> Search:
+    def search(self, index: int, grid: CellGrid) -> Search:
         """The search of a frame; kept at hand."""
         key = (index, grid)
         if key not in self._searches:
@@ -392,18 +394,18 @@ class Certification:
             pictures = self.pictures(index)
             every_unit = self.property.partitions is not None
             claim = self.claim(pictures)
-            pictures.weigh = partial(pixel_costs, pictures, self.model, claim)
+            pictures.weigh = partial(pixel_weights, pictures, self.model, claim)
             cover = self._cover(pictures)
             self._searches[key] = Search(
                 pictures, self.model, claim, grid, every_unit=every_unit, block=self.block, cover=cover
             )
         return self._searches[key]
 
-    def examine(self, number: int, grid: Grid, cells: tuple[Cell, ...]) -> Findings:
+    def examine(self, number: int, grid: CellGrid, cells: tuple[Cell, ...]) -> BlockResult:
         """What becomes of cells of a frame; see `ns_abstract.api.cell_search.Examiner`."""
         return self.search(number, grid).examine(cells)
 
-    def _cover(self, pictures: FramePictures, response: Response | None = None) -> Cover | None:
+    def _cover(self, pictures: FramePictures, response: CameraResponse | None = None) -> SubBoxProof | None:
         """What proves cells of a frame part by part; None with one parameter, and where rays cost more than networks.
 
         Args:
@@ -412,27 +414,27 @@ class Certification:
         """
         if pictures.box.dimensions < 2 or pictures.frame.tilewise:
             return None
-        poses, straight = pictures.pose_set, Cover(pictures, self.model, self.model, self.claim(pictures))
-        slanted = FramePictures(self.job.method, poses, self.picture, response, slanted=True)
-        if not (shear := slanted.pose_set.shear):
+        poses, straight = pictures.pose_set, SubBoxProof(pictures, self.model, self.model, self.claim(pictures))
+        sheared = FramePictures(self.job.method, poses, self.picture, response, sheared=True)
+        if not (shear := sheared.pose_set.shear):
             return straight
 
         def frame(cell: ParameterBox) -> tuple[ParameterBox, Callable[[ParameterBox], ParameterBox | None]]:
-            found = poses.within(cell).sheared(shear)
-            return found.box, found.feasible
+            sheared_poses = poses.within(cell).sheared(shear)
+            return sheared_poses.box, sheared_poses.feasible
 
-        claim = self.claim(pictures, slanted.pose_set)
-        return Cover(
-            slanted, self.model, self.model, claim, frame, most=_MOST_SLANTED, block=1, aim=_AIM_SLANTED, other=straight
+        claim = self.claim(pictures, sheared.pose_set)
+        return SubBoxProof(
+            sheared, self.model, self.model, claim, frame, most=_MOST_SHEARED, block=1, aim=_AIM_SHEARED, other=straight
         )
 
-    def places(self, kind: Kind) -> bool:
+    def places(self, kind: VariationKind) -> bool:
         """Whether a kind's parameters can be bounded beside those of every set."""
         return all(poses.box.dimensions + len(kind.place) <= MAX_DIMENSIONS for poses in self.job.pose_sets)
 
     def _varied(
-        self, kind: Kind, radius: float, frame: int
-    ) -> tuple[FramePictures, SearchedScene, SearchedModel, Cover | None]:
+        self, kind: VariationKind, radius: float, frame: int
+    ) -> tuple[FramePictures, SearchedScene, SearchedModel, SubBoxProof | None]:
         """Pictures of a frame for all that may vary, as the search sees them, and the network behind them (V13).
 
         The last is what proves cells part by part.
@@ -440,36 +442,38 @@ class Certification:
         method, poses, model = self.job.method, self.job.pose_sets[frame], self.model
         if kind.place:
             pictures = FramePictures(method, poses.registered(kind.place, radius), self.picture)
-            return pictures, RegisteredScene(pictures, pictures.frame), RegisteredModel(model), None
+            return pictures, RegisteredImages(pictures, pictures.frame), RegisteredModel(model), None
         response = None
         if kind.response is not None:
-            response = Response(kind.response, radius)
+            response = CameraResponse(kind.response, radius)
             pictures = FramePictures(method, poses, self.picture, response)
         else:
             pictures = FramePictures(method, self.job.varied(frame, kind.variation(radius)), self.picture)
         return pictures, pictures, model, self._cover(pictures, response)
 
-    def settle(self, kind: Kind) -> Settle:
+    def settle(self, kind: VariationKind) -> ProveCell:
         """Bounds and attacks cells for all scenes around the stored one (V13)."""
-        kept: dict[tuple[float, int], tuple[FramePictures, SearchedScene, SearchedModel, Cover | None, Claim]] = {}
+        searches: dict[
+            tuple[float, int], tuple[FramePictures, SearchedScene, SearchedModel, SubBoxProof | None, Claim]
+        ] = {}
 
-        def settle(radius: float, frame: int, box: ParameterBox) -> Settled:
+        def settle(radius: float, frame: int, box: ParameterBox) -> CellOutcome:
             key = radius, frame
-            if key not in kept:
+            if key not in searches:
                 # radii come one after the other
-                kept.clear()
+                searches.clear()
                 # what is claimed does not depend on the scenes
-                kept[key] = *self._varied(kind, radius, frame), self.claim(self.pictures(frame))
-            pictures, scene, model, cover, claim = kept[key]
-            search = Search(scene, model, claim, Grid.adaptive(box, [1] * box.dimensions), cuts=False, cover=cover)
+                searches[key] = *self._varied(kind, radius, frame), self.claim(self.pictures(frame))
+            pictures, scene, model, cover, claim = searches[key]
+            search = Search(scene, model, claim, CellGrid.adaptive(box, [1] * box.dimensions), cuts=False, cover=cover)
             (leaf,) = search.examine(search.grid.roots()).leaves
             if leaf.verdict == "certified":
-                return Settled("holds", "", np.zeros(box.dimensions))
+                return CellOutcome("holds", "", np.zeros(box.dimensions))
             if leaf.verdict == "unknown":
                 # the network's bounds are there, and not above 0
                 reason = leaf.reason if leaf.margin is None else "the margin's bound is not above 0"
-                whole = scene.widened(box) if isinstance(scene, RegisteredScene) else box
-                return Settled("unknown", reason, pictures.frame.motion(whole)[: box.dimensions])
+                whole = scene.widened(box) if isinstance(scene, RegisteredImages) else box
+                return CellOutcome("unknown", reason, pictures.frame.motion(whole)[: box.dimensions])
             if leaf.scene is None:
                 raise ContradictionError(
                     f"internal error: the stored scene breaks at {leaf.counterexample} what was proved there"
@@ -478,7 +482,7 @@ class Certification:
             example = {"image": leaf.image, "outputs": leaf.outputs, "values": np.array(leaf.counterexample)}
             example |= {"names": np.array(box.names, str), "radius": np.array(radius)}
             example |= {f"scene_{name}": array for name, array in leaf.scene.items()}
-            return Settled("falsified", "a scene breaks it", np.zeros(box.dimensions), example)
+            return CellOutcome("falsified", "a scene breaks it", np.zeros(box.dimensions), example)
 
         return settle
 
@@ -498,7 +502,7 @@ class Certification:
         # compiling says nothing about rays
         warm_up(frame)
         begin = time.perf_counter()
-        with abandoning(lambda: time.perf_counter() - begin > _FORESEEN * seconds):
+        with cancel_when(lambda: time.perf_counter() - begin > _FORESEEN * seconds):
             by_ray, parts = frame.effort()
         more = ""
         if by_ray is None:
@@ -551,7 +555,7 @@ class Certification:
         network = self.question.network
         return write_vnnlib(network, images, claim.rows, claim.offset, target, form, claim.groups)
 
-    def partitions(self, grid: Grid) -> int | None:
+    def partitions(self, grid: CellGrid) -> int | None:
         """Number of parts of the fixed partition, if there is one."""
         return math.prod(grid.units) if self.property.partitions is not None else None
 

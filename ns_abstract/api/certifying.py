@@ -25,7 +25,7 @@ from ns_abstract.api.certification import MEMORY, Certification, PropertySource,
 from ns_abstract.api.job import Job
 from ns_abstract.api.poses import PoseSet
 from ns_abstract.api.scenes import Scene
-from ns_abstract.execution.ending import Deadline
+from ns_abstract.execution.cancellation import Deadline
 from ns_abstract.execution.engines import EngineName, started
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.assumptions import Assumption
@@ -36,11 +36,11 @@ from ns_abstract.report.figures import percent, short_guarantee
 from ns_abstract.report.notebook import verdicts_html
 from ns_abstract.report.record import file_stamp
 from ns_abstract.report.verdict_picture import clear_pictures
-from ns_abstract.verify.cells import Cell, Grid
+from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.eight_bit import Picture
 from ns_abstract.verify.network import NetworkArithmetic
 from ns_abstract.verify.network.explain import check_cell
-from ns_abstract.verify.scene_margin import CAMERA_KINDS, KINDS, PLACES, Kind, Settle, check_scenes
+from ns_abstract.verify.scene_margin import CAMERA_KINDS, KINDS, PLACES, ProveCell, VariationKind, check_scenes
 from ns_abstract.verify.store import Store, fractions
 
 #: Seconds that pictures for the last report may take beyond the budget, where they are made ray by ray.
@@ -122,16 +122,16 @@ class CertificateQuestion(CellQuestion[CertifyProgress]):
             self._report = CertificateReport(self.job, self.about, search)
         return self._report
 
-    def grid(self, number: int) -> Grid:
+    def grid(self, number: int) -> CellGrid:
         return self.job.grid(number)
 
-    def first_blocks(self, grid: Grid) -> list[list[Cell]]:
+    def first_blocks(self, grid: CellGrid) -> list[list[Cell]]:
         return self.job.first_blocks(grid)
 
     def stored_set(self, number: int) -> ParameterBox | None:
         return self.job.job.pose_sets[number].box
 
-    def counterexamples(self, number: int, grid: Grid, findings: Any) -> Iterator[tuple[str, dict[str, Any]]]:
+    def counterexamples(self, number: int, grid: CellGrid, findings: Any) -> Iterator[tuple[str, dict[str, Any]]]:
         for leaf in findings.leaves:
             if leaf.counterexample is None or leaf.image is None or leaf.outputs is None:
                 continue
@@ -169,7 +169,7 @@ class CertificateQuestion(CellQuestion[CertifyProgress]):
     def finish(self, search: CellSearch[CertifyProgress]) -> None:
         search.deadline = search.deadline.extended(_LAST)
 
-    def varied_scenes(self) -> tuple[Sequence[Kind], Callable[[Kind], Settle]]:
+    def varied_scenes(self) -> tuple[Sequence[VariationKind], Callable[[VariationKind], ProveCell]]:
         return (*KINDS, *CAMERA_KINDS, *(kind for kind in PLACES if self.job.places(kind))), self.job.settle
 
     def progress(self, store: Store) -> CertifyProgress:
@@ -307,13 +307,13 @@ def certify(
     sets = [poses] if isinstance(poses, PoseSet) else list(poses)
     if not sets:
         raise InputError("found no set", field="poses", fix="give at least one PoseSet")
-    given = property if isinstance(property, Mapping) else Path(property)
-    question = Question(Path(model), PropertySource.of(given))
+    source = property if isinstance(property, Mapping) else Path(property)
+    question = Question(Path(model), PropertySource.of(source))
     drawn = [question.drawn(entry.of(scene)) for entry in sets]
     memory = network_memory(memory_limit, workers)
     job = Job(scene, drawn, arithmetic=arithmetic, workers=workers)
-    found = Certification(job, question, memory, network_arithmetic=network_arithmetic, picture=picture)
-    check_network_memory(found, memory_limit, workers)
+    certification = Certification(job, question, memory, network_arithmetic=network_arithmetic, picture=picture)
+    check_network_memory(certification, memory_limit, workers)
     settings = {
         "time_budget": time_budget,
         "arithmetic": arithmetic,
@@ -322,12 +322,12 @@ def certify(
         "engine": engine,
     }
     rows, document = answered(
-        CertificateQuestion(found, range(len(drawn)), settings, ("ns_abstract.certify",)),
+        CertificateQuestion(certification, range(len(drawn)), settings, ("ns_abstract.certify",)),
         request if on_progress is None else replace(request, on_progress=on_progress),
         lambda engines: engines.enter_context(started(engine, scheduler_address, 1 if scene.rays else workers)),
         output_dir,
     )
-    return certificate(found, rows, document)
+    return certificate(certification, rows, document)
 
 
 def certificate(job: Certification, rows: Mapping[int, list[Row]], document: Mapping[str, Any]) -> Certificate:

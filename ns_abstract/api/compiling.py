@@ -15,7 +15,7 @@ from multiprocessing.connection import Connection
 
 from ns_abstract.api.job import Job
 from ns_abstract.arithmetic.kernel_cache import SESSION, KernelMissingError, store
-from ns_abstract.execution.opening import opened
+from ns_abstract.execution.worker_cache import load
 from ns_abstract.refine.protocol import Frame
 
 #: Seconds between two lines on progress, and between two times that kernels are published.
@@ -38,17 +38,17 @@ def shares(stages: Sequence[str], count: int) -> list[list[str]]:
 
 def missing(frame: Frame) -> list[str]:
     """Return the frame's stages whose kernels are not in the cache."""
-    found = []
+    stages = []
     for stage in frame.stages:
         try:
             with store().complete():
                 frame.warm_up(stage)
         except KernelMissingError:
-            found.append(stage)
-    return found
+            stages.append(stage)
+    return stages
 
 
-class _Progress:
+class _CompileProgress:
     """Reports the progress of compiling."""
 
     def __init__(self, parts: Sequence[Sequence[str]]) -> None:
@@ -92,7 +92,7 @@ def compile_beside(job: Job, index: int, processes: int | None = None) -> None:
     if not frame.stages or not (stages := missing(frame)):
         return
     parts = shares(stages, len(os.sched_getaffinity(0)) if processes is None else processes)
-    progress = _Progress(parts)
+    progress = _CompileProgress(parts)
     if len(parts) < 2:
         return
     compiled = [0] * len(parts)
@@ -151,7 +151,7 @@ def main() -> None:
     line = Connection(int(sys.argv[1]))
     recipe, index = line.recv()
     threading.Thread(target=_watch, args=(line,), daemon=True).start()
-    frame = opened(recipe).frame(index)
+    frame = load(recipe).frame(index)
     for stage in sys.argv[2:]:
         frame.warm_up(stage)
 

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from ns_abstract.api.files import PathJob
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.report.figures import interval, listed, number
 
 #: Parts of the visible scene elements that are nearer than the depths that are told.
@@ -52,13 +52,13 @@ def _cameras(job: PathJob, frames: Sequence[int]) -> Iterator[str]:
         if depths is None or not depths.size:
             yield "    what it shows has no distance of its own" if depths is None else "    nothing is in the picture"
             continue
-        told = {name: float(np.quantile(depths, part)) for name, part in _QUANTILES.items()}
+        depth_quantiles = {name: float(np.quantile(depths, part)) for name, part in _QUANTILES.items()}
         scale = job.method.dataset_scale
-        text = ", ".join(f"{name} {number(z)} ({number(z / scale)})" for name, z in told.items())
+        text = ", ".join(f"{name} {number(z)} ({number(z / scale)})" for name, z in depth_quantiles.items())
         yield f"    depth in normalised units (of the data set): {text}"
         yield (
             f"    at the middle depth, a shift by 0.01 normalised units moves the picture by "
-            f"{number(0.01 * poses.camera.fx / told['middle'], 3)} pixels; 1 degree of yaw by "
+            f"{number(0.01 * poses.camera.fx / depth_quantiles['middle'], 3)} pixels; 1 degree of yaw by "
             f"{number(poses.camera.fx * math.tan(math.radians(1.0)), 3)}"
         )
     if len(frames) > _MOST_FRAMES:
@@ -66,10 +66,10 @@ def _cameras(job: PathJob, frames: Sequence[int]) -> Iterator[str]:
 
 
 def _sets(job: PathJob, frames: Sequence[int]) -> Iterator[str]:
-    told: dict[tuple[str, ...], list[int]] = {}
+    frames_by_text: dict[tuple[str, ...], list[int]] = {}
     for index in frames:
-        told.setdefault(tuple(_ranges(job.pose_sets[index], job.method.dataset_scale)), []).append(index)
-    for lines, indices in told.items():
+        frames_by_text.setdefault(tuple(_ranges(job.pose_sets[index], job.method.dataset_scale)), []).append(index)
+    for lines, indices in frames_by_text.items():
         some = f"frame{'s' if indices[1:] else ''} {listed(indices)}"
         yield f"set        of {'every frame' if len(indices) == len(frames) else some}:"
         if not lines:
@@ -81,7 +81,7 @@ def _sets(job: PathJob, frames: Sequence[int]) -> Iterator[str]:
             yield f"  {name} moves what frame {index} shows by {number(float(pixels), 3)} pixels over its range"
 
 
-def _ranges(poses: PoseSet, scale: float) -> Iterator[str]:
+def _ranges(poses: PoseBox, scale: float) -> Iterator[str]:
     box = poses.box
     for name, unit, low, high in zip(box.names, box.units, box.lower, box.upper, strict=True):
         text = interval(name, unit, low, high)

@@ -104,7 +104,7 @@ def explain(job: Job, index: int, result: FrameResult, seed: int = 0) -> Explana
     chosen = _chosen(frame, leaves, np.array(tiles), np.random.default_rng(seed))
     now = [_excess(frame, box, tile, seed) for box, tile in chosen]
     causes = {}
-    for name, other in job.method.easier(frame.pose_set):
+    for name, other in job.method.ablations(frame.pose_set):
         left = sum(_excess(other, box, tile, seed) for box, tile in chosen)
         causes[name] = float(min(1.0, max(0.0, 1.0 - left / max(sum(now), NONZERO))))
     most = np.argsort(tiles)[::-1][:_REGIONS]
@@ -113,7 +113,7 @@ def explain(job: Job, index: int, result: FrameResult, seed: int = 0) -> Explana
     bounds = frame.bound(box, np.array([tile]))
     width = float((bounds.upper - bounds.lower).mean())
     elements = tuple(
-        (number, gain / width) for number, gain in job.method.holders(frame, box, tile, _ELEMENTS) if width > 0.0
+        (number, gain / width) for number, gain in job.method.attribution(frame, box, tile, _ELEMENTS) if width > 0.0
     )
     return Explanation(index, gap, excess, len(chosen), causes, regions, elements)
 
@@ -150,5 +150,5 @@ def _excess(frame: Frame, box: ParameterBox, tile: int, seed: int) -> float:
     tiles = np.array([tile])
     bounds = frame.bound(box, tiles)
     poses = [box.middle, *box.corners()[:_POSES], *box.sample(_POSES, np.random.default_rng(seed))]
-    seen = np.stack([frame.render(values, tiles) for values in poses])
-    return float((bounds.upper - bounds.lower).mean() - (seen.max(axis=0) - seen.min(axis=0)).mean())
+    renders = np.stack([frame.render(values, tiles) for values in poses])
+    return float((bounds.upper - bounds.lower).mean() - (renders.max(axis=0) - renders.min(axis=0)).mean())

@@ -11,7 +11,7 @@ from ns_abstract.api.assumptions import file_choices
 from ns_abstract.api.job import Job
 from ns_abstract.api.scenes import Scene, SceneSource
 from ns_abstract.geometry.camera_path import CameraPath, load_camera_path
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.overrides import Overrides
@@ -56,7 +56,7 @@ class Settings:
         """The scene and the program that draws it."""
         return SceneSource(self.load_config, self.program, self.overrides)
 
-    def set_choices(self, pose_sets: Sequence[PoseSet], path: CameraPath) -> tuple[Assumption, ...]:
+    def set_choices(self, pose_sets: Sequence[PoseBox], path: CameraPath) -> tuple[Assumption, ...]:
         """Where the size of the pictures and their sets come from."""
         inside = any(entry is not None for entry in path.perturbations)
         return file_choices(
@@ -73,7 +73,7 @@ class PathJob(Job):
         settings: The files and options.
     """
 
-    def __init__(self, settings: Settings, scene: Scene, path: CameraPath, pose_sets: tuple[PoseSet, ...]) -> None:
+    def __init__(self, settings: Settings, scene: Scene, path: CameraPath, pose_sets: tuple[PoseBox, ...]) -> None:
         self.settings, self.path = settings, path
         try:
             super().__init__(
@@ -92,7 +92,7 @@ class PathJob(Job):
             named = error.field is not None and not error.field.startswith("--")
             raise error.within(settings.perturbation_filename or path.source) if named else error from None
 
-    def pose_set(self, index: int, perturbation: Perturbation) -> PoseSet:
+    def pose_set(self, index: int, perturbation: Perturbation) -> PoseBox:
         """The poses of ``perturbation`` around entry ``index`` of the path.
 
         Raises:
@@ -101,14 +101,14 @@ class PathJob(Job):
         return pose_set(self.path, index, perturbation)
 
 
-def pose_set(path: CameraPath, index: int, perturbation: Perturbation) -> PoseSet:
+def pose_set(path: CameraPath, index: int, perturbation: Perturbation) -> PoseBox:
     """The poses of ``perturbation`` around entry ``index`` of a path.
 
     Raises:
         InputError: The path cannot be swept as asked.
     """
     try:
-        return PoseSet.around(path.cameras[index], perturbation, path.following(index))
+        return PoseBox.around(path.cameras[index], perturbation, path.following(index))
     except InputError as error:
         raise error.within(path.source) from None
 
@@ -138,12 +138,12 @@ def path_sets(
     path: CameraPath,
     perturbation: Perturbation | None = None,
     default: Perturbation | None = None,
-) -> tuple[PoseSet, ...]:
+) -> tuple[PoseBox, ...]:
     """The sets of poses of a path's entries; arguments and errors as for `open_job`."""
-    found = (perturbation,) * len(path.cameras)
+    perturbations = (perturbation,) * len(path.cameras)
     if perturbation is None:
-        found = _perturbations(settings, scene.method(settings.arithmetic).dataset_scale, path, default)
-    return tuple(pose_set(path, k, entry) for k, entry in enumerate(found) if entry is not None)
+        perturbations = _perturbations(settings, scene.method(settings.arithmetic).dataset_scale, path, default)
+    return tuple(pose_set(path, k, entry) for k, entry in enumerate(perturbations) if entry is not None)
 
 
 def _perturbations(
@@ -151,14 +151,14 @@ def _perturbations(
 ) -> tuple[Perturbation, ...]:
     file = settings.perturbation_filename
     if settings.given_set is not None:
-        given = parse_perturbation(settings.given_set, dataset_scale=scale, field_prefix="--")
-        return (given,) * len(path.cameras)
+        option_set = parse_perturbation(settings.given_set, dataset_scale=scale, field_prefix="--")
+        return (option_set,) * len(path.cameras)
     if file is not None:
         return (load_perturbation(file, dataset_scale=scale),) * len(path.cameras)
-    found, folder = [], Path(path.source).parent
+    perturbations, folder = [], Path(path.source).parent
     for k, value in enumerate(path.perturbations):
         if value is None and default is not None:
-            found.append(default)
+            perturbations.append(default)
             continue
         if value is None:
             raise InputError(
@@ -169,14 +169,14 @@ def _perturbations(
             )
         prefix = "perturbation." if path.overrides[k] is None else f"camera_path[{k}].perturbation."
         try:
-            found.append(parse_perturbation(value, dataset_scale=scale, field_prefix=prefix, folder=folder))
+            perturbations.append(parse_perturbation(value, dataset_scale=scale, field_prefix=prefix, folder=folder))
         except InputError as error:
             raise error.within(path.source) from None
-    return tuple(found)
+    return tuple(perturbations)
 
 
-def resized(poses: PoseSet, height: int, width: int) -> PoseSet:
-    """The same poses with pictures of another size; see `Camera.resized`."""
+def resized(poses: PoseBox, height: int, width: int) -> PoseBox:
+    """The same poses with pictures of another size; see `PinholeCamera.resized`."""
     target = poses.target_camera
     return replace(
         poses,

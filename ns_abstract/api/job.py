@@ -18,18 +18,18 @@ from ns_abstract.api.assumptions import scene_choices
 from ns_abstract.api.assumptions import set_choices as object_choices
 from ns_abstract.api.scenes import Scene, SceneSource
 from ns_abstract.arithmetic.selfcheck import platform_problems
-from ns_abstract.execution.ending import AbandonedError, abandoning
-from ns_abstract.execution.opening import Recipe
+from ns_abstract.execution.cancellation import WorkCancelledError, cancel_when
 from ns_abstract.execution.threads import most_threads
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.execution.worker_cache import Recipe
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.memory import allowed_memory
 from ns_abstract.io.version import computed_by
 from ns_abstract.perturbation.variations import SceneVariation
-from ns_abstract.refine.engine import Goal, Refinement
+from ns_abstract.refine.engine import Refinement, RefinementGoal
 from ns_abstract.refine.protocol import Frame, Method
-from ns_abstract.refine.result import LAYERS, FrameResult, PartResult, TracePoint, joined
+from ns_abstract.refine.result import EXTRA_OUTPUTS, FrameResult, PartResult, TracePoint, joined
 
 #: Bytes for leaves below which nothing can be done.
 _LEAST_LEAF_BYTES = 64 << 20
@@ -49,7 +49,7 @@ class Job:
         seed: Of the random witnesses.
         memory_limit: GiB; None: 80 % of what is free.
         workers: Processes that one frame may use, where pictures are made ray by ray.
-        layers: What is bounded beside the colours, of `ns_abstract.refine.result.LAYERS`.
+        layers: What is bounded beside the colours, of `ns_abstract.refine.result.EXTRA_OUTPUTS`.
         notes: What reports say of the files of the sets, one sentence each.
         set_choices: Where the size of the pictures and their sets come from; None: from the caller's objects.
 
@@ -60,7 +60,7 @@ class Job:
     def __init__(
         self,
         scene: Scene,
-        pose_sets: Sequence[PoseSet],
+        pose_sets: Sequence[PoseBox],
         *,
         arithmetic: str | None = None,
         seed: int = 0,
@@ -71,9 +71,9 @@ class Job:
         set_choices: Sequence[Assumption] | None = None,
     ) -> None:
         self.notes = tuple(notes)
-        self.layers = tuple(name for name in LAYERS if name in layers)
-        if unknown := [name for name in layers if name not in LAYERS]:
-            raise InputError(f"found {unknown[0]}", field="--outputs", fix=f"use rgb, {', '.join(LAYERS)}")
+        self.layers = tuple(name for name in EXTRA_OUTPUTS if name in layers)
+        if unknown := [name for name in layers if name not in EXTRA_OUTPUTS]:
+            raise InputError(f"found {unknown[0]}", field="--outputs", fix=f"use rgb, {', '.join(EXTRA_OUTPUTS)}")
         self.source, self._arithmetic, self.rays = scene.source, arithmetic, scene.rays
         self.method: Method = scene.method(arithmetic, workers)
         self.pose_sets, self.seed, self.memory_limit = tuple(pose_sets), seed, memory_limit
@@ -115,7 +115,7 @@ class Job:
         pixels = max(poses.camera.width * poses.camera.height for poses in self.pose_sets)
         return self.method.memory(pixels, max(1, most_threads() // processes))
 
-    def varied(self, index: int, extra: SceneVariation) -> PoseSet:
+    def varied(self, index: int, extra: SceneVariation) -> PoseBox:
         """The set of frame ``index`` with more scenes in it."""
         poses = self.pose_sets[index]
         return replace(poses, perturbation=replace(poses.perturbation, scene=(*poses.perturbation.scene, extra)))
@@ -136,13 +136,13 @@ class Job:
 
     # ---------------------------------------------------------------- frames
 
-    def goal(self, ratio: float, seconds: float, cells: int | None = None) -> Goal:
+    def goal(self, ratio: float, seconds: float, cells: int | None = None) -> RefinementGoal:
         """The goal with the memory that is left for leaves."""
-        return Goal(ratio, seconds, cells, self.leaf_bytes(1))
+        return RefinementGoal(ratio, seconds, cells, self.leaf_bytes(1))
 
-    def frame(self, index: int, slanted: bool = False) -> Frame:
+    def frame(self, index: int, sheared: bool = False) -> Frame:
         """Frame ``index``, ready for refinement; see `Method.frame`."""
-        return self.method.frame(self.pose_sets[index], slanted, bool(self.layers))
+        return self.method.frame(self.pose_sets[index], sheared, bool(self.layers))
 
     def warm_up(self, index: int) -> None:
         """Compile the kernels that frame ``index`` needs, so that its clock measures bounding alone."""
@@ -161,7 +161,7 @@ class Job:
         frame = self.frame(index)
         some = np.unique(np.linspace(0, frame.tile_count - 1, _LOOK_RAYS).astype(np.int64))
         begin = time.perf_counter()
-        with suppress(AbandonedError), abandoning(lambda: time.perf_counter() - begin > seconds):
+        with suppress(WorkCancelledError), cancel_when(lambda: time.perf_counter() - begin > seconds):
             frame.render(frame.box.middle, some)
         least = (time.perf_counter() - begin) / some.size * frame.tile_count
         if least > seconds:
@@ -177,7 +177,7 @@ class Job:
     def bound(
         self,
         index: int,
-        goal: Goal,
+        goal: RefinementGoal,
         *,
         keep_leaves: bool = False,
         stopped: Callable[[], bool] = lambda: False,
@@ -189,7 +189,7 @@ class Job:
     def bound_part(
         self,
         index: int,
-        goal: Goal,
+        goal: RefinementGoal,
         tiles: np.ndarray | None = None,
         *,
         keep_leaves: bool = False,
@@ -203,7 +203,7 @@ class Job:
             AbandonedError: ``stopped`` was true, or the time was over, before a first picture was there.
         """
         # kept leaves are boxes of the set's parameters
-        frame = self.frame(index, slanted=not keep_leaves)
+        frame = self.frame(index, sheared=not keep_leaves)
         begin = time.perf_counter()
 
         def over() -> bool:
@@ -212,7 +212,7 @@ class Job:
 
         refinement = Refinement(
             frame, index, goal, seed=self.seed, keep_leaves=keep_leaves, stopped=over, progress=progress,
-            members=frame.members(self.seed), tiles=tiles, known=known,
+            members=frame.scene_samples(self.seed), tiles=tiles, known=known,
         )  # fmt: skip
         return replace(refinement.run_part(), problems=platform_problems())
 
@@ -224,9 +224,11 @@ class Job:
         """
         frame = self.frame(parts[0].index)
         result = replace(joined(parts, frame.camera), box=self.pose_sets[parts[0].index].box)
-        shown = [part.shown for part in parts]
-        known = [numbers for numbers in shown if numbers is not None]
-        count = int(np.unique(np.concatenate(known)).size) if len(known) == len(shown) else None
+        visible_sets = [part.shown for part in parts]
+        visible_numbers = [numbers for numbers in visible_sets if numbers is not None]
+        count = (
+            int(np.unique(np.concatenate(visible_numbers)).size) if len(visible_numbers) == len(visible_sets) else None
+        )
         plan = frame.plan(count, result.lower, result.upper)
         floor = max(part.floor for part in parts)
         if floor > 0.0:
@@ -295,7 +297,7 @@ def require_sound_platform() -> None:
 
 def _open(
     source: SceneSource,
-    pose_sets: tuple[PoseSet, ...],
+    pose_sets: tuple[PoseBox, ...],
     arithmetic: str | None,
     seed: int,
     memory_limit: float | None,
@@ -307,7 +309,7 @@ def _open(
 def warm_up(frame: Frame) -> None:
     """Compile the kernels that a frame needs; where one ray takes long, it is given up once they are compiled."""
     begin = time.perf_counter()
-    with suppress(AbandonedError), abandoning(lambda: frame.tilewise and time.perf_counter() - begin > _WARM_RAY):
+    with suppress(WorkCancelledError), cancel_when(lambda: frame.tilewise and time.perf_counter() - begin > _WARM_RAY):
         frame.warm_up()
 
 

@@ -17,22 +17,22 @@ from ns_abstract.api.certification import MEMORY
 from ns_abstract.api.job import Job, require_sound_platform
 from ns_abstract.api.scenes import Scene
 from ns_abstract.arithmetic.forms import MAX_DIMENSIONS
-from ns_abstract.execution.opening import Recipe
+from ns_abstract.execution.worker_cache import Recipe
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.specification import TRANSLATIONS
 from ns_abstract.reach.learned import LearnedDynamics
 from ns_abstract.reach.loop import Loop, load_loop, parse_loop
-from ns_abstract.reach.search import QUESTIONS, LoopFindings, LoopSearch
-from ns_abstract.reach.tubes import Dependence, Pictures, Pilot, Reacher
+from ns_abstract.reach.search import QUESTIONS, LoopBlockResult, LoopSearch
+from ns_abstract.reach.tubes import ControlBounds, Dependence, Pictures, TubeBuilder
 from ns_abstract.report.record import file_stamp
-from ns_abstract.verify.cells import Cell, Grid
+from ns_abstract.verify.camera_response import CameraResponse
+from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.model import NetworkModel
 from ns_abstract.verify.network import NetworkArithmetic, load_network
 from ns_abstract.verify.network.explain import check_cell
-from ns_abstract.verify.response import Response
-from ns_abstract.verify.scene_margin import REGISTRATION, Kind, Settle, Settled
+from ns_abstract.verify.scene_margin import REGISTRATION, CellOutcome, ProveCell, VariationKind
 
 #: Of the search's rules: results of different ones are not mixed.
 _RULES = 2
@@ -63,17 +63,17 @@ class LoopJob:
                 fix=f"write one column by output, {self.network.output_size}",
             )
 
-    def reacher(self, dependence: Dependence = "kept") -> Reacher:
+    def reacher(self, dependence: Dependence = "kept") -> TubeBuilder:
         """Computes tubes of the loop."""
         view = Pictures(self.job.method, self.job.pose_sets[0])
-        return Reacher(self.loop, view, Pilot(self.model, self.loop.control), dependence)
+        return TubeBuilder(self.loop, view, ControlBounds(self.model, self.loop.control), dependence)
 
     @cached_property
     def search(self) -> LoopSearch:
         """The search."""
         return LoopSearch(self.reacher())
 
-    def examine(self, number: int, grid: Grid, cells: tuple[Cell, ...]) -> LoopFindings:
+    def examine(self, number: int, grid: CellGrid, cells: tuple[Cell, ...]) -> LoopBlockResult:
         """What becomes of cells of a question; see `ns_abstract.api.cell_search.Examiner`."""
         return self.search.examine(number, grid, cells)
 
@@ -82,12 +82,12 @@ class LoopJob:
         # a place that does not depend on the state is no parameter that could be off
         return set(TRANSLATIONS) <= set(self.loop.camera.names)
 
-    def places(self, kind: Kind) -> bool:
+    def places(self, kind: VariationKind) -> bool:
         """Whether the scene's place can be bounded beside the pose: within it, or as more parameters."""
         fits = len(self.loop.camera.names) + len(kind.place) <= MAX_DIMENSIONS
         return fits or (kind is REGISTRATION and self._moves)
 
-    def _varied(self, kind: Kind, radius: float) -> Reacher:
+    def _varied(self, kind: VariationKind, radius: float) -> TubeBuilder:
         """Computes tubes for all scenes around the stored one (V13)."""
         method, poses = self.job.method, self.job.pose_sets[0]
         if kind is REGISTRATION and self._moves:
@@ -95,24 +95,24 @@ class LoopJob:
         if kind.place:
             view = Pictures(method, poses.registered(kind.place, radius))
         elif kind.response is not None:
-            view = Pictures(method, poses, Response(kind.response, radius))
+            view = Pictures(method, poses, CameraResponse(kind.response, radius))
         else:
             view = Pictures(method, self.job.varied(0, kind.variation(radius)))
         return replace(self.reacher(), view=view)
 
-    def settle(self, kind: Kind) -> Settle:
+    def settle(self, kind: VariationKind) -> ProveCell:
         """Bounds and attacks cells for all scenes around the stored one (V13)."""
-        kept: dict[float, LoopSearch] = {}
+        searches: dict[float, LoopSearch] = {}
 
-        def settle(radius: float, number: int, box: ParameterBox) -> Settled:
-            if radius not in kept:
+        def settle(radius: float, number: int, box: ParameterBox) -> CellOutcome:
+            if radius not in searches:
                 # radii come one after the other
-                kept.clear()
-                kept[radius] = LoopSearch(self._varied(kind, radius))
-            found = kept[radius].settle(QUESTIONS[number], box)
-            if found.example is None:
-                return found
-            return replace(found, example={**found.example, "radius": np.array(radius)})
+                searches.clear()
+                searches[radius] = LoopSearch(self._varied(kind, radius))
+            outcome = searches[radius].settle(QUESTIONS[number], box)
+            if outcome.example is None:
+                return outcome
+            return replace(outcome, example={**outcome.example, "radius": np.array(radius)})
 
         return settle
 

@@ -10,15 +10,15 @@ import numpy as np
 
 from ns_abstract.api.cell_search import CellSearch, Row
 from ns_abstract.api.loop_job import LoopJob
-from ns_abstract.execution.ending import AbandonedError, Deadline, abandoning
+from ns_abstract.execution.cancellation import Deadline, WorkCancelledError, cancel_when
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.reach.film import along, film_size, made
 from ns_abstract.reach.learned import LearnedDynamics
 from ns_abstract.reach.page import loop_page
-from ns_abstract.reach.search import QUESTIONS, Question, Run, pushes, simulate
+from ns_abstract.reach.search import QUESTIONS, Question, SimulatedRun, sampled_disturbances, simulate
 from ns_abstract.reach.tubes import Dependence, Tube
 from ns_abstract.report.certificate import SCENE_MARGIN, now
-from ns_abstract.report.outside import Outside
+from ns_abstract.report.outside import SceneDrawing
 from ns_abstract.report.record import file_stamp, guarantee_text, plain, versions
 from ns_abstract.verify.search import Verdict
 from ns_abstract.verify.store import Store, Tally, fractions
@@ -60,15 +60,15 @@ class LoopReport:
     def __init__(self, job: LoopJob, settings: Mapping[str, Any], command: tuple[str, ...]) -> None:
         self.job, self.settings, self.command = job, settings, command
         self.started = now()
-        self.simulated: list[Run] = []
+        self.simulated: list[SimulatedRun] = []
         self.tubes: list[dict[str, Any]] = []
         self.examples: list[dict[str, Any]] = []
         self.film: dict[str, Any] | None = None
         self._strips: list[tuple[int, bytes]] = []
         elements = job.job.method.elements()
-        self._outside = None if elements is None else Outside(elements)
+        self._outside = None if elements is None else SceneDrawing(elements)
 
-    def add_example(self, question: Question, run: Run) -> None:
+    def add_example(self, question: Question, run: SimulatedRun) -> None:
         """Take a run that goes wrong, if there are not enough of them."""
         if len(self.examples) < _EXAMPLES:
             margin = run.margin(self.job.loop, question)
@@ -83,10 +83,10 @@ class LoopReport:
             if deadline.request() or (self.simulated and deadline.late):
                 return
             try:
-                with abandoning(deadline.request):
-                    push = pushes(loop, generator, "random")
+                with cancel_when(deadline.request):
+                    push = sampled_disturbances(loop, generator, "random")
                     self.simulated.append(simulate(reacher, loop.state(loop.box, start), push))
-            except AbandonedError:
+            except WorkCancelledError:
                 return
 
     def show_tubes(self, store: Store, deadline: Deadline) -> None:
@@ -99,7 +99,7 @@ class LoopReport:
             try:
                 with deadline.enforced():
                     self.tubes.append(shown_tube(self.job, row["lower"], row["upper"], _CELL_RUNS))
-            except AbandonedError:
+            except WorkCancelledError:
                 return
 
     def make_film(self, store: Store, deadline: Deadline) -> None:
@@ -123,7 +123,7 @@ class LoopReport:
                 size = film_size(job.loop.preprocess.size(job.network.input_shape))
                 for step in along(job.search.reacher, job.job.method, size, tube):
                     steps.append(step)
-        except AbandonedError:
+        except WorkCancelledError:
             pass
         if not steps:
             self.film = {"skipped": "the work was interrupted" if deadline.request() else "the time ended first"}
@@ -225,20 +225,23 @@ def shown_tube(job: LoopJob, lower: list[float], upper: list[float], runs: int) 
         runs: How many.
     """
     box = ParameterBox(job.loop.box.names, job.loop.box.units, tuple(lower), tuple(upper))
-    kept = job.search.reacher
-    tube = kept.tube(box, whole=True)
+    builder = job.search.reacher
+    tube = builder.tube(box, whole=True)
     generator = np.random.default_rng(5)
     starts = [*box.corners(), *box.sample(max(0, runs - 2**box.dimensions), generator)]
-    found = [simulate(kept, job.loop.state(box, start), pushes(job.loop, generator, "ends")) for start in starts]
-    states = np.stack([run.states for run in found])
+    runs_from_cell = [
+        simulate(builder, job.loop.state(box, start), sampled_disturbances(job.loop, generator, "ends"))
+        for start in starts
+    ]
+    states = np.stack([run.states for run in runs_from_cell])
     modes: tuple[Dependence, ...] = ("step", "none")
     hulls = [entry.hull() for entry in tube.sets]
     return {
         "lower": list(box.lower),
         "upper": list(box.upper),
         "tube": [[low.tolist(), high.tolist()] for low, high in hulls],
-        "camera": [[end.tolist() for end in kept.places(entry)] for entry in tube.sets],
-        "runs": len(found),
+        "camera": [[end.tolist() for end in builder.places(entry)] for entry in tube.sets],
+        "runs": len(runs_from_cell),
         "hull": [
             [low.tolist(), high.tolist()] for low, high in zip(states.min(axis=0), states.max(axis=0), strict=True)
         ],

@@ -8,9 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from ns_abstract.execution.ending import Deadline
+from ns_abstract.execution.cancellation import Deadline
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.verify.scene_margin import Certified, Kind, SceneMargin, Settle, Settled, widest
+from ns_abstract.verify.scene_margin import (
+    CellOutcome,
+    CertifiedBox,
+    ProveCell,
+    SceneMargin,
+    VariationKind,
+    largest_radius,
+)
 from ns_abstract.verify.store import Store
 
 #: Part of the time that is kept for margins where they are asked for.
@@ -31,15 +38,15 @@ class Margins:
 
     def __init__(
         self,
-        cells: Sequence[Certified],
-        settle: Callable[[Kind], Settle],
+        cells: Sequence[CertifiedBox],
+        settle: Callable[[VariationKind], ProveCell],
         store: Store,
-        told: Callable[[SceneMargin], object] = lambda found: None,
+        on_progress: Callable[[SceneMargin], object] = lambda found: None,
     ) -> None:
-        self.cells, self._settle, self._store, self._told = cells, settle, store, told
+        self.cells, self._settle, self._store, self._told = cells, settle, store, on_progress
         self.found: list[SceneMargin] = []
 
-    def find(self, deadline: Deadline, kinds: Sequence[Kind]) -> None:
+    def find(self, deadline: Deadline, kinds: Sequence[VariationKind]) -> None:
         """Look for them; every kind has the same part of the time that is left then.
 
         Args:
@@ -48,51 +55,51 @@ class Margins:
         """
         for number, kind in enumerate(kinds if self.cells else ()):
             part = deadline.within(deadline.left / (len(kinds) - number))
-            self.found.append(widest(kind, self.cells, self._remembered(kind), part))
+            self.found.append(largest_radius(kind, self.cells, self._remembered(kind), part))
             self._told(self.found[-1])
 
-    def _remembered(self, kind: Kind) -> Settle:
+    def _remembered(self, kind: VariationKind) -> ProveCell:
         """Settles what the store does not hold yet."""
         settle = self._settle(kind)
 
-        def remembered(radius: float, frame: int, box: ParameterBox) -> Settled:
-            found = self._store.settled(kind.name, radius, frame, box)
-            if found is None:
-                found = settle(radius, frame, box)
-                self._store.keep_settled(kind.name, radius, frame, box, found)
-            return found
+        def remembered(radius: float, frame: int, box: ParameterBox) -> CellOutcome:
+            stored = self._store.settled(kind.name, radius, frame, box)
+            if stored is None:
+                stored = settle(radius, frame, box)
+                self._store.keep_settled(kind.name, radius, frame, box, stored)
+            return stored
 
         return remembered
 
     def keep(self) -> None:
         """Store the scenes that break what is certified."""
-        for found in self.found:
-            if found.example is not None:
+        for margin in self.found:
+            if margin.example is not None:
                 buffer = io.BytesIO()
-                arrays: dict[str, Any] = dict(found.example)
+                arrays: dict[str, Any] = dict(margin.example)
                 np.savez(buffer, **arrays)
-                self._store.keep_image(f"scene_margin_{found.kind.name}", buffer.getvalue())
+                self._store.keep_image(f"scene_margin_{margin.kind.name}", buffer.getvalue())
 
     @property
     def entry(self) -> dict[str, Any]:
         """What report.json holds."""
         skipped = None if self.cells else "nothing is certified"
-        return {"skipped": skipped, "kinds": [found.entry for found in self.found]}
+        return {"skipped": skipped, "kinds": [margin.entry for margin in self.found]}
 
 
 def certified_cells(
     rows: Mapping[int, Sequence[Mapping[str, Any]]], boxes: Callable[[int, Mapping[str, Any]], ParameterBox]
-) -> list[Certified]:
+) -> list[CertifiedBox]:
     """The certified cells of a store, with their parts of the volume.
 
     Args:
         rows: By frame, rows of ``cells``.
         boxes: The box of a row.
     """
-    found = [(frame, row, boxes(frame, row)) for frame, entries in rows.items() for row in entries]
-    found = [entry for entry in found if entry[1]["verdict"] == "certified"]
-    sizes = [float(np.prod(np.subtract(box.upper, box.lower))) for _, _, box in found]
+    certified = [(frame, row, boxes(frame, row)) for frame, entries in rows.items() for row in entries]
+    certified = [entry for entry in certified if entry[1]["verdict"] == "certified"]
+    sizes = [float(np.prod(np.subtract(box.upper, box.lower))) for _, _, box in certified]
     return [
-        Certified(frame, box, row["margin"], size / sum(sizes))
-        for (frame, row, box), size in zip(found, sizes, strict=True)
+        CertifiedBox(frame, box, row["margin"], size / sum(sizes))
+        for (frame, row, box), size in zip(certified, sizes, strict=True)
     ]

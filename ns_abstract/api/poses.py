@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike
 
 from ns_abstract.api.scenes import Scene
 from ns_abstract.geometry import poses
-from ns_abstract.geometry.camera_path import Camera as PinholeCamera
-from ns_abstract.geometry.camera_path import checked_pose, checked_side, focal_length
+from ns_abstract.geometry.camera_path import PinholeCamera, checked_pose, checked_side, focal_length
 from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.specification import Perturbation, parse_perturbation
 
@@ -147,13 +146,13 @@ class PoseSet:
     ) -> None:
         if not isinstance(camera, PinholeCamera):
             raise InputError(f"found {type(camera).__name__}", field="camera", fix="give an ns_abstract.Camera")
-        found = {
+        specification = {
             "camera": camera,
             "specification": dict(value) if isinstance(value, Mapping) else value,
             "following": following,
             "folder": None if folder is None else Path(folder),
         }
-        for name, entry in found.items():
+        for name, entry in specification.items():
             object.__setattr__(self, name, entry)
         # what is wrong is told where it is written
         self.perturbation()
@@ -166,15 +165,15 @@ class PoseSet:
         """
         return parse_perturbation(self.specification, dataset_scale=dataset_scale, field_prefix="", folder=self.folder)
 
-    def of(self, scene: Scene) -> poses.PoseSet:
+    def of(self, scene: Scene) -> poses.PoseBox:
         """The set for a scene, whose units it may be stated in.
 
         Raises:
             InputError: The set cannot be made.
         """
-        return poses.PoseSet.around(self.camera, self.perturbation(scene.method().dataset_scale), self.following)
+        return poses.PoseBox.around(self.camera, self.perturbation(scene.method().dataset_scale), self.following)
 
     @property
     def parameters(self) -> tuple[str, ...]:
         """Names of what varies, in the order of cells; scene variations are not among them."""
-        return poses.PoseSet.around(self.camera, self.perturbation(), self.following).box.names
+        return poses.PoseBox.around(self.camera, self.perturbation(), self.following).box.names

@@ -22,13 +22,13 @@ from ns_abstract.api.cell_search import (
 from ns_abstract.api.loop_job import LoopJob, open_loop
 from ns_abstract.api.loop_report import LoopReport
 from ns_abstract.api.scenes import Scene
-from ns_abstract.execution.ending import Deadline
+from ns_abstract.execution.cancellation import Deadline
 from ns_abstract.execution.engines import EngineName, started
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.reach.search import QUESTIONS
-from ns_abstract.verify.cells import Grid
+from ns_abstract.verify.cells import CellGrid
 from ns_abstract.verify.network import NetworkArithmetic
-from ns_abstract.verify.scene_margin import CAMERA_KINDS, KINDS, PLACES, Kind, Settle
+from ns_abstract.verify.scene_margin import CAMERA_KINDS, KINDS, PLACES, ProveCell, VariationKind
 from ns_abstract.verify.store import Store, fractions
 
 #: Parts of the time for random runs, for tubes that the report shows, and for a film.
@@ -71,7 +71,7 @@ class LoopQuestion(CellQuestion[ReachProgress]):
         self.job, self.film = job, film
         self.reports = LoopReport(job, settings, command)
 
-    def counterexamples(self, number: int, grid: Grid, findings: Any) -> Iterator[tuple[str, dict[str, Any]]]:
+    def counterexamples(self, number: int, grid: CellGrid, findings: Any) -> Iterator[tuple[str, dict[str, Any]]]:
         question, names = QUESTIONS[number], np.array(self.job.loop.names, str)
         for cell, run in findings.runs:
             arrays = {"states": run.states, "controls": run.controls, "disturbances": run.disturbances, "names": names}
@@ -96,7 +96,7 @@ class LoopQuestion(CellQuestion[ReachProgress]):
         if self.film:
             self.reports.make_film(search.store, deadline)
 
-    def varied_scenes(self) -> tuple[Sequence[Kind], Callable[[Kind], Settle]]:
+    def varied_scenes(self) -> tuple[Sequence[VariationKind], Callable[[VariationKind], ProveCell]]:
         return (*KINDS, *CAMERA_KINDS, *(kind for kind in PLACES if self.job.places(kind))), self.job.settle
 
     def margin_rows(self, rows: dict[int, list[Row]]) -> tuple[dict[int, list[Row]], dict[str, Any]]:
@@ -233,10 +233,10 @@ def result(job: LoopJob, rows: Mapping[int, list[Row]], document: Mapping[str, A
         for row in entries
     ]
     asked = document["questions"]
-    known = {name: asked[name]["certified"] if name in asked else None for name in QUESTIONS}
+    fractions = {name: asked[name]["certified"] if name in asked else None for name in QUESTIONS}
     return ReachResult(
-        safe=known["safe"],
-        reaches=known["reaches"],
+        safe=fractions["safe"],
+        reaches=fractions["reaches"],
         falsified=list(asked.values())[-1]["falsified"],
         verdict=document["verdict"],
         cells=tuple(cells),

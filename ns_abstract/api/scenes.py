@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from ns_abstract.geometry.camera_files import RunFrame
-from ns_abstract.geometry.camera_path import Camera
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
@@ -157,12 +157,12 @@ def load_scene(
     return scene
 
 
-def render(scene: Scene, camera: Camera) -> np.ndarray:
+def render(scene: Scene, camera: PinholeCamera) -> np.ndarray:
     """The picture of one camera, float64 [H, W, 3] in [0, 1]: what `bound` encloses.
 
     Raises:
         InputError: The camera cannot be used.
     """
-    frame = scene.method().frame(PoseSet.around(camera, Perturbation()))
+    frame = scene.method().frame(PoseBox.around(camera, Perturbation()))
     draw = frame.precise if isinstance(frame, PreciseFrame) else frame.render
     return assemble(draw(frame.box.middle), frame.camera).astype(np.float64)

@@ -7,22 +7,22 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from ns_abstract.arithmetic.kernel_cache import store as kernels
-from ns_abstract.execution.ending import AbandonedError, Deadline, abandoning
+from ns_abstract.execution.cancellation import Deadline, WorkCancelledError, cancel_when
 from ns_abstract.execution.engines import Engine
 from ns_abstract.execution.scheduler import Task, work
 from ns_abstract.execution.stopping import StopRequest
-from ns_abstract.verify.cells import Cell, Grid
-from ns_abstract.verify.search import Findings
-from ns_abstract.verify.store import Block, Store
+from ns_abstract.verify.cells import Cell, CellGrid
+from ns_abstract.verify.search import BlockResult
+from ns_abstract.verify.store import CellBlock, Store
 
 #: Seconds between notes of progress, and between reports.
 _TRACE, _REPORT = 1.0, 30.0
 #: Examines cells of a grid of the frame with this number.
-Examine = Callable[[int, Grid, tuple[Cell, ...]], Findings]
+Examine = Callable[[int, CellGrid, tuple[Cell, ...]], BlockResult]
 
 
-def paced(
-    store: Store, told: Callable[[], object], report: Callable[[], object] = lambda: None
+def periodic_report(
+    store: Store, on_progress: Callable[[], object], report: Callable[[], object] = lambda: None
 ) -> Callable[[float], None]:
     """Return what a search does between results: now and then a point of the trace and ``told``, rarely ``report``."""
     traced = reported = time.perf_counter()
@@ -32,7 +32,7 @@ def paced(
         if instant - traced >= _TRACE:
             traced = instant
             store.trace()
-            told()
+            on_progress()
         if instant - reported >= _REPORT:
             reported = instant
             report()
@@ -43,13 +43,13 @@ def paced(
 def search_blocks(
     store: Store,
     engine: Engine,
-    grids: dict[int, Grid],
+    grids: dict[int, CellGrid],
     here: Examine,
-    there: tuple[Callable[..., Findings], Any],
+    there: tuple[Callable[..., BlockResult], Any],
     *,
     deadline: Deadline,
     stop: StopRequest,
-    keep: Callable[[Block, Any], object],
+    keep: Callable[[CellBlock, Any], object],
     between: Callable[[float], object],
     waits: bool = True,
 ) -> None:
@@ -71,7 +71,7 @@ def search_blocks(
     """
     # workers take the kernels that were compiled here
     kernels().publish()
-    flying: dict[int, Block] = {}
+    flying: dict[int, CellBlock] = {}
     finished = 0 if waits else 1
 
     def offer(room: int) -> Iterator[Task]:
@@ -79,24 +79,24 @@ def search_blocks(
             return
         for block in store.pending(set(flying), room):
             flying[block.number] = block
-            found = block.frame, grids[block.frame], block.cells
+            arguments = block.frame, grids[block.frame], block.cells
             if engine.shares:
-                yield Task(block.number, examined, found)
+                yield Task(block.number, examined, arguments)
             else:
-                yield Task(block.number, there[0], (there[1], *found))
+                yield Task(block.number, there[0], (there[1], *arguments))
 
     def over() -> bool:
         return stop() or (deadline.late and finished > 0)
 
-    def examined(index: int, grid: Grid, cells: tuple[Cell, ...]) -> Findings | None:
+    def examined(index: int, grid: CellGrid, cells: tuple[Cell, ...]) -> BlockResult | None:
         # in this process a block is given up at the deadline or a signal
         try:
-            with stop.at_once(), abandoning(lambda: deadline.late and finished > 0):
+            with stop.at_once(), cancel_when(lambda: deadline.late and finished > 0):
                 return here(index, grid, cells)
-        except (KeyboardInterrupt, AbandonedError):
+        except (KeyboardInterrupt, WorkCancelledError):
             return None
 
-    def take(block: Block, findings: Findings | None) -> None:
+    def take(block: CellBlock, findings: BlockResult | None) -> None:
         nonlocal finished
         if findings is None:
             return

@@ -11,13 +11,13 @@ import numpy as np
 import torch
 
 from ns_abstract.api.certification import Certification, FramePictures
-from ns_abstract.execution.ending import AbandonedError, abandoning, checkpoint
+from ns_abstract.execution.cancellation import WorkCancelledError, cancel_when, check_cancelled
 from ns_abstract.io.errors import InputError
 from ns_abstract.report import regions as broken
 from ns_abstract.report import walk
-from ns_abstract.report.certificate_page import Closer
+from ns_abstract.report.certificate_page import CertificateDetails
 from ns_abstract.report.picture import preview, to_bytes
-from ns_abstract.report.regions import Region, Shown
+from ns_abstract.report.regions import FailureRegion, PoseImage
 from ns_abstract.verify.properties import Claim
 
 #: Seconds that all of it may take; the longest side of a picture; cells without a verdict that are tried for a right
@@ -25,24 +25,24 @@ from ns_abstract.verify.properties import Claim
 SECONDS, _PIXELS, _TRIED = 10.0, 160, 4
 _OVER = ", without pictures: there was no time for them"
 
-Rows = Mapping[int, Sequence[Mapping[str, Any]]]
+CellRows = Mapping[int, Sequence[Mapping[str, Any]]]
 
 
-class _Looks:
+class _PoseRenderer:
     """Renders poses and shows them to the network."""
 
-    def __init__(self, job: Certification, kept: Callable[[int, np.ndarray], np.ndarray | None]) -> None:
-        self._job, self._kept = job, kept
+    def __init__(self, job: Certification, cached: Callable[[int, np.ndarray], np.ndarray | None]) -> None:
+        self._job, self._kept = job, cached
         self._names = [name for name, _ in job.parameters]
         self._frames: dict[int, tuple[FramePictures, Claim]] = {}
 
-    def look(self, title: str, frame: int, values: Sequence[float]) -> Shown:
+    def look(self, title: str, frame: int, values: Sequence[float]) -> PoseImage:
         """The picture at values of all parameters, the network's outputs and the margin.
 
         Raises:
             AbandonedError: There is no time for it.
         """
-        checkpoint()
+        check_cancelled()
         if frame not in self._frames:
             pictures = self._job.pictures(frame)
             self._frames[frame] = pictures, self._job.claim(pictures)
@@ -56,28 +56,28 @@ class _Looks:
         with torch.no_grad():
             margin = float(claim.margin(torch.from_numpy(outputs), torch.from_numpy(pose[None]))[0])
         png = preview(to_bytes(image), _PIXELS)
-        return Shown(title, values, png, outputs[0].tolist(), margin if np.isfinite(margin) else None)
+        return PoseImage(title, values, png, outputs[0].tolist(), margin if np.isfinite(margin) else None)
 
-    def right(self, region: Region, rows: Rows, parameters: Sequence[Mapping[str, Any]]) -> Shown | None:
+    def right(self, region: FailureRegion, rows: CellRows, parameters: Sequence[Mapping[str, Any]]) -> PoseImage | None:
         """The nearest certified pose; where none is, the middle of a near cell at which the network is right."""
         cells = rows[region.frame]
         for _, pose in broken.nearest(cells, "certified", region.pose, parameters):
             return self.look("nearest certified pose", region.frame, pose)
         for k, _ in broken.nearest(cells, "unknown", region.pose, parameters, _TRIED):
             pose = [0.5 * (a + b) for a, b in zip(cells[k]["lower"], cells[k]["upper"], strict=True)]
-            shown = self.look("a near pose, right but not certified", region.frame, pose)
-            if shown.margin is not None and shown.margin > 0.0:
-                return shown
+            picture = self.look("a near pose, right but not certified", region.frame, pose)
+            if picture.margin is not None and picture.margin > 0.0:
+                return picture
         return None
 
 
 def look_closer(
     job: Certification,
     entries: Sequence[Mapping[str, Any]],
-    rows: Rows,
-    kept: Callable[[int, np.ndarray], np.ndarray | None],
+    rows: CellRows,
+    cached: Callable[[int, np.ndarray], np.ndarray | None],
     over: Callable[[], bool],
-) -> Closer:
+) -> CertificateDetails:
     """Regions where the property fails, and poses along the sets, with pictures.
 
     Args:
@@ -88,19 +88,21 @@ def look_closer(
         over: Whether no more pictures are to be rendered; `SECONDS` from now none are, either.
     """
     end = time.perf_counter() + SECONDS
-    looks = _Looks(job, kept)
+    looks = _PoseRenderer(job, cached)
     regions = broken.falsified_regions(entries, rows)
     sides = {entry["index"]: entry["parameters"] for entry in entries}
-    pictures: list[tuple[Shown, Shown | None]] = []
+    pictures: list[tuple[PoseImage, PoseImage | None]] = []
     stops = walk.stops(entries, rows)
-    seen: dict[int, Shown] = {}
+    pictures_by_frame: dict[int, PoseImage] = {}
     why = _OVER
     # a property that makes no sense for a frame is told by who searches
-    with suppress(AbandonedError, InputError), abandoning(lambda: over() or time.perf_counter() >= end):
+    with suppress(WorkCancelledError, InputError), cancel_when(lambda: over() or time.perf_counter() >= end):
         for region in regions[: broken.MOST]:
-            shown = looks.look("counterexample", region.frame, region.pose)
-            pictures.append((shown, looks.right(region, rows, sides[region.frame])))
+            picture = looks.look("counterexample", region.frame, region.pose)
+            pictures.append((picture, looks.right(region, rows, sides[region.frame])))
         why = ""
         for k in walk.coarse_first(len(stops)) if len(stops) > 1 else []:
-            seen[k] = looks.look(stops[k].at, stops[k].frame, stops[k].values)
-    return Closer(regions, pictures, [(stops[k], seen[k]) for k in sorted(seen)], why)
+            pictures_by_frame[k] = looks.look(stops[k].at, stops[k].frame, stops[k].values)
+    return CertificateDetails(
+        regions, pictures, [(stops[k], pictures_by_frame[k]) for k in sorted(pictures_by_frame)], why
+    )

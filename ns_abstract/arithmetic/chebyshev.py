@@ -44,8 +44,8 @@ class ChebyshevBasis:
     @cached_property
     def indices(self) -> NDArray[np.int64]:
         """[m, d] degrees by axis of every coefficient, the constant first."""
-        kept = sorted((k for k in self._tensor if sum(k) <= self.degree), key=lambda k: (sum(k), k))
-        return np.array(kept, np.int64).reshape(len(kept), self.dimensions)
+        exponents = sorted((k for k in self._tensor if sum(k) <= self.degree), key=lambda k: (sum(k), k))
+        return np.array(exponents, np.int64).reshape(len(exponents), self.dimensions)
 
     @property
     def size(self) -> int:
@@ -80,9 +80,9 @@ class ChebyshevBasis:
         for _ in range(self.dimensions):
             matrix = np.kron(matrix, by_axis)
         places = {k: i for i, k in enumerate(self._tensor)}
-        kept = [places[tuple(k)] for k in self.indices.tolist()]
+        rows = [places[tuple(k)] for k in self.indices.tolist()]
         rest = [i for k, i in places.items() if sum(k) > self.degree]
-        return matrix[kept], matrix[rest]
+        return matrix[rows], matrix[rest]
 
     @cached_property
     def interpolation_rounding(self) -> float:
@@ -136,14 +136,14 @@ class ChebyshevBasis:
             parts: Number of parts by axis; n is their product, the last axis runs fastest.
         """
         places = {k: i for i, k in enumerate(self._tensor)}
-        kept = [places[tuple(k)] for k in self.indices.tolist()]
-        found = []
+        columns = [places[tuple(k)] for k in self.indices.tolist()]
+        coefficients = []
         for part in itertools.product(*(bernstein_matrices(self.degree, count) for count in parts)):
             matrix = np.ones((1, 1))
             for factor in part:
                 matrix = np.kron(matrix, factor)
-            found.append(matrix[:, kept])
-        return np.stack(found)
+            coefficients.append(matrix[:, columns])
+        return np.stack(coefficients)
 
 
 @lru_cache(maxsize=64)

@@ -67,10 +67,10 @@ _log = logging.getLogger("ns_abstract.kernels")
 @cache
 def source_key() -> str:
     """Hash of the names and contents of all sources that kernels may use, and of the compiler's version."""
-    found = hashlib.sha256(numba.__version__.encode())
+    digest = hashlib.sha256(numba.__version__.encode())
     for path in sorted(path for folder in FOLDERS for path in (PACKAGE / folder).rglob("*.py")):
-        found.update(path.relative_to(PACKAGE).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
-    return found.hexdigest()
+        digest.update(path.relative_to(PACKAGE).as_posix().encode() + b"\0" + path.read_bytes() + b"\0")
+    return digest.hexdigest()
 
 
 class KernelMissingError(Exception):
@@ -149,18 +149,18 @@ class KernelStore:
         Raises:
             KernelMissingError: It is not kept, inside `complete`.
         """
-        found = load()
-        if found is None and self._complete:
+        loaded = load()
+        if loaded is None and self._complete:
             raise KernelMissingError(kernel)
-        if found is not None or not self.shared or kernel in self._claims:
-            return found
+        if loaded is not None or not self.shared or kernel in self._claims:
+            return loaded
         claims = self.session / "claims"
         claims.mkdir(exist_ok=True)
         with ExitStack() as stack:
             stack.enter_context(_locked(claims / hashlib.sha256(kernel.encode()).hexdigest()))
-            if (found := load()) is None:
+            if (loaded := load()) is None:
                 self._claims[kernel] = stack.pop_all()
-        return found
+        return loaded
 
     def saved(self, kernel: str, save: Callable[[], Any]) -> None:
         """Have ``save`` write a kernel that was compiled, and let others have it."""
@@ -272,12 +272,12 @@ class KernelStore:
 def _read_manifest(folder: Path) -> dict[str, dict[str, str]]:
     """Files of every function and their digests; empty where there is none or it is damaged."""
     try:
-        found = json.loads((folder / "manifest.json").read_bytes())
+        manifest = json.loads((folder / "manifest.json").read_bytes())
     except (OSError, ValueError, RecursionError):
         return {}
-    if not isinstance(found, dict):
+    if not isinstance(manifest, dict):
         return {}
-    return {name: files for name, files in found.items() if _are_files(files)}
+    return {name: files for name, files in manifest.items() if _are_files(files)}
 
 
 def _are_files(files: object) -> bool:
@@ -344,14 +344,14 @@ def _open() -> KernelStore:
         problem = error
     try:
         temporary = Path(tempfile.mkdtemp(prefix="ns-abstract-kernels-"))
-        found = KernelStore(temporary, key)
+        opened_store = KernelStore(temporary, key)
     except OSError as error:
         raise InputError(
             f"no folder for compiled kernels can be written ({error.strerror})",
             fix=f"set {VARIABLE} to a folder that can be written",
         ) from error
     if root is not None:
-        found.also_from(root / key[:32])
+        opened_store.also_from(root / key[:32])
     # processes that this one starts share it
     os.environ[VARIABLE] = str(temporary)
     process = os.getpid()
@@ -360,7 +360,7 @@ def _open() -> KernelStore:
     _log.warning(
         "compiled kernels are kept for this run only (%s); set %s to a folder that can be written", reason, VARIABLE
     )
-    return found
+    return opened_store
 
 
 @cache
@@ -370,12 +370,12 @@ def store() -> KernelStore:
     Raises:
         InputError: No folder can be written, not even a temporary one.
     """
-    found = _open()
+    opened_store = _open()
     process = os.getpid()
-    Finalize(None, lambda: os.getpid() == process and found.close(), exitpriority=-80)
-    if found.empty:
+    Finalize(None, lambda: os.getpid() == process and opened_store.close(), exitpriority=-80)
+    if opened_store.empty:
         _log.info("kernels are compiled at first use, which takes a minute or two")
-    return found
+    return opened_store
 
 
 class KernelLocator:

@@ -98,7 +98,7 @@ NEAR = 4.0 * UNIT
 # ---------------------------------------------------------------- constants that are computed (N23)
 
 
-class Format(NamedTuple):
+class FloatFormat(NamedTuple):
     """A floating-point type: unit roundoff, smallest normal number, and a number past which sums may overflow."""
 
     unit: float
@@ -108,9 +108,9 @@ class Format(NamedTuple):
 
 #: Half, single and double precision, by the bytes of a number; sums stay a factor 2, 4 or 2^24 below the largest one.
 FORMATS = {
-    2: Format(2.0**-11, 2.0**-14, 2.0**15),
-    4: Format(UNIT, FLUSH, OVERFLOW),
-    8: Format(DOUBLE_UNIT, 2.0**-1022, 2.0**1000),
+    2: FloatFormat(2.0**-11, 2.0**-14, 2.0**15),
+    4: FloatFormat(UNIT, FLUSH, OVERFLOW),
+    8: FloatFormat(DOUBLE_UNIT, 2.0**-1022, 2.0**1000),
 }
 #: One operation rounds once in the constant's own type, and 1 to spare.
 ONCE = 2.0
@@ -125,7 +125,7 @@ CONSTANT_SUMS = 4.0
 #: A library's function in another type: 4 ulp.
 OTHER_LIBRARY = 8.0
 #: Exact constants, enclosed by float64 operations: nothing is flushed.
-EXACT = Format(OWN_CONSTANT, 0.0, 2.0**1000)
+EXACT = FloatFormat(OWN_CONSTANT, 0.0, 2.0**1000)
 #: How far a constant may be off, where what is off multiplies it: second order, far less than a sixteenth.
 DOUBTS_UP = 1.0 + 2.0**-4
 #: A weight norm: squares, their root, quotient, product: 5; 11 to spare, beside its sum. In float64: 2^9 units.

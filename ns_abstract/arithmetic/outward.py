@@ -14,9 +14,9 @@ def outward(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarra
 def _beside(values: np.ndarray, sign: float) -> np.ndarray:
     """The nearest float32 numbers that are not above ``values``; not below for ``sign`` -1."""
     values = np.ascontiguousarray(values, np.float64)
-    found = np.empty(values.shape, np.float32)
-    _round_down(values.reshape(-1), sign, found.reshape(-1))
-    return found
+    neighbours = np.empty(values.shape, np.float32)
+    _round_down(values.reshape(-1), sign, neighbours.reshape(-1))
+    return neighbours
 
 
 @njit(cache=True, error_model="numpy")

@@ -99,20 +99,20 @@ def check_functions(
     problems = []
     for name, function in (FUNCTIONS if functions is None else functions).items():
         x, lower, upper = table(name)
-        found = np.empty_like(x)
-        function(x, found)
+        computed = np.empty_like(x)
+        function(x, computed)
         relative, absolute = ASSUMED_ERRORS[name]
         # no less than the error: the value lies between its neighbours
-        error = np.maximum(np.abs(found - lower), np.abs(found - upper))
+        error = np.maximum(np.abs(computed - lower), np.abs(computed - upper))
         allowed = relative * np.minimum(np.abs(lower), np.abs(upper)) + absolute
         if (relative, absolute) == (UNIT64, 0.0):
             # one rounding gives one of the neighbours
-            bad = (found != lower) & (found != upper)
+            bad = (computed != lower) & (computed != upper)
         else:
             bad = ~(error <= allowed)
         if bad.any():
             first = int(np.argmax(bad))
-            at, value, low, high = (float(a[first]) for a in (x, found, lower, upper))
+            at, value, low, high = (float(a[first]) for a in (x, computed, lower, upper))
             problems.append(
                 f"{name}({at!r}) is {value!r}, the value lies in [{low!r}, {high!r}]: the error exceeds"
                 f" the assumed {relative / UNIT64:g} relative and {absolute / UNIT64:g} absolute units"

@@ -42,8 +42,8 @@ class TaylorBasis:
     @cached_property
     def exponents(self) -> tuple[tuple[int, ...], ...]:
         """Exponents of every monomial, by total degree."""
-        found = itertools.product(range(self.degree + 1), repeat=self.dimensions)
-        return tuple(sorted((e for e in found if sum(e) <= self.degree), key=lambda e: (sum(e), e)))
+        exponents = itertools.product(range(self.degree + 1), repeat=self.dimensions)
+        return tuple(sorted((e for e in exponents if sum(e) <= self.degree), key=lambda e: (sum(e), e)))
 
     @cached_property
     def products(self) -> dict[tuple[int, int], int | None]:
@@ -209,8 +209,8 @@ def taylor_cos_sin(angle: TaylorArray) -> tuple[TaylorArray, TaylorArray]:
     # an absolute error of the centre's function moves every derivative
     largest = np.minimum(angle.size - np.abs(middle) + angle.radius, 700.0)
     slack = ANGLE_ROUNDING * (np.abs(middle) + 2.0) * np.exp(largest)
-    found = []
+    results = []
     for offset in (0, 3):
         derivatives = [cycle[(k + offset) % 4] / math.factorial(k) for k in range(n + 1)]
-        found.append(angle.compose(derivatives, last).widened(slack))
-    return found[0], found[1]
+        results.append(angle.compose(derivatives, last).widened(slack))
+    return results[0], results[1]

@@ -10,9 +10,9 @@ import numpy as np
 from ns_abstract.api.files import PathJob
 from ns_abstract.bench.sets import pose_set, splat_of
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.poses import PoseSet
-from ns_abstract.methods.splat.frame import Context, SplatFrame, TileBounds
-from ns_abstract.refine.engine import Goal, spread
+from ns_abstract.geometry.poses import PoseBox
+from ns_abstract.methods.splat.frame import SplatFrame, TileBounds, VisibleContext
+from ns_abstract.refine.engine import RefinementGoal, sampled_gap
 
 #: Width of the measured cell as a part of the set's: about what refinement ends with.
 PART = 1.0 / 32.0
@@ -31,7 +31,7 @@ def measure(functions: Sequence[Callable[[], object]], repeats: int) -> np.ndarr
     return seconds
 
 
-def small_cell(poses: PoseSet, part: float) -> ParameterBox:
+def small_cell(poses: PoseBox, part: float) -> ParameterBox:
     """The middle ``part`` of a set's range in every parameter."""
     cell = poses.box
     for axis in range(cell.dimensions):
@@ -52,12 +52,12 @@ def cell_cost(job: PathJob, name: str, frame: int, repeats: int) -> dict[str, ob
     poses = pose_set(job, name, frame)
     splat = splat_of(job)
     view = SplatFrame(splat.splats, splat.rasteriser, splat.arithmetic, poses)
-    excess = (Goal().ratio - 1.0) * spread(view, frame, job.seed) if poses.box.dimensions == 1 else 0.0
+    excess = (RefinementGoal().ratio - 1.0) * sampled_gap(view, frame, job.seed) if poses.box.dimensions == 1 else 0.0
     cell = small_cell(poses, PART)
     tiles = np.arange(view.tile_count)
     around = view.bound(cell, tiles).context
 
-    def bounded(allowed: float, within: Context | None) -> TileBounds:
+    def bounded(allowed: float, within: VisibleContext | None) -> TileBounds:
         view.set_tolerance(allowed)
         return view.bound(cell, tiles, within)
 

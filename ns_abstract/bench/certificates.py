@@ -9,7 +9,7 @@ from typing import Any
 from ns_abstract.api.certifying import CertifyProgress, certify
 from ns_abstract.api.poses import PoseSet
 from ns_abstract.api.scenes import Scene
-from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.camera_path import PinholeCamera
 
 #: Seconds between two words of where a search stands.
 _SAID = 10.0
@@ -31,7 +31,7 @@ SETS: dict[str, dict[str, Any]] = {
 
 def curve(
     scene: Scene,
-    camera: Camera,
+    camera: PinholeCamera,
     name: str,
     specification: dict[str, Any],
     model: Path,
@@ -40,7 +40,7 @@ def curve(
     workers: int,
     marks: Sequence[float],
     said: Callable[[str], object] = lambda text: None,
-    following: Camera | None = None,
+    following: PinholeCamera | None = None,
 ) -> dict[str, Any]:
     """Search one set for ``seconds``.
 
@@ -71,22 +71,22 @@ def curve(
                 f"unknown {point.unknown:.2%}"
             )
 
-    found = certify(
+    certificate = certify(
         scene, PoseSet.from_json(camera, specification, following=following), model, prop,
         time_budget=seconds, workers=workers, on_progress=on_progress,
     )  # fmt: skip
-    effort = found.report["effort"]
+    effort = certificate.report["effort"]
     bounded = effort["cells_bounded"]
-    row: dict[str, Any] = {"set": name, "parameters": len(found.parameters), "network": model.stem}
+    row: dict[str, Any] = {"set": name, "parameters": len(certificate.parameters), "network": model.stem}
     for mark in marks:
-        reached = [point.certified for point in points if point.seconds <= mark]
-        done = found.seconds <= mark
-        row[f"at {mark:g} s"] = found.certified if done else reached[-1] if reached else 0.0
+        certified = [point.certified for point in points if point.seconds <= mark]
+        done = certificate.seconds <= mark
+        row[f"at {mark:g} s"] = certificate.certified if done else certified[-1] if certified else 0.0
     return row | {
-        "seconds": found.seconds,
-        "certified": found.certified,
-        "falsified": found.falsified,
-        "unknown": found.unknown,
+        "seconds": certificate.seconds,
+        "certified": certificate.certified,
+        "falsified": certificate.falsified,
+        "unknown": certificate.unknown,
         "bounded": bounded,
         "worker s / bounded": effort["worker_seconds"] / bounded if bounded else float("nan"),
     }

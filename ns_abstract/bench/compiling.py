@@ -15,8 +15,8 @@ from typing import Any
 
 from ns_abstract.api.files import PathJob
 from ns_abstract.bench.sets import pose_set
-from ns_abstract.execution.opening import Recipe, opened
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.execution.worker_cache import Recipe, load
+from ns_abstract.geometry.poses import PoseBox
 
 #: Functions that a row names: those that took most by themselves.
 _NAMED = 3
@@ -106,9 +106,9 @@ def recording() -> Iterator[_Recorder]:
         yield found
 
 
-def _measured(recipe: Recipe[Any], poses: PoseSet) -> list[dict[str, Any]]:
+def _measured(recipe: Recipe[Any], poses: PoseBox) -> list[dict[str, Any]]:
     """The rows of one process, which has no kernel."""
-    view = opened(recipe).method.frame(poses)
+    view = load(recipe).method.frame(poses)
     with recording() as found:
         for stage in (*view.stages, None):
             found.stage = stage or "the rest"

@@ -13,7 +13,7 @@ from ns_abstract.api.loop_report import widths
 from ns_abstract.api.reaching import ReachCell, ReachProgress, ReachResult, reach
 from ns_abstract.api.scenes import Scene
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.reach.search import QUESTIONS, Run, first_outside, pushes, simulate
+from ns_abstract.reach.search import QUESTIONS, SimulatedRun, first_outside, sampled_disturbances, simulate
 from ns_abstract.reach.tubes import Dependence, Tube
 
 #: What tubes keep, by how a table calls it.
@@ -55,16 +55,18 @@ def measure(
     """
     points: list[ReachProgress] = []
     said(f"searching for {seconds:g} s")
-    found = reach(scene, loop, time_budget=seconds, workers=workers, on_progress=points.append)
+    result = reach(scene, loop, time_budget=seconds, workers=workers, on_progress=points.append)
     job, rng = open_loop(scene, loop), np.random.default_rng(seed)
     question = QUESTIONS[job.questions[-1]]
-    cells = [cell for cell in found.cells if cell.question == question]
-    row: dict[str, Any] = {"question": question, "seconds": found.seconds}
+    cells = [cell for cell in result.cells if cell.question == question]
+    row: dict[str, Any] = {"question": question, "seconds": result.seconds}
     for mark in marks:
-        reached = [getattr(point, question) for point in points if point.seconds <= mark]
-        row[f"at {mark:g} s"] = getattr(found, question) if found.seconds <= mark else reached[-1] if reached else 0.0
+        fractions = [getattr(point, question) for point in points if point.seconds <= mark]
+        row[f"at {mark:g} s"] = (
+            getattr(result, question) if result.seconds <= mark else fractions[-1] if fractions else 0.0
+        )
     said(f"{runs} runs from the whole box")
-    row |= _attack(job, found, cells, runs, rng)
+    row |= _attack(job, result, cells, runs, rng)
     certified = [cell for cell in cells if cell.verdict == "certified"]
     if not certified:
         return LoopTables([row], [])
@@ -81,11 +83,13 @@ def _box(job: LoopJob, cell: ReachCell) -> ParameterBox:
     return ParameterBox(box.names, box.units, tuple(cell.lower.tolist()), tuple(cell.upper.tolist()))
 
 
-def _runs(job: LoopJob, box: ParameterBox, count: int, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, Run]]:
+def _runs(
+    job: LoopJob, box: ParameterBox, count: int, rng: np.random.Generator
+) -> Iterator[tuple[np.ndarray, SimulatedRun]]:
     """Random starts and their runs, with disturbances at an end throughout and anywhere by turns."""
     reacher = job.search.reacher
     for number, start in enumerate(box.sample(count, rng)):
-        push = pushes(job.loop, rng, "ends" if number % 2 else "random")
+        push = sampled_disturbances(job.loop, rng, "ends" if number % 2 else "random")
         yield start, simulate(reacher, job.loop.state(box, start), push)
 
 
@@ -95,7 +99,7 @@ def _attack(
     """Random runs: how many go well, and whether all stay inside the tube of their cell."""
     question = QUESTIONS[job.questions[-1]]
     low, high = np.stack([cell.lower for cell in cells]), np.stack([cell.upper for cell in cells])
-    by_cell: dict[int, list[Run]] = {}
+    by_cell: dict[int, list[SimulatedRun]] = {}
     well = 0
     for start, run in _runs(job, job.loop.box, count, rng):
         by_cell.setdefault(int(np.argmax(((low <= start) & (start <= high)).all(axis=1))), []).append(run)
@@ -124,7 +128,8 @@ def _by_step(job: LoopJob, box: ParameterBox, count: int, rng: np.random.Generat
     """Widths by step of tubes that keep more or less, against the hull of runs; and runs that leave a tube."""
     tubes: dict[str, Tube] = {name: job.reacher(mode).tube(box, whole=True) for mode, name in _MODES.items()}
     corners = [
-        simulate(job.search.reacher, job.loop.state(box, c), pushes(job.loop, rng, "ends")) for c in box.corners()
+        simulate(job.search.reacher, job.loop.state(box, c), sampled_disturbances(job.loop, rng, "ends"))
+        for c in box.corners()
     ]
     runs = [*corners, *(run for _, run in _runs(job, box, count - len(corners), rng))]
     outside = sum(first_outside(tube, run) is not None for tube in tubes.values() for run in runs)
@@ -134,7 +139,7 @@ def _by_step(job: LoopJob, box: ParameterBox, count: int, rng: np.random.Generat
     for step, width in enumerate(hull):
         row = {"step": step, "simulated": float(width)}
         for name, tube in tubes.items():
-            found = widths(tube)
-            row[name] = found[step] if step < len(found) else float("inf")
+            tube_widths = widths(tube)
+            row[name] = tube_widths[step] if step < len(tube_widths) else float("inf")
         rows.append(row | {"kept / simulated": row["kept"] / float(width)})
     return rows, outside

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from ns_abstract.api.files import PathJob
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.splat.method import SplatMethod
 from ns_abstract.refine.result import FrameResult, max_pixel_gap
 
@@ -50,14 +50,14 @@ def _completed(values: tuple[Any, ...]) -> dict[str, Any]:
     return {**row, "MPG / empirical": row["MPG"] / row["empirical MPG"] if row["empirical MPG"] else None}
 
 
-def table_of(poses: PoseSet) -> int:
+def table_of(poses: PoseBox) -> int:
     """The table that a set belongs to: 6 where the scene varies, else 2."""
     perturbation = poses.perturbation
     varies = perturbation.scene or perturbation.hue is not None or perturbation.saturation is not None
     return 6 if varies else 2
 
 
-def _range(poses: PoseSet) -> str:
+def _range(poses: PoseBox) -> str:
     """The widths of the set's ranges, as the paper gives them."""
     box, perturbation = poses.box, poses.perturbation
     widths = {f"{high - low:g} {unit}" for low, high, unit in zip(box.lower, box.upper, box.units, strict=True)}
@@ -68,7 +68,7 @@ def _range(poses: PoseSet) -> str:
     return ", ".join(sorted(widths))
 
 
-def ours(job: PathJob, name: str, poses: PoseSet, result: FrameResult) -> dict[str, Any]:
+def ours(job: PathJob, name: str, poses: PoseBox, result: FrameResult) -> dict[str, Any]:
     """One row of ours: ranges are whole widths, "empirical" is what was really rendered."""
     last = result.trace[-1]
     method = "GS" if isinstance(job.method, SplatMethod) else "NeRF"

@@ -10,10 +10,10 @@ import numpy as np
 
 from ns_abstract.api.files import PathJob
 from ns_abstract.bench.sets import pose_set, splat_of
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.splat.activate import activate
-from ns_abstract.methods.splat.frame import Context, SplatFrame
-from ns_abstract.refine.engine import Goal, Refinement
+from ns_abstract.methods.splat.frame import SplatFrame, VisibleContext
+from ns_abstract.refine.engine import Refinement, RefinementGoal
 from ns_abstract.refine.result import FrameResult
 
 #: More than any run of a given number of cells takes.
@@ -23,7 +23,9 @@ _LONG = 1e6
 class _EveryGaussian(SplatFrame):
     """Looks at every Gaussian in every cell, whatever the cell around it shows."""
 
-    def candidates(self, tiles: np.ndarray, within: Context | None, pixels: np.ndarray | None) -> np.ndarray | None:
+    def candidates(
+        self, tiles: np.ndarray, within: VisibleContext | None, pixels: np.ndarray | None
+    ) -> np.ndarray | None:
         return None
 
 
@@ -31,7 +33,7 @@ def _refined(frame: SplatFrame, index: int, cells: int, seed: int) -> tuple[Fram
     """The result of a given number of cells, and its processor seconds."""
     frame.warm_up()
     started = time.process_time()
-    result = Refinement(frame, index, Goal(1.0, _LONG, cells), seed=seed).run()
+    result = Refinement(frame, index, RefinementGoal(1.0, _LONG, cells), seed=seed).run()
     return result, time.process_time() - started
 
 
@@ -43,11 +45,11 @@ def without(job: PathJob, name: str, frame: int, cells: int, scale: float = 1.0)
     """
     poses, splat = pose_set(job, name, frame, scale), splat_of(job)
 
-    def view(kind: type[SplatFrame], every_band: bool) -> Callable[[PoseSet], SplatFrame]:
+    def view(kind: type[SplatFrame], every_band: bool) -> Callable[[PoseBox], SplatFrame]:
         splats = activate(splat.scene, splat.rasteriser, every_band)
         return lambda p: kind(splats, splat.rasteriser, splat.arithmetic, p)
 
-    variants: dict[str, Callable[[PoseSet], SplatFrame]] = {
+    variants: dict[str, Callable[[PoseBox], SplatFrame]] = {
         "as planned": view(SplatFrame, False),
         "every Gaussian in every cell": view(_EveryGaussian, False),
     }

@@ -38,11 +38,11 @@ def save_scale(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     FigureCanvasAgg(figure)
     left, right = figure.subplots(1, 2)
     for size in dict.fromkeys(row["size"] for row in rows):
-        found = [row for row in rows if row["size"] == size]
-        counts = [row["Gaussians"] for row in found]
-        (line,) = left.loglog(counts, [row["cell ns / pair"] for row in found], marker="o", label=f"{size}, cell")
-        left.loglog(counts, [row["render ns / pair"] for row in found], color=line.get_color(), linestyle="--")
-        right.semilogx(counts, [row["peak GiB"] for row in found], marker="o", color=line.get_color(), label=size)
+        same_size = [row for row in rows if row["size"] == size]
+        counts = [row["Gaussians"] for row in same_size]
+        (line,) = left.loglog(counts, [row["cell ns / pair"] for row in same_size], marker="o", label=f"{size}, cell")
+        left.loglog(counts, [row["render ns / pair"] for row in same_size], color=line.get_color(), linestyle="--")
+        right.semilogx(counts, [row["peak GiB"] for row in same_size], marker="o", color=line.get_color(), label=size)
     left.set(xlabel="Gaussians", ylabel="ns by Gaussian and pixel (dashed: concrete render)")
     right.set(xlabel="Gaussians", ylabel="peak memory of the process, GiB")
     _finish(left, right)

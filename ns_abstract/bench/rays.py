@@ -11,7 +11,7 @@ import torch
 
 from ns_abstract.api.files import PathJob
 from ns_abstract.bench.sets import pose_set
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.method import NerfMethod
@@ -23,7 +23,7 @@ from ns_abstract.verify.attack.soundness import nerf_renderer
 class RaySample(NerfFrame):
     """Some rays of a frame, as a picture of one row."""
 
-    def __init__(self, method: NerfMethod, poses: PoseSet, count: int, seed: int) -> None:
+    def __init__(self, method: NerfMethod, poses: PoseBox, count: int, seed: int) -> None:
         super().__init__(method.scene, method.sampling, poses, method.device)
         chosen = np.sort(np.random.default_rng(seed).permutation(self.tile_count)[:count])
         #: [n, 2] rows and columns.
@@ -60,7 +60,7 @@ def measure(job: PathJob, name: str, frame: int, scale: float, **options: Any) -
     torch.set_num_threads(threads)
     _, probe, twin = nerf_renderer(job.method.scene, poses, job.method.sampling)
     chosen = torch.from_numpy(sample.chosen)
-    found = falsify(
+    attack = falsify(
         result.lower, result.upper, poses.box,
         lambda values: probe(values, sample.chosen)[None],
         lambda values, pixels: twin(values, chosen[pixels[:, 1]]),
@@ -82,9 +82,9 @@ def measure(job: PathJob, name: str, frame: int, scale: float, **options: Any) -
         "witness MPG": last.mpg_witness,
         "ratio": last.mpg / last.mpg_witness if last.mpg_witness else float("nan"),
         "cells": result.cells,
-        "poses": found.poses,
-        "ascent steps": found.steps,
-        "comparisons": found.comparisons,
-        "violations": found.violations,
-        "not finite": found.not_finite,
+        "poses": attack.poses,
+        "ascent steps": attack.steps,
+        "comparisons": attack.comparisons,
+        "violations": attack.violations,
+        "not finite": attack.not_finite,
     }

@@ -17,8 +17,8 @@ from ns_abstract.arithmetic.forms import Float64Array
 from ns_abstract.arithmetic.rounding import REAL
 from ns_abstract.bench.sets import pose_set, splat_of
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.camera_path import Camera
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.splat.activate import Splats, activate
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import PAPER
@@ -39,12 +39,12 @@ PAPER_RULES: dict[str, dict[str, object]] = {
 }
 
 
-def weights_at(splats: Splats, camera: Camera, rotation: Float64Array, position: Float64Array, u: Float64Array):
+def weights_at(splats: Splats, camera: PinholeCamera, rotation: Float64Array, position: Float64Array, u: Float64Array):
     """[N] share of the light at the point ``u`` [2] that each Gaussian takes, by Algorithm 1."""
     x, y, z = ((splats.means - position) @ rotation.T).T
-    seen = np.flatnonzero((z >= PAPER.near) & (z <= PAPER.far))
-    x, y, z = x[seen], y[seen], z[seen]
-    axes = np.einsum("ij,njk->nik", rotation, splats.axes[seen])
+    visible = np.flatnonzero((z >= PAPER.near) & (z <= PAPER.far))
+    x, y, z = x[visible], y[visible], z[visible]
+    axes = np.einsum("ij,njk->nik", rotation, splats.axes[visible])
     rows = [
         focal / z[:, None] * (axes[:, k] - (side / z)[:, None] * axes[:, 2])
         for k, (focal, side) in enumerate(((camera.fx, x), (camera.fy, y)))
@@ -53,24 +53,26 @@ def weights_at(splats: Splats, camera: Camera, rotation: Float64Array, position:
     dx, dy = u[0] - camera.fx * x / z - camera.cx, u[1] - camera.fy * y / z - camera.cy
     with np.errstate(all="ignore"):
         q = (c * dx * dx - 2.0 * b * dx * dy + a * dy * dy) / (a * c - b * b)
-        alpha = np.nan_to_num(splats.opacity[seen] * np.exp(-0.5 * q))
+        alpha = np.nan_to_num(splats.opacity[visible] * np.exp(-0.5 * q))
     order = np.argsort(z, kind="stable")
     light = np.concatenate([[1.0], np.cumprod(1.0 - alpha[order])[:-1]])
     weights = np.zeros(splats.count)
-    weights[seen[order]] = light * alpha[order]
+    weights[visible[order]] = light * alpha[order]
     return weights
 
 
-def _pixel_camera(camera: Camera, column: int, row: int) -> Camera:
+def _pixel_camera(camera: PinholeCamera, column: int, row: int) -> PinholeCamera:
     """A camera of one pixel, whose centre is that of ``camera``'s pixel (column, row)."""
     return replace(camera, cx=camera.cx - column, cy=camera.cy - row, width=1, height=1)
 
 
-def _own(splats: Splats, camera: Camera, poses: PoseSet, cell: ParameterBox) -> tuple[Float64Array, Float64Array]:
+def _own(
+    splats: Splats, camera: PinholeCamera, poses: PoseBox, cell: ParameterBox
+) -> tuple[Float64Array, Float64Array]:
     """[3] lower and upper ends of the only pixel, by the compiled stages."""
     bounds = SplatBounds(splats, PAPER, REAL)
-    found = bounds.cell(camera, poses.enclosure(cell, 2 if cell.dimensions == 1 else 1))
-    return found.lower[0, 0, 0], found.upper[0, 0, 0]
+    cell_bounds = bounds.cell(camera, poses.enclosure(cell, 2 if cell.dimensions == 1 else 1))
+    return cell_bounds.lower[0, 0, 0], cell_bounds.upper[0, 0, 0]
 
 
 def compare(
@@ -98,15 +100,15 @@ def compare(
         cell = cell.split(axis, parts)[parts // 2]
     camera, random = poses.camera, np.random.default_rng(seed)
     places = random.permutation(camera.width * camera.height)
-    rules: dict[str, Callable[[Splats, Camera], tuple[Float64Array, Float64Array]]] = {
+    rules: dict[str, Callable[[Splats, PinholeCamera], tuple[Float64Array, Float64Array]]] = {
         "ours": lambda scene, view: _own(scene, view, poses, cell)
     }
     forms = poses.enclosure(cell, 1)
     for rule, options in PAPER_RULES.items():
 
-        def by_rule(scene: Splats, view: Camera, options: dict = options) -> tuple[Float64Array, Float64Array]:
-            found: Enclosure = paper.bound(scene, view, forms, **options)
-            low, high = found.bounds()
+        def by_rule(scene: Splats, view: PinholeCamera, options: dict = options) -> tuple[Float64Array, Float64Array]:
+            enclosure: Enclosure = paper.bound(scene, view, forms, **options)
+            low, high = enclosure.bounds()
             return np.clip(low[0], 0.0, 1.0), np.clip(high[0], 0.0, 1.0)
 
         rules[rule] = by_rule
@@ -127,9 +129,9 @@ def compare(
             sh=splats.sh[chosen],
         )  # fmt: skip
         draws = [*cell.corners(), *cell.sample(_SAMPLES, random)]
-        shown = np.stack([paper.render(scene, view, *poses.world_to_camera(values))[0] for values in draws])
-        shown = np.clip(shown, 0.0, 1.0)
-        least, greatest = shown.min(axis=0), shown.max(axis=0)
+        renders = np.stack([paper.render(scene, view, *poses.world_to_camera(values))[0] for values in draws])
+        renders = np.clip(renders, 0.0, 1.0)
+        least, greatest = renders.min(axis=0), renders.max(axis=0)
         gaps["renders"].append(float(np.linalg.norm(greatest - least)))
         counts.append(chosen.size)
         for rule, bounded in rules.items():

@@ -66,7 +66,7 @@ def _row(
     entries = view.renderer.lists(splat.splats, view.camera, *poses.world_to_camera(cell.middle), tiles).entries
     pairs = entries.size * view.side**2
     times = measure([lambda: view.render(cell.middle), lambda: view.bound(cell, tiles)], repeats).min(axis=0)
-    found: dict[str, Any] = {
+    row: dict[str, Any] = {
         "scene": job.method.name,
         "Gaussians": count,
         "size": f"{view.camera.width}x{view.camera.height}",
@@ -82,10 +82,10 @@ def _row(
     if seconds > 0.0:
         result = refine(job, poses, frame, seconds, 1.0)
         last = result.trace[-1]
-        found |= {"s of refinement": last.seconds, "ratio": last.mpg / last.mpg_witness if last.mpg_witness else None}
+        row |= {"s of refinement": last.seconds, "ratio": last.mpg / last.mpg_witness if last.mpg_witness else None}
     # kibibytes, on macOS bytes
     unit = 1 if sys.platform == "darwin" else 1024
-    return {**found, "peak GiB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**30}
+    return {**row, "peak GiB": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 2**30}
 
 
 def curve(
@@ -99,8 +99,20 @@ def curve(
     """
     for width in widths:
         for count in counts:
-            given = seconds if (count, width) == (counts[-1], widths[-1]) else 0.0
+            refine_seconds = seconds if (count, width) == (counts[-1], widths[-1]) else 0.0
             # a process keeps its peak, so each row has its own
             with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-                arguments = config, path, frame, name, count, width, repeats, given, gibibytes, version, overrides
+                arguments = (
+                    config,
+                    path,
+                    frame,
+                    name,
+                    count,
+                    width,
+                    repeats,
+                    refine_seconds,
+                    gibibytes,
+                    version,
+                    overrides,
+                )
                 yield pool.submit(_row, *arguments).result()

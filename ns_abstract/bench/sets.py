@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.api.files import PathJob, Settings, open_job
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.program_options import ProgramOptions
@@ -86,7 +86,7 @@ def splat_of(job: PathJob) -> SplatMethod:
     return job.method
 
 
-def pose_set(job: PathJob, name: str, frame: int, scale: float = 1.0) -> PoseSet:
+def pose_set(job: PathJob, name: str, frame: int, scale: float = 1.0) -> PoseBox:
     """The set ``name`` around entry ``frame`` of the job's path; ``scale`` multiplies every range.
 
     Raises:

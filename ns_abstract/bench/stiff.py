@@ -20,14 +20,14 @@ from numpy.typing import ArrayLike
 from ns_abstract.arithmetic.rounding import Arithmetic
 from ns_abstract.arithmetic.rounding import arithmetic as arithmetic_of
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.camera_path import Camera
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.splat.activate import SH_C0, Splats, activate
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, Rasteriser
-from ns_abstract.methods.splat.frame import Context, SplatFrame, TileBounds
+from ns_abstract.methods.splat.frame import SplatFrame, TileBounds, VisibleContext
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.perturbation.specification import parse_perturbation
-from ns_abstract.refine.engine import Goal, Refinement
+from ns_abstract.refine.engine import Refinement, RefinementGoal
 from ns_abstract.refine.result import mean_pixel_gap
 from ns_abstract.verify.attack.falsify import Violation, falsify, merge
 from ns_abstract.verify.attack.soundness import compiled_renderer, reference_renderer
@@ -57,14 +57,14 @@ class Case:
 
     name: str
     scene: SplatScene = field(repr=False)
-    camera: Camera = field(repr=False)
+    camera: PinholeCamera = field(repr=False)
     spec: dict[str, Any]
-    following: Camera | None = field(default=None, repr=False)
+    following: PinholeCamera | None = field(default=None, repr=False)
     blank: bool = False
 
-    def pose_set(self) -> PoseSet:
+    def pose_set(self) -> PoseBox:
         """The poses."""
-        return PoseSet.around(self.camera, parse_perturbation(self.spec), self.following)
+        return PoseBox.around(self.camera, parse_perturbation(self.spec), self.following)
 
 
 @dataclass(frozen=True)
@@ -95,7 +95,7 @@ class WatchedFrame(SplatFrame):
         crossed: Pixel channels whose lower bound exceeds the upper one.
     """
 
-    def __init__(self, splats: Splats, rasteriser: Rasteriser, arithmetic: Arithmetic, pose_set: PoseSet) -> None:
+    def __init__(self, splats: Splats, rasteriser: Rasteriser, arithmetic: Arithmetic, pose_set: PoseBox) -> None:
         super().__init__(splats, rasteriser, arithmetic, pose_set)
         self.not_finite = self.crossed = 0
 
@@ -106,19 +106,25 @@ class WatchedFrame(SplatFrame):
         return picture
 
     def bound(
-        self, box: ParameterBox, tiles: np.ndarray, within: Context | None = None, keep_linear: bool = False,
+        self, box: ParameterBox, tiles: np.ndarray, within: VisibleContext | None = None, keep_linear: bool = False,
         pixels: np.ndarray | None = None,
     ) -> TileBounds:  # fmt: skip
         """See `SplatFrame.bound`."""
-        found = super().bound(box, tiles, within, keep_linear, pixels)
-        self.not_finite += _not_finite(found.lower, found.upper, found.slopes, *(found.linear or ()))
-        self.crossed += int((found.lower > found.upper).sum())
-        return found
+        tile_bounds = super().bound(box, tiles, within, keep_linear, pixels)
+        self.not_finite += _not_finite(
+            tile_bounds.lower, tile_bounds.upper, tile_bounds.slopes, *(tile_bounds.linear or ())
+        )
+        self.crossed += int((tile_bounds.lower > tile_bounds.upper).sum())
+        return tile_bounds
 
     def bound_parts(
-        self, boxes: Sequence[ParameterBox], tiles: np.ndarray, within: Context | None, keep_linear: bool,
+        self,
+        boxes: Sequence[ParameterBox],
+        tiles: np.ndarray,
+        within: VisibleContext | None,
+        keep_linear: bool,
         pixels: np.ndarray | None,
-    ) -> list[TileBounds]:  # fmt: skip
+    ) -> list[TileBounds]:
         """See `SplatFrame.bound_parts`; one by one, since they are counted."""
         return [self.bound(box, tiles, within, keep_linear, pixels) for box in boxes]
 
@@ -157,7 +163,7 @@ def run_case(
     began = time.perf_counter()
     pose_set = case.pose_set()
     view = frame(activate(case.scene, GSPLAT_1_4_0), GSPLAT_1_4_0, arithmetic_of(arithmetic), pose_set)
-    result = Refinement(view, 0, Goal(ratio=1.0, seconds=seconds, cells=cells), seed=seed).run()
+    result = Refinement(view, 0, RefinementGoal(ratio=1.0, seconds=seconds, cells=cells), seed=seed).run()
     render, probe = compiled_renderer(case.scene, pose_set, GSPLAT_1_4_0)
     other, other_probe, twin = reference_renderer(case.scene, pose_set, GSPLAT_1_4_0)
     programs = [(render, probe, poses), (other, other_probe, reference_poses)]
@@ -202,8 +208,8 @@ def run_case(
 
 def compare(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     """What float32 costs against real arithmetic in gap and time, for every case that was run in both."""
-    found = {(row["case"], row["arithmetic"]): row for row in rows}
-    pairs = [(row, found[name, "real"]) for (name, kind), row in found.items() if (name, "real") in found]
+    by_case = {(row["case"], row["arithmetic"]): row for row in rows}
+    pairs = [(row, by_case[name, "real"]) for (name, kind), row in by_case.items() if (name, "real") in by_case]
     return [
         {
             "case": single["case"],
@@ -222,11 +228,11 @@ def compare(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def _camera(
     width: int = 20, height: int | None = None, fov: float = 60.0, focal: float | None = None, pose: ArrayLike = _EYE
-) -> Camera:
+) -> PinholeCamera:
     """A camera (vertical ``fov`` in degrees, or ``focal`` in pixels) that looks along its -z axis."""
     height = width if height is None else height
     focal = 0.5 * height / math.tan(math.radians(0.5 * fov)) if focal is None else focal
-    return Camera(np.array(pose, np.float64), focal, focal, 0.5 * width, 0.5 * height, width, height)
+    return PinholeCamera(np.array(pose, np.float64), focal, focal, 0.5 * width, 0.5 * height, width, height)
 
 
 def _scene(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from ns_abstract.api.files import PathJob
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.refine.engine import Refinement
 from ns_abstract.refine.result import FrameResult, max_pixel_gap
 from ns_abstract.report.figures import seconds_to
@@ -14,11 +14,11 @@ from ns_abstract.report.figures import seconds_to
 MARKS = (1.5, 1.25, 1.1, 1.05, 1.02, 1.01)
 
 
-def refine(job: PathJob, poses: PoseSet, frame: int, seconds: float, ratio: float) -> FrameResult:
+def refine(job: PathJob, poses: PoseBox, frame: int, seconds: float, ratio: float) -> FrameResult:
     """The abstract image of ``poses`` about entry ``frame``; kernels are compiled before the clock starts."""
-    view, seed = job.method.frame(poses, slanted=True), job.seed
+    view, seed = job.method.frame(poses, sheared=True), job.seed
     view.warm_up()
-    result = Refinement(view, frame, job.goal(ratio, seconds), seed=seed, members=view.members(seed)).run()
+    result = Refinement(view, frame, job.goal(ratio, seconds), seed=seed, members=view.scene_samples(seed)).run()
     return replace(result, box=poses.box)
 
 

@@ -16,7 +16,7 @@ import numpy as np
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import file_beside, read_text
 from ns_abstract.io.packed import unpacked
-from ns_abstract.verify.boxes import Answer, decide
+from ns_abstract.verify.box_decisions import Decision, decide
 from ns_abstract.verify.network import Network, NetworkArithmetic, load_network
 from ns_abstract.verify.network.comparison import compare
 from ns_abstract.verify.network.explain import check_cell
@@ -53,7 +53,7 @@ def instances(folder: Path) -> list[Instance]:
         InputError: The list is absent, or a line is not understood.
     """
     path = folder / "instances.csv"
-    found = []
+    lines = []
     text = read_text(path, "list of instances", _LIST_LIMIT)
     try:
         for number, row in enumerate(csv.reader(io.StringIO(text)), 1):
@@ -70,10 +70,10 @@ def instances(folder: Path) -> list[Instance]:
                 seconds = np.nan
             if not 0.0 < seconds <= _LONGEST:
                 raise InputError(f"line {number}: {row[2]!r} seconds", file=path, fix=f"between 0 and {_LONGEST:g}")
-            found.append(Instance(row[0], row[1], seconds))
+            lines.append(Instance(row[0], row[1], seconds))
     except csv.Error as error:
         raise InputError(f"cannot be read: {error}", file=path, fix="write network,property,seconds") from None
-    return found
+    return lines
 
 
 def _stored(folder: Path, name: str) -> Path:
@@ -192,7 +192,7 @@ def _stem(name: str) -> str:
     return last
 
 
-def assignment(answer: Answer) -> str:
+def assignment(answer: Decision) -> str:
     """A counterexample as the competitions want it; nothing without one."""
     if answer.x is None or answer.y is None:
         return ""

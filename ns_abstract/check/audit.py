@@ -15,9 +15,9 @@ import numpy as np
 
 from ns_abstract.check.inputs import BadInput, dataset_scale, given_set, read_poses, read_scene
 from ns_abstract.check.pictures import Picture
-from ns_abstract.check.results import Cells, read_cells, read_report, read_verdicts, structure
+from ns_abstract.check.results import StoredCells, read_cells, read_report, read_verdicts, structure
 from ns_abstract.check.splats import RULES
-from ns_abstract.check.verdicts import Certificate, Loop
+from ns_abstract.check.verdicts import CheckedCertificate, CheckedLoop
 
 #: Part of the claims that must be settled; level of what is stated of all claims.
 ENOUGH, CONFIDENCE = 0.8, 0.95
@@ -113,7 +113,7 @@ def run(
     return audit
 
 
-def opened(folder: Path, report: dict[str, Any], moved: dict[str, Path | None]) -> tuple[list[Cells], list[Any]]:
+def opened(folder: Path, report: dict[str, Any], moved: dict[str, Path | None]) -> tuple[list[StoredCells], list[Any]]:
     """All cells of a result, and what its claims are about."""
     settings, renderer, name = report["settings"], report["renderer"], folder / "report.json"
     if not (renderer["name"] == "gsplat" and renderer["version"] in RULES) and renderer["name"] != "nerf-uniform":
@@ -133,7 +133,7 @@ def opened(folder: Path, report: dict[str, Any], moved: dict[str, Path | None]) 
     if report.get("kind") == "loop":
         parts = read_verdicts(folder, report)
         model = moved.get("model") or file("loop").parent / report["loop"]["network"]
-        return parts, [Loop(c, scene, report, model) for c in parts if Loop.claims(c)]
+        return parts, [CheckedLoop(c, scene, report, model) for c in parts if CheckedLoop.claims(c)]
     path, given = file("camera_path_filename"), given_set(settings, moved.get("perturbation_filename"))
     if (folder / "cells.sqlite").exists():
         parts, model = read_verdicts(folder, report), file("model")
@@ -157,8 +157,8 @@ def opened(folder: Path, report: dict[str, Any], moved: dict[str, Path | None]) 
             raise BadInput(f"frame {cells.index} of the result is another set of poses or size", path, fix=fix)
         if model is None:
             subjects.append(Picture(cells, scene, poses, report))
-        elif Certificate.claims(cells):
-            subjects.append(Certificate(cells, scene, poses, report, model))
+        elif CheckedCertificate.claims(cells):
+            subjects.append(CheckedCertificate(cells, scene, poses, report, model))
     return parts, subjects
 
 

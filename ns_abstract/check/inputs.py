@@ -14,9 +14,9 @@ import numpy as np
 import torch
 import yaml
 
-from ns_abstract.check.fields import Field
-from ns_abstract.check.poses import SHIFTS, TURNS, Camera, Poses
-from ns_abstract.check.splats import Splats, activated
+from ns_abstract.check.fields import CheckedField
+from ns_abstract.check.poses import SHIFTS, TURNS, CheckedCamera, Poses
+from ns_abstract.check.splats import ActivatedScene, activated
 
 Array = Any
 
@@ -47,14 +47,14 @@ def read_json(file: Path, what: str, fix: str | None = None) -> dict[str, Any]:
             raise BadInput(f"no such {what}", file, fix=fix)
         if file.stat().st_size > _TEXT:
             raise BadInput(f"this {what} is too large", file, fix=fix)
-        found = json.loads(file.read_bytes())
+        content = json.loads(file.read_bytes())
     except (OSError, ValueError, RecursionError) as error:
         if isinstance(error, BadInput):
             raise
         raise BadInput(f"this {what} cannot be read", file, fix=fix) from None
-    if not isinstance(found, dict):
+    if not isinstance(content, dict):
         raise BadInput("the top level is not an object", file, fix=fix)
-    return found
+    return content
 
 
 class _Inert(yaml.SafeLoader):
@@ -72,7 +72,7 @@ _Inert.add_multi_constructor("tag:yaml.org,2002:python/", _plain)
 _Inert.add_multi_constructor("!", _plain)
 
 
-def read_scene(file: Path, report: dict[str, Any]) -> Splats | Field:
+def read_scene(file: Path, report: dict[str, Any]) -> ActivatedScene | CheckedField:
     """The scene that a result is about: what its digest in the report says, or nothing.
 
     Args:
@@ -86,7 +86,7 @@ def read_scene(file: Path, report: dict[str, Any]) -> Splats | Field:
     with file.open("rb") as stream:
         ply = stream.read(4) in (b"ply\n", b"ply\r")
     if renderer["name"] == "nerf-uniform":
-        found, digest = _read_field(*_read_run(file, settings), file, settings, renderer)
+        scene, digest = _read_field(*_read_run(file, settings), file, settings, renderer)
         digest = digest.hexdigest()
     else:
         (*stored, mode, background, sigmoid, degree) = (_read_ply if ply else _read_splats)(file, settings)
@@ -98,10 +98,10 @@ def read_scene(file: Path, report: dict[str, Any]) -> Splats | Field:
         digest = hashlib.sha256(b"".join(a.tobytes() for a in (*stored, background)))
         digest.update(repr(("sigmoid" if sigmoid else "sh", degree, mode)).encode())
         about = {"sigmoid": sigmoid, "degree": degree, "antialiased": mode == "antialiased", "background": background}
-        found, digest = activated(*stored, **about, version=renderer["version"]), digest.hexdigest()
+        scene, digest = activated(*stored, **about, version=renderer["version"]), digest.hexdigest()
     if digest != report["fingerprint"].get("scene"):
         raise BadInput("is not the scene of the result (its digest differs)", file, fix=_SCENE)
-    return found
+    return scene
 
 
 def _drawn(stored: list[Array], file: Path, settings: dict[str, Any]) -> list[Array]:
@@ -208,7 +208,7 @@ def _read_field(model: dict[str, Any], state: dict[str, Any], file: Path, settin
         if not settings.get("background") and model.get("background_color", "white") != "random":
             background = _color(model.get("background_color", "white"))
         background = tuple(float(np.float32(v)) for v in background)
-        found = Field({k: v.float().numpy() for k, v in state.items() if k.startswith("field_fine.")})
+        found = CheckedField({k: v.float().numpy() for k, v in state.items() if k.startswith("field_fine.")})
         found.near, found.far, found.samples, found.background = near, far, int(renderer["samples"]), background
     except (KeyError, ValueError, TypeError, AttributeError):
         raise BadInput("holds no field of vanilla-nerf", file) from None
@@ -273,9 +273,13 @@ def given_set(settings: dict[str, Any], moved: Path | None) -> dict[str, Any] | 
     """The perturbation object that the options name; None: the path's own."""
     axes = {"translation": SHIFTS, "rotation": tuple(TURNS)}
     if any(settings.get(name) is not None for name in axes):
-        found: dict[str, Any] = {name: settings.get(name) for name in ("units", "angle_units") if settings.get(name)}
+        perturbation: dict[str, Any] = {
+            name: settings.get(name) for name in ("units", "angle_units") if settings.get(name)
+        }
         radii = {name: settings[name] for name in axes if settings.get(name) is not None}
-        return found | {n: dict(zip(axes[n], v if len(v) == 3 else list(v) * 3, strict=True)) for n, v in radii.items()}
+        return perturbation | {
+            n: dict(zip(axes[n], v if len(v) == 3 else list(v) * 3, strict=True)) for n, v in radii.items()
+        }
     file = moved or settings.get("perturbation_filename")
     if file is None:
         return None
@@ -283,15 +287,15 @@ def given_set(settings: dict[str, Any], moved: Path | None) -> dict[str, Any] | 
     return root["perturbation"] if "camera_path" in root and "perturbation" in root else root
 
 
-def _camera(root: dict[str, Any], entry: dict[str, Any], down: float) -> Camera:
+def _camera(root: dict[str, Any], entry: dict[str, Any], down: float) -> CheckedCamera:
     pose = np.array(entry["camera_to_world"], np.float64).reshape(4, 4)[:3]
     width, height = int(root["render_width"]), int(root["render_height"])
     fov = root["default_fov"] if entry.get("fov") is None else entry["fov"]
     focal = float(height / 2.0 / np.tan(float(fov) * (np.pi / 180.0) / 2.0))
     if down == 1.0:
-        return Camera(pose, focal, focal, width / 2.0, height / 2.0, width, height)
+        return CheckedCamera(pose, focal, focal, width / 2.0, height / 2.0, width, height)
     # nerfstudio holds the factor and the centre in float32
     scale = np.float32(1.0 / down)
     cx, cy = (float(np.float32(side / 2.0) * scale) for side in (width, height))
     wide, tall = (int(np.float32(side) * scale) for side in (width, height))
-    return Camera(pose, focal * float(scale), focal * float(scale), cx, cy, wide, tall)
+    return CheckedCamera(pose, focal * float(scale), focal * float(scale), cx, cy, wide, tall)

@@ -16,13 +16,13 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ns_abstract.check.forms import Form, U
+from ns_abstract.check.forms import FirstOrderForm, U
 
 #: Bytes of a file that are read, and neurons of a layer that are bounded again, at most.
 _MOST_BYTES, MOST_ROWS = 1 << 30, 4096
 
 
-class Layer(NamedTuple):
+class CheckedLayer(NamedTuple):
     """A node: its inputs and output; ``map`` is linear but for ``bias``, or a ReLU (None), or a sum of its inputs.
 
     ``absolute`` is the map of absolute weights, ``terms`` the number of products in a sum.
@@ -36,7 +36,7 @@ class Layer(NamedTuple):
     terms: int
 
 
-class Known(NamedTuple):
+class NodeBounds(NamedTuple):
     """A tensor over B pictures: centres [B, ...], slopes [d, B, ...], errors, and sizes of the sums that made it."""
 
     c: Tensor
@@ -50,7 +50,7 @@ class Known(NamedTuple):
         return self.c - width, self.c + width
 
 
-class Network:
+class CheckedNetwork:
     """A network of an .onnx file.
 
     Args:
@@ -74,7 +74,7 @@ class Network:
             raise ValueError("the output is not said")
         self.input = next(i.name for i in graph.input if i.name not in read)
         self.output, self.unit = output or names[0], unit
-        self.layers: list[Layer] = []
+        self.layers: list[CheckedLayer] = []
         for node in graph.node:
             options = {a.name: onnx.helper.get_attribute_value(a) for a in node.attribute}
             if node.op_type == "Constant":
@@ -83,13 +83,15 @@ class Network:
             constants = [read[name] for name in node.input if name in read]
             inputs = [name for name in node.input if name and name not in read]
             f, size, bias, terms = _layer(node.op_type, options, constants, len(inputs), node.input[0] in read)
-            self.layers.append(Layer(inputs, node.output[0], f, size, bias, terms))
+            self.layers.append(CheckedLayer(inputs, node.output[0], f, size, bias, terms))
 
-    def _charge(self, layer: Layer, shape: Any) -> float:
+    def _charge(self, layer: CheckedLayer, shape: Any) -> float:
         own = (layer.terms + 4.0) * self.unit if layer.terms else 0.0
         return own + 4.0 * U * (math.prod(shape[1:]) + 2.0 * layer.terms + 32.0)
 
-    def forward(self, picture: Form, closely: bool = True) -> tuple[dict[str, Known], dict[str, tuple[Tensor, Tensor]]]:
+    def forward(
+        self, picture: FirstOrderForm, closely: bool = True
+    ) -> tuple[dict[str, NodeBounds], dict[str, tuple[Tensor, Tensor]]]:
         """What is known of all tensors over pictures [B, C, H, W], and the ends of ReLUs' inputs.
 
         Args:
@@ -97,7 +99,7 @@ class Network:
             closely: Whether neurons that may bend are bounded again by rows that go back to the picture.
         """
         c, g, r = (torch.from_numpy(np.ascontiguousarray(a, np.float64)) for a in (picture.c, picture.g, picture.r))
-        known, ends = {self.input: Known(c, g, r, c.abs() + g.abs().sum(0) + r)}, {}
+        known, ends = {self.input: NodeBounds(c, g, r, c.abs() + g.abs().sum(0) + r)}, {}
         for layer in self.layers:
             (c, g, r, size), *others = (known[name] for name in layer.inputs)
             f, absolute = layer.map, layer.absolute
@@ -123,19 +125,19 @@ class Network:
                 half = 0.5 * lift
                 c, g, r, size = above * c + half, above * g, above * r + half, torch.maximum(high, -low).clamp(min=0.0)
             r = (r + self._charge(layer, c.shape) * size) * (1.0 + 8.0 * U)
-            known[layer.output] = Known(c, g, r, size)
+            known[layer.output] = NodeBounds(c, g, r, size)
         return known, ends
 
-    def outputs(self, picture: Form) -> Form:
+    def outputs(self, picture: FirstOrderForm) -> FirstOrderForm:
         """The outputs [B, n] as forms."""
         c, g, r, _ = self.forward(picture)[0][self.output]
-        return Form(c.flatten(1).numpy(), g.flatten(2).numpy(), r.flatten(1).numpy())
+        return FirstOrderForm(c.flatten(1).numpy(), g.flatten(2).numpy(), r.flatten(1).numpy())
 
-    def least(self, picture: Form, rows: Tensor) -> Tensor:
+    def least(self, picture: FirstOrderForm, rows: Tensor) -> Tensor:
         """Lower bounds [B, m] of ``rows`` [m, n] times the outputs over pictures [B, C, H, W]."""
         return self._back(*self.forward(picture), self.output, rows)
 
-    def _back(self, known: dict[str, Known], ends: dict[str, Any], name: str, rows: Tensor) -> Tensor:
+    def _back(self, known: dict[str, NodeBounds], ends: dict[str, Any], name: str, rows: Tensor) -> Tensor:
         """Lower bounds [B, m] of ``rows`` [m, n] times a tensor.
 
         Rows go back through the layers; a ReLU is replaced by a line below or above it, as the row's sign asks.

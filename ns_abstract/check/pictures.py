@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ns_abstract.check.forms import Form
+from ns_abstract.check.forms import FirstOrderForm
 from ns_abstract.check.poses import Poses
-from ns_abstract.check.results import Cells
-from ns_abstract.check.splats import FLOAT, Splats, meeting, pixels, reaches
+from ns_abstract.check.results import StoredCells
+from ns_abstract.check.splats import FLOAT, ActivatedScene, meeting, pixels, reaches
 
 Array = Any
 Verdict = tuple[bool | None, str, dict[str, Any]]
@@ -21,7 +21,7 @@ BATCH, MOST_BOXES = 40_000, 400_000
 FIRST = 0.5
 
 
-class Claim(NamedTuple):
+class PixelClaim(NamedTuple):
     """A pixel's channel over a cell."""
 
     cell: int
@@ -30,7 +30,7 @@ class Claim(NamedTuple):
     channel: int
 
 
-class Bounds(NamedTuple):
+class ClaimedBounds(NamedTuple):
     """What is claimed: constants of the frame, and planes over the cell's box."""
 
     least: float
@@ -39,7 +39,7 @@ class Bounds(NamedTuple):
     high: Array
     planes: tuple[tuple[Array, float], ...]
 
-    def excess(self, centre: Array, half: Array, form: Form) -> tuple[Array, Array]:
+    def excess(self, centre: Array, half: Array, form: FirstOrderForm) -> tuple[Array, Array]:
         """By how much pictures may lie [B] below the lower and above the upper bounds, over boxes [B, d]."""
         c, g, r, found = form.c, form.g, form.r, []
         for side, (plane, constant) in zip((1.0, -1.0), self.planes, strict=True):
@@ -75,21 +75,21 @@ class Picture:
         report: Of the result.
     """
 
-    def __init__(self, cells: Cells, scene: Any, poses: Poses, report: dict[str, Any]) -> None:
+    def __init__(self, cells: StoredCells, scene: Any, poses: Poses, report: dict[str, Any]) -> None:
         self.cells, self.scene, self.poses = cells, scene, poses
-        self.units, self.together = units(scene, report), 64 if isinstance(scene, Splats) else 4
+        self.units, self.together = units(scene, report), 64 if isinstance(scene, ActivatedScene) else 4
 
     @property
     def count(self) -> int:
         """Number of cells."""
         return len(self.cells.arrays["tile"])
 
-    def draw(self, rng: Any, hunted: bool) -> Claim:
+    def draw(self, rng: Any, hunted: bool) -> PixelClaim:
         """A claim that is uniform over cells, pixels and channels, or the most telling of eight: narrow and moving."""
         a = self.cells.arrays
         height, width, _ = a["lower"].shape
         side = a["b_lower"].shape[1]
-        best, found = -1.0, Claim(0, 0, 0, 0)
+        best, found = -1.0, PixelClaim(0, 0, 0, 0)
         for _ in range(8 if hunted else 1):
             while True:
                 cell = int(rng.integers(self.count))
@@ -97,26 +97,26 @@ class Picture:
                 # tiles may reach past the picture; those places are drawn again, so that pixels are uniform
                 if row < height and column < width:
                     break
-            claim = Claim(cell, row, column, int(rng.integers(3)))
+            claim = PixelClaim(cell, row, column, int(rng.integers(3)))
             (_, b), (slope, c) = self.bounds(claim).planes
             interest = float((np.abs(slope).sum() + 1e-4) / max(c - b, 1e-7)) if np.any(slope) else 0.0
             best, found = (interest, claim) if interest > best else (best, found)
         return found
 
-    def place(self, claim: Claim) -> dict[str, Any]:
+    def place(self, claim: PixelClaim) -> dict[str, Any]:
         """The claim for check.json."""
         at = {"pixel": [claim.row, claim.column], "channel": claim.channel}
         return {"cell": claim.cell, "parameters": list(self.cells.names), **at}
 
-    def bounds(self, claim: Claim) -> Bounds:
+    def bounds(self, claim: PixelClaim) -> ClaimedBounds:
         """What is claimed."""
         a, k = self.cells.arrays, claim.cell
         at = (k, claim.row - int(a["tile"][k, 0]), claim.column - int(a["tile"][k, 1]), claim.channel)
         least, most = (float(a[s][claim.row, claim.column, claim.channel]) for s in ("lower", "upper"))
         planes = tuple((a[f"A_{s}"][at].astype(np.float64), float(a[f"b_{s}"][at])) for s in ("lower", "upper"))
-        return Bounds(least, most, a["box_lower"][k], a["box_upper"][k], planes)
+        return ClaimedBounds(least, most, a["box_lower"][k], a["box_upper"][k], planes)
 
-    def settle(self, claim: Claim, deadline: float) -> Verdict:
+    def settle(self, claim: PixelClaim, deadline: float) -> Verdict:
         """True: proved; False: refuted, with the pose; None: open when the time was over; and of which picture."""
         bounds, begin = self.bounds(claim), time.monotonic()
         if bounds.trivial():
@@ -128,7 +128,9 @@ class Picture:
                 return verdict, "float32" if unit else "real", detail
         return None, "", {}
 
-    def _settle(self, bounds: Bounds, claim: Claim, unit: float, deadline: float) -> tuple[bool | None, dict[str, Any]]:
+    def _settle(
+        self, bounds: ClaimedBounds, claim: PixelClaim, unit: float, deadline: float
+    ) -> tuple[bool | None, dict[str, Any]]:
         low, high, looked = bounds.low, bounds.high, 0
         stack = [(low, high, self._near(low, high, claim, unit))]
         while stack:
@@ -155,16 +157,18 @@ class Picture:
                 stack.extend((a, b, inner) for a, b in divided(first[k], last[k], motion[:, k], high - low))
         return True, {}
 
-    def _near(self, low: Array, high: Array, claim: Claim, unit: float) -> Array:
-        if not isinstance(self.scene, Splats):
+    def _near(self, low: Array, high: Array, claim: PixelClaim, unit: float) -> Array:
+        if not isinstance(self.scene, ActivatedScene):
             return np.zeros(0, np.int64)
         view = self.poses.view(low[None], high[None])
         return meeting(reaches(self.scene, self.poses.camera, view, unit), claim.row, claim.column)
 
-    def _forms(self, low: Array, high: Array, index: Array, claim: Claim, unit: float) -> tuple[Form, Array, Array]:
+    def _forms(
+        self, low: Array, high: Array, index: Array, claim: PixelClaim, unit: float
+    ) -> tuple[FirstOrderForm, Array, Array]:
         view = self.poses.view(low, high)
         pixel = np.full(len(low), claim.row), np.full(len(low), claim.column)
-        if isinstance(self.scene, Splats):
+        if isinstance(self.scene, ActivatedScene):
             at = np.broadcast_to(index, (len(low), len(index)))
             form, kept, motion = pixels(self.scene, self.poses.camera, view, at, pixel, unit)
         else:
@@ -172,14 +176,16 @@ class Picture:
             kept, motion = np.zeros((len(low), 0), bool), np.ones((low.shape[1], len(low)))
         return form.of(lambda a: a[..., claim.channel]), kept, motion
 
-    def _points(self, bounds: Bounds, points: Array, index: Array, claim: Claim, unit: float) -> tuple[Any, bool]:
+    def _points(
+        self, bounds: ClaimedBounds, points: Array, index: Array, claim: PixelClaim, unit: float
+    ) -> tuple[Any, bool]:
         """A pose at which the picture surely lies outside the bounds, and whether one of the points can't be proved."""
         form, _, _ = self._forms(points, points, index, claim, unit)
         error, zero = np.abs(form.g).sum(axis=0) + form.r, np.zeros_like(points)
         hopeless = (np.maximum(*bounds.excess(points, zero, form)) > 0.0).any()
         for side, sign in (("lower", 1.0), ("upper", -1.0)):
             # the least picture above the upper bound, the largest below the lower one
-            shifted = Form(form.c + sign * 2.0 * error, 0.0 * form.g, error)
+            shifted = FirstOrderForm(form.c + sign * 2.0 * error, 0.0 * form.g, error)
             out = bounds.excess(points, zero, shifted)[side == "upper"] - 4e-13 * (1.0 + np.abs(form.c))
             k = int(np.argmax(np.where(np.isfinite(out) & np.isfinite(error), out, -1.0)))
             if np.isfinite(out[k]) and out[k] > 0.0 and np.isfinite(error[k]):
@@ -190,7 +196,7 @@ class Picture:
 
 def units(scene: Any, report: dict[str, Any]) -> tuple[float, ...]:
     """Roundoffs of the pictures that are tried: float32's first, where that is claimed and this program has charges."""
-    mine = isinstance(scene, Splats) and scene.rules.tiles
+    mine = isinstance(scene, ActivatedScene) and scene.rules.tiles
     return (FLOAT, 0.0) if mine and report.get("guarantee") == "float32-sound" else (0.0,)
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ns_abstract.check.forms import Form, U, fixed, parameters, product, rotation
+from ns_abstract.check.forms import FirstOrderForm, U, fixed, parameters, product, rotation
 
 Array = Any
 
@@ -17,7 +17,7 @@ _BASE = 256.0 * U
 
 
 @dataclass(frozen=True)
-class Camera:
+class CheckedCamera:
     """A pinhole camera: [3, 4] camera-to-world, OpenGL axes; focal lengths, centre and size in pixels."""
 
     pose: Array
@@ -42,29 +42,29 @@ class Poses:
         following: Pose [3, 4] at the end of the segment, or None.
     """
 
-    camera: Camera
+    camera: CheckedCamera
     names: tuple[str, ...]
     values: dict[str, float] = field(default_factory=dict)
     world: bool = False
     orbit: tuple[Array, Array] | None = None
     following: Array | None = None
 
-    def given(self, low: Array, high: Array) -> dict[str, Form]:
+    def given(self, low: Array, high: Array) -> dict[str, FirstOrderForm]:
         """The parameters by name over the boxes [B, d]."""
         middle = 0.5 * (low + high)
         free = parameters(middle, np.maximum(high - middle, middle - low) * (1.0 + 4.0 * U))
-        found = {"": Form.constant(0.0, free[0])} | dict(zip(self.names, free, strict=False))
-        return found | {name: Form.constant(v, free[0]) for name, v in self.values.items()}
+        found = {"": FirstOrderForm.constant(0.0, free[0])} | dict(zip(self.names, free, strict=False))
+        return found | {name: FirstOrderForm.constant(v, free[0]) for name, v in self.values.items()}
 
-    def view(self, low: Array, high: Array) -> View:
+    def view(self, low: Array, high: Array) -> CameraForms:
         """The cameras over the boxes [B, d]."""
-        return View(*self.posed(self.given(low, high)), self.camera.pose)
+        return CameraForms(*self.posed(self.given(low, high)), self.camera.pose)
 
-    def posed(self, p: dict[str, Form]) -> tuple[list[list[Form]], list[Form]]:
+    def posed(self, p: dict[str, FirstOrderForm]) -> tuple[list[list[FirstOrderForm]], list[FirstOrderForm]]:
         """Camera-to-world rotation and position at the parameters."""
         zero, pose = p[""], self.camera.pose
         if self.following is None:
-            turn, place = fixed(pose[:, :3], zero), [Form.constant(v, zero) for v in pose[:, 3]]
+            turn, place = fixed(pose[:, :3], zero), [FirstOrderForm.constant(v, zero) for v in pose[:, 3]]
         else:
             first, last = _nearest_rotation(pose[:, :3]), _nearest_rotation(self.following[:, :3])
             axis, angle = _axis_angle(first.T @ last)
@@ -86,7 +86,7 @@ class Poses:
         return turn, place
 
 
-class View:
+class CameraForms:
     """Where cameras stand over boxes of parameters, all forms [B].
 
     Attributes:
@@ -96,7 +96,7 @@ class View:
         stretch: By how much the keyframe's matrix is no rotation.
     """
 
-    def __init__(self, turn: list[list[Form]], place: list[Form], keyframe: Array) -> None:
+    def __init__(self, turn: list[list[FirstOrderForm]], place: list[FirstOrderForm], keyframe: Array) -> None:
         square = keyframe[:, :3] @ keyframe[:, :3].T
         self.stretch = np.full(len(place[0].c), float(np.linalg.norm(square - np.eye(3))) + _BASE)
         # OpenGL to OpenCV: y and z change their sign

@@ -25,7 +25,7 @@ _WHERE = "give the output folder of ns-abstract-render, ns-abstract-certify or n
 
 
 @dataclass(frozen=True)
-class Cells:
+class StoredCells:
     """Cells of a frame, or of a question about a loop; arrays as docs/results.md describes them.
 
     Attributes:
@@ -57,7 +57,7 @@ def read_report(folder: Path) -> dict[str, Any]:
     return report
 
 
-def read_cells(folder: Path, name: str, index: int, digest: object) -> Cells:
+def read_cells(folder: Path, name: str, index: int, digest: object) -> StoredCells:
     """A frame file, checked before anything in it is unpacked."""
     file = folder / name
     try:
@@ -93,7 +93,7 @@ def read_cells(folder: Path, name: str, index: int, digest: object) -> Cells:
         raise BadInput("cannot be read as a frame file", file, fix=_AGAIN) from None
     if not all(np.isfinite(a).all() for a in arrays.values()):
         raise BadInput("holds numbers that are not finite", file, fix=_AGAIN)
-    return Cells(index, tuple(map(str, table["name"])), table["lower"], table["upper"], arrays)
+    return StoredCells(index, tuple(map(str, table["name"])), table["lower"], table["upper"], arrays)
 
 
 def _header(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> tuple[tuple[int, ...], np.dtype]:
@@ -107,7 +107,7 @@ def _header(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> tuple[tuple[int
     return shape, kind
 
 
-def read_verdicts(folder: Path, report: dict[str, Any]) -> list[Cells]:
+def read_verdicts(folder: Path, report: dict[str, Any]) -> list[StoredCells]:
     """The cells of a certificate or a loop: by frame, or by question (0 safe, 1 reaches)."""
     file, rows, total, found = folder / "cells.sqlite", 0, 0, {}
     loop = report.get("kind") == "loop"
@@ -138,7 +138,7 @@ def read_verdicts(folder: Path, report: dict[str, Any]) -> list[Cells]:
             if any(a.shape != (len(entries), len(names)) or not np.isfinite(a).all() for a in boxes.values()):
                 raise ValueError
             verdicts = [e[2:] for e in entries]
-            cells.append(Cells(index, tuple(names), np.array(low), np.array(high), boxes, verdicts))
+            cells.append(StoredCells(index, tuple(names), np.array(low), np.array(high), boxes, verdicts))
     except (sqlite3.Error, OSError, ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
         if isinstance(error, BadInput):
             raise
@@ -146,7 +146,7 @@ def read_verdicts(folder: Path, report: dict[str, Any]) -> list[Cells]:
     return cells
 
 
-def structure(cells: Cells, report: dict[str, Any]) -> list[str]:
+def structure(cells: StoredCells, report: dict[str, Any]) -> list[str]:
     """What is wrong with a frame's cells: they must be a partition of the set, every pixel bounded, counts right."""
     a, wrong = cells.arrays, []
     if (a["box_lower"] > a["box_upper"]).any():
@@ -163,19 +163,19 @@ def structure(cells: Cells, report: dict[str, Any]) -> list[str]:
     groups: dict[tuple[int, ...], list[int]] = {}
     for k, tile in enumerate(tiles):
         groups.setdefault(tile, []).append(k)
-    seen: dict[bytes, bool] = {}
+    checked: dict[bytes, bool] = {}
     for tile, members in groups.items():
         low, high = a["box_lower"][members], a["box_upper"][members]
         key = low.tobytes() + high.tobytes()
-        if key not in seen:
-            seen[key] = partition(low, high, cells.lower, cells.upper) == 1
-        if not seen[key]:
+        if key not in checked:
+            checked[key] = partition(low, high, cells.lower, cells.upper) == 1
+        if not checked[key]:
             wrong.append(f"the cells of tile {list(tile)} are no partition of the set")
             break
     return wrong
 
 
-def _tallies(cells: Cells, report: dict[str, Any]) -> list[str]:
+def _tallies(cells: StoredCells, report: dict[str, Any]) -> list[str]:
     """Verdicts of a frame or question against the report, whose parts are sums of disjoint cells' volumes."""
     question = ("safe", "reaches")[min(cells.index, 1)]
     entry = (report.get("questions") or {}).get(question) or {}

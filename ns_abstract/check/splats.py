@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ns_abstract.check.forms import TINY, Form, U, total
-from ns_abstract.check.poses import Camera, View
+from ns_abstract.check.forms import TINY, FirstOrderForm, U, total
+from ns_abstract.check.poses import CameraForms, CheckedCamera
 
 Array = Any
 
@@ -27,7 +27,7 @@ ROOM = 1e-12
 LONGEST = 96
 
 
-class Rules(NamedTuple):
+class VersionRules(NamedTuple):
     """What differs between gsplat's versions: alpha's cap, least compensation, tiles that cut."""
 
     cap: float
@@ -36,15 +36,15 @@ class Rules(NamedTuple):
 
 
 RULES = {
-    "1.4.0": Rules(0.999, 0.0, True),
+    "1.4.0": VersionRules(0.999, 0.0, True),
     # from 1.5 on a box holds every pixel with an alpha above the threshold, so that tiles change nothing
-    "1.5.3": Rules(0.999, 0.0, False),
-    "1.6.0": Rules(float(np.float32(0.99)), float(np.float32(0.005)), False),
+    "1.5.3": VersionRules(0.999, 0.0, False),
+    "1.6.0": VersionRules(float(np.float32(0.99)), float(np.float32(0.005)), False),
 }
 
 
 @dataclass(frozen=True)
-class Splats:
+class ActivatedScene:
     """A scene's activated Gaussians: float64 arrays and how far they may be from the real numbers.
 
     Attributes:
@@ -63,13 +63,13 @@ class Splats:
     degree: int
     antialiased: bool
     background: Array
-    rules: Rules
+    rules: VersionRules
 
 
 def activated(
     means: Array, logs: Array, quats: Array, logits: Array, sh: Array, *, sigmoid: bool, degree: int,
     antialiased: bool, background: Array, version: str,
-) -> Splats:  # fmt: skip
+) -> ActivatedScene:  # fmt: skip
     """The scene of stored float32 parameters."""
     logs, q, logits = (v.astype(np.float64) for v in (logs, quats, logits))
     scales = np.exp(logs)
@@ -83,13 +83,13 @@ def activated(
         axis=1,
     ).reshape(-1, 3, 3)  # fmt: skip
     opacity = 1.0 / (1.0 + np.exp(np.minimum(-logits, 700.0)))
-    return Splats(
+    return ActivatedScene(
         means.astype(np.float64), turn * scales[:, None, :], scales, opacity, sh.astype(np.float64),
         sigmoid, degree, antialiased, np.asarray(background, np.float64), RULES[version],
     )  # fmt: skip
 
 
-def reaches(splats: Splats, cam: Camera, view: View, unit: float) -> Array:
+def reaches(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit: float) -> Array:
     """Ends [N, 4] in pixels (left, right, top, bottom) of where each Gaussian may show for some pose of one box.
 
     A Gaussian that shows nowhere has crossed ends.
@@ -129,66 +129,66 @@ def meeting(ends: Array, row: int, column: int) -> Array:
     return np.flatnonzero((ends[:, 0] <= x) & (ends[:, 1] >= x) & (ends[:, 2] <= y) & (ends[:, 3] >= y))
 
 
-def wide(form: Form) -> Form:
+def wide(form: FirstOrderForm) -> FirstOrderForm:
     """Forms [B] as forms [B, 1]."""
     return form.of(lambda a: a[..., None])
 
 
-def _points(splats: Splats, view: View, index: Array, unit: float) -> list[Form]:
+def _points(splats: ActivatedScene, view: CameraForms, index: Array, unit: float) -> list[FirstOrderForm]:
     """Camera coordinates [B, n] of the means.
 
     In float32 the pose is rounded, R C and R mu are sums of three: less than 8 units of |R| (|mu| + |C|).
     """
     means, origin = splats.means[index], view.origin[:, None, :]
     far = np.abs(means) + np.abs(origin) + np.sum([e.size() for e in view.position], axis=0)[:, None, None]
-    found = []
+    coordinates = []
     for row, move in zip(view.rotation, view.shift, strict=True):
         parts = [wide(e) * (means - origin)[..., s] for s, e in enumerate(row)]
         error = np.sum([wide(e).size() * far[..., s] for s, e in enumerate(row)], axis=0)
-        found.append((total(parts) + wide(move)).wider((4.0 * U + 8.0 * unit) * error))
-    return found
+        coordinates.append((total(parts) + wide(move)).wider((4.0 * U + 8.0 * unit) * error))
+    return coordinates
 
 
-class _Fragments(NamedTuple):
+class _PixelFragments(NamedTuple):
     """Alphas and depths [B, n] and colours [B, n, 3] of Gaussians, and which may show at all."""
 
-    alpha: Form
-    color: Form
-    depth: Form
+    alpha: FirstOrderForm
+    color: FirstOrderForm
+    depth: FirstOrderForm
     shows: Array
     motion: Array
 
 
-class Projected(NamedTuple):
+class ProjectedForms(NamedTuple):
     """Gaussians on the image plane, forms [B, n]: all that does not depend on the pixel.
 
     ``axes`` are the three columns of the covariance's root, ``errors`` those of the covariance's entries in float32,
     ``kappa`` the exponent's relative error there; ``color`` [B, n, 3].
     """
 
-    centre: list[Form]
-    axes: list[list[Form]]
-    squares: list[Form]
-    inverse: Form
-    opacity: Form
-    color: Form
-    depth: Form
+    centre: list[FirstOrderForm]
+    axes: list[list[FirstOrderForm]]
+    squares: list[FirstOrderForm]
+    inverse: FirstOrderForm
+    opacity: FirstOrderForm
+    color: FirstOrderForm
+    depth: FirstOrderForm
     errors: list[Array]
     kappa: Array
 
-    def among(self, index: Array) -> Projected:
+    def among(self, index: Array) -> ProjectedForms:
         """Rows of Gaussians ``index`` [W, n] out of one row of all [1, N]."""
 
         def pick(part: Any) -> Any:
             if isinstance(part, list):
                 return [pick(e) for e in part]
-            return part.of(lambda a: a[..., 0, index]) if isinstance(part, Form) else part[0, index]
+            return part.of(lambda a: a[..., 0, index]) if isinstance(part, FirstOrderForm) else part[0, index]
 
         rest = {name: pick(getattr(self, name)) for name in self._fields if name != "color"}
-        return Projected(**rest, color=self.color.of(lambda a: a[..., 0, index, :]))
+        return ProjectedForms(**rest, color=self.color.of(lambda a: a[..., 0, index, :]))
 
 
-def projected(splats: Splats, cam: Camera, view: View, at: Array, unit: float) -> Projected:
+def projected(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, at: Array, unit: float) -> ProjectedForms:
     """The Gaussians ``at`` [B, n] for cameras over B boxes."""
     x, y, z = _points(splats, view, at, unit)
     iz = z.reciprocal()
@@ -218,16 +218,16 @@ def projected(splats: Splats, cam: Camera, view: View, at: Array, unit: float) -
         h = [(iz * f).size() * (1.0 + e.size()) for e, f in zip(slopes, (cam.fx, cam.fy), strict=True)]
         errors, kappa, error = _rounded(det, (mm, nn), h, sizes)
         flat, det = flat.wider(error), det.wider(error)
-    opacity = Form.constant(splats.opacity[at], z, 32.0 * U * splats.opacity[at])
+    opacity = FirstOrderForm.constant(splats.opacity[at], z, 32.0 * U * splats.opacity[at])
     if splats.antialiased:
         opacity = opacity * _factor(flat, det, splats.rules.least_factor, unit)
     color = _colors(splats, view, at, z, unit)
-    return Projected(centre, roots, [mm, nn, mn], inverse, opacity, color, z, errors, kappa)
+    return ProjectedForms(centre, roots, [mm, nn, mn], inverse, opacity, color, z, errors, kappa)
 
 
 def _fragments(
-    splats: Splats, cam: Camera, p: Projected, index: Array, pixel: tuple[Array, Array], unit: float
-) -> _Fragments:
+    splats: ActivatedScene, cam: CheckedCamera, p: ProjectedForms, index: Array, pixel: tuple[Array, Array], unit: float
+) -> _PixelFragments:
     rules, (mx, my), (m, n), opacity, z = splats.rules, p.centre, p.axes, p.opacity, p.depth
     dx, dy = (e + -(place[:, None] + 0.5) for e, place in ((mx, pixel[1]), (my, pixel[0])))
     near = total((n[k] * dx - m[k] * dy).square() for k in range(3))
@@ -259,10 +259,10 @@ def _fragments(
     gone = np.where(shows, 1.0, 0.0)
     alpha = alpha.boxed(rough, bottom, np.maximum(top, bottom)).of(lambda a: a * gone)
     motion = np.where(shows[None], np.abs(mx.g) + np.abs(my.g), 0.0).max(axis=2, initial=0.0)
-    return _Fragments(alpha, p.color, z, shows, motion)
+    return _PixelFragments(alpha, p.color, z, shows, motion)
 
 
-def _rounded(det: Form, squares: Any, h: list[Array], sizes: Array) -> tuple[list[Array], Array, Array]:
+def _rounded(det: FirstOrderForm, squares: Any, h: list[Array], sizes: Array) -> tuple[list[Array], Array, Array]:
     """Errors in float32 of the covariance's entries (xx, yy, xy), of the exponent (relative) and of determinants.
 
     The covariance J R M M^T R^T J^T is a sum of products of factors that err by 12 (J), 2 (R) and 64 units of a scale
@@ -282,7 +282,7 @@ def _rounded(det: Form, squares: Any, h: list[Array], sizes: Array) -> tuple[lis
     return [ea, ec, eb], kappa, error
 
 
-def _factor(flat: Form, det: Form, least: float, unit: float) -> Form:
+def _factor(flat: FirstOrderForm, det: FirstOrderForm, least: float, unit: float) -> FirstOrderForm:
     """The opacity's factor sqrt(max(0, det before / det after the blur)), not below ``least``."""
     (low, high), (dlow, dhigh) = flat.range(), det.range()
     room, limit = ROOM + 16.0 * unit, 1.0 if not unit else 1e3
@@ -297,7 +297,7 @@ def _factor(flat: Form, det: Form, least: float, unit: float) -> Form:
     return root.boxed(rough, bottom, np.maximum(top, bottom)).clamped(least, limit + ROOM)
 
 
-def _tiles(cam: Camera, pixel: Any, centre: Any, squares: Any, unit: float) -> tuple[Array, Array]:
+def _tiles(cam: CheckedCamera, pixel: Any, centre: Any, squares: Any, unit: float) -> tuple[Array, Array]:
     """Whether gsplat 1.4.0 may, and surely does, list a Gaussian for the pixel's tile."""
     (al, ah), (bl, bh), (ml, mh) = (e.range() for e in squares)
     al, bl = np.maximum(al, 0.0), np.maximum(bl, 0.0)
@@ -322,15 +322,15 @@ def _tiles(cam: Camera, pixel: Any, centre: Any, squares: Any, unit: float) -> t
     return maybe, certain
 
 
-def _colors(splats: Splats, view: View, at: Array, like: Form, unit: float) -> Form:
+def _colors(splats: ActivatedScene, view: CameraForms, at: Array, like: FirstOrderForm, unit: float) -> FirstOrderForm:
     """Colours [B, n, 3]."""
     sh = splats.sh[at]
     flat = like.of(lambda a: np.broadcast_to(a[..., None], (*a.shape, 3)))
     if splats.sigmoid:
         value = 1.0 / (1.0 + np.exp(-sh[..., 0, :]))
-        return Form.constant(value, flat, (32.0 * U + 16.0 * unit) * value)
+        return FirstOrderForm.constant(value, flat, (32.0 * U + 16.0 * unit) * value)
     size = np.abs(sh[..., 0, :]) + 1.0
-    found = Form.constant(0.28209479177387814 * sh[..., 0, :] + 0.5, flat, (8.0 * U + 4.0 * unit) * size)
+    color = FirstOrderForm.constant(0.28209479177387814 * sh[..., 0, :] + 0.5, flat, (8.0 * U + 4.0 * unit) * size)
     if splats.degree and np.any(sh[..., 1:, :]):
         (x, y, z), error = _directions(splats, view, at, unit)
         bands = [y * -0.4886025119029199, z * 0.4886025119029199, x * -0.4886025119029199]
@@ -352,11 +352,13 @@ def _colors(splats: Splats, view: View, at: Array, like: Form, unit: float) -> F
         for k, band in enumerate(bands):
             # slopes of bands are below 8, and 16 roundings of sums of terms below 8 together
             band = band.wider(8.0 * error + 128.0 * unit)
-            found = found + wide(band) * sh[..., k + 1, :]
-    return found.clamped(0.0, np.inf)
+            color = color + wide(band) * sh[..., k + 1, :]
+    return color.clamped(0.0, np.inf)
 
 
-def _directions(splats: Splats, view: View, at: Array, unit: float) -> tuple[list[Form], Array]:
+def _directions(
+    splats: ActivatedScene, view: CameraForms, at: Array, unit: float
+) -> tuple[list[FirstOrderForm], Array]:
     """Unit vectors from the camera to the means, world axes, and how far those in float32 may be from them.
 
     Version 1.6.0 takes -R^T t with the view matrix, which differs where a keyframe's rotation is not orthonormal.
@@ -371,7 +373,7 @@ def _directions(splats: Splats, view: View, at: Array, unit: float) -> tuple[lis
     return [e * inverse for e in parts], np.where(np.isfinite(error), error, np.inf if unit else 0.0)
 
 
-def blended(f: _Fragments, background: Array, unit: float) -> tuple[Form, Array]:
+def blended(f: _PixelFragments, background: Array, unit: float) -> tuple[FirstOrderForm, Array]:
     """The blended colours [B, 3] before the clamp, and which of the fragments [B, n] matter."""
     # those that do not show stand behind all others
     order = np.argsort(np.where(f.shows, f.depth.c, np.inf), axis=1, kind="stable")
@@ -417,13 +419,13 @@ def blended(f: _Fragments, background: Array, unit: float) -> tuple[Form, Array]
         rest = 0.5 * (upper - lower) * (1.0 + ROOM) + 8.0 * U * (np.abs(form.c) + 1.0)
         middle = 0.5 * (lower + upper)
     bad = ~np.isfinite(rest)
-    form = Form(form.c + np.where(bad, 0.0, middle), form.g, form.r + np.where(bad, np.inf, rest))
+    form = FirstOrderForm(form.c + np.where(bad, 0.0, middle), form.g, form.r + np.where(bad, np.inf, rest))
     keep = np.zeros((count, n), bool)
     np.put_along_axis(keep, order, (place[:, :-1] < end + 1) & shows, 1)
     return form, keep
 
 
-def _groups(depth: Form, shows: Array) -> tuple[Array, Array, Array]:
+def _groups(depth: FirstOrderForm, shows: Array) -> tuple[Array, Array, Array]:
     """[B, n + 1] whether all in front of a place in the order is surely in front of all behind it; ranges of depth."""
     n = shows.shape[1]
     weight = shows / np.maximum(shows.sum(axis=1, keepdims=True), 1)
@@ -438,7 +440,9 @@ def _groups(depth: Form, shows: Array) -> tuple[Array, Array, Array]:
     return clean, low, high
 
 
-def from_the_back(alpha: Form, color: Form, inside: Array, background: Array, unit: float) -> Form:
+def from_the_back(
+    alpha: FirstOrderForm, color: FirstOrderForm, inside: Array, background: Array, unit: float
+) -> FirstOrderForm:
     """The colours [B, 3] of fragments that are blended in the order of their centres.
 
     S' = S + alpha (C - S): errors of S are met by 1 - alpha, those of C by alpha. In float32 a fragment's light errs by
@@ -459,7 +463,7 @@ def from_the_back(alpha: Form, color: Form, inside: Array, background: Array, un
         r = (r + ra * (np.abs(d) + tilt) + s * tilt) * (1.0 + 16.0 * U) + 32.0 * U * size + TINY
         c, g = c + a * d, g + a * dg + da * d
     # what is outside of the colours is not known better than that
-    return Form(c, g, np.where(np.isfinite(r), r, np.inf)).wider((4.0 * n + 16.0) * unit * size)
+    return FirstOrderForm(c, g, np.where(np.isfinite(r), r, np.inf)).wider((4.0 * n + 16.0) * unit * size)
 
 
 def _swaps(dlow: Array, dhigh: Array, inside: Array, most: Array, ah: Array, cl: Array, ch: Array) -> Any:
@@ -489,8 +493,13 @@ def _swaps(dlow: Array, dhigh: Array, inside: Array, most: Array, ah: Array, cl:
 
 
 def pixels(
-    splats: Splats, cam: Camera, view: View | Projected, index: Array, pixel: tuple[Array, Array], unit: float = 0.0
-) -> tuple[Form, Array, Array]:
+    splats: ActivatedScene,
+    cam: CheckedCamera,
+    view: CameraForms | ProjectedForms,
+    index: Array,
+    pixel: tuple[Array, Array],
+    unit: float = 0.0,
+) -> tuple[FirstOrderForm, Array, Array]:
     """Colours [B, 3] before the clamp of one pixel over each of B boxes; which Gaussians matter [B, n]; their motion.
 
     The motion [d, B], in pixels, is what each parameter moves a Gaussian by at most, about.
@@ -503,25 +512,30 @@ def pixels(
         unit: 0 for the picture in real numbers, `FLOAT` for all those in float32.
     """
     with np.errstate(all="ignore"):
-        if not isinstance(view, Projected):
+        if not isinstance(view, ProjectedForms):
             view = projected(splats, cam, view, np.maximum(index, 0), unit)
         f = _fragments(splats, cam, view, index, pixel, unit)
         used = np.flatnonzero(f.shows.any(axis=0))
         if not len(used):
             plain = np.zeros((len(index), 3))
-            form = Form(plain + splats.background, np.zeros((len(f.alpha.g), *plain.shape)), plain + 16.0 * unit)
+            form = FirstOrderForm(
+                plain + splats.background, np.zeros((len(f.alpha.g), *plain.shape)), plain + 16.0 * unit
+            )
             return form, f.shows, f.motion
-        some = _Fragments(
-            f.alpha.of(lambda a: a[..., used]), f.color.of(lambda a: a[..., used, :]),
-            f.depth.of(lambda a: a[..., used]), f.shows[:, used], f.motion,
-        )  # fmt: skip
+        some = _PixelFragments(
+            f.alpha.of(lambda a: a[..., used]),
+            f.color.of(lambda a: a[..., used, :]),
+            f.depth.of(lambda a: a[..., used]),
+            f.shows[:, used],
+            f.motion,
+        )
         form, keep = blended(some, splats.background, unit)
         kept = np.zeros(f.shows.shape, bool)
         kept[:, used] = keep
         return form, kept, f.motion
 
 
-def picture(splats: Splats, cam: Camera, view: View, unit: float) -> Form:
+def picture(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit: float) -> FirstOrderForm:
     """The picture [H, W, 3] over one box of poses."""
     ends, columns, parts = reaches(splats, cam, view, unit), np.arange(cam.width), []
     inside = (ends[:, 0] <= cam.width) & (ends[:, 1] >= 0.0) & (ends[:, 2] <= cam.height) & (ends[:, 3] >= 0.0)
@@ -537,4 +551,4 @@ def picture(splats: Splats, cam: Camera, view: View, unit: float) -> Form:
             place[: len(numbers)] = numbers
         part, pixel = whole.among(index), (np.full(cam.width, row), columns)
         parts.append(pixels(splats, cam, part, index, pixel, unit)[0].clamped(0.0, 1.0))
-    return Form(*(np.stack([getattr(p, name) for p in parts], axis=-3) for name in ("c", "g", "r")))
+    return FirstOrderForm(*(np.stack([getattr(p, name) for p in parts], axis=-3) for name in ("c", "g", "r")))

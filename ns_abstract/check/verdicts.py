@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from ns_abstract.check.forms import Form, fixed, product, rotation, total
+from ns_abstract.check.forms import FirstOrderForm, fixed, product, rotation, total
 from ns_abstract.check.inputs import BadInput
-from ns_abstract.check.networks import Network
+from ns_abstract.check.networks import CheckedNetwork
 from ns_abstract.check.pictures import FIRST, Verdict, divided, units
-from ns_abstract.check.poses import TURNS, Camera, Poses, View
-from ns_abstract.check.results import Cells
-from ns_abstract.check.splats import FLOAT, Splats, picture
+from ns_abstract.check.poses import TURNS, CameraForms, CheckedCamera, Poses
+from ns_abstract.check.results import StoredCells
+from ns_abstract.check.splats import FLOAT, ActivatedScene, picture
 
 Array = Any
 
@@ -31,11 +31,13 @@ class _Verdicts(ABC):
 
     kinds: tuple[str, ...] = ("certified",)
 
-    def __init__(self, cells: Cells, scene: Any, report: dict[str, Any], model: Path, about: dict[str, Any]) -> None:
+    def __init__(
+        self, cells: StoredCells, scene: Any, report: dict[str, Any], model: Path, about: dict[str, Any]
+    ) -> None:
         self.cells, self.scene, self.units = cells, scene, units(scene, report)
         self.rows = [k for k, v in enumerate(cells.verdicts or []) if v[0] in self.kinds]
         self.count = len(self.rows)
-        if not isinstance(scene, Splats):
+        if not isinstance(scene, ActivatedScene):
             raise BadInput("is of a NeRF, of which this program checks pictures alone", model, "renderer")
         self.shape = about.get("preprocess") or {}
         if not model.is_file():
@@ -46,12 +48,12 @@ class _Verdicts(ABC):
             raise BadInput("takes pictures that this program does not make", model, "preprocess")
         own = report["fingerprint"].get("network_arithmetic") == "float32"
         try:
-            self.network = Network(model, about.get("output"), FLOAT if own else 0.0)
+            self.network = CheckedNetwork(model, about.get("output"), FLOAT if own else 0.0)
         except Exception as error:  # onnx raises whatever a damaged file makes it run into
             raise BadInput(" ".join(str(error).split())[:160] or "cannot be read", model) from None
 
     @classmethod
-    def claims(cls, cells: Cells) -> bool:
+    def claims(cls, cells: StoredCells) -> bool:
         """Whether something is claimed."""
         return any(v[0] in cls.kinds for v in cells.verdicts or [])
 
@@ -64,7 +66,7 @@ class _Verdicts(ABC):
         """The claim for check.json."""
         return {"cell": claim, "parameters": list(self.cells.names)}
 
-    def resized(self, camera: Camera) -> Camera:
+    def resized(self, camera: CheckedCamera) -> CheckedCamera:
         """The camera at the size of the network's input."""
         height, width = self.shape.get("resize") or (camera.height, camera.width)
         down, across = height / camera.height, width / camera.width
@@ -73,10 +75,10 @@ class _Verdicts(ABC):
             width=int(width), height=int(height),
         )  # fmt: skip
 
-    def inputs(self, camera: Camera, views: list[View], unit: float) -> Form:
+    def inputs(self, camera: CheckedCamera, views: list[CameraForms], unit: float) -> FirstOrderForm:
         """The network's inputs [B, 3, H, W] over boxes of poses, one view each."""
         parts = [picture(self.scene, camera, view, unit) for view in views]
-        image = Form(*(np.stack([getattr(p, name) for p in parts], axis=-4) for name in ("c", "g", "r")))
+        image = FirstOrderForm(*(np.stack([getattr(p, name) for p in parts], axis=-4) for name in ("c", "g", "r")))
         image = image.of(lambda a: np.moveaxis(a, -1, -3))
         if self.shape.get("channels", "RGB") == "BGR":
             image = image.of(lambda a: a[..., ::-1, :, :])
@@ -123,12 +125,12 @@ class _Verdicts(ABC):
         """An upper bound of that at one point [1, d]."""
 
 
-class Certificate(_Verdicts):
+class CheckedCertificate(_Verdicts):
     """The claims of a frame's cells: a class is the largest output on every picture of a cell, or not on one."""
 
     kinds = "certified", "falsified"
 
-    def __init__(self, cells: Cells, scene: Any, poses: Poses, report: dict[str, Any], model: Path) -> None:
+    def __init__(self, cells: StoredCells, scene: Any, poses: Poses, report: dict[str, Any], model: Path) -> None:
         about = report["property"]
         if about.get("type") != "classification":
             raise BadInput(f"{about.get('type')!r} is a property that this program does not check", model, "type")
@@ -139,7 +141,7 @@ class Certificate(_Verdicts):
         rows[:, self.label] += 1.0
         self.rivals = torch.cat([rows[: self.label], rows[self.label + 1 :]])
 
-    def _inputs(self, low: Array, high: Array, unit: float) -> Form:
+    def _inputs(self, low: Array, high: Array, unit: float) -> FirstOrderForm:
         views = [self.poses.view(low[k : k + 1], high[k : k + 1]) for k in range(len(low))]
         return self.inputs(self.camera, views, unit)
 
@@ -152,10 +154,10 @@ class Certificate(_Verdicts):
         return float(-self.network.least(self._inputs(point, point, 0.0), -self.rivals).max())
 
 
-class Loop(_Verdicts):
+class CheckedLoop(_Verdicts):
     """The claims of a question about a loop: no run from a cell comes to harm, and (question 1) all reach the goal."""
 
-    def __init__(self, cells: Cells, scene: Any, report: dict[str, Any], model: Path) -> None:
+    def __init__(self, cells: StoredCells, scene: Any, report: dict[str, Any], model: Path) -> None:
         self.loop = loop = report["loop"]
         super().__init__(cells, scene, report, model, loop)
         if loop["dynamics"].get("type") != "affine":
@@ -165,17 +167,17 @@ class Loop(_Verdicts):
         height, width = self.shape["resize"]
         focal = float(height / 2.0 / np.tan(float(loop["camera"]["fov"]) * (np.pi / 180.0) / 2.0))
         pose = np.array(loop["camera"]["camera_to_world"], np.float64)[:3]
-        self.camera = Camera(pose, focal, focal, width / 2.0, height / 2.0, int(width), int(height))
+        self.camera = CheckedCamera(pose, focal, focal, width / 2.0, height / 2.0, int(width), int(height))
         self.steps, self.names = int(loop["steps"]), list(loop["state"])
 
-    def _state(self, low: Array, high: Array) -> list[Form]:
+    def _state(self, low: Array, high: Array) -> list[FirstOrderForm]:
         poses = Poses(self.camera, self.cells.names)
         given, start = poses.given(low, high), self.loop["initial"]
         zero = given[""]
         ends = {n: v if isinstance(v, (int, float)) else v[0] for n, v in start.items()}
         return [given[n] if n in given else zero + float(ends[n]) for n in self.names]
 
-    def _view(self, x: list[Form]) -> View:
+    def _view(self, x: list[FirstOrderForm]) -> CameraForms:
         about = self.loop["camera"]
         position = about.get("position") or {"offset": [0.0] * 3, "matrix": [[0.0] * len(x)] * 3}
         place = [_affine(row, x, o) for row, o in zip(position["matrix"], position["offset"], strict=True)]
@@ -183,9 +185,9 @@ class Loop(_Verdicts):
         for name, axis in TURNS.items():
             if about.get(name):
                 turn = product(turn, rotation(np.array(axis), _affine(about[name]["row"], x, about[name]["offset"])))
-        return View(turn, place, self.camera.pose)
+        return CameraForms(turn, place, self.camera.pose)
 
-    def _next(self, x: list[Form], unit: float) -> list[Form]:
+    def _next(self, x: list[FirstOrderForm], unit: float) -> list[FirstOrderForm]:
         law, control = self.loop["dynamics"], self.loop.get("control") or {}
         count = len(x[0].c)
         views = [self._view([e.of(lambda a, k=k: a[..., k : k + 1]) for e in x]) for k in range(count)]
@@ -226,11 +228,11 @@ class Loop(_Verdicts):
         return np.inf
 
 
-def _affine(row: Any, x: list[Form], constant: float) -> Form:
+def _affine(row: Any, x: list[FirstOrderForm], constant: float) -> FirstOrderForm:
     return total(e * float(v) for v, e in zip(row, x, strict=True)) + float(constant)
 
 
-def _outside(area: dict[str, Any], x: list[Form], names: list[str], inner: bool = False) -> Array:
+def _outside(area: dict[str, Any], x: list[FirstOrderForm], names: list[str], inner: bool = False) -> Array:
     """How far states surely are outside of a closed set, or, negated, how far inside of an open box if ``inner``."""
     if "half_space" in area:
         return -(_affine(area["half_space"]["normal"], x, -float(area["half_space"]["at_least"])).range()[1])

@@ -34,7 +34,7 @@ _TITLES = {
 
 
 @dataclass
-class Scenes:
+class SceneBenchmark:
     """What is measured."""
 
     load_config: tuple[Path, ...] = ()
@@ -53,7 +53,7 @@ class Scenes:
 
 
 @dataclass
-class Cell(Scenes):
+class CellBenchmark(SceneBenchmark):
     """What one bounded cell costs in units of the concrete render of the same view."""
 
     sets: tuple[str, ...] = ("x",)
@@ -63,7 +63,7 @@ class Cell(Scenes):
 
 
 @dataclass
-class Compile(Scenes):
+class Compile(SceneBenchmark):
     """What compiling costs at first use, by kernel: seconds by the clock, of the processor, and inside LLVM."""
 
     sets: tuple[str, ...] = ("x",)
@@ -71,7 +71,7 @@ class Compile(Scenes):
 
 
 @dataclass
-class Tightness(Scenes):
+class Tightness(SceneBenchmark):
     """Error against run time: ratio of outer to inner gap, with curves."""
 
     sets: tuple[str, ...] = ("x", "yaw")
@@ -87,7 +87,7 @@ class Tightness(Scenes):
 
 
 @dataclass
-class Soundness(Scenes):
+class Soundness(SceneBenchmark):
     """Attack abstract images by random poses, corners, gradient ascent and threshold jumps."""
 
     sets: tuple[str, ...] = ("x", "yaw", "roll", "six", "segments", "orbit")
@@ -107,7 +107,7 @@ class Soundness(Scenes):
 
 
 @dataclass
-class Plan(Scenes):
+class PlanBenchmark(SceneBenchmark):
     """Take back, one by one, what a scene's plan leaves out: what it costs, and how bounds differ."""
 
     sets: tuple[str, ...] = ("x", "yaw")
@@ -119,7 +119,7 @@ class Plan(Scenes):
 
 
 @dataclass
-class Rules(Scenes):
+class RulesBenchmark(SceneBenchmark):
     """Our bounds against the paper's rules, on the same Gaussians, pixels and cells."""
 
     sets: tuple[str, ...] = ("x", "yaw")
@@ -135,7 +135,7 @@ class Rules(Scenes):
 
 
 @dataclass
-class Rays(Scenes):
+class Rays(SceneBenchmark):
     """Random rays of a NeRF: CPU seconds by ray to a ratio, then attacks on the bounds."""
 
     sets: tuple[str, ...] = ("yaw",)
@@ -159,7 +159,7 @@ class Rays(Scenes):
 
 
 @dataclass
-class Scale(Scenes):
+class ScaleBenchmark(SceneBenchmark):
     """Cost and peak memory of a cell, by number of Gaussians (the scene is resampled) and size of the picture."""
 
     set: str = "x"
@@ -177,7 +177,7 @@ class Scale(Scenes):
 
 
 @dataclass
-class Certificates(Scenes):
+class Certificates(SceneBenchmark):
     """Certified fraction against time, by set of poses."""
 
     model: Path | None = None
@@ -337,7 +337,7 @@ def stiff(options: Stiff) -> int:
     return 1 if failed else DONE
 
 
-def scale(options: Scale) -> int:
+def scale(options: ScaleBenchmark) -> int:
     """Measure how cost grows; the table and the picture are written after every row."""
     from ns_abstract.bench.plots import save_scale
     from ns_abstract.bench.scale import curve
@@ -374,16 +374,16 @@ def certificates(options: Certificates) -> int:
         load_camera_path(file, options.downscale_factor),
         SceneSource(options.load_config[0], overrides=options.overrides).open(),
     )
-    known = SETS if path.perturbations[options.frame] is None else {**SETS, "path": path.perturbations[options.frame]}
+    sets = SETS if path.perturbations[options.frame] is None else {**SETS, "path": path.perturbations[options.frame]}
     for name in options.sets:
-        if name not in known:
-            raise InputError(f"found {name}", field="--sets", fix=f"the sets are {', '.join(known)}")
+        if name not in sets:
+            raise InputError(f"found {name}", field="--sets", fix=f"the sets are {', '.join(sets)}")
     rows: list[dict[str, Any]] = []
     for name in options.sets:
         marks = [mark for mark in options.marks if mark <= options.seconds]
         rows.append(
             curve(
-                scene, path.cameras[options.frame], name, known[name], options.model, options.property, options.seconds,
+                scene, path.cameras[options.frame], name, sets[name], options.model, options.property, options.seconds,
                 options.workers, marks, _said, path.following(options.frame),
             )
         )  # fmt: skip
@@ -401,21 +401,23 @@ def loops(options: Loops) -> int:
     if options.runs < 1:
         raise InputError(f"found {options.runs}", field="--runs", fix="give a number of at least 1")
     marks = [mark for mark in options.marks if mark <= options.seconds]
-    found = measure(
+    tables = measure(
         SceneSource(options.load_config, overrides=options.overrides).open(), options.loop, options.seconds,
         options.workers, options.runs, marks,
         options.seed, _said,
     )  # fmt: skip
-    for name, rows in (("loops", found.search), ("loops-steps", found.steps)):
+    for name, rows in (("loops", tables.search), ("loops-steps", tables.steps)):
         if rows:
             write(rows, options.output_dir, name, _TITLES["loops"] if name == "loops" else "Widths by step")
             print(markdown(rows))
-    return 1 if found.search[0]["violations"] else DONE
+    return 1 if tables.search[0]["violations"] else DONE
 
 
-def rows_of(options: Cell | Compile | Soundness | Plan | Rules | Rays, job: PathJob, name: str) -> list[dict[str, Any]]:
+def rows_of(
+    options: CellBenchmark | Compile | Soundness | PlanBenchmark | RulesBenchmark | Rays, job: PathJob, name: str
+) -> list[dict[str, Any]]:
     """What a benchmark without curves finds for one scene and set of poses."""
-    if isinstance(options, Cell):
+    if isinstance(options, CellBenchmark):
         from ns_abstract.bench.cell import cell_cost
 
         return [cell_cost(job, name, options.frame, options.repeats)]
@@ -432,7 +434,7 @@ def rows_of(options: Cell | Compile | Soundness | Plan | Rules | Rays, job: Path
                 options.scale, options.target_ratio,
             )
         ]  # fmt: skip
-    if isinstance(options, Plan):
+    if isinstance(options, PlanBenchmark):
         from ns_abstract.bench.plan import without
 
         return without(job, name, options.frame, options.cells, options.scale)
@@ -455,14 +457,14 @@ def rows_of(options: Cell | Compile | Soundness | Plan | Rules | Rays, job: Path
 
 
 def bench(
-    options: Cell
+    options: CellBenchmark
     | Compile
     | Tightness
     | Soundness
-    | Plan
-    | Rules
+    | PlanBenchmark
+    | RulesBenchmark
     | Rays
-    | Scale
+    | ScaleBenchmark
     | Certificates
     | Loops
     | Stiff
@@ -473,7 +475,7 @@ def bench(
         return vnnlib(options)
     if isinstance(options, Stiff):
         return stiff(options)
-    if isinstance(options, Scale):
+    if isinstance(options, ScaleBenchmark):
         return scale(options)
     if isinstance(options, Certificates):
         return certificates(options)
@@ -496,7 +498,7 @@ def bench(
     results = {}
     for job in jobs:
         for name in options.sets:
-            told = len(rows)
+            printed = len(rows)
             if isinstance(options, Tightness):
                 from ns_abstract.bench.tightness import refine, summary
 
@@ -508,7 +510,7 @@ def bench(
             else:
                 rows += rows_of(options, job, name)
             lines = markdown(rows).splitlines()
-            print("\n".join(lines[0 if not told else 2 + told :]), flush=True)
+            print("\n".join(lines[0 if not printed else 2 + printed :]), flush=True)
     kind = type(options).__name__.lower()
     write(rows, options.output_dir, kind, _TITLES[kind])
     if results:
@@ -533,14 +535,14 @@ def main() -> None:
     """Entry point of the console script."""
     kinds = tyro.extras.subcommand_type_from_defaults(
         {
-            "cell": Cell(),
+            "cell": CellBenchmark(),
             "compile": Compile(),
             "tightness": Tightness(),
             "soundness": Soundness(),
-            "plan": Plan(),
-            "rules": Rules(),
+            "plan": PlanBenchmark(),
+            "rules": RulesBenchmark(),
             "rays": Rays(),
-            "scale": Scale(),
+            "scale": ScaleBenchmark(),
             "certificates": Certificates(),
             "loops": Loops(load_config=tyro.MISSING, loop=tyro.MISSING),
             "stiff": Stiff(),

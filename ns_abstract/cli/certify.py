@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from ns_abstract.cli.commands import Certify
-from ns_abstract.cli.common import DONE, INTERRUPTED, Stop, run
+from ns_abstract.cli.common import DONE, INTERRUPTED, SignalStop, run
 from ns_abstract.cli.sets import given_set
 from ns_abstract.io.errors import InputError
 
@@ -25,7 +25,7 @@ def certify(options: Certify) -> int:
         raise InputError(f"found {options.time_budget}", field="--time-budget", fix="give a positive number")
     options.where.check()
     given_set(options)
-    stop = Stop()
+    stop = SignalStop()
     with stop.installed():
         with stop.at_once():
             from ns_abstract.cli.certifying import certify_path
@@ -34,7 +34,7 @@ def certify(options: Certify) -> int:
 
 
 @dataclass
-class Explain:
+class ExplainNetwork:
     """Print a network's layers, and what a cell of it will take; nothing is bounded."""
 
     model: Path
@@ -47,7 +47,7 @@ class Explain:
     """Name of the network's output. Default: the only one."""
 
 
-def explain(options: Explain) -> int:
+def explain(options: ExplainNetwork) -> int:
     """Print what a network consists of; returns the exit code.
 
     Raises:
@@ -65,7 +65,7 @@ def explain(options: Explain) -> int:
 def main() -> None:
     """Entry point of the console script."""
     if "--explain" in sys.argv[1:]:
-        run(explain, lambda: tyro.cli(Explain, prog="ns-abstract-certify"))
+        run(explain, lambda: tyro.cli(ExplainNetwork, prog="ns-abstract-certify"))
     run(certify, lambda: tyro.cli(Certify, prog="ns-abstract-certify"), "give fewer --workers or free memory")
 
 

@@ -14,7 +14,7 @@ from ns_abstract.api.certification import Certification, open_certification
 from ns_abstract.api.certifying import CertificateQuestion, CertifyProgress, check_network_memory, network_memory
 from ns_abstract.api.compiling import compile_beside
 from ns_abstract.api.job import check_frames
-from ns_abstract.cli.common import Stop, plain_console
+from ns_abstract.cli.common import SignalStop, plain_console
 from ns_abstract.cli.options import stated
 from ns_abstract.report.certificate import CertifiedRun, coverage
 from ns_abstract.report.figures import percent
@@ -34,12 +34,12 @@ class _Display:
         self.console, self.progress = console, progress
         self.task = progress.add_task("cells", total=1.0, state="")
 
-    def opened(self, store: Store) -> None:
+    def on_open(self, store: Store) -> None:
         if store.resumed:
             text = f"  {store.count} cells kept from before, {store.open_blocks} blocks open"
             self.console.print(text, markup=False)
 
-    def told(self, point: CertifyProgress) -> None:
+    def on_progress(self, point: CertifyProgress) -> None:
         shares = {"certified": point.certified, "falsified": point.falsified, "unknown": point.unknown}
         state = ", ".join(f"{kind} {percent(share)}" for kind, share in shares.items())
         self.progress.update(self.task, completed=1.0 - point.open, state=state)
@@ -52,7 +52,7 @@ def _introduce(console: Console, job: Certification, about: CertifiedRun) -> Non
         console.print(f"  {note}", markup=False, soft_wrap=True)
 
 
-def certify_path(options: Certify, stop: Stop) -> bool:
+def certify_path(options: Certify, stop: SignalStop) -> bool:
     """Search the frames and write the results; returns whether every frame has one.
 
     Raises:
@@ -69,7 +69,7 @@ def certify_path(options: Certify, stop: Stop) -> bool:
     _introduce(console, job, question.about)
 
     def opened(store: Store) -> None:
-        display.opened(store)
+        display.on_open(store)
         if options.where.engine == "local":
             # once, and not in every worker
             with stop.at_once():
@@ -90,7 +90,7 @@ def certify_path(options: Certify, stop: Stop) -> bool:
                 options.resume,
                 scene_margin=options.scene_margin,
                 on_open=opened,
-                on_progress=display.told,
+                on_progress=display.on_progress,
                 on_margin=lambda found: console.print(f"scene margin: {found.sentence}", markup=False, soft_wrap=True),
             ),
         )

@@ -48,7 +48,7 @@ def check(options: Check) -> int:
     """
     from ns_abstract.api.checking import check as audited
 
-    found = audited(
+    audit = audited(
         options.output_dir,
         claims=options.claims,
         seconds=options.seconds,
@@ -59,9 +59,9 @@ def check(options: Check) -> int:
         model=options.model,
         loop=options.loop,
     )
-    for text in found.structure:
+    for text in audit.structure:
         print(f"refuted: {text}")
-    for entry in found.refutations[:10]:
+    for entry in audit.refutations[:10]:
         where = f"frame {entry['frame']}, cell {entry['cell']}"
         if "pixel" in entry:
             row, column = entry["pixel"]
@@ -71,17 +71,17 @@ def check(options: Check) -> int:
             what = f"the margin is {entry['margin']:.6g} at most, {entry['excess']:.2g} below what is claimed"
         print(f"refuted: {where}: {what} at {entry['pose']}")
     print(
-        f"{found.claims} claims: {found.proved} proved ({found.float32} of every float32 evaluation, the others of the "
-        f"picture in real numbers), {found.refuted} refuted, {found.unsettled} not settled; "
-        f"{found.median_seconds:.2g} s a claim"
+        f"{audit.claims} claims: {audit.proved} proved ({audit.float32} of every float32 evaluation, the others of the "
+        f"picture in real numbers), {audit.refuted} refuted, {audit.unsettled} not settled; "
+        f"{audit.median_seconds:.2g} s a claim"
     )
-    share, count = found.uniform["holds_at_least"], found.uniform["claims"]
+    share, count = audit.uniform["holds_at_least"], audit.uniform["claims"]
     print(
         f"at least {100.0 * share:.1f} % of all claims hold in real numbers, and "
-        f"{100.0 * found.uniform['float32_at_least']:.1f} % in float32 (95 % confidence, {count} drawn uniformly)"
+        f"{100.0 * audit.uniform['float32_at_least']:.1f} % in float32 (95 % confidence, {count} drawn uniformly)"
     )
     print(f"details: {options.output_dir / 'check.json'}")
-    return found.exit_code
+    return audit.exit_code
 
 
 def main() -> None:

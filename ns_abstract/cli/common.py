@@ -35,7 +35,7 @@ _COMPLAINT = 600
 os.environ.setdefault("GOMP_SPINCOUNT", "3000")
 
 
-class Stop(StopRequest):
+class SignalStop(StopRequest):
     """Turns SIGINT and SIGTERM into a request to stop; a second signal stops at once."""
 
     def __init__(self) -> None:
@@ -50,7 +50,7 @@ class Stop(StopRequest):
             os.write(2, b"stopping; what is finished is being saved (once more: stop at once)\n")
 
     @contextmanager
-    def installed(self) -> Iterator[Stop]:
+    def installed(self) -> Iterator[SignalStop]:
         """Handle the signals inside the block."""
         with self.handling(*_SIGNALS), self._watched():
             yield self
@@ -149,9 +149,9 @@ def complaint(text: str) -> str:
 
 def _named(lines: list[str]) -> list[str]:
     """Options that lines begin with; their help stands below them, further in."""
-    found = [match for line in lines if (match := re.match(r"( +)(--?[a-z][\w-]*)", line))]
-    outermost = min((len(match[1]) for match in found), default=0)
-    return [match[2] for match in found if len(match[1]) == outermost]
+    matches = [match for line in lines if (match := re.match(r"( +)(--?[a-z][\w-]*)", line))]
+    outermost = min((len(match[1]) for match in matches), default=0)
+    return [match[2] for match in matches if len(match[1]) == outermost]
 
 
 def plain_console() -> Any:
@@ -189,14 +189,14 @@ def run(
         raise KeyboardInterrupt
 
     if threading.current_thread() is threading.main_thread():
-        # until `Stop` handles them, and after
+        # until `SignalStop` handles them, and after
         for number in _SIGNALS:
             signal.signal(number, leave)
     try:
         try:
-            given = parse(options)
+            parsed = parse(options)
             _check_address_space()
-            code = main(given)
+            code = main(parsed)
         finally:
             over = True
     except InputError as error:

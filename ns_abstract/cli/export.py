@@ -70,7 +70,7 @@ class Ply:
 
 
 @dataclass
-class VnnLib(GivenSet):
+class ExportVnnLib(GivenSet):
     """Abstract images, a network and a property as ONNX and VNN-LIB, for other verifiers.
 
     Cuts the set of poses of a frame into boxes and writes for each NAME.onnx, whose input is the box's parameters in
@@ -135,23 +135,23 @@ Command = (
     | Annotated[Png, tyro.conf.subcommand("png")]
     | Annotated[Mp4, tyro.conf.subcommand("mp4")]
     | Annotated[Ply, tyro.conf.subcommand("ply")]
-    | Annotated[VnnLib, tyro.conf.subcommand("vnnlib")]
+    | Annotated[ExportVnnLib, tyro.conf.subcommand("vnnlib")]
     | Annotated[Occupancy, tyro.conf.subcommand("occupancy")]
 )
 
 
-def export(options: Npz | Png | Mp4 | Ply | VnnLib | Occupancy) -> int:
+def export(options: Npz | Png | Mp4 | Ply | ExportVnnLib | Occupancy) -> int:
     """Run the command; returns the exit code.
 
     Raises:
         InputError: A file or an option cannot be used.
     """
-    into = isinstance(options, (Png, VnnLib))
+    into = isinstance(options, (Png, ExportVnnLib))
     target = options.output_dir if into else options.output_filename
     try:
         if not into:
             target.parent.mkdir(parents=True, exist_ok=True)
-        if isinstance(options, VnnLib):
+        if isinstance(options, ExportVnnLib):
             notes = _vnnlib(options)
         elif isinstance(options, Occupancy):
             notes = _occupancy(options)
@@ -204,11 +204,11 @@ def _occupancy(options: Occupancy) -> list[str]:
     return [grid.describe()]
 
 
-def _vnnlib(options: VnnLib) -> list[str]:
+def _vnnlib(options: ExportVnnLib) -> list[str]:
     from ns_abstract.api.certification import CertifySettings, open_certification
     from ns_abstract.api.job import check_frames
     from ns_abstract.io.atomic import write_atomic
-    from ns_abstract.verify.cells import Grid
+    from ns_abstract.verify.cells import CellGrid
 
     if options.timeout < 1:
         raise InputError(f"found {options.timeout}", field="--timeout", fix="give a number of at least 1")
@@ -233,7 +233,7 @@ def _vnnlib(options: VnnLib) -> list[str]:
         box = job.job.pose_sets[frame].box
         parts = options.parts or (1,) * box.dimensions
         try:
-            grid = Grid.fixed(box, parts, parts)
+            grid = CellGrid.fixed(box, parts, parts)
         except InputError as error:
             raise InputError(error.problem, field="--parts", fix=error.fix) from None
         for k, cell in enumerate(grid.roots()):

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from ns_abstract.cli.common import DONE, INTERRUPTED, Stop, plain_console, run
+from ns_abstract.cli.common import DONE, INTERRUPTED, SignalStop, plain_console, run
 from ns_abstract.cli.options import EngineOptions, Overrides, Program, ProgramOptions, SceneOverrides, Where, stated
 from ns_abstract.io.errors import InputError
 
@@ -62,7 +62,7 @@ def reach(options: Reach) -> int:
     if not 0.0 < options.time_budget < float("inf"):
         raise InputError(f"found {options.time_budget}", field="--time-budget", fix="give a positive number")
     options.where.check()
-    stop = Stop()
+    stop = SignalStop()
     with stop.installed():
         with stop.at_once():
             from ns_abstract.api.cell_search import CellSearch, Request
@@ -79,7 +79,7 @@ def reach(options: Reach) -> int:
         console = plain_console()
         said = 0.0
 
-        def told(point: ReachProgress) -> None:
+        def on_progress(point: ReachProgress) -> None:
             nonlocal said
             if point.seconds - said < _EVERY and point.open > 0.0:
                 return
@@ -96,8 +96,10 @@ def reach(options: Reach) -> int:
                 options.resume,
                 scene_margin=options.scene_margin,
                 on_open=lambda store: compile_beside(job.job, 0) if options.where.engine == "local" else None,
-                on_progress=told,
-                on_margin=lambda found: console.print(f"scene margin: {found.sentence}", markup=False, soft_wrap=True),
+                on_progress=on_progress,
+                on_margin=lambda reach_run: console.print(
+                    f"scene margin: {reach_run.sentence}", markup=False, soft_wrap=True
+                ),
             ),
         )
         for question, entry in document["questions"].items():

@@ -7,7 +7,7 @@ from dataclasses import replace
 import tyro
 
 from ns_abstract.cli.commands import Render
-from ns_abstract.cli.common import DONE, INTERRUPTED, Stop, run
+from ns_abstract.cli.common import DONE, INTERRUPTED, SignalStop, run
 from ns_abstract.cli.sets import given_set
 from ns_abstract.io.errors import InputError
 
@@ -26,15 +26,15 @@ def explain(options: Render) -> int:
     from ns_abstract.api.explaining import explain as explained
     from ns_abstract.api.files import open_job
     from ns_abstract.api.job import check_frames
-    from ns_abstract.execution.engines import Here
+    from ns_abstract.execution.engines import SerialEngine
 
     job = open_job(replace(options.settings, workers=1))
     check_explained(job)
     frames = check_frames(options.frames, job.frame_count)
-    stop = Stop()
+    stop = SignalStop()
     with stop.installed():
         results = bound_frames(
-            job, frames, engine=Here(), budget=options.time_budget or _EXPLAINED_S * len(frames),
+            job, frames, engine=SerialEngine(), budget=options.time_budget or _EXPLAINED_S * len(frames),
             target_ratio=options.target_ratio, keep_leaves=True, stop=stop,
         )  # fmt: skip
         for result in results:
@@ -83,7 +83,7 @@ def render(options: Render) -> int:
         raise InputError(f"found {options.seed}", field="--seed", fix="give a number of at least 0")
     options.where.check()
     given_set(options)
-    stop = Stop()
+    stop = SignalStop()
     with stop.installed():
         with stop.at_once():
             from ns_abstract.cli.rendering import render_path

@@ -15,12 +15,12 @@ from ns_abstract.api.compiling import compile_beside
 from ns_abstract.api.explaining import check_explained, explain
 from ns_abstract.api.files import PathJob, open_job
 from ns_abstract.api.job import Job, check_frames, platform_problems
-from ns_abstract.cli.common import Stop, plain_console
+from ns_abstract.cli.common import SignalStop, plain_console
 from ns_abstract.cli.options import stated
 from ns_abstract.execution.engines import Engine
 from ns_abstract.io.folder import claim
 from ns_abstract.report.figures import listed
-from ns_abstract.report.record import Report, Run, failed_self_check
+from ns_abstract.report.record import Report, RunRecord, failed_self_check
 
 if TYPE_CHECKING:
     from ns_abstract.cli.commands import Render
@@ -29,9 +29,9 @@ if TYPE_CHECKING:
 _SECONDS_BY_FRAME = 60.0
 
 
-def make_run(job: PathJob, options: Render, frames: tuple[int, ...], problems: tuple[str, ...]) -> Run:
+def make_run(job: PathJob, options: Render, frames: tuple[int, ...], problems: tuple[str, ...]) -> RunRecord:
     """What the report says about the command; ``problems`` of the platform take the guarantee away."""
-    return Run(
+    return RunRecord(
         guarantee="sampled" if problems else job.method.guarantee,
         renderer=job.method.program,
         scene=job.describe(),
@@ -46,7 +46,7 @@ def make_run(job: PathJob, options: Render, frames: tuple[int, ...], problems: t
     )
 
 
-def render_path(options: Render, stop: Stop) -> bool:
+def render_path(options: Render, stop: SignalStop) -> bool:
     """Bound the frames and write the results; returns whether every frame has one.
 
     Raises:
@@ -83,7 +83,7 @@ def render_path(options: Render, stop: Stop) -> bool:
     return not report.missing
 
 
-def _fill(report: Report, job: Job, options: Render, engine: Engine, stop: Stop, console: Console) -> None:
+def _fill(report: Report, job: Job, options: Render, engine: Engine, stop: SignalStop, console: Console) -> None:
     """Bound what is pending and write it."""
     # a frame without bounds comes before one that could be tighter
     missing = set(report.missing)
@@ -101,13 +101,13 @@ def _fill(report: Report, job: Job, options: Render, engine: Engine, stop: Stop,
             meter = _Meter(progress, len(pending), options.target_ratio)
             results = bounding.bound_frames(
                 job, pending, engine=engine, budget=budget, target_ratio=options.target_ratio,
-                keep_leaves=options.save_cells or options.explain, stop=stop, on_progress=meter.told,
+                keep_leaves=options.save_cells or options.explain, stop=stop, on_progress=meter.on_progress,
                 found_before=report.stored,
             )  # fmt: skip
             for done, result in enumerate(results, 1):
                 # first what was asked for: drawing loads matplotlib
-                kept = result if options.save_cells else replace(result, leaves=None)
-                _tell(console, report.add(kept, picture=False))
+                stored_result = result if options.save_cells else replace(result, leaves=None)
+                _tell(console, report.add(stored_result, picture=False))
                 report.draw(result.index)
                 if options.explain and result.bounded and not stop():
                     with stop.at_once():
@@ -155,7 +155,7 @@ class _Meter:
     def finished(self, frames: int) -> None:
         self.progress.update(self.task, completed=frames)
 
-    def told(self, point: bounding.Progress) -> None:
+    def on_progress(self, point: bounding.Progress) -> None:
         part = min(0.99, point.seconds / point.budget)
         if point.covered < 1.0:
             state = f"frame {point.frame}: covering the set, {point.covered:.0%}"

@@ -39,7 +39,7 @@ def given_set(options: GivenSet) -> dict[str, Any] | None:
     if options.perturbation_filename is not None:
         field = "--translation" if options.translation is not None else "--rotation"
         raise InputError("given beside --perturbation-filename", field=field, fix="give one of them")
-    found: dict[str, Any] = {"version": 1, "units": options.units, "angle_units": options.angle_units}
+    perturbation: dict[str, Any] = {"version": 1, "units": options.units, "angle_units": options.angle_units}
     for name, axes in _AXES.items():
         radii = getattr(options, name)
         if radii is None:
@@ -47,5 +47,5 @@ def given_set(options: GivenSet) -> dict[str, Any] | None:
         if len(radii) not in (1, 3):
             fix = f"give one radius, or three for {', '.join(axes)}"
             raise InputError(f"found {len(radii)} numbers", field=f"--{name}", fix=fix)
-        found[name] = dict(zip(axes, radii if len(radii) == 3 else radii * 3, strict=True))
-    return found
+        perturbation[name] = dict(zip(axes, radii if len(radii) == 3 else radii * 3, strict=True))
+    return perturbation

@@ -43,7 +43,7 @@ class Viewer:
 
 
 @dataclass
-class View:
+class ViewRun:
     """View a trained run with lower and upper bounds of what its camera could show.
 
     nerfstudio's viewer with the output types abstract_lower, abstract_upper, abstract_gap and
@@ -64,7 +64,7 @@ class View:
     overrides: SceneOverrides = field(default_factory=Overrides)
 
 
-def view(options: View) -> int:
+def view(options: ViewRun) -> int:
     """Run the command until it is interrupted; returns the exit code.
 
     Raises:
@@ -91,7 +91,7 @@ def view(options: View) -> int:
 
 def main() -> None:
     """Entry point of the console script."""
-    run(view, lambda: tyro.cli(tyro.conf.FlagConversionOff[View], prog="ns-abstract-viewer"))
+    run(view, lambda: tyro.cli(tyro.conf.FlagConversionOff[ViewRun], prog="ns-abstract-viewer"))
 
 
 if __name__ == "__main__":

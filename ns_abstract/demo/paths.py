@@ -7,25 +7,25 @@ from typing import Any
 
 import numpy as np
 
-from ns_abstract.geometry.views import View, around, look_at, path_json, ring
+from ns_abstract.geometry.keyframe_cameras import KeyframeCamera, around, look_at, path_json, ring
 from ns_abstract.io.atomic import write_json
 
 #: The middle of the airfield's aircraft.
 TARGET = (0.0, 0.0, 0.01)
 
 
-def airfield_views(size: int = 200) -> list[View]:
+def airfield_views(size: int = 200) -> list[KeyframeCamera]:
     """Five views of the airfield: from the aircraft's side round to the front, runway behind it."""
     places = ((-62.0, 13.0), (-50.0, 14.0), (-37.0, 15.0), (-25.0, 16.0), (-12.0, 17.0))
     return [around(TARGET, a, e, 1.0, height=size, width=size) for a, e in places]
 
 
-def dataset_views(count: int = 10, size: int = 200) -> list[View]:
+def dataset_views(count: int = 10, size: int = 200) -> list[KeyframeCamera]:
     """Views all around the airfield for the data set beside a run."""
     return ring(TARGET, 1.05, count, size)
 
 
-def gate_views(count: int = 10, size: int = 200) -> list[View]:
+def gate_views(count: int = 10, size: int = 200) -> list[KeyframeCamera]:
     """Views along the gate's course for the data set beside a run; the nearer to the gate, the nearer to its axis."""
     rng = np.random.default_rng(0)
     end = 0.06 + 0.1 * 0.35 * 24
@@ -36,7 +36,7 @@ def gate_views(count: int = 10, size: int = 200) -> list[View]:
     for place in np.stack([along, across, up], axis=1):
         pose = look_at((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
         pose[:3, 3] = place
-        found.append(View(pose, 60.0, size, size))
+        found.append(KeyframeCamera(pose, 60.0, size, size))
     return found
 
 

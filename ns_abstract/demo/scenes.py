@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from ns_abstract.geometry.views import View, look_at, path_json
+from ns_abstract.geometry.keyframe_cameras import KeyframeCamera, look_at, path_json
 from ns_abstract.io.arrays import open_archive
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer, NerfScene
@@ -25,14 +25,14 @@ _POSITION, _DIRECTION = Encoding(10, 0.0, 8.0), Encoding(4, 0.0, 4.0)
 _WIDTH, _LAYERS, _SKIP, _HEAD = 256, 8, 4, 128
 
 
-class _Reader(Protocol):
+class _ArchiveUnpickler(Protocol):
     """Reads an array of a type and shape; None stands for any length."""
 
     def __call__(self, name: str, kind: type, *shape: int | None) -> NDArray[Any]: ...
 
 
 @contextmanager
-def _stored(file: Path) -> Iterator[_Reader]:
+def _stored(file: Path) -> Iterator[_ArchiveUnpickler]:
     """Open an archive of the package.
 
     Raises:
@@ -114,14 +114,14 @@ def buoy_scene() -> NerfScene:
     return NerfScene(weights, weights, background=np.array([1.0, 1.0, 1.0], np.float32), name="buoy")
 
 
-def buoy_views(count: int = 8, size: int = 64) -> list[View]:
+def buoy_views(count: int = 8, size: int = 64) -> list[KeyframeCamera]:
     """Views all around the buoy for the data set beside the run."""
     angles = 2.0 * np.pi * np.arange(count) / count
     eyes = [(3.2 * np.cos(a), 3.2 * np.sin(a), 1.2) for a in angles]
-    return [View(look_at(eye, (0.0, 0.0, 0.1)), 40.0, size, size) for eye in eyes]
+    return [KeyframeCamera(look_at(eye, (0.0, 0.0, 0.1)), 40.0, size, size) for eye in eyes]
 
 
 def buoy_path(size: int = 16) -> dict[str, Any]:
     """One small view of the buoy, and a yaw of 0.002 rad either way."""
-    view = View(look_at((2.6, -1.8, 1.2), (0.0, 0.0, 0.1)), 40.0, size, size)
+    view = KeyframeCamera(look_at((2.6, -1.8, 1.2), (0.0, 0.0, 0.1)), 40.0, size, size)
     return path_json([view], seconds=1.0, perturbation={"version": 1, "rotation": {"yaw": 0.002}})

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from ns_abstract.demo.paths import dataset_views, gate_views, write_airfield_paths
 from ns_abstract.demo.scenes import DATA, buoy_path, buoy_scene, buoy_views, splat_scene
-from ns_abstract.geometry.camera_path import Camera, focal_length
-from ns_abstract.geometry.views import View
+from ns_abstract.geometry.camera_path import PinholeCamera, focal_length
+from ns_abstract.geometry.keyframe_cameras import KeyframeCamera
 from ns_abstract.io.atomic import write_json
 from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.methods.splat.activate import activate
@@ -31,12 +31,12 @@ def write_nerf_demo(folder: Path) -> tuple[Path, Path]:
     return config, write_json(folder / "camera_path_buoy.json", buoy_path())
 
 
-def _picture(renderer: Renderer) -> Callable[[View], NDArray[np.float64]]:
+def _picture(renderer: Renderer) -> Callable[[KeyframeCamera], NDArray[np.float64]]:
     """Gives the image [H, W, 3] of a view."""
 
-    def picture(view: View) -> NDArray[np.float64]:
+    def picture(view: KeyframeCamera) -> NDArray[np.float64]:
         focal = focal_length(view.fov, view.height, "fov")
-        camera = Camera(
+        camera = PinholeCamera(
             camera_to_world=view.camera_to_world,
             fx=focal,
             fy=focal,

@@ -24,11 +24,11 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple, Protocol
 from urllib.parse import urlsplit
 
-from ns_abstract.execution.ending import AbandonedError, abandoning, end_with_parent
+from ns_abstract.execution.cancellation import WorkCancelledError, cancel_when, end_with_parent
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import file_size
 
-#: Asks a worker to give up its task at the next `checkpoint`.
+#: Asks a worker to give up its task at the next `check_cancelled`.
 _GIVE_UP = signal.SIGUSR1
 #: Times that a task is begun again when its worker dies.
 _RETRIES = 3
@@ -101,7 +101,7 @@ class Engine(Protocol):
         ...
 
 
-class Here:
+class SerialEngine:
     """This process; `collect` does one task."""
 
     capacity = 1
@@ -128,7 +128,7 @@ class Here:
         self._tasks.clear()
 
 
-class _Worker(NamedTuple):
+class _WorkerProcess(NamedTuple):
     process: Any
     connection: Connection
 
@@ -144,8 +144,8 @@ class Processes:
 
     def __init__(self, count: int) -> None:
         self._context = multiprocessing.get_context("spawn")
-        self._idle: list[_Worker] = []
-        self._busy: dict[Connection, tuple[_Worker, int, Task]] = {}
+        self._idle: list[_WorkerProcess] = []
+        self._busy: dict[Connection, tuple[_WorkerProcess, int, Task]] = {}
         self._deaths: dict[int, int] = {}
         self._begun: set[Connection] = set()
         self.starting = True
@@ -171,7 +171,7 @@ class Processes:
         """Tasks that `collect` has not given back."""
         return len(self._busy) + len(self._waiting)
 
-    def _start(self) -> _Worker:
+    def _start(self) -> _WorkerProcess:
         ours, theirs = self._context.Pipe()
         before = {name: os.environ.get(name) for name in _THREADS}
         os.environ.update(dict.fromkeys(_THREADS, "1"))
@@ -183,14 +183,14 @@ class Processes:
                 os.environ.pop(name, None) if value is None else os.environ.__setitem__(name, value)
         # so that the end of the process ends the connection
         theirs.close()
-        return _Worker(process, ours)
+        return _WorkerProcess(process, ours)
 
     def submit(self, key: int, function: Callable[..., Any], *arguments: Any) -> None:
         self._waiting.append((key, (function, arguments)))
         self._feed()
 
     def abandon(self) -> None:
-        """Ask running tasks to end early; `collect` gives `AbandonedError` as the result of those that do."""
+        """Ask running tasks to end early; `collect` gives `WorkCancelledError` as the result of those that do."""
         self._waiting.clear()
         for worker, _, _ in self._busy.values():
             if worker.process.is_alive():
@@ -223,7 +223,7 @@ class Processes:
         self._waiting.insert(0, (key, task))
 
     def collect(self, seconds: float) -> list[tuple[int, Any]]:
-        found: list[tuple[int, Any]] = []
+        results: list[tuple[int, Any]] = []
         for connection in wait(list(self._busy), seconds):
             assert isinstance(connection, Connection)
             try:
@@ -240,9 +240,9 @@ class Processes:
             self.starting = False
             if not good:
                 raise value
-            found.append((key, value))
+            results.append((key, value))
         self._feed()
-        return found
+        return results
 
     def close(self) -> None:
         workers = [*self._idle, *(worker for worker, _, _ in self._busy.values())]
@@ -277,23 +277,23 @@ def _needs_guard(script: Path) -> InputError:
 def _serve(connection: Connection) -> None:
     """Run a worker: receive tasks, send (good, result or exception), until the connection ends."""
     end_with_parent()
-    asked = threading.Event()
+    cancel_requested = threading.Event()
 
     # a terminal sends Ctrl-C to all; the parent decides
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
-    signal.signal(_GIVE_UP, lambda number, frame: asked.set())
+    signal.signal(_GIVE_UP, lambda number, frame: cancel_requested.set())
     connection.send(_BEGUN)
     while True:
         try:
             function, arguments = connection.recv()
         except EOFError:
             return
-        asked.clear()
+        cancel_requested.clear()
         try:
-            with abandoning(asked.is_set):
+            with cancel_when(cancel_requested.is_set):
                 answer = (True, function(*arguments))
-        except AbandonedError as given_up:
+        except WorkCancelledError as given_up:
             answer = (True, given_up)
         except Exception as error:
             answer = (False, error)
@@ -477,12 +477,12 @@ class Tls:
         Raises:
             InputError: Some are missing, a file cannot be read, or there is no scheduler to talk to.
         """
-        given = {"--tls-ca-file": ca_file, "--tls-cert": cert, "--tls-key": key}
-        if not any(given.values()):
+        options = {"--tls-ca-file": ca_file, "--tls-cert": cert, "--tls-key": key}
+        if not any(options.values()):
             return None
-        for name, file in given.items():
+        for name, file in options.items():
             if file is None:
-                raise InputError("missing", field=name, fix=f"give all of {', '.join(given)}")
+                raise InputError("missing", field=name, fix=f"give all of {', '.join(options)}")
             file_size(file, "PEM file")
         if address is None:
             raise InputError("given without --scheduler-address", field="--tls-ca-file", fix="leave it out")
@@ -525,12 +525,12 @@ def _within(seconds: float, make: Callable[[], Any]) -> Any:
         OSError: It does not, or what answers is no scheduler.
         ValueError, TypeError: As ``make``.
     """
-    made: list[Any] = []
+    results: list[Any] = []
     failed: list[Exception] = []
 
     def work() -> None:
         try:
-            made.append(make())
+            results.append(make())
         except Exception as error:
             failed.append(error)
 
@@ -542,9 +542,9 @@ def _within(seconds: float, make: Callable[[], Any]) -> Any:
     if failed:
         # what is no message of Dask's is taken for one, and its first bytes for sizes
         raise ConnectionError(type(failed[0]).__name__)
-    if not made:
+    if not results:
         raise TimeoutError
-    return made[0]
+    return results[0]
 
 
 @contextmanager
@@ -569,8 +569,8 @@ def connected(address: str | None, workers: int = 1, tls: Tls | None = None) -> 
     try:
         if address is None:
             name = "distributed.nanny.pre-spawn-environ"
-            kept = {key: value for key, value in config.get(name, {}).items() if key != _TRIM}
-            with config.set({name: kept}):
+            settings = {key: value for key, value in config.get(name, {}).items() if key != _TRIM}
+            with config.set({name: settings}):
                 client: Any = Client(n_workers=workers, threads_per_worker=1, host=_LOOPBACK, dashboard_address=None)
         elif tls is None:
             client = _within(2.0 * _CONNECT, lambda: Client(address, timeout=_CONNECT))
@@ -623,6 +623,6 @@ def started(name: EngineName, address: str | None, workers: int, tls: Tls | None
         if name == "dask":
             engine: Engine = Cluster(stack.enter_context(connected(address, workers, tls)))
         else:
-            engine = Here() if workers == 1 else Processes(workers)
+            engine = SerialEngine() if workers == 1 else Processes(workers)
         stack.callback(engine.close)
         yield engine

@@ -48,15 +48,15 @@ def most_threads() -> int:
 
 def lane() -> int:
     """Number of the calling piece of work among those of `each` that go on side by side; 0 outside."""
-    found = _lane.get()
-    return 0 if found is None else found.number
+    current = _lane.get()
+    return 0 if current is None else current.number
 
 
 def threads() -> int:
     """How many work side by side, of those that the calling piece of work has to itself."""
-    found = _lane.get()
-    if found is not None:
-        return found.threads
+    current = _lane.get()
+    if current is not None:
+        return current.threads
     most = most_threads()
     return most if _setting.count is None else max(1, min(_setting.count, most))
 
@@ -98,7 +98,7 @@ def each(work: Callable[[T], R], items: Sequence[T]) -> list[R]:
     lanes = min(mine, len(items))
     if lanes < 2:
         return [work(item) for item in items]
-    found: dict[int, R] = {}
+    results: dict[int, R] = {}
     raised: dict[int, Exception] = {}
     turns = itertools.count()
 
@@ -106,11 +106,11 @@ def each(work: Callable[[T], R], items: Sequence[T]) -> list[R]:
         _lane.set(_Lane(number, mine // lanes))
         while not raised and (turn := next(turns)) < len(items):
             try:
-                found[turn] = work(items[turn])
+                results[turn] = work(items[turn])
             except Exception as error:
                 raised[turn] = error
 
     side_by_side(run, lanes)
     if raised:
         raise raised[min(raised)]
-    return [found[turn] for turn in range(len(items))]
+    return [results[turn] for turn in range(len(items))]

@@ -53,9 +53,9 @@ class ParameterBox:
 
     def without(self, names: Sequence[str]) -> ParameterBox:
         """The box without the axes ``names``."""
-        kept = [j for j, name in enumerate(self.names) if name not in names]
+        remaining = [j for j, name in enumerate(self.names) if name not in names]
         parts = (self.names, self.units, self.lower, self.upper)
-        return ParameterBox(*(tuple(part[j] for j in kept) for part in parts))  # pyright: ignore[reportArgumentType]
+        return ParameterBox(*(tuple(part[j] for j in remaining) for part in parts))  # pyright: ignore[reportArgumentType]
 
     def split(self, axis: int, parts: int = 2) -> list[ParameterBox]:
         """``parts`` boxes of equal width along ``axis`` whose union is this box exactly."""

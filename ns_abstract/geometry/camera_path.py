@@ -34,7 +34,7 @@ class Intrinsics(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Camera:
+class PinholeCamera:
     """A pinhole camera.
 
     Attributes:
@@ -62,7 +62,7 @@ class Camera:
         """The camera without its pose."""
         return Intrinsics(self.fx, self.fy, self.cx, self.cy, float(self.width), float(self.height))
 
-    def rescaled(self, downscale_factor: float) -> Camera:
+    def rescaled(self, downscale_factor: float) -> PinholeCamera:
         """The camera of an image ``downscale_factor`` times smaller; sides are rounded down.
 
         Uses the arithmetic of nerfstudio's ``Cameras.rescale_output_resolution``, which holds
@@ -87,7 +87,7 @@ class Camera:
                 fix=f"give a factor from {max(self.width, self.height) / SIDE_LIMIT:.3g}"
                 f" to {min(self.width, self.height)}",
             )
-        return Camera(
+        return PinholeCamera(
             camera_to_world=self.camera_to_world,
             fx=self.fx * float(scale),
             fy=self.fy * float(scale),
@@ -97,13 +97,13 @@ class Camera:
             height=int(sides[1]),
         )
 
-    def resized(self, height: int, width: int) -> Camera:
+    def resized(self, height: int, width: int) -> PinholeCamera:
         """The camera that shows the same picture with other pixels, as if it had been resized.
 
         Each direction has its own factor, so another aspect ratio squeezes the picture.
         """
         down, across = height / self.height, width / self.width
-        return Camera(
+        return PinholeCamera(
             camera_to_world=self.camera_to_world,
             fx=self.fx * across,
             fy=self.fy * down,
@@ -128,7 +128,7 @@ class CameraPath:
         notes: What of the file is not used because nothing is known of it, one sentence each.
     """
 
-    cameras: tuple[Camera, ...]
+    cameras: tuple[PinholeCamera, ...]
     perturbation: Mapping[str, Any] | None
     overrides: tuple[Mapping[str, Any] | None, ...]
     fps: float | None
@@ -146,7 +146,7 @@ class CameraPath:
         """The perturbation object of every camera, for `ns_abstract.PoseSet.from_json`."""
         return tuple(self.perturbation_of(k) for k in range(len(self.cameras)))
 
-    def following(self, index: int) -> Camera | None:
+    def following(self, index: int) -> PinholeCamera | None:
         """The camera after ``index``: after the last one the first where the path closes, else None."""
         if index + 1 < len(self.cameras):
             return self.cameras[index + 1]
@@ -187,7 +187,7 @@ def _photo_path(found: Iterable[FileCamera], source: str, downscale_factor: floa
     """The path of the cameras of photos."""
     cameras = []
     for entry in found:
-        camera = Camera(
+        camera = PinholeCamera(
             camera_to_world=checked_pose([*entry.camera_to_world, [0, 0, 0, 1]], entry.field),
             fx=_pixels(entry.fx, f"{entry.field}: focal length"),
             fy=_pixels(entry.fy, f"{entry.field}: focal length"),
@@ -222,7 +222,7 @@ def _parse(root: dict[str, Any], source: str, downscale_factor: float) -> Camera
     for field, entry in _entries(root, unknown):
         own = {key: entry.get(key, root.get(key)) for key in ("fx", "fy", "cx", "cy")}
         focal = _focal(entry, root, field, height) if own["fx"] is None else _pixels(own["fx"], f"{field}.fx")
-        camera = Camera(
+        camera = PinholeCamera(
             camera_to_world=checked_pose(entry.get("camera_to_world"), f"{field}.camera_to_world"),
             fx=focal,
             fy=focal if own["fy"] is None else _pixels(own["fy"], f"{field}.fy"),
@@ -278,7 +278,7 @@ def _entries(root: dict[str, Any], unknown: list[str]) -> list[tuple[str, dict[s
 
     The viewer interpolates between keyframes, and writes no camera where there is but one of them: it is the camera.
     """
-    found: dict[str, list[tuple[str, dict[str, Any]]]] = {}
+    fields_by_name: dict[str, list[tuple[str, dict[str, Any]]]] = {}
     for name, table in (("camera_path", ENTRY), ("keyframes", KEYFRAME)):
         entries = root.get(name)
         if entries is None and name == "keyframes":
@@ -286,17 +286,17 @@ def _entries(root: dict[str, Any], unknown: list[str]) -> list[tuple[str, dict[s
         if not isinstance(entries, list):
             problem = "missing" if entries is None else f"found {show(entries)}"
             raise InputError(problem, field=name, fix="write a list of cameras")
-        found[name] = []
+        fields_by_name[name] = []
         for i, entry in enumerate(entries):
             field = f"{name}[{i}]"
             if not isinstance(entry, dict):
                 raise InputError(f"found {show(entry)}", field=field, fix="write an object")
             unknown += [f"{name}[].{key}" for key in table.unknown(entry, f"{field}.")]
-            found[name].append((field, entry))
-    if found["camera_path"]:
-        return found["camera_path"]
-    if len(found["keyframes"]) != 1:
-        count = len(found["keyframes"])
+            fields_by_name[name].append((field, entry))
+    if fields_by_name["camera_path"]:
+        return fields_by_name["camera_path"]
+    if len(fields_by_name["keyframes"]) != 1:
+        count = len(fields_by_name["keyframes"])
         raise InputError(
             f"the list is empty, and there are {count} keyframes: the viewer wrote no camera" if count else "empty",
             field="camera_path",
@@ -304,7 +304,7 @@ def _entries(root: dict[str, Any], unknown: list[str]) -> list[tuple[str, dict[s
             if count
             else "write a list of at least one camera",
         )
-    field, keyframe = found["keyframes"][0]
+    field, keyframe = fields_by_name["keyframes"][0]
     matrix = _keyframe_matrix(keyframe.get("matrix"), f"{field}.matrix")
     return [(field, {**keyframe, "camera_to_world": matrix})]
 
@@ -335,8 +335,8 @@ def checked_side(value: Any, name: str) -> int:
     """
     # The viewer may write 1080.0.
     if not is_number(value) or value != math.floor(value) or not 1 <= value <= SIDE_LIMIT:
-        found = "missing" if value is None else f"found {show(value)}"
-        raise InputError(found, field=name, fix=f"write an integer from 1 to {SIDE_LIMIT}")
+        problem = "missing" if value is None else f"found {show(value)}"
+        raise InputError(problem, field=name, fix=f"write an integer from 1 to {SIDE_LIMIT}")
     return int(value)
 
 
@@ -382,8 +382,8 @@ def checked_pose(value: Any, field: str) -> NDArray[np.float64]:
                 raise InputError(f"{len(row)} numbers", field=f"{field}[{i}]", fix="write four numbers")
         value = [number for row in value for number in row]
     if not isinstance(value, list) or len(value) != 16:
-        found = "missing" if value is None else f"found {show(value)}"
-        raise InputError(found, field=field, fix="write 16 numbers, row by row")
+        description = "missing" if value is None else f"found {show(value)}"
+        raise InputError(description, field=field, fix="write 16 numbers, row by row")
     limit = float(np.finfo(np.float32).max)
     for i, number in enumerate(value):
         if not is_number(number) or abs(number) > limit:
@@ -418,7 +418,7 @@ def _refuse_scaled(matrix: NDArray[np.float64], field: str) -> None:
     row = matrix[3]
     if np.abs(row - (0, 0, 0, 1)).max() <= InputTuning.last_row:
         return
-    shown = f"the last row is ({', '.join(f'{x:.6g}' for x in row)}), not (0, 0, 0, 1)"
+    problem = f"the last row is ({', '.join(f'{x:.6g}' for x in row)}), not (0, 0, 0, 1)"
     scale = float(row[3])
     if not row[:3].any() and scale != 0.0:
         with np.errstate(all="ignore"):
@@ -427,8 +427,8 @@ def _refuse_scaled(matrix: NDArray[np.float64], field: str) -> None:
         fix = (
             f"divide all 16 numbers by {scale:.6g}" if whole else "write 1 at its end; the rotation is not scaled by it"
         )
-        raise InputError(f"a scaled matrix: {shown}", field=field, fix=fix)
-    raise InputError(shown, field=field, fix="write the matrix row by row, the position in the fourth column")
+        raise InputError(f"a scaled matrix: {problem}", field=field, fix=fix)
+    raise InputError(problem, field=field, fix="write the matrix row by row, the position in the fourth column")
 
 
 def _perturbation(holder: dict[str, Any], field: str) -> Mapping[str, Any] | None:

@@ -1,4 +1,4 @@
-"""A torch version of `PoseSet.pose`: the same poses, differentiable with respect to the parameters."""
+"""A torch version of `PoseBox.pose`: the same poses, differentiable with respect to the parameters."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ns_abstract.geometry.poses import SCENE_SHIFTS, SCENE_TURNS, PoseSet, axis_angle, orthonormal
+from ns_abstract.geometry.poses import SCENE_SHIFTS, SCENE_TURNS, PoseBox, axis_angle, orthonormal
 from ns_abstract.perturbation.specification import ROTATIONS, TRANSLATIONS
 
 #: Elementary rotation axes of yaw, pitch and roll in camera axes.
@@ -29,12 +29,12 @@ def _turn(axis: Tensor, angle: Tensor) -> Tensor:
     )
 
 
-def differentiable_pose(pose_set: PoseSet) -> Callable[[Tensor], Tensor]:
+def differentiable_pose(pose_set: PoseBox) -> Callable[[Tensor], Tensor]:
     """The function from parameter values [d] to camera-to-world [3, 4], both float64.
 
-    Values are in physical units and in the order of ``pose_set.box``, as for `PoseSet.pose`; the rules
+    Values are in physical units and in the order of ``pose_set.box``, as for `PoseBox.pose`; the rules
     are those of the perturbation file: segment, then orbit, then translation, then yaw, pitch and roll; then those of
-    `PoseSet.registered`.
+    `PoseBox.registered`.
     """
     perturbation = pose_set.perturbation
     start = torch.from_numpy(np.array(pose_set.camera.camera_to_world))

@@ -18,7 +18,7 @@ from ns_abstract.arithmetic.rounding import HALF_UP, POSE_ROUNDING, STILL_ROOM, 
 from ns_abstract.arithmetic.taylor import TaylorArray, TaylorBasis, taylor_cos_sin
 from ns_abstract.arithmetic.trigonometry import cos_sin
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.specification import ROTATIONS, TRANSLATIONS, Perturbation
 
@@ -105,7 +105,7 @@ class PoseForms:
 
 
 @dataclass(frozen=True, eq=False)
-class PoseSet:
+class PoseBox:
     """The set of poses of one frame: a camera and a box of pose parameters around it.
 
     Attributes:
@@ -119,15 +119,17 @@ class PoseSet:
             cells are slanted (`sheared`).
     """
 
-    camera: Camera
+    camera: PinholeCamera
     perturbation: Perturbation
     box: ParameterBox
     fixed: dict[str, float]
-    target_camera: Camera | None = None
+    target_camera: PinholeCamera | None = None
     shear: dict[str, dict[str, float]] = field(default_factory=dict)
 
     @classmethod
-    def around(cls, camera: Camera, perturbation: Perturbation, following: Camera | None = None) -> PoseSet:
+    def around(
+        cls, camera: PinholeCamera, perturbation: Perturbation, following: PinholeCamera | None = None
+    ) -> PoseBox:
         """The set of one keyframe; ``following`` is the next one, used where the sweep is over segments.
 
         Raises:
@@ -164,11 +166,11 @@ class PoseSet:
         return cls(camera, perturbation, box, fixed, segment)
 
     @property
-    def geometry(self) -> PoseSet:
+    def geometry(self) -> PoseBox:
         """The same poses without the parameters that shift colours."""
         return replace(self, box=self.box.without(COLOR_SHIFTS))
 
-    def registered(self, names: tuple[str, ...], radius: float) -> PoseSet:
+    def registered(self, names: tuple[str, ...], radius: float) -> PoseBox:
         """The same poses as seen from a scene that stands elsewhere as a whole (design.md, P3).
 
         Args:
@@ -185,7 +187,7 @@ class PoseSet:
         parts = box.names, box.units, box.lower, box.upper
         return replace(self, box=ParameterBox(*(a + b for a, b in zip(parts, more, strict=True))))  # pyright: ignore[reportArgumentType]
 
-    def sheared(self, shear: dict[str, dict[str, float]]) -> PoseSet:
+    def sheared(self, shear: dict[str, dict[str, float]]) -> PoseBox:
         """The same poses in slanted parameters: rotation = own + sum of factor * other (design.md, P2).
 
         The box holds every pose of the set and, near its ends, parameters of none: see `feasible`; `pose` takes them to
@@ -203,7 +205,7 @@ class PoseSet:
             box = box.replace(axis, low - sum(b for _, b in ends) - room, high - sum(a for a, _ in ends) + room)
         return replace(self, box=box, shear=shear)
 
-    def within(self, box: ParameterBox) -> PoseSet:
+    def within(self, box: ParameterBox) -> PoseBox:
         """The poses of a box of the same parameters, as a set of their own (design.md, V15); not of slanted ones."""
         ranges = dict(self.perturbation.rotation)
         for name, low, high in zip(box.names, box.lower, box.upper, strict=True):
@@ -314,10 +316,10 @@ class PoseSet:
         """Camera-to-world rotation and position over ``box`` in the arithmetic ``kind``, without rounding of `pose`."""
 
         def parameter(name: str) -> Any:
-            found = plain(name)
+            form = plain(name)
             for other, factor in self.shear.get(name, {}).items():
-                found = found + plain(other) * factor
-            return found
+                form = form + plain(other) * factor
+            return form
 
         def plain(name: str) -> Any:
             if name in self.fixed:

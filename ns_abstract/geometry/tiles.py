@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.camera_path import PinholeCamera
 
 
-def tile_grid(camera: Camera, side: int) -> tuple[int, int]:
+def tile_grid(camera: PinholeCamera, side: int) -> tuple[int, int]:
     """Tiles across and down."""
     return -(-camera.width // side), -(-camera.height // side)
 
@@ -21,7 +21,7 @@ def in_tiles(image: np.ndarray, side: int) -> np.ndarray:
     return padded.reshape(down, side, across, side, *rest).swapaxes(1, 2).reshape(-1, side, side, *rest)
 
 
-def assemble(tiles: np.ndarray, camera: Camera) -> np.ndarray:
+def assemble(tiles: np.ndarray, camera: PinholeCamera) -> np.ndarray:
     """The image [H, W, ...] from all its tiles [T, side, side, ...] in row-major order."""
     across, _ = tile_grid(camera, tiles.shape[1])
     return np.ascontiguousarray(laid_out(tiles, across)[: camera.height, : camera.width])

@@ -57,10 +57,10 @@ def claim(folder: Path) -> BinaryIO:
 def _refuse_strangers(folder: Path) -> None:
     if (folder / MARK).exists():
         return
-    found = sorted(entry.name for entry in os.scandir(folder) if _RESULT.fullmatch(entry.name))
-    if found and not _is_report(folder / "report.json"):
+    results = sorted(entry.name for entry in os.scandir(folder) if _RESULT.fullmatch(entry.name))
+    if results and not _is_report(folder / "report.json"):
         raise InputError(
-            f"{found[0]} stands there and was not written by this program",
+            f"{results[0]} stands there and was not written by this program",
             file=folder,
             field="--output-dir",
             fix="choose another folder, or move it away",

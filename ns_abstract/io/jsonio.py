@@ -237,9 +237,9 @@ class _Strict:
         return math.nan
 
     def mapping(self, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        found = dict(pairs)
-        self.good &= len(found) == len(pairs)
-        return found
+        content = dict(pairs)
+        self.good &= len(content) == len(pairs)
+        return content
 
 
 def _deeper(text: str, depth: int) -> bool:

@@ -116,6 +116,6 @@ def sentence(names: Sequence[str], file: str) -> tuple[str, ...]:
     """Return a note that ``file`` holds unknown keys, which are not used; no note without such keys."""
     if not names:
         return ()
-    found = sorted(dict.fromkeys(names))
-    shown = ", ".join(found[:10]) + (f" and {len(found) - 10} more" if len(found) > 10 else "")
-    return (f"unknown keys of {file}, which are not used: {shown}",)
+    sorted_names = sorted(dict.fromkeys(names))
+    listing = ", ".join(sorted_names[:10]) + (f" and {len(sorted_names) - 10} more" if len(sorted_names) > 10 else "")
+    return (f"unknown keys of {file}, which are not used: {listing}",)

@@ -59,9 +59,9 @@ def refuse_other_kind(path: Path) -> None:
     Raises:
         InputError: Names the kind, and the command that converts or fetches it.
     """
-    found = _other_kind(path, _head(path))
-    if found is not None:
-        raise InputError(f"is {found[0]}", file=path, fix=found[1].replace("{name}", path.name))
+    kind = _other_kind(path, _head(path))
+    if kind is not None:
+        raise InputError(f"is {kind[0]}", file=path, fix=kind[1].replace("{name}", path.name))
 
 
 def _head(path: Path) -> bytes:

@@ -156,7 +156,7 @@ def read_checkpoint(path: Path) -> Any:
             index = _check_members(archive, path, size)
             data = archive.read(index)
             _check_instructions(data, path)
-            return _Reader(data, _Storages(path, archive, index.filename.removesuffix("data.pkl"))).load()
+            return _CheckedUnpickler(data, _Storages(path, archive, index.filename.removesuffix("data.pkl"))).load()
     except (InputError, MemoryError):
         raise
     except OSError as error:
@@ -360,7 +360,7 @@ _NAMES: dict[str, Any] = {
 }
 
 
-class _Reader(pickle.Unpickler):
+class _CheckedUnpickler(pickle.Unpickler):
     """Builds what a checked pickle describes."""
 
     def __init__(self, data: bytes, storages: _Storages) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods import runs
-from ns_abstract.methods.nerf.opening import NERF
+from ns_abstract.methods.nerf.representation import NERF
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.representation import Representation
 from ns_abstract.methods.splat.formats.readers import scene_file
@@ -35,9 +35,9 @@ def open_scene(path: str | os.PathLike[str], overrides: Overrides | None = None)
     folder = os.path.isdir(path) and scene_file(Path(path), None) is None
     if folder or Path(path).suffix.lower() in (".yml", ".yaml"):
         source = runs.read_config(path)
-    for found in REPRESENTATIONS:
-        if found.reads(source):
-            return found, found.load(source, overrides or Overrides())
+    for representation in REPRESENTATIONS:
+        if representation.reads(source):
+            return representation, representation.load(source, overrides or Overrides())
     raise InputError("holds no scene known here", file=str(path), fix="give config.yml of a run, or a .ply")
 
 

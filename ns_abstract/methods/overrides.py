@@ -57,7 +57,7 @@ class Overrides:
                 raise InputError(problem, field="--" + name.replace("_", "-"), fix="leave it out")
 
 
-def chosen(name: str, given: object, flag: str, stored: object, origin: str) -> Assumption:
+def assumption_of(name: str, given: object, flag: str, stored: object, origin: str) -> Assumption:
     """Return the record of a choice: an option wins, and the record names what it replaces.
 
     Args:

@@ -13,7 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ns_abstract.geometry.views import View, ring
+from ns_abstract.geometry.keyframe_cameras import KeyframeCamera, ring
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.transform import DataparserTransform
@@ -31,7 +31,7 @@ _LPIPS = {
 _LPIPS_HEADS = (64, 192, 384, 256, 256)
 
 
-class Shown(Protocol):
+class DatasetScene(Protocol):
     """The properties of a scene that a data set beside its run needs."""
 
     @property
@@ -42,7 +42,7 @@ class Shown(Protocol):
 
 
 def write_run(
-    scene: Shown,
+    scene: DatasetScene,
     folder: Path,
     method: str,
     timestamp: str,
@@ -52,8 +52,8 @@ def write_run(
     checkpoint: bytes,
     config: str,
     steps: str,
-    views: Sequence[View] | None,
-    render: Callable[[View], ArrayLike] | None,
+    views: Sequence[KeyframeCamera] | None,
+    render: Callable[[KeyframeCamera], ArrayLike] | None,
 ) -> Path:
     """Write a run and a small data set beside it; config.yml comes last, so a run with a config is complete.
 
@@ -137,7 +137,10 @@ def lpips_state(prefix: str) -> dict[str, Any]:
 
 
 def write_dataset(
-    scene: Shown, folder: Path, views: Sequence[View], render: Callable[[View], ArrayLike] | None
+    scene: DatasetScene,
+    folder: Path,
+    views: Sequence[KeyframeCamera],
+    render: Callable[[KeyframeCamera], ArrayLike] | None,
 ) -> None:
     """Write transforms.json and one PNG per view; poses are stored in the normalised frame."""
     if len(views) < 2 or any(

@@ -26,7 +26,7 @@ from ns_abstract.io.errors import InputError, first_line, visible
 from ns_abstract.io.jsonio import FIX_ACCESS, InputTuning, file_size, is_number, load_json, read_text, show
 from ns_abstract.io.kinds import refuse_other_kind
 from ns_abstract.methods.checkpoint import RECOPY, read_checkpoint
-from ns_abstract.methods.overrides import chosen
+from ns_abstract.methods.overrides import assumption_of
 from ns_abstract.methods.transform import DataparserTransform
 
 CONFIG_NAME = "config.yml"
@@ -189,25 +189,25 @@ def find_checkpoint(run: RunConfig, step: int | None = None) -> Path:
             file=folder,
             fix=FIX_ACCESS,
         ) from None
-    found: dict[int, list[str]] = {}
+    files_by_step: dict[int, list[str]] = {}
     for name in names:
         if match := _CHECKPOINT_NAME.fullmatch(name):
-            found.setdefault(int(match[1]), []).append(name)
-    if not found:
+            files_by_step.setdefault(int(match[1]), []).append(name)
+    if not files_by_step:
         raise InputError("no step-*.ckpt here", file=folder, fix="train the run until it saves a checkpoint")
     wanted = load_step(run) if step is None else step
-    if wanted is not None and wanted not in found:
-        steps = ", ".join(map(str, sorted(found)[-_STEPS_SHOWN:]))
-        dots = "..., " if len(found) > _STEPS_SHOWN else ""
+    if wanted is not None and wanted not in files_by_step:
+        steps = ", ".join(map(str, sorted(files_by_step)[-_STEPS_SHOWN:]))
+        dots = "..., " if len(files_by_step) > _STEPS_SHOWN else ""
         raise InputError(
             f"names step {wanted}, and {folder} holds steps {dots}{steps}",
             file=run.file if step is None else None,
             field="load_step" if step is None else "--load-step",
             fix=f"copy step-{wanted:09d}.ckpt there, or give --load-step with one of these",
         )
-    taken = max(found) if wanted is None else wanted
+    taken = max(files_by_step) if wanted is None else wanted
     # the name that Nerfstudio writes and reads comes first
-    return folder / min(found[taken], key=lambda name: (name != f"step-{taken:09d}.ckpt", -len(name), name))
+    return folder / min(files_by_step[taken], key=lambda name: (name != f"step-{taken:09d}.ckpt", -len(name), name))
 
 
 def load_step(run: RunConfig) -> int | None:
@@ -228,9 +228,9 @@ def step_assumption(run: RunConfig, checkpoint: Path, given: int | None) -> Assu
     step = int(match[1]) if match else checkpoint.name
     stored = load_step(run)
     if stored is not None:
-        return chosen("load_step", given, "--load-step", stored, "config.yml: load_step")
+        return assumption_of("load_step", given, "--load-step", stored, "config.yml: load_step")
     default = step if given is None else "the highest one"
-    return chosen("load_step", given, "--load-step", default, "default: the highest step there is")
+    return assumption_of("load_step", given, "--load-step", default, "default: the highest step there is")
 
 
 def target_class(run: RunConfig) -> str:
@@ -322,8 +322,8 @@ def _is_list(value: Any, length: int) -> bool:
 def _section(parent: dict[str, Any], key: str, field: str, file: Path) -> dict[str, Any]:
     section = as_mapping(parent.get(key))
     if section is None:
-        found = "missing" if key not in parent else f"found {show(parent[key])}, not a mapping"
-        raise InputError(found, file=file, field=field, fix="give the config.yml of ns-train")
+        problem = "missing" if key not in parent else f"found {show(parent[key])}, not a mapping"
+        raise InputError(problem, file=file, field=field, fix="give the config.yml of ns-train")
     return section
 
 
@@ -423,15 +423,15 @@ class _InertLoader(yaml.SafeLoader):
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
         if isinstance(node, yaml.MappingNode):
-            seen = set()
+            keys = set()
             for key_node, _ in node.value:
                 if not isinstance(key_node, yaml.ScalarNode):
                     raise _constructor_error("a key is not a scalar", key_node.start_mark)
                 key = self.construct_object(key_node, deep=True)
-                if key in seen:
+                if key in keys:
                     problem = f"key {show(key)} stands twice in one mapping"
                     raise _constructor_error(problem, key_node.start_mark)
-                seen.add(key)
+                keys.add(key)
         return super().construct_mapping(node, deep=deep)
 
     def construct_inert(self, node: Any) -> Any:

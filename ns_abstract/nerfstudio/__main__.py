@@ -19,8 +19,8 @@ def main() -> None:
     commands = {point.name: point for point in entry_points(group="console_scripts") if point.name.startswith("ns-")}
     name = sys.argv[1] if len(sys.argv) > 1 else None
     if name not in commands:
-        known = ", ".join(sorted(commands)) or "none: pip install 'ns-abstract[nerfstudio]'"
-        print(f"error: {name or 'no command'}: give one of the installed commands ({known})", file=sys.stderr)
+        names = ", ".join(sorted(commands)) or "none: pip install 'ns-abstract[nerfstudio]'"
+        print(f"error: {name or 'no command'}: give one of the installed commands ({names})", file=sys.stderr)
         raise SystemExit(2)
     sys.argv = sys.argv[1:]
     sys.exit(commands[name].load()())

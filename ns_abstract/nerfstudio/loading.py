@@ -55,10 +55,10 @@ def lpips_weights(*, download: bool) -> Iterator[None]:
                 return original(net, True)
             except OSError as error:
                 CONSOLE.print(f"[yellow]No weights for LPIPS ({error}): the metric is left out.")
-        found = original(net, False)
-        for parameter in found.parameters():
+        features = original(net, False)
+        for parameter in features.parameters():
             parameter.data.zero_()
-        return found
+        return features
 
     lpips_module._get_tv_model_features = features
     try:
@@ -129,9 +129,9 @@ def _expected(kind: str, name: str) -> bool:
         return False
     module, _, last = name.rpartition(".")
     try:
-        found = getattr(importlib.import_module(module), last)
+        named_object = getattr(importlib.import_module(module), last)
     except (ImportError, AttributeError, ValueError):
         return False
-    if not isinstance(found, type):
+    if not isinstance(named_object, type):
         return False
-    return {"name": True, "object": is_dataclass(found), "object/apply": issubclass(found, Enum)}[kind]
+    return {"name": True, "object": is_dataclass(named_object), "object/apply": issubclass(named_object, Enum)}[kind]

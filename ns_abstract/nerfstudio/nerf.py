@@ -55,10 +55,10 @@ class AbstractNerfModelConfig(VanillaModelConfig):
     @classmethod
     def of(cls, config: VanillaModelConfig) -> AbstractNerfModelConfig:
         """The configuration of nerfstudio's vanilla-nerf (vanilla_nerf.py:82-104) with abstract images."""
-        known = {entry.name for entry in dataclasses.fields(VanillaModelConfig)} - {"_target"}
-        given = {name: value for name, value in vars(config).items() if name in known}
+        names = {entry.name for entry in dataclasses.fields(VanillaModelConfig)} - {"_target"}
+        settings = {name: value for name, value in vars(config).items() if name in names}
         return cls(
-            **given,
+            **settings,
             width=256,
             depth=8,
             num_frequencies=10,
@@ -150,15 +150,17 @@ class AbstractNerfModel(AbstractOutputs, NeRFModel):
         self._cropped = obb_box is not None
         if not self.abstract.control.present or self.device.type == "cuda" or self.training:
             return with_depth(super()._concrete(camera, obb_box))
-        shown = camera_of(camera)
+        pinhole = camera_of(camera)
         box = None if obb_box is None else tuple(torch.cat([obb_box.R.flatten(), obb_box.T, obb_box.S]).tolist())
-        key = shown.camera_to_world.tobytes(), round(shown.fy / shown.height, 6), box
+        key = pinhole.camera_to_world.tobytes(), round(pinhole.fy / pinhole.height, 6), box
         best, seconds = self._drawn[1:] if self._drawn is not None and self._drawn[0] == key else ({}, _FIRST)
         if seconds <= _LAST:
             # pictures of one view never shrink, however slow the machine has become
             rows = max([_ROWS, *(value.shape[0] for value in best.values())])
-            factor = max(1.0, min(math.sqrt(shown.width * shown.height / (self._speed * seconds)), shown.height / rows))
-            small = shown.rescaled(factor)
+            factor = max(
+                1.0, min(math.sqrt(pinhole.width * pinhole.height / (self._speed * seconds)), pinhole.height / rows)
+            )
+            small = pinhole.rescaled(factor)
             pose = camera.camera_to_worlds.reshape(-1, 3, 4)[:1]
             at = Cameras(pose, small.fx, small.fy, small.cx, small.cy, small.width, small.height).to(self.device)
             start = time.perf_counter()
@@ -166,7 +168,7 @@ class AbstractNerfModel(AbstractOutputs, NeRFModel):
             self._speed = small.width * small.height / (time.perf_counter() - start)
             self._drawn = key, best, _GROWTH * seconds if factor > 1.0 else math.inf
             self.abstract.control.draw()
-        return {name: resampled(value, shown.height, shown.width) for name, value in best.items()}
+        return {name: resampled(value, pinhole.height, pinhole.width) for name, value in best.items()}
 
     def get_loss_dict(self, outputs: Any, batch: Any, metrics_dict: Any = None) -> dict[str, torch.Tensor]:
         """The losses of vanilla-nerf and the penalty."""

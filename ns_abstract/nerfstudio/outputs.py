@@ -19,9 +19,9 @@ from ns_abstract.nerfstudio.loading import lpips_known
 from ns_abstract.nerfstudio.panel import AbstractPanel, Insistent, camera_of
 from ns_abstract.perturbation.specification import ROTATIONS, TRANSLATIONS
 from ns_abstract.perturbation.variations import VARIATIONS
-from ns_abstract.refine.engine import Goal, Refinement
+from ns_abstract.refine.engine import Refinement, RefinementGoal
 from ns_abstract.viewer.background import Background
-from ns_abstract.viewer.views import Snapshot, Source, View
+from ns_abstract.viewer.views import Snapshot, Source, ViewRequest
 
 if TYPE_CHECKING:
     from nerfstudio.models.base_model import Model
@@ -83,11 +83,15 @@ def pictures(snapshot: Snapshot | None, height: int, width: int, depth: bool = F
         lower, upper = snapshot.lower, snapshot.upper
         least, most = snapshot.witness_lower, snapshot.witness_upper
     gaps = [np.linalg.norm(high - low, axis=-1, keepdims=True) for low, high in ((lower, upper), (least, most))]
-    found = [resampled(torch.from_numpy(image), height, width) for image in (lower, upper, *gaps)]
-    named: dict[str, torch.Tensor] = dict(zip(OUTPUTS, found, strict=True))
+    images = [resampled(torch.from_numpy(image), height, width) for image in (lower, upper, *gaps)]
+    named: dict[str, torch.Tensor] = dict(zip(OUTPUTS, images, strict=True))
     if depth:
-        known = None if snapshot is None else snapshot.depth
-        ends = np.array([[[0.0]], [[_FAR]]], np.float32) if known is None else np.minimum(known, np.float32(_FAR))
+        depth_bounds = None if snapshot is None else snapshot.depth
+        ends = (
+            np.array([[[0.0]], [[_FAR]]], np.float32)
+            if depth_bounds is None
+            else np.minimum(depth_bounds, np.float32(_FAR))
+        )
         for name, end in zip(DEPTH_OUTPUTS, ends, strict=True):
             named[name] = resampled(torch.from_numpy(np.ascontiguousarray(end))[..., None], height, width)
     return named
@@ -170,12 +174,12 @@ class AbstractOutputs(_Base):
             self.abstract.depth = float(depth[depth.shape[0] // 2, depth.shape[1] // 2, 0])
         try:
             with uninterrupted():
-                found = self._abstract(camera)
+                abstract_outputs = self._abstract(camera)
         except Exception as error:
             # the viewer's render thread must not end; nothing is known, and that is what is shown
             CONSOLE.print(f"[yellow]No abstract image: {type(error).__name__}: {error}")
-            found = self._pictures(None, int(camera.height.reshape(-1)[0]), int(camera.width.reshape(-1)[0]))
-        return {**outputs, **{name: value.to(self.device) for name, value in found.items()}}
+            abstract_outputs = self._pictures(None, int(camera.height.reshape(-1)[0]), int(camera.width.reshape(-1)[0]))
+        return {**outputs, **{name: value.to(self.device) for name, value in abstract_outputs.items()}}
 
     def _concrete(self, camera: Any, obb_box: Any) -> dict[str, torch.Tensor]:
         """The model's own outputs."""
@@ -185,15 +189,15 @@ class AbstractOutputs(_Base):
         options: AbstractConfig = self.config.abstract  # pyright: ignore[reportAttributeAccessIssue]
         if not (self.abstract.control.present or options.seconds > 0.0):
             return {}
-        shown = camera_of(camera)
+        pinhole = camera_of(camera)
         try:
             source = self.abstract_source()
             if source is None:
                 return {}
-            view = View(shown, self.abstract.perturbation)
+            view = ViewRequest(pinhole, self.abstract.perturbation)
         except InputError as error:
             self.abstract.refuse(error)
-            return self._pictures(None, shown.height, shown.width)
+            return self._pictures(None, pinhole.height, pinhole.width)
         if self.abstract.control.present:
             self._show(source)
             snapshot = self._background.best(view.at_most(source.most), self.abstract.seconds)
@@ -206,11 +210,11 @@ class AbstractOutputs(_Base):
         options: AbstractConfig = self.config.abstract  # pyright: ignore[reportAttributeAccessIssue]
         return pictures(snapshot, height, width, options.depth and self.gaussians)
 
-    def _now(self, source: Source, view: View, seconds: float) -> Snapshot:
+    def _now(self, source: Source, view: ViewRequest, seconds: float) -> Snapshot:
         if self._problems is None:
             self._problems = check_functions()
         frame = source.frame(view.camera, view.perturbation)
-        result = Refinement(frame, 0, Goal(seconds=seconds), members=frame.members(0)).run()
+        result = Refinement(frame, 0, RefinementGoal(seconds=seconds), members=frame.scene_samples(0)).run()
         return Snapshot.of(result, final=True, guarantee="sampled" if self._problems else source.guarantee)
 
     def _attached(self) -> None:
@@ -229,8 +233,8 @@ class AbstractOutputs(_Base):
 
     def _current(self) -> bool:
         """Whether the panel tells what the background does, or nobody looks."""
-        told, now = self.abstract.told, self._background.status
-        return told in (None, now) or now.state == "off" or not self.abstract.control.watched
+        reported, now = self.abstract.reported, self._background.status
+        return reported in (None, now) or now.state == "off" or not self.abstract.control.watched
 
     def get_image_metrics_and_images(
         self, outputs: dict[str, torch.Tensor], batch: dict[str, torch.Tensor]

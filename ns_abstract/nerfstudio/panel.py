@@ -22,16 +22,16 @@ from nerfstudio.viewer.viewer_elements import (
 )
 from viser import ViserServer
 
-from ns_abstract.geometry.camera_path import Camera
-from ns_abstract.geometry.views import View as PathView
-from ns_abstract.geometry.views import path_json
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.keyframe_cameras import KeyframeCamera as PathView
+from ns_abstract.geometry.keyframe_cameras import path_json
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.specification import ROTATIONS, TRANSLATIONS, Perturbation, perturbation_object
 from ns_abstract.perturbation.variations import VARIATIONS
 from ns_abstract.report.figures import number
 from ns_abstract.viewer.background import Status
-from ns_abstract.viewer.views import Snapshot, View, perturbation_of
+from ns_abstract.viewer.views import Snapshot, ViewRequest, perturbation_of
 
 #: Right ends of the sliders, in thousandths.
 _MOST = 100.0
@@ -168,9 +168,9 @@ class AbstractPanel(torch.nn.Module):
     ) -> None:
         super().__init__()
         self._refine = refine
-        self._last: View | None = None
+        self._last: ViewRequest | None = None
         #: what the text says of the background; None: nothing
-        self.told: Status | None = None
+        self.reported: Status | None = None
         self._certified = select is not None
         self._figures = Figures("Abstract images: no view yet")
         self._sliders: dict[str, ViewerSlider] = {}
@@ -242,14 +242,14 @@ class AbstractPanel(torch.nn.Module):
         seconds = float(self._seconds.value)
         return min(max(seconds, 0.1), 86400.0) if math.isfinite(seconds) else 1.0
 
-    def show(self, view: View, snapshot: Snapshot | None, status: Status, about: str = "") -> None:
+    def show(self, view: ViewRequest, snapshot: Snapshot | None, status: Status, about: str = "") -> None:
         """Say what is known of the view on screen; ``about`` as `ns_abstract.viewer.views.Source.about`."""
-        self._last, self.told = view, status
+        self._last, self.reported = view, status
         self._figures.show(describe(view, snapshot, status, about))
 
     def refuse(self, error: InputError) -> None:
         """Say why there is no set."""
-        self._last = self.told = None
+        self._last = self.reported = None
         self._figures.show(f"**Abstract images**: no bounds, [0, 1] is shown  \n{error}")
 
     def send(self) -> None:
@@ -282,7 +282,7 @@ def _free_name(folder: Path) -> Path:
     return file
 
 
-def certify_path(view: View) -> dict[str, Any]:
+def certify_path(view: ViewRequest) -> dict[str, Any]:
     """A camera path of one entry, with the set under "perturbation", as the other commands read it."""
     camera, perturbation = view.camera, view.perturbation
     pose = np.concatenate([camera.camera_to_world, [[0.0, 0.0, 0.0, 1.0]]])
@@ -291,7 +291,7 @@ def certify_path(view: View) -> dict[str, Any]:
     return path_json([PathView(pose, fov, camera.height, camera.width)], seconds=1.0, perturbation=spec)
 
 
-def describe(view: View, snapshot: Snapshot | None, status: Status, about: str = "") -> str:
+def describe(view: ViewRequest, snapshot: Snapshot | None, status: Status, about: str = "") -> str:
     """The figures of a view for people (Markdown)."""
     states = {"off": "", "starting": "starting", "working": "refining …", "idle": "done", "failed": "stopped"}
     state = states[status.state] + (f": {status.detail}" if status.detail else "")
@@ -314,14 +314,14 @@ def describe(view: View, snapshot: Snapshot | None, status: Status, about: str =
     return "  \n".join(lines)
 
 
-def camera_of(cameras: Any) -> Camera:
+def camera_of(cameras: Any) -> PinholeCamera:
     """The first of nerfstudio's ``Cameras`` as a pinhole camera; lens distortion plays no part, as in Splatfacto."""
 
     def first(value: Any) -> float:
         return float(value.reshape(-1)[0])
 
     pose = cameras.camera_to_worlds.reshape(-1, *cameras.camera_to_worlds.shape[-2:])[0, :3]
-    return Camera(
+    return PinholeCamera(
         np.ascontiguousarray(pose.detach().cpu().numpy(), np.float64),
         first(cameras.fx),
         first(cameras.fy),

@@ -35,8 +35,8 @@ class AbstractSplatfactoModelConfig(SplatfactoModelConfig):
     @classmethod
     def of(cls, config: SplatfactoModelConfig) -> AbstractSplatfactoModelConfig:
         """The same configuration with abstract images."""
-        known = {entry.name for entry in dataclasses.fields(cls)} - {"_target"}
-        return cls(**{name: value for name, value in vars(config).items() if name in known})
+        names = {entry.name for entry in dataclasses.fields(cls)} - {"_target"}
+        return cls(**{name: value for name, value in vars(config).items() if name in names})
 
 
 class AbstractSplatfactoModel(AbstractOutputs, SplatfactoModel):
@@ -49,12 +49,12 @@ class AbstractSplatfactoModel(AbstractOutputs, SplatfactoModel):
         """Set up the parameters; without CUDA a checkpoint brings them, so that none are made of points."""
         self._shown: tuple[Any, SplatSource, Renderer] | None = None
         self._active: tuple[Any, SplatScene, Splats] | None = None
-        given = self.config
+        config = self.config
         if not torch.cuda.is_available():
             self.seed_points = None
-            self.config = dataclasses.replace(given, random_init=True, num_random=8)
+            self.config = dataclasses.replace(config, random_init=True, num_random=8)
         super().populate_modules()
-        self.config = given
+        self.config = config
 
     def _splats(self) -> tuple[SplatScene, Splats]:
         """The Gaussians of the current parameters, as stored and activated."""

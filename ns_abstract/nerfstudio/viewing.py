@@ -18,7 +18,7 @@ from nerfstudio.pipelines.base_pipeline import Pipeline
 from nerfstudio.scripts.viewer.run_viewer import _start_viewer
 from nerfstudio.utils.eval_utils import eval_setup
 
-from ns_abstract.geometry.views import around
+from ns_abstract.geometry.keyframe_cameras import around
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.load import load_any
 from ns_abstract.methods.overrides import Overrides
@@ -177,10 +177,10 @@ def _find_data(config: TrainerConfig, file: Path) -> None:
     named = manager.data if manager.data is not None else manager.dataparser.data
     for base in (Path(), *file.resolve().parents):
         # beside the method's folder, where the whole folder was moved
-        for found in (base / named, base / named.name):
-            if found.exists():
-                manager.data = manager.dataparser.data = found
+        for folder in (base / named, base / named.name):
+            if folder.exists():
+                manager.data = manager.dataparser.data = folder
                 if config.data is not None:
-                    config.data = found
+                    config.data = folder
                 return
     raise InputError(f"no data set {named}", file=file, field="pipeline.datamanager.data", fix=_FIX_DATA)

@@ -214,7 +214,7 @@ class Enclosure:
             base = base.square() if exponent else base
         return result.meet(whole)
 
-    def _curve(self, curve: lines.Curve, domain: BoolArray, taylor: FormArray | None) -> Enclosure:
+    def _curve(self, curve: lines.ConvexFunction, domain: BoolArray, taylor: FormArray | None) -> Enclosure:
         """A convex or concave function: a band, or the Taylor polynomial where that leaves less."""
         whole = curve.value(self.range)
         domain = domain & np.isfinite(self.range.lower) & np.isfinite(self.range.upper)

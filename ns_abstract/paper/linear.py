@@ -142,11 +142,11 @@ class LinearBounds:
         if not np.all(bounded):
             # elements without planes are multiplied as zeros and widened afterwards
             zero, unknown = np.zeros(shape), np.where(bounded, 0.0, np.inf)
-            known = [
+            products = [
                 LinearBounds(*(_select(bounded, side.broadcast_to(shape), zero) for side in (v.lower, v.upper)))
                 for v in (self, other)
             ]
-            return known[0].multiply(known[1], weight) + Interval(-unknown, unknown)
+            return products[0].multiply(products[1], weight) + Interval(-unknown, unknown)
 
         def plane(x_end: Float64Array, y_end: Float64Array) -> LinearBounds:
             # (x - x_end)(y - y_end) has a known sign when the ends are chosen so
@@ -185,7 +185,7 @@ class LinearBounds:
         m = self.shape[1]
         return self.reshape(1, k, m).broadcast_to((n, k, m)).scale(other[:, :, None]).sum(1)
 
-    def _curve(self, curve: lines.Curve, domain: BoolArray) -> LinearBounds:
+    def _curve(self, curve: lines.ConvexFunction, domain: BoolArray) -> LinearBounds:
         """The chord on one side and the tangent at the middle of the range on the other."""
         x = self.range
         domain = domain & np.isfinite(x.lower) & np.isfinite(x.upper)

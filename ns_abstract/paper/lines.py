@@ -17,7 +17,7 @@ from ns_abstract.paper.interval import Float64Array, Interval
 
 
 @dataclass(frozen=True)
-class Curve:
+class ConvexFunction:
     """A convex or concave function of one variable.
 
     Attributes:
@@ -33,14 +33,14 @@ class Curve:
     convex: bool = True
 
 
-EXP = Curve(Interval.exp, Interval.exp, np.log)
+EXP = ConvexFunction(Interval.exp, Interval.exp, np.log)
 #: On positive numbers.
-RECIPROCAL = Curve(Interval.reciprocal, lambda x: -(x.square().reciprocal()), lambda s: np.sqrt(-1.0 / s))
+RECIPROCAL = ConvexFunction(Interval.reciprocal, lambda x: -(x.square().reciprocal()), lambda s: np.sqrt(-1.0 / s))
 #: On non-negative numbers; not differentiable at 0.
-SQRT = Curve(Interval.sqrt, lambda x: (x.sqrt() * 2.0).reciprocal(), lambda s: 0.25 / (s * s), convex=False)
+SQRT = ConvexFunction(Interval.sqrt, lambda x: (x.sqrt() * 2.0).reciprocal(), lambda s: 0.25 / (s * s), convex=False)
 
 
-def chord_slope(curve: Curve, x: Interval) -> Float64Array:
+def chord_slope(curve: ConvexFunction, x: Interval) -> Float64Array:
     """Slope of the chord over ``x``, rounded; that of a tangent where ``x`` is degenerate."""
     ends = [curve.value(Interval(end)).middle for end in x.bounds()]
     with np.errstate(all="ignore"):
@@ -49,7 +49,7 @@ def chord_slope(curve: Curve, x: Interval) -> Float64Array:
     return np.where(np.isfinite(chord), chord, tangent)
 
 
-def chord_side(curve: Curve, x: Interval, slope: Float64Array) -> Float64Array:
+def chord_side(curve: ConvexFunction, x: Interval, slope: Float64Array) -> Float64Array:
     """The offset on the chord's side: ``high`` of a convex function, ``low`` of a concave one."""
     offsets = [curve.value(Interval(end)) - Interval(end) * slope for end in x.bounds()]
     if curve.convex:
@@ -57,7 +57,9 @@ def chord_side(curve: Curve, x: Interval, slope: Float64Array) -> Float64Array:
     return np.minimum(offsets[0].lower, offsets[1].lower)
 
 
-def tangent_side(curve: Curve, x: Interval, slope: Float64Array, at: Float64Array | None = None) -> Float64Array:
+def tangent_side(
+    curve: ConvexFunction, x: Interval, slope: Float64Array, at: Float64Array | None = None
+) -> Float64Array:
     """The offset on the other side, from the tangent at ``at`` (by default where it is parallel to ``slope``)."""
     if at is None:
         with np.errstate(all="ignore"):
@@ -71,7 +73,7 @@ def tangent_side(curve: Curve, x: Interval, slope: Float64Array, at: Float64Arra
     return np.maximum(offsets[0].upper, offsets[1].upper)
 
 
-def band(curve: Curve, x: Interval) -> tuple[Float64Array, Interval]:
+def band(curve: ConvexFunction, x: Interval) -> tuple[Float64Array, Interval]:
     """The narrowest band around ``curve`` over the bounded interval ``x``.
 
     Returns:

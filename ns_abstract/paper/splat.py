@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 
 from ns_abstract.arithmetic.forms import Float64Array
-from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.poses import PoseForms
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.constants import PAPER
@@ -36,7 +36,7 @@ def _require_plain(splats: Splats) -> None:
         raise ValueError("Algorithm 1 knows RGB colours on black only: activate the scene with the rasteriser PAPER")
 
 
-def pixel_centers(camera: Camera) -> Float64Array:
+def pixel_centers(camera: PinholeCamera) -> Float64Array:
     """[H * W, 2] pixel centres (x, y), row-major."""
     x, y = (np.arange(size, dtype=np.float64) + 0.5 for size in (camera.width, camera.height))
     x, y = np.meshgrid(x, y)
@@ -44,7 +44,11 @@ def pixel_centers(camera: Camera) -> Float64Array:
 
 
 def render(
-    splats: Splats, camera: Camera, rotation: Float64Array, position: Float64Array, pixels: Float64Array | None = None
+    splats: Splats,
+    camera: PinholeCamera,
+    rotation: Float64Array,
+    position: Float64Array,
+    pixels: Float64Array | None = None,
 ) -> Float64Array:
     """GAUSSIANSPLAT (Algorithm 1) in float64, line by line.
 
@@ -65,9 +69,9 @@ def render(
     u = pixel_centers(camera) if pixels is None else np.asarray(pixels, np.float64)
     focal, center = np.array([camera.fx, camera.fy]), np.array([camera.cx, camera.cy])
     mean_c = (splats.means - position) @ rotation.T
-    kept = (mean_c[:, 2] >= PAPER.near) & (mean_c[:, 2] <= PAPER.far)
+    in_range = (mean_c[:, 2] >= PAPER.near) & (mean_c[:, 2] <= PAPER.far)
     alphas, depths = [], []
-    for axes, mean, opacity in zip(splats.axes[kept], mean_c[kept], splats.opacity[kept], strict=True):
+    for axes, mean, opacity in zip(splats.axes[in_range], mean_c[in_range], splats.opacity[in_range], strict=True):
         covariance_c = rotation @ axes @ axes.T @ rotation.T
         x, y, z = mean
         jacobian = np.array([[focal[0] / z, 0.0, -focal[0] * x / z**2], [0.0, focal[1] / z, -focal[1] * y / z**2]])
@@ -79,7 +83,7 @@ def render(
     color = np.zeros((u.shape[0], 3))
     light = np.ones(u.shape[0])
     for i in np.argsort(np.array(depths), kind="stable"):
-        color += (light * alphas[i])[:, None] * splats.sh[kept][i, 0]
+        color += (light * alphas[i])[:, None] * splats.sh[in_range][i, 0]
         light *= 1.0 - alphas[i]
     return color
 
@@ -89,7 +93,7 @@ def _alpha(
     mean: Enclosure,
     opacity: float,
     rotation: Enclosure,
-    camera: Camera,
+    camera: PinholeCamera,
     u: Float64Array,
     inverse: Inverse,
     order: int,
@@ -122,7 +126,7 @@ def _alpha(
 
 def bound(
     splats: Splats,
-    camera: Camera,
+    camera: PinholeCamera,
     forms: PoseForms,
     pixels: Float64Array | None = None,
     *,

@@ -157,7 +157,7 @@ def perturbation_object(perturbation: Perturbation) -> dict[str, Any]:
     def ranges(limits: Mapping[str, Range]) -> dict[str, list[float]]:
         return {name: list(ends) for name, ends in limits.items()}
 
-    found: dict[str, Any] = {
+    content: dict[str, Any] = {
         "version": 1,
         "frame": perturbation.frame,
         "translation": ranges(perturbation.translation),
@@ -165,24 +165,24 @@ def perturbation_object(perturbation: Perturbation) -> dict[str, Any]:
         "sweep": perturbation.sweep,
     }
     if (orbit := perturbation.orbit) is not None:
-        found["orbit"] = {"target": list(orbit.target), "axis": list(orbit.axis), "azimuth": list(orbit.azimuth)}
+        content["orbit"] = {"target": list(orbit.target), "axis": list(orbit.axis), "azimuth": list(orbit.azimuth)}
     for name in ("hue", "saturation"):
         if (shift := getattr(perturbation, name)) is not None:
-            found[name] = list(shift)
+            content[name] = list(shift)
     if perturbation.scene:
-        found["scene"] = [
+        content["scene"] = [
             {"select": selection_object(entry.select)}
             | ranges({key: limits for key in VARIATIONS if (limits := getattr(entry, key)) is not None})
             for entry in perturbation.scene
         ]
-    return found
+    return content
 
 
 def _choice(value: Mapping[str, Any], name: str, choices: tuple[str, ...], fail: Fail) -> str:
-    found = value.get(name, choices[0])
-    if found not in choices or not isinstance(found, str):
-        raise fail(name, f"found {show(found)}", f"write {' or '.join(choices)}")
-    return found
+    chosen = value.get(name, choices[0])
+    if chosen not in choices or not isinstance(chosen, str):
+        raise fail(name, f"found {show(chosen)}", f"write {' or '.join(choices)}")
+    return chosen
 
 
 def _ranges(value: Mapping[str, Any], name: str, keys: tuple[str, ...], fail: Fail) -> dict[str, Range]:
@@ -203,7 +203,7 @@ def _scene(value: Mapping[str, Any], fail, prefix: str, folder: Path | None) -> 
     entries = value["scene"]
     if not isinstance(entries, list) or not entries:
         raise fail("scene", f"found {show(entries)}", "write a list of objects with select, mean, opacity, color")
-    found = []
+    variations = []
     for k, entry in enumerate(entries):
         name = f"scene[{k}]"
         if not isinstance(entry, dict):
@@ -215,8 +215,8 @@ def _scene(value: Mapping[str, Any], fail, prefix: str, folder: Path | None) -> 
             raise fail(name, "nothing varies", "write mean, opacity or color")
         ranges = {key: interval(entry[key], f"{name}.{key}", fail) for key in VARIATIONS if key in entry}
         select = parse_selection(entry["select"], f"{name}.select", fail, folder)
-        found.append(SceneVariation(select, **ranges, name=f"{prefix}{name}"))
-    return tuple(found)
+        variations.append(SceneVariation(select, **ranges, name=f"{prefix}{name}"))
+    return tuple(variations)
 
 
 def _orbit(value: Mapping[str, Any], fail: Fail, turn: float) -> Orbit | None:

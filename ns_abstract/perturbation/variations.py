@@ -97,17 +97,17 @@ def parse_selection(value: object, name: str, fail: Fail, folder: Path | None) -
 
 def selection_object(select: Selection) -> dict[str, Any]:
     """Return the content of a file for a selection; `parse_selection` reads it back as the same one."""
-    found: dict[str, Any] = {}
+    content: dict[str, Any] = {}
     if select.box is not None:
-        found["box"] = [list(corner) for corner in select.box]
+        content["box"] = [list(corner) for corner in select.box]
     if select.indices is not None:
-        found["indices"] = list(select.indices)
+        content["indices"] = list(select.indices)
     if select.opacity is not None:
-        found["opacity"] = list(select.opacity)
+        content["opacity"] = list(select.opacity)
     colors = {"min": select.color_min, "max": select.color_max}
     if any(color is not None for color in colors.values()):
-        found["color"] = {name: list(color) for name, color in colors.items() if color is not None}
-    return found
+        content["color"] = {name: list(color) for name, color in colors.items() if color is not None}
+    return content
 
 
 def _ordered(low: Vector, high: Vector, name: str, fail: Fail) -> None:
@@ -146,8 +146,8 @@ def _index_file(file: Path) -> np.ndarray | None:
     """What an index file holds; None where that is not whole numbers."""
     kind = file.suffix.lower()
     if kind == ".json":
-        found = load_json(file, "index file", _INDEX_BYTES)
-        return _whole_numbers(found) if isinstance(found, list) else None
+        content = load_json(file, "index file", _INDEX_BYTES)
+        return _whole_numbers(content) if isinstance(content, list) else None
     if kind == ".npy":
         try:
             array = np.load(io.BytesIO(read_bytes(file, "index file", _INDEX_BYTES)), allow_pickle=False)

@@ -1,6 +1,6 @@
 """Discrete dynamics ``x' = f(x, u)``: one concrete step in float64, and its enclosure over a box (docs/design.md, L1).
 
-Every law is written once, over an arithmetic: `Floats` evaluates it, `Forms` encloses it, and `Sizes` follows
+Every law is written once, over an arithmetic: `Floats` evaluates it, `Forms` encloses it, and `TermSizes` follows
 how large its terms are, which is what a float64 evaluation's rounding is charged by.
 """
 
@@ -64,7 +64,7 @@ class Forms(Floats):
         return value.compose(middle * np.abs(middle), 2.0 * np.abs(middle), least, most, 0.0)
 
 
-class Sizes(Floats):
+class TermSizes(Floats):
     """Upper bounds of the sizes of terms; sums never cancel."""
 
     @staticmethod
@@ -81,7 +81,7 @@ class Sizes(Floats):
 Law = Callable[[Sequence[Any], Sequence[Any], type[Floats]], list[Any]]
 
 
-class Enclosure(NamedTuple):
+class StepEnclosure(NamedTuple):
     """``f(x, u) = center + slopes (xi, eta) + e`` with ``|e| <= radius``, and a float64 evaluation of it, too.
 
     ``xi`` and ``eta`` count x and u from the middles of their boxes in half-widths, so they are in [-1, 1].
@@ -127,7 +127,7 @@ class Dynamics:
         """[n] the next state, in float64, from a state [n] and a control [m]."""
         return np.array(self.law(list(map(np.float64, x)), list(map(np.float64, u)), Floats), np.float64)
 
-    def enclose(self, lower: Float64, upper: Float64) -> Enclosure:
+    def enclose(self, lower: Float64, upper: Float64) -> StepEnclosure:
         """Enclosure over the box [n + m] of states and controls, of the exact law and of `step` (L1).
 
         What leaves the range of float64 gets a radius that is not finite.
@@ -137,14 +137,14 @@ class Dynamics:
         basis = Basis(n + m, 1)
         with np.errstate(all="ignore"):
             forms = [FormArray.parameter(basis, k, middle[k], half[k]) for k in range(n + m)]
-            found = self.law(forms[:n], forms[n:], Forms)
+            next_state = self.law(forms[:n], forms[n:], Forms)
             sizes = list(np.maximum(np.abs(lower), np.abs(upper)))
-            size = np.array(self.law(sizes[:n], sizes[n:], Sizes), np.float64)
-            radius = np.array([float(form.radius) for form in found])
+            size = np.array(self.law(sizes[:n], sizes[n:], TermSizes), np.float64)
+            radius = np.array([float(form.radius) for form in next_state])
             radius = (radius + 2.0 * gamma(STEP_ROUNDINGS) * size) * STEP_UP + UNDERFLOW64
-        center = np.array([float(form.center) for form in found])
-        slopes = np.array([form.linear.reshape(-1) for form in found]).reshape(n, n + m)
-        return Enclosure(center, slopes, radius, middle, half)
+        center = np.array([float(form.center) for form in next_state])
+        slopes = np.array([form.linear.reshape(-1) for form in next_state]).reshape(n, n + m)
+        return StepEnclosure(center, slopes, radius, middle, half)
 
 
 # ---------------------------------------------------------------- the family
@@ -154,13 +154,13 @@ def affine(a: Float64, b: Float64, c: Float64) -> Dynamics:
     """``x' = A x + B u + c`` with A [n, n], B [n, m], c [n]."""
 
     def law(x: Sequence[Any], u: Sequence[Any], kind: type[Floats]) -> list[Any]:
-        found = []
+        next_state = []
         for row in range(a.shape[0]):
             total = x[0] * 0.0
             for value, factor in zip((*x, *u), (*a[row], *b[row]), strict=True):
                 total = total + kind.scaled(value, float(factor))
-            found.append(total + (abs(float(c[row])) if kind is Sizes else float(c[row])))
-        return found
+            next_state.append(total + (abs(float(c[row])) if kind is TermSizes else float(c[row])))
+        return next_state
 
     return Dynamics("affine", a.shape[0], b.shape[1], law, "x' = A x + B u + c")
 
@@ -235,7 +235,7 @@ def quadrotor(dt: float, lag: float, gravity: float) -> Dynamics:
     def law(x: Sequence[Any], u: Sequence[Any], kind: type[Floats]) -> list[Any]:
         upright, tilted = kind.cos_sin(x[4])
         thrust = u[1] + gravity
-        weight = dt * gravity if kind is Sizes else -dt * gravity
+        weight = dt * gravity if kind is TermSizes else -dt * gravity
         return [
             x[0] + kind.scaled(x[2], dt),
             x[1] + kind.scaled(x[3], dt),
@@ -340,34 +340,34 @@ def parse_dynamics(value: Any, states: int, dt: float, folder: Path, fail: Fail)
     if not isinstance(kind, str) or kind not in _KEYS:
         raise fail("dynamics.type", f"found {show(kind)}", f"write one of {kinds}")
     known(value, _KEYS[kind], "dynamics.", fail)
-    found: Dynamics | LearnedDynamics
+    dynamics: Dynamics | LearnedDynamics
     if kind == "onnx":
-        found = LearnedDynamics(named_file(value.get("file"), "dynamics.file", folder, "an .onnx", fail), states)
+        dynamics = LearnedDynamics(named_file(value.get("file"), "dynamics.file", folder, "an .onnx", fail), states)
     elif kind == "affine":
         a = matrix(value.get("A"), "dynamics.A", states, states, fail)
         b = matrix(value.get("B"), "dynamics.B", states, None, fail)
         c = numbers(value.get("c", [0.0] * states), "dynamics.c", states, fail)
-        found = affine(a, b, c)
+        dynamics = affine(a, b, c)
     elif kind == "unicycle":
         speed = None if "speed" not in value else number(value["speed"], "dynamics.speed", fail)
-        found = unicycle(dt, speed)
+        dynamics = unicycle(dt, speed)
     elif kind == "fixed wing":
-        found = fixed_wing(dt, number(value.get("speed"), "dynamics.speed", fail, positive=True))
+        dynamics = fixed_wing(dt, number(value.get("speed"), "dynamics.speed", fail, positive=True))
     elif kind == "quadrotor":
         lag = number(value.get("lag"), "dynamics.lag", fail, positive=True)
-        found = quadrotor(dt, lag, number(value.get("gravity", _GRAVITY), "dynamics.gravity", fail, positive=True))
+        dynamics = quadrotor(dt, lag, number(value.get("gravity", _GRAVITY), "dynamics.gravity", fail, positive=True))
     else:
         axes = value.get("axes")
         if type(axes) is not int or not 1 <= axes <= MOST // 3:
             raise fail("dynamics.axes", f"found {show(axes)}", f"write a whole number from 1 to {MOST // 3}")
         drags = [number(value.get(key, 0), f"dynamics.{key}", fail) for key in ("drag", "quadratic_drag")]
-        found = double_integrator(dt, axes, *drags)
-    if found.states != states:
-        raise fail("state", f"{states} names", f"dynamics of type {kind} have {found.states} here; name as many")
-    if found.states + found.controls > MOST:
-        count = f"{found.states} states and {found.controls} controls"
+        dynamics = double_integrator(dt, axes, *drags)
+    if dynamics.states != states:
+        raise fail("state", f"{states} names", f"dynamics of type {kind} have {dynamics.states} here; name as many")
+    if dynamics.states + dynamics.controls > MOST:
+        count = f"{dynamics.states} states and {dynamics.controls} controls"
         raise fail("dynamics", count, f"use at most {MOST} together")
-    return found
+    return dynamics
 
 
 def unusable(problem: str, name: str, fix: str) -> InputError:

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ns_abstract.execution.ending import checkpoint
+from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.reach.tubes import Pictures, Reacher, Tube
+from ns_abstract.reach.tubes import Pictures, Tube, TubeBuilder
 from ns_abstract.refine.protocol import Method
 from ns_abstract.refine.result import FrameResult
 from ns_abstract.report.export import encoded, panels, picture
@@ -58,13 +58,13 @@ class Film:
 
     def strips(self) -> list[tuple[int, bytes]]:
         """Some steps and PNGs of their pictures, one below the other."""
-        found = []
+        strips = []
         for k in _some(len(self.steps), _MOST_SHOWN):
             result = self.steps[k]
             side = _SMALL * max(1, round(max(result.image.shape[:2]) / _SMALL))
             pictures = [picture(result, name, self.largest) for name in SHOWN]
-            found.append((result.index, preview(np.concatenate(pictures), side * len(SHOWN))))
-        return found
+            strips.append((result.index, preview(np.concatenate(pictures), side * len(SHOWN))))
+        return strips
 
 
 def _some(count: int, most: int) -> list[int]:
@@ -78,7 +78,7 @@ def film_size(size: tuple[int, int]) -> tuple[int, int]:
     return size[0] * max(1, times), size[1] * max(1, times)
 
 
-def along(reacher: Reacher, method: Method, size: tuple[int, int], tube: Tube) -> Iterator[FrameResult]:
+def along(reacher: TubeBuilder, method: Method, size: tuple[int, int], tube: Tube) -> Iterator[FrameResult]:
     """Yield, step by step, bounds of all pictures that the camera may take, and the picture at the middle pose.
 
     The bounds are those of one cell, as tubes have them.
@@ -96,7 +96,7 @@ def along(reacher: Reacher, method: Method, size: tuple[int, int], tube: Tube) -
     poses = camera.poses(size)
     view, begin = Pictures(method, poses), time.perf_counter()
     for step in _some(len(tube.sets), _MOST_STEPS):
-        checkpoint()
+        check_cancelled()
         pose = reacher.poses(tube.sets[step])
         low, high = pose.hull()
         outer = poses.box

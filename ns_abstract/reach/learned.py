@@ -85,5 +85,5 @@ class LearnedDynamics:
         images = ImageSets(*(part[None] for part in parts))
         unit = np.eye(self.states)
         rows, zero = np.concatenate([unit, -unit]), np.zeros(2 * self.states)
-        found = bound_outputs(self.network, parametric(images), rows, zero, memory=_MEMORY)
-        return OutputBounds(found.lower, found.a[..., : images.dimensions], found.b)
+        output_bounds = bound_outputs(self.network, parametric(images), rows, zero, memory=_MEMORY)
+        return OutputBounds(output_bounds.lower, output_bounds.a[..., : images.dimensions], output_bounds.b)

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.camera_path import Camera, checked_pose, focal_length
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.camera_path import PinholeCamera, checked_pose, focal_length
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.fields import Fail, interval, known
 from ns_abstract.io.jsonio import is_moderate, is_number, load_json, show
@@ -44,7 +44,7 @@ _KEYS = (
 
 
 @dataclass(frozen=True)
-class Face:
+class HalfSpace:
     """``normal . x - offset``, a function of the state that is above 0 on one side of a plane.
 
     Attributes:
@@ -62,7 +62,7 @@ class Face:
 
 
 @dataclass(frozen=True)
-class Goal:
+class GoalBox:
     """The goal: the open box that the state has to be in.
 
     Attributes:
@@ -70,7 +70,7 @@ class Goal:
         when: "end", after the last step; "any", after at least one.
     """
 
-    faces: tuple[Face, ...]
+    faces: tuple[HalfSpace, ...]
     when: Literal["end", "any"]
 
 
@@ -95,16 +95,16 @@ class CameraMount:
     factors: Float64
     fixed: Mapping[str, float]
 
-    def poses(self, size: tuple[int, int]) -> PoseSet:
+    def poses(self, size: tuple[int, int]) -> PoseBox:
         """All poses that may be looked at, in pictures of ``size`` (height, width)."""
         ranges = {name: (-FARTHEST, FARTHEST) if name in TRANSLATIONS else (-_TURN, _TURN) for name in self.names}
         ranges |= {name: (value, value) for name, value in self.fixed.items()}
         focal = focal_length(self.fov, size[0], "camera.fov")
         height, width = size
         pose = np.concatenate([self.rotation, np.zeros((3, 1))], axis=1)
-        camera = Camera(pose, focal, focal, 0.5 * width, 0.5 * height, width, height)
+        camera = PinholeCamera(pose, focal, focal, 0.5 * width, 0.5 * height, width, height)
         chosen = [{n: ranges[n] for n in group if n in ranges} for group in (TRANSLATIONS, ROTATIONS)]
-        return PoseSet.around(camera, Perturbation(frame="world", translation=chosen[0], rotation=chosen[1]))
+        return PoseBox.around(camera, Perturbation(frame="world", translation=chosen[0], rotation=chosen[1]))
 
     @property
     def place(self) -> tuple[Float64, Float64]:
@@ -175,8 +175,8 @@ class Loop:
     network: Path
     preprocess: Preprocess
     control: Control
-    unsafe: tuple[tuple[Face, ...], ...]
-    goal: Goal | None
+    unsafe: tuple[tuple[HalfSpace, ...], ...]
+    goal: GoalBox | None
     value: Mapping[str, Any]
 
     @property
@@ -374,7 +374,7 @@ def _control(value: Any, controls: int, fail: Fail) -> Control:
     return Control(gain, goal, lower, upper)
 
 
-def _box_faces(value: Any, field: str, names: tuple[str, ...], fail: Fail, *, inside: bool) -> tuple[Face, ...]:
+def _box_faces(value: Any, field: str, names: tuple[str, ...], fail: Fail, *, inside: bool) -> tuple[HalfSpace, ...]:
     """Faces of a box; above 0 inside, or each above 0 on its own outside."""
     if not isinstance(value, Mapping) or not value:
         raise fail(field, f"found {show(value)}", "write an object with [low, high] by state, null for no end")
@@ -388,11 +388,11 @@ def _box_faces(value: Any, field: str, names: tuple[str, ...], fail: Fail, *, in
         for end, sign in zip(ends, (1.0, -1.0), strict=True):
             if end is not None:
                 side = sign if inside else -sign
-                faces.append(Face(tuple((side * unit).tolist()), side * float(end)))
+                faces.append(HalfSpace(tuple((side * unit).tolist()), side * float(end)))
     return tuple(faces)
 
 
-def _unsafe(value: Any, field: str, names: tuple[str, ...], fail: Fail) -> tuple[Face, ...]:
+def _unsafe(value: Any, field: str, names: tuple[str, ...], fail: Fail) -> tuple[HalfSpace, ...]:
     if not isinstance(value, Mapping) or len(value) != 1:
         raise fail(field, f"found {show(value)}", 'write {"box": ..} or {"half_space": ..}')
     known(value, ("box", "half_space"), f"{field}.", fail)
@@ -406,14 +406,14 @@ def _unsafe(value: Any, field: str, names: tuple[str, ...], fail: Fail) -> tuple
     if not normal.any():
         raise fail(f"{field}.half_space.normal", "all are 0", "write a direction")
     end = number(entry.get("at_least"), f"{field}.half_space.at_least", fail)
-    return (Face(tuple((-normal).tolist()), -end),)
+    return (HalfSpace(tuple((-normal).tolist()), -end),)
 
 
-def _goal(value: Any, names: tuple[str, ...], fail: Fail) -> Goal:
+def _goal(value: Any, names: tuple[str, ...], fail: Fail) -> GoalBox:
     if not isinstance(value, Mapping):
         raise fail("goal", f"found {show(value)}", "write an object with box and when")
     known(value, ("box", "when"), "goal.", fail)
     when = value.get("when", "end")
     if when not in ("end", "any") or not isinstance(when, str):
         raise fail("goal.when", f"found {show(when)}", "write end or any")
-    return Goal(_box_faces(value.get("box"), "goal.box", names, fail, inside=True), when)  # pyright: ignore[reportArgumentType]
+    return GoalBox(_box_faces(value.get("box"), "goal.box", names, fail, inside=True), when)  # pyright: ignore[reportArgumentType]

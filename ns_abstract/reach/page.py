@@ -10,12 +10,12 @@ from markupsafe import Markup
 
 from ns_abstract.reach.film import SHOWN
 from ns_abstract.reach.loop import Loop
-from ns_abstract.reach.planes import Marks, View, plane_marks, region, views
+from ns_abstract.reach.planes import LoopPlot, Marks, plane_marks, region, views
 from ns_abstract.reach.search import QUESTIONS
 from ns_abstract.report.figures import interval
 from ns_abstract.report.html import set_of, whole_page
-from ns_abstract.report.outside import PICTURE_WIDTH, Outside, behind, draw_plane, plane_axes
-from ns_abstract.report.svg import Axis, draw_legend, draw_line, draw_plot
+from ns_abstract.report.outside import PICTURE_WIDTH, SceneDrawing, behind, draw_plane, plane_axes
+from ns_abstract.report.svg import PlotAxis, draw_legend, draw_line, draw_plot
 
 _SIZE = 560, 320
 _FILM_NAMES = {"lower": "lower", "upper": "upper", "gap": "gap", "image": "render"}
@@ -31,7 +31,7 @@ def loop_page(
     document: Mapping[str, Any],
     rows: Mapping[int, Sequence[Mapping[str, Any]]],
     loop: Loop,
-    outside: Outside | None = None,
+    outside: SceneDrawing | None = None,
     strips: Sequence[tuple[int, bytes]] = (),
 ) -> str:
     """The page.
@@ -75,7 +75,7 @@ def _pictures(
     document: Mapping[str, Any],
     rows: Mapping[int, Sequence[Mapping[str, Any]]],
     loop: Loop,
-    outside: Outside | None,
+    outside: SceneDrawing | None,
 ) -> list[tuple[str, str, Markup]]:
     """Titles, texts and plots: the loop from above and from the side, or in the plane of two states.
 
@@ -83,33 +83,34 @@ def _pictures(
     """
     last = max(rows, default=None)
     cells = [] if last is None else rows[last]
-    asked = (
+    plot_arguments = (
         ""
         if last is None
         else f" Cells by the verdict on “{QUESTIONS[last]}”: green certified, red falsified, grey undecided."
     )
-    found = [
-        _seen(view, document, loop, outside, asked) for view in views(document, cells, loop, outside, PICTURE_WIDTH)
+    figures = [
+        _seen(view, document, loop, outside, plot_arguments)
+        for view in views(document, cells, loop, outside, PICTURE_WIDTH)
     ]
-    if found or len(loop.names) < 2:
-        return found
+    if figures or len(loop.names) < 2:
+        return figures
     marks = plane_marks(document, cells, loop, np.eye(2, len(loop.names)), np.zeros(2))
     ends = marks.ends
     if ends is None:
         return []
     width, height = _SIZE
-    x = Axis(ends[0][0], ends[1][0], 52, width - 12, log=False)
-    y = Axis(ends[0][1], ends[1][1], height - 34, 20, log=False)
+    x = PlotAxis(ends[0][0], ends[1][0], 52, width - 12, log=False)
+    y = PlotAxis(ends[0][1], ends[1][1], height - 34, 20, log=False)
     one, two = (f"{name} {unit}".strip() for name, unit in list(zip(loop.names, loop.units, strict=True))[:2])
     title = "Seen by its first two states"
     plot = draw_plot(x, y, (one, two), _drawn(marks, x, y), size=_SIZE, title=title)
-    return [(title, f"{_MARKS_TEXT} tubes of a few certified cells.{asked}", plot)]
+    return [(title, f"{_MARKS_TEXT} tubes of a few certified cells.{plot_arguments}", plot)]
 
 
 _MARKS_TEXT = "Grey: simulated runs; red: stored runs that go wrong; blue outlines:"
 
 
-def _drawn(marks: Marks, x: Axis, y: Axis) -> str:
+def _drawn(marks: Marks, x: PlotAxis, y: PlotAxis) -> str:
     text = "".join(
         f'<rect class="{kind}" x="{x(low[0]):.1f}" y="{y(high[1]):.1f}" '
         f'width="{max(1.0, x(high[0]) - x(low[0])):.1f}" height="{max(1.0, y(low[1]) - y(high[1])):.1f}"/>'
@@ -119,21 +120,21 @@ def _drawn(marks: Marks, x: Axis, y: Axis) -> str:
 
 
 def _seen(
-    view: View, document: Mapping[str, Any], loop: Loop, outside: Outside | None, asked: str
+    view: LoopPlot, document: Mapping[str, Any], loop: Loop, outside: SceneDrawing | None, asked: str
 ) -> tuple[str, str, Markup]:
     window, marks = view.window, ""
     x, y = plane_axes(window)
     sets = [("unsafe", faces, -1.0) for faces in loop.unsafe]
     sets += [] if loop.goal is None else [("goal", loop.goal.faces, 1.0)]
-    shown = set()
+    legend = set()
     for kind, faces, sign in sets:
         corners = region(faces, loop, view.axes, window, sign)
         if corners:
-            shown.add(kind)
+            legend.add(kind)
             points = " ".join(f"{x(a):.1f},{y(b):.1f}" for a, b in corners)
             marks += f'<polygon class="{kind}" points="{points}"/>'
     dashed = {"unsafe": "red, dashed: unsafe sets", "goal": "green, dashed: the goal"}
-    extra = "".join(f"; {text}" for kind, text in dashed.items() if kind in shown)
+    extra = "".join(f"; {text}" for kind, text in dashed.items() if kind in legend)
     title = f"Seen {view.title}"
     plot = draw_plane(outside, window, view.nearest, marks + _drawn(view.marks, x, y), title)
     scene = behind(outside, view.nearest, "tubes alone")
@@ -146,7 +147,7 @@ def _seen(
 
 def _widths(document: Mapping[str, Any]) -> list[tuple[Mapping[str, Any], Markup]]:
     """Tubes that are shown, and plots of their widths by step."""
-    found = []
+    figures = []
     for tube in document["tubes"]:
         curves = [("kept", "dependence kept", tube["width"])]
         curves += [(m, {"step": "within a step", "none": "none"}[m], w) for m, w in tube["width_by_dependence"].items()]
@@ -155,12 +156,12 @@ def _widths(document: Mapping[str, Any]) -> list[tuple[Mapping[str, Any], Markup
         if not values:
             continue
         width, height = _SIZE
-        x = Axis(0, max(len(line) for _, _, line in curves) - 1, 52, width - 12, log=False)
-        y = Axis(min(values), max(values), height - 34, 20, log=True)
+        x = PlotAxis(0, max(len(line) for _, _, line in curves) - 1, 52, width - 12, log=False)
+        y = PlotAxis(min(values), max(values), height - 34, 20, log=True)
         marks = "".join(
             draw_line([(x(k), y(v)) for k, v in enumerate(line) if v is not None and v > 0.0], kind, False)
             for kind, _, line in curves
         )
         marks += draw_legend([(kind, label) for kind, label, _ in curves], width - 12)
-        found.append((tube, draw_plot(x, y, ("step", "width"), marks, size=_SIZE, title="Width by step")))
-    return found
+        figures.append((tube, draw_plot(x, y, ("step", "width"), marks, size=_SIZE, title="Width by step")))
+    return figures

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ns_abstract.reach.loop import Face, Loop
-from ns_abstract.report.outside import ABOVE, Outside, Window, about, sideways
+from ns_abstract.reach.loop import HalfSpace, Loop
+from ns_abstract.report.outside import ABOVE, PlotWindow, SceneDrawing, about, sideways
 
 Float64 = NDArray[np.float64]
 
@@ -85,7 +85,7 @@ def plane_marks(
 
 
 def region(
-    faces: Sequence[Face], loop: Loop, axes: tuple[int, int], window: Window, sign: float
+    faces: Sequence[HalfSpace], loop: Loop, axes: tuple[int, int], window: PlotWindow, sign: float
 ) -> list[tuple[float, float]]:
     """Corners of the part of a window where all faces are on one side, seen by where the camera is.
 
@@ -123,25 +123,25 @@ def region(
 
 def _clipped(corners: list[tuple[float, float]], a: float, b: float, level: float) -> list[tuple[float, float]]:
     """The part of a convex polygon where ``a x + b y >= level``."""
-    found = []
+    corners_inside = []
     for (x, y), (u, v) in zip(corners, [*corners[1:], *corners[:1]], strict=True):
         here, there = a * x + b * y - level, a * u + b * v - level
         if here >= 0.0:
-            found.append((x, y))
+            corners_inside.append((x, y))
         if (here < 0.0) != (there < 0.0) and here != there:
             part = here / (here - there)
-            found.append((x + part * (u - x), y + part * (v - y)))
-    return found
+            corners_inside.append((x + part * (u - x), y + part * (v - y)))
+    return corners_inside
 
 
 @dataclass(frozen=True)
-class View:
+class LoopPlot:
     """A plot of a loop in a plane.
 
     Attributes:
         title: In words.
         axes: The world's axes to the right and up.
-        nearest: As `ns_abstract.report.outside.Outside.picture` has it.
+        nearest: As `ns_abstract.report.outside.SceneDrawing.picture` has it.
         marks: What is drawn over the scene.
         window: What is shown.
     """
@@ -150,12 +150,12 @@ class View:
     axes: tuple[int, int]
     nearest: float
     marks: Marks
-    window: Window
+    window: PlotWindow
 
 
 def views(
-    document: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], loop: Loop, outside: Outside | None, width: int
-) -> list[View]:
+    document: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], loop: Loop, outside: SceneDrawing | None, width: int
+) -> list[LoopPlot]:
     """From above and from the side, where the camera's position moves; pictures are ``width`` pixels wide."""
     matrix, offset = loop.camera.place
     if not matrix.any():
@@ -163,7 +163,7 @@ def views(
     whole = plane_marks(document, rows, loop, matrix[:2], offset[:2], ABOVE).ends
     if whole is None:
         return []
-    found = []
+    plots = []
     for axes, title in ((ABOVE, "from above"), (sideways(*whole), "from the side")):
         marks = plane_marks(document, rows, loop, matrix[list(axes)], offset[list(axes)], axes)
         ends, nearest = marks.ends, np.inf
@@ -173,5 +173,5 @@ def views(
             up = plane_marks(document, rows, loop, matrix[[0, 2]], offset[[0, 2]], (0, 2)).ends
             assert up is not None
             nearest = float(up[1][1])
-        found.append(View(title, axes, nearest, marks, about(outside, axes, *ends, nearest, width)))
-    return found
+        plots.append(LoopPlot(title, axes, nearest, marks, about(outside, axes, *ends, nearest, width)))
+    return plots

@@ -20,11 +20,11 @@ from numpy.typing import NDArray
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.reach.loop import Loop
-from ns_abstract.reach.tubes import Reacher, Tube
-from ns_abstract.refine.protocol import Member
-from ns_abstract.verify.cells import Cell, Grid
-from ns_abstract.verify.scene_margin import Settled
-from ns_abstract.verify.search import FAILURES, ContradictionError, Findings, Leaf, failure_text
+from ns_abstract.reach.tubes import Tube, TubeBuilder
+from ns_abstract.refine.protocol import SceneSample
+from ns_abstract.verify.cells import Cell, CellGrid
+from ns_abstract.verify.scene_margin import CellOutcome
+from ns_abstract.verify.search import FAILURES, BlockResult, ContradictionError, FinishedCell, failure_text
 
 Float64 = NDArray[np.float64]
 Question = Literal["safe", "reaches"]
@@ -48,7 +48,7 @@ _SHRINK = {_FEW: 1.0, _MANY: 0.5}
 
 
 @dataclass(frozen=True, eq=False)
-class Run:
+class SimulatedRun:
     """A simulated run.
 
     Attributes:
@@ -66,21 +66,21 @@ class Run:
         if not np.isfinite(self.states).all():
             return math.nan
         states = self.states.tolist()
-        found = [max(face.exact(x) for face in faces) for x in states for faces in loop.unsafe]
+        clearances = [max(face.exact(x) for face in faces) for x in states for faces in loop.unsafe]
         if question == "reaches":
             assert loop.goal is not None
             depths = [min(face.exact(x) for face in loop.goal.faces) for x in states]
-            found.append(depths[-1] if loop.goal.when == "end" else max(depths))
-        return float(min(found)) if found else math.inf
+            clearances.append(depths[-1] if loop.goal.when == "end" else max(depths))
+        return float(min(clearances)) if clearances else math.inf
 
 
 def simulate(
-    reacher: Reacher,
+    reacher: TubeBuilder,
     start: Float64,
     disturbances: Float64,
-    member: Member | None = None,
+    member: SceneSample | None = None,
     off: Float64 | None = None,
-) -> Run:
+) -> SimulatedRun:
     """One run with the real renderer and the deployed network, in float64 but for these.
 
     Args:
@@ -88,7 +88,7 @@ def simulate(
         start: [n] initial state.
         disturbances: [steps, n], added to every next state.
         member: The scene that is seen throughout; None: the stored one.
-        off: Where the scene stands throughout, as `Reacher.seen_from` has it; None: at its place.
+        off: Where the scene stands throughout, as `TubeBuilder.seen_from` has it; None: at its place.
     """
     loop = reacher.loop
     more = () if member is None else (member,)
@@ -105,45 +105,47 @@ def simulate(
     missing = loop.steps + 1 - len(states)
     lost = np.full((missing, len(start)), np.nan)
     empty = np.full((loop.steps - len(controls), loop.dynamics.controls), np.nan)
-    return Run(
+    return SimulatedRun(
         np.concatenate([np.stack(states), lost]),
         np.concatenate([np.array(controls).reshape(-1, loop.dynamics.controls), empty]),
         np.asarray(disturbances, np.float64),
     )
 
 
-def pushes(loop: Loop, generator: np.random.Generator, kind: Literal["middle", "ends", "random"]) -> Float64:
+def sampled_disturbances(
+    loop: Loop, generator: np.random.Generator, kind: Literal["middle", "ends", "random"]
+) -> Float64:
     """[steps, n] disturbances inside their box: its middle, one corner of it throughout, or anything in it."""
     low, high = loop.disturbance
     shape = loop.steps, len(low)
     if kind == "middle":
-        found = np.broadcast_to(0.5 * (low + high), shape)
+        disturbances = np.broadcast_to(0.5 * (low + high), shape)
     elif kind == "ends":
-        found = np.broadcast_to(np.where(generator.random(len(low)) < 0.5, low, high), shape)
+        disturbances = np.broadcast_to(np.where(generator.random(len(low)) < 0.5, low, high), shape)
     else:
-        found = low + generator.random(shape) * (high - low)
-    return np.clip(found, low, high)
+        disturbances = low + generator.random(shape) * (high - low)
+    return np.clip(disturbances, low, high)
 
 
 @dataclass(frozen=True)
-class LoopFindings(Findings):
+class LoopBlockResult(BlockResult):
     """The result of a block of cells.
 
     Attributes:
         runs: The runs behind falsified cells.
     """
 
-    runs: tuple[tuple[Cell, Run], ...] = ()
+    runs: tuple[tuple[Cell, SimulatedRun], ...] = ()
 
 
 @dataclass
-class _Seen:
+class _CellRuns:
     """Simulated runs from one cell, with their margins."""
 
     cell: Cell
     box: ParameterBox
     starts: list[Float64] = field(default_factory=list)
-    runs: list[Run] = field(default_factory=list)
+    runs: list[SimulatedRun] = field(default_factory=list)
     margins: list[float] = field(default_factory=list)
 
     @property
@@ -166,10 +168,10 @@ class LoopSearch:
         reacher: Computes tubes.
     """
 
-    def __init__(self, reacher: Reacher) -> None:
+    def __init__(self, reacher: TubeBuilder) -> None:
         self.reacher, self.loop = reacher, reacher.loop
         self._tubes: OrderedDict[ParameterBox, Tube | str] = OrderedDict()
-        self._runs: OrderedDict[bytes, Run] = OrderedDict()
+        self._runs: OrderedDict[bytes, SimulatedRun] = OrderedDict()
 
     def tube(self, box: ParameterBox) -> Tube | str:
         """The tube of a cell, kept for a while; or why there is none."""
@@ -188,20 +190,20 @@ class LoopSearch:
         """Lower bound of the margin of all runs in a tube; minus infinity where nothing is known (L5)."""
         if tube.reason or len(tube.sets) != self.loop.steps + 1 or not all(step.finite for step in tube.sets):
             return -math.inf
-        found = tube.safe(self.loop.unsafe)
+        clearance = tube.safe(self.loop.unsafe)
         if question == "reaches":
             goal = self.loop.goal
             assert goal is not None
             steps = [self.loop.steps] if goal.when == "end" else range(self.loop.steps + 1)
             # some one step is in the goal for all runs
-            found = min(found, max(tube.inside(k, goal.faces) for k in steps))
-        return found if math.isfinite(found) or found == math.inf else -math.inf
+            clearance = min(clearance, max(tube.inside(k, goal.faces) for k in steps))
+        return clearance if math.isfinite(clearance) or clearance == math.inf else -math.inf
 
-    def _scenes(self, generator: np.random.Generator) -> Iterator[tuple[Member | None, Float64 | None]]:
+    def _scenes(self, generator: np.random.Generator) -> Iterator[tuple[SceneSample | None, Float64 | None]]:
         """Scenes of the set, without end: other Gaussians, or the stored ones elsewhere, corners first."""
         reach = self.reacher.place if self.reacher.place.size else self.reacher.shift
         if not reach.any():
-            yield from ((member, None) for member in self.reacher.view.members(0))
+            yield from ((member, None) for member in self.reacher.view.scene_samples(0))
             return
         for signs in itertools.product((-1.0, 1.0), repeat=int(np.count_nonzero(reach))):
             corner = reach.copy()
@@ -210,15 +212,15 @@ class LoopSearch:
         while True:
             yield None, generator.uniform(-1.0, 1.0, len(reach)) * reach
 
-    def settle(self, question: Question, box: ParameterBox) -> Settled:
+    def settle(self, question: Question, box: ParameterBox) -> CellOutcome:
         """A cell as it is, for all scenes of the view: its tube, and runs in some of them (V13).
 
         Raises:
             ContradictionError: A run leaves its tube: the program has a fault.
         """
         tube = self.tube(box)
-        known = not isinstance(tube, str)
-        bound = self.proved(tube, question) if known else -math.inf
+        has_tube = not isinstance(tube, str)
+        bound = self.proved(tube, question) if has_tube else -math.inf
         proved, width = bound > 0.0, np.array(box.upper) - np.array(box.lower)
         generator = np.random.default_rng(np.frombuffer(np.array(box.lower + box.upper).tobytes(), np.uint32))
         starts = [box.middle, np.array(box.lower), np.array(box.upper)]
@@ -226,9 +228,9 @@ class LoopSearch:
         scenes = itertools.islice(self._scenes(generator), first, first + 1 if proved else _SCENES)
         for number, (member, off) in enumerate(scenes):
             state = self.loop.state(box, starts[number % len(starts)])
-            push = pushes(self.loop, generator, "ends" if number % 2 else "middle")
+            push = sampled_disturbances(self.loop, generator, "ends" if number % 2 else "middle")
             run = simulate(self.reacher, state, push, member, off)
-            outside = first_outside(tube, run) if known else None
+            outside = first_outside(tube, run) if has_tube else None
             margin = run.margin(self.loop, question)
             if outside is not None or (proved and margin <= 0.0):
                 raise ContradictionError(
@@ -236,58 +238,58 @@ class LoopSearch:
                     f"at least {bound}; outside: {outside}"
                 )
             if math.isnan(margin):
-                return Settled("unknown", "the states of a run are no finite numbers", width)
+                return CellOutcome("unknown", "the states of a run are no finite numbers", width)
             if margin <= 0.0 and simulate(self.reacher, state, push, member, off).margin(self.loop, question) <= 0.0:
                 arrays = {"states": run.states, "controls": run.controls, "disturbances": run.disturbances}
                 arrays |= {"names": np.array(self.loop.names, str)}
                 varied = {} if member is None else member.arrays
                 arrays |= {f"scene_{name}": array for name, array in varied.items()}
                 arrays |= {} if off is None else {"place" if self.reacher.place.size else "shift": off}
-                return Settled("falsified", "a run goes wrong", width, arrays)
+                return CellOutcome("falsified", "a run goes wrong", width, arrays)
         if proved:
-            return Settled("holds", "", width)
-        reason = tube.reason if known else str(tube)
-        slopes = tube.slopes if known and tube.slopes.any() else width
-        return Settled("unknown", reason or "the margin's bound is not above 0", slopes)
+            return CellOutcome("holds", "", width)
+        reason = tube.reason if has_tube else str(tube)
+        slopes = tube.slopes if has_tube and tube.slopes.any() else width
+        return CellOutcome("unknown", reason or "the margin's bound is not above 0", slopes)
 
-    def examine(self, number: int, grid: Grid, block: Sequence[Cell]) -> LoopFindings:
+    def examine(self, number: int, grid: CellGrid, block: Sequence[Cell]) -> LoopBlockResult:
         """Examine cells for the question of this number.
 
         Raises:
             ContradictionError: A run leaves its tube: the program has a fault.
-            AbandonedError: There is no time for it (`ns_abstract.execution.ending`).
+            AbandonedError: There is no time for it (`ns_abstract.execution.cancellation`).
         """
         question = QUESTIONS[number]
         begin = time.perf_counter()
-        leaves: list[Leaf] = []
+        leaves: list[FinishedCell] = []
         children: list[tuple[float, Cell]] = []
         samples: list[tuple[Cell, bool]] = []
-        runs: list[tuple[Cell, Run]] = []
+        runs: list[tuple[Cell, SimulatedRun]] = []
         bounded = 0
         for cell in block:
             begun = time.perf_counter()
-            seen, bound, reason, slopes, parts = self._one(question, grid, cell)
+            cell_runs, bound, reason, slopes, parts = self._one(question, grid, cell)
             bounded += bound is not None
-            samples.append((cell, seen.margins[0] > 0.0))
+            samples.append((cell, cell_runs.margins[0] > 0.0))
             seconds = time.perf_counter() - begun
-            if bound is not None and bound > 0.0 and not seen.undecided:
+            if bound is not None and bound > 0.0 and not cell_runs.undecided:
                 # without unsafe sets nothing can go wrong, which is as good as any number
-                leaves.append(Leaf(cell, "certified", min(bound, 1e300), seconds))
+                leaves.append(FinishedCell(cell, "certified", min(bound, 1e300), seconds))
                 continue
-            if seen.undecided:
+            if cell_runs.undecided:
                 reason = "the states of a run are no finite numbers"
-            hopeless = seen.broken + seen.undecided == len(seen.margins)
+            hopeless = cell_runs.broken + cell_runs.undecided == len(cell_runs.margins)
             if cell.volume > 1 and not hopeless:
-                rank = self._rank(seen, bound, cell.volume / grid.volume)
+                rank = self._rank(cell_runs, bound, cell.volume / grid.volume)
                 children += [(rank, part) for part in grid.divide(cell, slopes, _SHRINK[parts], parts)]
-            elif seen.broken:
-                leaf, run = self._counterexample(question, seen, seconds)
+            elif cell_runs.broken:
+                leaf, run = self._counterexample(question, cell_runs, seconds)
                 leaves.append(leaf)
                 if leaf.verdict == "falsified":
                     runs.append((cell, run))
             else:
-                leaves.append(Leaf(cell, "unknown", None, seconds, reason=reason or "the finest cell"))
-        return LoopFindings(
+                leaves.append(FinishedCell(cell, "unknown", None, seconds, reason=reason or "the finest cell"))
+        return LoopBlockResult(
             tuple(leaves),
             tuple((cell,) for _, cell in children),
             tuple(samples),
@@ -297,93 +299,97 @@ class LoopSearch:
             tuple(runs),
         )
 
-    def _one(self, question: Question, grid: Grid, cell: Cell) -> tuple[_Seen, float | None, str, Float64, int]:
+    def _one(self, question: Question, grid: CellGrid, cell: Cell) -> tuple[_CellRuns, float | None, str, Float64, int]:
         """Runs, proven margin or None, why there is none, what a cut along each parameter may gain, parts to cut."""
         box = grid.box_of(cell)
-        seen, generator = _Seen(cell, box), np.random.default_rng([*cell.first, *cell.past])
-        self._run(question, seen, box.middle, pushes(self.loop, generator, "middle"))
+        cell_runs, generator = _CellRuns(cell, box), np.random.default_rng([*cell.first, *cell.past])
+        self._run(question, cell_runs, box.middle, sampled_disturbances(self.loop, generator, "middle"))
         for end in (box.lower, box.upper)[: _EARLY if box.dimensions else 0]:
-            self._run(question, seen, np.array(end), pushes(self.loop, generator, "ends"))
+            self._run(question, cell_runs, np.array(end), sampled_disturbances(self.loop, generator, "ends"))
         width = np.array(box.upper) - np.array(box.lower)
-        if seen.broken or seen.undecided:
-            return seen, None, "", width, _FEW
+        if cell_runs.broken or cell_runs.undecided:
+            return cell_runs, None, "", width, _FEW
         tube = self.tube(box)
         if isinstance(tube, str):
-            return seen, None, tube, width, _FEW
+            return cell_runs, None, tube, width, _FEW
         bound = self.proved(tube, question)
         # no proof is believed without an attack, and no doubt is left without one
         proved = bound > 0.0
         for _ in range(_CORNERS if box.dimensions and proved else 1):
             corner = np.where(generator.random(box.dimensions) < 0.5, box.lower, box.upper)
-            self._run(question, seen, corner, pushes(self.loop, generator, "ends"))
+            self._run(question, cell_runs, corner, sampled_disturbances(self.loop, generator, "ends"))
         for start in box.sample(_RANDOM, generator):
-            self._run(question, seen, start, pushes(self.loop, generator, "random"))
-        self._descend(question, seen, generator, _STEPS if proved else _STEPS_OPEN)
-        for start, run in zip(seen.starts, seen.runs, strict=True):
+            self._run(question, cell_runs, start, sampled_disturbances(self.loop, generator, "random"))
+        self._descend(question, cell_runs, generator, _STEPS if proved else _STEPS_OPEN)
+        for start, run in zip(cell_runs.starts, cell_runs.runs, strict=True):
             outside = first_outside(tube, run)
             if outside is not None:
                 raise ContradictionError(f"internal error: the run from {start.tolist()} leaves its tube at {outside}")
-        if proved and seen.broken:
+        if proved and cell_runs.broken:
             raise ContradictionError(
                 f"internal error: margin proved to be at least {bound} from {box.lower} to {box.upper}, found "
-                f"{seen.margins[seen.worst]} from {seen.starts[seen.worst].tolist()}"
+                f"{cell_runs.margins[cell_runs.worst]} from {cell_runs.starts[cell_runs.worst].tolist()}"
             )
         slopes = tube.slopes if tube.slopes.any() else width
         # a tube that ends far from the end is far too wide
         parts = _MANY if tube.reason and len(tube.sets) < _SOON * self.loop.steps else _FEW
-        return seen, bound if bound > -math.inf else None, tube.reason, slopes, parts
+        return cell_runs, bound if bound > -math.inf else None, tube.reason, slopes, parts
 
-    def _run(self, question: Question, seen: _Seen, start: Float64, disturbances: Float64) -> float:
-        state = self.loop.state(seen.box, start)
+    def _run(self, question: Question, cell_runs: _CellRuns, start: Float64, disturbances: Float64) -> float:
+        state = self.loop.state(cell_runs.box, start)
         key = state.tobytes() + disturbances.tobytes()
         if key not in self._runs:
             while len(self._runs) >= _KEPT_RUNS:
                 self._runs.popitem(last=False)
             self._runs[key] = simulate(self.reacher, state, disturbances)
         run = self._runs[key]
-        seen.starts.append(start)
-        seen.runs.append(run)
-        seen.margins.append(run.margin(self.loop, question))
-        return seen.margins[-1]
+        cell_runs.starts.append(start)
+        cell_runs.runs.append(run)
+        cell_runs.margins.append(run.margin(self.loop, question))
+        return cell_runs.margins[-1]
 
-    def _descend(self, question: Question, seen: _Seen, generator: np.random.Generator, steps: int) -> None:
+    def _descend(self, question: Question, cell_runs: _CellRuns, generator: np.random.Generator, steps: int) -> None:
         """Without gradients: from the worst start so far, random directions, kept where the margin falls."""
-        box = seen.box
-        if not box.dimensions or seen.broken:
+        box = cell_runs.box
+        if not box.dimensions or cell_runs.broken:
             return
         low, high = np.array(box.lower), np.array(box.upper)
-        best, step = seen.worst, _FIRST_STEP
+        best, step = cell_runs.worst, _FIRST_STEP
         for _ in range(steps):
             turn = generator.standard_normal(box.dimensions)
-            start = np.clip(seen.starts[best] + step * turn * (high - low), low, high)
-            if self._run(question, seen, start, seen.runs[best].disturbances) < seen.margins[best]:
-                best = len(seen.starts) - 1
+            start = np.clip(cell_runs.starts[best] + step * turn * (high - low), low, high)
+            if self._run(question, cell_runs, start, cell_runs.runs[best].disturbances) < cell_runs.margins[best]:
+                best = len(cell_runs.starts) - 1
             else:
                 step *= 0.5
 
-    def _rank(self, seen: _Seen, bound: float | None, share: float) -> float:
+    def _rank(self, cell_runs: _CellRuns, bound: float | None, share: float) -> float:
         """How many times the bound misses the margin that runs show; the nearest to a proof come first."""
-        if seen.broken:
+        if cell_runs.broken:
             return _RANK_BROKEN - math.log2(share)
-        margin = seen.margins[seen.worst]
+        margin = cell_runs.margins[cell_runs.worst]
         if bound is None or not 0.0 < margin < math.inf:
             return 10.0 - math.log2(share) if bound is None else _RANK_UNKNOWN * (1.0 + share)
         return min((margin - bound) / margin, _RANK_UNKNOWN)
 
-    def _counterexample(self, question: Question, seen: _Seen, seconds: float) -> tuple[Leaf, Run]:
+    def _counterexample(
+        self, question: Question, cell_runs: _CellRuns, seconds: float
+    ) -> tuple[FinishedCell, SimulatedRun]:
         """The worst run, simulated once more."""
-        start, old = seen.starts[seen.worst], seen.runs[seen.worst]
-        run = simulate(self.reacher, self.loop.state(seen.box, start), old.disturbances)
+        start, old = cell_runs.starts[cell_runs.worst], cell_runs.runs[cell_runs.worst]
+        run = simulate(self.reacher, self.loop.state(cell_runs.box, start), old.disturbances)
         margin = run.margin(self.loop, question)
         low, high = self.loop.disturbance
-        inside = seen.box.contains(start) and bool(((low <= run.disturbances) & (run.disturbances <= high)).all())
+        inside = cell_runs.box.contains(start) and bool(((low <= run.disturbances) & (run.disturbances <= high)).all())
         if not (margin <= 0.0 and inside):
-            return Leaf(seen.cell, "unknown", None, seconds, reason="a run that goes wrong was not confirmed"), run
-        leaf = Leaf(seen.cell, "falsified", margin, seconds, counterexample=tuple(start.tolist()))
+            return FinishedCell(
+                cell_runs.cell, "unknown", None, seconds, reason="a run that goes wrong was not confirmed"
+            ), run
+        leaf = FinishedCell(cell_runs.cell, "falsified", margin, seconds, counterexample=tuple(start.tolist()))
         return leaf, run
 
 
-def first_outside(tube: Tube, run: Run) -> str | None:
+def first_outside(tube: Tube, run: SimulatedRun) -> str | None:
     """The first state or control of a run that is not in a tube, in words; None where all are (no tolerance)."""
     for step, entry in enumerate(tube.sets):
         if not entry.finite:

@@ -19,19 +19,19 @@ from ns_abstract.arithmetic.rounding import (
     UNDERFLOW64,
     gamma,
 )
-from ns_abstract.execution.ending import checkpoint
+from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.perturbation.specification import TRANSLATIONS
 from ns_abstract.reach.dynamics import middle_half
 from ns_abstract.reach.learned import LearnedDynamics
-from ns_abstract.reach.loop import Control, Face, Loop
-from ns_abstract.refine.protocol import Frame, Member, Method
+from ns_abstract.reach.loop import Control, HalfSpace, Loop
+from ns_abstract.refine.protocol import Frame, Method, SceneSample
+from ns_abstract.verify.camera_response import CameraResponse, response_sets
 from ns_abstract.verify.model import NetworkModel
 from ns_abstract.verify.network import OutputBounds
 from ns_abstract.verify.properties import Query
-from ns_abstract.verify.response import Response, shown_sets
 
 Float64 = NDArray[np.float64]
 #: What is kept from step to step: how states depend on the initial state and on earlier disturbances ("kept"); only how
@@ -100,8 +100,8 @@ class AffineSet:
             # every entry is a sum of n products and an offset
             spread = steep @ (self.radius + share * size) + share * np.abs(offset) + radius
             spread = spread * (1.0 + 2.0 * gamma(n + q + SET_ROUNDINGS)) + np.where(steep.any(axis=1), UNDERFLOW64, 0.0)
-            found = matrix @ self.center + offset, matrix @ self.generators
-        return AffineSet(*found, spread, self.first)
+            image = matrix @ self.center + offset, matrix @ self.generators
+        return AffineSet(*image, spread, self.first)
 
     def beside(self, other: AffineSet) -> AffineSet:
         """Both one after the other; ``other`` is in the same symbols."""
@@ -129,10 +129,10 @@ class AffineSet:
             self.center, np.concatenate([generators, np.diag(radius)[:, wide]], axis=1), np.zeros(n), self.first
         )
 
-    def least(self, face: Face) -> float:
+    def least(self, face: HalfSpace) -> float:
         """Lower bound of a face's value; minus infinity where nothing is known."""
-        found = self.mapped(np.array(face.normal)[None], np.array([-face.offset]))
-        low = float(found.hull()[0][0])
+        image = self.mapped(np.array(face.normal)[None], np.array([-face.offset]))
+        low = float(image.hull()[0][0])
         return low if np.isfinite(low) else -np.inf
 
 
@@ -149,21 +149,21 @@ def _scaled(values: AffineSet, middle: Float64, half: Float64) -> AffineSet:
 # ---------------------------------------------------------------- pictures and the network
 
 
-class View(Protocol):
+class LoopPictures(Protocol):
     """The interface of the pictures that the camera may take."""
 
-    pose_set: PoseSet
+    pose_set: PoseBox
 
-    def image(self, values: Float64, member: Member | None = None) -> np.ndarray:
+    def image(self, values: Float64, member: SceneSample | None = None) -> np.ndarray:
         """[H, W, 3] float32 at pose parameters [d], of another scene of the set if one is named."""
         ...
 
-    def members(self, seed: int) -> Iterator[Member]:
+    def scene_samples(self, seed: int) -> Iterator[SceneSample]:
         """Other scenes of the set, without end; none where only poses vary."""
         ...
 
     def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
-        """Return linear sets, bounds and slopes over a box of poses; see `ns_abstract.verify.protocol.Scene`."""
+        """Return linear sets, bounds and slopes over a box of poses; see `ns_abstract.verify.protocol.FrameImages`."""
         ...
 
 
@@ -176,28 +176,30 @@ class Pictures:
         response: The cameras that may show them; None: one that shows what is rendered.
     """
 
-    def __init__(self, method: Method, poses: PoseSet, response: Response | None = None) -> None:
+    def __init__(self, method: Method, poses: PoseBox, response: CameraResponse | None = None) -> None:
         self.frame: Frame = method.frame(poses)
         self._response = response
         self.pose_set = self.frame.pose_set
         self._tiles = np.arange(self.frame.tile_count)
 
-    def image(self, values: Float64, member: Member | None = None) -> np.ndarray:
-        checkpoint()
-        shown = self.frame.render if member is None else member
-        return assemble(shown(np.asarray(values, np.float64)), self.frame.camera)
+    def image(self, values: Float64, member: SceneSample | None = None) -> np.ndarray:
+        check_cancelled()
+        render = self.frame.render if member is None else member
+        return assemble(render(np.asarray(values, np.float64)), self.frame.camera)
 
-    def members(self, seed: int) -> Iterator[Member]:
-        return self.frame.members(seed) if self._response is None else self._response.members(self.frame, seed)
+    def scene_samples(self, seed: int) -> Iterator[SceneSample]:
+        return (
+            self.frame.scene_samples(seed) if self._response is None else self._response.scene_samples(self.frame, seed)
+        )
 
     def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
-        found = self.frame.bound(box, self._tiles, keep_linear=True)
-        linear, lower, upper = shown_sets(found, self.frame.camera, self._response)
-        return linear, lower, upper, found.slopes
+        tile_bounds = self.frame.bound(box, self._tiles, keep_linear=True)
+        linear, lower, upper = response_sets(tile_bounds, self.frame.camera, self._response)
+        return linear, lower, upper, tile_bounds.slopes
 
 
 @dataclass(frozen=True)
-class Linear:
+class AffineBounds:
     """``y = slopes q + center + e`` with |e| <= radius, and ``lower <= y <= upper``, at places q in [-1, 1]^d.
 
     Attributes:
@@ -212,7 +214,7 @@ class Linear:
     upper: Float64
 
 
-def clipped(raw: Linear, lower: Float64, upper: Float64) -> Linear:
+def clipped(raw: AffineBounds, lower: Float64, upper: Float64) -> AffineBounds:
     """``clip(z, lower, upper)`` for z given by ``raw`` (L3).
 
     ``clip(z) - lambda z`` is largest and smallest at the ends of z's range or where the clip begins, for any lambda.
@@ -236,7 +238,7 @@ def clipped(raw: Linear, lower: Float64, upper: Float64) -> Linear:
         shape = (-1, *[1] * (same.ndim - 1))
         return np.where(inside.reshape(shape), same, np.where(flat.reshape(shape), level, steep))
 
-    return Linear(
+    return AffineBounds(
         chosen(raw.slopes, slope[:, None] * raw.slopes, 0.0),
         chosen(raw.center, slope * raw.center + middle, center),
         chosen(raw.radius, radius, spread),
@@ -245,7 +247,7 @@ def clipped(raw: Linear, lower: Float64, upper: Float64) -> Linear:
     )
 
 
-class Pilot:
+class ControlBounds:
     """Bounds the controls that the network gives for a set of pictures.
 
     Args:
@@ -264,23 +266,23 @@ class Pilot:
         """[m] the control for a picture, as the deployed network computes it."""
         return self.control.of(self.model.outputs(image[None])[0].astype(np.float64))
 
-    def bound(self, linear: Sequence[np.ndarray], lower: np.ndarray, upper: np.ndarray) -> Linear | None:
+    def bound(self, linear: Sequence[np.ndarray], lower: np.ndarray, upper: np.ndarray) -> AffineBounds | None:
         """The controls for a set of pictures, and float64 evaluations of K (y - goal); None: nothing is known (L3)."""
         control = self.control
         m, o = control.gain.shape
         images = self.model.input_sets(tuple(part[None] for part in linear), lower[None], upper[None])
-        found = self.model.bound(images, self._query)
+        output_bounds = self.model.bound(images, self._query)
         with np.errstate(all="ignore"):
-            least = found.lower[0]
+            least = output_bounds.lower[0]
             outputs = np.maximum(-least[2 * m : 2 * m + o], -least[2 * m + o :])
             # K (y - goal) in float64, and K goal
             steep = np.abs(control.gain)
             room = 2.0 * gamma(2 * o + SET_ROUNDINGS) * (steep @ (np.abs(outputs) + np.abs(control.goal)))
-            raw = between(found, m, control.gain @ control.goal, room)
+            raw = between(output_bounds, m, control.gain @ control.goal, room)
             return None if raw is None else clipped(raw, control.lower, control.upper)
 
 
-def between(found: OutputBounds, count: int, shift: Float64, room: Float64) -> Linear | None:
+def between(found: OutputBounds, count: int, shift: Float64, room: Float64) -> AffineBounds | None:
     """Return the affine set between planes: the first ``count`` rows and their negatives, of one cell (L3).
 
     Args:
@@ -307,10 +309,10 @@ def between(found: OutputBounds, count: int, shift: Float64, room: Float64) -> L
         low, high = least[:count], -least[count:]
         # the sums above, and the shift
         wide = room + 2.0 * gamma(a.shape[1] + SET_ROUNDINGS) * (size + np.abs(shift))
-        raw = Linear(slopes, center - shift, half + wide, low - shift - wide, high - shift + wide)
+        raw = AffineBounds(slopes, center - shift, half + wide, low - shift - wide, high - shift + wide)
         poor = ~(raw.radius < 0.5 * (raw.upper - raw.lower))
         middle, spread = middle_half(raw.lower, raw.upper)
-    return Linear(
+    return AffineBounds(
         np.where(poor[:, None], 0.0, raw.slopes),
         np.where(poor, middle, raw.center),
         np.where(poor, spread, raw.radius),
@@ -322,7 +324,7 @@ def between(found: OutputBounds, count: int, shift: Float64, room: Float64) -> L
 # ---------------------------------------------------------------- the tube
 
 
-def clearance(state: AffineSet, unsafe: Sequence[Sequence[Face]]) -> float:
+def clearance(state: AffineSet, unsafe: Sequence[Sequence[HalfSpace]]) -> float:
     """Lower bound, over unsafe sets, of the distance to them along the best face (L4)."""
     return min((max(state.least(face) for face in faces) for faces in unsafe), default=np.inf)
 
@@ -343,17 +345,17 @@ class Tube:
     slopes: Float64
     reason: str = ""
 
-    def safe(self, unsafe: Sequence[Sequence[Face]]) -> float:
+    def safe(self, unsafe: Sequence[Sequence[HalfSpace]]) -> float:
         """Lower bound, over all steps and unsafe sets, of the distance to them along the best face (L4)."""
         return min((clearance(step, unsafe) for step in self.sets), default=np.inf)
 
-    def inside(self, step: int, faces: Sequence[Face]) -> float:
+    def inside(self, step: int, faces: Sequence[HalfSpace]) -> float:
         """Lower bound of how deep all states of a step lie inside a box."""
         return min(self.sets[step].least(face) for face in faces)
 
 
 @dataclass
-class Reacher:
+class TubeBuilder:
     """Tubes of a loop.
 
     Attributes:
@@ -363,12 +365,12 @@ class Reacher:
         dependence: What is kept from step to step.
         registration: How far the scene may stand from its place along every world axis, all of a run through; needs a
             camera that moves along all of them. Otherwise the view's set may tell where the scene stands
-            (`PoseSet.registered`).
+            (`PoseBox.registered`).
     """
 
     loop: Loop
-    view: View
-    pilot: Pilot
+    view: LoopPictures
+    pilot: ControlBounds
     dependence: Dependence = "kept"
     registration: float = 0.0
     _limits: tuple[Float64, Float64] = field(init=False)
@@ -416,14 +418,14 @@ class Reacher:
                 reason = f"unsafe states cannot be ruled out at step {step}"
             if reason or step == self.loop.steps:
                 break
-            checkpoint()
+            check_cancelled()
             if self.dependence != "kept":
                 state = AffineSet.box(*state.hull())
-            found = self._advanced(state.promoted())
-            if isinstance(found, str):
-                reason = f"{found} at step {step}"
+            next_set = self._advanced(state.promoted())
+            if isinstance(next_set, str):
+                reason = f"{next_set} at step {step}"
                 break
-            state, control, moved = found
+            state, control, moved = next_set
             if self.dependence == "kept":
                 slopes[places] += moved[: len(places)]
             sets.append(state)
@@ -490,9 +492,9 @@ class Reacher:
         push, wide = middle_half(*loop.disturbance)
         most = np.abs(loop.disturbance).max(axis=0)
         if isinstance(law, LearnedDynamics):
-            found = law.bound(both.center, both.generators, both.radius, *ends)
+            output_bounds = law.bound(both.center, both.generators, both.radius, *ends)
             none = np.zeros(law.states)
-            lines = None if found is None else between(found, law.states, none, none)
+            lines = None if output_bounds is None else between(output_bounds, law.states, none, none)
             if lines is None:
                 return "the dynamics' bounds are not finite"
             moved = AffineSet(lines.center, lines.slopes, lines.radius, both.first)

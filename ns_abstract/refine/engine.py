@@ -18,16 +18,16 @@ from dataclasses import replace
 import numpy as np
 
 from ns_abstract.arithmetic.rounding import MEAN_DOWN
-from ns_abstract.execution.ending import AbandonedError, abandoning
+from ns_abstract.execution.cancellation import WorkCancelledError, cancel_when
 from ns_abstract.geometry.tiles import in_tiles
-from ns_abstract.refine.frame_tiles import Cell, FrameTiles, context_bytes, usable
-from ns_abstract.refine.goal import Goal
+from ns_abstract.refine.frame_tiles import FrameTiles, LeafCell, context_bytes, usable
+from ns_abstract.refine.goal import RefinementGoal
 from ns_abstract.refine.initial import InitialPartition, Partition
-from ns_abstract.refine.inner import InnerBound, spread
+from ns_abstract.refine.inner import InnerBound, sampled_gap
 from ns_abstract.refine.leaves import Change, LeafBounds
 from ns_abstract.refine.linear_sets import LeafSets
 from ns_abstract.refine.protocol import ACCUMULATION, COLORS, DEPTH, Bounds, Frame, Render
-from ns_abstract.refine.result import FrameResult, Layer, PartResult, TracePoint, joined
+from ns_abstract.refine.result import ExtraOutput, FrameResult, PartResult, TracePoint, joined
 from ns_abstract.refine.sub_boxes import BoxSplitter, SubBox
 from ns_abstract.refine.tuning import TUNING, Tuning
 
@@ -66,7 +66,7 @@ class Refinement:
         self,
         frame: Frame,
         index: int,
-        goal: Goal,
+        goal: RefinementGoal,
         *,
         seed: int = 0,
         keep_leaves: bool = False,
@@ -142,7 +142,7 @@ class Refinement:
         """`run` for tiles that are to be put beside others."""
         return self._part_result(self._work())
 
-    def proceed(self, goal: Goal) -> FrameResult:
+    def proceed(self, goal: RefinementGoal) -> FrameResult:
         """Go on after `run` has covered the set; time between the two does not count."""
         self.goal = goal
         self.start = time.perf_counter() - self.trace[-1].seconds
@@ -156,12 +156,12 @@ class Refinement:
     def _work(self) -> TracePoint:
         self.frame.set_tolerance(0.0)
         # the first call compiles kernels; the clock of the trace starts after it
-        with abandoning(self.stopped):
+        with cancel_when(self.stopped):
             self.inner.render_middle()
         self.start = time.perf_counter()
         self._record(0.0)
         # where the whole set costs nothing, or rays may be left at [0, 1], the cover keeps to the time
-        with abandoning(self._late if self.frame.tilewise else self.stopped), suppress(AbandonedError):
+        with cancel_when(self._late if self.frame.tilewise else self.stopped), suppress(WorkCancelledError):
             corners = self._begin()
             if self._cover() and not self._over():
                 self.inner.render_scenes(self._over)
@@ -178,24 +178,24 @@ class Refinement:
             return corners
         early = np.arange(len(corners)) % max(1, len(corners) // self.tuning.early_corners) == 0
         for values in corners[early]:
-            with suppress(AbandonedError):
+            with suppress(WorkCancelledError):
                 self.inner.render(values)
         if dimensions == 1 and self.goal.ratio >= self.tuning.aim_ratio:
             # the cover alone may reach the goal; cells that are split had better tell what they hide
             self.floor = self.frame.set_tolerance((self.goal.ratio - 1.0) * self.inner.mean_gap)
         return corners[~early]
 
-    def _cell(self, part: SubBox) -> Cell:
-        return Cell(next(self._numbers), part, self.splitter.is_narrow(part.box))
+    def _cell(self, part: SubBox) -> LeafCell:
+        return LeafCell(next(self._numbers), part, self.splitter.is_narrow(part.box))
 
     def _bound(
-        self, cells: list[Cell], parent: Cell | None, places: np.ndarray, pixels: np.ndarray | None = None
+        self, cells: list[LeafCell], parent: LeafCell | None, places: np.ndarray, pixels: np.ndarray | None = None
     ) -> list[tuple[np.ndarray, np.ndarray, Bounds]]:
         """Of each cell, usable lower and upper bounds [t, side, side, channels], and all that the frame returned."""
         bounds = self.tiles.bound(cells, parent, places, pixels)
         return [self._take(*both) for both in zip(cells, bounds, strict=True)]
 
-    def _take(self, cell: Cell, bounds: Bounds) -> tuple[np.ndarray, np.ndarray, Bounds]:
+    def _take(self, cell: LeafCell, bounds: Bounds) -> tuple[np.ndarray, np.ndarray, Bounds]:
         self.cells += 1
         cell.context = bounds.context
         cell.slopes = bounds.slopes
@@ -206,7 +206,7 @@ class Refinement:
         everything = self.tiles.all
         partition = InitialPartition(self.tiles, self.splitter, self.inner, self.goal, self.tuning).choose()
         parts = partition.parts
-        leaves: list[tuple[Cell, np.ndarray, np.ndarray]] = []
+        leaves: list[tuple[LeafCell, np.ndarray, np.ndarray]] = []
         for number, part in enumerate(parts):
             if number and self._over():
                 if self.stopped():
@@ -236,7 +236,7 @@ class Refinement:
         self._record(1.0)
         return True
 
-    def _initial_cell(self, part: SubBox, partition: Partition) -> tuple[Cell, np.ndarray, np.ndarray]:
+    def _initial_cell(self, part: SubBox, partition: Partition) -> tuple[LeafCell, np.ndarray, np.ndarray]:
         """A cell of the initial partition with its bounds, which are computed unless they were tried before."""
         cell, everything = self._cell(part), self.tiles.all
         tried = part.box == partition.tried.box
@@ -247,7 +247,7 @@ class Refinement:
     def _refine(self) -> None:
         self.frame.set_tolerance(0.0)
         # nothing is changed before all that a step needs is there
-        with abandoning(self._late), suppress(AbandonedError):
+        with cancel_when(self._late), suppress(WorkCancelledError):
             while self._round():
                 pass
 
@@ -278,7 +278,7 @@ class Refinement:
                 break
             try:
                 added += self._split(cell, rows, count, changes)
-            except AbandonedError:
+            except WorkCancelledError:
                 break
             fresh.update(rows)
             # by number, not by time: where a round ends must not depend on the machine
@@ -292,7 +292,7 @@ class Refinement:
         self.leaves.apply(changes)
         return True
 
-    def _split(self, cell: Cell, rows: dict[int, int], parts: int, changes: dict[int, Change]) -> int:
+    def _split(self, cell: LeafCell, rows: dict[int, int], parts: int, changes: dict[int, Change]) -> int:
         """Bound the parts of ``cell`` in the tiles of ``rows``; returns the bytes of the new leaves."""
         places = np.array(list(rows), np.int64)
         pixels = self.leaves.wanted(rows)
@@ -330,7 +330,7 @@ class Refinement:
         layers = None
         if self.frame.channels > COLORS:
             places = {"accumulation": ACCUMULATION, "depth": DEPTH}
-            layers = {name: Layer(*(picture[..., k] for picture in pictures)) for name, k in places.items()}
+            layers = {name: ExtraOutput(*(picture[..., k] for picture in pictures)) for name, k in places.items()}
         keeps = self.tiles.keep_linear and self.covered
         return PartResult(
             index=self.index,
@@ -367,7 +367,7 @@ def groups(frame: Frame, count: int) -> list[np.ndarray]:
     return np.array_split(everything, count)
 
 
-def shared_goal(frame: Frame, index: int, goal: Goal, seed: int) -> Goal:
+def shared_goal(frame: Frame, index: int, goal: RefinementGoal, seed: int) -> RefinementGoal:
     """A goal for each of several parts of a frame: where all reach theirs, the whole frame reaches ``goal`` (R6).
 
     Parts that hardly move would never come near a ratio; they may miss it by what the others stay below it.
@@ -376,5 +376,5 @@ def shared_goal(frame: Frame, index: int, goal: Goal, seed: int) -> Goal:
         return goal
     excess = goal.ratio - 1.0
     # rounding of means must not turn the sum around
-    slack = _SLACK_SHARE * excess * spread(frame, index, seed) * MEAN_DOWN
+    slack = _SLACK_SHARE * excess * sampled_gap(frame, index, seed) * MEAN_DOWN
     return replace(goal, ratio=1.0 + (1.0 - _SLACK_SHARE) * excess, slack=slack)

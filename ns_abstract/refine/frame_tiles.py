@@ -7,19 +7,19 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.refine.protocol import COLORS, DEPTH, Bounds, Context, Frame, PartsFrame
+from ns_abstract.refine.protocol import COLORS, DEPTH, Bounds, CellContext, Frame, PartsFrame
 from ns_abstract.refine.result import gap
 from ns_abstract.refine.sub_boxes import SubBox
 
 
-class Cell:
+class LeafCell:
     """A sub-box of the set, the context for cells inside it, and how much the picture varies along each axis [d]."""
 
     __slots__ = ("context", "narrow", "number", "part", "slopes")
 
     def __init__(self, number: int, part: SubBox, narrow: bool) -> None:
         self.number, self.part, self.narrow = number, part, narrow
-        self.context: Context | None = None
+        self.context: CellContext | None = None
         self.slopes = np.zeros(part.box.dimensions)
 
     @property
@@ -73,7 +73,7 @@ class FrameTiles:
         return render(values, None if whole else self.numbers(places))
 
     def bound(
-        self, cells: Sequence[Cell], parent: Cell | None, places: np.ndarray, pixels: np.ndarray | None = None
+        self, cells: Sequence[LeafCell], parent: LeafCell | None, places: np.ndarray, pixels: np.ndarray | None = None
     ) -> Sequence[Bounds]:
         """Bounds of each cell in the tiles at ``places``.
 
@@ -117,6 +117,6 @@ def usable(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return low, high
 
 
-def context_bytes(context: Context | None) -> int:
+def context_bytes(context: CellContext | None) -> int:
     """Memory that a context holds."""
     return 0 if context is None else context.nbytes

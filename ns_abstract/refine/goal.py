@@ -8,7 +8,7 @@ from ns_abstract.refine.result import TracePoint
 
 
 @dataclass(frozen=True)
-class Goal:
+class RefinementGoal:
     """When to stop.
 
     Attributes:

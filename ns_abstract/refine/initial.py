@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ns_abstract.refine.frame_tiles import FrameTiles, context_bytes, usable
-from ns_abstract.refine.goal import Goal
+from ns_abstract.refine.goal import RefinementGoal
 from ns_abstract.refine.inner import InnerBound
 from ns_abstract.refine.linear_sets import linear_bytes
 from ns_abstract.refine.protocol import Bounds
@@ -44,7 +44,7 @@ class InitialPartition:
     """
 
     def __init__(
-        self, tiles: FrameTiles, splitter: BoxSplitter, inner: InnerBound, goal: Goal, tuning: Tuning = TUNING
+        self, tiles: FrameTiles, splitter: BoxSplitter, inner: InnerBound, goal: RefinementGoal, tuning: Tuning = TUNING
     ) -> None:
         self.tiles, self.splitter, self.inner, self.goal, self.tuning = tiles, splitter, inner, goal, tuning
 

@@ -8,9 +8,9 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.refine.frame_tiles import Cell, FrameTiles, pixels_inside
+from ns_abstract.refine.frame_tiles import FrameTiles, LeafCell, pixels_inside
 from ns_abstract.refine.protocol import COLORS, DEPTH, Frame, Render
-from ns_abstract.refine.result import Views, gap
+from ns_abstract.refine.result import SampleImages, gap
 from ns_abstract.refine.sub_boxes import SubBox
 from ns_abstract.refine.tuning import TUNING, Tuning
 
@@ -55,7 +55,7 @@ class InnerBound:
         return picture
 
     def render_middle(self) -> None:
-        """Render the pose in the middle of the set, which becomes `image`."""
+        """Render the pose in the middle of the set, which becomes `input_planes`."""
         self.image = self.render(self.tiles.frame.box.middle)
 
     def render_scenes(self, over: Callable[[], bool]) -> None:
@@ -72,7 +72,7 @@ class InnerBound:
             if over():
                 break
 
-    def render_children(self, parent: Cell, children: Sequence[Cell], places: np.ndarray) -> None:
+    def render_children(self, parent: LeafCell, children: Sequence[LeafCell], places: np.ndarray) -> None:
         """Render poses in the parts of a cell that is split."""
         if parent.box.dimensions > 1:
             if children:
@@ -123,12 +123,12 @@ class InnerBound:
                     yield box.at(np.where(np.arange(box.dimensions) == axis, step, 0.0))
 
     @property
-    def views(self) -> Views:
+    def views(self) -> SampleImages:
         """The pictures of `look_around`."""
         values = [values for values, _ in self._views]
         images = [picture[..., :COLORS] for _, picture in self._views]
         whole = np.stack(images) if images else np.zeros((0, *self.image.shape[:-1], COLORS), np.float32)
-        return Views(np.array(values, np.float64).reshape(len(values), self.tiles.frame.box.dimensions), whole)
+        return SampleImages(np.array(values, np.float64).reshape(len(values), self.tiles.frame.box.dimensions), whole)
 
     def _widen(self, picture: np.ndarray, places: np.ndarray | None) -> None:
         which = slice(None) if places is None else places
@@ -142,7 +142,7 @@ class InnerBound:
         self.observed()
 
 
-def spread(frame: Frame, index: int, seed: int, tuning: Tuning = TUNING) -> float:
+def sampled_gap(frame: Frame, index: int, seed: int, tuning: Tuning = TUNING) -> float:
     """MPG of the pictures at the middle and at two opposite ends of the set: no more than the inner bound's."""
     corners = _some_corners(frame.box, np.random.default_rng([seed, index]), tuning.most_corners)
     pictures = [frame.render(values) for values in (frame.box.middle, *corners[[0, -1]])]

@@ -6,10 +6,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ns_abstract.refine.frame_tiles import Cell, FrameTiles, context_bytes, usable
-from ns_abstract.refine.goal import Goal
+from ns_abstract.refine.frame_tiles import FrameTiles, LeafCell, context_bytes, usable
+from ns_abstract.refine.goal import RefinementGoal
 from ns_abstract.refine.inner import InnerBound
-from ns_abstract.refine.protocol import COLORS, MOST_PARTS, Context
+from ns_abstract.refine.protocol import COLORS, MOST_PARTS, CellContext
 from ns_abstract.refine.tuning import TUNING, Tuning
 
 
@@ -18,7 +18,7 @@ class Change:
     """What a round does to the leaves of one tile: rows that go, and what comes in their place."""
 
     gone: list[int] = field(default_factory=list)
-    cells: list[Cell] = field(default_factory=list)
+    cells: list[LeafCell] = field(default_factory=list)
     lower: list[np.ndarray] = field(default_factory=list)
     upper: list[np.ndarray] = field(default_factory=list)
 
@@ -29,7 +29,7 @@ class TileLeaves:
 
     closed_lower: np.ndarray
     closed_upper: np.ndarray
-    cells: list[Cell] = field(default_factory=list)
+    cells: list[LeafCell] = field(default_factory=list)
     lower: np.ndarray | None = None
     upper: np.ndarray | None = None
 
@@ -110,7 +110,7 @@ class LeafBounds:
         """MPG of the outer bound."""
         return self.tiles.mean_gap(self.lower, self.upper)
 
-    def begin(self, leaves: list[tuple[Cell, np.ndarray, np.ndarray]]) -> None:
+    def begin(self, leaves: list[tuple[LeafCell, np.ndarray, np.ndarray]]) -> None:
         """Take cells that cover the set, with lower and upper bounds [t, side, side, channels] of all tiles."""
         for t in self.tiles.all:
             cells, lowers, uppers = zip(*((cell, lower[t], upper[t]) for cell, lower, upper in leaves), strict=True)
@@ -154,7 +154,7 @@ class LeafBounds:
         if self.tiles.by_pixel:
             self._closed_excess = max(self._closed_excess, self.tuning.closed_share * allowed)
 
-    def next_round(self, goal: Goal) -> tuple[list[tuple[Cell, dict[int, int]]], int]:
+    def next_round(self, goal: RefinementGoal) -> tuple[list[tuple[LeafCell, dict[int, int]]], int]:
         """The cells to split in the next round, each with its row by tile, and into how many parts."""
         while True:
             amounts, owner = self._excess()
@@ -166,7 +166,7 @@ class LeafBounds:
             self._close_least(order, owner)
         running = np.cumsum(amounts[order])
         count = int(np.searchsorted(running, self.tuning.round_share * running[-1])) + 1
-        by_cell: dict[int, tuple[Cell, dict[int, int]]] = {}
+        by_cell: dict[int, tuple[LeafCell, dict[int, int]]] = {}
         for position in order[:count]:
             t, k = owner[position]
             cell = self.by_tile[t].cells[k]
@@ -188,7 +188,7 @@ class LeafBounds:
         """
         excess: list[np.ndarray] = [np.empty(0)]
         owner: list[tuple[int, int]] = []
-        contexts: dict[int, Context | None] = {}
+        contexts: dict[int, CellContext | None] = {}
         self.bytes = 0
         for t, tile in enumerate(self.by_tile):
             if tile.lower is None or tile.upper is None:

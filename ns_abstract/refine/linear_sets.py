@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.refine.frame_tiles import Cell, FrameTiles
+from ns_abstract.refine.frame_tiles import FrameTiles, LeafCell
 from ns_abstract.refine.protocol import Bounds
 from ns_abstract.refine.result import Leaves
 
@@ -29,7 +29,7 @@ class LeafSets:
         self._sets.clear()
         self.bytes = 0
 
-    def keep(self, cell: Cell, bounds: Bounds, places: np.ndarray, parent: Cell | None = None) -> None:
+    def keep(self, cell: LeafCell, bounds: Bounds, places: np.ndarray, parent: LeafCell | None = None) -> None:
         """Take those of ``cell`` in the tiles at ``places``, in place of those of its ``parent``."""
         if not self.tiles.keep_linear or bounds.linear is None:
             return

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.camera_path import Camera
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.perturbation.specification import Perturbation
 
 if TYPE_CHECKING:
@@ -31,7 +31,7 @@ Render = Callable[[np.ndarray, "np.ndarray | None"], np.ndarray]
 Score = Callable[["torch.Tensor", "torch.Tensor"], "torch.Tensor"]
 
 
-class Elements(NamedTuple):
+class SceneElements(NamedTuple):
     """Positions, sizes and colours of scene elements, for drawings of the scene from outside.
 
     Attributes:
@@ -47,14 +47,16 @@ class Elements(NamedTuple):
     opacities: np.ndarray
 
 
-class Member(Protocol):
+class SceneSample(Protocol):
     """A sample of a set of scenes."""
 
     def __call__(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
         """Tiles [t, side, side, 3] float32 of the concrete image at parameter values [d]; all tiles if None."""
         ...
 
-    def pushed(self, box: ParameterBox, values: np.ndarray, score: Score, size: float) -> tuple[np.ndarray, Member]:
+    def signed_gradient_step(
+        self, box: ParameterBox, values: np.ndarray, score: Score, size: float
+    ) -> tuple[np.ndarray, SceneSample]:
         """Parameter values in ``box`` and a scene a signed step on, along which the score of the picture should grow.
 
         Args:
@@ -66,7 +68,7 @@ class Member(Protocol):
         ...
 
     @property
-    def nearest(self) -> Member:
+    def nearest(self) -> SceneSample:
         """The scene of the set that `Frame.render` shows."""
         ...
 
@@ -76,7 +78,7 @@ class Member(Protocol):
         ...
 
 
-class Context(Protocol):
+class CellContext(Protocol):
     """Results of a bounded cell that speed up the cells inside it."""
 
     @property
@@ -110,7 +112,7 @@ class Bounds(Protocol):
     def slopes(self) -> np.ndarray: ...
 
     @property
-    def context(self) -> Context | None: ...
+    def context(self) -> CellContext | None: ...
 
     @property
     def linear(self) -> LinearSets | None: ...
@@ -136,13 +138,13 @@ class Frame(Protocol):
     """
 
     @property
-    def pose_set(self) -> PoseSet: ...
+    def pose_set(self) -> PoseBox: ...
 
     @property
     def box(self) -> ParameterBox: ...
 
     @property
-    def camera(self) -> Camera: ...
+    def camera(self) -> PinholeCamera: ...
 
     @property
     def channels(self) -> int: ...
@@ -183,7 +185,7 @@ class Frame(Protocol):
         """Tiles [t, side, side, channels] float32 of the concrete image at parameter values [d]; all tiles if None."""
         ...
 
-    def members(self, seed: int) -> Iterator[Member]:
+    def scene_samples(self, seed: int) -> Iterator[SceneSample]:
         """Other scenes of the set; none where only poses vary."""
         ...
 
@@ -218,7 +220,7 @@ class Frame(Protocol):
         """
         ...
 
-    def plan(self, shown: int | None, lower: np.ndarray, upper: np.ndarray) -> list[str]:
+    def plan(self, visible: int | None, lower: np.ndarray, upper: np.ndarray) -> list[str]:
         """What was left out for this frame and why, one sentence each.
 
         Args:
@@ -343,7 +345,7 @@ class Method(Protocol):
         """Bytes that a process of so many threads needs beside the leaves to bound pictures of ``pixels``."""
         ...
 
-    def frame(self, poses: PoseSet, slanted: bool = False, layers: bool = False) -> Frame:
+    def frame(self, poses: PoseBox, sheared: bool = False, layers: bool = False) -> Frame:
         """One frame.
 
         Args:
@@ -356,19 +358,19 @@ class Method(Protocol):
         """
         ...
 
-    def easier(self, poses: PoseSet) -> Iterator[tuple[str, Frame]]:
+    def ablations(self, poses: PoseBox) -> Iterator[tuple[str, Frame]]:
         """What makes bounds of a set loose, in words, and its frame without that: not the one asked for."""
         ...
 
-    def holders(self, frame: Frame, box: ParameterBox, tile: int, count: int) -> list[tuple[int, float]]:
+    def attribution(self, frame: Frame, box: ParameterBox, tile: int, count: int) -> list[tuple[int, float]]:
         """Scene elements without which the mean gap of a tile over a cell is less, and by how much, in that order."""
         ...
 
-    def elements(self) -> Elements | None:
+    def elements(self) -> SceneElements | None:
         """What can be drawn of the scene as it is seen from outside; None: nothing has a place of its own."""
         ...
 
-    def differentiable(self, poses: PoseSet) -> Callable[[torch.Tensor], torch.Tensor] | None:
+    def differentiable(self, poses: PoseBox) -> Callable[[torch.Tensor], torch.Tensor] | None:
         """Parameter values [d] to the picture [H, W, 3] by differentiable operations, for the search.
 
         None: certificates are not made of this representation.

@@ -57,7 +57,7 @@ class Leaves:
 
 
 @dataclass(frozen=True)
-class Layer:
+class ExtraOutput:
     """A further output (depth, accumulation): bounds, sampled bounds and one render, [H, W] float32 each.
 
     The accumulation is the part of the light that the scene takes, in [0, 1]. The expected depth is the mean of the
@@ -80,14 +80,14 @@ class Layer:
         return float((self.witness_upper.astype(np.float64) - self.witness_lower).mean())
 
 
-#: Arrays of a `Layer`.
-LAYER_ARRAYS = tuple(Layer.__dataclass_fields__)
+#: Arrays of a `ExtraOutput`.
+EXTRA_OUTPUT_ARRAYS = tuple(ExtraOutput.__dataclass_fields__)
 #: What may be bounded beside the colours.
-LAYERS = ("depth", "accumulation")
+EXTRA_OUTPUTS = ("depth", "accumulation")
 
 
 @dataclass(frozen=True)
-class Views:
+class SampleImages:
     """Concrete renders of some poses of a frame's set.
 
     Attributes:
@@ -115,7 +115,7 @@ class FrameResult:
         plan: What was left out for this frame and why, one sentence each.
         bounded: False while no bound but [0, 1] is known (the budget ended first).
         leaves: The leaf cells' linear sets, if they were asked for.
-        layers: What else was bounded, by name, of `LAYERS`.
+        layers: What else was bounded, by name, of `EXTRA_OUTPUTS`.
         views: Concrete renders across the set, where leaves are kept.
         problems: What is wrong with the arithmetic of a process that bounded some of it; nothing is guaranteed then.
     """
@@ -133,8 +133,8 @@ class FrameResult:
     plan: tuple[str, ...] = ()
     bounded: bool = True
     leaves: Leaves | None = field(default=None, repr=False)
-    layers: Mapping[str, Layer] = field(default_factory=dict, repr=False)
-    views: Views | None = field(default=None, repr=False)
+    layers: Mapping[str, ExtraOutput] = field(default_factory=dict, repr=False)
+    views: SampleImages | None = field(default=None, repr=False)
     problems: tuple[str, ...] = ()
 
 
@@ -168,8 +168,8 @@ class PartResult:
     shown: NDArray[np.int64] | None
     floor: float = 0.0
     leaves: Leaves | None = field(default=None, repr=False)
-    layers: Mapping[str, Layer] | None = field(default=None, repr=False)
-    views: Views | None = field(default=None, repr=False)
+    layers: Mapping[str, ExtraOutput] | None = field(default=None, repr=False)
+    views: SampleImages | None = field(default=None, repr=False)
     problems: tuple[str, ...] = ()
 
 
@@ -198,11 +198,13 @@ def joined(parts: Sequence[PartResult], camera: Any) -> FrameResult:
     def whole(name: str) -> np.ndarray:
         return assemble(np.concatenate([getattr(part, name) for part in parts])[order], camera)
 
-    layers: dict[str, Layer] = {}
+    layers: dict[str, ExtraOutput] = {}
     for name in first.layers or ():
-        found = [part.layers[name] for part in parts if part.layers is not None]
-        arrays = (np.concatenate([getattr(layer, array) for layer in found])[order] for array in LAYER_ARRAYS)
-        layers[name] = Layer(*(assemble(array, camera) for array in arrays))
+        part_layers = [part.layers[name] for part in parts if part.layers is not None]
+        arrays = (
+            np.concatenate([getattr(layer, array) for layer in part_layers])[order] for array in EXTRA_OUTPUT_ARRAYS
+        )
+        layers[name] = ExtraOutput(*(assemble(array, camera) for array in arrays))
     if layers:
         layers["depth"] = _whole_depth(layers["depth"], layers["accumulation"])
     bounded = all(part.bounded for part in parts)
@@ -225,7 +227,7 @@ def joined(parts: Sequence[PartResult], camera: Any) -> FrameResult:
     )
 
 
-def _whole_depth(depth: Layer, accumulation: Layer) -> Layer:
+def _whole_depth(depth: ExtraOutput, accumulation: ExtraOutput) -> ExtraOutput:
     """The expected depth also where nothing is drawn: there it is the largest one of the picture (design.md, D4).
 
     Args:
@@ -244,7 +246,7 @@ def _whole_depth(depth: Layer, accumulation: Layer) -> Layer:
     image = np.where(empty, farthest, depth.image)
     low = np.where(empty, np.minimum(depth.witness_lower, farthest), depth.witness_lower)
     high = np.where(empty, np.maximum(depth.witness_upper, farthest), depth.witness_upper)
-    return Layer(*(array.astype(np.float32) for array in (lower, upper, low, high, image)))
+    return ExtraOutput(*(array.astype(np.float32) for array in (lower, upper, low, high, image)))
 
 
 def _joined_trace(parts: Sequence[PartResult]) -> tuple[TracePoint, ...]:
@@ -266,26 +268,26 @@ def _joined_trace(parts: Sequence[PartResult]) -> tuple[TracePoint, ...]:
     return tuple(points)
 
 
-def _joined_views(parts: Sequence[Views | None], order: NDArray[np.intp], camera: Any) -> Views | None:
+def _joined_views(parts: Sequence[SampleImages | None], order: NDArray[np.intp], camera: Any) -> SampleImages | None:
     """The poses that every part has rendered, in their common order."""
-    known = [part for part in parts if part is not None]
-    if len(known) < len(parts):
+    available = [part for part in parts if part is not None]
+    if len(available) < len(parts):
         return None
-    count = min(part.values.shape[0] for part in known)
-    tiles = np.concatenate([part.images[:count] for part in known], axis=1)[:, order]
+    count = min(part.values.shape[0] for part in available)
+    tiles = np.concatenate([part.images[:count] for part in available], axis=1)[:, order]
     images = [assemble(picture, camera) for picture in tiles]
     shape = (0, camera.height, camera.width, 3)
-    return Views(known[0].values[:count], np.stack(images) if images else np.zeros(shape, np.float32))
+    return SampleImages(available[0].values[:count], np.stack(images) if images else np.zeros(shape, np.float32))
 
 
 def _joined_leaves(parts: Sequence[Leaves | None]) -> Leaves | None:
     """All leaves, ordered by box and tile."""
-    known = [part for part in parts if part is not None]
-    if len(known) < len(parts):
+    available = [part for part in parts if part is not None]
+    if len(available) < len(parts):
         return None
-    if len(known) == 1:
-        return known[0]
-    arrays = {name: np.concatenate([getattr(part, name) for part in known]) for name in Leaves.__dataclass_fields__}
+    if len(available) == 1:
+        return available[0]
+    arrays = {name: np.concatenate([getattr(part, name) for part in available]) for name in Leaves.__dataclass_fields__}
     keys = np.concatenate([arrays["box_lower"], arrays["box_upper"], arrays["tile"].astype(np.float64)], axis=1)
     order = np.lexsort(keys.T[::-1])
     return Leaves(**{name: array[order] for name, array in arrays.items()})

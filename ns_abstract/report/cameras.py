@@ -10,15 +10,15 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from ns_abstract.geometry.camera_path import Camera
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.report.figures import number
 from ns_abstract.report.html import fill
 from ns_abstract.report.outside import (
     ABOVE,
     PICTURE_WIDTH,
-    Outside,
-    Window,
+    PlotWindow,
+    SceneDrawing,
     about,
     behind,
     draw_plane,
@@ -61,7 +61,7 @@ class CellCamera:
     rays: Float64
 
 
-def corner_rays(camera: Camera, pose: Float64) -> Float64:
+def corner_rays(camera: PinholeCamera, pose: Float64) -> Float64:
     """[4, 3] unit vectors through the corners of the picture, in order around it, for a pose [3, 4]."""
     left, right = ((x - camera.cx) / camera.fx for x in (0.0, float(camera.width)))
     top, bottom = ((camera.cy - y) / camera.fy for y in (0.0, float(camera.height)))
@@ -71,7 +71,7 @@ def corner_rays(camera: Camera, pose: Float64) -> Float64:
 
 
 def cell_cameras(
-    pose_sets: Mapping[int, PoseSet], rows: Mapping[int, Sequence[Mapping[str, Any]]], names: Sequence[str]
+    pose_sets: Mapping[int, PoseBox], rows: Mapping[int, Sequence[Mapping[str, Any]]], names: Sequence[str]
 ) -> tuple[list[CellCamera], int]:
     """Cameras at the middles of cells, the widest cells first.
 
@@ -83,21 +83,23 @@ def cell_cameras(
     Returns:
         At most `MOST` cameras, some of every verdict, and the number of cells that are left out.
     """
-    keys = [(frame, k) for frame, found in rows.items() for k in range(len(found))]
-    width = np.concatenate([np.ones(0), *(_shares(pose_sets[f].box, found, names) for f, found in rows.items())])
+    keys = [(frame, k) for frame, frame_rows in rows.items() for k in range(len(frame_rows))]
+    width = np.concatenate(
+        [np.ones(0), *(_shares(pose_sets[f].box, frame_rows, names) for f, frame_rows in rows.items())]
+    )
     # by parts of their sets; of equal ones some from everywhere
     order = np.lexsort(((_GOLDEN * np.arange(len(keys))) % 1.0, -width.round(12)))
     # a verdict that has narrow cells alone is to be seen, too
     kinds = np.array([rows[keys[n][0]][keys[n][1]]["verdict"] for n in order], str)
     first = np.concatenate([np.flatnonzero(kinds == kind)[:_OF_VERDICT] for kind in _ORDER])
     order = np.concatenate([order[first], np.delete(order, first)])
-    found = []
+    frame_rows = []
     for frame, k in sorted(keys[n] for n in order[:MOST]):
         row, poses = rows[frame][k], pose_sets[frame]
         middle = {n: 0.5 * (a + b) for n, a, b in zip(names, row["lower"], row["upper"], strict=True)}
         pose = poses.pose(np.array([middle[name] for name in poses.box.names]))
-        found.append(CellCamera(frame, k, row["verdict"], pose, corner_rays(poses.camera, pose)))
-    return found, len(keys) - len(found)
+        frame_rows.append(CellCamera(frame, k, row["verdict"], pose, corner_rays(poses.camera, pose)))
+    return frame_rows, len(keys) - len(frame_rows)
 
 
 def _shares(box: Any, rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Float64:
@@ -110,7 +112,7 @@ def _shares(box: Any, rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -
     return sides.prod(axis=1)
 
 
-def standing(pose_sets: Mapping[int, PoseSet]) -> tuple[Float64, Float64]:
+def standing(pose_sets: Mapping[int, PoseBox]) -> tuple[Float64, Float64]:
     """[3], [3] ends of a box around where cameras of the sets stand: of poses that vary one parameter each."""
     axes = sum(poses.box.dimensions for poses in pose_sets.values())
     steps = min(_STEPS, max(2, _POSES // max(1, axes)))
@@ -145,24 +147,24 @@ def cameras_entry(cameras: Sequence[CellCamera], left_out: int) -> dict[str, Any
 
 
 @dataclass(frozen=True)
-class View:
+class CameraPlot:
     """A drawing of cameras in a plane.
 
     Attributes:
         title: From where one looks.
-        nearest: As `ns_abstract.report.outside.Outside.picture` has it.
+        nearest: As `ns_abstract.report.outside.SceneDrawing.picture` has it.
         window: The part of the plane.
         shapes: Cameras and the corners of their frusta, normalised units, in the order in which they are drawn.
     """
 
     title: str
     nearest: float
-    window: Window
+    window: PlotWindow
     shapes: list[tuple[CellCamera, list[tuple[float, float]]]]
 
 
 @dataclass(frozen=True)
-class Cameras:
+class CameraDrawings:
     """The drawings of cameras on a page.
 
     Attributes:
@@ -175,15 +177,15 @@ class Cameras:
     cells: Sequence[CellCamera]
     left_out: int
     ends: tuple[Float64, Float64]
-    outside: Outside | None
+    outside: SceneDrawing | None
 
-    def views(self, width: int) -> list[View]:
+    def views(self, width: int) -> list[CameraPlot]:
         """What there is to see from above and from the side, in pictures so many pixels wide."""
         low, high = self.ends
         span = float((high - low).max())
         room = _LENGTH * max(span, _LEAST)
         around = room + 0.5 * max(0.0, _LEAST - span)
-        found = []
+        plots = []
         for axes, title, nearest in (
             # a ceiling would hide everything
             (ABOVE, "from above", float(high[2])),
@@ -197,8 +199,8 @@ class Cameras:
                 place = camera.pose[:, 3]
                 points = np.concatenate([place[None], place + length * camera.rays])[:, chosen]
                 shapes.append((camera, _hull([(a, b) for a, b in points.tolist()])))
-            found.append(View(title, nearest, window, shapes))
-        return found
+            plots.append(CameraPlot(title, nearest, window, shapes))
+        return plots
 
     def plots(self, numbers: Mapping[tuple[int, int], int]) -> list[tuple[Markup, str, str]]:
         """From above and from the side: the plot, its title, and what of the scene it shows."""
@@ -234,14 +236,14 @@ def _hull(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
         return rising
 
     def half(along: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-        kept: list[tuple[float, float]] = []
+        corners: list[tuple[float, float]] = []
         for c in along:
-            while len(kept) > 1:
-                a, b = kept[-2:]
+            while len(corners) > 1:
+                a, b = corners[-2:]
                 if (b[0] - a[0]) * (c[1] - a[1]) - (b[1] - a[1]) * (c[0] - a[0]) > 0.0:
                     break
-                kept.pop()
-            kept.append(c)
-        return kept[:-1]
+                corners.pop()
+            corners.append(c)
+        return corners[:-1]
 
     return half(rising) + half(rising[::-1])

@@ -10,14 +10,14 @@ from typing import Any
 
 from markupsafe import Markup, escape
 
-from ns_abstract.report.cameras import Cameras
+from ns_abstract.report.cameras import CameraDrawings
 from ns_abstract.report.figures import number, percent, unit_of_axis
 from ns_abstract.report.html import set_of, uri, whole_page
 from ns_abstract.report.record import plain
-from ns_abstract.report.regions import Region, Shown, regions_html
-from ns_abstract.report.svg import Axis, draw_line, draw_plot, draw_svg
+from ns_abstract.report.regions import FailureRegion, PoseImage, regions_html
+from ns_abstract.report.svg import PlotAxis, draw_line, draw_plot, draw_svg
 from ns_abstract.report.verdict_maps import free_parameters, maps_of, matrix_svg, mixed, pixels
-from ns_abstract.report.walk import Stop, walk_html
+from ns_abstract.report.walk import WalkPose, walk_html
 
 _VERDICTS = ("certified", "falsified", "unknown")
 _STATES = {
@@ -37,7 +37,7 @@ _RING = 1.0
 
 
 @dataclass(frozen=True)
-class Closer:
+class CertificateDetails:
     """Details that were computed when a search ended: regions of failure, poses with pictures.
 
     Attributes:
@@ -47,9 +47,9 @@ class Closer:
         why: Why there are no more pictures, as the end of a sentence; empty if there were not to be more.
     """
 
-    regions: Sequence[Region] = ()
-    pictures: Sequence[tuple[Shown, Shown | None]] = ()
-    stops: Sequence[tuple[Stop, Shown]] = ()
+    regions: Sequence[FailureRegion] = ()
+    pictures: Sequence[tuple[PoseImage, PoseImage | None]] = ()
+    stops: Sequence[tuple[WalkPose, PoseImage]] = ()
     why: str = ""
 
 
@@ -58,8 +58,8 @@ def certificate_page(
     cells: Mapping[int, Sequence[Mapping[str, Any]]],
     pictures: Sequence[Mapping[str, Any]],
     seen: Mapping[tuple[int, int], Mapping[str, Any]] | None = None,
-    cameras: Cameras | None = None,
-    closer: Closer | None = None,
+    cameras: CameraDrawings | None = None,
+    closer: CertificateDetails | None = None,
 ) -> str:
     """The page of a certificate.
 
@@ -75,7 +75,7 @@ def certificate_page(
         HTML, self-contained; every text of the document is escaped.
     """
     name = str(document["scene"].get("name", "scene"))
-    numbers, closer = _numbered(document, cells), closer or Closer()
+    numbers, closer = _numbered(document, cells), closer or CertificateDetails()
     sides = {entry["index"]: entry["parameters"] for entry in document["frames"]}
     covered = percent(document["coverage"]["certified"])
     kind, heading = {
@@ -121,11 +121,11 @@ def _numbered(
     document: Mapping[str, Any], cells: Mapping[int, Sequence[Mapping[str, Any]]]
 ) -> dict[tuple[int, int], int]:
     """Numbers of the cells that can be chosen, by frame and position; none where there are too many."""
-    found: dict[tuple[int, int], int] = {}
+    numbers: dict[tuple[int, int], int] = {}
     for entry in document["frames"][:_MOST_ROWS]:
         for position in range(len(cells.get(entry["index"], ()))):
-            found[entry["index"], position] = len(found)
-    return found if len(found) <= _MOST_CELLS else {}
+            numbers[entry["index"], position] = len(numbers)
+    return numbers if len(numbers) <= _MOST_CELLS else {}
 
 
 def _cell_data(
@@ -234,13 +234,13 @@ def path_spans(
         last: How wide a keyframe by itself is drawn.
     """
     free = free_parameters(entry["parameters"])
-    found = []
+    spans = []
     for row in rows:
         low, high = (row["lower"][free[0]], row["upper"][free[0]]) if free else (0.0, last)
         example = row.get("counterexample")
         at = None if example is None else example[free[0]] if free else 0.5 * last
-        found.append((low, high, row["verdict"], at))
-    return found
+        spans.append((low, high, row["verdict"], at))
+    return spans
 
 
 #: How wide the last keyframe of a path is drawn, as a part of the path.
@@ -249,8 +249,8 @@ LAST = 0.015
 
 def _broken(rows: Sequence[Mapping[str, Any]]) -> list[Sequence[float]]:
     """Counterexamples, each once; some of many, evenly spread."""
-    found = list({tuple(e): e for row in rows if (e := row.get("counterexample")) is not None}.values())
-    return found[:: max(1, -(-len(found) // _MOST_MARKS))]
+    counterexamples = list({tuple(e): e for row in rows if (e := row.get("counterexample")) is not None}.values())
+    return counterexamples[:: max(1, -(-len(counterexamples) // _MOST_MARKS))]
 
 
 def _ring(spans: Sequence[_Span], parameter: Mapping[str, Any], broken: Sequence[float]) -> Markup:
@@ -284,7 +284,7 @@ def _ring(spans: Sequence[_Span], parameter: Mapping[str, Any], broken: Sequence
 
 
 def _strip(spans: Sequence[_Span], parameter: Mapping[str, Any], broken: Sequence[float]) -> Markup:
-    axis = Axis(parameter["lower"], parameter["upper"], 20, 700, log=False)
+    axis = PlotAxis(parameter["lower"], parameter["upper"], 20, 700, log=False)
     marks = _along(spans, axis, broken)
     marks += [
         f'<text x="{axis(tick):.1f}" y="58" text-anchor="middle">{number(tick, 3)}</text>' for tick in axis.ticks()
@@ -294,7 +294,7 @@ def _strip(spans: Sequence[_Span], parameter: Mapping[str, Any], broken: Sequenc
     return draw_svg(720, 80, f"Verdicts along {parameter['name']}", "".join(marks))
 
 
-def _along(spans: Sequence[_Span], axis: Axis, broken: Sequence[float], offset: float = 0.0) -> list[str]:
+def _along(spans: Sequence[_Span], axis: PlotAxis, broken: Sequence[float], offset: float = 0.0) -> list[str]:
     """Cells side by side, counterexamples below them."""
     marks = [
         f'<rect class="{kind}"{_chosen(n)} x="{axis(offset + a):.2f}" y="8" '
@@ -312,12 +312,12 @@ def _path(
     """All ways from keyframe to keyframe, one after another."""
     ways = sum(bool(free_parameters(entry["parameters"])) for entry in frames)
     last = LAST * ways
-    axis = Axis(0.0, ways + (last if ways < len(frames) else 0.0), 20, 1000, log=False)
+    axis = PlotAxis(0.0, ways + (last if ways < len(frames) else 0.0), 20, 1000, log=False)
     marks = []
     for position, entry in enumerate(frames):
-        found = path_spans(entry, cells.get(entry["index"], ()), last)
-        spans = [(a, b, kind, numbers.get((entry["index"], k))) for k, (a, b, kind, _) in enumerate(found)]
-        broken = sorted({at for *_, at in found if at is not None})
+        frame_spans = path_spans(entry, cells.get(entry["index"], ()), last)
+        spans = [(a, b, kind, numbers.get((entry["index"], k))) for k, (a, b, kind, _) in enumerate(frame_spans)]
+        broken = sorted({at for *_, at in frame_spans if at is not None})
         marks += _along(spans, axis, broken[:: max(1, -(-len(broken) // _MOST_MARKS))], position)
         at = axis(position)
         marks.append(f'<path class="axis" d="M{at:.1f},4V48"/>')
@@ -335,8 +335,8 @@ def _plane(
 ) -> Markup:
     i, j = free
     parameters = [entry["parameters"][k] for k in free]
-    x = Axis(parameters[0]["lower"], parameters[0]["upper"], 58, 438, log=False)
-    y = Axis(parameters[1]["lower"], parameters[1]["upper"], 400, 20, log=False)
+    x = PlotAxis(parameters[0]["lower"], parameters[0]["upper"], 58, 438, log=False)
+    y = PlotAxis(parameters[1]["lower"], parameters[1]["upper"], 400, 20, log=False)
     if len(rows) > _MOST_CELLS:
         marks = (
             f'<image class="pixels" x="58" y="20" width="380" height="380" preserveAspectRatio="none" '
@@ -409,8 +409,8 @@ def _bars(
 
 def _least(rows: Sequence[Mapping[str, Any]], kind: str) -> int | None:
     """The cell of a verdict whose margin is the least; one without a margin if all are."""
-    found = [k for k, row in enumerate(rows) if row["verdict"] == kind]
-    return min(found, key=lambda k: math.inf if (m := rows[k].get("margin")) is None else m, default=None)
+    of_verdict = [k for k, row in enumerate(rows) if row["verdict"] == kind]
+    return min(of_verdict, key=lambda k: math.inf if (m := rows[k].get("margin")) is None else m, default=None)
 
 
 def _time(trace: Sequence[Mapping[str, float]]) -> Markup:
@@ -419,8 +419,8 @@ def _time(trace: Sequence[Mapping[str, float]]) -> Markup:
     points = [p for k, p in enumerate(trace) if k % stride == 0 or k == len(trace) - 1]
     if len(points) < 2:
         return Markup()
-    x = Axis(0.0, max(p["seconds"] for p in points), 52, 628, log=False)
-    y = Axis(0.0, 1.0, 216, 26, log=False)
+    x = PlotAxis(0.0, max(p["seconds"] for p in points), 52, 628, log=False)
+    y = PlotAxis(0.0, 1.0, 216, 26, log=False)
     marks = "".join(
         draw_line([(x(p["seconds"]), y(p[kind])) for p in points], f"c-{kind}", False) for kind in _VERDICTS
     )

@@ -176,8 +176,8 @@ def panels(result: FrameResult, names: Sequence[str], largest: float, text: str)
     step = width + _PANEL_GAP
     whole = Image.new("RGB", (step * len(names) - _PANEL_GAP, height + 2 * _PANEL_TEXT), "white")
     pen = ImageDraw.Draw(whole)
-    for k, (name, shown) in enumerate(zip(names, pictures, strict=True)):
-        whole.paste(Image.fromarray(shown), (k * step, _PANEL_TEXT))
+    for k, (name, image) in enumerate(zip(names, pictures, strict=True)):
+        whole.paste(Image.fromarray(image), (k * step, _PANEL_TEXT))
         pen.text((k * step + 4, 4), _LABELS[name], fill="black")
     pen.text((4, height + _PANEL_TEXT + 4), text, fill="black")
     return np.asarray(whole)

@@ -40,22 +40,22 @@ def layer_metrics(result: FrameResult) -> dict[str, dict[str, float | None]]:
         ``mean_gap``: mean over the pixels of upper - lower, in the output's unit; ``mean_gap_witness``: the same of
         what was rendered; ``ratio``: of the two; None where a number is not finite.
     """
-    found: dict[str, dict[str, float | None]] = {}
+    metrics_by_name: dict[str, dict[str, float | None]] = {}
     for name, layer in result.layers.items():
         outer, inner = layer.mean_gap(), layer.mean_gap_witness()
         ratio = outer / inner if inner > 0.0 else math.inf
         values = {"mean_gap": outer, "mean_gap_witness": inner, "ratio": ratio}
-        found[name] = {key: value if math.isfinite(value) else None for key, value in values.items()}
-    return found
+        metrics_by_name[name] = {key: value if math.isfinite(value) else None for key, value in values.items()}
+    return metrics_by_name
 
 
 def seconds_to(trace: Sequence[TracePoint], marks: Sequence[float] = MARKS) -> dict[float, float | None]:
     """Seconds of work after which MPG was at most each of ``marks`` times the witness MPG; None: never."""
-    found: dict[float, float | None] = {}
+    seconds: dict[float, float | None] = {}
     for mark in marks:
-        reached = (p.seconds for p in trace if p.covered == 1.0 and p.mpg <= mark * p.mpg_witness)
-        found[mark] = next(reached, None)
-    return found
+        times = (p.seconds for p in trace if p.covered == 1.0 and p.mpg <= mark * p.mpg_witness)
+        seconds[mark] = next(times, None)
+    return seconds
 
 
 def number(value: float | None, digits: int = 4) -> str:
@@ -100,8 +100,8 @@ def listed(numbers: Sequence[int]) -> str:
             runs[-1][1] = number
         else:
             runs.append([number, number])
-    told = [f"{a} to {b}" if b > a + 1 else ", ".join(map(str, dict.fromkeys((a, b)))) for a, b in runs[:_RUNS]]
-    return ", ".join(told) + (f" and others, {len(numbers):,} together" if len(runs) > _RUNS else "")
+    texts = [f"{a} to {b}" if b > a + 1 else ", ".join(map(str, dict.fromkeys((a, b)))) for a, b in runs[:_RUNS]]
+    return ", ".join(texts) + (f" and others, {len(numbers):,} together" if len(runs) > _RUNS else "")
 
 
 def short_guarantee(guarantee: str, bounded: str | None) -> str:

@@ -21,14 +21,22 @@ from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import parse_json
 from ns_abstract.io.memory import check_memory
-from ns_abstract.refine.result import LAYER_ARRAYS, LAYERS, FrameResult, Layer, Leaves, TracePoint, Views
+from ns_abstract.refine.result import (
+    EXTRA_OUTPUT_ARRAYS,
+    EXTRA_OUTPUTS,
+    ExtraOutput,
+    FrameResult,
+    Leaves,
+    SampleImages,
+    TracePoint,
+)
 
 FORMAT = "ns-abstract frame"
 VERSION = 1
 #: Arrays [H, W, 3] of every frame file.
 IMAGES = ("lower", "upper", "witness_lower", "witness_upper", "image")
-#: Arrays [H, W] of a frame file with further outputs, by name and field of `Layer`: ``depth_lower``.
-LAYER_NAMES = {f"{name}_{array}": (name, array) for name in LAYERS for array in LAYER_ARRAYS}
+#: Arrays [H, W] of a frame file with further outputs, by name and field of `ExtraOutput`: ``depth_lower``.
+LAYER_NAMES = {f"{name}_{array}": (name, array) for name in EXTRA_OUTPUTS for array in EXTRA_OUTPUT_ARRAYS}
 #: Arrays of a frame file with leaf cells.
 LEAVES = tuple(field.name for field in fields(Leaves))
 #: Arrays of a frame file with leaf cells: poses of the set, and what was rendered there.
@@ -103,7 +111,7 @@ def check_frame(result: FrameResult) -> None:
         _check_views(result, result.views, fail)
 
 
-def _check_views(result: FrameResult, views: Views, fail: Callable[[str], ValueError]) -> None:
+def _check_views(result: FrameResult, views: SampleImages, fail: Callable[[str], ValueError]) -> None:
     values, images, box = views.values, views.images, result.box
     if values.dtype != np.float64 or values.ndim != 2 or values.shape[1] != box.dimensions:
         raise fail(f"views: values are {values.dtype} {list(values.shape)}, not float64 [n, {box.dimensions}]")
@@ -116,8 +124,8 @@ def _check_views(result: FrameResult, views: Views, fail: Callable[[str], ValueE
         raise fail("views: a render lies outside the bounds; the bounds are not sound")
 
 
-def _check_layer(name: str, layer: Layer, shape: tuple[int, ...], fail: Callable[[str], ValueError]) -> None:
-    for field in LAYER_ARRAYS:
+def _check_layer(name: str, layer: ExtraOutput, shape: tuple[int, ...], fail: Callable[[str], ValueError]) -> None:
+    for field in EXTRA_OUTPUT_ARRAYS:
         array = getattr(layer, field)
         if array.dtype != np.float32 or array.shape != shape:
             raise fail(f"{name}_{field} is {array.dtype} {list(array.shape)}, not float32 {list(shape)}")
@@ -315,12 +323,12 @@ def _parse(archive: Archive, has_leaves: bool, read_leaves: bool) -> StoredFrame
         tuple(map(float, table["upper"])),
     )
     layers = {}
-    for name in LAYERS:
-        known = [full for full, (layer, _) in LAYER_NAMES.items() if layer == name and full in archive.declared]
-        if known and len(known) < len(LAYER_ARRAYS):
+    for name in EXTRA_OUTPUTS:
+        stored_layers = [full for full, (layer, _) in LAYER_NAMES.items() if layer == name and full in archive.declared]
+        if stored_layers and len(stored_layers) < len(EXTRA_OUTPUT_ARRAYS):
             raise InputError(f"not all arrays of {name}")
-        if known:
-            layers[name] = Layer(*(archive.read(full) for full in known))
+        if stored_layers:
+            layers[name] = ExtraOutput(*(archive.read(full) for full in stored_layers))
     result = FrameResult(
         index=_integer(record["index"]),
         box=box,
@@ -336,7 +344,7 @@ def _parse(archive: Archive, has_leaves: bool, read_leaves: bool) -> StoredFrame
         bounded=record["bounded"] is True,
         leaves=Leaves(**{name: archive.read(name) for name in LEAVES}) if has_leaves and read_leaves else None,
         layers=layers,
-        views=Views(*(archive.read(name) for name in VIEWS))
+        views=SampleImages(*(archive.read(name) for name in VIEWS))
         if read_leaves and set(VIEWS) <= set(archive.declared)
         else None,
     )

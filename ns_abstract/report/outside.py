@@ -10,10 +10,10 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from ns_abstract.refine.protocol import Elements
+from ns_abstract.refine.protocol import SceneElements
 from ns_abstract.report.html import uri
 from ns_abstract.report.picture import png
-from ns_abstract.report.svg import Axis, draw_plot
+from ns_abstract.report.svg import PlotAxis, draw_plot
 
 Float64 = NDArray[np.float64]
 K = TypeVar("K")
@@ -41,7 +41,7 @@ ABOVE = (0, 1)
 
 
 @dataclass(frozen=True)
-class Window:
+class PlotWindow:
     """The window of a plot: the part of a plane that is shown, at one scale.
 
     Attributes:
@@ -56,27 +56,27 @@ class Window:
     size: tuple[int, int]
 
 
-def _remembered(kept: dict[K, V], key: K, find: Callable[[], V]) -> V:
+def _remembered(cached: dict[K, V], key: K, find: Callable[[], V]) -> V:
     """Return the value of a key from a small cache, or compute it."""
-    if key not in kept:
-        while len(kept) >= _KEPT:
-            kept.pop(next(iter(kept)))
-        kept[key] = find()
-    return kept[key]
+    if key not in cached:
+        while len(cached) >= _KEPT:
+            cached.pop(next(iter(cached)))
+        cached[key] = find()
+    return cached[key]
 
 
 @dataclass
-class Outside:
+class SceneDrawing:
     """Draws a scene from outside.
 
     Args:
         elements: What is drawn.
     """
 
-    elements: Elements
+    elements: SceneElements
     # reports are written again and again, mostly of the same windows
-    _windows: dict[tuple[Any, ...], Window] = field(default_factory=dict)
-    _pictures: dict[tuple[Window, float], bytes] = field(default_factory=dict)
+    _windows: dict[tuple[Any, ...], PlotWindow] = field(default_factory=dict)
+    _pictures: dict[tuple[PlotWindow, float], bytes] = field(default_factory=dict)
 
     @staticmethod
     def sight(axes: tuple[int, int]) -> tuple[int, float]:
@@ -89,10 +89,10 @@ class Outside:
         third, sign = self.sight(axes)
         depth = sign * self.elements.places[:, third]
         good = np.isfinite(self.elements.places).all(axis=1) & (self.elements.opacities >= _OPAQUE)
-        found = np.flatnonzero(good & (depth <= nearest))
-        return found[np.argsort(depth[found], kind="stable")]
+        visible = np.flatnonzero(good & (depth <= nearest))
+        return visible[np.argsort(depth[visible], kind="stable")]
 
-    def window(self, axes: tuple[int, int], low: Float64, high: Float64, nearest: float, width: int) -> Window:
+    def window(self, axes: tuple[int, int], low: Float64, high: Float64, nearest: float, width: int) -> PlotWindow:
         """A window about the box [2] to [2] that shows some of the scene about it.
 
         Args:
@@ -104,7 +104,7 @@ class Outside:
         key = axes, *low.tolist(), *high.tolist(), nearest, width
         return _remembered(self._windows, key, lambda: self._window(axes, low, high, nearest, width))
 
-    def _window(self, axes: tuple[int, int], low: Float64, high: Float64, nearest: float, width: int) -> Window:
+    def _window(self, axes: tuple[int, int], low: Float64, high: Float64, nearest: float, width: int) -> PlotWindow:
         span = max(float((high - low).max()), 1e-6)
         places = self.elements.places[self._drawn(axes, nearest)][:, list(axes)]
         if len(places):
@@ -116,7 +116,7 @@ class Outside:
             high = np.maximum(high, np.minimum(near.max(axis=0), high + room))
         return framed(axes, low, high, width)
 
-    def picture(self, window: Window, nearest: float = np.inf) -> bytes:
+    def picture(self, window: PlotWindow, nearest: float = np.inf) -> bytes:
         """PNG of the elements in a window.
 
         Args:
@@ -125,7 +125,7 @@ class Outside:
         """
         return _remembered(self._pictures, (window, nearest), lambda: self._picture(window, nearest))
 
-    def _picture(self, window: Window, nearest: float) -> bytes:
+    def _picture(self, window: PlotWindow, nearest: float) -> bytes:
         low, high = np.array(window.low), np.array(window.high)
         axes = list(window.axes)
         numbers = self._drawn(window.axes, nearest)
@@ -133,9 +133,9 @@ class Outside:
         flat = self.elements.spreads[numbers][:, axes]
         half = np.sqrt((flat**2).sum(axis=2))
         places = self.elements.places[numbers][:, axes]
-        seen = ((places + half >= low) & (places - half <= high)).all(axis=1)
-        seen &= half.max(axis=1) <= _HUGE * float((high - low).max())
-        numbers, flat, places = numbers[seen], flat[seen], places[seen]
+        inside = ((places + half >= low) & (places - half <= high)).all(axis=1)
+        inside &= half.max(axis=1) <= _HUGE * float((high - low).max())
+        numbers, flat, places = numbers[inside], flat[inside], places[inside]
         # corners of ellipses of one standard deviation, in pixels
         values, vectors = np.linalg.eigh(flat @ flat.swapaxes(1, 2)) if len(flat) else (np.ones((0, 2)), flat[..., :2])
         axis = np.maximum(scale * np.sqrt(np.maximum(values, 0.0)), _FINE * _LEAST)
@@ -151,16 +151,16 @@ class Outside:
         fill = np.clip(fill, 0.0, 255.0).astype(np.uint8)
         data = b""
         for count in _COUNTS:
-            kept = np.arange(len(numbers))
-            if len(kept) > count:
-                kept = np.sort(np.random.default_rng(0).choice(len(kept), count, replace=False))
-            data = _ellipses(window.size, corners[kept], fill[kept])
+            drawn = np.arange(len(numbers))
+            if len(drawn) > count:
+                drawn = np.sort(np.random.default_rng(0).choice(len(drawn), count, replace=False))
+            data = _ellipses(window.size, corners[drawn], fill[drawn])
             if len(data) <= _MOST_BYTES:
                 break
         return data
 
 
-def framed(axes: tuple[int, int], low: Float64, high: Float64, width: int) -> Window:
+def framed(axes: tuple[int, int], low: Float64, high: Float64, width: int) -> PlotWindow:
     """A window of one scale around the box, with a margin, neither flat nor tall."""
     margin = 0.06 * max(float((high - low).max()), 1e-6)
     low, high = low - margin, high + margin
@@ -169,7 +169,7 @@ def framed(axes: tuple[int, int], low: Float64, high: Float64, width: int) -> Wi
     across, up = max(across, up / shape), max(up, across * shape)
     middle, half = 0.5 * (low + high), 0.5 * np.array([across, up])
     low, high = (middle - half).tolist(), (middle + half).tolist()
-    return Window(axes, (low[0], low[1]), (high[0], high[1]), (width, max(1, round(width * shape))))
+    return PlotWindow(axes, (low[0], low[1]), (high[0], high[1]), (width, max(1, round(width * shape))))
 
 
 def sideways(low: Float64, high: Float64) -> tuple[int, int]:
@@ -178,28 +178,28 @@ def sideways(low: Float64, high: Float64) -> tuple[int, int]:
 
 
 def about(
-    outside: Outside | None, axes: tuple[int, int], low: Float64, high: Float64, nearest: float, width: int
-) -> Window:
-    """`Outside.window`; `framed` where there is nothing to draw of the scene."""
+    outside: SceneDrawing | None, axes: tuple[int, int], low: Float64, high: Float64, nearest: float, width: int
+) -> PlotWindow:
+    """`SceneDrawing.window`; `framed` where there is nothing to draw of the scene."""
     return framed(axes, low, high, width) if outside is None else outside.window(axes, low, high, nearest, width)
 
 
-def plane_axes(window: Window) -> tuple[Axis, Axis]:
+def plane_axes(window: PlotWindow) -> tuple[PlotAxis, PlotAxis]:
     """From the plane's coordinates to those of `draw_plane`."""
     (left, _, above, _), (width, height) = _ROOM, window.size
     return (
-        Axis(window.low[0], window.high[0], left, left + width, log=False),
-        Axis(window.low[1], window.high[1], above + height, above, log=False),
+        PlotAxis(window.low[0], window.high[0], left, left + width, log=False),
+        PlotAxis(window.low[1], window.high[1], above + height, above, log=False),
     )
 
 
-def draw_plane(outside: Outside | None, window: Window, nearest: float, marks: str, title: str) -> Markup:
+def draw_plane(outside: SceneDrawing | None, window: PlotWindow, nearest: float, marks: str, title: str) -> Markup:
     """SVG of a window: the scene, if it has elements, and ``marks`` over it.
 
     Args:
         outside: Draws the scene.
         window: What is shown.
-        nearest: As `Outside.picture` has it.
+        nearest: As `SceneDrawing.picture` has it.
         marks: SVG, in the coordinates of `plane_axes`.
         title: Of the plot.
     """
@@ -214,7 +214,7 @@ def draw_plane(outside: Outside | None, window: Window, nearest: float, marks: s
     return draw_plot(*plane_axes(window), labels, marks, size=size, title=title)
 
 
-def behind(outside: Outside | None, nearest: float, alone: str) -> str:
+def behind(outside: SceneDrawing | None, nearest: float, alone: str) -> str:
     """Return a caption of what a plot shows of the scene; ``alone``: the caption without a scene."""
     if outside is None:
         return f"The scene has no elements with a place of their own (a NeRF's field has none): {alone}."

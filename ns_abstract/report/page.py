@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from ns_abstract.report.figures import MARKS, number
 from ns_abstract.report.html import counted, set_of, whole_page
-from ns_abstract.report.svg import Axis, draw_legend, draw_line, draw_plot, stairs, through
+from ns_abstract.report.svg import PlotAxis, draw_legend, draw_line, draw_plot, stairs, through
 
 #: Points drawn of one curve.
 _CURVE_POINTS = 200
@@ -107,18 +107,21 @@ def _set(entry: Mapping[str, Any]) -> str:
 
 def _verdict(document: Mapping[str, Any]) -> dict[str, Any]:
     """Kind and title of the verdict, how many frames have bounds, and further sentences."""
-    asked, missing = len(document["frames_asked"]), len(document["missing"])
-    bounded = asked - missing
+    frame_count, missing = len(document["frames_asked"]), len(document["missing"])
+    bounded = frame_count - missing
     sampled = document["guarantee"] == "sampled"
     frames = document["frames"]
     if sampled:
-        kind, title = "bad", f"No guarantee: rendered samples of {counted(asked, 'frame')}"
+        kind, title = "bad", f"No guarantee: rendered samples of {counted(frame_count, 'frame')}"
     elif not bounded:
-        kind, title = "bad", f"No bounds yet: 0 of {counted(asked, 'frame')}"
+        kind, title = "bad", f"No bounds yet: 0 of {counted(frame_count, 'frame')}"
     elif missing:
-        kind, title = "fair", f"Bounds for {bounded} of {counted(asked, 'frame')}"
+        kind, title = "fair", f"Bounds for {bounded} of {counted(frame_count, 'frame')}"
     else:
-        kind, title = "good", f"Bounds for all {counted(asked, 'frame')}" if asked > 1 else "Bounds for the frame"
+        kind, title = (
+            "good",
+            f"Bounds for all {counted(frame_count, 'frame')}" if frame_count > 1 else "Bounds for the frame",
+        )
     lines = []
     ratios = [entry["ratio"] for entry in frames if entry["ratio"] is not None and entry["status"] != "missing"]
     if ratios and not sampled:
@@ -168,28 +171,28 @@ def _captions(entry: Mapping[str, Any], sampled: bool) -> Sequence[tuple[str, st
 def _thinned(trace: Sequence[Mapping[str, float]]) -> list[Mapping[str, float]]:
     """Points after the first moment, some of many, the last one always."""
     stride = max(1, math.ceil(len(trace) / _CURVE_POINTS))
-    kept = [point for k, point in enumerate(trace) if k % stride == 0 or k == len(trace) - 1]
-    return [point for point in kept if point["seconds"] > 0.0]
+    points = [point for k, point in enumerate(trace) if k % stride == 0 or k == len(trace) - 1]
+    return [point for point in points if point["seconds"] > 0.0]
 
 
 def _curve(entry: Mapping[str, Any]) -> Markup | None:
     """Error against run time, both axes logarithmic; zero has no place on them and is left out."""
-    kept = _thinned(entry["trace"])
-    outer = [(point["seconds"], point["mpg"]) for point in kept if point["mpg"] > 0.0]
-    inner = [(point["seconds"], point["mpg_witness"]) for point in kept if point["mpg_witness"] > 0.0]
+    points = _thinned(entry["trace"])
+    outer = [(point["seconds"], point["mpg"]) for point in points if point["mpg"] > 0.0]
+    inner = [(point["seconds"], point["mpg_witness"]) for point in points if point["mpg_witness"] > 0.0]
     if not outer:
         return None
     values = [value for _, value in outer + inner]
     end = max(t for t, _ in outer + inner)
-    x = Axis(min(t for t, _ in outer + inner), end, 52, 408, log=True)
-    y = Axis(min(values), max(values), 216, 26, log=True)
+    x = PlotAxis(min(t for t, _ in outer + inner), end, 52, 408, log=True)
+    y = PlotAxis(min(values), max(values), 216, 26, log=True)
     upper = [(x(t), y(v)) for t, v in stairs(outer, end)]
     lower = [(x(t), y(v)) for t, v in stairs(inner, end)]
     band = ""
     if len(upper) > 2 and len(lower) > 2:
         band = f'<path class="band" d="{through(upper + lower[::-1])}Z"/>'
     marks = band + draw_line(upper, "outer", False) + draw_line(lower, "inner", False)
-    if len(kept) <= 25:
+    if len(points) <= 25:
         marks += draw_line([(x(t), y(v)) for t, v in outer], "outer", True, joined=False)
         marks += draw_line([(x(t), y(v)) for t, v in inner], "inner", True, joined=False)
     marks += draw_legend((("outer", "bounds (MPG)"), ("inner", "witness MPG")), 408)
@@ -199,7 +202,7 @@ def _curve(entry: Mapping[str, Any]) -> Markup | None:
 
 def _path_curve(frames: Sequence[Mapping[str, Any]]) -> Markup | None:
     """Error against run time of the whole path: every frame on its own clock, and their mean."""
-    traces = [kept for entry in frames if len(kept := _thinned(entry["trace"])) > 1]
+    traces = [thinned for entry in frames if len(thinned := _thinned(entry["trace"])) > 1]
     if len(traces) < 2:
         return None
     times = sorted({point["seconds"] for trace in traces for point in trace})
@@ -207,26 +210,26 @@ def _path_curve(frames: Sequence[Mapping[str, Any]]) -> Markup | None:
     times = [*times[::every], times[-1]]
 
     def at(trace: Sequence[Mapping[str, float]], key: str, before: float) -> list[float]:
-        found, position, value = [], 0, before
+        values_at, position, value = [], 0, before
         for time in times:
             while position < len(trace) and trace[position]["seconds"] <= time:
                 value = trace[position][key]
                 position += 1
-            found.append(value)
-        return found
+            values_at.append(value)
+        return values_at
 
     end = times[-1]
     lines: dict[str, list[list[float]]] = {
         "outer": [at(trace, "mpg", math.sqrt(3.0)) for trace in traces],
         "inner": [at(trace, "mpg_witness", 0.0) for trace in traces],
     }
-    positive = [v for found in lines.values() for values in found for v in values if v > 0.0]
+    positive = [v for frame_values in lines.values() for values in frame_values for v in values if v > 0.0]
     if not positive:
         return None
-    x, y = Axis(times[0], end, 52, 988, log=True), Axis(min(positive), max(positive), 236, 26, log=True)
+    x, y = PlotAxis(times[0], end, 52, 988, log=True), PlotAxis(min(positive), max(positive), 236, 26, log=True)
     marks = ""
-    for kind, found in lines.items():
-        for values, strength in (*((values, " one") for values in found), (_means(found), "")):
+    for kind, frame_values in lines.items():
+        for values, strength in (*((values, " one") for values in frame_values), (_means(frame_values), "")):
             points = [(t, v) for t, v in zip(times, values, strict=True) if v > 0.0]
             if points:
                 marks += draw_line([(x(t), y(v)) for t, v in stairs(points, end)], f"{kind}{strength}", False)
@@ -240,10 +243,10 @@ def _means(lines: Sequence[Sequence[float]]) -> list[float]:
 
 
 def _reached(frames: Sequence[Mapping[str, Any]], mark: str) -> str:
-    found = [seconds for entry in frames if (seconds := entry["seconds_to_ratio"].get(mark)) is not None]
-    if not found:
+    times = [seconds for entry in frames if (seconds := entry["seconds_to_ratio"].get(mark)) is not None]
+    if not times:
         return "no frame"
-    return f"{len(found)} of {counted(len(frames), 'frame')}, after {number(median(found), 3)} s (median)"
+    return f"{len(times)} of {counted(len(frames), 'frame')}, after {number(median(times), 3)} s (median)"
 
 
 def _overview(frames: Sequence[Mapping[str, Any]]) -> Markup | None:
@@ -251,8 +254,8 @@ def _overview(frames: Sequence[Mapping[str, Any]]) -> Markup | None:
     frames = [entry for entry in frames if entry["status"] != "missing"]
     if len(frames) < 2:
         return None
-    x = Axis(-0.5, len(frames) - 0.5, 52, 988, log=False)
-    y = Axis(0.0, 1.05 * max(entry["mpg"] for entry in frames), 176, 26, log=False)
+    x = PlotAxis(-0.5, len(frames) - 0.5, 52, 988, log=False)
+    y = PlotAxis(0.0, 1.05 * max(entry["mpg"] for entry in frames), 176, 26, log=False)
     half = min(14.0, 0.42 * (x(1) - x(0)))
     every = math.ceil(len(frames) / 24)
     marks = ""

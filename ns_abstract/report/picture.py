@@ -137,7 +137,7 @@ def frame_figure(result: FrameResult, *, guarantee: str = "", about: str = "") -
     x, base = px(_MARGIN), px(_MARGIN)
     for k, (label, image) in enumerate(panels):
         axes = figure.add_axes((x / total_w, base / total_h, panel_w / total_w, panel_h / total_h))
-        shown = axes.imshow(
+        heat_map = axes.imshow(
             image, cmap=GAP_COLORS if k == 2 else None, vmin=0.0, vmax=top if top > 0.0 else 1.0,
             interpolation="antialiased",
         )  # fmt: skip
@@ -147,7 +147,7 @@ def frame_figure(result: FrameResult, *, guarantee: str = "", about: str = "") -
         if k == 2:
             left = x - px(_GUTTER) + px(_GUTTER / 2)
             side = figure.add_axes((left / total_w, base / total_h, px(_BAR) / total_w, panel_h / total_h))
-            _color_bar(figure, shown, side, panel_h / dpi)
+            _color_bar(figure, heat_map, side, panel_h / dpi)
             x += bar
     return figure
 
@@ -157,7 +157,7 @@ def layer_figure(result: FrameResult, name: str) -> Figure:
 
     Args:
         result: The frame.
-        name: Of `ns_abstract.refine.result.LAYERS`; its colour scale ends where what is known ends.
+        name: Of `ns_abstract.refine.result.EXTRA_OUTPUTS`; its colour scale ends where what is known ends.
     """
     from matplotlib.figure import Figure
 
@@ -166,8 +166,8 @@ def layer_figure(result: FrameResult, name: str) -> Figure:
     panel = _PANEL_INCHES, _PANEL_INCHES * min(1.5, max(0.25, height / width))
     figure = Figure(figsize=(4.0 * panel[0] + 1.2, panel[1] + 0.8), facecolor="white", layout="constrained")
     axes: Any = figure.subplots(1, 4)
-    known = layer.upper[np.isfinite(layer.upper)]
-    top = float(max(known.max(initial=0.0), layer.image.max(initial=0.0))) or 1.0
+    finite = layer.upper[np.isfinite(layer.upper)]
+    top = float(max(finite.max(initial=0.0), layer.image.max(initial=0.0))) or 1.0
     length = np.where(np.isfinite(layer.upper), layer.upper.astype(np.float64) - layer.lower, np.nan)
     panels = (
         ("lower bound", layer.lower), ("upper bound", np.minimum(layer.upper, np.float32(top))),
@@ -176,13 +176,13 @@ def layer_figure(result: FrameResult, name: str) -> Figure:
     )  # fmt: skip
     for place, (label, image) in zip(axes, panels, strict=True):
         whole = float(np.nan_to_num(length).max(initial=0.0)) or 1.0 if image is length else top
-        shown = place.imshow(
+        heat_map = place.imshow(
             image, cmap=GAP_COLORS if image is length else _LAYER_COLORS, vmin=0.0, vmax=whole,
             interpolation="antialiased",
         )  # fmt: skip
         _bare(place)
         place.set_title(label, fontsize=_LABEL_POINTS, color=_INK)
-        figure.colorbar(shown, ax=place, fraction=0.05, pad=0.02).ax.tick_params(labelsize=_TICK_POINTS)
+        figure.colorbar(heat_map, ax=place, fraction=0.05, pad=0.02).ax.tick_params(labelsize=_TICK_POINTS)
     unit = " (units of the normalised frame)" if name == "depth" else ""
     figure.suptitle(f"Frame {result.index}  ·  {_LAYER_TITLES[name]}{unit}", fontsize=_TITLE_POINTS, color=_INK)
     return figure
@@ -285,11 +285,11 @@ def previews(result: FrameResult, side: int) -> Mapping[str, bytes]:
         "image": to_bytes(result.image),
     }
     for name, layer in result.layers.items():
-        known = np.isfinite(layer.upper)
-        high = np.where(known, layer.upper, 0.0)
-        length = np.where(known, high - layer.lower, 0.0)
+        finite = np.isfinite(layer.upper)
+        high = np.where(finite, layer.upper, 0.0)
+        length = np.where(finite, high - layer.lower, 0.0)
         whole = float(max(high.max(initial=0.0), layer.image.max(initial=0.0)))
-        high = np.where(known, high, whole)
+        high = np.where(finite, high, whole)
         for kind, array in (("lower", layer.lower), ("upper", high), ("image", layer.image)):
             images[f"{name}_{kind}"] = heat(array, whole, _LAYER_COLORS)
         images[f"{name}_gap"] = heat(length, float(length.max(initial=0.0)))

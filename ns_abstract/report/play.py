@@ -161,9 +161,9 @@ def _whole(
     axes = (0, *range(4, slopes.ndim), 3, 1, 2)
     a = np.ascontiguousarray(slopes.astype(np.float64).transpose(axes))
     b = np.ascontiguousarray(offsets.astype(np.float64).transpose(0, 3, 1, 2))
-    known = (np.abs(b) < _LARGE) & (np.abs(a).sum(axis=1) < _LARGE)
+    representable = (np.abs(b) < _LARGE) & (np.abs(a).sum(axis=1) < _LARGE)
     # values lie in [0, 1] whatever the coefficients say
-    a, b = np.where(known[:, None], a, 0.0), np.where(known, b, 0.5 + 0.5 * way)
+    a, b = np.where(representable[:, None], a, 0.0), np.where(representable, b, 0.5 + 0.5 * way)
     whole = np.rint(a * steps)
     lost = np.abs(a - whole / steps).sum(axis=1) + _SLACK
     outward = np.floor if way < 0.0 else np.ceil

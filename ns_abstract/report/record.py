@@ -23,7 +23,7 @@ from ns_abstract.io.folder import remove_parts, unwritable
 from ns_abstract.io.jsonio import file_size, is_number, load_json
 from ns_abstract.io.version import ADVISORY, stale
 from ns_abstract.io.version import VERSION as PACKAGE
-from ns_abstract.refine.result import FrameResult, Layer, TracePoint
+from ns_abstract.refine.result import ExtraOutput, FrameResult, TracePoint
 from ns_abstract.report.figures import layer_metrics, metrics, seconds_to, short_guarantee
 from ns_abstract.report.files import (
     StoredFrame,
@@ -142,32 +142,32 @@ def file_stamp(path: str | os.PathLike[str]) -> dict[str, Any]:
 
 def frame_digests(document: Any) -> dict[str, str]:
     """SHA-256 of the frame files by name, as report.json has them; what is damaged is left out."""
-    known = document.get("sha256") if isinstance(document, dict) else None
-    return {str(k): v for k, v in known.items() if isinstance(v, str)} if isinstance(known, dict) else {}
+    digests = document.get("sha256") if isinstance(document, dict) else None
+    return {str(k): v for k, v in digests.items() if isinstance(v, str)} if isinstance(digests, dict) else {}
 
 
 def explanations(document: Any) -> dict[int, tuple[str, ...]]:
     """Return the explanations of frames in a report.json, which others may have written."""
     frames = document.get("frames") if isinstance(document, dict) else None
-    found = {}
+    texts = {}
     for entry in frames if isinstance(frames, list) else ():
         if isinstance(entry, dict) and isinstance(entry.get("index"), int):
             lines = entry.get("explanation")
             if isinstance(lines, list) and all(isinstance(line, str) for line in lines):
-                found[entry["index"]] = tuple(lines)
-    return found
+                texts[entry["index"]] = tuple(lines)
+    return texts
 
 
 def versions() -> dict[str, str | None]:
     """Versions of what computed the bounds; None where a package has no metadata."""
-    found: dict[str, str | None] = {"python": platform.python_version(), "machine": platform.machine()}
-    found["ns-abstract"] = PACKAGE
+    versions_found: dict[str, str | None] = {"python": platform.python_version(), "machine": platform.machine()}
+    versions_found["ns-abstract"] = PACKAGE
     for name in ("numpy", "numba"):
         try:
-            found[name] = importlib.metadata.version(name)
+            versions_found[name] = importlib.metadata.version(name)
         except importlib.metadata.PackageNotFoundError:
-            found[name] = None
-    return found
+            versions_found[name] = None
+    return versions_found
 
 
 def failed_self_check(problem: str) -> str:
@@ -176,7 +176,7 @@ def failed_self_check(problem: str) -> str:
 
 
 @dataclass(frozen=True)
-class Run:
+class RunRecord:
     """The record of a command's run; all mappings must have a JSON form (see `plain`).
 
     Attributes:
@@ -212,10 +212,10 @@ class Run:
 def _leaves_of(value: Any, path: str = "") -> dict[str, Any]:
     """Dotted paths and values of a JSON tree."""
     if isinstance(value, dict) and (value or not path):
-        found: dict[str, Any] = {}
+        leaves: dict[str, Any] = {}
         for key, item in value.items():
-            found |= _leaves_of(item, f"{path}.{key}" if path else str(key))
-        return found
+            leaves |= _leaves_of(item, f"{path}.{key}" if path else str(key))
+        return leaves
     return {path: value}
 
 
@@ -264,8 +264,8 @@ def merged(older: FrameResult, newer: FrameResult) -> FrameResult:
     )
 
 
-def _merged_layer(older: Layer, newer: Layer) -> Layer:
-    return Layer(
+def _merged_layer(older: ExtraOutput, newer: ExtraOutput) -> ExtraOutput:
+    return ExtraOutput(
         np.maximum(older.lower, newer.lower),
         np.minimum(older.upper, newer.upper),
         np.minimum(older.witness_lower, newer.witness_lower),
@@ -292,14 +292,14 @@ class Report:
         InputError: The folder cannot be written.
     """
 
-    def __init__(self, output_dir: str | os.PathLike[str], run: Run, *, keep_stored: bool = False) -> None:
+    def __init__(self, output_dir: str | os.PathLike[str], run: RunRecord, *, keep_stored: bool = False) -> None:
         self._start(Path(output_dir), run)
         if keep_stored:
             self._keep()
         self._publish(page=True)
 
     @classmethod
-    def resume(cls, output_dir: str | os.PathLike[str], run: Run) -> Report:
+    def resume(cls, output_dir: str | os.PathLike[str], run: RunRecord) -> Report:
         """Continue in a folder: frames stored with the same fingerprint are kept, asked for or not.
 
         A folder without results starts afresh. Truncated, damaged or foreign frame files are not used;
@@ -310,7 +310,7 @@ class Report:
         """
         return cls(output_dir, run, keep_stored=True)
 
-    def _start(self, folder: Path, run: Run) -> None:
+    def _start(self, folder: Path, run: RunRecord) -> None:
         self.folder, self.run = folder, run
         self.kept: list[int] = []
         self.ignored: list[str] = []
@@ -334,7 +334,7 @@ class Report:
         except OSError as error:
             raise unwritable(folder, error) from None
 
-    def _describe(self, run: Run) -> None:
+    def _describe(self, run: RunRecord) -> None:
         """Take ``run`` for what report.json and the files of frames say from now on."""
         self.run = run
         self._about = plain(
@@ -659,8 +659,8 @@ class Report:
     def _play(self, index: int) -> str | None:
         if index not in self._plays:
             path = self.folder / frame_name(index, "npz")
-            kept = path.stat().st_size <= _PLAY_FILE
-            self._plays[index] = self._played(load_frame(path, leaves=True).result) if kept else None
+            small_enough = path.stat().st_size <= _PLAY_FILE
+            self._plays[index] = self._played(load_frame(path, leaves=True).result) if small_enough else None
         return self._plays[index]
 
     def _preview(self, index: int) -> Mapping[str, bytes]:

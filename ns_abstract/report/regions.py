@@ -20,7 +20,7 @@ MOST, _TOGETHER, _OUTPUTS = 6, 64, 10
 
 
 @dataclass(frozen=True)
-class Region:
+class FailureRegion:
     """A connected region of falsified cells of a frame.
 
     Attributes:
@@ -42,7 +42,7 @@ class Region:
 
 
 @dataclass(frozen=True)
-class Shown:
+class PoseImage:
     """A picture with the network's outputs for it.
 
     Attributes:
@@ -63,11 +63,11 @@ class Shown:
 def touching(lower: Float64, upper: Float64) -> NDArray[np.int64]:
     """[n] numbers of regions: closed boxes [n, d] to [n, d] with a point in common, and so on, are of one."""
     count = len(lower)
-    found = np.full(count, -1, np.int64)
+    region_numbers = np.full(count, -1, np.int64)
     left = np.arange(count)
     regions = 0
     while left.size:
-        found[left[0]] = regions
+        region_numbers[left[0]] = regions
         edge, left = left[:1], left[1:]
         while edge.size:
             some, edge = edge[-_TOGETHER:], edge[:-_TOGETHER]
@@ -76,24 +76,24 @@ def touching(lower: Float64, upper: Float64) -> NDArray[np.int64]:
             maybe = left[near]
             meets = (lower[maybe, None] <= high) & (upper[maybe, None] >= low)
             new = np.asarray(meets.all(axis=2)).any(axis=1)
-            found[maybe[new]] = regions
+            region_numbers[maybe[new]] = regions
             edge = np.concatenate([edge, maybe[new]])
             near[near] = new
             left = left[~near]
         regions += 1
-    return found
+    return region_numbers
 
 
 def falsified_regions(
     entries: Sequence[Mapping[str, Any]], rows: Mapping[int, Sequence[Mapping[str, Any]]]
-) -> list[Region]:
+) -> list[FailureRegion]:
     """The regions of all frames, the largest parts of their sets first, single poses last.
 
     Args:
         entries: Frames of report.json: index and parameters (name, lower, upper).
         rows: By frame, its cells: lower, upper, verdict, margin, counterexample.
     """
-    found = []
+    regions = []
     for entry in entries:
         cells = rows.get(entry["index"], ())
         broken = [k for k, row in enumerate(cells) if row["verdict"] == "falsified"]
@@ -108,8 +108,8 @@ def falsified_regions(
         order = np.argsort(numbers, kind="stable")
         for members in np.split(order, np.flatnonzero(np.diff(numbers[order])) + 1):
             worst = cells[broken[members[np.argmin(margins[members])]]]
-            found.append(
-                Region(
+            regions.append(
+                FailureRegion(
                     entry["index"],
                     tuple(broken[k] for k in members),
                     float(shares[members].sum()),
@@ -120,7 +120,7 @@ def falsified_regions(
                 )
             )
     # a set of one pose has no volume: behind all that have one
-    return sorted(found, key=lambda region: (region.lower == region.upper, -region.share, region.frame, region.cells))
+    return sorted(regions, key=lambda region: (region.lower == region.upper, -region.share, region.frame, region.cells))
 
 
 def _ranges(parameters: Sequence[Mapping[str, Any]]) -> Float64:
@@ -160,8 +160,8 @@ def nearest(
 
 
 def regions_html(
-    regions: Sequence[Region],
-    pictures: Sequence[tuple[Shown, Shown | None]],
+    regions: Sequence[FailureRegion],
+    pictures: Sequence[tuple[PoseImage, PoseImage | None]],
     parameters: Mapping[int, Sequence[Mapping[str, Any]]],
     why: str,
 ) -> Markup:
@@ -176,7 +176,7 @@ def regions_html(
             for p, a, b in zip(sides, region.lower, region.upper, strict=True)
             if p["lower"] < p["upper"]
         )
-        told = told_outputs(broken.outputs, right and right.outputs)
+        told = reported_outputs(broken.outputs, right and right.outputs)
         both = [broken, right] if right else [broken]
         shown.append(
             {
@@ -191,7 +191,7 @@ def regions_html(
     return fill("regions.html", regions=regions, shown=shown, why=why)
 
 
-def _pose(one: Shown, other: Shown, sides: Sequence[Mapping[str, Any]]) -> str:
+def _pose(one: PoseImage, other: PoseImage, sides: Sequence[Mapping[str, Any]]) -> str:
     """The parameters that vary, and which are those of the other picture."""
     return ", ".join(
         f"{p['name']} = {number(v, 5)}" + (" (same)" if other is not one and other.values[k] == v else "")
@@ -200,7 +200,7 @@ def _pose(one: Shown, other: Shown, sides: Sequence[Mapping[str, Any]]) -> str:
     )
 
 
-def told_outputs(broken: Sequence[float], right: Sequence[float] | None, most: int = _OUTPUTS) -> list[int]:
+def reported_outputs(broken: Sequence[float], right: Sequence[float] | None, most: int = _OUTPUTS) -> list[int]:
     """Return the numbers of the outputs to report: all, or those that differ most (without ``right``: the largest)."""
     values = np.asarray(broken, np.float64)
     change = np.abs(values if right is None else values - np.asarray(right, np.float64))

@@ -22,7 +22,7 @@ def through(points: Iterable[tuple[float, float]]) -> str:
     return "M" + "L".join(f"{a:.1f},{b:.1f}" for a, b in points)
 
 
-class Axis:
+class PlotAxis:
     """One axis of a plot: data to SVG units, and where its ticks stand."""
 
     def __init__(self, low: float, high: float, start: float, end: float, *, log: bool) -> None:
@@ -51,15 +51,15 @@ class Axis:
         first, last = math.floor(self.low), math.ceil(self.high)
         every = max(1, math.ceil((last - first) / 6))
         for steps in ((1,), (1, 2, 5), (1, 1.5, 2, 3, 4, 5, 6, 8)):
-            found = [k * 10.0**e for e in range(first, last + 1, every) for k in steps]
-            found = [v for v in found if v > 0.0 and self.low <= math.log10(v) <= self.high]
-            if len(found) >= 3:
+            ticks = [k * 10.0**e for e in range(first, last + 1, every) for k in steps]
+            ticks = [v for v in ticks if v > 0.0 and self.low <= math.log10(v) <= self.high]
+            if len(ticks) >= 3:
                 break
-        return found
+        return ticks
 
 
 def draw_plot(
-    x: Axis | None, y: Axis, labels: tuple[str, str], marks: str, *, size: tuple[int, int], title: str,
+    x: PlotAxis | None, y: PlotAxis, labels: tuple[str, str], marks: str, *, size: tuple[int, int], title: str,
 ) -> Markup:  # fmt: skip
     """An SVG with axes, ``marks`` above them; without ``x`` the marks bring their own labels."""
     width, height = size

@@ -12,12 +12,12 @@ from markupsafe import Markup, escape
 
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.folder import unwritable
-from ns_abstract.report.cameras import Cameras
+from ns_abstract.report.cameras import CameraDrawings
 from ns_abstract.report.certificate_page import along_path, verdict_drawings
 from ns_abstract.report.figures import percent
 from ns_abstract.report.verdict_maps import BAD, GOOD, OPEN, free_parameters, maps_of, matrix_svg
 
-Rows = Sequence[Mapping[str, Any]]
+CellRows = Sequence[Mapping[str, Any]]
 #: Frames with a picture; height of the title, and of a line of the legend.
 MOST, _TITLE, _LEGEND = 8, 26, 24
 _NAMES = re.compile(r"verdicts_(\d{5,}|path)\.(svg|png)|cameras\.(svg|png)")
@@ -60,7 +60,7 @@ def standalone(plots: Sequence[Markup], text: str, covered: Mapping[str, float])
     )
 
 
-def _frame(entry: Mapping[str, Any], rows: Rows) -> str | None:
+def _frame(entry: Mapping[str, Any], rows: CellRows) -> str | None:
     """The verdicts over a frame's set; None of a single pose."""
     free = free_parameters(entry["parameters"])
     if not free or not rows:
@@ -82,7 +82,7 @@ def clear_pictures(folder: Path) -> None:
 
 
 def write_pictures(
-    folder: Path, document: Mapping[str, Any], rows: Mapping[int, Rows], cameras: Cameras | None
+    folder: Path, document: Mapping[str, Any], rows: Mapping[int, CellRows], cameras: CameraDrawings | None
 ) -> list[str]:
     """Write the pictures of a certificate, each whole or not at all; returns their names.
 

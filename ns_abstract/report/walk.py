@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from ns_abstract.report.figures import number, unit_of_axis
 from ns_abstract.report.html import fill
-from ns_abstract.report.regions import Shown
+from ns_abstract.report.regions import PoseImage
 
 #: Pictures of the slider.
 MOST = 24
@@ -19,7 +19,7 @@ _FULL_TURN = 2.0 * np.pi
 
 
 @dataclass(frozen=True)
-class Stop:
+class WalkPose:
     """A pose that the slider shows, with its verdict.
 
     Attributes:
@@ -46,7 +46,7 @@ def direction(parameters: Sequence[Mapping[str, Any]]) -> int | None:
 
 def stops(
     entries: Sequence[Mapping[str, Any]], rows: Mapping[int, Sequence[Mapping[str, Any]]], most: int = MOST
-) -> list[Stop]:
+) -> list[WalkPose]:
     """Poses along every frame's set in turn, evenly spread, the other parameters in the middle.
 
     Args:
@@ -57,13 +57,13 @@ def stops(
     if len(entries) > most:
         entries = [entries[k * (len(entries) - 1) // (most - 1)] for k in range(most)]
     each = most // max(1, len(entries))
-    found = []
+    poses = []
     for position, entry in enumerate(entries):
         parameters = entry["parameters"]
         axis = direction(parameters)
         middle = [0.5 * (p["lower"] + p["upper"]) for p in parameters]
         if axis is None or each < 2:
-            found.append(_stop(entry, rows, middle, None))
+            poses.append(_stop(entry, rows, middle, None))
             continue
         low, high = parameters[axis]["lower"], parameters[axis]["upper"]
         name = parameters[axis]["name"]
@@ -71,20 +71,22 @@ def stops(
         follows = position + 1 < len(entries) and name == "segment"
         closed = name == "azimuth" and high - low >= _FULL_TURN * (1.0 - 1e-9)
         for value in np.linspace(low, high, each, endpoint=not (follows or closed)).tolist():
-            found.append(_stop(entry, rows, [*middle[:axis], value, *middle[axis + 1 :]], axis))
-    return found
+            poses.append(_stop(entry, rows, [*middle[:axis], value, *middle[axis + 1 :]], axis))
+    return poses
 
 
 def _stop(
     entry: Mapping[str, Any], rows: Mapping[int, Sequence[Mapping[str, Any]]], values: list[float], axis: int | None
-) -> Stop:
+) -> WalkPose:
     row = cell_at(rows.get(entry["index"], ()), values)
     at = f"frame {entry['index']}"
     if axis is not None:
         p = entry["parameters"][axis]
         at += f", {p['name']} = {number(values[axis], 4)} {unit_of_axis(p['unit'])}"
     verdict = "unknown" if row is None else row["verdict"]
-    return Stop(entry["index"], tuple(values), verdict, row["margin"] if row and verdict == "certified" else None, at)
+    return WalkPose(
+        entry["index"], tuple(values), verdict, row["margin"] if row and verdict == "certified" else None, at
+    )
 
 
 def cell_at(rows: Sequence[Mapping[str, Any]], values: Sequence[float]) -> Mapping[str, Any] | None:
@@ -103,6 +105,6 @@ def coarse_first(count: int) -> list[int]:
     return sorted(range(count), key=lambda k: int(f"{k:0{bits}b}"[::-1], 2))
 
 
-def walk_html(found: Sequence[tuple[Stop, Shown]]) -> Markup:
+def walk_html(found: Sequence[tuple[WalkPose, PoseImage]]) -> Markup:
     """The page's part: all pictures; `walk.js` shows one at a time, as the slider stands."""
     return fill("walk.html", stops=found) if len(found) > 1 else Markup()

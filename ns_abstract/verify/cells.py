@@ -42,7 +42,7 @@ class Cell:
 
 
 @dataclass(frozen=True)
-class Grid:
+class CellGrid:
     """The grid of a frame: each parameter cut into ``units[k]`` equal units, of which cells consist.
 
     Attributes:
@@ -56,12 +56,12 @@ class Grid:
     coarse: tuple[int, ...]
 
     @classmethod
-    def adaptive(cls, box: ParameterBox, coarse: Sequence[int]) -> Grid:
+    def adaptive(cls, box: ParameterBox, coarse: Sequence[int]) -> CellGrid:
         """A grid whose units are first cells halved `HALVINGS` times."""
         return cls(box, tuple(n << HALVINGS for n in coarse), tuple(coarse))
 
     @classmethod
-    def fixed(cls, box: ParameterBox, partitions: Sequence[int], coarse: Sequence[int]) -> Grid:
+    def fixed(cls, box: ParameterBox, partitions: Sequence[int], coarse: Sequence[int]) -> CellGrid:
         """The grid of a fixed partition, as in the paper.
 
         Raises:
@@ -138,7 +138,7 @@ class Grid:
         return [Cell(tuple(a for a, _ in part), tuple(b for _, b in part)) for part in itertools.product(*spans)]
 
 
-def coarse_parts(motion: np.ndarray, pixels: float) -> tuple[int, ...]:
+def initial_divisions(motion: np.ndarray, pixels: float) -> tuple[int, ...]:
     """Return the number of initial cells along each parameter such that the picture moves by ``pixels`` in one.
 
     Fewer where there would be too many; in several parameters the search finds by itself where fine cells

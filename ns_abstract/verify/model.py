@@ -10,13 +10,13 @@ import numpy as np
 import torch
 
 from ns_abstract.verify.network import (
-    Family,
     ImageSets,
     Network,
     NetworkArithmetic,
     OutputBounds,
+    SharedCoefficients,
     bound_outputs,
-    lends_anywhere,
+    reusable_anywhere,
 )
 from ns_abstract.verify.network.branching import branch
 from ns_abstract.verify.network.load import onnx_runner
@@ -64,17 +64,17 @@ class NetworkModel:
         return self.preprocess.sets((linear[0], linear[1], linear[2], linear[3]), lower, upper)
 
     @property
-    def lends_anywhere(self) -> bool:
-        return lends_anywhere(self.network)
+    def reusable_anywhere(self) -> bool:
+        return reusable_anywhere(self.network)
 
-    def family(self, images: ImageSets) -> ModelFamily:
+    def shared_bounds(self, images: ImageSets) -> ModelSharedBounds:
         """Bounds of one cell, whose rows can serve for others (N15)."""
-        shared = Family(self.network, parametric(images), memory=self.memory, arithmetic=self.arithmetic)
-        return ModelFamily(shared)
+        shared = SharedCoefficients(self.network, parametric(images), memory=self.memory, arithmetic=self.arithmetic)
+        return ModelSharedBounds(shared)
 
     def bound(self, images: ImageSets, query: Query) -> OutputBounds:
         d = images.dimensions
-        found = bound_outputs(
+        output_bounds = bound_outputs(
             self.network,
             parametric(images),
             query.rows,
@@ -82,7 +82,7 @@ class NetworkModel:
             memory=self.memory,
             arithmetic=self.arithmetic,
         )
-        return found if d else dataclasses.replace(found, a=found.a[..., :0])
+        return output_bounds if d else dataclasses.replace(output_bounds, a=output_bounds.a[..., :0])
 
     def branch(self, images: ImageSets, query: Query, groups: Sequence[Sequence[int]], most: int) -> float:
         """A lower bound of the margin ``min over groups of max over its rows`` in the one cell of ``images``.
@@ -96,16 +96,16 @@ class NetworkModel:
 
 
 @dataclasses.dataclass(frozen=True)
-class ModelFamily:
+class ModelSharedBounds:
     """Bounds of a cell, and of others with its coefficients; see `ns_abstract.verify.protocol.SharedBounds`."""
 
-    family: Family
+    shared_bounds: SharedCoefficients
 
     def first(self, query: Query) -> OutputBounds:
-        return self.family.first(query.rows, query.offset)
+        return self.shared_bounds.first(query.rows, query.offset)
 
     def others(self, images: ImageSets, query: Query, *, fresh: bool = False) -> OutputBounds:
-        return self.family.others(parametric(images), query.rows, query.offset, fresh=fresh)
+        return self.shared_bounds.others(parametric(images), query.rows, query.offset, fresh=fresh)
 
 
 def parametric(images: ImageSets) -> ImageSets:

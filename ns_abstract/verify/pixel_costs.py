@@ -7,10 +7,10 @@ import torch
 
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.verify.properties import Claim
-from ns_abstract.verify.protocol import Model, Scene
+from ns_abstract.verify.protocol import FrameImages, Model
 
 
-def pixel_costs(scene: Scene, model: Model, claim: Claim, box: ParameterBox) -> np.ndarray | None:
+def pixel_weights(scene: FrameImages, model: Model, claim: Claim, box: ParameterBox) -> np.ndarray | None:
     """[H, W, 3] slopes of the margin by pixel in the middle of a cell, as parts of the margin there (an estimate).
 
     None where the margin is not above 0, or a slope is no number: no width would be narrow enough. What is found

@@ -161,16 +161,16 @@ def parse_preprocess(value: Any) -> Preprocess:
     known(value, _KEYS, "preprocess.", lambda name, problem, fix: InputError(problem, field=name, fix=fix))
 
     def numbers(name: str, count: int, default: tuple[float, ...]) -> tuple[float, ...]:
-        found = value.get(name, list(default))
-        if not (isinstance(found, list) and len(found) == count and all(is_moderate(v) for v in found)):
-            raise fail(f".{name}", found, f"write {count} numbers, each {FIX_MODERATE}")
-        return tuple(float(v) for v in found)
+        numbers = value.get(name, list(default))
+        if not (isinstance(numbers, list) and len(numbers) == count and all(is_moderate(v) for v in numbers)):
+            raise fail(f".{name}", numbers, f"write {count} numbers, each {FIX_MODERATE}")
+        return tuple(float(v) for v in numbers)
 
     def choice(name: str, choices: tuple[str, str]) -> str:
-        found = value.get(name, choices[0])
-        if found not in choices or not isinstance(found, str):
-            raise fail(f".{name}", found, f"write {' or '.join(choices)}")
-        return found
+        chosen = value.get(name, choices[0])
+        if chosen not in choices or not isinstance(chosen, str):
+            raise fail(f".{name}", chosen, f"write {' or '.join(choices)}")
+        return chosen
 
     resize = value.get("resize")
     if resize is not None and not (

@@ -22,7 +22,7 @@ from ns_abstract.arithmetic.forms import FormArray
 from ns_abstract.arithmetic.network_charges import OWN_MARGIN
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.differentiable_pose import differentiable_pose
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.fields import known
 from ns_abstract.io.jsonio import FIX_MODERATE, MODERATE, file_beside, is_moderate, is_number, show
@@ -83,7 +83,7 @@ class Property(ABC):
         """The property in words, as the end of "on every image ..."."""
 
     @abstractmethod
-    def bind(self, pose_set: PoseSet, nominal: Callable[[], np.ndarray]) -> Claim:
+    def bind(self, pose_set: PoseBox, nominal: Callable[[], np.ndarray]) -> Claim:
         """The claim about a frame; ``nominal`` gives outputs [n] at the middle of the set.
 
         Raises:
@@ -108,9 +108,9 @@ class LinearClaim(Claim):
     groups: tuple[tuple[int, ...], ...]
 
     def margin(self, outputs: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
-        found = outputs @ torch.from_numpy(self.rows).to(outputs.dtype).T
-        found = found + torch.from_numpy(self.offset).to(outputs.dtype)
-        return torch.stack([found[:, list(group)].amax(dim=1) for group in self.groups]).amin(dim=0)
+        row_values = outputs @ torch.from_numpy(self.rows).to(outputs.dtype).T
+        row_values = row_values + torch.from_numpy(self.offset).to(outputs.dtype)
+        return torch.stack([row_values[:, list(group)].amax(dim=1) for group in self.groups]).amin(dim=0)
 
     def query(self, outputs: np.ndarray) -> Query:
         return Query(self.rows, self.offset)
@@ -133,7 +133,7 @@ class Classification(Property):
     def sentence(self) -> str:
         return f"output {self.label} is larger than each of the other {self.classes - 1}"
 
-    def bind(self, pose_set: PoseSet, nominal: Callable[[], np.ndarray]) -> Claim:
+    def bind(self, pose_set: PoseBox, nominal: Callable[[], np.ndarray]) -> Claim:
         others = [k for k in range(self.classes) if k != self.label]
         rows = np.zeros((len(others), self.classes))
         rows[:, self.label] = 1.0
@@ -142,7 +142,7 @@ class Classification(Property):
 
 
 @dataclass(frozen=True)
-class VnnLib(Property):
+class VnnLibProperty(Property):
     """No output is in the unsafe set of a VNN-LIB file."""
 
     file: Path
@@ -160,7 +160,7 @@ class VnnLib(Property):
             return ()
         return (f"{count} assertions on inputs set aside: the images of the scene take their place",)
 
-    def bind(self, pose_set: PoseSet, nominal: Callable[[], np.ndarray]) -> Claim:
+    def bind(self, pose_set: PoseBox, nominal: Callable[[], np.ndarray]) -> Claim:
         return LinearClaim(self.unsafe.rows, self.unsafe.offset, self.unsafe.groups)
 
 
@@ -168,7 +168,7 @@ class VnnLib(Property):
 
 
 @dataclass(frozen=True)
-class Truth:
+class TrueValues:
     """True values as functions of the pose.
 
     Attributes:
@@ -182,7 +182,7 @@ class Truth:
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0)
     scale: float = 1.0
 
-    def forms(self, pose_set: PoseSet, box: ParameterBox) -> FormArray:
+    def forms(self, pose_set: PoseBox, box: ParameterBox) -> FormArray:
         """[c] forms of order 1 that enclose the values over a cell."""
         poses = pose_set.enclosure(box, 1)
         # OpenCV to OpenGL camera axes
@@ -190,8 +190,8 @@ class Truth:
         camera = poses.position - np.array(self.origin)
         parts: dict[str, FormArray] = {}
         if any(isinstance(c, str) and c.startswith("object") for c in self.components):
-            seen = (poses.rotation @ (np.array(self.origin) - poses.origin) + poses.offset) * flip
-            parts |= {f"object.{name}": seen[k] for k, name in enumerate("xyz")}
+            in_camera = (poses.rotation @ (np.array(self.origin) - poses.origin) + poses.offset) * flip
+            parts |= {f"object.{name}": in_camera[k] for k, name in enumerate("xyz")}
         parts |= {f"camera.{name}": camera[k] for k, name in enumerate("xyz")}
         if "distance" in self.components:
             parts["distance"] = camera.square().sum(0).sqrt()
@@ -206,9 +206,9 @@ class Truth:
         """[c] values at a camera-to-world pose [3, 4]."""
         origin = torch.tensor(self.origin, dtype=pose.dtype)
         camera = pose[:, 3] - origin
-        seen = -(pose[:, :3].T @ camera)
+        in_camera = -(pose[:, :3].T @ camera)
         parts = {f"camera.{n}": camera[k] for k, n in enumerate("xyz")}
-        parts |= {f"object.{n}": seen[k] for k, n in enumerate("xyz")}
+        parts |= {f"object.{n}": in_camera[k] for k, n in enumerate("xyz")}
         parts["distance"] = camera.norm()
         numbers = [torch.tensor(0.0 if isinstance(c, str) else c, dtype=pose.dtype) for c in self.components]
         return torch.stack(
@@ -220,10 +220,10 @@ class Truth:
 class RegressionClaim(Claim):
     """The claim that outputs are close to the true values (V3)."""
 
-    truth: Truth
+    truth: TrueValues
     absolute: tuple[float, ...] | None
     relative: float | None
-    pose_set: PoseSet
+    pose_set: PoseBox
 
     def margin(self, outputs: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
         pose = differentiable_pose(self.pose_set)
@@ -241,12 +241,12 @@ class RegressionClaim(Claim):
         return Query(np.concatenate([unit, -unit]), np.zeros(2 * len(unit)))
 
     def proved(self, query: Query, bounds: OutputBounds, boxes: Sequence[ParameterBox]) -> np.ndarray:
-        found = np.full(len(boxes), -np.inf)
+        margins = np.full(len(boxes), -np.inf)
         for cell, box in enumerate(boxes):
             with np.errstate(all="ignore"):
                 margin = self._cell(bounds.lower[cell], bounds.a[cell], bounds.b[cell], box)
-            found[cell] = margin if math.isfinite(margin) else -np.inf
-        return found
+            margins[cell] = margin if math.isfinite(margin) else -np.inf
+        return margins
 
     def _cell(self, lower: np.ndarray, a: np.ndarray, b: np.ndarray, box: ParameterBox) -> float:
         truth = self.truth.forms(self.pose_set, box)
@@ -277,7 +277,7 @@ class RegressionClaim(Claim):
 class Regression(Property):
     """Outputs within a tolerance of the truth."""
 
-    truth: Truth
+    truth: TrueValues
     absolute: tuple[float, ...] | None
     relative: float | None
     preprocess: Preprocess = field(default_factory=Preprocess)
@@ -292,7 +292,7 @@ class Regression(Property):
             return f"the outputs are closer to ({names}) than {self.absolute[0]:g} (Euclidean length)"
         return f"each output is closer to its value of ({names}) than {', '.join(f'{v:g}' for v in self.absolute)}"
 
-    def bind(self, pose_set: PoseSet, nominal: Callable[[], np.ndarray]) -> Claim:
+    def bind(self, pose_set: PoseBox, nominal: Callable[[], np.ndarray]) -> Claim:
         return RegressionClaim(self.truth, self.absolute, self.relative, pose_set)
 
 
@@ -397,13 +397,13 @@ class DetectionClaim(Claim):
 
     def proved(self, query: Query, bounds: OutputBounds, boxes: Sequence[ParameterBox]) -> np.ndarray:
         size = len(query.rows) // len(query.about)
-        found = np.full(len(boxes), -np.inf)
+        margins = np.full(len(boxes), -np.inf)
         for k, number in enumerate(query.about):
             lower = bounds.lower[:, k * size : (k + 1) * size]
             with np.errstate(all="ignore"):
                 margin = self._candidate(np.where(np.isnan(lower), -np.inf, lower), number)
-            found = np.fmax(found, np.where(np.isfinite(margin), margin, -np.inf))
-        return found
+            margins = np.fmax(margins, np.where(np.isfinite(margin), margin, -np.inf))
+        return margins
 
     def _candidate(self, lower: np.ndarray, number: int) -> np.ndarray:
         """[m] lower bounds of one box's margin."""
@@ -474,14 +474,14 @@ class Detection(Property):
             where = f" and an overlap (IoU) above {self.iou:g} with {reference}"
         return f"the detector finds a box with {what} above {self.confidence:g}{where}"
 
-    def bind(self, pose_set: PoseSet, nominal: Callable[[], np.ndarray]) -> Claim:
+    def bind(self, pose_set: PoseBox, nominal: Callable[[], np.ndarray]) -> Claim:
         box = self.box
         if self.iou is not None and box is None:
             anywhere = DetectionClaim(self.label, self.confidence, None, None, self.stride, self.grid)
             outputs = torch.from_numpy(np.asarray(nominal(), np.float64))[None]
             best = int(anywhere.margins(outputs).argmax())
-            found = decode(outputs, self.stride)[2].movedim(2, -1).reshape(-1, 4)[best].tolist()
-            box = (found[0], found[1], found[2], found[3])
+            corners = decode(outputs, self.stride)[2].movedim(2, -1).reshape(-1, 4)[best].tolist()
+            box = (corners[0], corners[1], corners[2], corners[3])
         return DetectionClaim(self.label, self.confidence, self.iou, box, self.stride, self.grid)
 
 
@@ -490,7 +490,7 @@ class Detection(Property):
 _COMMON = ("type", "preprocess", "partitions", "output")
 
 
-class _Setting(NamedTuple):
+class _KeySetting(NamedTuple):
     """What a parser knows beside the file: where it lies, numbers of the network's inputs and outputs, the picture."""
 
     folder: Path
@@ -504,7 +504,7 @@ class _Type(NamedTuple):
     """The keys of a type of property, and what makes the property of the file's object and the common attributes."""
 
     keys: tuple[str, ...]
-    parse: Callable[[dict[str, Any], _Setting, dict[str, Any]], Property]
+    parse: Callable[[dict[str, Any], _KeySetting, dict[str, Any]], Property]
 
 
 def _fail(name: str, found: Any, fix: str) -> InputError:
@@ -542,7 +542,7 @@ def parse_property(root: Any, folder: Path, input_shape: tuple[int, ...], output
     preprocess = parse_preprocess(root.get("preprocess", {}))
     height, width = preprocess.size(input_shape)
     common: dict[str, Any] = {"preprocess": preprocess, "partitions": _partitions(root)}
-    setting = _Setting(folder, math.prod(input_shape), math.prod(output_shape), height, width)
+    setting = _KeySetting(folder, math.prod(input_shape), math.prod(output_shape), height, width)
     return _TYPES[kind].parse(root, setting, common)
 
 
@@ -556,7 +556,7 @@ def _partitions(root: dict[str, Any]) -> tuple[int, ...] | None:
     return tuple(counts)
 
 
-def _classification(root: dict[str, Any], setting: _Setting, common: dict[str, Any]) -> Property:
+def _classification(root: dict[str, Any], setting: _KeySetting, common: dict[str, Any]) -> Property:
     label, outputs = root.get("label"), setting.outputs
     if outputs < 2:
         raise InputError(f"the network has {outputs} output", field="type", fix="use a classifier")
@@ -565,7 +565,7 @@ def _classification(root: dict[str, Any], setting: _Setting, common: dict[str, A
     return Classification(label=label, classes=outputs, **common)
 
 
-def _regression(root: dict[str, Any], setting: _Setting, common: dict[str, Any]) -> Property:
+def _regression(root: dict[str, Any], setting: _KeySetting, common: dict[str, Any]) -> Property:
     target, outputs = root.get("target"), setting.outputs
     if target in ("camera", "object"):
         target = [f"{target}.{axis}" for axis in "xyz"]
@@ -600,11 +600,11 @@ def _regression(root: dict[str, Any], setting: _Setting, common: dict[str, Any])
     else:
         relative = float(values[0])
     x, y, z = (float(v) for v in origin)
-    truth = Truth(tuple(v if isinstance(v, str) else float(v) for v in target), (x, y, z), float(scale))
+    truth = TrueValues(tuple(v if isinstance(v, str) else float(v) for v in target), (x, y, z), float(scale))
     return Regression(truth=truth, absolute=absolute, relative=relative, **common)
 
 
-def _detection(root: dict[str, Any], setting: _Setting, common: dict[str, Any]) -> Property:
+def _detection(root: dict[str, Any], setting: _KeySetting, common: dict[str, Any]) -> Property:
     outputs, height, width = setting.outputs, setting.height, setting.width
     grid = math.isqrt(outputs // _HEAD)
     if outputs != _HEAD * grid * grid or grid == 0 or height != width or height % grid:
@@ -640,7 +640,7 @@ def _detection(root: dict[str, Any], setting: _Setting, common: dict[str, Any]) 
     )
 
 
-def _vnnlib(root: dict[str, Any], setting: _Setting, common: dict[str, Any]) -> Property:
+def _vnnlib(root: dict[str, Any], setting: _KeySetting, common: dict[str, Any]) -> Property:
     name = root.get("file")
     if not isinstance(name, str) or not name:
         raise _fail("file", name, "write the name of a VNN-LIB file, relative to this one")
@@ -648,7 +648,7 @@ def _vnnlib(root: dict[str, Any], setting: _Setting, common: dict[str, Any]) -> 
         file = file_beside(setting.folder, name)
     except InputError as error:
         raise InputError(error.problem, field="file", fix=error.fix) from None
-    return VnnLib(file=file, unsafe=load_vnnlib(file, setting.outputs, setting.inputs), **common)
+    return VnnLibProperty(file=file, unsafe=load_vnnlib(file, setting.outputs, setting.inputs), **common)
 
 
 _TYPES = {

@@ -9,21 +9,21 @@ import numpy as np
 import torch
 
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.refine.protocol import Member
+from ns_abstract.refine.protocol import SceneSample
 from ns_abstract.verify.network import ImageSets, OutputBounds
 from ns_abstract.verify.properties import Query
 
 
-class Scene(Protocol):
+class FrameImages(Protocol):
     """The pictures of one frame at the network's resolution."""
 
     box: ParameterBox
 
-    def image(self, values: np.ndarray, member: Member | None = None) -> np.ndarray:
+    def image(self, values: np.ndarray, member: SceneSample | None = None) -> np.ndarray:
         """Concrete picture [H, W, 3] float32 at parameter values [d], of another scene of the set if one is named."""
         ...
 
-    def members(self, seed: int) -> Iterator[Member]:
+    def scene_samples(self, seed: int) -> Iterator[SceneSample]:
         """Other scenes of the set, without end; none where only poses vary."""
         ...
 
@@ -61,7 +61,7 @@ class Model(Protocol):
 
 
 class SharedBounds(Protocol):
-    """Bounds of a cell, and of others with its coefficients (`Family`)."""
+    """Bounds of a cell, and of others with its coefficients (`SharedCoefficients`)."""
 
     def first(self, query: Query) -> OutputBounds:
         """Bounds of the query's rows over the cell."""
@@ -72,14 +72,14 @@ class SharedBounds(Protocol):
         ...
 
 
-class SharingModel(Protocol):
+class SharedBoundsModel(Protocol):
     """A network whose backward coefficients can be reused across cells."""
 
     @property
-    def lends_anywhere(self) -> bool:
+    def reusable_anywhere(self) -> bool:
         """Whether rows of a cell serve for others that are no parts of it."""
         ...
 
-    def family(self, images: ImageSets) -> SharedBounds:
+    def shared_bounds(self, images: ImageSets) -> SharedBounds:
         """Bounds of one cell, whose rows are to serve for others."""
         ...

@@ -15,41 +15,41 @@ import torch
 
 from ns_abstract.arithmetic.network_charges import OWN_LINE
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.refine.protocol import Frame, Member, Score
+from ns_abstract.refine.protocol import Frame, SceneSample, Score
 from ns_abstract.verify.network import ImageSets, OutputBounds
 from ns_abstract.verify.properties import Query
-from ns_abstract.verify.protocol import Model, Scene
+from ns_abstract.verify.protocol import FrameImages, Model
 
 #: Parameters of where a scene stands.
 PLACE = 3
 
 
-class RegisteredScene:
-    """Pictures of poses for every position of the scene; see `ns_abstract.verify.protocol.Scene`.
+class RegisteredImages:
+    """Pictures of poses for every position of the scene; see `ns_abstract.verify.protocol.FrameImages`.
 
     Args:
-        scene: Pictures of a set of `PoseSet.registered`: its last parameters tell where the scene stands.
+        scene: Pictures of a set of `PoseBox.registered`: its last parameters tell where the scene stands.
         frame: The frame behind them.
     """
 
-    def __init__(self, scene: Scene, frame: Frame) -> None:
+    def __init__(self, scene: FrameImages, frame: Frame) -> None:
         self.scene, self.frame = scene, frame
         box = scene.box
         self.box = box.without(box.names[-PLACE:])
         #: [3] how far each may be off
         self.reach = np.array(box.upper[-PLACE:])
 
-    def image(self, values: np.ndarray, member: Member | None = None) -> np.ndarray:
-        assert member is None or isinstance(member, RegisteredMember)
+    def image(self, values: np.ndarray, member: SceneSample | None = None) -> np.ndarray:
+        assert member is None or isinstance(member, RegisteredSample)
         return self.scene.image(np.concatenate([values, np.zeros(PLACE) if member is None else member.offset]))
 
-    def members(self, seed: int) -> Iterator[RegisteredMember]:
+    def scene_samples(self, seed: int) -> Iterator[RegisteredSample]:
         """Places of the scene, without end, corners first."""
         for signs in itertools.product((-1.0, 1.0), repeat=PLACE):
-            yield RegisteredMember(self, self.reach * signs)
+            yield RegisteredSample(self, self.reach * signs)
         generator = np.random.default_rng(seed)
         while True:
-            yield RegisteredMember(self, self.reach * generator.uniform(-1.0, 1.0, PLACE))
+            yield RegisteredSample(self, self.reach * generator.uniform(-1.0, 1.0, PLACE))
 
     def widened(self, box: ParameterBox) -> ParameterBox:
         """A box of poses with all places of the scene."""
@@ -67,34 +67,34 @@ class RegisteredScene:
 
 
 @dataclass(frozen=True)
-class RegisteredMember:
-    """One position of the scene; see `ns_abstract.refine.protocol.Member`.
+class RegisteredSample:
+    """One position of the scene; see `ns_abstract.refine.protocol.SceneSample`.
 
     Attributes:
         scene: The pictures.
         offset: [3] where the scene stands.
     """
 
-    scene: RegisteredScene = field(repr=False)
+    scene: RegisteredImages = field(repr=False)
     offset: np.ndarray
 
     def __call__(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
         return self.scene.frame.render(np.concatenate([values, self.offset]), tiles)
 
-    def pushed(
+    def signed_gradient_step(
         self, box: ParameterBox, values: np.ndarray, score: Score, size: float
-    ) -> tuple[np.ndarray, RegisteredMember]:
+    ) -> tuple[np.ndarray, RegisteredSample]:
         pose, offset = (torch.tensor(part, dtype=torch.float64, requires_grad=True) for part in (values, self.offset))
-        found = score(self.scene.scene.differentiable(torch.cat([pose, offset])), pose)
-        if found.requires_grad:
-            found.backward()
+        gradient_source = score(self.scene.scene.differentiable(torch.cat([pose, offset])), pose)
+        if gradient_source.requires_grad:
+            gradient_source.backward()
         low, high, reach = np.array(box.lower), np.array(box.upper), self.scene.reach
         values = np.clip(values + 0.5 * size * _sign(pose) * (high - low), low, high)
-        return values, RegisteredMember(self.scene, np.clip(self.offset + size * _sign(offset) * reach, -reach, reach))
+        return values, RegisteredSample(self.scene, np.clip(self.offset + size * _sign(offset) * reach, -reach, reach))
 
     @property
-    def nearest(self) -> RegisteredMember:
-        return RegisteredMember(self.scene, np.zeros(PLACE))
+    def nearest(self) -> RegisteredSample:
+        return RegisteredSample(self.scene, np.zeros(PLACE))
 
     @property
     def arrays(self) -> dict[str, np.ndarray]:
@@ -122,9 +122,9 @@ class RegisteredModel:
 
     def bound(self, images: ImageSets, query: Query) -> OutputBounds:
         """Bounds in the poses' parameters, for all places of the scene."""
-        found = self.model.bound(images, query)
-        kept = images.dimensions - PLACE
-        lost = np.abs(found.a[..., kept:]).sum(axis=-1)
+        output_bounds = self.model.bound(images, query)
+        image_dimensions = images.dimensions - PLACE
+        lost = np.abs(output_bounds.a[..., image_dimensions:]).sum(axis=-1)
         with np.errstate(invalid="ignore"):
-            b = found.b - lost - OWN_LINE * (np.abs(found.b) + lost)
-        return OutputBounds(found.lower, found.a[..., :kept], b)
+            b = output_bounds.b - lost - OWN_LINE * (np.abs(output_bounds.b) + lost)
+        return OutputBounds(output_bounds.lower, output_bounds.a[..., :image_dimensions], b)

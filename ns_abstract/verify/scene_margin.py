@@ -14,13 +14,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ns_abstract.execution.ending import AbandonedError, abandoning, checkpoint
+from ns_abstract.execution.cancellation import WorkCancelledError, cancel_when, check_cancelled
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import SCENE_SHIFTS, SCENE_TURNS
 from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.variations import SceneVariation, Selection
-from ns_abstract.verify.cells import Cell, Grid
-from ns_abstract.verify.response import ResponseName
+from ns_abstract.verify.camera_response import ResponseName
+from ns_abstract.verify.cells import Cell, CellGrid
 
 Outcome = Literal["holds", "falsified", "unknown"]
 
@@ -48,7 +48,7 @@ _TUNING = MarginTuning()
 
 
 @dataclass(frozen=True)
-class Kind:
+class VariationKind:
     """A kind of variation: of each Gaussian (`KINDS`), of the camera (`CAMERA_KINDS`), of the whole scene (`PLACES`).
 
     Attributes:
@@ -57,7 +57,7 @@ class Kind:
         first: Radius that is tried first.
         most: Radius beyond which none is tried.
         response: What of the camera varies, if it is not the scene.
-        place: Parameters of where the scene as a whole stands, if these vary (`PoseSet.registered`).
+        place: Parameters of where the scene as a whole stands, if these vary (`PoseBox.registered`).
     """
 
     name: str
@@ -75,20 +75,20 @@ class Kind:
 
 
 KINDS = (
-    Kind("mean", "every coordinate of every Gaussian's mean", "normalised units", 0.001, 10.0),
-    Kind("opacity", "every Gaussian's opacity", "of 1", 0.01, 1.0),
-    Kind("color", "every channel of every Gaussian's colour", "of 1", 0.01, 1.0),
+    VariationKind("mean", "every coordinate of every Gaussian's mean", "normalised units", 0.001, 10.0),
+    VariationKind("opacity", "every Gaussian's opacity", "of 1", 0.01, 1.0),
+    VariationKind("color", "every channel of every Gaussian's colour", "of 1", 0.01, 1.0),
 )
 
 #: Of the camera, the same all over the picture (V14).
-CAMERA_KINDS: tuple[Kind, ...] = (
-    Kind("brightness", "the factor of the camera's brightness", "of 1", 0.01, 0.9, "brightness"),
-    Kind("white_balance", "the factor of every channel", "of 1", 0.01, 0.9, "white balance"),
-    Kind("gamma", "the power of the camera's response", "of 1", 0.01, 0.9, "gamma"),
+CAMERA_KINDS: tuple[VariationKind, ...] = (
+    VariationKind("brightness", "the factor of the camera's brightness", "of 1", 0.01, 0.9, "brightness"),
+    VariationKind("white_balance", "the factor of every channel", "of 1", 0.01, 0.9, "white balance"),
+    VariationKind("gamma", "the power of the camera's response", "of 1", 0.01, 0.9, "gamma"),
 )
 
 #: The scene as a whole, the same for a whole run of a loop.
-REGISTRATION = Kind(
+REGISTRATION = VariationKind(
     "registration",
     "the place of the whole scene along every world axis",
     "normalised units",
@@ -96,7 +96,7 @@ REGISTRATION = Kind(
     10.0,
     place=SCENE_SHIFTS,
 )
-TURN = Kind(
+TURN = VariationKind(
     "turn",
     "the turn of the whole scene about every world axis through the origin",
     "rad",
@@ -108,7 +108,7 @@ PLACES = (REGISTRATION, TURN)
 
 
 @dataclass(frozen=True)
-class Settled:
+class CellOutcome:
     """The outcome of a cell for all scenes of a set.
 
     Attributes:
@@ -125,11 +125,11 @@ class Settled:
 
 
 #: A cell as it is (it is not cut), by radius, frame and box.
-Settle = Callable[[float, int, ParameterBox], Settled]
+ProveCell = Callable[[float, int, ParameterBox], CellOutcome]
 
 
 @dataclass(frozen=True)
-class Certified:
+class CertifiedBox:
     """A certified cell.
 
     Attributes:
@@ -172,7 +172,7 @@ class SceneMargin:
         example: Arrays that tell the scene of the smallest falsified radius, or None.
     """
 
-    kind: Kind
+    kind: VariationKind
     cells: int
     radius: float = 0.0
     reached: float = 0.0
@@ -183,8 +183,8 @@ class SceneMargin:
     example: Mapping[str, np.ndarray] | None = None
 
     def _least(self, *outcomes: Outcome) -> Trial | None:
-        found = [trial for trial in self.trials if trial.outcome in outcomes]
-        return min(found, key=lambda trial: trial.radius, default=None)
+        trials = [trial for trial in self.trials if trial.outcome in outcomes]
+        return min(trials, key=lambda trial: trial.radius, default=None)
 
     @property
     def failing(self) -> Trial | None:
@@ -243,7 +243,9 @@ class SceneMargin:
         }
 
 
-def widest(kind: Kind, cells: Sequence[Certified], settle: Settle, over: Callable[[], bool]) -> SceneMargin:
+def largest_radius(
+    kind: VariationKind, cells: Sequence[CertifiedBox], settle: ProveCell, over: Callable[[], bool]
+) -> SceneMargin:
     """Return the largest radius, within a tenth, for which every cell is proved again (V13).
 
     Args:
@@ -253,29 +255,29 @@ def widest(kind: Kind, cells: Sequence[Certified], settle: Settle, over: Callabl
         over: Whether to end with what is known; asked about once a second.
     """
     begin = time.perf_counter()
-    found = SceneMargin(kind, len(cells))
-    work = _Bisection(found, settle)
+    margin = SceneMargin(kind, len(cells))
+    work = _Bisection(margin, settle)
     try:
-        with abandoning(over):
+        with cancel_when(over):
             # those that are nearest to failing decide
             order = sorted(range(len(cells)), key=lambda k: (cells[k].margin, cells[k].frame, cells[k].box.lower))
             for place, number in enumerate(order):
-                radius = work.largest(number, cells[number], found.reached if place else None)
-                found.reached, found.part = radius, found.part + cells[number].part
+                radius = work.largest(number, cells[number], margin.reached if place else None)
+                margin.reached, margin.part = radius, margin.part + cells[number].part
                 if radius == 0.0:
                     break
             else:
-                found.radius = found.reached
-            failing = found.failing
-            if failing is not None and found.falsified is None:
+                margin.radius = margin.reached
+            failing = margin.failing
+            if failing is not None and margin.falsified is None:
                 work.attack(failing, cells[failing.cell])
-    except AbandonedError:
-        found.state = "ended"
-    found.seconds = time.perf_counter() - begin
-    return found
+    except WorkCancelledError:
+        margin.state = "ended"
+    margin.seconds = time.perf_counter() - begin
+    return margin
 
 
-def _told(radius: float) -> float:
+def three_digits(radius: float) -> float:
     """Return the radius rounded down to three digits, so that a report states exactly what was proved."""
     return float(f"{radius:.3g}")
 
@@ -283,16 +285,16 @@ def _told(radius: float) -> float:
 class _Bisection:
     """The bisection of one kind of variation."""
 
-    def __init__(self, found: SceneMargin, settle: Settle) -> None:
+    def __init__(self, found: SceneMargin, settle: ProveCell) -> None:
         self.found, self.kind, self.settle = found, found.kind, settle
 
-    def largest(self, number: int, cell: Certified, ceiling: float | None) -> float:
+    def largest(self, number: int, cell: CertifiedBox, ceiling: float | None) -> float:
         """The largest radius for one cell, of which more than ``ceiling`` is of no use; None: it is the first."""
         most = self.kind.most if ceiling is None else ceiling
         radius = min(self.kind.first, most) if ceiling is None else ceiling
         low, high = 0.0, math.inf
         while low < most and not (low > 0.0 and high <= _TUNING.close * low):
-            radius = min(most, _told(radius))
+            radius = min(most, three_digits(radius))
             if radius < _TUNING.least * self.kind.first:
                 return 0.0
             if self._try(number, cell, radius):
@@ -305,18 +307,18 @@ class _Bisection:
                 radius = math.sqrt(low * high) if low > 0.0 else high / _TUNING.stride
         return low
 
-    def attack(self, failing: Trial, cell: Certified) -> None:
+    def attack(self, failing: Trial, cell: CertifiedBox) -> None:
         """Larger radii, until a scene breaks what is certified."""
         radius = failing.radius
         for _ in range(_TUNING.doublings):
             if radius >= self.kind.most:
                 return
-            radius = min(_told(2.0 * radius), self.kind.most)
+            radius = min(three_digits(2.0 * radius), self.kind.most)
             self._try(failing.cell, cell, radius, cuts=False)
             if self.found.trials[-1].outcome != "unknown":
                 return
 
-    def _try(self, number: int, cell: Certified, radius: float, *, cuts: bool = True) -> bool:
+    def _try(self, number: int, cell: CertifiedBox, radius: float, *, cuts: bool = True) -> bool:
         """Whether a cell is proved for a radius."""
         begin = time.perf_counter()
         outcome, reason, parts, example = self._examined(cell, radius, cuts)
@@ -328,28 +330,28 @@ class _Bisection:
         return outcome == "holds"
 
     def _examined(
-        self, cell: Certified, radius: float, cuts: bool
+        self, cell: CertifiedBox, radius: float, cuts: bool
     ) -> tuple[Outcome, str, int, Mapping[str, np.ndarray] | None]:
         """The cell, cut where it is not proved as a whole: all parts must be."""
-        grid = Grid.adaptive(cell.box, [1] * cell.box.dimensions)
+        grid = CellGrid.adaptive(cell.box, [1] * cell.box.dimensions)
         waiting: list[tuple[Cell, int]] = [(part, 0) for part in grid.roots()]
         count = 0
         while waiting:
             part, depth = waiting.pop()
-            checkpoint()
-            found = self.settle(radius, cell.frame, grid.box_of(part))
+            check_cancelled()
+            outcome = self.settle(radius, cell.frame, grid.box_of(part))
             count += 1
-            if found.outcome == "falsified":
-                return "falsified", found.reason, count, found.example
-            if found.outcome == "holds":
+            if outcome.outcome == "falsified":
+                return "falsified", outcome.reason, count, outcome.example
+            if outcome.outcome == "holds":
                 continue
             parts = (
-                grid.divide(part, found.slopes, 1.0 / _TUNING.parts, _TUNING.parts)
+                grid.divide(part, outcome.slopes, 1.0 / _TUNING.parts, _TUNING.parts)
                 if cuts and depth < _TUNING.depth
                 else []
             )
             if not parts or count + len(waiting) + len(parts) > _TUNING.most:
-                return "unknown", found.reason, count, None
+                return "unknown", outcome.reason, count, None
             waiting += [(entry, depth + 1) for entry in parts]
         return "holds", "", count, None
 

@@ -16,14 +16,14 @@ from typing import Any, Literal
 import numpy as np
 import torch
 
-from ns_abstract.execution.ending import checkpoint
+from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
-from ns_abstract.refine.protocol import Member
-from ns_abstract.verify.cells import Cell, Grid
-from ns_abstract.verify.cover import Cover, PictureSets, Weights
+from ns_abstract.refine.protocol import SceneSample
+from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.properties import Claim, LinearClaim
-from ns_abstract.verify.protocol import Model, Scene
+from ns_abstract.verify.protocol import FrameImages, Model
+from ns_abstract.verify.subboxes import PictureSets, PixelWeights, SubBoxProof
 
 Verdict = Literal["certified", "falsified", "unknown"]
 
@@ -59,7 +59,7 @@ _ATTACKERS = 24
 
 
 @dataclass(frozen=True)
-class Leaf:
+class FinishedCell:
     """A finished cell with its verdict.
 
     Attributes:
@@ -88,7 +88,7 @@ class Leaf:
 
 
 @dataclass(frozen=True)
-class Findings:
+class BlockResult:
     """The result of a block of cells.
 
     Attributes:
@@ -100,7 +100,7 @@ class Findings:
         seconds: Time spent.
     """
 
-    leaves: tuple[Leaf, ...]
+    leaves: tuple[FinishedCell, ...]
     blocks: tuple[tuple[Cell, ...], ...]
     samples: tuple[tuple[Cell, bool], ...]
     bounded: int
@@ -109,11 +109,11 @@ class Findings:
 
 
 #: A pose, and the scene of the set that is shown; None: the stored one, or the nearest to it.
-Sample = tuple[np.ndarray, "Member | None"]
+Sample = tuple[np.ndarray, "SceneSample | None"]
 
 
 @dataclass
-class _Seen:
+class _CellSamples:
     """Concrete pictures of one cell, with their margins."""
 
     cell: Cell
@@ -152,8 +152,8 @@ class _Seen:
     @property
     def wavers(self) -> bool:
         """Whether margins differ so much that there may be poses where the property fails."""
-        known = [margin for margin in self.margins if math.isfinite(margin)]
-        return bool(known) and 2.0 * min(known) <= max(known)
+        finite = [margin for margin in self.margins if math.isfinite(margin)]
+        return bool(finite) and 2.0 * min(finite) <= max(finite)
 
     @property
     def holds(self) -> bool:
@@ -189,21 +189,21 @@ class Search:
 
     def __init__(
         self,
-        scene: Scene,
+        scene: FrameImages,
         model: Model,
         claim: Claim,
-        grid: Grid,
+        grid: CellGrid,
         *,
         every_unit: bool = False,
         block: int = BLOCK,
         cuts: bool = True,
-        cover: Cover | None = None,
+        cover: SubBoxProof | None = None,
     ) -> None:
         self.scene, self.model, self.claim, self.grid = scene, model, claim, grid
         self.every_unit, self.cuts, self.cover = every_unit, cuts, cover
         self.block = block if cover is None else min(block, cover.block)
         self._latest: dict[tuple[bytes, int], np.ndarray] = {}
-        self.varies = next(iter(scene.members(0)), None) is not None
+        self.varies = next(iter(scene.scene_samples(0)), None) is not None
 
     def margins(self, samples: Sequence[Sample]) -> tuple[np.ndarray, np.ndarray]:
         """[s] concrete margins and [s, n] outputs at poses, each of a scene of the set."""
@@ -214,60 +214,60 @@ class Search:
             margin = self.claim.margin(torch.from_numpy(outputs), torch.from_numpy(np.stack([p for p, _ in samples])))
         return margin.numpy(), outputs
 
-    def _image(self, values: np.ndarray, member: Member | None) -> np.ndarray:
-        checkpoint()
+    def _image(self, values: np.ndarray, member: SceneSample | None) -> np.ndarray:
+        check_cancelled()
         return self.scene.image(values) if member is None else self.scene.image(values, member)
 
-    def examine(self, block: Sequence[Cell]) -> Findings:
+    def examine(self, block: Sequence[Cell]) -> BlockResult:
         """Examine the cells.
 
         Raises:
             ContradictionError: A cell was proved and has a counterexample: the program has a fault.
-            AbandonedError: There is no time for it (`ns_abstract.execution.ending`).
+            AbandonedError: There is no time for it (`ns_abstract.execution.cancellation`).
         """
         begin = time.perf_counter()
-        seen = [_Seen(cell, self.grid.box_of(cell)) for cell in block]
-        outputs = self._sample(seen, self._early)
+        samples = [_CellSamples(cell, self.grid.box_of(cell)) for cell in block]
+        outputs = self._sample(samples, self._early)
         bounded: dict[int, float] = {}
         reasons: dict[int, str] = {}
-        slopes = np.zeros((len(seen), self.grid.box.dimensions))
-        costs = np.full(len(seen), np.nan)
+        slopes = np.zeros((len(samples), self.grid.box.dimensions))
+        costs = np.full(len(samples), np.nan)
         cuts: dict[int, tuple[int, ...]] = {}
-        open_cells = [k for k, cell in enumerate(seen) if not (cell.broken or cell.undecided)]
+        open_cells = [k for k, cell in enumerate(samples) if not (cell.broken or cell.undecided)]
         if open_cells:
-            self._bound([seen[k] for k in open_cells], outputs, open_cells, bounded, reasons, slopes, costs, cuts)
+            self._bound([samples[k] for k in open_cells], outputs, open_cells, bounded, reasons, slopes, costs, cuts)
         proved = {k for k in open_cells if bounded.get(k, -math.inf) > 0.0}
-        self._sample([seen[k] for k in sorted(proved)], self._attack)
-        failing = [seen[k] for k in open_cells if k not in proved]
+        self._sample([samples[k] for k in sorted(proved)], self._attack)
+        failing = [samples[k] for k in open_cells if k not in proved]
         self._sample(failing, self._late)
         self._ascend(failing)
         if self.varies:
             self._vary(failing)
-        leaves, children = self._verdicts(seen, bounded, reasons, slopes, costs, cuts)
+        leaves, children = self._verdicts(samples, bounded, reasons, slopes, costs, cuts)
         seconds = time.perf_counter() - begin
         # cells of one rank are examined together
         children.sort(key=lambda child: child[0])
         parts = [children[i : i + self.block] for i in range(0, len(children), self.block)]
-        share = seconds / len(seen)
-        return Findings(
+        share = seconds / len(samples)
+        return BlockResult(
             leaves=tuple(_timed(leaf, share) for leaf in leaves),
             blocks=tuple(tuple(cell for _, cell in part) for part in parts),
             ranks=tuple(part[0][0] for part in parts),
-            samples=tuple((cell.cell, cell.holds) for cell in seen),
+            samples=tuple((cell.cell, cell.holds) for cell in samples),
             bounded=len(bounded),
             seconds=seconds,
         )
 
     # ---------------------------------------------------------------- concrete poses
 
-    def _early(self, cell: _Seen) -> list[Sample]:
+    def _early(self, cell: _CellSamples) -> list[Sample]:
         """The middle and two opposite corners."""
         box = cell.box
         if not box.dimensions:
             return [(box.middle, None)]
         return [(pose, None) for pose in (box.middle, np.array(box.lower), np.array(box.upper))[: 1 + _EARLY]]
 
-    def _attack(self, cell: _Seen) -> list[Sample]:
+    def _attack(self, cell: _CellSamples) -> list[Sample]:
         """A random pose and scene: no proof is believed without."""
         generator = _generator(cell.cell)
         poses = list(cell.box.sample(1, generator)) if cell.box.dimensions else []
@@ -277,10 +277,10 @@ class Search:
         member = next(itertools.islice(self._members(cell), number, None))
         return [(pose, member) for pose in poses or [cell.box.middle]]
 
-    def _members(self, cell: _Seen) -> Iterator[Member]:
-        return self.scene.members(int(_generator(cell.cell).integers(1 << 31)))
+    def _members(self, cell: _CellSamples) -> Iterator[SceneSample]:
+        return self.scene.scene_samples(int(_generator(cell.cell).integers(1 << 31)))
 
-    def _late(self, cell: _Seen) -> list[Sample]:
+    def _late(self, cell: _CellSamples) -> list[Sample]:
         """Corners and random poses that no sample has been yet."""
         box = cell.box
         if not box.dimensions:
@@ -290,7 +290,9 @@ class Search:
         fresh = {pose.tobytes(): pose for pose in (*poses, *box.sample(_RANDOM, generator))}
         return [(pose, None) for key, pose in fresh.items() if key not in cell.poses]
 
-    def _sample(self, cells: Sequence[_Seen], choose: Callable[[_Seen], list[Sample]]) -> list[np.ndarray]:
+    def _sample(
+        self, cells: Sequence[_CellSamples], choose: Callable[[_CellSamples], list[Sample]]
+    ) -> list[np.ndarray]:
         """Add samples to the cells; returns the outputs at each cell's first new one."""
         chosen = [choose(cell) for cell in cells]
         # neighbours share corners
@@ -304,17 +306,17 @@ class Search:
             cell.margins += [float(margins[place[_key(sample)]]) for sample in samples]
         return [outputs[place[_key(samples[0])]] for samples in chosen if samples]
 
-    def _vary(self, cells: Sequence[_Seen]) -> None:
+    def _vary(self, cells: Sequence[_CellSamples]) -> None:
         """Scenes of the set that break the property, at every pose looked at of every cell without a proof (V12).
 
         The nearest is moved to the ends of its ranges along the signs of the margin's gradient, the worst by then half
         as far, and the worst of all tried at the other poses, for what breaks the property at one mostly breaks it
         nearby.
         """
-        known: list[Member] = []
+        members: list[SceneSample] = []
         for cell in sorted(cells, key=lambda c: c.margins[c.worst]):
             pose = cell.samples[cell.worst][0]
-            tried = [*itertools.islice(self._members(cell), _MEMBERS), *known]
+            tried = [*itertools.islice(self._members(cell), _MEMBERS), *members]
             margins = self._shown(cell, [(pose, member) for member in tried])
             least = min(range(len(tried)), key=lambda k: margins[k] if math.isfinite(margins[k]) else math.inf)
             best, margin = tried[least], margins[least]
@@ -322,14 +324,14 @@ class Search:
             for start, size in ((best.nearest, 2.0), (None, 1.0)):
                 if margin <= 0.0:
                     break
-                moved = (start or best).pushed(cell.box, pose, self._loss, size)
-                (found,) = self._shown(cell, [moved])
-                if found < margin:
-                    (pose, best), margin = moved, found
-            known = [best]
+                moved = (start or best).signed_gradient_step(cell.box, pose, self._loss, size)
+                (image,) = self._shown(cell, [moved])
+                if image < margin:
+                    (pose, best), margin = moved, image
+            members = [best]
             self._shown(cell, [(other, best) for key, other in cell.poses.items() if key != pose.tobytes()])
 
-    def _shown(self, cell: _Seen, samples: list[Sample]) -> list[float]:
+    def _shown(self, cell: _CellSamples, samples: list[Sample]) -> list[float]:
         """Add samples to a cell; their margins."""
         self._sample([cell], lambda _: samples)
         return cell.margins[len(cell.margins) - len(samples) :]
@@ -338,7 +340,7 @@ class Search:
         """The margin's negative."""
         return -self.claim.margin(self.model.differentiable(picture[None]), values[None])[0]
 
-    def _ascend(self, cells: Sequence[_Seen]) -> None:
+    def _ascend(self, cells: Sequence[_CellSamples]) -> None:
         """Projected gradient descent of the margin in the cell that came closest to a counterexample.
 
         With one parameter, samples do better than gradients.
@@ -348,11 +350,11 @@ class Search:
         if d < 2 or not hopeful:
             return
         cell = min(hopeful, key=lambda c: c.margins[c.worst])
-        found = self._descend(cell)
-        if found is not None:
-            self._sample([cell], lambda c: [(found, None)])
+        step = self._descend(cell)
+        if step is not None:
+            self._sample([cell], lambda c: [(step, None)])
 
-    def _descend(self, cell: _Seen) -> np.ndarray | None:
+    def _descend(self, cell: _CellSamples) -> np.ndarray | None:
         low, high = (torch.tensor(v, dtype=torch.float64) for v in (cell.box.lower, cell.box.upper))
 
         def evaluate(scaled: torch.Tensor) -> tuple[float, torch.Tensor]:
@@ -386,7 +388,7 @@ class Search:
 
     def _bound(
         self,
-        cells: Sequence[_Seen],
+        cells: Sequence[_CellSamples],
         outputs: Sequence[np.ndarray],
         numbers: Sequence[int],
         bounded: dict[int, float],
@@ -396,11 +398,11 @@ class Search:
         cuts: dict[int, tuple[int, ...]],
     ) -> None:
         """Lower bounds of the margin by cell; what fails leaves a reason and no bound, maybe how to cut the cell."""
-        kept: list[int] = []
+        numbers_kept: list[int] = []
         parts: list[Any] = []
-        seen = dict(zip(numbers, cells, strict=True))
-        for number, cell in seen.items():
-            checkpoint()
+        cells_by_number = dict(zip(numbers, cells, strict=True))
+        for number, cell in cells_by_number.items():
+            check_cancelled()
             try:
                 linear, lower, upper, slope = self.scene.sets(cell.box)
             except InputError:
@@ -419,34 +421,34 @@ class Search:
                 if self._coverable(cell.cell):
                     self._covered(cell, number, outputs[number], bounded, reasons, cuts)
             else:
-                kept.append(number)
+                numbers_kept.append(number)
                 parts.append((*linear, lower, upper, cell.box))
-        if not kept:
+        if not numbers_kept:
             return
         *arrays, boxes = zip(*parts, strict=True)
         stacked = [np.stack(values) for values in arrays]
         try:
-            query = self.claim.query(np.stack([outputs[number] for number in kept]))
+            query = self.claim.query(np.stack([outputs[number] for number in numbers_kept]))
             inputs = self.model.input_sets(tuple(stacked[:4]), stacked[4], stacked[5])
-            found = np.array(self.claim.proved(query, self.model.bound(inputs, query), boxes), np.float64)
-            for place, number in enumerate(kept):
-                groups = self._branching(seen[number], float(found[place]))
+            margins = np.array(self.claim.proved(query, self.model.bound(inputs, query), boxes), np.float64)
+            for place, number in enumerate(numbers_kept):
+                groups = self._branching(cells_by_number[number], float(margins[place]))
                 if groups:
                     better = self.model.branch(inputs[place : place + 1], query, groups, _BRANCHES)
-                    found[place] = max(found[place], better)
+                    margins[place] = max(margins[place], better)
         except InputError:
             raise
         except FAILURES as error:
-            reasons.update(dict.fromkeys(kept, failure_text(error)))
+            reasons.update(dict.fromkeys(numbers_kept, failure_text(error)))
             return
-        for number, margin in zip(kept, found.tolist(), strict=True):
+        for number, margin in zip(numbers_kept, margins.tolist(), strict=True):
             # infinite or NaN bounds prove nothing
             if math.isfinite(margin):
                 bounded[number] = margin
             else:
                 reasons[number] = "the network's bounds are not finite"
 
-    def _too_wide(self, cell: _Seen, number: int, sets: PictureSets, costs: np.ndarray) -> bool:
+    def _too_wide(self, cell: _CellSamples, number: int, sets: PictureSets, costs: np.ndarray) -> bool:
         """Whether the network's bounds would be wasted on the sets.
 
         ``costs[number]`` becomes the part of the margin that they cost. A guess by the margin's gradient at the middle,
@@ -461,7 +463,7 @@ class Search:
 
     def _covered(
         self,
-        cell: _Seen,
+        cell: _CellSamples,
         number: int,
         outputs: np.ndarray,
         bounded: dict[int, float],
@@ -473,18 +475,18 @@ class Search:
         if weights is None or self.cover is None:
             return
         try:
-            found = self.cover.prove(cell.box, outputs, weights)
+            outcome = self.cover.prove(cell.box, outputs, weights)
         except InputError:
             raise
         except FAILURES as error:
             reasons[number] = failure_text(error)
             return
-        if found.margin is not None and math.isfinite(found.margin):
-            bounded[number] = found.margin
-        elif found.cuts:
-            cuts[number] = found.cuts
+        if outcome.margin is not None and math.isfinite(outcome.margin):
+            bounded[number] = outcome.margin
+        elif outcome.cuts:
+            cuts[number] = outcome.cuts
 
-    def _weights(self, cell: _Seen) -> Weights | None:
+    def _weights(self, cell: _CellSamples) -> PixelWeights | None:
         """The margin's gradient at the middle, as a part of the margin; None where one of them is no number."""
         values = cell.box.middle
         image = self._latest.get(_key((values, None)))
@@ -498,9 +500,9 @@ class Search:
         except FAILURES:
             return None
         here = float(margin.detach())
-        return Weights(gradient.numpy() / here, here) if here > 0.0 else None
+        return PixelWeights(gradient.numpy() / here, here) if here > 0.0 else None
 
-    def _branching(self, cell: _Seen, margin: float) -> Sequence[Sequence[int]]:
+    def _branching(self, cell: _CellSamples, margin: float) -> Sequence[Sequence[int]]:
         """The claim's groups, if branches may prove a cell that cannot be cut any more, and nothing else can (N16)."""
         if not isinstance(self.claim, LinearClaim) or self._splittable(cell.cell) or cell.broken or cell.undecided:
             return ()
@@ -514,14 +516,14 @@ class Search:
 
     def _verdicts(
         self,
-        seen: Sequence[_Seen],
+        seen: Sequence[_CellSamples],
         bounded: dict[int, float],
         reasons: dict[int, str],
         slopes: np.ndarray,
         costs: np.ndarray,
         cuts: Mapping[int, tuple[int, ...]],
-    ) -> tuple[list[Leaf], list[tuple[float, Cell]]]:
-        leaves: list[Leaf] = []
+    ) -> tuple[list[FinishedCell], list[tuple[float, Cell]]]:
+        leaves: list[FinishedCell] = []
         children: list[tuple[float, Cell]] = []
         for number, cell in enumerate(seen):
             bound = bounded.get(number)
@@ -533,7 +535,7 @@ class Search:
                         f"{cell.box.upper}, found {cell.margins[cell.worst]} at {cell.samples[cell.worst][0].tolist()}"
                     )
                 if not cell.undecided:
-                    leaves.append(Leaf(cell.cell, "certified", bound, 0.0))
+                    leaves.append(FinishedCell(cell.cell, "certified", bound, 0.0))
                     continue
                 bound = None
             if cell.undecided:
@@ -550,10 +552,10 @@ class Search:
                 leaves.append(self._counterexample(cell))
             else:
                 reason, undecided = reasons.get(number, "the finest cell"), cell.undecided > 0
-                leaves.append(Leaf(cell.cell, "unknown", bound, 0.0, reason=reason, undecided=undecided))
+                leaves.append(FinishedCell(cell.cell, "unknown", bound, 0.0, reason=reason, undecided=undecided))
         return leaves, children
 
-    def _rank(self, cell: _Seen, bound: float | None, cost: float) -> float:
+    def _rank(self, cell: _CellSamples, bound: float | None, cost: float) -> float:
         """How many times the bound of ``cell`` misses the margin that samples show: its parts need about as many cuts.
 
         Largest cells first would prove nothing for long where all cells need several cuts; the nearest to a proof
@@ -570,7 +572,7 @@ class Search:
             return min(cost, RANK_FIRST / 2.0) if math.isfinite(cost) else _RANK_UNKNOWN * (1.0 + share)
         return min((margin - bound) / margin, _RANK_UNKNOWN)
 
-    def _cuts(self, cell: _Seen, bound: float | None, cost: float) -> tuple[float, int]:
+    def _cuts(self, cell: _CellSamples, bound: float | None, cost: float) -> tuple[float, int]:
         """How many times narrower parts should be for a proof, and how many there may be."""
         if cell.broken:
             return 0.25, 4
@@ -579,15 +581,17 @@ class Search:
         margin = cell.margins[cell.worst]
         return (0.25, 4) if margin - bound > _FAR * margin else (0.5, 2)
 
-    def _counterexample(self, cell: _Seen) -> Leaf:
+    def _counterexample(self, cell: _CellSamples) -> FinishedCell:
         """The worst pose, rendered and classified once more."""
         values, member = cell.samples[cell.worst]
         image = self._image(values, member)
         margins, outputs = self.margins([(values, member)])
         margin = float(margins[0])
         if not -math.inf < margin <= 0.0 or not cell.box.contains(values):
-            return Leaf(cell.cell, "unknown", None, 0.0, reason="a counterexample was not confirmed", undecided=True)
-        return Leaf(
+            return FinishedCell(
+                cell.cell, "unknown", None, 0.0, reason="a counterexample was not confirmed", undecided=True
+            )
+        return FinishedCell(
             cell.cell,
             "falsified",
             margin,
@@ -612,7 +616,7 @@ def failure_text(error: Exception) -> str:
     return " ".join(f"{type(error).__name__}: {error}".split())[:200]
 
 
-def _timed(leaf: Leaf, seconds: float) -> Leaf:
+def _timed(leaf: FinishedCell, seconds: float) -> FinishedCell:
     return replace(leaf, seconds=seconds)
 
 

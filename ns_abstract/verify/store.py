@@ -5,7 +5,7 @@ children there. So a kill at any moment loses at most the blocks that were being
 twice (a retried worker) counts once.
 
 Tables ``parameters`` and ``cells`` are for readers; ``search_*`` are the search's own. What was changed by others
-since is noticed (`Seal`) and not continued.
+since is noticed (`TableChecksum`) and not continued.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.verify.cells import Cell, Grid
-from ns_abstract.verify.scene_margin import Settled
-from ns_abstract.verify.search import RANK_FIRST, Findings, Leaf, Verdict
-from ns_abstract.verify.store_file import BLOCK, FRAME, Seal, StoreFile
+from ns_abstract.verify.cells import Cell, CellGrid
+from ns_abstract.verify.scene_margin import CellOutcome
+from ns_abstract.verify.search import RANK_FIRST, BlockResult, FinishedCell, Verdict
+from ns_abstract.verify.store_file import BLOCK, FRAME, StoreFile, TableChecksum
 
 #: One open block of so many is the one with the largest cells, all others are those nearest to a proof.
 _LARGEST_EVERY = 4
 
 
 @dataclass(frozen=True)
-class Block:
+class CellBlock:
     """Cells of one frame to examine together; ``depth`` counts the cuts from the first cells."""
 
     number: int
@@ -102,12 +102,12 @@ class Store(StoreFile):
 
     # ---------------------------------------------------------------- frames and blocks
 
-    def grid(self, frame: int, box: ParameterBox) -> Grid | None:
+    def grid(self, frame: int, box: ParameterBox) -> CellGrid | None:
         """The grid of a frame that was begun, or None."""
         row = self._base.execute("SELECT units, coarse FROM search_frames WHERE frame = ?", (frame,)).fetchone()
-        return None if row is None else Grid(box, tuple(json.loads(row[0])), tuple(json.loads(row[1])))
+        return None if row is None else CellGrid(box, tuple(json.loads(row[0])), tuple(json.loads(row[1])))
 
-    def begin(self, frame: int, grid: Grid, blocks: Iterable[Sequence[Cell]]) -> None:
+    def begin(self, frame: int, grid: CellGrid, blocks: Iterable[Sequence[Cell]]) -> None:
         """Note a frame's first blocks, once."""
         box = grid.box
         with self._transaction():
@@ -121,31 +121,31 @@ class Store(StoreFile):
             self._seals.frames.add(row)
             self._open(frame, 0, grid, ((cells, RANK_FIRST) for cells in blocks))
 
-    def _open(self, frame: int, depth: int, grid: Grid, blocks: Iterable[tuple[Sequence[Cell], float]]) -> None:
+    def _open(self, frame: int, depth: int, grid: CellGrid, blocks: Iterable[tuple[Sequence[Cell], float]]) -> None:
         for cells, rank in blocks:
             volume = max(c.volume for c in cells) / grid.volume
             row = frame, volume, float(rank), depth, json.dumps([[c.first, c.past] for c in cells])
             query = "INSERT INTO search_blocks(frame, volume, rank, depth, cells) VALUES (?, ?, ?, ?, ?)"
             self._seals.blocks.add((self._base.execute(query, row).lastrowid, *row))
 
-    def pending(self, known: set[int], count: int) -> list[Block]:
+    def pending(self, known: set[int], count: int) -> list[CellBlock]:
         """Up to ``count`` open blocks that are not in ``known``: those nearest to a proof, now and then the largest."""
-        found: list[Block] = []
+        blocks: list[CellBlock] = []
         for _ in range(count):
             self._turn += 1
             order = "volume DESC" if self._turn % _LARGEST_EVERY == 0 else "rank, volume"
-            for block in self._listed(f"ORDER BY {order}, id LIMIT {len(known) + len(found) + 1}"):
-                if block.number not in known and block not in found:
-                    found.append(block)
+            for block in self._listed(f"ORDER BY {order}, id LIMIT {len(known) + len(blocks) + 1}"):
+                if block.number not in known and block not in blocks:
+                    blocks.append(block)
                     break
             else:
                 break
-        return found
+        return blocks
 
-    def _listed(self, which: str) -> list[Block]:
+    def _listed(self, which: str) -> list[CellBlock]:
         rows = self._base.execute(f"SELECT id, frame, depth, cells FROM search_blocks {which}").fetchall()
         return [
-            Block(number, frame, depth, tuple(Cell(tuple(a), tuple(b)) for a, b in json.loads(cells)))
+            CellBlock(number, frame, depth, tuple(Cell(tuple(a), tuple(b)) for a, b in json.loads(cells)))
             for number, frame, depth, cells in rows
         ]
 
@@ -154,7 +154,7 @@ class Store(StoreFile):
         """Number of blocks that are not examined yet."""
         return self._base.execute("SELECT COUNT(*) FROM search_blocks").fetchone()[0]
 
-    def close_block(self, block: Block, findings: Findings, grid: Grid) -> bool:
+    def close_block(self, block: CellBlock, findings: BlockResult, grid: CellGrid) -> bool:
         """Store what became of a block; false, and nothing changes, if that was stored before."""
         with self._transaction():
             query = f"SELECT {BLOCK} FROM search_blocks WHERE id = ?"
@@ -194,10 +194,10 @@ class Store(StoreFile):
 
     def _list(self, frame: int, box: ParameterBox, values: Sequence[float]) -> str:
         """Values in the order of the table ``parameters``; 0 where this frame has none."""
-        known = {**self._fixed.get(frame, {}), **dict(zip(box.names, values, strict=True))}
-        return json.dumps([known.get(name, 0.0) for name in self._names])
+        values_by_name = {**self._fixed.get(frame, {}), **dict(zip(box.names, values, strict=True))}
+        return json.dumps([values_by_name.get(name, 0.0) for name in self._names])
 
-    def _add(self, frame: int, leaf: Leaf, grid: Grid) -> None:
+    def _add(self, frame: int, leaf: FinishedCell, grid: CellGrid) -> None:
         box = grid.box_of(leaf.cell)
         margin = leaf.margin if leaf.margin is not None and math.isfinite(leaf.margin) else None
         if leaf.verdict == "certified" and (margin is None or not margin > 0.0):
@@ -216,15 +216,15 @@ class Store(StoreFile):
         self._base.execute("INSERT INTO cells VALUES (?, ?, ?, ?, ?, ?, ?)", row)
         self._seals.cells.add(row)
 
-    def settled(self, kind: str, radius: float, frame: int, box: ParameterBox) -> Settled | None:
+    def settled(self, kind: str, radius: float, frame: int, box: ParameterBox) -> CellOutcome | None:
         """What `keep_settled` was told of a cell, or None."""
         query = "kind = ? AND radius = ? AND frame = ? AND lower = ? AND upper = ?"
         row = self._base.execute(
             f"SELECT outcome, reason, slopes FROM search_settled WHERE {query}", _settled_key(kind, radius, frame, box)
         ).fetchone()
-        return None if row is None else Settled(row[0], row[1], np.array(json.loads(row[2]), np.float64))
+        return None if row is None else CellOutcome(row[0], row[1], np.array(json.loads(row[2]), np.float64))
 
-    def keep_settled(self, kind: str, radius: float, frame: int, box: ParameterBox, found: Settled) -> None:
+    def keep_settled(self, kind: str, radius: float, frame: int, box: ParameterBox, found: CellOutcome) -> None:
         """Note what is known of a cell for all scenes of a radius; scenes that break it are found again."""
         if found.outcome == "falsified":
             return
@@ -234,7 +234,7 @@ class Store(StoreFile):
             self._base.execute(f"INSERT INTO search_settled VALUES ({', '.join('?' * len(row))})", row)
             self._seals.settled.add(row)
 
-    def finish(self, grids: Mapping[int, Grid]) -> None:
+    def finish(self, grids: Mapping[int, CellGrid]) -> None:
         """List what is still open as unknown, so that the cells cover the set; `Store` takes it back on resuming."""
         with self._transaction():
             rows = []
@@ -266,7 +266,7 @@ class Store(StoreFile):
         return [dict(zip(names, row, strict=True)) for row in rows]
 
     @property
-    def seal(self) -> Seal:
+    def seal(self) -> TableChecksum:
         """Of the rows of ``cells`` that have a verdict."""
         return self._seals.cells
 
@@ -298,7 +298,7 @@ class Store(StoreFile):
         rows = self._base.execute(
             "SELECT lower, upper, verdict, margin, seconds, counterexample FROM cells WHERE frame = ?", (frame,)
         )
-        found = [
+        leaves = [
             {
                 "lower": json.loads(low),
                 "upper": json.loads(high),
@@ -310,7 +310,7 @@ class Store(StoreFile):
             for low, high, kind, margin, seconds, example in rows
             if verdict in (None, kind)
         ]
-        return sorted(found, key=lambda row: row["lower"])
+        return sorted(leaves, key=lambda row: row["lower"])
 
 
 def _settled_key(kind: str, radius: float, frame: int, box: ParameterBox) -> tuple[str, float, int, str, str]:

@@ -58,7 +58,7 @@ SETTLED = "kind, radius, frame, lower, upper, outcome, reason, slopes"
 
 
 @dataclass
-class Seal:
+class TableChecksum:
     """Number and sum of the hashes of a table's rows: rows come and go in any order, and no other rows fit.
 
     It finds what was damaged or edited; who also writes the seal anew is not found out.
@@ -80,19 +80,19 @@ class Seal:
 
 
 @dataclass
-class _Seals:
+class _Checksums:
     """Of the cells that have a verdict, the open blocks, the frames, and what is known of margins."""
 
-    cells: Seal = field(default_factory=Seal)
-    blocks: Seal = field(default_factory=Seal)
-    frames: Seal = field(default_factory=Seal)
-    settled: Seal = field(default_factory=Seal)
+    cells: TableChecksum = field(default_factory=TableChecksum)
+    blocks: TableChecksum = field(default_factory=TableChecksum)
+    frames: TableChecksum = field(default_factory=TableChecksum)
+    settled: TableChecksum = field(default_factory=TableChecksum)
 
     def plain(self) -> dict[str, Any]:
         return {name: [seal.rows, seal.text] for name, seal in vars(self).items()}
 
-    def copy(self) -> _Seals:
-        return _Seals(**{name: Seal(seal.rows, seal.total) for name, seal in vars(self).items()})
+    def copy(self) -> _Checksums:
+        return _Checksums(**{name: TableChecksum(seal.rows, seal.total) for name, seal in vars(self).items()})
 
 
 class StoreFile:
@@ -119,7 +119,7 @@ class StoreFile:
         self._base: Any = None
         self._fresh = not resume
         self.folder, self.file = folder, folder / NAME
-        self._seals = _Seals()
+        self._seals = _Checksums()
         self._lock = claim(folder)
         try:
             self.resumed = not self._open_base(fingerprint, parameters, resume)
@@ -152,7 +152,7 @@ class StoreFile:
         return InputError(f"cannot be used: {error}", file=self.file, field="--output-dir", fix=fix)
 
     @contextmanager
-    def told(self) -> Iterator[None]:
+    def errors_as_input(self) -> Iterator[None]:
         """Errors of the file inside the block are told like a user's mistakes.
 
         Raises:
@@ -234,7 +234,7 @@ class StoreFile:
         if known != [(k, *names) for k, names in enumerate(parameters)]:
             raise self._damaged("its parameters are others")
         written = self._reported()
-        found = _Seals()
+        found = _Checksums()
         cells = f"SELECT {CELL} FROM cells WHERE rowid NOT IN (SELECT value FROM json_each(?)) ORDER BY rowid"
         for row in self._base.execute(cells, self._left()):
             found.cells.add(row)

@@ -62,7 +62,7 @@ class UnsafeSet:
 
 
 @dataclass(frozen=True)
-class Region:
+class InputRegion:
     """A box of inputs with the outputs that are unsafe there.
 
     Attributes:
@@ -80,7 +80,7 @@ class Region:
         return any(bool((value[list(group)] <= 0.0).all()) for group in self.unsafe.groups)
 
 
-class _Sizes(NamedTuple):
+class _VariableCounts(NamedTuple):
     """Numbers of inputs and outputs; inputs may be None where no assertion is to name them."""
 
     inputs: int | None
@@ -127,7 +127,7 @@ def _check_declared(declared: set[str], kind: str, count: int) -> None:
         )
 
 
-def load_regions(path: Path, input_size: int, output_size: int, text: str | None = None) -> tuple[Region, ...]:
+def load_regions(path: Path, input_size: int, output_size: int, text: str | None = None) -> tuple[InputRegion, ...]:
     """Read a VNN-LIB file with its inputs: the property is violated if some region has an input with an unsafe output.
 
     Args:
@@ -140,12 +140,12 @@ def load_regions(path: Path, input_size: int, output_size: int, text: str | None
     """
     text = _text(path) if text is None else text
     try:
-        return _regions(_expressions(text), _Sizes(input_size, output_size))
+        return _regions(_expressions(text), _VariableCounts(input_size, output_size))
     except InputError as error:
         raise error.within(path) from None
 
 
-def _regions(expressions: list[Any], sizes: _Sizes) -> tuple[Region, ...]:
+def _regions(expressions: list[Any], sizes: _VariableCounts) -> tuple[InputRegion, ...]:
     declared: set[str] = set()
     assert sizes.inputs is not None
     ends = np.full((2, sizes.inputs), np.inf) * np.array([[-1.0], [1.0]])
@@ -170,13 +170,13 @@ def _regions(expressions: list[Any], sizes: _Sizes) -> tuple[Region, ...]:
         if (len(boxes) + 1) * ends.size > _BOXES:
             raise InputError(f"boxes of inputs with more than {_BOXES} numbers", fix="use fewer boxes")
         boxes.setdefault(own.tobytes(), (own, []))[1].append(outputs)
-    found = []
+    regions = []
     for own, conjunctions in boxes.values():
         if not np.isfinite(own).all():
             index = int(np.flatnonzero(~np.isfinite(own).all(0))[0])
             raise InputError(f"X_{index} has no bounds", fix="assert a lower and an upper bound of every input")
-        found.append(Region(own[0], own[1], _unsafe(conjunctions, sizes.outputs, 0)))
-    return tuple(found)
+        regions.append(InputRegion(own[0], own[1], _unsafe(conjunctions, sizes.outputs, 0)))
+    return tuple(regions)
 
 
 def _bound(constraint: _Linear, ends: np.ndarray) -> bool:
@@ -265,7 +265,7 @@ def _parse(expressions: list[Any], output_size: int, input_size: int | None) -> 
         if names == {"X"}:
             inputs += 1
             continue
-        ways = _ways(expression[1], declared, _Sizes(None, output_size))
+        ways = _ways(expression[1], declared, _VariableCounts(None, output_size))
         if len(unsafe) * len(ways) > _CONJUNCTIONS:
             raise InputError(f"more than {_CONJUNCTIONS} combinations of cases", fix="use fewer assertions of (or")
         unsafe = [[*old, *new] for old in unsafe for new in ways]
@@ -280,18 +280,18 @@ def _parse(expressions: list[Any], output_size: int, input_size: int | None) -> 
 def _unsafe(conjunctions: list[_Conjunction], output_size: int, inputs: int) -> UnsafeSet:
     rows: list[np.ndarray] = []
     offsets: list[float] = []
-    known: dict[tuple[Any, float], int] = {}
+    group_numbers: dict[tuple[Any, float], int] = {}
     groups = []
     for conjunction in conjunctions:
         group = []
         for coefficients, constant in conjunction:
             key = (tuple(sorted(coefficients.items())), constant)
-            if key not in known:
-                known[key] = len(rows)
+            if key not in group_numbers:
+                group_numbers[key] = len(rows)
                 row, offset = _scaled(coefficients, constant, output_size)
                 rows.append(row)
                 offsets.append(offset)
-            group.append(known[key])
+            group.append(group_numbers[key])
         groups.append(tuple(group))
     return UnsafeSet(np.array(rows).reshape(-1, output_size), np.array(offsets), tuple(groups), inputs)
 
@@ -329,7 +329,7 @@ def _names(expression: Any) -> set[str]:
     return {expression} if _VARIABLE.fullmatch(expression) else set()
 
 
-def _ways(expression: Any, declared: set[str], size: _Sizes) -> list[_Conjunction]:
+def _ways(expression: Any, declared: set[str], size: _VariableCounts) -> list[_Conjunction]:
     """The expression as a disjunction of conjunctions."""
     head = expression[0] if isinstance(expression, list) and expression else None
     if head == "or" and len(expression) > 1:
@@ -363,13 +363,13 @@ def _added(total: float, factor: float, value: float) -> float:
         InputError: It overflows, or the product vanishes.
     """
     product = factor * value
-    found = total + product
-    if not np.isfinite(found) or (factor and value and abs(product) < _SMALLEST):
+    sum_ = total + product
+    if not np.isfinite(sum_) or (factor and value and abs(product) < _SMALLEST):
         raise InputError(f"numbers overflow or vanish at {factor:g} times {value:g}", fix="use factors nearer to 1")
-    return found
+    return sum_
 
 
-def _linear(expression: Any, declared: set[str], size: _Sizes) -> _Linear:
+def _linear(expression: Any, declared: set[str], size: _VariableCounts) -> _Linear:
     if isinstance(expression, str):
         return _atom(expression, declared, size)
     head, parts = (expression[0], expression[1:]) if expression else (None, [])
@@ -392,7 +392,7 @@ def _linear(expression: Any, declared: set[str], size: _Sizes) -> _Linear:
     raise _fail(expression, "write a linear expression of outputs")
 
 
-def _atom(text: str, declared: set[str], size: _Sizes) -> _Linear:
+def _atom(text: str, declared: set[str], size: _VariableCounts) -> _Linear:
     match = _VARIABLE.fullmatch(text)
     if match is None:
         number = _NUMBER.fullmatch(text)

@@ -22,7 +22,7 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
-from ns_abstract.viewer.views import Snapshot, Source, View
+from ns_abstract.viewer.views import Snapshot, Source, ViewRequest
 
 #: Memory for pictures that were seen before.
 _CACHE_BYTES = 256 << 20
@@ -116,7 +116,7 @@ class Background:
         self._workers: list[_Process] = []
         self._cache: OrderedDict[_Key, Snapshot] = OrderedDict()
         #: number, key and view of the newest request, and the seconds it was given
-        self._wanted: tuple[int, _Key, View, float] | None = None
+        self._wanted: tuple[int, _Key, ViewRequest, float] | None = None
         self._asked = 0.0
         self._answered = True
         self._failures: dict[_Key, str] = {}
@@ -138,7 +138,7 @@ class Background:
                 worker.post(("scene", token, source))
             self._staff()
 
-    def best(self, view: View, seconds: float) -> Snapshot | None:
+    def best(self, view: ViewRequest, seconds: float) -> Snapshot | None:
         """The best that is known of ``view``; what is missing is asked for.
 
         Args:
@@ -149,11 +149,11 @@ class Background:
             if self._source is None or self._closed:
                 return None
             key = (self._source[0], *view.key)
-            known = self._known(key, view)
-            done = known is not None and known.final and known.size >= (view.camera.height, view.camera.width)
+            snapshot = self._known(key, view)
+            done = snapshot is not None and snapshot.final and snapshot.size >= (view.camera.height, view.camera.width)
             if not (done or key in self._failures or self._is_wanted(key, view)):
-                self._ask(key, view, seconds, 0 if known is None or not known.final else max(known.size))
-            return known
+                self._ask(key, view, seconds, 0 if snapshot is None or not snapshot.final else max(snapshot.size))
+            return snapshot
 
     def more(self, seconds: float) -> None:
         """Go on for ``seconds`` with the view that was asked for last."""
@@ -188,18 +188,18 @@ class Background:
 
     # --- requests ------------------------------------------------------------------------------
 
-    def _known(self, key: _Key, view: View) -> Snapshot | None:
-        found = self._cache.get(key)
-        if found is None or not view.fits(*found.size):
+    def _known(self, key: _Key, view: ViewRequest) -> Snapshot | None:
+        snapshot = self._cache.get(key)
+        if snapshot is None or not view.fits(*snapshot.size):
             return None
         self._cache.move_to_end(key)
-        return found
+        return snapshot
 
-    def _is_wanted(self, key: _Key, view: View) -> bool:
+    def _is_wanted(self, key: _Key, view: ViewRequest) -> bool:
         """Whether the newest request answers this one as well."""
         return self._wanted is not None and self._wanted[1] == key and self._wanted[2].side >= view.side
 
-    def _ask(self, key: _Key, view: View, seconds: float, known: int) -> None:
+    def _ask(self, key: _Key, view: ViewRequest, seconds: float, known: int) -> None:
         number = 0 if self._wanted is None else self._wanted[0] + 1
         self._wanted, self._answered, self._asked = (number, key, view, seconds), False, time.monotonic()
         self._staff()
@@ -288,7 +288,7 @@ class Background:
         elif kind == "done":
             self._answered = True
 
-    def _store(self, key: _Key, view: View, snapshot: Snapshot) -> None:
+    def _store(self, key: _Key, view: ViewRequest, snapshot: Snapshot) -> None:
         old = self._known(key, view)
         if old is not None and (old.size > snapshot.size or (snapshot.says_less(old) and not snapshot.final)):
             return

@@ -10,8 +10,8 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 
 from ns_abstract.arithmetic.rounding import arithmetic as arithmetic_named
-from ns_abstract.geometry.camera_path import Camera
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.jsonio import parse_json
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.method import NerfMethod
@@ -57,10 +57,10 @@ def perturbation_of(radii: Mapping[str, float], select: str = "{}") -> Perturbat
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class ViewRequest:
     """A camera with the size it is shown at, and the set of poses and scenes around it."""
 
-    camera: Camera
+    camera: PinholeCamera
     perturbation: Perturbation
 
     @property
@@ -70,7 +70,7 @@ class View:
         around = f"{self.perturbation!r} {self.perturbation.scene!r}"
         return camera.camera_to_world.tobytes(), round(camera.fy / camera.height, 6), around
 
-    def at_most(self, side: int | None) -> View:
+    def at_most(self, side: int | None) -> ViewRequest:
         """This view with a picture of no more than ``side`` pixels along its longest side."""
         if side is None or self.side <= side:
             return self
@@ -89,7 +89,7 @@ class View:
 
     def stages(
         self, seconds: float, known: int = 0, ladder: Mapping[int, float] = SPLAT_LADDER
-    ) -> list[tuple[Camera, float]]:
+    ) -> list[tuple[PinholeCamera, float]]:
         """Cameras of growing size above the longest side ``known`` and their times; the last is this view's own."""
         smaller = [(self.camera.rescaled(self.side / s), t) for s, t in ladder.items() if known < s < self.side]
         return [*smaller, (self.camera, seconds)]
@@ -166,7 +166,7 @@ class Snapshot:
 class SceneFrame(Frame, Protocol):
     """A frame whose scene may vary."""
 
-    def members(self, seed: int) -> Iterator[Any]:
+    def scene_samples(self, seed: int) -> Iterator[Any]:
         """Other scenes of the set, each as a function like ``render``."""
         ...
 
@@ -198,7 +198,7 @@ class Source(Protocol):
         """What the bounds are worth on a platform that passes its self-check."""
         ...
 
-    def frame(self, camera: Camera, perturbation: Perturbation) -> SceneFrame:
+    def frame(self, camera: PinholeCamera, perturbation: Perturbation) -> SceneFrame:
         """The frame of ``camera`` and a set of poses around it.
 
         Raises:
@@ -246,7 +246,7 @@ class SplatSource:
         """What the bounds are worth on a platform that passes its self-check."""
         return f"{self.arithmetic}-sound"
 
-    def frame(self, camera: Camera, perturbation: Perturbation) -> SplatFrame:
+    def frame(self, camera: PinholeCamera, perturbation: Perturbation) -> SplatFrame:
         """The frame of ``camera`` and a set of poses and scenes around it.
 
         Raises:
@@ -256,18 +256,18 @@ class SplatSource:
             self.splats,
             rasteriser_named(self.renderer, self.version),
             arithmetic_named(self.arithmetic),
-            PoseSet.around(camera, perturbation),
+            PoseBox.around(camera, perturbation),
             varied=self._varied(perturbation),
-            slanted=True,
+            sheared=True,
             layers=self.layers,
         )
 
     def _varied(self, perturbation: Perturbation) -> VariedSplats:
         """The scenes of a set; those of the last set are kept, as pictures of several sizes ask for them."""
         if perturbation.scene not in self._kept:
-            found = vary(self.scene, self.splats, perturbation.scene)
+            varied = vary(self.scene, self.splats, perturbation.scene)
             self._kept.clear()
-            self._kept[perturbation.scene] = found
+            self._kept[perturbation.scene] = varied
         return self._kept[perturbation.scene]
 
     def warm_up(self) -> None:
@@ -278,7 +278,7 @@ class SplatSource:
         pose = np.eye(3, 4)
         pose[:, 3] = middle
         pose[2, 3] += distance
-        camera = Camera(pose, 32.0, 32.0, 16.0, 16.0, 32, 32)
+        camera = PinholeCamera(pose, 32.0, 32.0, 16.0, 16.0, 32, 32)
         for radii in ({"x": 1e-4}, {"x": 1e-4, "yaw": 1e-4}):
             self.frame(camera, perturbation_of(radii)).warm_up()
 
@@ -318,17 +318,17 @@ class NerfSource:
         s = self._method.sampling
         return f"of the fine field at {s.samples} uniform samples by ray, not of the picture with importance samples"
 
-    def frame(self, camera: Camera, perturbation: Perturbation) -> NerfFrame:
+    def frame(self, camera: PinholeCamera, perturbation: Perturbation) -> NerfFrame:
         """The frame of ``camera`` and a set of poses around it.
 
         Raises:
             InputError: Gaussians are to vary.
         """
         self._method.prepare([perturbation])
-        return self._method.frame(PoseSet.around(camera, perturbation))
+        return self._method.frame(PoseBox.around(camera, perturbation))
 
     def warm_up(self) -> None:
         """Compile the kernels for one and for several parameters."""
-        camera = Camera(np.eye(3, 4), 2.0, 2.0, 1.0, 1.0, 2, 2)
+        camera = PinholeCamera(np.eye(3, 4), 2.0, 2.0, 1.0, 1.0, 2, 2)
         for radii in ({"x": 1e-4}, {"x": 1e-4, "yaw": 1e-4}):
             self.frame(camera, perturbation_of(radii)).warm_up()

@@ -17,12 +17,12 @@ from multiprocessing.connection import Connection
 from typing import Any
 
 from ns_abstract.arithmetic.selfcheck import check_functions
-from ns_abstract.execution.ending import AbandonedError
-from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.execution.cancellation import WorkCancelledError
+from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.io.errors import InputError
-from ns_abstract.refine.engine import Goal, Refinement
+from ns_abstract.refine.engine import Refinement, RefinementGoal
 from ns_abstract.refine.result import TracePoint
-from ns_abstract.viewer.views import Snapshot, Source, View
+from ns_abstract.viewer.views import Snapshot, Source, ViewRequest
 
 #: Seconds that a request waits for a newer one: the camera may still be moving.
 _SETTLE = 0.08
@@ -33,7 +33,7 @@ _RATIO = 1.05
 _LEAF_BYTES = 512 << 20
 
 
-class Worker:
+class BoundsWorker:
     """Answers requests until the other end of the pipe is closed."""
 
     def __init__(self, connection: Connection) -> None:
@@ -79,7 +79,7 @@ class Worker:
                 self._waiting.pop()
             self._waiting.append(message)
 
-    def _work(self, number: int, view: View, seconds: float, known: int) -> None:
+    def _work(self, number: int, view: ViewRequest, seconds: float, known: int) -> None:
         assert self.source is not None
         perturbation, key = view.perturbation, (view.key, view.camera.height, view.camera.width)
         if self.refinement is not None and self.about == key and self.refinement.covered:
@@ -94,22 +94,24 @@ class Worker:
         if not self._stopped():
             self.connection.send(("done", number))
 
-    def _bound(self, number: int, camera: Camera, perturbation: Any, seconds: float, about: tuple[Any, ...]) -> bool:
+    def _bound(
+        self, number: int, camera: PinholeCamera, perturbation: Any, seconds: float, about: tuple[Any, ...]
+    ) -> bool:
         """Refine one size; False if a newer message waits."""
         assert self.source is not None
         frame = self.source.frame(camera, perturbation)
-        refinement = Refinement(frame, 0, self._goal(seconds), stopped=self._stopped, members=frame.members(0))
+        refinement = Refinement(frame, 0, self._goal(seconds), stopped=self._stopped, members=frame.scene_samples(0))
         refinement.progress = _Teller(self, number, refinement)
         self.refinement, self.about = refinement, about
-        with suppress(AbandonedError):
+        with suppress(WorkCancelledError):
             refinement.run()
         stopped = self._stopped()
         if refinement.covered:
             self.tell(number, refinement, final=not stopped)
         return not stopped
 
-    def _goal(self, seconds: float) -> Goal:
-        return Goal(_RATIO, seconds, None, _LEAF_BYTES)
+    def _goal(self, seconds: float) -> RefinementGoal:
+        return RefinementGoal(_RATIO, seconds, None, _LEAF_BYTES)
 
     def _stopped(self) -> bool:
         return self.connection.poll()
@@ -124,7 +126,7 @@ class Worker:
 class _Teller:
     """Sends pictures of a refinement that goes on, not too often."""
 
-    def __init__(self, worker: Worker, number: int, refinement: Refinement) -> None:
+    def __init__(self, worker: BoundsWorker, number: int, refinement: Refinement) -> None:
         self.worker, self.number, self.refinement = worker, number, refinement
         self.last = -_BETWEEN
 
@@ -138,7 +140,7 @@ def main() -> None:
     """Serve the pipe whose file descriptor is the only argument."""
     os.nice(10)
     try:
-        Worker(Connection(int(sys.argv[1]))).run()
+        BoundsWorker(Connection(int(sys.argv[1]))).run()
     except (EOFError, BrokenPipeError, ConnectionResetError, KeyboardInterrupt):
         # the viewer has ended
         pass

@@ -28,7 +28,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.methods.splat.scene import SplatScene
 
 _HERE = Path(__file__).resolve().parent
@@ -403,7 +403,7 @@ class Kernels:
         view[:, :3, 3:4] = -torch.bmm(inverse, pose[:, :3, 3:4])
         return view[0].contiguous(), torch.inverse(view)[0, :3, 3].contiguous()
 
-    def stages(self, camera: Camera, camera_to_world: np.ndarray) -> Stages:
+    def stages(self, camera: PinholeCamera, camera_to_world: np.ndarray) -> Stages:
         """Projection, colours and tiles for one pose [3, 4] (OpenGL)."""
         n, dtype = self.scene.count, torch.zeros(0, dtype=self.type).numpy().dtype
         view, eye = self.view(camera_to_world)
@@ -433,7 +433,7 @@ class Kernels:
         return Stages(radii, means2d, conics, depths, opacities, colors, offsets, ids[:total])
 
     def pixels(
-        self, camera: Camera, camera_to_world: np.ndarray, pixels: np.ndarray, found: Stages | None = None
+        self, camera: PinholeCamera, camera_to_world: np.ndarray, pixels: np.ndarray, found: Stages | None = None
     ) -> np.ndarray:
         """Colours [k, 3] in [0, 1] of pixels [k, 2] (row, column)."""
         if found is None:
@@ -443,7 +443,7 @@ class Kernels:
         render = torch.from_numpy(colors) + (1 - torch.from_numpy(alphas)[:, None]) * self.background
         return torch.clamp(render, 0.0, 1.0).numpy()
 
-    def layers(self, camera: Camera, camera_to_world: np.ndarray) -> np.ndarray:
+    def layers(self, camera: PinholeCamera, camera_to_world: np.ndarray) -> np.ndarray:
         """Accumulation and expected depth [H, W, 2], as of gsplat's render mode RGB+ED, before Splatfacto fills in the
         pixels where nothing is drawn, whose depth is NaN here."""
         found = self.stages(camera, camera_to_world)
@@ -457,7 +457,7 @@ class Kernels:
         return both.numpy().reshape(camera.height, camera.width, 2)
 
     def _rasterized(
-        self, camera: Camera, found: Stages, pixels: np.ndarray, values: np.ndarray
+        self, camera: PinholeCamera, found: Stages, pixels: np.ndarray, values: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Weighted sums [k, 3] of ``values`` [N, 3] and accumulations [k] of pixels [k, 2]."""
         pixels = np.ascontiguousarray(pixels, np.int64)
@@ -470,7 +470,7 @@ class Kernels:
         )  # fmt: skip
         return colors, alphas
 
-    def image(self, camera: Camera, camera_to_world: np.ndarray) -> np.ndarray:
+    def image(self, camera: PinholeCamera, camera_to_world: np.ndarray) -> np.ndarray:
         """The picture [H, W, 3] in [0, 1]."""
         pixels = np.stack(np.mgrid[: camera.height, : camera.width], axis=-1).reshape(-1, 2)
         return self.pixels(camera, camera_to_world, pixels).reshape(camera.height, camera.width, 3)

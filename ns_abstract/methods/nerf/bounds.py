@@ -18,18 +18,18 @@ from torch import Tensor
 from ns_abstract.arithmetic.chebyshev import ChebyshevBasis
 from ns_abstract.arithmetic.outward import outward
 from ns_abstract.arithmetic.rounding import DENSITY_ROUNDING, DIRECTION_ROUNDING, KEPT_LIGHT_UP, SAMPLE_ROUNDING
-from ns_abstract.execution.ending import checkpoint
+from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.poses import PoseSet
-from ns_abstract.methods.nerf.division import ENDS, Division, divided, regrouped
+from ns_abstract.geometry.poses import PoseBox
+from ns_abstract.methods.nerf.division import ENDS, Division, division_for, regroup_parts
 from ns_abstract.methods.nerf.hsv import Range, shifted_bounds
 from ns_abstract.methods.nerf.outputs import bounds_by_part, brightness, greatest, opacity
-from ns_abstract.methods.nerf.paths import Following, Paths
-from ns_abstract.methods.nerf.pencil import TAYLOR, Pencil
+from ns_abstract.methods.nerf.ray_bundle import TAYLOR, RayBundle
 from ns_abstract.methods.nerf.render import Sampling
-from ns_abstract.methods.nerf.samples import composite, hulls
+from ns_abstract.methods.nerf.sample_paths import BundleBounds, SamplePaths
+from ns_abstract.methods.nerf.samples import composite, field_hulls
 from ns_abstract.methods.nerf.scene import FieldWeights, NerfScene
-from ns_abstract.methods.nerf.zonotope import ERROR_TERMS, Affine, FieldBounds, Pieces
+from ns_abstract.methods.nerf.zonotope import ERROR_TERMS, FieldBounds, PostActivation, PreActivation
 
 #: (degree, grid) of the polynomials by number of parameters.
 _DEGREES = {0: (1, 2), 1: (28, 112), 2: (6, 20), 3: (4, 10), 4: (2, 5)}
@@ -138,10 +138,10 @@ class RayBounds:
 
 
 @dataclass(frozen=True)
-class _Asked:
+class _RayRequest:
     """The arguments of `NerfBounds.rays`."""
 
-    pose_set: PoseSet
+    pose_set: PoseBox
     box: ParameterBox
     pixels: np.ndarray
     tolerance: float
@@ -149,15 +149,15 @@ class _Asked:
     aim: tuple[np.ndarray, np.ndarray] | None
     shifts: list[Shifts]
 
-    def take(self, which: np.ndarray) -> _Asked:
+    def take(self, which: np.ndarray) -> _RayRequest:
         """Some of the rays."""
-        known = None if self.known is None else self.known[which]
+        known_alpha = None if self.known is None else self.known[which]
         aim = None if self.aim is None else (self.aim[0][which], self.aim[1][which])
-        return replace(self, pixels=self.pixels[which], known=known, aim=aim)
+        return replace(self, pixels=self.pixels[which], known=known_alpha, aim=aim)
 
 
 @dataclass
-class _Items:
+class _SampleCells:
     """Cells of samples: ray, sample, cell, [k] each, all of one level."""
 
     ray: np.ndarray
@@ -167,13 +167,13 @@ class _Items:
     def __len__(self) -> int:
         return self.ray.size
 
-    def take(self, which: np.ndarray | slice) -> _Items:
-        return _Items(self.ray[which], self.sample[which], self.cell[which])
+    def take(self, which: np.ndarray | slice) -> _SampleCells:
+        return _SampleCells(self.ray[which], self.sample[which], self.cell[which])
 
 
-def join_items(parts: list[_Items]) -> _Items:
+def join_sample_cells(parts: list[_SampleCells]) -> _SampleCells:
     """All items of ``parts``."""
-    return _Items(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("ray", "sample", "cell")))
+    return _SampleCells(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("ray", "sample", "cell")))
 
 
 class NerfBounds:
@@ -207,7 +207,7 @@ class NerfBounds:
         self.paths = None
         if self.swept:
             coarse = FieldBounds(scene.coarse, basis_of(dimensions, scene.coarse), device=device, compiled=compiled)
-            self.paths = Paths(coarse, self.field, sampling, scene.occupancy, self.batch)
+            self.paths = SamplePaths(coarse, self.field, sampling, scene.occupancy, self.batch)
         self.distances, self.lengths = sampling.bins
         self.taylor = min(TAYLOR, max(1, self.basis.degree))
         #: Where to begin to look for `RayBounds.displacement`.
@@ -215,7 +215,7 @@ class NerfBounds:
 
     def rays(
         self,
-        pose_set: PoseSet,
+        pose_set: PoseBox,
         box: ParameterBox,
         pixels: np.ndarray,
         tolerance: float,
@@ -235,47 +235,51 @@ class NerfBounds:
             shifts: Intervals of hue and saturation that are added to all colours; bounds hold over all of them.
             division: The cells, in place of those that suit the rays; bounds are then kept by part.
         """
-        asked = _Asked(pose_set, box, pixels, tolerance, known, aim, shifts or [])
+        request = _RayRequest(pose_set, box, pixels, tolerance, known, aim, shifts or [])
         if self.paths is None:
-            return self._apart(asked, division, division is not None, self.displacement)
-        found, alone = self._followed(self.paths, asked, division)
-        loose = np.flatnonzero(alone & ((found.upper - found.lower).max(axis=1) > _LOOSE))
+            return self._apart(request, division, division is not None, self.displacement)
+        ray_bounds, alone = self._followed(self.paths, request, division)
+        loose = np.flatnonzero(alone & ((ray_bounds.upper - ray_bounds.lower).max(axis=1) > _LOOSE))
         if not loose.size:
-            return found
+            return ray_bounds
         # narrower boxes would not help: samples anywhere in their bins
-        bins = self._apart(asked.take(loose), None, division is not None, _DISPLACEMENT)
-        found.lower[loose] = np.maximum(found.lower[loose], bins.lower)
-        found.upper[loose] = np.minimum(found.upper[loose], bins.upper)
-        found.alpha[loose] = bins.alpha
-        if found.parts is not None and bins.parts is not None:
-            low, high = (regrouped(*side, found.parts.shape[3:-1]) for side in zip(bins.parts, ENDS, strict=True))
-            found.parts[0][loose] = np.maximum(found.parts[0][loose], low)
-            found.parts[1][loose] = np.minimum(found.parts[1][loose], high)
-        found.cells += bins.cells
-        return found
+        bins = self._apart(request.take(loose), None, division is not None, _DISPLACEMENT)
+        ray_bounds.lower[loose] = np.maximum(ray_bounds.lower[loose], bins.lower)
+        ray_bounds.upper[loose] = np.minimum(ray_bounds.upper[loose], bins.upper)
+        ray_bounds.alpha[loose] = bins.alpha
+        if ray_bounds.parts is not None and bins.parts is not None:
+            low, high = (
+                regroup_parts(*side, ray_bounds.parts.shape[3:-1]) for side in zip(bins.parts, ENDS, strict=True)
+            )
+            ray_bounds.parts[0][loose] = np.maximum(ray_bounds.parts[0][loose], low)
+            ray_bounds.parts[1][loose] = np.minimum(ray_bounds.parts[1][loose], high)
+        ray_bounds.cells += bins.cells
+        return ray_bounds
 
-    def _nothing(self, asked: _Asked, parts: tuple[int, ...] | None) -> RayBounds:
+    def _nothing(self, request: _RayRequest, parts: tuple[int, ...] | None) -> RayBounds:
         """What holds of any rays; also by ``parts``, if there are any."""
-        n = len(asked.pixels)
-        found = np.zeros((n, 3)), np.ones((n, 3)), np.ones((n, self.distances.size), np.float32), 0, self.displacement
+        n = len(request.pixels)
+        trivial = np.zeros((n, 3)), np.ones((n, 3)), np.ones((n, self.distances.size), np.float32), 0, self.displacement
         if parts is None:
-            return RayBounds(*found)
-        low = np.zeros((n, max(1, len(asked.shifts)), *parts, 3), np.float32)
-        return RayBounds(*found, np.stack([low, np.ones_like(low)]))
+            return RayBounds(*trivial)
+        low = np.zeros((n, max(1, len(request.shifts)), *parts, 3), np.float32)
+        return RayBounds(*trivial, np.stack([low, np.ones_like(low)]))
 
-    def _followed(self, paths: Paths, asked: _Asked, given: Division | None) -> tuple[RayBounds, np.ndarray]:
+    def _followed(
+        self, paths: SamplePaths, request: _RayRequest, given: Division | None
+    ) -> tuple[RayBounds, np.ndarray]:
         """Bounds from samples that are followed; [0, 1] where the box is too wide for that.
 
         Also [n] whether the box is so narrow that it is one cell to begin with.
         """
-        pencil = Pencil(asked.pose_set, asked.box, asked.pixels, paths.degree)
+        pencil = RayBundle(request.pose_set, request.box, request.pixels, paths.degree)
         moves = pencil.displacement(self.distances, self.lengths)
         division = self.division(moves) if given is None else given
         parts = None if given is None else given.parts
         if division is None or not pencil.finite:
-            return self._nothing(asked, parts), np.zeros(len(moves), bool)
+            return self._nothing(request, parts), np.zeros(len(moves), bool)
         start = division.first(moves, self.displacement).max(axis=1)
-        work = Following(paths, pencil, division, start, asked.tolerance, asked.aim, asked.shifts)
+        work = BundleBounds(paths, pencil, division, start, request.tolerance, request.aim, request.shifts)
         work.run()
         n, shifts = len(moves), work.lower.shape[2]
         # [n, shifts, *parts, 3]
@@ -287,21 +291,23 @@ class NerfBounds:
         )  # fmt: skip
         return rays, start == 0
 
-    def _apart(self, asked: _Asked, given: Division | None, by_part: bool, displacement: float) -> RayBounds:
+    def _apart(self, request: _RayRequest, given: Division | None, by_part: bool, displacement: float) -> RayBounds:
         """Bounds from cells of every sample, or of the bins that samples lie in."""
-        n, samples, box = len(asked.pixels), self.distances.size, asked.box
-        pencil = Pencil(asked.pose_set, box, asked.pixels, self.taylor, self.swept)
+        n, samples, box = len(request.pixels), self.distances.size, request.box
+        pencil = RayBundle(request.pose_set, box, request.pixels, self.taylor, self.swept)
         moves = pencil.displacement(self.distances, self.lengths)
         division = given
         if division is None:
             d = moves.shape[2]
-            division = divided(moves, displacement, _PARTS, _DEEPER.get(d, _DEEPER_MORE), _FINER.get(d, 0), self.swept)
+            division = division_for(
+                moves, displacement, _PARTS, _DEEPER.get(d, _DEEPER_MORE), _FINER.get(d, 0), self.swept
+            )
         if division is None or not pencil.finite:
             parts = (1,) * box.dimensions if division is None else division.parts[: box.dimensions]
-            return self._nothing(asked, parts if by_part else None)
+            return self._nothing(request, parts if by_part else None)
         if n > 1 and n * samples * math.prod(division.parts) > _NUMBERS:
             halves = [
-                self._apart(asked.take(which), given, by_part, displacement)
+                self._apart(request.take(which), given, by_part, displacement)
                 for which in (np.arange(n // 2), np.arange(n // 2, n))
             ]
             lower, upper, alpha = (
@@ -314,11 +320,11 @@ class NerfBounds:
             )  # fmt: skip
         edges = None
         if self.paths is not None:
-            edges = self._edges(self.paths, Pencil(asked.pose_set, box, asked.pixels, self.taylor), division)
-        work = _Work(self, pencil, division, moves, asked, displacement, edges)
-        return work.run(asked.shifts, by_part)
+            edges = self._edges(self.paths, RayBundle(request.pose_set, box, request.pixels, self.taylor), division)
+        work = _BundleWork(self, pencil, division, moves, request, displacement, edges)
+        return work.run(request.shifts, by_part)
 
-    def _edges(self, paths: Paths, pencil: Pencil, division: Division) -> tuple[np.ndarray, np.ndarray]:
+    def _edges(self, paths: SamplePaths, pencil: RayBundle, division: Division) -> tuple[np.ndarray, np.ndarray]:
         """Bounds [n parts, .] of the fine samples' edges by parts of the poses (design.md, F14)."""
         monomials = np.prod(paths.coarse.basis.nodes[:, None, :] ** pencil.exponents, axis=-1)
         origin, direction = monomials @ pencil.origin, monomials @ pencil.direction
@@ -328,13 +334,13 @@ class NerfBounds:
         return low.reshape(-1, low.shape[2]), high.reshape(-1, high.shape[2])
 
     def division(self, moves: np.ndarray, most: int = _PARTS, deeper: int | None = None) -> Division | None:
-        """`divided` for samples that move by ``moves`` [n, samples, d], as wide as the network's bounds bear."""
+        """`division_for` for samples that move by ``moves`` [n, samples, d], as wide as the network's bounds bear."""
         d = moves.shape[2]
         if self.paths is None:
             usual, finer = _DEEPER.get(d, _DEEPER_MORE), _FINER.get(d, 0)
         else:
             usual, finer = _FOLLOWED_DEEPER * d, _FOLLOWED_FINER.get(d, _FOLLOWED_FINER_MORE)
-        return divided(moves, self.displacement, most, usual if deeper is None else deeper, finer)
+        return division_for(moves, self.displacement, most, usual if deeper is None else deeper, finer)
 
 
 def typical_displacement(parts: Sequence[RayBounds]) -> float:
@@ -342,22 +348,22 @@ def typical_displacement(parts: Sequence[RayBounds]) -> float:
     return math.exp(sum(math.log(part.displacement) for part in parts) / len(parts))
 
 
-class _Work:
+class _BundleWork:
     """The bounds of one pencil of rays; see `NerfBounds.rays`."""
 
     def __init__(
         self,
         owner: NerfBounds,
-        pencil: Pencil,
+        pencil: RayBundle,
         division: Division,
         moves: np.ndarray,
-        asked: _Asked,
+        request: _RayRequest,
         displacement: float,
         edges: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> None:
-        self.edges, known = edges, asked.known
+        self.edges, known = edges, request.known
         self.owner, self.pencil, self.division = owner, pencil, division
-        self.tolerance, self.aim = asked.tolerance * (_SWEPT if owner.swept else 1.0), asked.aim
+        self.tolerance, self.aim = request.tolerance * (_SWEPT if owner.swept else 1.0), request.aim
         self.basis, self.field = owner.basis, owner.field
         n, samples = moves.shape[:2]
         parts = math.prod(division.parts)
@@ -395,12 +401,12 @@ class _Work:
             self.light *= np.prod(1.0 - self._anywhere(self.alpha_low[block], np.minimum), axis=0)
         self._learn()
         self._improve()
-        color, found = (self.color_low, self.color_high), []
+        color, bounded = (self.color_low, self.color_high), []
         for shift in shifts:
-            checkpoint()
+            check_cancelled()
             self.color_low, self.color_high = self._shifted(color, shift)
-            found.append(self._composite())
-        low, high = (np.stack(ends, axis=1) for ends in zip(*(found or [self._composite()]), strict=True))
+            bounded.append(self._composite())
+        low, high = (np.stack(ends, axis=1) for ends in zip(*(bounded or [self._composite()]), strict=True))
         alpha = self.alpha_high.max(axis=2).T.astype(np.float32)
         return RayBounds(
             low.min(axis=(1, 2)), high.max(axis=(1, 2)), np.nextafter(alpha, np.float32(2.0)), self.cells,
@@ -436,13 +442,13 @@ class _Work:
             )
         return self._levels[level]
 
-    def _rows(self, level: int, items: _Items) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _rows(self, level: int, items: _SampleCells) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Where the parts [k, parts of a cell] of ``items`` stand in the arrays by sample, ray and part."""
         return items.sample[:, None], items.ray[:, None], self._level(level)[2][items.cell]
 
     def _bound_block(self, block: np.ndarray) -> None:
         """Bound the samples ``block`` of all rays."""
-        waiting: dict[int, list[_Items]] = {}
+        waiting: dict[int, list[_SampleCells]] = {}
         for level in range(self.division.levels + 1):
             ray, place = np.nonzero((self.start[:, block] == level) & ~self.quiet[:, block])
             if not ray.size:
@@ -452,26 +458,26 @@ class _Work:
             item, cell = np.nonzero(bright[ray])
             if not item.size:
                 continue
-            waiting[level] = [_Items(ray[item], block[place[item]], cell)]
+            waiting[level] = [_SampleCells(ray[item], block[place[item]], cell)]
         self.wide |= any(level > 0 for level in waiting)
         for level in range(self.division.levels + 1):
             if level not in waiting:
                 continue
-            items = join_items(waiting.pop(level))
+            items = join_sample_cells(waiting.pop(level))
             again = []
             for start in range(0, len(items), self.owner.batch):
                 batch = items.take(slice(start, start + self.owner.batch))
-                halve, lost, seen = self._bound_batch(level, batch, _TUNING.coarse)
+                halve, lost, visible = self._bound_batch(level, batch, _TUNING.coarse)
                 again.append(batch.take(halve))
                 first = self.start[batch.ray, batch.sample] == level
                 self.lost += int((lost & first).sum())
-                self.tried += int((seen & first).sum())
-            coarse = join_items(again)
+                self.tried += int((visible & first).sum())
+            coarse = join_sample_cells(again)
             below = self.division.below[level]
             if below < 0 or not len(coarse):
                 continue
             children = self.division.children(level, coarse.cell)
-            finer = _Items(np.tile(coarse.ray, 2), np.tile(coarse.sample, 2), children)
+            finer = _SampleCells(np.tile(coarse.ray, 2), np.tile(coarse.sample, 2), children)
             waiting.setdefault(below, []).append(finer)
 
     def _learn(self) -> None:
@@ -508,9 +514,9 @@ class _Work:
             for deeper in np.unique(level):
                 which = level == deeper
                 cell = self._cell_of(deeper)[part[which]]
-                found = np.unique(np.stack([ray[which], sample[which], cell]), axis=1)
-                for start in range(0, found.shape[1], self.owner.batch):
-                    items = _Items(*found[:, start : start + self.owner.batch])
+                unique_cells = np.unique(np.stack([ray[which], sample[which], cell]), axis=1)
+                for start in range(0, unique_cells.shape[1], self.owner.batch):
+                    items = _SampleCells(*unique_cells[:, start : start + self.owner.batch])
                     self._bound_batch(int(deeper), items, math.inf)
             rays = np.unique(ray)
 
@@ -566,12 +572,12 @@ class _Work:
         """[count, parts, 3] the colour behind the last sample."""
         return np.tile(np.array(self.owner.sampling.background, np.float64), (count, self.light.shape[1], 1))
 
-    def _bound_batch(self, level: int, items: _Items, coarse: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _bound_batch(self, level: int, items: _SampleCells, coarse: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Bound some cells of one level.
 
         Returns [k] which leave more light open than ``coarse``, which leave all of it, and which needed the network.
         """
-        checkpoint()
+        check_cancelled()
         halve, lost, tried = (np.zeros(len(items), bool) for _ in range(3))
         lines, radius = self.pencil.points(
             items.ray, self.owner.distances[items.sample], 0.5 * self.owner.lengths[items.sample]
@@ -584,7 +590,7 @@ class _Work:
         return halve, lost, tried
 
     def _occupied(
-        self, level: int, items: _Items, lines: np.ndarray, radius: np.ndarray
+        self, level: int, items: _SampleCells, lines: np.ndarray, radius: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Which items may see occupied voxels, and [k] whether an item surely does; the others are made empty (F11)."""
         everything = np.arange(len(items))
@@ -604,7 +610,7 @@ class _Work:
     def _bound_field(
         self,
         level: int,
-        items: _Items,
+        items: _SampleCells,
         lines: np.ndarray,
         radius: np.ndarray,
         sure: np.ndarray,
@@ -619,10 +625,14 @@ class _Work:
         encoded = field.encode(nodes, torch.from_numpy(radius).to(device), field.position)
         pieces, density = field.base(*encoded)
         halve, lost = np.zeros((2, len(items)), bool)
-        seen = np.flatnonzero(~self._leave_alike(level, items, density))
-        if not seen.size:
+        differing = np.flatnonzero(~self._leave_alike(level, items, density))
+        if not differing.size:
             return halve, lost
-        items, sure, density = items.take(seen), sure[seen], density.without_columns(torch.from_numpy(seen).to(device))
+        items, sure, density = (
+            items.take(differing),
+            sure[differing],
+            density.without_columns(torch.from_numpy(differing).to(device)),
+        )
         low, high, error = bounds_by_part(density, bernstein)
         length = torch.from_numpy(self.owner.lengths[items.sample]).to(device)[:, None]
         alpha_low, alpha_high = opacity(low[..., 0], length, up=False), opacity(high[..., 0], length, up=True)
@@ -642,17 +652,17 @@ class _Work:
         self.open[rows] = np.minimum(self.open[rows], open_)
         self.level[rows] = level
         halved = (open_ * light).max(axis=1) > coarse
-        halve[seen], lost[seen] = halved, halved & (open_.min(axis=1) > _LOST)
+        halve[differing], lost[differing] = halved, halved & (open_.min(axis=1) > _LOST)
         shines = (high_a * light).max(axis=1) > self._negligible
         # what is halved gets its colours from the halves, if there are any
         final = ~halved | (self.division.below[level] < 0)
         coloured = np.flatnonzero(shines & final & ~density.failed.cpu().numpy())
         if coloured.size:
-            which = torch.from_numpy(seen[coloured]).to(device)
+            which = torch.from_numpy(differing[coloured]).to(device)
             self._color(level, items.take(coloured), pieces.select(which), there[which])
         return halve, lost
 
-    def _leave_alike(self, level: int, items: _Items, density: Affine) -> np.ndarray:
+    def _leave_alike(self, level: int, items: _SampleCells, density: PreActivation) -> np.ndarray:
         """[k] whether next to nothing is seen of an item: that is all that is found out about it then."""
         length = torch.from_numpy(self.owner.lengths[items.sample]).to(density.poly.device)
         most = opacity(greatest(density)[:, 0], length, up=True)
@@ -664,7 +674,7 @@ class _Work:
         self.level[rows] = level
         return alike
 
-    def _color(self, level: int, items: _Items, pieces: Pieces, there: Tensor) -> None:
+    def _color(self, level: int, items: _SampleCells, pieces: PostActivation, there: Tensor) -> None:
         """Bound the colours of ``pieces``, those of ``items``; ``there``: monomials at their nodes."""
         device, field = self.owner.device, self.field
         bernstein = self._level(level)[1]
@@ -692,9 +702,9 @@ class _Work:
 
     def _shifted(self, color: tuple[np.ndarray, np.ndarray], shift: Shifts) -> tuple[np.ndarray, np.ndarray]:
         """Bounds of ``color`` (lower, upper) after ``shift``; [0, 1] where next to nothing is seen of it."""
-        seen = self.before * self.alpha_high > _TUNING.unseen
+        visible = self.before * self.alpha_high > _TUNING.unseen
         low, high = np.zeros_like(color[0]), np.ones_like(color[1])
-        low[seen], high[seen] = shifted_bounds(color[0][seen], color[1][seen], *shift)
+        low[visible], high[visible] = shifted_bounds(color[0][visible], color[1][visible], *shift)
         return low, high
 
     def _composite(self) -> tuple[np.ndarray, np.ndarray]:
@@ -732,7 +742,7 @@ class _Work:
         count = edges_low.shape[1] - 1
         density, color = np.empty((2, rows, count)), np.empty((2, rows, count, 3))
         near, far = owner.sampling.near, owner.sampling.far
-        hulls(
+        field_hulls(
             edges_low, edges_high, near, (far - near) / (samples * inner),
             np.stack([along(density_low), along(density_high)]), colors, density, color,
         )  # fmt: skip

@@ -30,10 +30,12 @@ class Division:
     def _levels(self) -> list[tuple[int, ...]]:
         """Cells by axis of every level."""
         halved = len(self.axes)
-        found = [tuple(1 << self.axes[:level].count(j) for j in range(self.dimensions)) for level in range(halved + 1)]
+        level_counts = [
+            tuple(1 << self.axes[:level].count(j) for j in range(self.dimensions)) for level in range(halved + 1)
+        ]
         if self.dimensions == 1:
-            found += [(3 << k,) for k in range(halved - 1)]
-        return sorted(found, key=math.prod)
+            level_counts += [(3 << k,) for k in range(halved - 1)]
+        return sorted(level_counts, key=math.prod)
 
     @property
     def levels(self) -> int:
@@ -64,8 +66,8 @@ class Division:
     def boxes(self, level: int) -> tuple[np.ndarray, np.ndarray]:
         """[cells, d] lower and upper ends in [-1, 1]."""
         counts = np.array(self.counts(level), np.int64)
-        found = list(np.ndindex(*counts.tolist()))
-        places = np.array(found, np.float64).reshape(len(found), self.dimensions)
+        cell_places = list(np.ndindex(*counts.tolist()))
+        places = np.array(cell_places, np.float64).reshape(len(cell_places), self.dimensions)
         return 2.0 * places / counts - 1.0, 2.0 * (places + 1.0) / counts - 1.0
 
     def members(self, level: int) -> np.ndarray:
@@ -78,25 +80,25 @@ class Division:
     def first(self, moves: np.ndarray, displacement: float) -> np.ndarray:
         """[...] the first level on whose cells samples that move by ``moves`` [..., d] over the box bear it."""
         inverse = (1.0 / np.array(self.counts(level), np.float64) for level in range(self.levels))
-        found = np.zeros(moves.shape[:-1], np.int64)
+        first_levels = np.zeros(moves.shape[:-1], np.int64)
         for level, row in enumerate(inverse):
-            found[(found == level) & (moves @ row > displacement)] = level + 1
-        return found
+            first_levels[(first_levels == level) & (moves @ row > displacement)] = level + 1
+        return first_levels
 
     def children(self, level: int, cells: np.ndarray) -> np.ndarray:
         """[2 n] cells of the level `below` inside ``cells`` [n]."""
         counts, halves = self.counts(level), self.counts(self.below[level])
         axis = int(np.argmax(np.array(halves) > counts))
         places = np.array(np.unravel_index(cells, counts)).reshape(self.dimensions, -1)
-        found = []
+        child_numbers = []
         for half in (0, 1):
             inside = places.copy()
             inside[axis] = 2 * inside[axis] + half
-            found.append(np.ravel_multi_index(tuple(inside), halves))
-        return np.concatenate(found)
+            child_numbers.append(np.ravel_multi_index(tuple(inside), halves))
+        return np.concatenate(child_numbers)
 
 
-def divided(
+def division_for(
     moves: np.ndarray, displacement: float, most: int, deeper: int, finer: int, swept: bool = False
 ) -> Division | None:
     """Return the subdivision whose cells keep samples within ``displacement``; ``moves`` [n, samples, d] over the box.
@@ -136,7 +138,7 @@ def divided(
 ENDS = (np.minimum, np.maximum)
 
 
-def regrouped(values: np.ndarray, end: np.ufunc, counts: tuple[int, ...]) -> np.ndarray:
+def regroup_parts(values: np.ndarray, end: np.ufunc, counts: tuple[int, ...]) -> np.ndarray:
     """Bounds [n, shifts, *parts, 3] of equal parts of a box for others, ``counts`` by axis: ``end`` of all met."""
     for axis, count in enumerate(counts, start=2):
         size = values.shape[axis]

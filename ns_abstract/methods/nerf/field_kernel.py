@@ -10,20 +10,20 @@ from numba import njit
 
 from ns_abstract.arithmetic.simd.lanes import LINE
 from ns_abstract.methods.nerf import relu_kernel
-from ns_abstract.methods.nerf.layer_kernel import Before, Behind, Weights, linear
+from ns_abstract.methods.nerf.layer_kernel import LayerInput, LayerOutput, LayerWeights, linear
 from ns_abstract.methods.nerf.relu_kernel import relu
 
 #: Pieces that go through all layers together.
 CHUNK = 16
 
 
-class Layers(NamedTuple):
+class StackedLayers(NamedTuple):
     """All layers of a network in flat arrays, so that one compiled kernel serves any depth; made by `stacked`.
 
     Attributes:
         shapes: [L, 3] rows that belong to an encoded vector, to neurons, and outputs.
         begins: [L, 3] where a layer begins in ``wide`` and ``columns``, in ``absolute``, and in ``bias``.
-        wide, columns, absolute, bias: Those of `layer_kernel.Weights`, rows of an encoded vector first.
+        wide, columns, absolute, bias: Those of `layer_kernel.LayerWeights`, rows of an encoded vector first.
         rounding: [L].
         narrow, underflow: Of all layers.
     """
@@ -38,12 +38,12 @@ class Layers(NamedTuple):
     narrow: float
     underflow: float
 
-    def none(self) -> Layers:
+    def none(self) -> StackedLayers:
         """No layer, with columns of the same type."""
         return self._replace(shapes=self.shapes[:0], begins=self.begins[:0])
 
 
-def stacked(layers: Sequence[Weights]) -> Layers:
+def stacked(layers: Sequence[LayerWeights]) -> StackedLayers:
     """``layers``, one at least, whose columns are of one type, one behind the other."""
     shapes = np.array([(len(w.seen), len(w.wide), len(w.bias)) for w in layers], np.int64)
     wide = [part.ravel() for w in layers for part in (w.seen, w.wide)]
@@ -52,7 +52,7 @@ def stacked(layers: Sequence[Weights]) -> Layers:
     absolute = [part.ravel() for w in layers for part in (w.seen_absolute, w.absolute)]
     sizes = [(w.seen.size + w.wide.size, w.seen_absolute.size + w.absolute.size, len(w.bias)) for w in layers]
     begins = np.concatenate([np.zeros((1, 3), np.int64), np.cumsum(np.array(sizes, np.int64), axis=0)[:-1]])
-    return Layers(
+    return StackedLayers(
         shapes, begins, _joined(wide), _joined(columns), _joined(absolute), _joined([w.bias for w in layers]),
         np.array([w.rounding for w in layers]), layers[0].narrow, layers[0].underflow,
     )  # fmt: skip
@@ -66,7 +66,7 @@ def _joined(parts: list[np.ndarray]) -> np.ndarray:
     return np.concatenate(parts, out=room[first : first + size])
 
 
-class Outputs(NamedTuple):
+class FieldOutputs(NamedTuple):
     """B pieces behind a last layer: polynomials [B, m, n], sums of absolute columns and box [B, n]."""
 
     poly: np.ndarray
@@ -74,25 +74,25 @@ class Outputs(NamedTuple):
     box: np.ndarray
 
 
-class Room(NamedTuple):
+class Workspace(NamedTuple):
     """Scratch for CHUNK pieces behind a ``layer`` and its ``activation``, sized for the widest layer."""
 
-    layer: Behind
-    activation: relu_kernel.Behind
+    layer: LayerOutput
+    activation: relu_kernel.ReluOutput
 
 
 @njit(cache=True, error_model="numpy")
-def _room(m, n, columns, kind):
-    """A `Room` for layers of at most n neurons, m coefficients and so many ``columns``."""
+def _workspace(m, n, columns, kind):
+    """A `Workspace` for layers of at most n neurons, m coefficients and so many ``columns``."""
     k = CHUNK * n
-    layer = Behind(
+    layer = LayerOutput(
         np.empty(m * k), np.empty(columns * n, kind), np.empty(columns, np.int64), np.empty(k), np.empty(k)
     )  # fmt: skip
-    activation = relu_kernel.Behind(
+    activation = relu_kernel.ReluOutput(
         np.empty(k), np.empty(k), np.empty(k), np.empty(CHUNK, np.bool_), np.empty(CHUNK, np.int64),
         np.empty(k, np.int64), np.empty(k, np.int64), np.empty(k),
     )  # fmt: skip
-    return Room(layer, activation)
+    return Workspace(layer, activation)
 
 
 @njit(cache=True, error_model="numpy")
@@ -103,17 +103,24 @@ def _table(flat, rows, n):
 
 @njit(cache=True, error_model="numpy")
 def _layer(layers, i):
-    """The layer i as `layer_kernel.Weights`."""
-    seen, inputs, n = layers.shapes[i]
+    """The layer i as `layer_kernel.LayerWeights`."""
+    seen_inputs, inputs, n = layers.shapes[i]
     first, second, third = layers.begins[i]
-    rows, stride = seen + inputs, n + -n % (LINE // 2)
+    rows, stride = seen_inputs + inputs, n + -n % (LINE // 2)
     wide = layers.wide[first : first + rows * stride].reshape((rows, stride))
     columns = layers.columns[first : first + rows * stride].reshape((rows, stride))
     absolute = layers.absolute[second : second + rows * n].reshape((rows, n))
-    return Weights(
-        wide[:seen], absolute[:seen], wide[seen:], columns[seen:], absolute[seen:], layers.bias[third : third + n],
-        layers.rounding[i], layers.narrow, layers.underflow,
-    )  # fmt: skip
+    return LayerWeights(
+        wide[:seen_inputs],
+        absolute[:seen_inputs],
+        wide[seen_inputs:],
+        columns[seen_inputs:],
+        absolute[seen_inputs:],
+        layers.bias[third : third + n],
+        layers.rounding[i],
+        layers.narrow,
+        layers.underflow,
+    )
 
 
 @njit(cache=True, error_model="numpy")
@@ -122,17 +129,17 @@ def _step(z, encoded, remainder, weights, grid, limit, room):
     (pieces, m, _), n = z.poly.shape, weights.bias.shape[0]
     poly, columns, owner, sums, box = room.layer
     slope, size, spread, failed, count, piece, neuron, error = room.activation
-    layer = Behind(
+    layer = LayerOutput(
         poly[: pieces * m * n].reshape((pieces, m, n)), _table(columns, owner.shape[0], n), owner,
         _table(sums, pieces, n), _table(box, pieces, n),
     )  # fmt: skip
     total = linear(z, encoded, remainder, weights, layer)
-    activation = relu_kernel.Behind(
+    activation = relu_kernel.ReluOutput(
         _table(slope, pieces, n), _table(size, pieces, n), _table(spread, pieces, n), failed[:pieces], count[:pieces],
         piece, neuron, error,
     )  # fmt: skip
-    new = relu(relu_kernel.Before(layer.poly, layer.sums, layer.box, z.failed, z.count), grid, limit, activation)
-    return Before(
+    new = relu(relu_kernel.ReluInput(layer.poly, layer.sums, layer.box, z.failed, z.count), grid, limit, activation)
+    return LayerInput(
         layer.poly, activation.size, activation.spread, layer.box, activation.slope, activation.failed,
         activation.count, layer.columns[:total], owner[:total], piece[:new], neuron[:new], error[:new],
     )  # fmt: skip
@@ -159,7 +166,7 @@ def _piecewise(z, first, new, begin, past):
     while latest < z.new_owner.shape[0] and z.new_owner[latest] < past:
         latest += 1
     return (
-        Before(
+        LayerInput(
             z.poly[begin:past], z.size[begin:past], z.spread[begin:past], z.box[begin:past], z.slope[begin:past],
             z.failed[begin:past], z.count[begin:past], z.columns[first:last], z.owner[first:last] - begin,
             z.new_owner[new:latest] - begin, z.new_neuron[new:latest], z.new_size[new:latest],
@@ -198,12 +205,12 @@ def through_layers(z, encoded, remainder, layers, last, grid, limit, out, output
     """Layers with their activations and a last one without, the pieces in the order in which they are given.
 
     Args:
-        z: `layer_kernel.Before` of B pieces.
+        z: `layer_kernel.LayerInput` of B pieces.
         encoded, remainder: [B, m, k] and [B, k] of the vector that layers see (`layer_kernel.linear`).
-        layers, last: `Layers`; at most one is last, which sees no encoded vector.
+        layers, last: `StackedLayers`; at most one is last, which sees no encoded vector.
         grid, limit: See `relu_kernel.relu`.
-        out: `layer_kernel.Before` behind ``layers``; room for [B limit, n] columns and [B n] new error terms.
-        outputs: `Outputs` of the last layer, filled.
+        out: `layer_kernel.LayerInput` behind ``layers``; room for [B limit, n] columns and [B n] new error terms.
+        outputs: `FieldOutputs` of the last layer, filled.
 
     Returns:
         Numbers of columns and of new error terms.
@@ -213,27 +220,29 @@ def through_layers(z, encoded, remainder, layers, last, grid, limit, out, output
     if last.shapes.shape[0]:
         widest = max(widest, last.shapes[0, 2])
     rows, kind = CHUNK * limit, z.columns.dtype
-    here, there = _room(m, widest, rows, kind), _room(m, widest, rows, kind)
+    here, there = _workspace(m, widest, rows, kind), _workspace(m, widest, rows, kind)
     first, new, columns, terms = 0, 0, 0, 0
     for begin in range(0, pieces, CHUNK):
         past = min(begin + CHUNK, pieces)
-        found, first, new = _piecewise(z, first, new, begin, past)
+        piece_layers, first, new = _piecewise(z, first, new, begin, past)
         for i in range(layers.shapes.shape[0]):
-            found = _step(found, encoded[begin:past], remainder[begin:past], _layer(layers, i), grid, limit, here)
+            piece_layers = _step(
+                piece_layers, encoded[begin:past], remainder[begin:past], _layer(layers, i), grid, limit, here
+            )
             here, there = there, here
         if last.shapes.shape[0]:
             # its columns are of no use but for their sums; ``here`` is free
             weights, n = _layer(last, 0), last.shapes[0, 2]
             columns_there, owner = _table(here.layer.columns, rows, n), here.layer.owner
             poly, sums, box = outputs.poly[begin:past], outputs.sums[begin:past], outputs.box[begin:past]
-            behind = Behind(poly, columns_there, owner, sums, box)
-            linear(found, encoded[begin:past], remainder[begin:past], weights, behind)
-        _copy(found.poly, out.poly[begin:past])
-        _copy(found.size, out.size[begin:past])
-        _copy(found.spread, out.spread[begin:past])
-        _copy(found.box, out.box[begin:past])
-        _copy(found.slope, out.slope[begin:past])
-        _copy(found.failed, out.failed[begin:past])
-        _copy(found.count, out.count[begin:past])
-        columns, terms = _keep(found, begin, out, columns, terms)
+            behind = LayerOutput(poly, columns_there, owner, sums, box)
+            linear(piece_layers, encoded[begin:past], remainder[begin:past], weights, behind)
+        _copy(piece_layers.poly, out.poly[begin:past])
+        _copy(piece_layers.size, out.size[begin:past])
+        _copy(piece_layers.spread, out.spread[begin:past])
+        _copy(piece_layers.box, out.box[begin:past])
+        _copy(piece_layers.slope, out.slope[begin:past])
+        _copy(piece_layers.failed, out.failed[begin:past])
+        _copy(piece_layers.count, out.count[begin:past])
+        columns, terms = _keep(piece_layers, begin, out, columns, terms)
     return columns, terms

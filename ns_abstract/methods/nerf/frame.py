@@ -15,17 +15,17 @@ import numpy as np
 
 from ns_abstract.arithmetic.outward import outward
 from ns_abstract.arithmetic.rounding import UNIT32
-from ns_abstract.execution.ending import AbandonedError, checkpoint, is_over
+from ns_abstract.execution.cancellation import WorkCancelledError, check_cancelled, is_cancelled
 from ns_abstract.execution.engines import Processes
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseSet
+from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseBox
 from ns_abstract.geometry.tiles import tile_grid
 from ns_abstract.methods.nerf.bounds import NerfBounds, RayBounds, Shifts, typical_displacement
 from ns_abstract.methods.nerf.hsv import color_shift
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
-from ns_abstract.methods.nerf.strips import Strips
-from ns_abstract.refine.protocol import LinearSets, Member
+from ns_abstract.methods.nerf.strips import PoseStrips
+from ns_abstract.refine.protocol import LinearSets, SceneSample
 
 
 @dataclass(frozen=True)
@@ -92,7 +92,7 @@ class RayContext:
 
 
 @dataclass(frozen=True)
-class RayBox:
+class RayCellBounds:
     """Bounds of some rays over one cell; see `ns_abstract.refine.protocol.Bounds`."""
 
     lower: np.ndarray
@@ -142,7 +142,7 @@ class NerfFrame:
     witnesses = 8
 
     def __init__(
-        self, scene: NerfScene, sampling: Sampling, pose_set: PoseSet, device: str = "cpu", workers: int = 1
+        self, scene: NerfScene, sampling: Sampling, pose_set: PoseBox, device: str = "cpu", workers: int = 1
     ) -> None:
         self.pose_set, self.camera, self.box = pose_set, pose_set.camera, pose_set.box
         self.side = 1
@@ -169,7 +169,7 @@ class NerfFrame:
         """Number of rays, row by row."""
         return self.across * self.down
 
-    def members(self, seed: int) -> Iterator[Member]:
+    def scene_samples(self, seed: int) -> Iterator[SceneSample]:
         """Other scenes of the set: none, only poses vary."""
         return iter(())
 
@@ -207,16 +207,16 @@ class NerfFrame:
         d = box.dimensions
         low, high = np.array(box.lower), np.array(box.upper)
         distance = self.bounds.distances[self.bounds.distances.size // 2]
-        found = np.zeros(d)
+        largest = np.zeros(d)
         here = self._point(box.middle, distance)
         for k in range(d):
             step = np.zeros(d)
             step[k] = _TUNING.motion_step * (high[k] - low[k])
             moved = np.linalg.norm(self._point(box.middle + step, distance) - here) / _TUNING.motion_step
-            found[k] = moved / distance * self.camera.fx
+            largest[k] = moved / distance * self.camera.fx
             if box.names[k] in COLOR_SHIFTS:
-                found[k] = _SHIFT_MOTION * (high[k] - low[k])
-        return found
+                largest[k] = _SHIFT_MOTION * (high[k] - low[k])
+        return largest
 
     def _point(self, values: np.ndarray, distance: float) -> np.ndarray:
         pose = self.pose_set.pose(values)
@@ -224,32 +224,34 @@ class NerfFrame:
 
     def bound(
         self, box: ParameterBox, tiles: np.ndarray, within: RayContext | None = None, keep_linear: bool = False
-    ) -> RayBox:
+    ) -> RayCellBounds:
         """Bounds of the rays ``tiles`` over ``box``; ``within`` is the context of these rays and a box around it.
 
-        Rays that there is no time for any more (`ns_abstract.execution.ending`) are bounded by [0, 1].
+        Rays that there is no time for any more (`ns_abstract.execution.cancellation`) are bounded by [0, 1].
         """
         return self.bound_parts([box], tiles, within, keep_linear)[0]
 
     def bound_parts(
         self, boxes: Sequence[ParameterBox], tiles: np.ndarray, within: RayContext | None = None,
         keep_linear: bool = False, pixels: np.ndarray | None = None,
-    ) -> list[RayBox]:  # fmt: skip
+    ) -> list[RayCellBounds]:  # fmt: skip
         """`bound` over each of ``boxes``, side by side; see `ns_abstract.refine.protocol.PartsFrame`."""
         tiles = np.asarray(tiles)
         if self.box.dimensions > 0 and self.box in boxes:
             nothing = self._unknown(tiles.size)
             return [self._box(nothing.lower, nothing.upper, None, keep_linear) for _ in boxes]
         order = np.argsort(tiles)
-        found = []
+        part_bounds = []
         for parts in self._parts(boxes, tiles, None if within is None else within.of(tiles)):
             lower, upper, alpha = (
                 np.concatenate([getattr(part, name) for part in parts]) for name in ("lower", "upper", "alpha")
             )
-            found.append(self._box(lower, upper, RayContext(tiles[order], alpha[order]), keep_linear))
-        return found
+            part_bounds.append(self._box(lower, upper, RayContext(tiles[order], alpha[order]), keep_linear))
+        return part_bounds
 
-    def _box(self, lower: np.ndarray, upper: np.ndarray, context: RayContext | None, keep_linear: bool) -> RayBox:
+    def _box(
+        self, lower: np.ndarray, upper: np.ndarray, context: RayContext | None, keep_linear: bool
+    ) -> RayCellBounds:
         """What is told of bounds [t, 3]."""
         d = self.box.dimensions
         low, high = (side.reshape(-1, 1, 1, 3) for side in outward(lower, upper))
@@ -257,7 +259,7 @@ class NerfFrame:
         if keep_linear:
             flat = np.zeros((*low.shape, d), np.float32)
             linear = flat, low, flat, high
-        return RayBox(low, high, np.zeros(d), context, linear)
+        return RayCellBounds(low, high, np.zeros(d), context, linear)
 
     def _unknown(self, count: int) -> RayBounds:
         """What holds of any ``count`` rays."""
@@ -268,22 +270,22 @@ class NerfFrame:
         self, boxes: Sequence[ParameterBox], tiles: np.ndarray, known: np.ndarray | None
     ) -> list[list[RayBounds]]:
         """Bounds of rays over each of ``boxes``, in some pieces; [0, 1] where there is no time for more."""
-        found: list[list[RayBounds]] = [[] for _ in boxes]
-        with suppress(AbandonedError):
+        bounds_by_box: list[list[RayBounds]] = [[] for _ in boxes]
+        with suppress(WorkCancelledError):
             for first in range(0, tiles.size, self.tiles_at_once):
-                checkpoint()
+                check_cancelled()
                 mine, begun = slice(first, first + self.tiles_at_once), 0
                 while begun < len(boxes):
                     past = len(boxes) if self._steady else begun + 1
                     batch = self._batch(boxes[begun:past], tiles[mine], None if known is None else known[mine])
-                    for parts, more in zip(found[begun:past], batch, strict=True):
+                    for parts, more in zip(bounds_by_box[begun:past], batch, strict=True):
                         parts += more
                     begun = past
-        for parts in found:
+        for parts in bounds_by_box:
             missing = tiles.size - sum(len(part.lower) for part in parts)
             if missing:
                 parts.append(self._unknown(missing))
-        return found
+        return bounds_by_box
 
     def _batch(
         self, boxes: Sequence[ParameterBox], tiles: np.ndarray, known: np.ndarray | None
@@ -321,16 +323,16 @@ class NerfFrame:
         Raises:
             AbandonedError: There is no time for all of them.
         """
-        found = [part for part in self._tried(calls) if part is not None]
-        if len(found) < len(calls):
-            raise AbandonedError
-        return found
+        parts = [part for part in self._tried(calls) if part is not None]
+        if len(parts) < len(calls):
+            raise WorkCancelledError
+        return parts
 
     def _tried(self, calls: Sequence[Sequence[Any]]) -> list[RayBounds | None]:
         """See `_run`; None: there was no time for a call."""
         if len(calls) == 1 or self.workers == 1:
             parts: list[RayBounds | None] = []
-            with suppress(AbandonedError):
+            with suppress(WorkCancelledError):
                 for call in calls:
                     parts.append(self.bounds.rays(*call))
             return parts + [None] * (len(calls) - len(parts))
@@ -342,9 +344,9 @@ class NerfFrame:
         try:
             while len(done) < len(calls):
                 for number, answer in engine.collect(_PATIENCE):
-                    if not isinstance(answer, AbandonedError):
+                    if not isinstance(answer, WorkCancelledError):
                         done[number] = answer
-                if patience is None and is_over():
+                if patience is None and is_cancelled():
                     patience = time.monotonic() + _GRACE
                     engine.abandon()
                 if patience is not None and (not engine.unfinished or time.monotonic() > patience):
@@ -357,10 +359,10 @@ class NerfFrame:
         return [done.get(number) for number in range(len(calls))]
 
     @cached_property
-    def _strips(self) -> Strips:
-        return Strips(self.bounds, self.pose_set, self._pixels(np.arange(self.tile_count)), self._run)
+    def _strips(self) -> PoseStrips:
+        return PoseStrips(self.bounds, self.pose_set, self._pixels(np.arange(self.tile_count)), self._run)
 
-    def sets(self, box: ParameterBox, weigh: Callable[[], np.ndarray | None] | None = None) -> RayBox:
+    def sets(self, box: ParameterBox, weigh: Callable[[], np.ndarray | None] | None = None) -> RayCellBounds:
         """All rays over a cell ``box`` with linear bounds, from strips of the set that are kept.
 
         Args:
@@ -373,8 +375,8 @@ class NerfFrame:
         """
 
         def weights() -> np.ndarray | None:
-            found = None if weigh is None else weigh()
-            return None if found is None else np.asarray(found, np.float64).reshape(self.tile_count, 3)
+            pixel_weights = None if weigh is None else weigh()
+            return None if pixel_weights is None else np.asarray(pixel_weights, np.float64).reshape(self.tile_count, 3)
 
         linear, lower, upper = self._strips.sets(box, weights)
         shape = (self.tile_count, 1, 1, 3)
@@ -382,15 +384,15 @@ class NerfFrame:
         d = box.dimensions
         slopes = 0.5 * (np.abs(a_lower) + np.abs(a_upper)).astype(np.float64).sum(axis=(0, 1))
         sets = a_lower.reshape(*shape, d), b_lower.reshape(shape), a_upper.reshape(*shape, d), b_upper.reshape(shape)
-        return RayBox(lower.reshape(shape), upper.reshape(shape), slopes, None, sets)
+        return RayCellBounds(lower.reshape(shape), upper.reshape(shape), slopes, None, sets)
 
     def effort(self) -> tuple[float | None, int]:
         """Seconds that one ray takes over one strip of the set, about, and how many strips there are.
 
-        None: there was no time to find out (`ns_abstract.execution.ending`).
+        None: there was no time to find out (`ns_abstract.execution.cancellation`).
         """
         strips = self._strips
-        with suppress(AbandonedError):
+        with suppress(WorkCancelledError):
             strips.layout()
         return strips.effort, strips.count
 
@@ -404,7 +406,7 @@ class NerfFrame:
         """Nothing is left out of first cells, which cost nothing."""
         return 0.0
 
-    def plan(self, shown: int | None, lower: np.ndarray, upper: np.ndarray) -> list[str]:
+    def plan(self, visible: int | None, lower: np.ndarray, upper: np.ndarray) -> list[str]:
         """What was left out for this frame, given what refinement found."""
         untreated = int(((lower == 0.0) & (upper == 1.0)).all(axis=-1).sum())
         total = lower.shape[0] * lower.shape[1]

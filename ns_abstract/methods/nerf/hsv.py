@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ns_abstract.arithmetic.rounding import HUE_ROOM, HUE_ROUNDING
-from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseSet
+from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseBox
 
 Float64Array = NDArray[np.float64]
 Range = tuple[float, float]
 
 
-def color_shift(pose_set: PoseSet, values: Any) -> tuple[Any, Any] | None:
+def color_shift(pose_set: PoseBox, values: Any) -> tuple[Any, Any] | None:
     """Hue (turns) and saturation that are added at parameter ``values`` [d] of a set; None where neither is named."""
     named = {**pose_set.fixed, **dict(zip(pose_set.box.names, values, strict=True))}
     if not any(name in named for name in COLOR_SHIFTS):
@@ -83,9 +83,9 @@ def shifted_bounds(
     first, last = _hues(low, high)
     value_low, value_high = low.max(axis=1)[:, None], high.max(axis=1)[:, None]
     taken = [saturation[1] * v for v in (value_low, value_high)]
-    given = [saturation[0] * v for v in (value_low, value_high)]
+    scaled = [saturation[0] * v for v in (value_low, value_high)]
     least = np.clip(low.min(axis=1)[:, None] - np.maximum(*taken), 0.0, value_low)
-    most = np.clip(high.min(axis=1)[:, None] - np.minimum(*given), 0.0, value_high)
+    most = np.clip(high.min(axis=1)[:, None] - np.minimum(*scaled), 0.0, value_high)
     centre = np.array([0.0, 2.0, 4.0])
     start = (first + 6.0 * hue[0])[:, None] - centre
     width = (last - first + 6.0 * (hue[1] - hue[0]) + 2.0 * HUE_ROOM)[:, None]

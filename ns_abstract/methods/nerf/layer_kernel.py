@@ -49,7 +49,7 @@ def multiply(x, live, weight, rest, out):
                         out[r, j] = rest[r - first, j - c]
 
 
-class Weights(NamedTuple):
+class LayerWeights(NamedTuple):
     """A layer.
 
     Attributes:
@@ -74,8 +74,8 @@ class Weights(NamedTuple):
     underflow: float
 
 
-class Before(NamedTuple):
-    """B pieces before a layer; see `zonotope.Pieces`. What stands where ``size`` is 0 is not looked at.
+class LayerInput(NamedTuple):
+    """B pieces before a layer; see `zonotope.PostActivation`. What stands where ``size`` is 0 is not looked at.
 
     Attributes:
         poly: [B, m, inputs].
@@ -99,7 +99,7 @@ class Before(NamedTuple):
     new_size: np.ndarray
 
 
-class Behind(NamedTuple):
+class LayerOutput(NamedTuple):
     """B pieces behind a layer.
 
     Attributes:
@@ -167,7 +167,12 @@ def _columns(b, z, first, new, live, weights, scratch, out, place):
 def _box(b, z, encoded, remainder, live, weights, box):
     """The ``box`` [n] of the piece ``b`` behind a layer, but for its bias: that before it, and rounding (F4)."""
     size, before, spread, n = z.size[b], z.box[b], z.spread[b], box.shape[0]
-    rounding, underflow, absolute, given = weights.rounding, weights.underflow, weights.absolute, weights.seen_absolute
+    rounding, underflow, absolute, seen_absolute = (
+        weights.rounding,
+        weights.underflow,
+        weights.absolute,
+        weights.seen_absolute,
+    )
     narrow = (live.shape[0] + NARROW_STEPS) * weights.narrow
     box[:] = underflow
     for j in live:
@@ -175,7 +180,7 @@ def _box(b, z, encoded, remainder, live, weights, box):
         radius += narrow * spread[j] + underflow
         for k in range(n):
             box[k] += radius * absolute[j, k]
-    if not given.shape[0]:
+    if not seen_absolute.shape[0]:
         return
     poly, rest = encoded[b], remainder[b]
     whole = rest.copy()
@@ -185,7 +190,7 @@ def _box(b, z, encoded, remainder, live, weights, box):
     for j in range(whole.shape[0]):
         radius = rest[j] + rounding * whole[j]
         for k in range(n):
-            box[k] += radius * given[j, k]
+            box[k] += radius * seen_absolute[j, k]
 
 
 @njit(cache=True, error_model="numpy")
@@ -193,35 +198,35 @@ def linear(z, encoded, remainder, weights, out):
     """A linear layer, piece by piece (design.md, F4); returns the number of columns behind it.
 
     Args:
-        z: `Before`.
+        z: `LayerInput`.
         encoded, remainder: [B, m, k] and [B, k] polynomials and remainders of an encoded vector, if the layer sees it.
-        weights: `Weights`.
-        out: `Behind`, filled; its columns and owners may have room for more.
+        weights: `LayerWeights`.
+        out: `LayerOutput`, filled; its columns and owners may have room for more.
     """
     inputs, n = weights.absolute.shape
-    found, kind = np.empty(inputs, np.int64), weights.columns.dtype
+    live_inputs, kind = np.empty(inputs, np.int64), weights.columns.dtype
     rest_wide = np.empty((ROWS, 2 * LINE // weights.wide.itemsize), np.float64)
     scratch = (
         np.empty((BLOCK, inputs), kind), np.empty(inputs, kind),
         np.empty((ROWS, 2 * LINE // weights.columns.itemsize), kind),
     )  # fmt: skip
-    every, given, bias = np.arange(weights.seen.shape[0]), np.empty((z.poly.shape[1], n)), weights.bias
+    every, bias_absolute, bias = np.arange(weights.seen.shape[0]), np.empty((z.poly.shape[1], n)), weights.bias
     first, new, place = 0, 0, 0
     for b in range(z.poly.shape[0]):
         count, size = 0, z.size[b]
         for j in range(inputs):
             if size[j] != 0.0:
-                found[count] = j
+                live_inputs[count] = j
                 count += 1
-        live, poly, box = found[:count], out.poly[b], out.box[b]
+        live, poly, box = live_inputs[:count], out.poly[b], out.box[b]
         multiply(z.poly[b], live, weights.wide, rest_wide, poly)
         first, new, place = _columns(b, z, first, new, live, weights, scratch, out, place)
         _box(b, z, encoded, remainder, live, weights, box)
         if every.shape[0]:
-            multiply(encoded[b], every, weights.seen, rest_wide, given)
+            multiply(encoded[b], every, weights.seen, rest_wide, bias_absolute)
             for k in range(poly.shape[0]):
                 for j in range(n):
-                    poly[k, j] += given[k, j]
+                    poly[k, j] += bias_absolute[k, j]
         for j in range(n):
             poly[0, j] += bias[j]
             box[j] = (box[j] + BIAS_ROUNDING * (abs(bias[j]) + abs(poly[0, j]))) * FIELD_UP

@@ -20,7 +20,7 @@ from ns_abstract.io.jsonio import is_number, show
 from ns_abstract.methods import config_keys, runs
 from ns_abstract.methods.checkpoint import to_float32
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer, NerfScene
-from ns_abstract.methods.overrides import Overrides, chosen
+from ns_abstract.methods.overrides import Overrides, assumption_of
 
 _FIX = "give a run of vanilla-nerf or abstract-nerf"
 _LAYERS_LIMIT = 64
@@ -164,9 +164,11 @@ def _background(run: runs.RunConfig, overrides: Overrides) -> tuple[Assumption, 
         stored = tuple(float(part) for part in run.color("background_color", "white", _BACKGROUNDS))
         if named and not isinstance(run.model["background_color"], str):
             origin += ", three numbers, at which Nerfstudio's own model stops"
-    given = overrides.background
-    record = chosen("background", given, "--background", stored, origin if named else "default of nerfstudio 1.1.5")
-    return record, np.array(stored if given is None else given, np.float32)
+    override = overrides.background
+    record = assumption_of(
+        "background", override, "--background", stored, origin if named else "default of nerfstudio 1.1.5"
+    )
+    return record, np.array(stored if override is None else override, np.float32)
 
 
 def _refuse_unknown(state: _ReadState, checkpoint: Path) -> None:
@@ -246,16 +248,16 @@ def field_weights(
         return Layer(weight, bias, skip)
 
     def layers(key: str) -> list[Layer]:
-        found = []
-        while f"{name}.{key}.layers.{len(found)}.weight" in state and len(found) < _LAYERS_LIMIT:
-            found.append(layer(f"{key}.layers.{len(found)}"))
-        return found or [layer(f"{key}.layers.0")]
+        layer_list = []
+        while f"{name}.{key}.layers.{len(layer_list)}.weight" in state and len(layer_list) < _LAYERS_LIMIT:
+            layer_list.append(layer(f"{key}.layers.{len(layer_list)}"))
+        return layer_list or [layer(f"{key}.layers.0")]
 
-    def fits(key: str, found: int, expected: tuple[int, ...]) -> None:
-        if found not in expected:
+    def fits(key: str, outputs: int, expected: tuple[int, ...]) -> None:
+        if outputs not in expected:
             wanted = " or ".join(map(str, dict.fromkeys(expected)))
             raise InputError(
-                f"takes {found} inputs, expected {wanted}",
+                f"takes {outputs} inputs, expected {wanted}",
                 file=file,
                 field=f"pipeline._model.{name}.{key}.weight",
                 fix=_FIX,
@@ -276,9 +278,9 @@ def field_weights(
     for i in range(1, len(head)):
         fits(f"mlp_head.layers.{i}", head[i].weight.shape[1], (head[i - 1].weight.shape[0],))
     fits("field_heads.0.net", color.weight.shape[1], (head[-1].weight.shape[0],))
-    for key, found, expected in (("field_output_density", density, 1), ("field_heads.0", color, 3)):
-        if found.weight.shape[0] != expected:
-            problem = f"{found.weight.shape[0]} outputs, expected {expected}"
+    for key, outputs, expected in (("field_output_density", density, 1), ("field_heads.0", color, 3)):
+        if outputs.weight.shape[0] != expected:
+            problem = f"{outputs.weight.shape[0]} outputs, expected {expected}"
             raise InputError(problem, file=file, field=f"pipeline._model.{name}.{key}.net", fix=_FIX)
     return FieldWeights(tuple(base), density, tuple(head), color, position, direction)
 
@@ -291,12 +293,12 @@ def _encoding(size: int, highest: float, count: int | None, file: Path, field: s
             field=f"{field}.layers.0.weight",
             fix=_FIX,
         )
-    found = (size - 3) // 6
-    if count not in (None, found):
+    frequencies = (size - 3) // 6
+    if count not in (None, frequencies):
         raise InputError(
-            f"takes {found} frequencies, config.yml says {count}",
+            f"takes {frequencies} frequencies, config.yml says {count}",
             file=file,
             field=f"{field}.layers.0.weight",
             fix="give the checkpoint that belongs to config.yml",
         )
-    return Encoding(found, 0.0, highest)
+    return Encoding(frequencies, 0.0, highest)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.bounds import basis_of, device_bytes
 from ns_abstract.methods.nerf.device import check_device, processes_that_fit
@@ -135,7 +135,7 @@ class NerfMethod:
         """The scene in a few words."""
         return f"vanilla NeRF, {self.scene.fine.text}"
 
-    def frame(self, poses: PoseSet, slanted: bool = False, layers: bool = False) -> NerfFrame:
+    def frame(self, poses: PoseBox, sheared: bool = False, layers: bool = False) -> NerfFrame:
         """One frame, ready for refinement; its cells are never ``slanted``.
 
         Raises:
@@ -152,11 +152,11 @@ class NerfMethod:
         field, swept = self.scene.fine, self.sampling.kind == "hierarchical"
         return processes_that_fit(device_bytes(field, basis_of(dimensions + swept, field)), self.workers)
 
-    def easier(self, poses: PoseSet) -> Iterator[tuple[str, NerfFrame]]:
+    def ablations(self, poses: PoseBox) -> Iterator[tuple[str, NerfFrame]]:
         """None are known."""
         return iter(())
 
-    def holders(self, frame: Frame, box: ParameterBox, tile: int, count: int) -> list[tuple[int, float]]:
+    def attribution(self, frame: Frame, box: ParameterBox, tile: int, count: int) -> list[tuple[int, float]]:
         """A field has no elements."""
         return []
 
@@ -228,7 +228,7 @@ class NerfMethod:
             "notes": list(scene.notes),
         }
 
-    def differentiable(self, poses: PoseSet) -> Callable[[torch.Tensor], torch.Tensor]:
+    def differentiable(self, poses: PoseBox) -> Callable[[torch.Tensor], torch.Tensor]:
         """Parameter values [d] to the picture [H, W, 3], by the concrete renderer."""
         from ns_abstract.geometry.differentiable_pose import differentiable_pose
         from ns_abstract.methods.nerf.hsv import color_shift

@@ -156,22 +156,22 @@ def sample_grid(
     """
     low, high = np.array(lower, np.float64), np.array(upper, np.float64)
     size = (high - low) / resolution
-    found = np.zeros((resolution,) * 3, bool)
+    occupied = np.zeros((resolution,) * 3, bool)
     corners = np.stack(np.meshgrid(*[[0.25, 0.75]] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    flat = found.reshape(-1)
+    flat = occupied.reshape(-1)
     for start in range(0, flat.size, _POINTS // 8):
         numbers = np.arange(start, min(flat.size, start + _POINTS // 8))
-        places = np.stack(np.unravel_index(numbers, found.shape), axis=-1)
+        places = np.stack(np.unravel_index(numbers, occupied.shape), axis=-1)
         points = low + (places[:, None] + corners) * size
         with torch.inference_mode():
             values = density(torch.from_numpy(points.reshape(-1, 3)))
         flat[numbers] = (values.reshape(-1, 8) > least).any(dim=1).cpu().numpy()
         progress((numbers[-1] + 1) / flat.size)
     for axis in range(3):
-        grown = found.copy()
+        grown = occupied.copy()
         head, tail = [slice(None)] * 3, [slice(None)] * 3
         head[axis], tail[axis] = slice(1, None), slice(None, -1)
-        grown[tuple(head)] |= found[tuple(tail)]
-        grown[tuple(tail)] |= found[tuple(head)]
-        found = grown
-    return OccupancyGrid.of_box(low, high, found)
+        grown[tuple(head)] |= occupied[tuple(tail)]
+        grown[tuple(tail)] |= occupied[tuple(head)]
+        occupied = grown
+    return OccupancyGrid.of_box(low, high, occupied)

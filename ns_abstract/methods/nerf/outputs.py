@@ -12,16 +12,16 @@ from ns_abstract.arithmetic.rounding import (
     COMPOSITE_ROUNDING,
     SOFTPLUS_LINE,
 )
-from ns_abstract.methods.nerf.zonotope import Affine
+from ns_abstract.methods.nerf.zonotope import PreActivation
 
 
-def greatest(value: Affine) -> Tensor:
+def greatest(value: PreActivation) -> Tensor:
     """Upper bounds [B, n] of an affine batch on whole cells."""
     middle, spread = value.poly[:, 0], value.poly[:, 1:].abs().sum(dim=1)
     return middle + spread + (value.radius + CHEBYSHEV_ROUNDING * (middle.abs() + spread))
 
 
-def bounds_by_part(value: Affine, bernstein: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def bounds_by_part(value: PreActivation, bernstein: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Bounds [B, parts, n] of an affine batch on every part of its cell, and its radius [B, n]."""
     error = value.radius
     (batch, m, n), (parts, k, _) = value.poly.shape, bernstein.shape
@@ -43,21 +43,21 @@ def density(z: Tensor, *, up: bool) -> Tensor:
 
     torch returns z itself for the softplus of z > 20, which is less than the function by 2.1e-9.
     """
-    found = torch.clamp(z, min=0.0) + torch.log1p(torch.exp(-z.abs()))
+    softplus = torch.clamp(z, min=0.0) + torch.log1p(torch.exp(-z.abs()))
     if up:
-        return found * (1.0 + ACTIVATION_ROUNDING)
-    return torch.where(z > SOFTPLUS_LINE, z, found) * (1.0 - ACTIVATION_ROUNDING)
+        return softplus * (1.0 + ACTIVATION_ROUNDING)
+    return torch.where(z > SOFTPLUS_LINE, z, softplus) * (1.0 - ACTIVATION_ROUNDING)
 
 
 def opacity(z: Tensor, length: Tensor, *, up: bool) -> Tensor:
     """A bound of ``1 - exp(-length softplus(z))``, from above or below (design.md, F7)."""
-    found = -torch.expm1(-length * density(z, up=up))
+    alpha = -torch.expm1(-length * density(z, up=up))
     if up:
-        return (found * (1.0 + ACTIVATION_ROUNDING) + ACTIVATION_FLOOR).clamp(max=1.0)
-    return (found * (1.0 - ACTIVATION_ROUNDING)).clamp(min=0.0)
+        return (alpha * (1.0 + ACTIVATION_ROUNDING) + ACTIVATION_FLOOR).clamp(max=1.0)
+    return (alpha * (1.0 - ACTIVATION_ROUNDING)).clamp(min=0.0)
 
 
-def brightness(value: Affine, bernstein: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def brightness(value: PreActivation, bernstein: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Bounds [B, parts, n] of the sigmoid on every part, [0, 1] for pieces that were given up, and radii [B, n]."""
     low, high, error = bounds_by_part(value, bernstein)
     bad = value.failed[:, None, None]

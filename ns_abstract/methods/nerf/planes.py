@@ -20,7 +20,7 @@ _STEPS, _ROUNDS = 24, 2
 _GOLDEN = 0.5 * (5.0**0.5 - 1.0)
 
 
-def united(low: np.ndarray, high: np.ndarray, ends: list[Float64Array]) -> tuple[np.ndarray, np.ndarray, list]:
+def unite_parts(low: np.ndarray, high: np.ndarray, ends: list[Float64Array]) -> tuple[np.ndarray, np.ndarray, list]:
     """Parts [n, K_1, ..., K_d, 3] with edges ``ends`` [K_j + 1], at most `MOST_PARTS` by axis: neighbours united."""
     for axis, edges in enumerate(ends):
         count = len(edges) - 1
@@ -51,7 +51,7 @@ def fit_planes(
         A_lower [n, 3, d], b_lower [n, 3], A_upper, b_upper, float32. They also hold what is rounded to float32.
     """
     n, d = low.shape[0], len(ends)
-    low, high, ends = united(low, high, list(ends))
+    low, high, ends = unite_parts(low, high, list(ends))
     count = int(np.prod([len(edges) - 1 for edges in ends], dtype=int))
     middles = [0.5 * (edges[1:] + edges[:-1]) for edges in ends]
     wider = list(slack) or [0.0] * d
@@ -63,7 +63,7 @@ def fit_planes(
         np.stack(np.meshgrid(*part, indexing="ij"), axis=-1).reshape(count, d) if d else np.zeros((1, 0))
         for part in (middles, halves)
     )
-    found = []
+    planes = []
     for sign, values in ((-1.0, low), (1.0, high)):
         # [n 3, parts]: below is above upside down
         rows = sign * np.moveaxis(values.reshape(n, count, 3).astype(np.float64), 1, 2).reshape(3 * n, count)
@@ -71,8 +71,8 @@ def fit_planes(
         offset = _offset(rows, slope, centre, half)
         offset = offset + PLANE_ROUNDING * (1.0 + np.abs(slope).sum(axis=1)) + UNIT32
         offset = outward(sign * offset, sign * offset)[0 if sign < 0.0 else 1]
-        found += [(sign * slope).reshape(n, 3, d).astype(np.float32), offset.reshape(n, 3)]
-    return found[0], found[1], found[2], found[3]
+        planes += [(sign * slope).reshape(n, 3, d).astype(np.float32), offset.reshape(n, 3)]
+    return planes[0], planes[1], planes[2], planes[3]
 
 
 def _offset(rows: Float64Array, slope: Float64Array, centre: Float64Array, half: Float64Array) -> Float64Array:
@@ -99,7 +99,7 @@ def _slopes(rows: Float64Array, centre: Float64Array, half: Float64Array) -> Flo
     return slope
 
 
-def _least(offset, reach: Float64Array, known: Float64Array) -> Float64Array:
+def _least(offset, reach: Float64Array, least_known: Float64Array) -> Float64Array:
     """Where the convex ``offset`` is about least on [-reach, reach]; no worse than at ``known`` and at 0."""
     low, high = -reach, reach.copy()
     inner = [high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)]
@@ -111,6 +111,6 @@ def _least(offset, reach: Float64Array, known: Float64Array) -> Float64Array:
         value = offset(fresh)
         inner = [np.where(left, fresh, inner[1]), np.where(left, inner[0], fresh)]
         values = [np.where(left, value, values[1]), np.where(left, values[0], value)]
-    tried = np.stack([inner[0], known, np.zeros_like(known)])
+    tried = np.stack([inner[0], least_known, np.zeros_like(least_known)])
     best = np.argmin(np.stack([offset(place) for place in tried]), axis=0)
     return np.take_along_axis(tried, best[None], axis=0)[0]

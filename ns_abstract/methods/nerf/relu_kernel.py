@@ -21,7 +21,7 @@ from ns_abstract.arithmetic.simd.products import ROWS, rows_from, store_rows, su
 LANES = 32
 
 
-class Grid(NamedTuple):
+class FitGrid(NamedTuple):
     """The first half of a symmetric grid of g points, its middle included, and how a polynomial is fitted there.
 
     Attributes:
@@ -43,8 +43,8 @@ class Grid(NamedTuple):
     norming: float
 
 
-class Before(NamedTuple):
-    """B pieces before an activation; see `zonotope.Affine`.
+class ReluInput(NamedTuple):
+    """B pieces before an activation; see `zonotope.PreActivation`.
 
     Attributes:
         poly: [B, m, n] coefficients; replaced where the sign is open, and where a piece fails. What is off keeps its
@@ -61,8 +61,8 @@ class Before(NamedTuple):
     count: np.ndarray
 
 
-class Behind(NamedTuple):
-    """B pieces behind an activation; see `zonotope.Pieces`.
+class ReluOutput(NamedTuple):
+    """B pieces behind an activation; see `zonotope.PostActivation`.
 
     Attributes:
         slope: [B, n] what columns are multiplied by.
@@ -81,18 +81,18 @@ class Behind(NamedTuple):
     error: np.ndarray
 
 
-def grid_of(basis: ChebyshevBasis) -> Grid:
+def grid_of(basis: ChebyshevBasis) -> FitGrid:
     """The grid of a ``basis`` of one variable, whose ``grid`` is even."""
     points = basis.grid // 2 + 1
     values, fit = basis.evaluation[:points], basis.fit[:, :points]
     parts = values[:, 0::2], values[:, 1::2], fit[0::2], fit[1::2]
     even, odd, fit_even, fit_odd = map(np.ascontiguousarray, parts)
-    return Grid(points, even, odd, fit_even, fit_odd, np.arange(max(points, basis.size)), basis.chord, basis.norming)
+    return FitGrid(points, even, odd, fit_even, fit_odd, np.arange(max(points, basis.size)), basis.chord, basis.norming)
 
 
 @njit(cache=True, error_model="numpy")
 def _multiply(matrix, order, lanes, out):
-    """``out = matrix @ lanes``, [R, LANES] of [R, K] and [K, LANES]; ``order``: see `Grid`."""
+    """``out = matrix @ lanes``, [R, LANES] of [R, K] and [K, LANES]; ``order``: see `FitGrid`."""
     count, terms = matrix.shape
     factors, elements, results = pointer(matrix), pointer(lanes), pointer(out)
     places, line = pointer(order), LINE // lanes.itemsize
@@ -178,7 +178,7 @@ def _certain(poly, rho, box, failed, slope, size, which, neuron):
     """
     pieces, m, n = poly.shape
     spread = np.empty(n)
-    found = 0
+    undecided = 0
     for b in range(pieces):
         if failed[b]:
             slope[b], size[b], box[b] = 0.0, 0.0, 0.0
@@ -197,10 +197,10 @@ def _certain(poly, rho, box, failed, slope, size, which, neuron):
             if middle <= -radius:
                 slope[b, j] = size[b, j] = box[b, j] = 0.0
                 continue
-            which[found] = b
-            neuron[found] = j
-            found += 1
-    return found
+            which[undecided] = b
+            neuron[undecided] = j
+            undecided += 1
+    return undecided
 
 
 @njit(cache=True, error_model="numpy")
@@ -312,17 +312,17 @@ def _open(poly, rho, box, failed, grid, slope, size, which, neuron, error):
 
     See `relu`; ``rho``: [B, n] sums of absolute columns, ``which``, ``neuron`` and ``error``: new error terms.
     """
-    found = _certain(poly, rho, box, failed, slope, size, which, neuron)
-    lows, highs = np.empty(found), np.empty(found)
-    found = _decide(poly, rho, box, grid, slope, size, which, neuron, found, lows, highs)
+    undecided = _certain(poly, rho, box, failed, slope, size, which, neuron)
+    lows, highs = np.empty(undecided), np.empty(undecided)
+    undecided = _decide(poly, rho, box, grid, slope, size, which, neuron, undecided, lows, highs)
     m, points = poly.shape[1], grid.points
     (even, odd), (even_q, odd_q) = _degrees(grid), _degrees(grid)
     sum_even, sum_odd = np.empty((points, LANES)), np.empty((points, LANES))
     values, fitted = np.empty((2 * points - 1, LANES)), np.empty((2 * points - 1, LANES))
     absolute, absolute_q, above = np.empty(LANES), np.empty(LANES), np.empty(LANES)
     below, least, most = np.empty(LANES), np.empty(LANES), np.empty(LANES)
-    for first in range(0, found, LANES):
-        past = min(first + LANES, found)
+    for first in range(0, undecided, LANES):
+        past = min(first + LANES, undecided)
         _gather(poly, which[first:past], neuron[first:past], even, odd)
         _absolute(even, odd, absolute)
         _on_grid(even, odd, grid, values)
@@ -339,10 +339,10 @@ def _open(poly, rho, box, failed, grid, slope, size, which, neuron, error):
             bottom, top = lows[first + c] - e - r, highs[first + c] + e + r
             line = max(top / (top - bottom), LEAST_SLOPE)
             line_error = (0.5 * line * -bottom + 4.0 * slack) * FIELD_UP
-            kept, shift, total = 0.5, 0.5 * (most[c] + least[c]), 0.0
+            slope_part, shift, total = 0.5, 0.5 * (most[c] + least[c]), 0.0
             by_line = line_error + line * r < new + r
             if by_line:
-                kept, shift, new = line, 0.5 * line * -bottom, line_error
+                slope_part, shift, new = line, 0.5 * line * -bottom, line_error
                 box[b, j] = r * line
             evens, odds, factor = (even, odd, line) if by_line else (even_q, odd_q, 1.0)
             for k in range(0, m, 2):
@@ -356,11 +356,11 @@ def _open(poly, rho, box, failed, grid, slope, size, which, neuron, error):
                     poly[b, k + 1, j] = q
                     total += abs(q)
             new += RELU_ROUNDING * (total + e)
-            slope[b, j] = kept
-            size[b, j] = (total + kept * e + new) * FIELD_UP
+            slope[b, j] = slope_part
+            size[b, j] = (total + slope_part * e + new) * FIELD_UP
             box[b, j] *= FIELD_UP
             error[first + c] = new
-    return found
+    return undecided
 
 
 @njit(cache=True, error_model="numpy")
@@ -368,22 +368,22 @@ def relu(z, grid, limit, out):
     """max(0, z) in place (design.md, F5); returns the number of new error terms.
 
     Args:
-        z: `Before`.
-        grid: `Grid`.
+        z: `ReluInput`.
+        grid: `FitGrid`.
         limit: Error terms of a piece beyond which it fails.
-        out: `Behind`, filled.
+        out: `ReluOutput`, filled.
     """
     # arrays of a record are counted each time they are taken out of it
     poly, sums, box, old_failed, old_count = z
     slope, size, spread, failed, count, piece, neuron, error = out
     pieces, n = sums.shape
     rho = sums * FIELD_UP
-    found = _open(poly, rho, box, old_failed, grid, slope, size, piece, neuron, error)
+    new_terms = _open(poly, rho, box, old_failed, grid, slope, size, piece, neuron, error)
     for b in range(pieces):
         count[b] = old_count[b]
         for j in range(n):
             spread[b, j] = rho[b, j] * slope[b, j]
-    for i in range(found):
+    for i in range(new_terms):
         spread[piece[i], neuron[i]] += error[i]
         count[piece[i]] += 1
     for b in range(pieces):
@@ -394,4 +394,4 @@ def relu(z, grid, limit, out):
         failed[b] = fails
         if fails:
             poly[b], box[b], size[b], spread[b] = 0.0, 0.0, 0.0, 0.0
-    return found
+    return new_terms

@@ -15,8 +15,8 @@ import torch
 from torch import Tensor
 from torch.utils.checkpoint import checkpoint as recompute
 
-from ns_abstract.execution.ending import checkpoint
-from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.execution.cancellation import check_cancelled
+from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.methods.nerf.field import Field
 from ns_abstract.methods.nerf.hsv import shifted
 from ns_abstract.methods.nerf.scene import NerfScene
@@ -62,7 +62,7 @@ class Sampling:
         return bins * self.far + (1.0 - bins) * self.near
 
 
-def camera_rays(camera: Camera, pixels: np.ndarray) -> np.ndarray:
+def camera_rays(camera: PinholeCamera, pixels: np.ndarray) -> np.ndarray:
     """[n, 3] float64 ray directions in camera axes, not normalised, of ``pixels`` [n, 2] (row, column)."""
     rows, columns = np.asarray(pixels).T
     x = (columns + 0.5 - camera.cx) / camera.fx
@@ -111,8 +111,8 @@ class NerfRenderer:
         weights = _weights(density, self._lengths(bins))
         if not weights.requires_grad:
             # most samples of empty space add exactly nothing, whatever their colour
-            seen = weights > 0.0
-            base, inside = base[seen[inside]], seen
+            visible = weights > 0.0
+            base, inside = base[visible[inside]], visible
         color = self.fine.color(base, world[:, None].expand(-1, weights.shape[1], -1)[inside])
         if shift is not None:
             color = shifted(color, *shift)
@@ -121,7 +121,9 @@ class NerfRenderer:
         total = total + self._background * (1.0 - weights.sum(dim=1))[:, None]
         return total.clamp(0.0, 1.0)
 
-    def pixels(self, camera: Camera, pose: np.ndarray, pixels: np.ndarray, shift: Shift | None = None) -> np.ndarray:
+    def pixels(
+        self, camera: PinholeCamera, pose: np.ndarray, pixels: np.ndarray, shift: Shift | None = None
+    ) -> np.ndarray:
         """Colours [n, 3] float64 of ``pixels`` [n, 2] (row, column) from camera-to-world ``pose`` [3, 4]."""
         directions = torch.from_numpy(camera_rays(camera, pixels)).to(self.device, self.dtype)
         matrix = torch.tensor(np.asarray(pose)).to(self.device, self.dtype)
@@ -130,16 +132,16 @@ class NerfRenderer:
         with torch.inference_mode():
             parts = []
             for part in directions.split(step):
-                checkpoint()
+                check_cancelled()
                 parts.append(self.rays(matrix, part, shift))
         return torch.cat(parts).double().cpu().numpy() if parts else np.zeros((0, 3))
 
-    def image(self, camera: Camera, pose: np.ndarray, shift: Shift | None = None) -> np.ndarray:
+    def image(self, camera: PinholeCamera, pose: np.ndarray, shift: Shift | None = None) -> np.ndarray:
         """The image [H, W, 3] float64."""
         grid = np.indices((camera.height, camera.width)).reshape(2, -1).T
         return self.pixels(camera, pose, grid, shift).reshape(camera.height, camera.width, 3)
 
-    def picture(self, camera: Camera, pose: Tensor, shift: Shift | None = None) -> Tensor:
+    def picture(self, camera: PinholeCamera, pose: Tensor, shift: Shift | None = None) -> Tensor:
         """The image [H, W, 3] from camera-to-world ``pose`` [3, 4]; differentiable.
 
         Rays are worked on some at a time, and once more where slopes are asked for, so that memory stays small.
@@ -149,7 +151,7 @@ class NerfRenderer:
         count = self.sampling.samples + (self.sampling.importance if self.sampling.kind == "hierarchical" else 0)
 
         def part(pose: Tensor, directions: Tensor) -> Tensor:
-            checkpoint()
+            check_cancelled()
             return self.rays(pose, directions, shift)
 
         parts = [recompute(part, pose, some, use_reentrant=False) for some in directions.split(max(1, _CHUNK // count))]

@@ -36,7 +36,7 @@ def edge_bounds(alpha_low: np.ndarray, alpha_high: np.ndarray, sampling: Samplin
     count = sampling.importance + 1
     wanted = (np.arange(count) + 0.5) / count
     knots = np.linspace(0.0, 1.0, bins + 1)
-    found = []
+    edges = []
     for shares, sign in ((most, -1.0), (least, 1.0)):
         new = np.stack([np.interp(wanted + sign * rounding, row, knots) for row in shares])
         places = np.sort(np.concatenate([np.broadcast_to(knots, (rows, bins + 1)), new], axis=1), axis=1)
@@ -44,12 +44,12 @@ def edge_bounds(alpha_low: np.ndarray, alpha_high: np.ndarray, sampling: Samplin
         places[:, 0], places[:, -1] = 0.0, 1.0
         ends = places * sampling.far + (1.0 - places) * sampling.near
         ends[:, 1:-1] += sign * rounding * sampling.far
-        found.append(np.clip(ends, sampling.near, sampling.far))
-    return found[0], found[1]
+        edges.append(np.clip(ends, sampling.near, sampling.far))
+    return edges[0], edges[1]
 
 
 @njit(cache=True, error_model="numpy")
-def hulls(edges_low, edges_high, start, step, densities, colors, density, color):
+def field_hulls(edges_low, edges_high, start, step, densities, colors, density, color):
     """Return bounds of the field at sample midpoints from its bounds on parts of the rays (design.md, F14).
 
     Args:

@@ -18,11 +18,11 @@ import numpy as np
 
 from ns_abstract.arithmetic.rounding import PART_END_ROUNDING
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseSet
+from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseBox
 from ns_abstract.methods.nerf.bounds import NerfBounds, RayBounds, Shifts
 from ns_abstract.methods.nerf.division import Division
-from ns_abstract.methods.nerf.pencil import Pencil
 from ns_abstract.methods.nerf.planes import fit_planes
+from ns_abstract.methods.nerf.ray_bundle import RayBundle
 
 #: Rays that are bounded together by compiled kernels, and by torch alone, which wants many cells at a time.
 _GROUP, _GROUP_ON_DEVICE = 8, 64
@@ -48,11 +48,11 @@ _TRIED, _ROUNDS = 8, 3
 
 #: Bounds of one group: arguments of `NerfBounds.rays` behind the poses, by group, to what it found.
 Run = Callable[[Sequence[tuple]], list[RayBounds]]
-Weigh = Callable[[], "np.ndarray | None"]
+PixelWeightSource = Callable[[], "np.ndarray | None"]
 
 
 @dataclass(frozen=True)
-class _Kept:
+class _StripBounds:
     """Bounds of one group of rays over a strip: [2, n, *parts, 3] by part, and [n, samples] opacities."""
 
     parts: np.ndarray
@@ -64,7 +64,7 @@ class _Kept:
 
 
 @dataclass(frozen=True)
-class Layout:
+class StripLayout:
     """How a set is cut into strips.
 
     Attributes:
@@ -78,7 +78,7 @@ class Layout:
     displacement: float
 
 
-class Strips:
+class PoseStrips:
     """Bounds of all rays of a frame over strips of its set (design.md, F13).
 
     Args:
@@ -88,16 +88,16 @@ class Strips:
         run: Bounds groups of rays, here or in other processes.
     """
 
-    def __init__(self, bounds: NerfBounds, pose_set: PoseSet, pixels: np.ndarray, run: Run) -> None:
+    def __init__(self, bounds: NerfBounds, pose_set: PoseBox, pixels: np.ndarray, run: Run) -> None:
         self.bounds, self.pose_set, self.geometry = bounds, pose_set, pose_set.geometry
         self.pixels, self.run = pixels, run
         self.poses = self.geometry.box
         self.shifting = tuple(name for name in pose_set.box.names if name in COLOR_SHIFTS)
         group = _GROUP if bounds.field.compiled else _GROUP_ON_DEVICE
         self.groups = [slice(k, min(k + group, len(pixels))) for k in range(0, len(pixels), group)]
-        self._known: OrderedDict[tuple, _Kept] = OrderedDict()
+        self._known: OrderedDict[tuple, _StripBounds] = OrderedDict()
         self._bytes = 0
-        self._layout: Layout | None = None
+        self._layout: StripLayout | None = None
         self._displacement = bounds.displacement
         #: Strips of the first level, as far as the layout has got.
         self.count = 1
@@ -106,34 +106,34 @@ class Strips:
 
     # ---------------------------------------------------------------- layout
 
-    def layout(self) -> Layout:
+    def layout(self) -> StripLayout:
         """Strips that the network's bounds bear, tried on a few rays in the middle of the set."""
         if self._layout is None:
             tried = self.pixels[np.unique(np.linspace(0, len(self.pixels) - 1, _TRIED).astype(int))]
             displacement = self._displacement
             for _ in range(_ROUNDS):
-                found = self._cut(displacement, tried)
-                self.count = math.prod(found.counts)
-                strip = self._strip(found.counts, tuple(n // 2 for n in found.counts))
+                layout_found = self._cut(displacement, tried)
+                self.count = math.prod(layout_found.counts)
+                strip = self._strip(layout_found.counts, tuple(n // 2 for n in layout_found.counts))
                 learned = displacement
                 # one ray first: where not even a few can be done, that tells how long they take
                 for rays in (tried[len(tried) // 2 :][:1], tried):
                     begin = time.perf_counter()
-                    learned = self.run([self._call(strip, rays, found, 0, None)])[0].displacement
+                    learned = self.run([self._call(strip, rays, layout_found, 0, None)])[0].displacement
                     self.effort = (time.perf_counter() - begin) / len(rays)
                 if 0.6 < learned / displacement < 1.7:
                     break
                 displacement = learned
-            self._layout = found
+            self._layout = layout_found
         return self._layout
 
-    def _cut(self, displacement: float, pixels: np.ndarray) -> Layout:
+    def _cut(self, displacement: float, pixels: np.ndarray) -> StripLayout:
         d = self.poses.dimensions
         counts = [1] * d
         self.bounds.displacement = displacement
         while True:
             box = self._strip(counts, [n // 2 for n in counts])
-            pencil = Pencil(self.geometry, box, pixels, self.bounds.taylor)
+            pencil = RayBundle(self.geometry, box, pixels, self.bounds.taylor)
             moves = pencil.displacement(self.bounds.distances, self.bounds.lengths)
             line = moves.shape[2] == 1
             most, deeper = (_PARTS_LINE, _DEEPER_LINE) if line else (_PARTS, None)
@@ -145,7 +145,7 @@ class Strips:
         if division is None:
             # nothing is known then
             counts, division = [1] * d, Division((), d)
-        return Layout(tuple(counts), division, displacement)
+        return StripLayout(tuple(counts), division, displacement)
 
     def _strip(self, counts: Sequence[int], place: Sequence[int]) -> ParameterBox:
         """The strip ``place`` of ``counts`` along each parameter; neighbours share their ends exactly."""
@@ -167,7 +167,7 @@ class Strips:
 
     def _shift_ends(self, level: int) -> list[np.ndarray]:
         """Edges of the parts of hue and saturation of a level; two where it is fixed."""
-        found = []
+        ends_by_shift = []
         for name in COLOR_SHIFTS:
             if name in self.shifting:
                 axis = self.pose_set.box.names.index(name)
@@ -176,8 +176,8 @@ class Strips:
                 ends[0], ends[-1] = low, high
             else:
                 ends = np.full(2, self.pose_set.fixed.get(name, 0.0))
-            found.append(ends)
-        return found
+            ends_by_shift.append(ends)
+        return ends_by_shift
 
     def _shifts(self, level: int) -> list[Shifts]:
         """Parts of hue and saturation, the latter running faster; empty: nothing is shifted."""
@@ -189,20 +189,20 @@ class Strips:
     # ---------------------------------------------------------------- strips
 
     def _call(
-        self, strip: ParameterBox, pixels: np.ndarray, layout: Layout, level: int, known: np.ndarray | None
+        self, strip: ParameterBox, pixels: np.ndarray, layout: StripLayout, level: int, known: np.ndarray | None
     ) -> tuple:
         shifts = self._shifts(level)
         return self.geometry, strip, pixels, TOLERANCES[level], known, None, shifts, layout.division
 
-    def _ensure(self, level: int, place: tuple[int, ...], groups: Sequence[int]) -> list[_Kept]:
+    def _ensure(self, level: int, place: tuple[int, ...], groups: Sequence[int]) -> list[_StripBounds]:
         """Bounds of ``groups`` over a strip, those that are missing worked out."""
-        found: dict[int, _Kept] = {}
+        computed: dict[int, _StripBounds] = {}
         missing = []
         for group in groups:
             key = (level, place, group)
             if key in self._known:
                 self._known.move_to_end(key)
-                found[group] = self._known[key]
+                computed[group] = self._known[key]
             else:
                 missing.append(group)
         if missing:
@@ -213,14 +213,14 @@ class Strips:
             strip, layout = self._strip(self._counts(level), place), self.layout()
             calls = []
             for k, group in enumerate(missing):
-                known = None if above is None else above[k].alpha
-                calls.append(self._call(strip, self.pixels[self.groups[group]], layout, level, known))
+                known_alpha = None if above is None else above[k].alpha
+                calls.append(self._call(strip, self.pixels[self.groups[group]], layout, level, known_alpha))
             self.bounds.displacement = layout.displacement
             for group, result in zip(missing, self.run(calls), strict=True):
-                found[group] = self._keep((level, place, group), result)
-        return [found[group] for group in groups]
+                computed[group] = self._keep((level, place, group), result)
+        return [computed[group] for group in groups]
 
-    def _keep(self, key: tuple, result: RayBounds) -> _Kept:
+    def _keep(self, key: tuple, result: RayBounds) -> _StripBounds:
         assert result.parts is not None
         hues, saturations = (len(ends) - 1 for ends in self._shift_ends(key[0]))
         parts = result.parts
@@ -231,12 +231,12 @@ class Strips:
             parts = parts.reshape(*parts.shape[:-2], *sizes, 3)
         else:
             parts = parts[:, :, 0]
-        kept = _Kept(np.ascontiguousarray(parts), result.alpha)
-        self._known[key] = kept
-        self._bytes += kept.nbytes
+        strip_bounds = _StripBounds(np.ascontiguousarray(parts), result.alpha)
+        self._known[key] = strip_bounds
+        self._bytes += strip_bounds.nbytes
         while self._bytes > _KEPT and len(self._known) > len(self.groups):
             self._bytes -= self._known.popitem(last=False)[1].nbytes
-        return kept
+        return strip_bounds
 
     # ---------------------------------------------------------------- cells
 
@@ -249,7 +249,9 @@ class Strips:
                     return level
         return len(TOLERANCES)
 
-    def sets(self, box: ParameterBox, weigh: Weigh | None) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
+    def sets(
+        self, box: ParameterBox, weigh: PixelWeightSource | None
+    ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
         """Linear bounds (A_lower, b_lower, A_upper, b_upper) [t, 3, d] and [t, 3], and lower and upper [t, 3].
 
         Args:
@@ -287,11 +289,11 @@ class Strips:
         ranges = [self._overlapped(axis, count, box) for axis, count in enumerate(counts)]
         parts = self.layout().division.parts[: self.poses.dimensions]
         # [2, rays, *parts, 3] of all strips that the cell meets, side by side
-        kept = {
+        bounds_by_place = {
             place: np.concatenate([k.parts for k in self._ensure(level, place, groups.tolist())], axis=1)
             for place in itertools.product(*(range(a, b) for a, b in ranges))
         }
-        values = _joined(kept, ranges, 0, ())
+        values = _joined(bounds_by_place, ranges, 0, ())
         edges = [
             self._part_ends(axis, count, first, past, parts[axis])
             for axis, (count, (first, past)) in enumerate(zip(counts, ranges, strict=True))
@@ -328,8 +330,8 @@ class Strips:
         """Edges of the parts of the strips from ``first`` to ``past`` (exclusive), in the parameter's unit."""
         ends = self._ends(axis, count, first, past)
         inner = np.arange(parts) / parts
-        found = ends[:-1, None] + (ends[1:] - ends[:-1])[:, None] * inner
-        return np.append(found.ravel(), ends[-1])
+        inner_ends = ends[:-1, None] + (ends[1:] - ends[:-1])[:, None] * inner
+        return np.append(inner_ends.ravel(), ends[-1])
 
 
 def _joined(

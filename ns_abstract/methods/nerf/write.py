@@ -9,7 +9,7 @@ from string import Template
 
 from numpy.typing import ArrayLike
 
-from ns_abstract.geometry.views import View
+from ns_abstract.geometry.keyframe_cameras import KeyframeCamera
 from ns_abstract.methods.nerf.scene import FieldWeights, NerfScene
 from ns_abstract.methods.run_writer import STEP, background_name, lpips_state, write_run
 
@@ -20,8 +20,8 @@ def write_nerf_run(
     *,
     timestamp: str,
     experiment_name: str,
-    views: Sequence[View] | None = None,
-    render: Callable[[View], ArrayLike] | None = None,
+    views: Sequence[KeyframeCamera] | None = None,
+    render: Callable[[KeyframeCamera], ArrayLike] | None = None,
 ) -> Path:
     """Write ``scene`` as a vanilla-nerf run.
 

@@ -37,10 +37,10 @@ from ns_abstract.arithmetic.rounding import (
 )
 from ns_abstract.arithmetic.simd.lanes import LINE
 from ns_abstract.methods.nerf import layer_kernel
-from ns_abstract.methods.nerf.field_kernel import Layers, Outputs, stacked, through_layers
-from ns_abstract.methods.nerf.layer_kernel import Weights, linear
-from ns_abstract.methods.nerf.pencil import TAYLOR
-from ns_abstract.methods.nerf.relu_kernel import Grid, grid_of
+from ns_abstract.methods.nerf.field_kernel import FieldOutputs, StackedLayers, stacked, through_layers
+from ns_abstract.methods.nerf.layer_kernel import LayerWeights, linear
+from ns_abstract.methods.nerf.ray_bundle import TAYLOR
+from ns_abstract.methods.nerf.relu_kernel import FitGrid, grid_of
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer, Waves
 
 #: Radii of Bernstein ellipses that are tried for the remainder of an encoding.
@@ -48,7 +48,8 @@ _ELLIPSES = (1.05, 1.15, 1.3, 1.6, 2.0, 2.6, 3.5, 5.0, 8.0, 14.0, 30.0, 80.0, 30
 #: Last layers of the base whose columns are multiplied in float32, as those of the head: the later a radius begins, the
 #: less it grows.
 _NARROW_LAYERS = 4
-#: Most that an encoded vector's degree by variable may be: that of `ns_abstract.methods.nerf.pencil.TAYLOR`, and one of
+#: Most that an encoded vector's degree by variable may be: that of `ns_abstract.methods.nerf.ray_bundle.TAYLOR`, and
+#: one of
 #: a place that moves along the ray.
 VECTOR_DEGREE = TAYLOR + 1
 #: Error terms of a piece beyond which it is given up.
@@ -71,7 +72,7 @@ def column_sums(columns: Tensor, owner: Tensor, pieces: int) -> Tensor:
 
 
 @dataclass
-class Pieces:
+class PostActivation:
     """A batch of Chebyshev zonotopes behind an activation.
 
     Attributes:
@@ -100,15 +101,15 @@ class Pieces:
     failed: Tensor
     count: Tensor
 
-    def select(self, which: Tensor) -> Pieces:
+    def select(self, which: Tensor) -> PostActivation:
         """The pieces ``which`` [k] (indices, ascending)."""
         place = torch.full_like(self.failed, -1, dtype=torch.int64)
         place[which] = torch.arange(which.numel(), device=which.device)
-        kept, new = place[self.owner] >= 0, place[self.new_owner] >= 0
-        return Pieces(
+        owned, new = place[self.owner] >= 0, place[self.new_owner] >= 0
+        return PostActivation(
             self.poly[which],
-            self.columns[kept],
-            place[self.owner[kept]],
+            self.columns[owned],
+            place[self.owner[owned]],
             self.slope[which],
             place[self.new_owner[new]],
             self.new_neuron[new],
@@ -122,8 +123,8 @@ class Pieces:
 
 
 @dataclass
-class Affine:
-    """A batch before an activation: `Pieces` with all error terms in ``columns``, whose sums are ``spread``."""
+class PreActivation:
+    """A batch before an activation: `PostActivation` with all error terms in ``columns``, whose sums are ``spread``."""
 
     poly: Tensor
     columns: Tensor
@@ -138,24 +139,24 @@ class Affine:
         """[B, n] columns and box together."""
         return (self.spread * FIELD_UP + self.box) * FIELD_UP
 
-    def without_columns(self, which: Tensor) -> Affine:
+    def without_columns(self, which: Tensor) -> PreActivation:
         """The pieces ``which`` [k], all but their columns."""
         parts = (self.poly, self.spread, self.box, self.failed, self.count)
         poly, spread, box, failed, count = (part[which] for part in parts)
-        return Affine(poly, self.columns[:0], self.owner[:0], spread, box, failed, count)
+        return PreActivation(poly, self.columns[:0], self.owner[:0], spread, box, failed, count)
 
 
-def _before(pieces: Pieces, kind: torch.dtype) -> layer_kernel.Before:
+def _before(pieces: PostActivation, kind: torch.dtype) -> layer_kernel.LayerInput:
     """``pieces`` for compiled layers, with columns of the type ``kind``."""
     arrays = (
         pieces.poly, pieces.size, pieces.spread, pieces.box, pieces.slope, pieces.failed, pieces.count,
         pieces.columns.to(kind), pieces.owner, pieces.new_owner, pieces.new_neuron, pieces.new_size,
     )  # fmt: skip
-    return layer_kernel.Before(*(array.numpy() for array in arrays))
+    return layer_kernel.LayerInput(*(array.numpy() for array in arrays))
 
 
 @dataclass(frozen=True)
-class _Linear:
+class _FieldLayer:
     """A linear layer: transposed ``weight`` [in, out], its ``absolute`` value and ``bias`` [out], all float64.
 
     The first ``seen`` inputs are an encoded vector's, those behind them neurons.
@@ -173,8 +174,8 @@ class _Linear:
 
 def _seeing(layer: Layer, encoding: Encoding, waves: Waves) -> Layer:
     """``layer``, whose first inputs are the encoded vector, without those that nothing looks at."""
-    kept = np.concatenate([waves.columns, np.arange(encoding.size, layer.weight.shape[1])])
-    return replace(layer, weight=np.ascontiguousarray(layer.weight[:, kept]))
+    columns = np.concatenate([waves.columns, np.arange(encoding.size, layer.weight.shape[1])])
+    return replace(layer, weight=np.ascontiguousarray(layer.weight[:, columns]))
 
 
 class FieldBounds:
@@ -209,8 +210,8 @@ class FieldBounds:
             for i, layer in enumerate(weights.head)
         ]
         self._density, self._color = self._put(weights.density, True), self._put(weights.color, True)
-        kept, rest = (torch.from_numpy(a).to(device) for a in basis.interpolation)
-        self._kept, self._rest = kept, rest
+        low_degrees, rest = (torch.from_numpy(a).to(device) for a in basis.interpolation)
+        self._kept, self._rest = low_degrees, rest
         self._evaluation = torch.from_numpy(basis.evaluation).to(device)
         self._fit = torch.from_numpy(np.ascontiguousarray(basis.fit)).to(device)
         self._chord = torch.from_numpy(basis.chord).to(device)
@@ -233,16 +234,16 @@ class FieldBounds:
             self._bernstein[parts] = torch.from_numpy(self.basis.bernstein(parts)).to(self.device)
         return self._bernstein[parts]
 
-    def _put(self, layer: Layer, narrow: bool, sees: tuple[Encoding, Waves] | None = None) -> _Linear:
+    def _put(self, layer: Layer, narrow: bool, sees: tuple[Encoding, Waves] | None = None) -> _FieldLayer:
         if sees is not None:
             layer = _seeing(layer, *sees)
-        seen = 0 if sees is None else sees[1].columns.size
+        seen_inputs = 0 if sees is None else sees[1].columns.size
         weight = torch.from_numpy(layer.weight).to(self.device, torch.float64).T.contiguous()
         bias = torch.from_numpy(layer.bias).to(self.device, torch.float64)
         # only the compiled product gains by float32
         narrow &= self.compiled
         lines = functional.pad(weight, (0, -weight.shape[1] % (LINE // 2))) if self.compiled else weight
-        return _Linear(seen, weight, weight.abs(), bias, lines, lines.float() if narrow else None)
+        return _FieldLayer(seen_inputs, weight, weight.abs(), bias, lines, lines.float() if narrow else None)
 
     # --- encodings -----------------------------------------------------------------------------
 
@@ -285,38 +286,45 @@ class FieldBounds:
 
     # --- layers --------------------------------------------------------------------------------
 
-    def _linear(self, pieces: Pieces, layer: _Linear, first: Encoded) -> Affine:
+    def _linear(self, pieces: PostActivation, layer: _FieldLayer, first: Encoded) -> PreActivation:
         """A linear layer on ``pieces``, and on the encoded vector ``first`` if the layer sees it (F4)."""
         if self.compiled:
             return self._linear_compiled(pieces, layer, first)
-        seen, rounding = layer.seen, _rounding(layer.weight.shape[0])
+        seen_inputs, rounding = layer.seen, _rounding(layer.weight.shape[0])
         radius = (pieces.size + pieces.box).mul_(rounding).add_(pieces.box)
-        box = radius @ layer.absolute[seen:]
-        weight = layer.weight[seen:]
+        box = radius @ layer.absolute[seen_inputs:]
+        weight = layer.weight[seen_inputs:]
         columns = (pieces.columns * pieces.slope[pieces.owner]) @ weight
         columns = torch.cat([columns, weight[pieces.new_neuron] * pieces.new_size[:, None]])
         owner = torch.cat([pieces.owner, pieces.new_owner])
         poly = pieces.poly @ weight
-        if seen:
+        if seen_inputs:
             encoded, remainder = first
-            poly += encoded @ layer.weight[:seen]
-            box += (remainder + rounding * (encoded.abs().sum(dim=1) + remainder)) @ layer.absolute[:seen]
+            poly += encoded @ layer.weight[:seen_inputs]
+            box += (remainder + rounding * (encoded.abs().sum(dim=1) + remainder)) @ layer.absolute[:seen_inputs]
         poly[:, 0] += layer.bias
         box += BIAS_ROUNDING * (layer.bias.abs() + poly[:, 0].abs())
         spread = column_sums(columns, owner, poly.shape[0])
-        return Affine(poly, columns, owner, spread, box * FIELD_UP, pieces.failed, pieces.count)
+        return PreActivation(poly, columns, owner, spread, box * FIELD_UP, pieces.failed, pieces.count)
 
-    def _weights(self, layer: _Linear) -> Weights:
+    def _weights(self, layer: _FieldLayer) -> LayerWeights:
         """``layer`` for compiled products."""
-        seen, narrow = layer.seen, layer.narrow is not None
+        seen_inputs, narrow = layer.seen, layer.narrow is not None
         kind = layer.lines if layer.narrow is None else layer.narrow
         lines, absolute = layer.lines.numpy(), layer.absolute.numpy()
-        return Weights(
-            lines[:seen], absolute[:seen], lines[seen:], kind.numpy()[seen:], absolute[seen:], layer.bias.numpy(),
-            _rounding(len(absolute)), NARROW_ROUNDING if narrow else 0.0, UNDERFLOW_COLUMNS if narrow else 0.0,
-        )  # fmt: skip
+        return LayerWeights(
+            lines[:seen_inputs],
+            absolute[:seen_inputs],
+            lines[seen_inputs:],
+            kind.numpy()[seen_inputs:],
+            absolute[seen_inputs:],
+            layer.bias.numpy(),
+            _rounding(len(absolute)),
+            NARROW_ROUNDING if narrow else 0.0,
+            UNDERFLOW_COLUMNS if narrow else 0.0,
+        )
 
-    def _linear_compiled(self, pieces: Pieces, layer: _Linear, first: Encoded) -> Affine:
+    def _linear_compiled(self, pieces: PostActivation, layer: _FieldLayer, first: Encoded) -> PreActivation:
         """See `_linear`."""
         encoded, remainder = (a.contiguous() for a in first)
         (batch, m, _), n = pieces.poly.shape, layer.weight.shape[1]
@@ -324,15 +332,17 @@ class FieldBounds:
         poly, sums = torch.empty(batch, m, n, dtype=torch.float64), torch.empty(batch, n, dtype=torch.float64)
         columns = torch.empty(total, n, dtype=torch.float64 if layer.narrow is None else torch.float32)
         owner, box = torch.empty(total, dtype=torch.int64), torch.empty(batch, n, dtype=torch.float64)
-        found = linear(
+        columns_behind = linear(
             _before(pieces, columns.dtype), encoded.numpy(), remainder.numpy(), self._weights(layer),
-            layer_kernel.Behind(*(a.numpy() for a in (poly, columns, owner, sums, box))),
+            layer_kernel.LayerOutput(*(a.numpy() for a in (poly, columns, owner, sums, box))),
         )  # fmt: skip
-        return Affine(poly, columns[:found], owner[:found], sums, box, pieces.failed, pieces.count)
+        return PreActivation(
+            poly, columns[:columns_behind], owner[:columns_behind], sums, box, pieces.failed, pieces.count
+        )
 
     def _through(
-        self, pieces: Pieces, layers: Layers, last: Layers, first: Encoded, grid: Grid
-    ) -> tuple[Pieces, Affine]:
+        self, pieces: PostActivation, layers: StackedLayers, last: StackedLayers, first: Encoded, grid: FitGrid
+    ) -> tuple[PostActivation, PreActivation]:
         """``layers`` with their activations and the ``last`` one, compiled; see `_linear`.
 
         The last one's columns are left out.
@@ -342,7 +352,7 @@ class FieldBounds:
         kind = torch.from_numpy(layers.columns).dtype
         rooms = batch * self.limit, batch * n
         size, spread, box, slope = torch.empty(4, batch, n, dtype=torch.float64)
-        out = Pieces(
+        out = PostActivation(
             torch.empty(batch, m, n, dtype=torch.float64), torch.empty(rooms[0], n, dtype=kind),
             torch.empty(rooms[0], dtype=torch.int64), slope, torch.empty(rooms[1], dtype=torch.int64),
             torch.empty(rooms[1], dtype=torch.int64), torch.empty(rooms[1], dtype=torch.float64), spread, box, size,
@@ -353,15 +363,15 @@ class FieldBounds:
         sums, radius = torch.empty(2, batch, count, dtype=torch.float64)
         columns, terms = through_layers(
             _before(pieces, kind), encoded.numpy(), remainder.numpy(), layers, last, grid, self.limit,
-            _before(out, kind), Outputs(poly.numpy(), sums.numpy(), radius.numpy()),
+            _before(out, kind), FieldOutputs(poly.numpy(), sums.numpy(), radius.numpy()),
         )  # fmt: skip
         out = replace(
             out, columns=out.columns[:columns], owner=out.owner[:columns], new_owner=out.new_owner[:terms],
             new_neuron=out.new_neuron[:terms], new_size=out.new_size[:terms],
         )  # fmt: skip
-        return out, Affine(poly, out.columns[:0, :0], out.owner[:0], sums, radius, out.failed, out.count)
+        return out, PreActivation(poly, out.columns[:0, :0], out.owner[:0], sums, radius, out.failed, out.count)
 
-    def _relu(self, z: Affine) -> Pieces:
+    def _relu(self, z: PreActivation) -> PostActivation:
         """max(0, z) (design.md, F5); ``z`` is used up."""
         rho = z.spread * FIELD_UP
         poly, box = z.poly, z.box
@@ -396,7 +406,7 @@ class FieldBounds:
         use_line = line_error + line * r < error + r
         q = torch.where(use_line[:, None], p * line[:, None], q)
         q[:, 0] += torch.where(use_line, 0.5 * line * -bottom, 0.0)
-        kept = torch.where(use_line, line, 0.5)
+        relu_slope = torch.where(use_line, line, 0.5)
         error = torch.where(use_line, line_error, error)
         # the new polynomial's and the slopes' own rounding
         error = error + RELU_ROUNDING * (q.abs().sum(dim=1) + e)
@@ -404,9 +414,9 @@ class FieldBounds:
         box[which, neuron] = r * torch.where(use_line, line, 1.0)
         poly = poly * slope[:, None]
         poly[which, :, neuron] = q
-        slope[which, neuron] = kept
+        slope[which, neuron] = relu_slope
         size = (middle.abs() + spread + rho) * slope
-        size[which, neuron] = q.abs().sum(dim=1) + kept * e + error
+        size[which, neuron] = q.abs().sum(dim=1) + relu_slope * e + error
         size *= FIELD_UP
         box *= FIELD_UP
         spread = rho * slope
@@ -421,7 +431,7 @@ class FieldBounds:
             stays = ~failed[which]
             which, neuron, error = which[stays], neuron[stays], error[stays]
             poly[failed], box[failed], size[failed], spread[failed] = 0.0, 0.0, 0.0, 0.0
-        return Pieces(poly, columns, owner, slope, which, neuron, error, spread, box, size, failed, count)
+        return PostActivation(poly, columns, owner, slope, which, neuron, error, spread, box, size, failed, count)
 
     def _fitted(self, p: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
         """Polynomials q [k, m] and errors [k]: ``|max(0, p) - q| <= error`` over the cell (design.md, F5)."""
@@ -452,7 +462,7 @@ class FieldBounds:
 
     # --- networks ------------------------------------------------------------------------------
 
-    def base(self, poly: Tensor, remainder: Tensor) -> tuple[Pieces, Affine]:
+    def base(self, poly: Tensor, remainder: Tensor) -> tuple[PostActivation, PreActivation]:
         """The base network on an encoded position (`encode`), and the density before its softplus, one output.
 
         The density's columns are left out.
@@ -469,7 +479,7 @@ class FieldBounds:
         return pieces, density.without_columns(torch.arange(len(poly), device=self.device))
 
     @cached_property
-    def _base_stacks(self) -> list[tuple[Layers, Layers]]:
+    def _base_stacks(self) -> list[tuple[StackedLayers, StackedLayers]]:
         """Layers of the base, those together whose columns are of one type, and the one behind them, if any."""
         layers = [self._weights(layer) for layer in self._base]
         parts = [stacked(list(group)) for _, group in itertools.groupby(layers, key=lambda layer: layer.columns.dtype)]
@@ -477,21 +487,21 @@ class FieldBounds:
         return [(part, part.none()) for part in parts[:-1]] + [(parts[-1], last)]
 
     @cached_property
-    def _head_stacks(self) -> tuple[Layers, Layers]:
+    def _head_stacks(self) -> tuple[StackedLayers, StackedLayers]:
         """Layers of the head, and the colour's."""
         return stacked([self._weights(layer) for layer in self._head]), stacked([self._weights(self._color)])
 
-    def _nothing(self, poly: Tensor) -> Pieces:
+    def _nothing(self, poly: Tensor) -> PostActivation:
         """As many pieces as ``poly`` [B, m, k] has, of no neuron."""
         none = poly[:, 0, :0]
         index = torch.zeros(0, dtype=torch.int64, device=self.device)
         failed = torch.zeros(len(poly), dtype=torch.bool, device=self.device)
-        return Pieces(
+        return PostActivation(
             poly[..., :0].contiguous(), none[:0], index, none, index, index, poly.new_zeros(0), none, none, none,
             failed, failed.to(torch.int64),
         )  # fmt: skip
 
-    def color(self, pieces: Pieces, poly: Tensor, remainder: Tensor) -> Affine:
+    def color(self, pieces: PostActivation, poly: Tensor, remainder: Tensor) -> PreActivation:
         """The colour before its sigmoid, three outputs, from an encoded direction; its columns are left out."""
         first = poly, remainder
         if self._grid is not None:

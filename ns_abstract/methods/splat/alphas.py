@@ -25,7 +25,7 @@ from ns_abstract.arithmetic.rounding import (
 )
 from ns_abstract.arithmetic.simd.intrinsics import signed
 from ns_abstract.arithmetic.simd.lanes import bits, load8, maximum, minimum, store, store_columns, where
-from ns_abstract.methods.splat.block import (
+from ns_abstract.methods.splat.pixel_block import (
     ALPHA_HIGH,
     ALPHA_LOW,
     BEND,
@@ -37,7 +37,14 @@ from ns_abstract.methods.splat.block import (
     parabola,
     set_unknown,
 )
-from ns_abstract.methods.splat.records import EXPONENT_LIMIT, FORMS, KAPPA, OPACITY_HIGH, OPACITY_LOW, UNBOUNDED
+from ns_abstract.methods.splat.projection_errors import (
+    EXPONENT_LIMIT,
+    FORMS,
+    KAPPA,
+    OPACITY_HIGH,
+    OPACITY_LOW,
+    UNBOUNDED,
+)
 
 #: Half-width of the exponent's range up to which exp(-t) is fitted by a polynomial.
 _FIT_LIMIT = 2.0
@@ -87,7 +94,7 @@ class _Exponent(NamedTuple):
 
 
 class _Alpha(NamedTuple):
-    """Alphas of eight pixels: bounds, the form's centre and radius, and `_Drawn.jump`.
+    """Alphas of eight pixels: bounds, the form's centre and radius, and `_ThresholdedAlpha.jump`.
 
     The form's coefficients are ``weight`` times the exponent's, and ``curve`` times those of its linear part squared.
     """
@@ -125,7 +132,7 @@ class _Range(NamedTuple):
     slack: Any
 
 
-class _Drawn(NamedTuple):
+class _ThresholdedAlpha(NamedTuple):
     """Alphas of eight pixels after the thresholds.
 
     Attributes:
@@ -213,7 +220,7 @@ def _quadratic_alphas(record, begin, n, given, block, limits, charges, antialias
     k0, k1, k2, kr = _form(record, 5, antialiased)
     k_low = max(0.0, k0 - abs(k1) - abs(k2) - kr)
     k_high = abs(k0) + abs(k1) + abs(k2) + kr
-    found = 0
+    drawn_lanes = 0
     for q in range(0, n, 8):
         ax = load8(batch.offset_x, begin + q)
         ay = load8(batch.offset_y, begin + q)
@@ -256,8 +263,8 @@ def _quadratic_alphas(record, begin, n, given, block, limits, charges, antialias
             values, given + 8 * q, 8,
             (alpha.low, alpha.high, alpha.jump, alpha.high, alpha.center, tilt, bent, alpha.radius),
         )  # fmt: skip
-        found |= (_ALL - bits(alpha.high < limits.alpha_min)) << q
-    return found
+        drawn_lanes |= (_ALL - bits(alpha.high < limits.alpha_min)) << q
+    return drawn_lanes
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -426,19 +433,19 @@ def _alphas_of_several(record, begin, n, given, block, limits, charges, antialia
     """`alphas` for several parameters, or none: curvature of forms of order 1 (design.md, B10)."""
     batch, rows, width = block.batch, block.batch.rows, block.fragments.width
     forms = _affine_forms(record, m, antialiased)
-    found = 0
+    drawn_lanes = 0
     for q in range(0, n, 8):
         ax = load8(batch.offset_x, begin + q)
         ay = load8(batch.offset_y, begin + q)
         exponent = _exponent_of_several(record, forms, ax, ay, rows, 8 * width, m, antialiased)
         alpha = _fitted_exponential(exponent, limits, charges)
-        reached = _ALL - bits(alpha.high < limits.alpha_min)
-        if reached == 0:
+        drawable = _ALL - bits(alpha.high < limits.alpha_min)
+        if drawable == 0:
             continue
-        found |= reached << q
+        drawn_lanes |= drawable << q
         _set_curvature(alpha, rows, 8 * width, m)
         _store_fragments(rows, alpha, block.fragments, given + q * width, m)
-    return found
+    return drawn_lanes
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -455,7 +462,7 @@ def _alphas_over_parts(record, begin, n, given, block, limits, inputs):
     store(rows, ends + 16, zero + least * (1.0 - slack))
     store(rows, ends + 24, zero + most * (1.0 + slack))
     store(rows, ends + 32, zero + limits.alpha_min_high)
-    found = 0
+    drawn_lanes = 0
     for q in range(0, n, 8):
         ax = load8(batch.offset_x, begin + q)
         ay = load8(batch.offset_y, begin + q)
@@ -480,15 +487,15 @@ def _alphas_over_parts(record, begin, n, given, block, limits, inputs):
         radius = fma(c1, r1, fma(c2, r2, fma(FRAGMENT_ROUNDING, fma(c1, l1 + r1, fma(c2, l2 + r2, s0)), slope)))
         low, high = _square_sum_range(c1, c2, l1 + r1, l2 + r2, forms.k_low, forms.k_high)
         low = maximum(low, s0 + forms.k_low - radius * UP - FRAGMENT_ROUNDING * (s0 + forms.k_low))
-        drawn = _drawn(zero, zero, _exponential_range(low, high, zero, limits, charges), limits, charges)
-        reached = _ALL - bits(drawn.high < limits.alpha_min)
-        if reached == 0:
+        drawn = _thresholded(zero, zero, _exponential_range(low, high, zero, limits, charges), limits, charges)
+        drawable = _ALL - bits(drawn.high < limits.alpha_min)
+        if drawable == 0:
             continue
-        found |= reached << q
+        drawn_lanes |= drawable << q
         store(rows, 8 * ALPHA_LOW, drawn.low)
         store(rows, 8 * ALPHA_HIGH, drawn.high)
         _store_rows(rows, fragments, given + q * fragments.width)
-    return found
+    return drawn_lanes
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -529,7 +536,7 @@ def _cubic_exponential(low, high, center, radius, linear, quadratic, limits, cha
     """Opacity exp(-sigma) for one parameter, fitted by a polynomial of degree 3 (design.md, B3).
 
     The exponent sigma lies between ``low`` and ``high`` and within ``radius`` of
-    ``center`` + ``linear`` p + ``quadratic`` p^2. Returns the `_Drawn`, and the coefficients of p and p^2.
+    ``center`` + ``linear`` p + ``quadratic`` p^2. Returns the `_ThresholdedAlpha`, and the coefficients of p and p^2.
     """
     sigma = _exponential_range(low, high, radius, limits, charges)
     # exp(-t) = k0 - k1 t + k2 t^2 - k3 t^3 +- fit over |t| <= half
@@ -561,9 +568,9 @@ def _cubic_exponential(low, high, center, radius, linear, quadratic, limits, cha
     size = abs(t0) + moved + 1.0
     size = size * size * fma(2.0, size, 4.0)
     error = fma(steepest, sigma.radius, fma(FIT_ROUNDING, size, dropped + fit))
-    alpha = _drawn(middle, error, sigma, limits, charges)
-    kept = alpha.keep == 1.0
-    return alpha, where(kept, sigma.scale * tilt, 0.0), where(kept, sigma.scale * bend, 0.0)
+    alpha = _thresholded(middle, error, sigma, limits, charges)
+    always_drawn = alpha.keep == 1.0
+    return alpha, where(always_drawn, sigma.scale * tilt, 0.0), where(always_drawn, sigma.scale * bend, 0.0)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -588,7 +595,7 @@ def _fitted_exponential(exponent, limits, charges):
     error = fma(abs(weight), sr, fma(k2, bent, fma(FIT_ROUNDING, size, fit)))
     middle = fma(t0, fma(k2, t0, -k1), fma(-0.125 * k2, turn * turn, k0))
     weight = fma(k2, turn, weight)
-    alpha = _drawn(middle, error, sigma, limits, charges)
+    alpha = _thresholded(middle, error, sigma, limits, charges)
     return _Alpha(
         alpha.low, alpha.high, alpha.center, alpha.radius, alpha.jump,
         alpha.keep * (sigma.scale * weight), alpha.keep * (sigma.scale * k2),
@@ -596,8 +603,8 @@ def _fitted_exponential(exponent, limits, charges):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _drawn(middle, error, sigma, limits, charges):
-    """The `_Drawn` of the `_Range` ``sigma``; the form is about ``middle``, off by ``error`` (B4)."""
+def _thresholded(middle, error, sigma, limits, charges):
+    """The `_ThresholdedAlpha` of the `_Range` ``sigma``; the form is about ``middle``, off by ``error`` (B4)."""
     opacity_low, opacity_high, alpha_max = limits.opacity_low, limits.opacity_high, limits.alpha_max
     slack, at_low = sigma.slack, sigma.at_low
     opacity = 0.5 * (opacity_low + opacity_high)
@@ -624,7 +631,7 @@ def _drawn(middle, error, sigma, limits, charges):
     keep = where(radius < flat, sigma.fits * limits.sure, 0.0)
     center = where(keep == 1.0, center, 0.5 * (a_high + a_low))
     radius = where(keep == 1.0, radius, flat * UP)
-    return _Drawn(a_low, a_high, center, radius, keep, where(skips, keep * limits.alpha_min_high, 0.0))
+    return _ThresholdedAlpha(a_low, a_high, center, radius, keep, where(skips, keep * limits.alpha_min_high, 0.0))
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -637,13 +644,13 @@ def alphas(record, begin, n, given, sure, block, inputs):
     """
     rules, charges, shape = inputs.rules, inputs.charges, inputs.shape
     alpha_min = rules.alpha_min * (1.0 - charges.threshold)
-    found = 0
+    drawn_lanes = 0
     if record[UNBOUNDED] != 0.0:
         high = min(record[OPACITY_HIGH], rules.alpha_max) * (1.0 + charges.threshold)
         if high >= alpha_min:
             for q in range(n):
                 set_unknown(block.fragments, given + q * block.fragments.width, high, shape.monomials)
-            found = -1
+            drawn_lanes = -1
     else:
         # G12: what may miss its tile by rounding is hardly above the threshold
         room = rules.tile_room
@@ -653,12 +660,12 @@ def alphas(record, begin, n, given, sure, block, inputs):
             rules.alpha_min * (1.0 + charges.threshold + missed), rules.alpha_max, 1.0 if sure else 0.0,
         )  # fmt: skip
         if shape.order == 2:
-            found = _quadratic_alphas(record, begin, n, given, block, limits, charges, rules.antialiased)
+            drawn_lanes = _quadratic_alphas(record, begin, n, given, block, limits, charges, rules.antialiased)
         elif shape.parts > 0:
-            found = _alphas_over_parts(record, begin, n, given, block, limits, inputs)
+            drawn_lanes = _alphas_over_parts(record, begin, n, given, block, limits, inputs)
         else:
-            found = _alphas_of_several(
+            drawn_lanes = _alphas_of_several(
                 record, begin, n, given, block, limits, charges, rules.antialiased, shape.monomials
             )
     # not the lanes in excess
-    return signed(found & ((2 << (int(n) - 1)) - 1))
+    return signed(drawn_lanes & ((2 << (int(n) - 1)) - 1))

@@ -21,7 +21,9 @@ from ns_abstract.arithmetic.rounding import (
 )
 from ns_abstract.arithmetic.simd.intrinsics import advanced, lowest_bit, prefetch, signed
 from ns_abstract.arithmetic.simd.lanes import LINE, bits, load4, maximum, minimum, store, where
-from ns_abstract.methods.splat.block import (
+from ns_abstract.methods.splat.intervals import AHEAD, BlendBounds, blend_interval, blend_parts
+from ns_abstract.methods.splat.lists import BLOCK
+from ns_abstract.methods.splat.pixel_block import (
     ALPHA_HIGH,
     ALPHA_LOW,
     BEND,
@@ -30,14 +32,12 @@ from ns_abstract.methods.splat.block import (
     OPEN,
     RHO,
     color_ends,
-    jump_of,
+    crossing_of,
     listed_fragment,
     parabola,
 )
-from ns_abstract.methods.splat.intervals import AHEAD, Ends, blend_interval, blend_parts
-from ns_abstract.methods.splat.jumps import bound_by_parts, gather_jumps, set_blend, set_straight
-from ns_abstract.methods.splat.lists import BLOCK
-from ns_abstract.methods.splat.reordering import Scratch, sharpened
+from ns_abstract.methods.splat.reordering import ReorderScratch, sharpened
+from ns_abstract.methods.splat.threshold_crossings import bound_by_parts, gather_crossings, set_blend, set_straight
 
 
 @dataclass(frozen=True)
@@ -48,10 +48,10 @@ class BlendTuning:
     jumps_matter: float = 2.0**-4
 
 
-_JUMPS_MATTER = BlendTuning.jumps_matter
+_CROSSINGS_MATTER = BlendTuning.jumps_matter
 
 
-class _Shown(NamedTuple):
+class _PixelResult(NamedTuple):
     """Bounds and form of a pixel; lanes are channels.
 
     Attributes:
@@ -106,14 +106,14 @@ def blend_quadratic(begin, end, fragments, palette, moves, t, jumps, split):
     p1 = 0.0 * p0
     p2 = 0.0 * p0
     r = 0.0 * p0
-    ends = Ends(p0, p0, p0, p0)
+    ends = BlendBounds(p0, p0, p0, p0)
     number = 0
     for entry in range(end - 1, begin - 1, -1):
         at, key, move = listed_fragment(fragments, entry, forms)
         a0, a1, a2 = values[at + FORM], values[at + FORM + 1], values[at + FORM + 2]
         jump = 0.0
         if split:
-            jump = 0.5 * jump_of(fragments, at)
+            jump = 0.5 * crossing_of(fragments, at)
             a0 += jump
         # colour - P, a form without radius
         v0 = load4(colors, key) - p0
@@ -148,7 +148,7 @@ def blend_quadratic(begin, end, fragments, palette, moves, t, jumps, split):
             falls, rises = load4(moves, move), load4(moves, move + 4)
             p0 = p0 + 0.5 * (rises - falls)
             r = r + 0.5 * (rises + falls)
-            ends = Ends(ends.low - falls, ends.high + rises, ends.darkest, ends.brightest)
+            ends = BlendBounds(ends.low - falls, ends.high + rises, ends.darkest, ends.brightest)
     store(t, 0, p0)
     store(t, 4, p1)
     store(t, 8, p2)
@@ -197,10 +197,10 @@ def _step_of_several(r, at, key, jump, fragments, palette, t, u, m):
     sunk, risen = _curve_range(t, u, m)
     middle_curve, wound, curved = 0.5 * (sunk + risen), 0.5 * (risen - sunk), maximum(risen, -sunk)
     a0 = form[0] + jump
-    kept = a0 + about
+    remaining = a0 + about
     p0 = load4(t, 0)
     value = load4(colors, key) - p0
-    shown = value - middle_curve
+    visible_value = value - middle_curve
     steep = 0.0
     change_size = 0.0 * p0
     for k in range(1, m):
@@ -209,7 +209,7 @@ def _step_of_several(r, at, key, jump, fragments, palette, t, u, m):
         if moving:
             change = load4(colors, key + 4 * k) - slope
         store(u, 4 * k, change)
-        store(t, 4 * k, fma(kept, change, fma(form[k], shown, slope)))
+        store(t, 4 * k, fma(remaining, change, fma(form[k], visible_value, slope)))
         steep += abs(form[k])
         change_size = change_size + abs(change)
     middle = fma(about, middle_curve, fma(a0, value, p0))
@@ -222,7 +222,7 @@ def _step_of_several(r, at, key, jump, fragments, palette, t, u, m):
             product = a * load4(u, 4 * k)
             if j < k:
                 product = fma(form[k], change, product)
-            store(t, 4 * (m + pair), fma(-kept, curve, fma(bends[pair], shown, curve + product)))
+            store(t, 4 * (m + pair), fma(-remaining, curve, fma(bends[pair], visible_value, curve + product)))
             pair += 1
     nearest, farthest = value - change_size - risen, value + change_size - sunk
     size = abs(value) + change_size + curved
@@ -254,7 +254,7 @@ def blend_several(begin, end, fragments, palette, moves, t, m, jumps, split):
     u = advanced(t, 4 * (m + fragments.bends))
     for k in range(1, m + fragments.bends):
         store(t, 4 * k, r)
-    ends = Ends(p0, p0, p0, p0)
+    ends = BlendBounds(p0, p0, p0, p0)
     number, since = 0, r
     for entry in range(end - 1, begin - 1, -1):
         ahead, _, _ = listed_fragment(fragments, max(entry - AHEAD, begin), forms)
@@ -263,7 +263,7 @@ def blend_several(begin, end, fragments, palette, moves, t, m, jumps, split):
         at, key, move = listed_fragment(fragments, entry, forms)
         jump = 0.0
         if split:
-            jump = 0.5 * jump_of(fragments, at)
+            jump = 0.5 * crossing_of(fragments, at)
         r, nearest, farthest, size = _step_of_several(r, at, key, jump, fragments, palette, t, u, m)
         if jump > 0.0:
             _keep_distances(number, entry, nearest, farthest, size, jumps)
@@ -273,7 +273,7 @@ def blend_several(begin, end, fragments, palette, moves, t, m, jumps, split):
             falls, rises = load4(moves, move), load4(moves, move + 4)
             store(t, 0, load4(t, 0) + 0.5 * (rises - falls))
             r = r + 0.5 * (rises + falls)
-            ends = Ends(ends.low - falls, ends.high + rises, ends.darkest, ends.brightest)
+            ends = BlendBounds(ends.low - falls, ends.high + rises, ends.darkest, ends.brightest)
         # where the interval says more than the form, the form is the interval
         half = 0.5 * (ends.high - ends.low)
         wide = r > half
@@ -334,7 +334,7 @@ def _slack(q, ends, block, inputs, u):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _form_bounds(begin, end, block, inputs, linear):
-    """Return the `_Shown` of a pixel's list entries [begin, end), by forms and intervals (design.md, B7-B11).
+    """Return the `_PixelResult` of a pixel's list entries [begin, end), by forms and intervals (design.md, B7-B11).
 
     The block's sums receive the polynomials, scratch behind them; ``linear`` tells whether their sets are asked for.
     """
@@ -354,7 +354,7 @@ def _form_bounds(begin, end, block, inputs, linear):
         store(u, 0, radius * up)
         set_blend(t, u, jumps, d)
         store(u, 16, blended.since)
-        gather_jumps(begin, end, blended.jumps, advanced(u, 16), fragments, jumps, u, inputs.shape)
+        gather_crossings(begin, end, blended.jumps, advanced(u, 16), fragments, jumps, u, inputs.shape)
         falls, rises = load4(u, 0), load4(u, 4)
     if order == 1:
         radius = flattened(t, radius, u, m)
@@ -366,8 +366,8 @@ def _form_bounds(begin, end, block, inputs, linear):
     # what skipping adds to bounds without it
     drawn_low, drawn_high = maximum(ends.low, drawn_low), minimum(ends.high, drawn_high)
     added = (minimum(ends.high, high) - drawn_high) + (drawn_low - maximum(ends.low, low))
-    if blended.jumps == 0 or d == 0 or bits(added > _JUMPS_MATTER * (drawn_high - drawn_low)) & 7 == 0:
-        return _Shown(low, high, ends, center, radius)
+    if blended.jumps == 0 or d == 0 or bits(added > _CROSSINGS_MATTER * (drawn_high - drawn_low)) & 7 == 0:
+        return _PixelResult(low, high, ends, center, radius)
     store(u, 0, falls)
     store(u, 4, rises)
     bound_by_parts(blended.jumps, limit, jumps, u, d)
@@ -382,7 +382,7 @@ def _form_bounds(begin, end, block, inputs, linear):
         half = 0.5 * (most - least) + FRAGMENT_ROUNDING * (abs(least) + abs(most))
         center = where(half < radius, 0.5 * (least + most), center)
         radius = minimum(radius, half)
-    return _Shown(low, high, ends, center, radius)
+    return _PixelResult(low, high, ends, center, radius)
 
 
 @njit(cache=True, error_model="numpy")
@@ -399,7 +399,7 @@ def shade(pixels, left, above, reordered, block, inputs, bounds):
     # behind the polynomials: scratch, then sums of absolute linear coefficients
     u = advanced(t, 4 * (m + fragments.bends))
     sums = advanced(u, 4 * m + 20)
-    scratch = Scratch(u, block.entries.depth_radius, block.entries.first)
+    scratch = ReorderScratch(u, block.entries.depth_radius, block.entries.first)
     for k in range(d):
         store(sums, 4 * k, 0.0 * load4(palette.background, 0))
     while pixels != 0:
@@ -409,10 +409,10 @@ def shade(pixels, left, above, reordered, block, inputs, bounds):
         end = begin + int(fragments.lengths[q])
         if inputs.shape.parts > 0:
             own = blend_parts(begin, end, block, inputs, advanced(t, 4))
-            shown = _Shown(own.low, own.high, own, 0.5 * (own.low + own.high), 0.5 * (own.high - own.low))
+            pixel_bounds = _PixelResult(own.low, own.high, own, 0.5 * (own.low + own.high), 0.5 * (own.high - own.low))
         else:
-            shown = _form_bounds(begin, end, block, inputs, linear.shape[0] > 0)
-        form_low, form_high, ends = shown.low, shown.high, shown.ends
+            pixel_bounds = _form_bounds(begin, end, block, inputs, linear.shape[0] > 0)
+        form_low, form_high, ends = pixel_bounds.low, pixel_bounds.high, pixel_bounds.ends
         low, high = ends.low, ends.high
         if reordered:
             low, high = sharpened(begin, end, ends, form_low, form_high, block, scratch)
@@ -422,18 +422,18 @@ def shade(pixels, left, above, reordered, block, inputs, bounds):
         bottom = maximum(low, form_low) - fall
         top = minimum(high, form_high) + rise
         # crossed or not a number: nothing is known
-        known = bottom <= top
-        store(u, 0, minimum(1.0, maximum(0.0, where(known, bottom, 0.0))))
-        store(u, 4, maximum(0.0, minimum(1.0, where(known, top, 1.0))))
-        if bits(known) != 15:
+        consistent = bottom <= top
+        store(u, 0, minimum(1.0, maximum(0.0, where(consistent, bottom, 0.0))))
+        store(u, 4, maximum(0.0, minimum(1.0, where(consistent, top, 1.0))))
+        if bits(consistent) != 15:
             bounds.statistics[4] += 1
         row, column = above + q // BLOCK, left + q % BLOCK
         for channel in range(3):
             lower[row, column, channel] = u[channel]
             upper[row, column, channel] = u[4 + channel]
         if linear.shape[0] > 0:
-            store(t, 0, shown.center)
-            store(u, 0, (shown.radius + maximum(fall, rise)) * UP)
+            store(t, 0, pixel_bounds.center)
+            store(u, 0, (pixel_bounds.radius + maximum(fall, rise)) * UP)
             for channel in range(3):
                 for k in range(m):
                     linear[0, row, column, channel, k] = t[4 * k + channel]

@@ -23,16 +23,16 @@ from ns_abstract.arithmetic.rounding import (
     charges,
 )
 from ns_abstract.execution.threads import lane, threads
-from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.poses import PoseForms
 from ns_abstract.geometry.tiles import tile_grid
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.colors import color_magnitudes, fixed_colors, gathered, moving_colors
 from ns_abstract.methods.splat.constants import Rasteriser, RasterRules, raster_rules
 from ns_abstract.methods.splat.gaussians import covariance_noise, gaussian_stage
-from ns_abstract.methods.splat.lists import TileLists, depth_order, marked, pixel_sets, tile_lists, tile_mask
+from ns_abstract.methods.splat.lists import TileLists, depth_order, pixel_sets, tile_lists, tile_mask, visible_again
 from ns_abstract.methods.splat.pixels import pixel_stage
-from ns_abstract.methods.splat.records import columns, exponent_limits
+from ns_abstract.methods.splat.projection_errors import columns, exponent_limits
 from ns_abstract.methods.splat.stage_data import (
     CellPoses,
     Colors,
@@ -55,12 +55,12 @@ PAIR_LIMIT = 30_000
 
 
 @contextmanager
-def alone(stage: str) -> Iterator[None]:
+def compile_alone(stage: str) -> Iterator[None]:
     """Replace all `STAGES` but one by no-ops inside the block, so that only that one is compiled.
 
     What `SplatBounds.cell` then returns is no bound of anything.
     """
-    kept = {name: globals()[name] for name in STAGES}
+    stages = {name: globals()[name] for name in STAGES}
     nothing = {name: lambda *arguments: None for name in STAGES}
     # nothing is seen
     nothing["gaussian_stage"] = lambda *arguments: arguments[-1].fill(0)
@@ -68,7 +68,7 @@ def alone(stage: str) -> Iterator[None]:
     try:
         yield
     finally:
-        globals().update(kept)
+        globals().update(stages)
 
 
 @dataclass
@@ -189,16 +189,16 @@ class SplatBounds:
     def _buffer(self, name: str, shape: tuple[int, ...], dtype: type = np.float64) -> np.ndarray:
         """Uninitialised memory that begins with a cache line and is kept from call to call of the same lane."""
         size, key = math.prod(shape), (lane(), name)
-        kept = self._buffers.get(key)
-        if kept is None or kept.size < size:
+        buffer = self._buffers.get(key)
+        if buffer is None or buffer.size < size:
             room = np.empty(size * np.dtype(dtype).itemsize + 64, np.uint8)
             start = -room.ctypes.data % 64
-            kept = self._buffers[key] = room[start : start + room.size - 64].view(dtype)
-        return kept[:size].reshape(shape)
+            buffer = self._buffers[key] = room[start : start + room.size - 64].view(dtype)
+        return buffer[:size].reshape(shape)
 
     def cell(
         self,
-        camera: Camera,
+        camera: PinholeCamera,
         forms: PoseForms,
         wanted: np.ndarray | None = None,
         candidates: np.ndarray | None = None,
@@ -254,7 +254,7 @@ class SplatBounds:
         mask = tile_mask(wanted, across * down)
         offsets, entries = tile_lists(depth_order(alive, gaussians.depth), gaussians.tiles, mask, across)
         shaped = (wanted.size, self.side, self.side, 3)
-        found = PixelBounds(
+        pixel_bounds = PixelBounds(
             lower=np.zeros(shaped),
             upper=np.zeros(shaped),
             linear=np.zeros((wanted.size if keep_linear else 0, *shaped[1:], m + 1)),
@@ -269,7 +269,7 @@ class SplatBounds:
             common = np.ascontiguousarray(offset[: m + 1, 2])
         pixel_stage(
             TileLists(wanted, offsets, entries),
-            pixel_sets(np.broadcast_to(True, found.lower.shape[:3]) if pixels is None else pixels),
+            pixel_sets(np.broadcast_to(True, pixel_bounds.lower.shape[:3]) if pixels is None else pixels),
             gaussians,
             self._viewing_axes(forms, rotation_magnitude, gaussians),
             view,
@@ -279,14 +279,14 @@ class SplatBounds:
             self._cutoffs(floor),
             shape,
             cell_parts(np.ones(d, np.int64) if parts is None else parts),
-            found,
+            pixel_bounds,
         )
         return CellBounds(
-            wanted, found.lower, found.upper,
-            *marked(found.marks, candidates, gaussians.box, gaussians.tiles, self.side),
-            found.linear if keep_linear else None, found.layers if layers else None,
-            found.slopes.sum(axis=0) / (max(wanted.size, 1) * self.side**2 * 3),
-            found.statistics.sum(axis=0),
+            wanted, pixel_bounds.lower, pixel_bounds.upper,
+            *visible_again(pixel_bounds.marks, candidates, gaussians.box, gaussians.tiles, self.side),
+            pixel_bounds.linear if keep_linear else None, pixel_bounds.layers if layers else None,
+            pixel_bounds.slopes.sum(axis=0) / (max(wanted.size, 1) * self.side**2 * 3),
+            pixel_bounds.statistics.sum(axis=0),
         )  # fmt: skip
 
     def _room(self, n: int, m: int) -> ProjectedGaussians:
@@ -363,13 +363,13 @@ class SplatBounds:
         if not np.any(position.linear) and float(position.radius.max()) < STILL_POSITION:
             position_error += 2.0 * float(position.radius.max())
             view = (*position.center.tolist(), position_error)
-            seen = self._seen_from.get(lane())
-            if seen is None or seen[0] != view:
+            cached = self._seen_from.get(lane())
+            if cached is None or cached[0] != view:
                 # of every Gaussian: cells that only turn the camera share them
                 colors = self._buffer("colors", (splats.count, 6))
                 fixed_colors(scene, position.center, position_error, self.charges, colors)
-                seen = self._seen_from[lane()] = view, colors
-            colors = seen[1]
+                cached = self._seen_from[lane()] = view, colors
+            colors = cached[1]
             return colors if n == splats.count else gathered(colors, candidates, alive, self._buffer("some", (n, 6)))
         indices = np.empty((alive.size, 2), np.int64)
         indices[:, 0], indices[:, 1] = alive, candidates[alive]
@@ -414,5 +414,5 @@ def _shifted_colors(varied: VariedSplats, charges: Charges) -> np.ndarray | None
     size = color + np.maximum(np.abs(varied.color_low), np.abs(varied.color_high))
     # one addition and the ends' own rounding
     radius = 0.5 * (high - low) + (charges.shifted_color + SHIFTED_ROUNDING) * size
-    found = np.stack([np.where(moved, 0.5 * (low + high), color), np.where(moved, radius, 0.0)], axis=-1)
-    return np.ascontiguousarray(found.reshape(-1, 6))
+    colors = np.stack([np.where(moved, 0.5 * (low + high), color), np.where(moved, radius, 0.0)], axis=-1)
+    return np.ascontiguousarray(colors.reshape(-1, 6))

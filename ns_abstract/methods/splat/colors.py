@@ -14,9 +14,9 @@ from ns_abstract.arithmetic.simd.intrinsics import advanced, borrowed, pointer, 
 from ns_abstract.arithmetic.simd.wide_forms import size
 from ns_abstract.methods.splat.form_colors import WORKSPACE, form_colors
 from ns_abstract.methods.splat.line_colors import accumulate_line, basis_line, directions_line
-from ns_abstract.methods.splat.records import LANES
-from ns_abstract.methods.splat.sharing import CHUNK, chunked
+from ns_abstract.methods.splat.projection_errors import LANES
 from ns_abstract.methods.splat.stage_data import FormShape, SceneColors
+from ns_abstract.methods.splat.work_sharing import CHUNK, run_in_chunks
 
 #: Largest change of each basis function per unit change of the direction, rounded up.
 _SLOPE = np.array(
@@ -28,7 +28,7 @@ _SIZE = np.array(
 )
 
 
-class _Scratch(NamedTuple):
+class _ColorScratch(NamedTuple):
     """Memory for a block of `LANES` Gaussians.
 
     Attributes:
@@ -47,13 +47,13 @@ class _Scratch(NamedTuple):
 
 def color_magnitudes(sh: np.ndarray, degree: int) -> np.ndarray:
     """[N, 6] by channel: most that ``sh`` [N, K, 3] can add up to, and most that it changes by with the direction."""
-    found = np.zeros((sh.shape[0], 6))
+    magnitudes = np.zeros((sh.shape[0], 6))
     for k in range((degree + 1) * (degree + 1)):
         sizes = np.abs(sh[:, k])
-        found[:, :3] += _SIZE[k] * sizes
-        found[:, 3:] += _SLOPE[k] * sizes
+        magnitudes[:, :3] += _SIZE[k] * sizes
+        magnitudes[:, 3:] += _SLOPE[k] * sizes
     # rounding of the sums
-    return found * MAGNITUDE_UP
+    return magnitudes * MAGNITUDE_UP
 
 
 @njit(cache=True, error_model="numpy")
@@ -171,7 +171,7 @@ def fixed_colors(
         charges: For the program's rounding.
         colors: The output.
     """
-    chunked(_fixed_worker, scene.means.shape[0], scene, position, position_error, charges, colors)
+    run_in_chunks(_fixed_worker, scene.means.shape[0], scene, position, position_error, charges, colors)
 
 
 @njit(cache=True, error_model="numpy")
@@ -282,7 +282,7 @@ def _moving_worker(counter_, indices, scene, position, origin, position_error, c
     wide_ = np.empty(WORKSPACE * size(m))
     numbers_ = np.empty(LANES, np.int64)
     work, numbers = borrowed(work_), borrowed(numbers_)
-    scratch = _Scratch(
+    scratch = _ColorScratch(
         borrowed(work_.reshape(-1)), borrowed(wide_), borrowed(ends_[0]), borrowed(ends_[1]), borrowed(ends_[2]),
         borrowed(ends_[3]),
     )  # fmt: skip
@@ -325,4 +325,6 @@ def moving_colors(
         shape: Of the forms of ``position``.
         colors: [., 3 (m + 1)] output: coefficients and radius by channel.
     """
-    chunked(_moving_worker, indices.shape[0], indices, scene, position, origin, position_error, charges, shape, colors)
+    run_in_chunks(
+        _moving_worker, indices.shape[0], indices, scene, position, origin, position_error, charges, shape, colors
+    )

@@ -23,7 +23,8 @@ from ns_abstract.arithmetic.rounding import (
 from ns_abstract.arithmetic.simd.intrinsics import advanced, lowest_bit, signed
 from ns_abstract.arithmetic.simd.lanes import maximum, minimum, store
 from ns_abstract.methods.splat.blend import blend_quadratic, blend_several, flattened, form_range
-from ns_abstract.methods.splat.block import (
+from ns_abstract.methods.splat.lists import BLOCK
+from ns_abstract.methods.splat.pixel_block import (
     ALPHA_HIGH,
     FORM,
     OPEN,
@@ -32,7 +33,6 @@ from ns_abstract.methods.splat.block import (
     color_size,
     listed_fragment,
 )
-from ns_abstract.methods.splat.lists import BLOCK
 
 #: Lanes of accumulation and depth.
 _SUM, DEPTH = 0, 3
@@ -239,5 +239,5 @@ def shade_layers(pixels, left, above, block, inputs, bounds):
         size = max(abs(low), abs(high))
         off = common[m] + charges.expected_depth * size + DEPTH_ROUNDING * (all_of_it + size)
         low, high = low - off, high + off
-        known = low <= high and math.isfinite(high - low)
-        layers[DEPTH_LOW], layers[DEPTH_HIGH] = max(low if known else 0.0, 0.0), high if known else np.inf
+        is_bounded = low <= high and math.isfinite(high - low)
+        layers[DEPTH_LOW], layers[DEPTH_HIGH] = max(low if is_bounded else 0.0, 0.0), high if is_bounded else np.inf

@@ -16,7 +16,7 @@ from ns_abstract.arithmetic.simd.wide_forms import (
     size,
     square,
 )
-from ns_abstract.methods.splat.records import LANES
+from ns_abstract.methods.splat.projection_errors import LANES
 
 # numbers of the forms in the workspace: directions, then unit ones and their products
 (

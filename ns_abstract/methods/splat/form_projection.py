@@ -22,8 +22,8 @@ from ns_abstract.arithmetic.simd.wide_forms import (
     size,
     square,
 )
-from ns_abstract.methods.splat import records as row
-from ns_abstract.methods.splat.records import LANES
+from ns_abstract.methods.splat import projection_errors as row
+from ns_abstract.methods.splat.projection_errors import LANES
 
 # numbers of the forms in the workspace; behind _LOG stands the logarithm's scratch
 (

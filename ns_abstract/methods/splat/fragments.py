@@ -16,7 +16,8 @@ from ns_abstract.arithmetic.rounding import ORDER_ROUNDING, REGION, TURN_ROOM, U
 from ns_abstract.arithmetic.simd.intrinsics import advanced, lowest_bit, pointer, prefetch, signed
 from ns_abstract.arithmetic.simd.lanes import load8, maximum, minimum, root, spans, store, where
 from ns_abstract.methods.splat.alphas import alphas
-from ns_abstract.methods.splat.block import (
+from ns_abstract.methods.splat.lists import AHEAD, BLOCK, PIXELS
+from ns_abstract.methods.splat.pixel_block import (
     ALPHA_HIGH,
     ALPHA_LOW,
     BATCH,
@@ -37,8 +38,7 @@ from ns_abstract.methods.splat.block import (
     longest_list,
     set_unknown,
 )
-from ns_abstract.methods.splat.lists import AHEAD, BLOCK, PIXELS
-from ns_abstract.methods.splat.records import EXPONENT_LIMIT, FORMS, MEAN_X, MEAN_Y, SPREAD, UNBOUNDED
+from ns_abstract.methods.splat.projection_errors import EXPONENT_LIMIT, FORMS, MEAN_X, MEAN_Y, SPREAD, UNBOUNDED
 
 #: Pixel q of a block lies in row q >> _ROW_SHIFT; sets of pixels are the bits of an int64.
 _ROW_SHIFT = BLOCK.bit_length() - 1
@@ -47,7 +47,7 @@ GIVE_UP = -1
 GROW = -2
 
 
-class _Listed(NamedTuple):
+class _BlockList(NamedTuple):
     """A block's list of Gaussians, nearest first, with pointers to their `ProjectedGaussians`.
 
     Attributes:
@@ -74,13 +74,13 @@ class _Listed(NamedTuple):
     m: int
 
 
-class _Window(NamedTuple):
+class _DepthWindow(NamedTuple):
     """How far apart in depth list positions may change places (O1).
 
     Attributes:
         room: Positions i, j keep their order where ``room |depth_i - depth_j| > radius_i + radius_j``; if not positive,
             nothing is known.
-        largest: Largest `Entries.depth_radius` of all but the few positions in ``far``.
+        largest: Largest `ListEntries.depth_radius` of all but the few positions in ``far``.
         far: How many these are.
         farthest: Their largest one.
     """
@@ -91,7 +91,7 @@ class _Window(NamedTuple):
     farthest: float
 
 
-class _Stop(NamedTuple):
+class _EarlyTermination(NamedTuple):
     """Bounds on the transmittance of early termination, the transmittance below which tracking ends, and rounding."""
 
     low: float
@@ -143,7 +143,7 @@ def _steadiness(along):
 def _depth_radii(numbers, gaussians, slope, ray, m, entries):
     """How far in depth each entry may move against the block's central ray (design.md, O1).
 
-    Fills ``entries.depth_radius`` and ``entries.depth``; returns `_Window.room` and `_Window.largest`.
+    Fills ``entries.depth_radius`` and ``entries.depth``; returns `_DepthWindow.room` and `_DepthWindow.largest`.
     """
     depth, delta, depth_error = gaussians.depth, gaussians.delta, gaussians.depth_error
     radii, deep = entries.depth_radius, entries.depth
@@ -181,7 +181,7 @@ def _depth_radii(numbers, gaussians, slope, ray, m, entries):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _start(numbers, inputs, block):
-    """Reset a block's pixels and list positions; returns the `_Window`."""
+    """Reset a block's pixels and list positions; returns the `_DepthWindow`."""
     entries, per_pixel, lengths = block.entries, block.fragments.per_pixel, block.fragments.lengths
     for q in range(PIXELS):
         per_pixel[TLO + q] = 1.0
@@ -208,7 +208,7 @@ def _start(numbers, inputs, block):
     # row 0 is for fragments that do not move
     for r in range(MOVES):
         block.reordering.moves[r] = 0.0
-    return _Window(room, largest, far, farthest)
+    return _DepthWindow(room, largest, far, farthest)
 
 
 @njit(cache=True, error_model="numpy")
@@ -277,12 +277,12 @@ def _pixels_once(k, listed, entries, per_pixel):
 
 
 @njit(cache=True, error_model="numpy")
-def _pixels_at(found, pixels):
+def _pixels_at(lanes, pixels):
     """The set of the pixels that stand in the lanes ``found``."""
     at = 0
-    while found != 0:
-        at |= 1 << int(pixels[lowest_bit(found)])
-        found &= found - 1
+    while lanes != 0:
+        at |= 1 << int(pixels[lowest_bit(lanes)])
+        lanes &= lanes - 1
     return signed(at)
 
 
@@ -294,7 +294,7 @@ def _find_pairs(k, found, pixels, listed, entries, per_pixel, window, reordering
     """
     radii, deep, far, pairs = entries.depth_radius, entries.depth, entries.far, reordering.pairs
     i = listed.numbers[k]
-    shown = 0
+    pixel_set = 0
     beyond = listed.length
     near = radii[k] + window.largest
     # those within the window, then those that reach far
@@ -319,10 +319,10 @@ def _find_pairs(k, found, pixels, listed, entries, per_pixel, window, reordering
                 break
         if (deep[other] - deep[k]) * window.room > radii[k] + radii[other]:
             continue
-        if shown == 0:
-            shown = _pixels_at(found, pixels)
+        if pixel_set == 0:
+            pixel_set = _pixels_at(found, pixels)
         theirs = _pixels_once(other, listed, entries, per_pixel)
-        if shown & int(theirs) == 0 or not _uncertain(i, listed.numbers[other], listed):
+        if pixel_set & int(theirs) == 0 or not _uncertain(i, listed.numbers[other], listed):
             continue
         if count >= reordering.pair_limit:
             return -1
@@ -335,12 +335,12 @@ def _find_pairs(k, found, pixels, listed, entries, per_pixel, window, reordering
 
 
 @njit(cache=True, error_model="numpy")
-def _still_live(found, pixels, live):
+def _still_live(lanes, pixels, live):
     """Those lanes of ``found`` whose pixel is in ``live``."""
     left = 0
-    while found != 0:
-        lane = lowest_bit(found)
-        found &= found - 1
+    while lanes != 0:
+        lane = lowest_bit(lanes)
+        lanes &= lanes - 1
         if live & (1 << int(pixels[lane])) != 0:
             left |= 1 << lane
     return left
@@ -364,7 +364,7 @@ def _append(number, q, k, t_low, t_high, fragments):
 
 
 @njit(cache=True, error_model="numpy")
-def _keep_drawn(found, pixels, number, k, fragments, stop):
+def _keep_drawn(lanes, pixels, number, k, fragments, stop):
     """Keep the fragments of a Gaussian whose place is certain in those lanes of ``found`` that leave enough light.
 
     Lane b is fragment ``number + b`` on the pixel ``pixels[b]``. Returns the other lanes.
@@ -372,9 +372,9 @@ def _keep_drawn(found, pixels, number, k, fragments, stop):
     per_pixel, values = fragments.per_pixel, fragments.values
     bright = max(stop.high, stop.floor)
     rest = 0
-    while found != 0:
-        lane = lowest_bit(found)
-        found &= found - 1
+    while lanes != 0:
+        lane = lowest_bit(lanes)
+        lanes &= lanes - 1
         q = int(pixels[lane])
         at = (number + lane) * fragments.width
         t_low = per_pixel[TLO + q] * (1.0 - values[at + ALPHA_HIGH]) * stop.shrink
@@ -387,16 +387,16 @@ def _keep_drawn(found, pixels, number, k, fragments, stop):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _keep_alone(found, pixels, number, k, fragments, stop, live, dim, m):
+def _keep_alone(lanes, pixels, number, k, fragments, stop, live, dim, m):
     """`_keep_drawn` for lanes that a stop may hide (B6).
 
     Returns ``live`` without the pixels that surely stop, and ``dim`` with those that get too little light.
     """
     per_pixel, values = fragments.per_pixel, fragments.values
     dark = max(stop.low, stop.floor)
-    while found != 0:
-        lane = lowest_bit(found)
-        found &= found - 1
+    while lanes != 0:
+        lane = lowest_bit(lanes)
+        lanes &= lanes - 1
         q = int(pixels[lane])
         at = (number + lane) * fragments.width
         high = values[at + ALPHA_HIGH]
@@ -421,7 +421,7 @@ def _keep_alone(found, pixels, number, k, fragments, stop, live, dim, m):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _keep_moving(found, pixels, number, k, slot, block, stop, dim, moved):
+def _keep_moving(lanes, pixels, number, k, slot, block, stop, dim, moved):
     """Keep the fragments of slot ``slot``, whose place is uncertain; ``dim`` and the number of moves with theirs."""
     fragments, entries, reordering = block.fragments, block.entries, block.reordering
     per_pixel, values = fragments.per_pixel, fragments.values
@@ -429,9 +429,9 @@ def _keep_moving(found, pixels, number, k, slot, block, stop, dim, moved):
     reordering.slots[k] = slot
     reordering.owners[slot] = k
     drawn = 0
-    while found != 0:
-        lane = lowest_bit(found)
-        found &= found - 1
+    while lanes != 0:
+        lane = lowest_bit(lanes)
+        lanes &= lanes - 1
         q = int(pixels[lane])
         at = (number + lane) * fragments.width
         t_low = per_pixel[TLO + q] * (1.0 - values[at + ALPHA_HIGH]) * stop.shrink
@@ -500,7 +500,7 @@ def _colors_behind(first, listed, colors, channels, palette, marks):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _place_batch(start, some, live, listed, inputs, block):
-    """Find the pixels of `Batch` for ``some`` positions from ``start`` on that they may be drawn on.
+    """Find the pixels of `FragmentBatch` for ``some`` positions from ``start`` on that they may be drawn on.
 
     Returns how many there are.
     """
@@ -534,7 +534,7 @@ def _place_batch(start, some, live, listed, inputs, block):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _find_alphas(start, some, used, place, listed, inputs, block):
-    """Write the alphas of `_place_batch`'s positions: fragments from number ``used`` on, and `Batch.found`."""
+    """Write the alphas of `_place_batch`'s positions: fragments from number ``used`` on, and `FragmentBatch.found`."""
     batch = block.batch
     for b in range(some):
         i = listed.numbers[start + b]
@@ -549,9 +549,9 @@ def _find_alphas(start, some, used, place, listed, inputs, block):
                 and core[2] <= place.tile_y
                 and place.tile_y < core[3]
             )
-            given = (used + begin) * block.fragments.width
+            offset = (used + begin) * block.fragments.width
             record = advanced(listed.record, i * listed.columns)
-            batch.found[b] = alphas(record, begin, n, given, sure, block, inputs)
+            batch.found[b] = alphas(record, begin, n, offset, sure, block, inputs)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -588,14 +588,16 @@ def collect_fragments(numbers, place, inputs, block, marks_):
     fragments, entries, reordering, batch = block.fragments, block.entries, block.reordering, block.batch
     gaussians, charges, m = inputs.gaussians, inputs.charges, inputs.shape.monomials
     colors, channels, marks = inputs.colors.values, inputs.colors.channels, pointer(marks_)
-    listed = _Listed(
+    listed = _BlockList(
         pointer(numbers), numbers.size, pointer(gaussians.record), gaussians.record.shape[1], pointer(gaussians.box),
         pointer(gaussians.tiles), pointer(gaussians.delta), pointer(gaussians.depth_error),
         pointer(inputs.axes.depth), inputs.axes.tied, place.x0, place.y0, m,
     )  # fmt: skip
     length, capacity, color_columns = listed.length, fragments.capacity, colors.shape[1]
     stop_light, step = inputs.rules.transmittance_min, charges.transmittance
-    stop = _Stop(stop_light * (1.0 - step), stop_light * (1.0 + step), inputs.cutoffs.floor, 1.0 - step, 1.0 + step)
+    stop = _EarlyTermination(
+        stop_light * (1.0 - step), stop_light * (1.0 + step), inputs.cutoffs.floor, 1.0 - step, 1.0 + step
+    )
     window = _start(numbers, inputs, block)
     if not window.room > 0.0:
         return GIVE_UP, 0
@@ -613,16 +615,16 @@ def collect_fragments(numbers, place, inputs, block, marks_):
             return GROW, 0
         _find_alphas(start, some, used, place, listed, inputs, block)
         for b in range(some):
-            found = batch.found[b]
+            lanes = batch.found[b]
             begin = batch.begins[b]
             pixels = advanced(batch.pixels, begin)
             if live != begun:
-                found = _still_live(found, pixels, live)
-            if found == 0:
+                lanes = _still_live(lanes, pixels, live)
+            if lanes == 0:
                 continue
             k = start + b
             i = listed.numbers[k]
-            pairs = _find_pairs(k, found, pixels, listed, entries, fragments.per_pixel, window, reordering, pairs)
+            pairs = _find_pairs(k, lanes, pixels, listed, entries, fragments.per_pixel, window, reordering, pairs)
             if pairs < 0:
                 return GIVE_UP, 0
             # threads share these bytes: written no more than once each
@@ -631,12 +633,12 @@ def collect_fragments(numbers, place, inputs, block, marks_):
             color = advanced(pointer(colors), i * color_columns)
             _set_colors(block.palette, k, color, color_columns // channels, channels)
             if entries.first[k] == k and entries.last[k] == k:
-                found = _keep_drawn(found, pixels, used + begin, k, fragments, stop)
-                live, dim = _keep_alone(found, pixels, used + begin, k, fragments, stop, live, dim, m)
+                lanes = _keep_drawn(lanes, pixels, used + begin, k, fragments, stop)
+                live, dim = _keep_alone(lanes, pixels, used + begin, k, fragments, stop, live, dim, m)
             else:
                 if slots >= 2 * capacity or moved + PIXELS > 32 * capacity:
                     return GROW, 0
-                dim, moved = _keep_moving(found, pixels, used + begin, k, slots, block, stop, dim, moved)
+                dim, moved = _keep_moving(lanes, pixels, used + begin, k, slots, block, stop, dim, moved)
                 slots += 1
             live, missing = _hide_dim(dim & live, k, length, live, missing, fragments, stop.low)
         if live == 0:

@@ -12,13 +12,13 @@ import numpy as np
 
 from ns_abstract.arithmetic.outward import outward
 from ns_abstract.arithmetic.rounding import LINEAR_ROUNDING, LINEAR_UP, Arithmetic
-from ns_abstract.execution.ending import checkpoint
+from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.execution.threads import each
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.poses import PoseSet, translation_only
+from ns_abstract.geometry.poses import PoseBox, translation_only
 from ns_abstract.geometry.tiles import laid_out, tile_grid
 from ns_abstract.methods.splat.activate import Splats
-from ns_abstract.methods.splat.bounds import STAGES, SceneSums, SplatBounds, alone
+from ns_abstract.methods.splat.bounds import STAGES, SceneSums, SplatBounds, compile_alone
 from ns_abstract.methods.splat.constants import Rasteriser
 from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW, DEPTH_HIGH, DEPTH_LOW
 from ns_abstract.methods.splat.lists import summed_area, touching
@@ -59,7 +59,7 @@ _TUNING = FrameTuning()
 
 
 @dataclass(frozen=True)
-class Context:
+class VisibleContext:
     """The Gaussians that a cell may show on the requested pixels, reused for the cells inside it.
 
     Attributes:
@@ -96,14 +96,14 @@ class TileBounds:
     lower: np.ndarray
     upper: np.ndarray
     slopes: np.ndarray
-    context: Context
+    context: VisibleContext
     linear: LinearSets | None
     trivial: int
 
 
 @dataclass(frozen=True)
-class SplatMember:
-    """A scene of a frame's set; see `ns_abstract.refine.protocol.Member`.
+class SplatSample:
+    """A scene of a frame's set; see `ns_abstract.refine.protocol.SceneSample`.
 
     Attributes:
         frame: The frame.
@@ -118,29 +118,29 @@ class SplatMember:
     def __call__(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
         return self.frame.drawn(values, tiles, self.splats)
 
-    def pushed(
+    def signed_gradient_step(
         self, box: ParameterBox, values: np.ndarray, score: Score, size: float
-    ) -> tuple[np.ndarray, SplatMember]:
-        from ns_abstract.methods.splat.descent import pushed
+    ) -> tuple[np.ndarray, SplatSample]:
+        from ns_abstract.methods.splat.signed_steps import signed_gradient_step
 
         frame = self.frame
         if self.reference is None:
             return values, self
-        values, splats = pushed(
+        values, splats = signed_gradient_step(
             self.reference(), frame.pose_set, frame.varied, box, np.asarray(values, np.float64), self.splats,
             lambda show, pose: score(show(None), pose), size,
         )  # fmt: skip
-        return values, SplatMember(frame, splats, self.reference)
+        return values, SplatSample(frame, splats, self.reference)
 
     @property
-    def nearest(self) -> SplatMember:
-        return SplatMember(self.frame, self.frame.varied.nearest, self.reference)
+    def nearest(self) -> SplatSample:
+        return SplatSample(self.frame, self.frame.varied.nearest, self.reference)
 
     @property
     def arrays(self) -> dict[str, np.ndarray]:
         counts, splats = self.frame.varied.counts, self.splats
-        found = {"mean": splats.means, "opacity": splats.opacity, "color": splats.color_shift}
-        return {name: array for name, array in found.items() if counts[name]}
+        arrays = {"mean": splats.means, "opacity": splats.opacity, "color": splats.color_shift}
+        return {name: array for name, array in arrays.items() if counts[name]}
 
 
 class SplatFrame:
@@ -155,7 +155,7 @@ class SplatFrame:
         slanted: Whether cells may be slanted, so that rotations make up for what other parameters move (P2). Their
             parameters are then not those of ``pose_set``.
         layers: Whether accumulation and expected depth stand behind the colours, in renders and bounds.
-        reference: Makes the renderer with gradients, for steps of `members`.
+        reference: Makes the renderer with gradients, for steps of `scene_samples`.
         sums: See `SplatBounds`.
     """
 
@@ -171,10 +171,10 @@ class SplatFrame:
         splats: Splats,
         rasteriser: Rasteriser,
         arithmetic: Arithmetic,
-        pose_set: PoseSet,
+        pose_set: PoseBox,
         order: int | None = None,
         varied: VariedSplats | None = None,
-        slanted: bool = False,
+        sheared: bool = False,
         layers: bool = False,
         reference: Callable[[], Reference] | None = None,
         sums: SceneSums | None = None,
@@ -192,7 +192,7 @@ class SplatFrame:
         self._stop = rasteriser.transmittance_min
         self._floor = -1.0
         self.across, self.down = tile_grid(self.camera, self.side)
-        if slanted and (shear := self._shear()):
+        if sheared and (shear := self._shear()):
             self.pose_set = pose_set.sheared(shear)
             self.box = self.pose_set.box
 
@@ -209,14 +209,14 @@ class SplatFrame:
         if stage is None:
             self.bound(box, np.arange(1))
         elif stage != "render":
-            with alone(stage):
+            with compile_alone(stage):
                 self.bound(box, np.arange(1))
         if stage in (None, "render"):
             self.render(box.middle)
 
     def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
         """Tiles [t, side, side, channels] float32 of the concrete image at parameter values [d]."""
-        checkpoint()
+        check_cancelled()
         return self.drawn(values, tiles, None)
 
     def drawn(self, values: np.ndarray, tiles: np.ndarray | None, member: Splats | None) -> np.ndarray:
@@ -228,11 +228,11 @@ class SplatFrame:
         draw = self.renderer.tiles if self.channels == COLORS else self.renderer.layer_tiles
         return draw(self.camera, *self.pose_set.world_to_camera(values), tiles, member)
 
-    def members(self, seed: int) -> Iterator[SplatMember]:
+    def scene_samples(self, seed: int) -> Iterator[SplatSample]:
         """Other scenes of the set, without end; none where nothing varies."""
         if self.varied.varies:
-            for splats in self.varied.members(np.random.default_rng(seed)):
-                yield SplatMember(self, splats, self._reference)
+            for splats in self.varied.scene_samples(np.random.default_rng(seed)):
+                yield SplatSample(self, splats, self._reference)
 
     def set_tolerance(self, excess: float) -> float:
         """Let later bounds be looser by a small part of ``excess`` on average, where that saves time (B6).
@@ -247,13 +247,13 @@ class SplatFrame:
     def observe(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
         """Bounds do not depend on what was rendered."""
 
-    def plan(self, shown: int | None, lower: np.ndarray, upper: np.ndarray) -> list[str]:
+    def plan(self, visible: int | None, lower: np.ndarray, upper: np.ndarray) -> list[str]:
         """What was left out for this frame, given what refinement found."""
         varied = self.varied
         total, plan = varied.nearest.count, []
-        if shown is not None and shown < total:
+        if visible is not None and visible < total:
             plan.append(
-                f"{total - shown:,} of {total:,} Gaussians left out: no pose of the set shows them "
+                f"{total - visible:,} of {total:,} Gaussians left out: no pose of the set shows them "
                 "(behind, beside, hidden by others or below the alpha threshold)"
             )
         for quantity, name in (("mean", "mean"), ("opacity", "opacity"), ("color", "colour")):
@@ -266,18 +266,18 @@ class SplatFrame:
         return plan
 
     def feasible(self, box: ParameterBox) -> ParameterBox | None:
-        """See `PoseSet.feasible`."""
+        """See `PoseBox.feasible`."""
         return self.pose_set.feasible(box)
 
     def bound(
-        self, box: ParameterBox, tiles: np.ndarray, within: Context | None = None, keep_linear: bool = False,
+        self, box: ParameterBox, tiles: np.ndarray, within: VisibleContext | None = None, keep_linear: bool = False,
         pixels: np.ndarray | None = None,
     ) -> TileBounds:  # fmt: skip
         """See `ns_abstract.refine.protocol.Frame.bound`, and `bound_parts` for ``pixels``."""
         return self._bound(box, tiles, within, self.candidates(tiles, within, pixels), keep_linear, pixels)
 
     def bound_parts(
-        self, boxes: Sequence[ParameterBox], tiles: np.ndarray, within: Context | None, keep_linear: bool,
+        self, boxes: Sequence[ParameterBox], tiles: np.ndarray, within: VisibleContext | None, keep_linear: bool,
         pixels: np.ndarray | None,
     ) -> list[TileBounds]:  # fmt: skip
         """See `ns_abstract.refine.protocol.PartsFrame`."""
@@ -285,11 +285,11 @@ class SplatFrame:
         return each(lambda box: self._bound(box, tiles, within, candidates, keep_linear, pixels), boxes)
 
     def _bound(
-        self, box: ParameterBox, tiles: np.ndarray, within: Context | None, candidates: np.ndarray | None,
+        self, box: ParameterBox, tiles: np.ndarray, within: VisibleContext | None, candidates: np.ndarray | None,
         keep_linear: bool, pixels: np.ndarray | None,
     ) -> TileBounds:  # fmt: skip
         """`bound`, given what may be seen there."""
-        checkpoint()
+        check_cancelled()
         forms = self.pose_set.enclosure(box, self.order)
         layers = self.channels > COLORS
         parts = None if keep_linear or layers else self._parts(box)
@@ -302,8 +302,8 @@ class SplatFrame:
             lower, upper = np.concatenate([lower, low], axis=-1), np.concatenate([upper, high], axis=-1)
         lower, upper = outward(lower, upper)
         # hardly smaller: not worth its memory
-        kept = within is not None and cell.visible.size > _TUNING.worth_keeping * within.visible.size
-        context = within if within is not None and kept else Context(cell.visible, cell.reach)
+        hands_on = within is not None and cell.visible.size > _TUNING.worth_keeping * within.visible.size
+        context = within if within is not None and hands_on else VisibleContext(cell.visible, cell.reach)
         linear = None
         if keep_linear:
             assert cell.linear is not None
@@ -338,7 +338,9 @@ class SplatFrame:
         rate = slopes[parts > 1].sum() / moved[parts > 1].sum()
         return np.where(parts > 1, slopes, rate * moved)
 
-    def candidates(self, tiles: np.ndarray, within: Context | None, pixels: np.ndarray | None) -> np.ndarray | None:
+    def candidates(
+        self, tiles: np.ndarray, within: VisibleContext | None, pixels: np.ndarray | None
+    ) -> np.ndarray | None:
         """What may be seen on ``pixels`` of ``tiles`` in a cell ``within`` another; None: everything."""
         if within is None:
             return None
@@ -355,18 +357,18 @@ class SplatFrame:
         names = [name for name in ROTATIONS if name in box.names]
         others = [name for name in box.names if name not in ROTATIONS]
         means, width = self._typical_means(), np.array(box.upper) - np.array(box.lower)
-        here, seen = self._seen(middle, means)
-        if not names or not others or not seen.any():
+        here, visible = self._seen(middle, means)
+        if not names or not others or not visible.any():
             return {}
 
         def moved(name: str) -> np.ndarray:
             step = np.zeros(box.dimensions)
             step[box.names.index(name)] = _TUNING.motion_step * width[box.names.index(name)]
-            return ((self._project(middle + step, means)[0] - here)[seen] / step.sum()).ravel()
+            return ((self._project(middle + step, means)[0] - here)[visible] / step.sum()).ravel()
 
         turns, shifts = (np.stack([moved(name) for name in group], axis=1) for group in (names, others))
         factors = -np.linalg.lstsq(turns, shifts, rcond=None)[0]
-        found: dict[str, dict[str, float]] = {}
+        shears: dict[str, dict[str, float]] = {}
         # few bits: the last ones depend on the library's threads, results must not
         mantissa, exponent = np.frexp(factors)
         factors = np.ldexp(np.round(mantissa * 256.0), exponent - 8)
@@ -378,8 +380,8 @@ class SplatFrame:
                 if math.isfinite(factor) and abs(factor) * width[box.names.index(other)] > least
             }
             if useful:
-                found[name] = useful
-        return found
+                shears[name] = useful
+        return shears
 
     def _typical_means(self) -> np.ndarray:
         means = self.bounds.splats.means
@@ -399,22 +401,22 @@ class SplatFrame:
         low, high = np.array(box.lower), np.array(box.upper)
         total = np.zeros(d)
         for values in (box.middle, *box.sample(_TUNING.motion_poses - 1, np.random.default_rng(0))):
-            here, seen = self._seen(values, means)
-            if not seen.any():
+            here, visible = self._seen(values, means)
+            if not visible.any():
                 continue
             for k in range(d):
                 step = np.zeros(d)
                 step[k] = (high[k] - low[k]) * _TUNING.motion_step
                 there, _ = self._project(values + step, means)
-                moved = np.linalg.norm(there[seen] - here[seen], axis=1) / _TUNING.motion_step
+                moved = np.linalg.norm(there[visible] - here[visible], axis=1) / _TUNING.motion_step
                 total[k] = max(total[k], float(np.quantile(moved, 0.75)))
         return total
 
     def depths(self) -> np.ndarray:
         """[n] depths of typical Gaussians that lie in the picture of the middle pose."""
         means = self._typical_means()
-        _, seen = self._seen(self.box.middle, means)
-        return self._project(self.box.middle, means)[1][seen]
+        _, visible = self._seen(self.box.middle, means)
+        return self._project(self.box.middle, means)[1][visible]
 
     def _project(self, values: np.ndarray, means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         # as the parameters go on: taken back into the set, a shift would come without the turn that undoes it

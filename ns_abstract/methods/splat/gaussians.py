@@ -1,7 +1,7 @@
 """Per-Gaussian stage of the bounds: from pose forms to what a pixel needs (design.md, G1-G11).
 
 Gaussians that no pose of the cell shows are dropped, the others projected in blocks: by `line_projection` for one
-parameter and order 2, by `form_projection` otherwise. `records` tells what is left of each.
+parameter and order 2, by `form_projection` otherwise. `projection_errors` tells what is left of each.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from ns_abstract.arithmetic.simd.intrinsics import borrowed, pointer, signed, ta
 from ns_abstract.arithmetic.simd.lanes import bits, load8, scatter_columns, store, where
 from ns_abstract.arithmetic.simd.wide_forms import bounds, magnitude, size
 from ns_abstract.geometry.camera_path import Intrinsics
-from ns_abstract.methods.splat import records as row
+from ns_abstract.methods.splat import projection_errors as row
 from ns_abstract.methods.splat.constants import RasterRules
 from ns_abstract.methods.splat.form_projection import WORKSPACE, project_forms, rotate
 from ns_abstract.methods.splat.line_projection import compensate_line, project_line
-from ns_abstract.methods.splat.records import (
+from ns_abstract.methods.splat.projection_errors import (
     LANES,
     REGION,
     compensations,
@@ -32,7 +32,6 @@ from ns_abstract.methods.splat.records import (
     projected_stretch,
     regions,
 )
-from ns_abstract.methods.splat.sharing import CHUNK, chunked
 from ns_abstract.methods.splat.stage_data import (
     CellPoses,
     FormShape,
@@ -40,6 +39,7 @@ from ns_abstract.methods.splat.stage_data import (
     ProjectionInputs,
     SceneGaussians,
 )
+from ns_abstract.methods.splat.work_sharing import CHUNK, run_in_chunks
 
 
 def covariance_noise(axes: np.ndarray, charges: Charges) -> np.ndarray:
@@ -67,12 +67,12 @@ def covariance_noise(axes: np.ndarray, charges: Charges) -> np.ndarray:
     return out
 
 
-class _Scratch(NamedTuple):
+class _ProjectionScratch(NamedTuple):
     """Memory for a block of `LANES` Gaussians.
 
     Attributes:
         work: Forms of eight, flat; see `form_projection`.
-        rows: Rows of lanes, flat; see `records`.
+        rows: Rows of lanes, flat; see `projection_errors`.
         logarithms: [17, LANES] for `line_projection.compensate_line`.
         places: [LANES] where records go.
     """
@@ -107,13 +107,15 @@ def _stage_worker(counter_, candidates_, scene, poses, camera, rules, charges, s
         borrowed(out.record), borrowed(out.box), borrowed(out.tiles), borrowed(out.depth), borrowed(out.delta),
         borrowed(out.depth_error),
     )  # fmt: skip
-    owned = _Scratch(
+    owned = _ProjectionScratch(
         np.empty(WORKSPACE * size(inputs.shape.monomials)),
         np.empty(row.table_rows(out.record.shape[1]) * LANES),
         np.empty((17, LANES)),
         np.empty(LANES, np.int64),
     )
-    scratch = _Scratch(borrowed(owned.work), borrowed(owned.rows), borrowed(owned.logarithms), borrowed(owned.places))
+    scratch = _ProjectionScratch(
+        borrowed(owned.work), borrowed(owned.rows), borrowed(owned.logarithms), borrowed(owned.places)
+    )
     alive_, everyone_ = np.empty(CHUNK, np.int64), np.empty(CHUNK, np.int64)
     alive, everyone = borrowed(alive_), borrowed(everyone_)
     while True:
@@ -149,10 +151,12 @@ def gaussian_stage(
         rules: The rasteriser's.
         charges: For the program's rounding.
         shape: Of the poses' forms.
-        out: The output; ``out.record`` has `records.columns`.
+        out: The output; ``out.record`` has `projection_errors.columns`.
         state: [n] uint8 output: 1 if visible; else the candidate's row of ``out`` is not set.
     """
-    chunked(_stage_worker, candidates.shape[0], candidates, scene, poses, camera, rules, charges, shape, out, state)
+    run_in_chunks(
+        _stage_worker, candidates.shape[0], candidates, scene, poses, camera, rules, charges, shape, out, state
+    )
 
 
 @njit(cache=True, error_model="numpy")

@@ -14,7 +14,7 @@ from ns_abstract.arithmetic.elementary import exp_kernel, fma
 from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, UP
 from ns_abstract.arithmetic.simd.intrinsics import prefetch
 from ns_abstract.arithmetic.simd.lanes import LINE, lane_sum, load4, load8, maximum, minimum, store, where
-from ns_abstract.methods.splat.block import (
+from ns_abstract.methods.splat.pixel_block import (
     ALPHA_HIGH,
     ALPHA_LOW,
     EXPONENT,
@@ -29,7 +29,7 @@ from ns_abstract.methods.splat.stage_data import PART_LANES
 AHEAD = 2
 
 
-class Ends(NamedTuple):
+class BlendBounds(NamedTuple):
     """Bounds of a blend, and of the colours in it; lanes are channels."""
 
     low: Any
@@ -64,7 +64,7 @@ def blend_interval(behind, values, at, colors, ends):
     """One fragment over what is ``behind`` (design.md, B7); its colour's bounds stand at ``ends``."""
     a_low, a_high = values[at + ALPHA_LOW], values[at + ALPHA_HIGH]
     c_low, c_high = load4(colors, ends), load4(colors, ends + 4)
-    return Ends(
+    return BlendBounds(
         _least(behind.low, c_low, a_low, a_high), _most(behind.high, c_high, a_low, a_high),
         minimum(behind.darkest, c_low), maximum(behind.brightest, c_high),
     )  # fmt: skip
@@ -174,4 +174,4 @@ def blend_parts(begin, end, block, inputs, slopes):
             out[4 * side + channel] = value
         # the lane of nothing
         out[4 * side + 3] = 0.0
-    return Ends(load4(out, 0), load4(out, 4), darkest, brightest)
+    return BlendBounds(load4(out, 0), load4(out, 4), darkest, brightest)

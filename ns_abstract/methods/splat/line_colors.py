@@ -16,7 +16,7 @@ from ns_abstract.arithmetic.line_forms import (
     store,
 )
 from ns_abstract.arithmetic.rounding import SUM_ROUNDING, UP
-from ns_abstract.methods.splat.records import LANES
+from ns_abstract.methods.splat.projection_errors import LANES
 
 # Slots of the scratch of `colors.moving_colors` in one row; a slot has 6 rows of lanes.
 _X, _Y, _Z, _Z2, _C1, _S1, _C2, _S2, _BASIS, _SPARE, _RED = range(6 * 6 * LANES, 17 * 6 * LANES, 6 * LANES)
@@ -127,9 +127,9 @@ def _accumulated(s, n, weights, target):
     for q in range(n):
         w = abs(weights[q])
         basis = load(s, _BASIS, LANES, q)
-        found = load(s, target, LANES, q)
-        c = found.center + weights[q] * basis.center
-        g, b = found.slope + weights[q] * basis.slope, found.bend + weights[q] * basis.bend
+        sum_form = load(s, target, LANES, q)
+        c = sum_form.center + weights[q] * basis.center
+        g, b = sum_form.slope + weights[q] * basis.slope, sum_form.bend + weights[q] * basis.bend
         added = w * magnitude(basis)
-        radius = (found.radius + w * basis.radius + SUM_ROUNDING * (added + abs(c) + added)) * UP
+        radius = (sum_form.radius + w * basis.radius + SUM_ROUNDING * (added + abs(c) + added)) * UP
         store(LineForm(c, g, b, radius), s, target, LANES, q)

@@ -22,8 +22,8 @@ from ns_abstract.arithmetic.line_forms import (
     store,
 )
 from ns_abstract.arithmetic.rounding import SUM_ROUNDING, UP
-from ns_abstract.methods.splat import records as row
-from ns_abstract.methods.splat.records import LANES
+from ns_abstract.methods.splat import projection_errors as row
+from ns_abstract.methods.splat.projection_errors import LANES
 
 
 class _RotationRow(NamedTuple):
@@ -109,13 +109,13 @@ def _sum_of_products(a0, b0, a1, b1, a2, b2):
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _crossed(a, b, c, d):
     """``(a d - b c)^2``."""
-    found = combined(multiplied(a, d), 1.0, multiplied(b, c), -1.0)
-    return multiplied(found, found)
+    cross = combined(multiplied(a, d), 1.0, multiplied(b, c), -1.0)
+    return multiplied(cross, cross)
 
 
 @njit(cache=True, error_model="numpy")
 def project_line(s, n, rotation, offset, camera, rules):
-    """Bounds and forms of ``n`` Gaussians from the rows that `records.gather` filled (design.md, G4-G9).
+    """Bounds and forms of ``n`` Gaussians from the rows that `projection_errors.gather` filled (design.md, G4-G9).
 
     See design.md, G1.
 

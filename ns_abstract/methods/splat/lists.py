@@ -92,7 +92,7 @@ def touching(indices, rectangles, table):
 
 
 @njit(cache=True, error_model="numpy")
-def marked(marks, numbers, box, tiles, side):
+def visible_again(marks, numbers, box, tiles, side):
     """Return the ``numbers`` whose mark is not 0, and the pixel rectangles on which they may be drawn (design.md, R2).
 
     Args:
@@ -107,12 +107,12 @@ def marked(marks, numbers, box, tiles, side):
     count = 0
     for k in range(marks.size):
         count += marks[k] != 0
-    found, pixels = np.empty(count, numbers.dtype), np.empty((count, 4), np.int32)
+    numbers_marked, pixels = np.empty(count, numbers.dtype), np.empty((count, 4), np.int32)
     count = 0
     for k in range(marks.size):
         if marks[k] == 0:
             continue
-        found[count] = numbers[k]
+        numbers_marked[count] = numbers[k]
         for axis in range(0, 4, 2):
             first, past = tiles[k, axis] * side, tiles[k, axis + 1] * side
             # a pixel's middle lies half a pixel behind its number; what is not a number leaves nothing out
@@ -123,7 +123,7 @@ def marked(marks, numbers, box, tiles, side):
             if high < past:
                 pixels[count, axis + 1] = int(math.floor(max(high, first - 1.0))) + 1
         count += 1
-    return found, pixels
+    return numbers_marked, pixels
 
 
 @njit(cache=True, error_model="numpy")

@@ -21,11 +21,11 @@ from ns_abstract.io.kinds import is_ply, refuse_other_kind
 from ns_abstract.io.memory import check_memory
 from ns_abstract.methods import config_keys, runs
 from ns_abstract.methods.checkpoint import to_float32
-from ns_abstract.methods.overrides import MODES, Overrides, chosen
+from ns_abstract.methods.overrides import MODES, Overrides, assumption_of
+from ns_abstract.methods.splat.drawable import StoredGaussians, coordinates_note, drawable
 from ns_abstract.methods.splat.formats.decoded import scene_of
 from ns_abstract.methods.splat.formats.readers import decoder_of, scene_file
 from ns_abstract.methods.splat.ply_read import load_ply
-from ns_abstract.methods.splat.rows import StoredRows, coordinates_note, drawable
 from ns_abstract.methods.splat.scene import Float32Array, SplatScene
 
 # nerfstudio/models/splatfacto.py: SplatfactoModel.load_state_dict sets this step.
@@ -121,14 +121,14 @@ def scene_from_parameters(
     Raises:
         InputError: A value is not finite or cannot be drawn.
     """
-    found = {key: np.array(parameters[key], np.float32) for key in _PARAMETERS}
-    rest = found["features_rest"][:, : (sh_degree + 1) ** 2 - 1]
-    arrays = StoredRows(
-        means=found["means"],
-        log_scales=found["scales"],
-        quats=found["quats"],
-        opacity_logits=found["opacities"].reshape(-1),
-        sh=np.concatenate([found["features_dc"][:, None], rest], axis=1),
+    stored_arrays = {key: np.array(parameters[key], np.float32) for key in _PARAMETERS}
+    rest = stored_arrays["features_rest"][:, : (sh_degree + 1) ** 2 - 1]
+    arrays = StoredGaussians(
+        means=stored_arrays["means"],
+        log_scales=stored_arrays["scales"],
+        quats=stored_arrays["quats"],
+        opacity_logits=stored_arrays["opacities"].reshape(-1),
+        sh=np.concatenate([stored_arrays["features_dc"][:, None], rest], axis=1),
     )
     fields = {name: name for name in ("scales", "quats", "opacities", "colours")}
     arrays, dropped = drawable(arrays, Path(source), fields)
@@ -205,8 +205,8 @@ def _picture(run: runs.RunConfig, overrides: Overrides) -> tuple[tuple[Assumptio
     if not isinstance(run.model.get("background_color", ""), str):
         origins["background_color"] += ", three numbers, at which Nerfstudio's own model stops"
     choices = (
-        chosen("rasterize_mode", overrides.rasterize_mode, "--rasterize-mode", mode, origins["rasterize_mode"]),
-        chosen("background", overrides.background, "--background", stored, origins["background_color"]),
+        assumption_of("rasterize_mode", overrides.rasterize_mode, "--rasterize-mode", mode, origins["rasterize_mode"]),
+        assumption_of("background", overrides.background, "--background", stored, origins["background_color"]),
     )
     return choices, np.array(overrides.background or stored, np.float32)
 
@@ -284,7 +284,7 @@ def _gaussian_state(state: dict[str, Any], file: Path, method: str) -> dict[str,
     return {name: state.get(f"{prefix}{name}") for name in _PARAMETERS}
 
 
-def _run_arrays(state: dict[str, Any], file: Path, degree_stored: int, degree: int) -> StoredRows:
+def _run_arrays(state: dict[str, Any], file: Path, degree_stored: int, degree: int) -> StoredGaussians:
     count = _row_count(state["means"], file)
     bands = (degree_stored + 1) ** 2
     shapes = {
@@ -302,17 +302,17 @@ def _run_arrays(state: dict[str, Any], file: Path, degree_stored: int, degree: i
         if name == "features_rest" and state[name] is None and bands == 1:
             arrays[name] = np.zeros(shape, np.float32)
             continue
-        found = tuple(getattr(state[name], "shape", ()))
-        if found != shape and not (name == "opacities" and found == (count,)):
+        stored_shape = tuple(getattr(state[name], "shape", ()))
+        if stored_shape != shape and not (name == "opacities" and stored_shape == (count,)):
             fix = "give config.yml and checkpoint of the same run"
             if name == "features_rest":
                 fix += f": pipeline.model.sh_degree {degree_stored} there needs {bands - 1} bands"
-            problem = f"shape {_shape(found)}, expected {_shape(shape)}"
+            problem = f"shape {_shape(stored_shape)}, expected {_shape(shape)}"
             raise InputError(problem, file=file, field=_run_field(name), fix=fix)
         arrays[name] = to_float32(state[name], file, _run_field(name), finite=False).reshape(shape)
-    kept = (degree + 1) ** 2
-    first, rest = arrays["features_dc"][:, None, :], arrays["features_rest"][:, : kept - 1, :]
-    return StoredRows(
+    bands_used = (degree + 1) ** 2
+    first, rest = arrays["features_dc"][:, None, :], arrays["features_rest"][:, : bands_used - 1, :]
+    return StoredGaussians(
         means=arrays["means"],
         log_scales=arrays["scales"],
         quats=arrays["quats"],

@@ -12,7 +12,7 @@ import numpy as np
 from ns_abstract.arithmetic.rounding import Arithmetic, charges
 from ns_abstract.arithmetic.rounding import arithmetic as arithmetic_named
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseSet
+from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.representation import ProgramOptions, Representation
@@ -26,7 +26,7 @@ from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.methods.splat.variations import VariedSplats, vary
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.perturbation.variations import SceneVariation
-from ns_abstract.refine.protocol import MOST_PARTS, Elements, Frame
+from ns_abstract.refine.protocol import MOST_PARTS, Frame, SceneElements
 
 if TYPE_CHECKING:
     import torch
@@ -94,7 +94,7 @@ class SplatMethod:
         """The scene in a few words."""
         return f"{self.scene.count:,} Gaussians{' alone, of a model that may draw more' if self.scene.alone else ''}"
 
-    def frame(self, poses: PoseSet, slanted: bool = False, layers: bool = False) -> SplatFrame:
+    def frame(self, poses: PoseBox, sheared: bool = False, layers: bool = False) -> SplatFrame:
         """One frame, ready for refinement; ``slanted``, ``layers``: see `SplatFrame`.
 
         Raises:
@@ -105,22 +105,22 @@ class SplatMethod:
         varied = self.varied(poses.perturbation.scene)
         sums = self._sums[poses.perturbation.scene]
         return SplatFrame(
-            self.splats, self.rasteriser, self.arithmetic, poses, varied=varied, slanted=slanted, layers=layers,
+            self.splats, self.rasteriser, self.arithmetic, poses, varied=varied, sheared=sheared, layers=layers,
             reference=self._slow, sums=sums,
         )  # fmt: skip
 
-    def easier(self, poses: PoseSet) -> Iterator[tuple[str, SplatFrame]]:
-        """See `Method.easier`."""
-        from ns_abstract.methods.splat.causes import easier
+    def ablations(self, poses: PoseBox) -> Iterator[tuple[str, SplatFrame]]:
+        """See `Method.ablations`."""
+        from ns_abstract.methods.splat.ablations import ablations
 
-        return easier(self.scene, self.rasteriser, self.arithmetic, poses, self.varied(poses.perturbation.scene))
+        return ablations(self.scene, self.rasteriser, self.arithmetic, poses, self.varied(poses.perturbation.scene))
 
-    def holders(self, frame: Frame, box: ParameterBox, tile: int, count: int) -> list[tuple[int, float]]:
-        """See `Method.holders`."""
-        from ns_abstract.methods.splat.causes import holders
+    def attribution(self, frame: Frame, box: ParameterBox, tile: int, count: int) -> list[tuple[int, float]]:
+        """See `Method.attribution`."""
+        from ns_abstract.methods.splat.ablations import attribution
 
         assert isinstance(frame, SplatFrame)
-        return holders(frame, box, tile, count)
+        return attribution(frame, box, tile, count)
 
     def prepare(self, perturbations: Sequence[Perturbation]) -> None:
         """Find the Gaussians that vary.
@@ -202,13 +202,13 @@ class SplatMethod:
             **({"bounded": GAUSSIANS_ALONE} if scene.alone else {}),
         }
 
-    def elements(self) -> Elements:
+    def elements(self) -> SceneElements:
         """The Gaussians, in the colours of band 0."""
         splats, base = self.splats, self.splats.sh[:, 0]
         colors = base if splats.degree == 0 else SH_C0 * base + 0.5
-        return Elements(splats.means, splats.axes, np.clip(colors, 0.0, 1.0), splats.opacity)
+        return SceneElements(splats.means, splats.axes, np.clip(colors, 0.0, 1.0), splats.opacity)
 
-    def differentiable(self, poses: PoseSet) -> Callable[[torch.Tensor], torch.Tensor]:
+    def differentiable(self, poses: PoseBox) -> Callable[[torch.Tensor], torch.Tensor]:
         """Parameter values [d] to the picture [H, W, 3], by the reference renderer."""
         from ns_abstract.geometry.differentiable_pose import differentiable_pose
 

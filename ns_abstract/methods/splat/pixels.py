@@ -1,7 +1,7 @@
 """Per-pixel stage of the bounds: the tiles of a picture, block by block, on all threads (design.md, B1-B12, R4).
 
 A block of `PIXELS` pixels passes two steps: `fragments` collects what may be drawn, with alphas from `alphas`, and
-`blend` blends it, each pixel by itself; `block` tells how fragments are kept.
+`blend` blends it, each pixel by itself; `pixel_block` tells how fragments are kept.
 """
 
 from __future__ import annotations
@@ -15,13 +15,12 @@ from ns_abstract.arithmetic.rounding import Charges
 from ns_abstract.arithmetic.simd.intrinsics import borrowed, lowest_bit, pointer, signed, taken
 from ns_abstract.geometry.camera_path import Intrinsics
 from ns_abstract.methods.splat.blend import shade
-from ns_abstract.methods.splat.block import Place, block_of, longest_list, new_buffers, resized
 from ns_abstract.methods.splat.constants import RasterRules
 from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW, DEPTH_HIGH, DEPTH_LOW, shade_layers
 from ns_abstract.methods.splat.fragments import GIVE_UP, GROW, apply_stops, collect_fragments, number_groups
 from ns_abstract.methods.splat.lists import BLOCK, TileLists, block_lists, longest_first
+from ns_abstract.methods.splat.pixel_block import BlockPlace, block_of, longest_list, new_buffers, resized
 from ns_abstract.methods.splat.reordering import swap_bounds
-from ns_abstract.methods.splat.sharing import by_tiles
 from ns_abstract.methods.splat.stage_data import (
     Colors,
     Cutoffs,
@@ -32,6 +31,7 @@ from ns_abstract.methods.splat.stage_data import (
     ProjectedGaussians,
     ViewingAxes,
 )
+from ns_abstract.methods.splat.work_sharing import run_by_tiles
 
 
 @njit(cache=True, error_model="numpy")
@@ -123,7 +123,7 @@ def _tile_bounds(bounds, number, thread):
 def _pixel_worker(
     share, lists, pixels, gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape, parts, bounds
 ):
-    """One thread's tiles; see `Share` and `pixel_stage`."""
+    """One thread's tiles; see `ThreadShare` and `pixel_stage`."""
     sequence, counter = borrowed(share.sequence), pointer(share.counter)
     inputs = _borrowed_inputs(gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape, parts)
     camera = inputs.intrinsics
@@ -150,7 +150,7 @@ def _pixel_worker(
         )  # fmt: skip
         for b in range(blocks * blocks):
             x0, y0 = tile_x * side + (b % blocks) * BLOCK, tile_y * side + (b // blocks) * BLOCK
-            place = Place(x0, y0, tile_x, tile_y, pixels[number, b])
+            place = BlockPlace(x0, y0, tile_x, tile_y, pixels[number, b])
             if place.x0 >= camera.width or place.y0 >= camera.height:
                 continue
             numbers = block_entries[block_offsets[b] : block_offsets[b + 1]]
@@ -186,7 +186,7 @@ def pixel_stage(
         parts: Of the cell, where ``shape`` has some; then no linear sets and no layers are found.
         bounds: The output; one row of its statistics for each thread.
     """
-    by_tiles(
+    run_by_tiles(
         _pixel_worker, longest_first(lists.wanted, lists.offsets), bounds.statistics.shape[0],
         lists, pixels, gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape, parts, bounds,
     )  # fmt: skip

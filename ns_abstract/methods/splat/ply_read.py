@@ -98,9 +98,14 @@ def filtered(
         total = square + np.square(width.astype(np.float64))[:, None]
         weight = np.sqrt(np.prod(square / total, axis=1))
         opacity = weight / (1.0 + np.exp(-opacity_logits.astype(np.float64)))
-        found = (0.5 * np.log(total)).astype(np.float32), (np.log(opacity) - np.log1p(-opacity)).astype(np.float32)
+        scales_and_opacities = (
+            (0.5 * np.log(total)).astype(np.float32),
+            (np.log(opacity) - np.log1p(-opacity)).astype(np.float32),
+        )
     same = width == 0
-    return np.where(same[:, None], log_scales, found[0]), np.where(same, opacity_logits, found[1])
+    return np.where(same[:, None], log_scales, scales_and_opacities[0]), np.where(
+        same, opacity_logits, scales_and_opacities[1]
+    )
 
 
 def _read_vertex(path: Path, element: PlyElement) -> Any:

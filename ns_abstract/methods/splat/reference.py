@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from ns_abstract.arithmetic.rounding import PIXEL_ROOM
-from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.methods.splat.constants import ACCUMULATION_MIN, GSPLAT_1_4_0, Rasteriser
 from ns_abstract.methods.splat.scene import SplatScene
 
@@ -141,7 +141,7 @@ class Reference:
         other._shift = None if color_shift is None else color_shift.to(self.dtype)
         return other
 
-    def project(self, camera: Camera, camera_to_world: Tensor, subset: Tensor | None = None) -> Projection:
+    def project(self, camera: PinholeCamera, camera_to_world: Tensor, subset: Tensor | None = None) -> Projection:
         """Project the scene (fully_fused_projection_fwd.cu, isect_tiles.cu).
 
         Args:
@@ -159,8 +159,8 @@ class Reference:
         x, y, z = means.unbind(1)
         points = torch.stack([a * x + b * y + c * z for a, b, c in rotation], dim=1) + translation
         if subset is None:
-            kept = torch.nonzero((points[:, 2] >= r.near) & (points[:, 2] <= r.far)).squeeze(1)
-            indices, points = indices[kept], points[kept]
+            in_range = torch.nonzero((points[:, 2] >= r.near) & (points[:, 2] <= r.far)).squeeze(1)
+            indices, points = indices[in_range], points[in_range]
         means2d, covariance, flat = self._splat(camera, rotation, points, indices)
         xx, yy, xy = covariance[:, 0, 0] + r.eps2d, covariance[:, 1, 1] + r.eps2d, covariance[:, 0, 1]
         det = xx * yy - xy * xy
@@ -173,22 +173,22 @@ class Reference:
         with torch.no_grad():
             radii, tiles, visible = self._tile_ranges(camera, means2d, xx, yy, det, opacities)
             extents = self._extents(xx, yy, opacities)
-        kept = torch.nonzero(visible).squeeze(1) if subset is None else torch.arange(len(indices))
+        in_range = torch.nonzero(visible).squeeze(1) if subset is None else torch.arange(len(indices))
         return Projection(
-            indices=indices[kept],
-            means2d=means2d[kept],
-            conics=torch.stack([yy / det, -xy / det, xx / det], dim=1)[kept],
-            radii=radii[kept].amax(dim=1),
-            depths=points[kept, 2],
-            tiles=tiles[kept],
+            indices=indices[in_range],
+            means2d=means2d[in_range],
+            conics=torch.stack([yy / det, -xy / det, xx / det], dim=1)[in_range],
+            radii=radii[in_range].amax(dim=1),
+            depths=points[in_range, 2],
+            tiles=tiles[in_range],
             # the inverse of the view matrix holds the position, also where it is no rotation
-            colors=self._colors(indices[kept], -(rotation.T @ translation) if r.eye_from_view else pose[:, 3]),
-            opacities=opacities[kept],
-            extents=extents[kept],
+            colors=self._colors(indices[in_range], -(rotation.T @ translation) if r.eye_from_view else pose[:, 3]),
+            opacities=opacities[in_range],
+            extents=extents[in_range],
         )
 
     def _splat(
-        self, camera: Camera, rotation: Tensor, points: Tensor, indices: Tensor
+        self, camera: PinholeCamera, rotation: Tensor, points: Tensor, indices: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Centres [n, 2], covariances [n, 2, 2] before the blur, and their determinants (utils.cuh:255-291)."""
         margin = self.rules.view_margin
@@ -208,7 +208,7 @@ class Reference:
         return means2d, covariance, flat
 
     def _tile_ranges(
-        self, camera: Camera, means2d: Tensor, xx: Tensor, yy: Tensor, det: Tensor, opacities: Tensor
+        self, camera: PinholeCamera, means2d: Tensor, xx: Tensor, yy: Tensor, det: Tensor, opacities: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """Radii [n, 2], tile ranges [n, 4] and whether the Gaussian is drawn [n].
 
@@ -309,7 +309,7 @@ class Reference:
                 break
         return color, light
 
-    def image(self, camera: Camera, camera_to_world: Tensor) -> Tensor:
+    def image(self, camera: PinholeCamera, camera_to_world: Tensor) -> Tensor:
         """The picture [H, W, 3] in [0, 1].
 
         Args:
@@ -318,12 +318,12 @@ class Reference:
         """
         return self._picture(camera, camera_to_world, self._blend)
 
-    def layers(self, camera: Camera, camera_to_world: Tensor) -> Tensor:
-        """Accumulation and expected depth [H, W, 2], NaN where nothing is drawn; arguments as for `image`."""
+    def layers(self, camera: PinholeCamera, camera_to_world: Tensor) -> Tensor:
+        """Accumulation and expected depth [H, W, 2], NaN where nothing is drawn; arguments as for `input_planes`."""
         return self._picture(camera, camera_to_world, self._blend_layers)
 
     def _picture(
-        self, camera: Camera, camera_to_world: Tensor, blend: Callable[[Projection, Tensor, Tensor], Tensor]
+        self, camera: PinholeCamera, camera_to_world: Tensor, blend: Callable[[Projection, Tensor, Tensor], Tensor]
     ) -> Tensor:
         p = self.project(camera, camera_to_world)
         order = torch.argsort(p.depths.detach(), stable=True)
@@ -340,7 +340,7 @@ class Reference:
             rows.append(torch.cat(row, dim=1))
         return torch.cat(rows)
 
-    def pixels(self, camera: Camera, camera_to_world: Tensor, pixels: Tensor) -> Tensor:
+    def pixels(self, camera: PinholeCamera, camera_to_world: Tensor, pixels: Tensor) -> Tensor:
         """Colours [k, 3] of some pixels; gradients cost only the Gaussians that reach them.
 
         Args:
@@ -355,13 +355,13 @@ class Reference:
         for row, column in pixels.tolist():
             center = torch.tensor([column + 0.5, row + 0.5], dtype=self.dtype)
             layers = self._layers(p, self._layers(p, order, 1, row + 0.5, row + 0.5), 0, column + 0.5, column + 0.5)
-            reached, kept = p, layers
+            transmittance, layers_left = p, layers
             leaves = (camera_to_world, self._means, self._opacities, self._shift)
             if torch.is_grad_enabled() and any(leaf is not None and leaf.requires_grad for leaf in leaves):
                 # the decisions of the first pass stand, the second one only adds derivatives
-                reached = self.project(camera, camera_to_world, p.indices[layers])
-                kept = torch.arange(len(layers))
-            colors.append(self._blend(reached, kept, center[None]).squeeze(0))
+                transmittance = self.project(camera, camera_to_world, p.indices[layers])
+                layers_left = torch.arange(len(layers))
+            colors.append(self._blend(transmittance, layers_left, center[None]).squeeze(0))
         return torch.stack(colors)
 
 
@@ -372,7 +372,7 @@ def _limit(ratio: Tensor, center: float, size: int, focal: float, margin: float)
 
 
 def project(
-    scene: SplatScene, camera: Camera, camera_to_world: Tensor, *, rasteriser: Rasteriser = GSPLAT_1_4_0
+    scene: SplatScene, camera: PinholeCamera, camera_to_world: Tensor, *, rasteriser: Rasteriser = GSPLAT_1_4_0
 ) -> Projection:
     """What gsplat's projection and tile stages say about a scene; see `Reference.project`."""
     return Reference(scene, rasteriser).project(camera, camera_to_world)

@@ -16,7 +16,7 @@ from ns_abstract.arithmetic.elementary import exp_kernel
 from ns_abstract.arithmetic.rounding import LOGARITHM_ROOM, NONZERO, REGION
 from ns_abstract.arithmetic.simd.intrinsics import borrowed, pointer, taken
 from ns_abstract.execution.threads import threads
-from ns_abstract.geometry.camera_path import Camera
+from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.tiles import assemble, tile_grid
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.colors import sh_color
@@ -33,7 +33,7 @@ from ns_abstract.methods.splat.lists import (
     tile_mask,
     touching,
 )
-from ns_abstract.methods.splat.sharing import CHUNK, by_tiles, chunked
+from ns_abstract.methods.splat.work_sharing import CHUNK, run_by_tiles, run_in_chunks
 
 _EXPONENT_LIMIT = 60.0
 
@@ -42,7 +42,7 @@ _MEAN_X, _MEAN_Y, _P, _Q, _S, _OPACITY, _RED = range(7)
 _COLUMNS = 9
 
 
-class _Scene(NamedTuple):
+class _SceneArrays(NamedTuple):
     """A scene's activated Gaussians as kernels take them; see `Splats`."""
 
     means: np.ndarray
@@ -111,14 +111,14 @@ def _region(mean_x, mean_y, a, b, c, alpha, camera, rules):
     extent_y = math.sqrt(exponent * c) * REGION
     x0, x1 = mean_x - extent_x, mean_x + extent_x
     y0, y1 = mean_y - extent_y, mean_y + extent_y
-    shown = True
+    visible = True
     tile = rules.tile_size
     if tile > 0.0:
         half = 0.5 * (a - c)
         spread = math.sqrt(max(rules.discriminant_min, half * half + b * b))
         # np.ceil: math.ceil is an int64, which a huge Gaussian overflows
         radius = np.ceil(rules.radius_sigmas * math.sqrt(0.5 * (a + c) + spread))
-        shown = not (
+        visible = not (
             mean_x + radius <= 0.0
             or mean_x - radius >= camera.width
             or mean_y + radius <= 0.0
@@ -130,14 +130,15 @@ def _region(mean_x, mean_y, a, b, c, alpha, camera, rules):
         y0 = max(y0, np.floor((mean_y - radius) / tile) * tile)
         y1 = min(y1, np.ceil((mean_y + radius) / tile) * tile)
     outside = x1 < 0.5 or x0 > camera.width - 0.5 or y1 < 0.5 or y0 > camera.height - 0.5 or x1 < x0 or y1 < y0
-    return x0, x1, y0, y1, shown and not outside
+    return x0, x1, y0, y1, visible and not outside
 
 
 @njit(cache=True, error_model="numpy", inline="always")
 def _set_color(sh, shift, degree, most, i, direction, basis, color):
     """Write the colour of Gaussian i, seen along ``direction`` [3] (not of unit length), to ``color`` [>= 3].
 
-    ``sh``, ``shift``, ``degree`` and ``most`` are of `_Scene`; a record's arrays would all be counted at every call.
+    ``sh``, ``shift``, ``degree`` and ``most`` are of `_SceneArrays`; a record's arrays would all be counted at every
+    call.
     """
     if degree == 0:
         for channel in range(3):
@@ -154,8 +155,8 @@ def _project_worker(counter_, scene, rotation, position, eye, camera, rules, out
     """One thread's Gaussians; see `ns_abstract.methods.splat.constants` for the rules' sources.
 
     Args:
-        counter_: See `chunked`.
-        scene: `_Scene`.
+        counter_: See `run_in_chunks`.
+        scene: `_SceneArrays`.
         rotation: [3, 3] world to camera, OpenCV axes.
         position: [3] camera, world.
         eye: [3] where colours are seen from, world.
@@ -213,8 +214,8 @@ def _project_worker(counter_, scene, rotation, position, eye, camera, rules, out
                 alpha *= max(rules.compensation_min, math.sqrt(sharp / det))
             if alpha < alpha_min or alpha == 0.0:
                 continue
-            x0, x1, y0, y1, shown = _region(mean_x, mean_y, a, b, c, alpha, camera, rules)
-            if not shown:
+            x0, x1, y0, y1, in_image = _region(mean_x, mean_y, a, b, c, alpha, camera, rules)
+            if not in_image:
                 continue
             tiles[i, 0] = int(max(0.0, np.floor(x0 / tile)))
             tiles[i, 1] = int(min(float(tiles_x), np.floor(x1 / tile) + 1.0))
@@ -298,7 +299,7 @@ def _rasterise_worker(share, lists, record_, box_, camera, rules, background, im
     """Blend one thread's tiles of ``lists.wanted``.
 
     Args:
-        share: `Share`.
+        share: `ThreadShare`.
         lists: `TileLists`.
         record_, box_: Of `_Projected`.
         camera: `Intrinsics`.
@@ -365,7 +366,7 @@ class Renderer:
 
     def tiles(
         self,
-        camera: Camera,
+        camera: PinholeCamera,
         rotation: np.ndarray,
         position: np.ndarray,
         wanted: np.ndarray | None = None,
@@ -387,16 +388,16 @@ class Renderer:
         return self._blend(camera, lists, self._projected.record, splats.background)
 
     def lists(
-        self, splats: Splats, camera: Camera, rotation: np.ndarray, position: np.ndarray, wanted: np.ndarray
+        self, splats: Splats, camera: PinholeCamera, rotation: np.ndarray, position: np.ndarray, wanted: np.ndarray
     ) -> TileLists:
         """Project every Gaussian; the lists of the tiles ``wanted``."""
-        scene = _Scene(
+        scene = _SceneArrays(
             splats.means, splats.axes, splats.opacity, splats.sh, splats.degree, splats.color_shift, splats.color_max
         )
-        found = self._projected
+        projected = self._projected
         rotation = np.ascontiguousarray(rotation, np.float64)
         position = np.ascontiguousarray(position, np.float64)
-        chunked(
+        run_in_chunks(
             _project_worker,
             splats.count,
             scene,
@@ -405,33 +406,33 @@ class Renderer:
             rotation.T @ (rotation @ position) if self._eye_from_view else position,
             camera.intrinsics,
             self.rules,
-            found,
+            projected,
         )
         across, down = tile_grid(camera, self.side)
         mask = tile_mask(wanted, across * down)
-        seen = np.flatnonzero(found.visible)
+        visible = np.flatnonzero(projected.visible)
         if not mask.all():
-            seen = touching(seen, found.tiles, summed_area(mask.reshape(down, across)))
-        offsets, entries = tile_lists(depth_order(seen, found.depth), found.tiles, mask, across)
+            visible = touching(visible, projected.tiles, summed_area(mask.reshape(down, across)))
+        offsets, entries = tile_lists(depth_order(visible, projected.depth), projected.tiles, mask, across)
         return TileLists(np.asarray(wanted, np.int64), offsets, entries)
 
-    def _blend(self, camera: Camera, lists: TileLists, record: np.ndarray, background: np.ndarray) -> np.ndarray:
+    def _blend(self, camera: PinholeCamera, lists: TileLists, record: np.ndarray, background: np.ndarray) -> np.ndarray:
         image = np.zeros((lists.wanted.size, self.side, self.side, 3))
         box = self._projected.box
-        by_tiles(
+        run_by_tiles(
             _rasterise_worker, longest_first(lists.wanted, lists.offsets), threads(),
             lists, record, box, camera.intrinsics, self.rules, background, image,
         )  # fmt: skip
         return image
 
     def image(
-        self, camera: Camera, rotation: np.ndarray, position: np.ndarray, member: Splats | None = None
+        self, camera: PinholeCamera, rotation: np.ndarray, position: np.ndarray, member: Splats | None = None
     ) -> np.ndarray:
         """The whole image, float64 [H, W, 3] in [0, 1]; see `tiles`."""
         return assemble(self.tiles(camera, rotation, position, member=member), camera)
 
     def layers(
-        self, camera: Camera, rotation: np.ndarray, position: np.ndarray
+        self, camera: PinholeCamera, rotation: np.ndarray, position: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """What Splatfacto outputs in evaluation (splatfacto.py:620-665; gsplat's render mode RGB+ED).
 
@@ -439,14 +440,14 @@ class Renderer:
             Image [H, W, 3] and accumulation [H, W, 1] in [0, 1]; expected depth [H, W, 1], the largest
             one of the image where nothing is hit.
         """
-        found = assemble(self.layer_tiles(camera, rotation, position), camera)
-        image, accumulation, depth = found[..., :3], found[..., 3:4], found[..., 4:]
+        whole_image = assemble(self.layer_tiles(camera, rotation, position), camera)
+        image, accumulation, depth = whole_image[..., :3], whole_image[..., 3:4], whole_image[..., 4:]
         drawn = accumulation > 0.0
         return image, accumulation, np.where(drawn, depth, depth[drawn].max(initial=0.0))
 
     def layer_tiles(
         self,
-        camera: Camera,
+        camera: PinholeCamera,
         rotation: np.ndarray,
         position: np.ndarray,
         wanted: np.ndarray | None = None,
@@ -460,15 +461,15 @@ class Renderer:
         wanted = np.arange(across * down) if wanted is None else np.asarray(wanted, np.int64)
         splats = self.splats if member is None else member
         lists = self.lists(splats, camera, rotation, position, wanted)
-        found = self._projected
-        image = self._blend(camera, lists, found.record, splats.background)
+        projected = self._projected
+        image = self._blend(camera, lists, projected.record, splats.background)
         # the same weights, with depths as colours; the blending clamps to [0, 1]
-        seen = found.visible.astype(bool)
-        farthest = max(float(found.depth[seen].max(initial=0.0)), NONZERO)
-        record = found.record.copy()
-        record[seen, _RED] = 1.0
-        record[seen, _RED + 1] = found.depth[seen] / farthest
-        record[seen, _RED + 2] = 0.0
+        visible = projected.visible.astype(bool)
+        farthest = max(float(projected.depth[visible].max(initial=0.0)), NONZERO)
+        record = projected.record.copy()
+        record[visible, _RED] = 1.0
+        record[visible, _RED + 1] = projected.depth[visible] / farthest
+        record[visible, _RED + 2] = 0.0
         sums = self._blend(camera, lists, record, np.zeros(3))
         accumulation = sums[..., :1]
         depth = farthest * sums[..., 1:2] / np.maximum(accumulation, ACCUMULATION_MIN)

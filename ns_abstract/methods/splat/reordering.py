@@ -14,7 +14,9 @@ from ns_abstract.arithmetic.elementary import fma
 from ns_abstract.arithmetic.rounding import SWAP_ROUNDING, UP
 from ns_abstract.arithmetic.simd.intrinsics import lowest_bit
 from ns_abstract.arithmetic.simd.lanes import bits, load4, load8, maximum, minimum, store
-from ns_abstract.methods.splat.block import (
+from ns_abstract.methods.splat.intervals import BlendBounds, blend_interval
+from ns_abstract.methods.splat.lists import PIXELS
+from ns_abstract.methods.splat.pixel_block import (
     ALPHA_HIGH,
     ALPHA_LOW,
     LIGHT,
@@ -23,8 +25,6 @@ from ns_abstract.methods.splat.block import (
     color_size,
     listed_fragment,
 )
-from ns_abstract.methods.splat.intervals import Ends, blend_interval
-from ns_abstract.methods.splat.lists import PIXELS
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class OrderTuning:
 _REORDERING_MATTERS = OrderTuning.reordering_matters
 
 
-class Scratch(NamedTuple):
+class ReorderScratch(NamedTuple):
     """Memory for `_interval_group`: 16 numbers, then keys and places by list position."""
 
     numbers: Any
@@ -132,7 +132,7 @@ def _interval_group(start, stop, behind, fragments, palette, moves, scratch):
         hull_low, hull_high = minimum(front.low, hull_low), maximum(front.high, hull_high)
         low = maximum(front.low - load4(moves, move), hull_low)
         high = minimum(front.high + load4(moves, move + 4), hull_high)
-        behind = Ends(low, high, front.darkest, front.brightest)
+        behind = BlendBounds(low, high, front.darkest, front.brightest)
     store(t, 0, behind.low)
     store(t, 4, behind.high)
     count = stop - start
@@ -155,7 +155,7 @@ def _interval_group(start, stop, behind, fragments, palette, moves, scratch):
                 t[channel] = max(t[channel], value)
             else:
                 t[4 + channel] = min(t[4 + channel], value)
-    return Ends(load4(t, 0), load4(t, 4), behind.darkest, behind.brightest)
+    return BlendBounds(load4(t, 0), load4(t, 4), behind.darkest, behind.brightest)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -185,7 +185,7 @@ def sharpened(begin, end, ends, form_low, form_high, block, scratch):
     if not _worth_reordering(begin, end, ends, form_low, form_high, fragments, forms, moves):
         return low, high
     background = load4(palette.background, 0)
-    value = Ends(background, background, background, background)
+    value = BlendBounds(background, background, background, background)
     stop = end
     while stop > begin:
         start = stop - 1

@@ -55,7 +55,7 @@ class SceneGaussians(NamedTuple):
         extents: [N] largest standard deviations, world units, up to rounding.
         noise: [N, 12] see `gaussians.covariance_noise`.
         opacity_low, opacity_high: [N] ends of the opacities' ranges.
-        exponent_limits: [N] see `records.exponent_limits`.
+        exponent_limits: [N] see `projection_errors.exponent_limits`.
     """
 
     means: np.ndarray
@@ -121,7 +121,7 @@ class ProjectedGaussians(NamedTuple):
     """The projected Gaussians that the per-Gaussian stage writes (design.md, G4-G10).
 
     Attributes:
-        record: [n, columns] see `records`: mean in pixels, opacity, whitening forms.
+        record: [n, columns] see `projection_errors`: mean in pixels, opacity, whitening forms.
         box: [n, 4] pixels x0, x1, y0, y1 that may be reached.
         tiles: [n, 8] outer, then inner tile ranges x0, x1, y0, y1 (ends exclusive).
         depth: [n] at the cell's middle, world units.

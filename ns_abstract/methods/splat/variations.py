@@ -96,7 +96,7 @@ class VariedSplats:
             return self.stored
         return self.at(self.stored.means, self.stored.opacity, np.zeros_like(self.color_low))
 
-    def members(self, generator: np.random.Generator) -> Iterator[Splats]:
+    def scene_samples(self, generator: np.random.Generator) -> Iterator[Splats]:
         """Members without end: first all at the ends that make pictures bright or dark or shift them, then random.
 
         See design.md, S5.

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ns_abstract.geometry.views import View
+from ns_abstract.geometry.keyframe_cameras import KeyframeCamera
 from ns_abstract.methods.run_writer import STEP, background_name, lpips_state, write_run
 from ns_abstract.methods.splat.scene import SplatScene
 
@@ -38,8 +38,8 @@ def write_splatfacto_run(
     *,
     timestamp: str,
     experiment_name: str,
-    views: Sequence[View] | None = None,
-    render: Callable[[View], ArrayLike] | None = None,
+    views: Sequence[KeyframeCamera] | None = None,
+    render: Callable[[KeyframeCamera], ArrayLike] | None = None,
 ) -> Path:
     """Write ``scene`` as a Splatfacto run, and a small data set beside it.
 

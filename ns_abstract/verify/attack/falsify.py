@@ -22,9 +22,9 @@ from ns_abstract.geometry.box import Float64Array, ParameterBox
 #: Parameter values [d] to an image [H, W, 3].
 Render = Callable[[Float64Array], NDArray[np.floating]]
 #: Parameter values [d] and pixels [k, 2] (row, column) to colours [k, 3].
-Probe = Callable[[Float64Array, NDArray[np.int64]], NDArray[np.floating]]
+RenderPixels = Callable[[Float64Array, NDArray[np.int64]], NDArray[np.floating]]
 #: The same in torch, differentiable with respect to the values.
-Twin = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
+DifferentiableRender = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 
 STRATEGIES = ("given", "corners", "random", "ascent", "jumps")
 
@@ -111,11 +111,11 @@ class Attack:
         return float("inf") if np.isnan(self.worst[0].amount) else self.worst[0].amount
 
 
-class _Enough(Exception):
+class _BudgetSpentError(Exception):
     """The budget is spent."""
 
 
-class _Record:
+class _ImageExtremes:
     """Compares images with the bounds and keeps the extreme values with their poses."""
 
     def __init__(
@@ -149,14 +149,14 @@ class _Record:
 
     def _keep(self, violation: Violation) -> None:
         place = (violation.row, violation.column, violation.channel)
-        known = self.found.get(place)
-        if known is None or _severity(violation) > _severity(known):
+        current = self.found.get(place)
+        if current is None or _severity(violation) > _severity(current):
             self.found[place] = violation
 
     def image(self, values: Float64Array, strategy: str) -> Float64Array:
         """Render and compare one pose."""
         if len(self.poses) >= self.limit or time.perf_counter() >= self.deadline:
-            raise _Enough
+            raise _BudgetSpentError
         values = np.clip(np.asarray(values, np.float64), self.box.lower, self.box.upper)
         image = np.asarray(self.render(values), np.float64)
         if image.shape != self.lower.shape:
@@ -205,15 +205,15 @@ class _Record:
             row, column = (int(place[0]), int(place[1])) if pixels is None else map(int, pixels[place[0]])
             bound = lower[index] if image[index] < lower[index] else upper[index]
             where = (row, column, int(place[-1]))
-            seen = (float(image[index]), float(bound), float(amount[index]))
-            self._keep(Violation(tuple(values.tolist()), *where, *seen))
+            values_at = (float(image[index]), float(bound), float(amount[index]))
+            self._keep(Violation(tuple(values.tolist()), *where, *values_at))
 
-    def pixel(self, probe: Probe | None, values: Float64Array, target: _Target) -> float:
+    def pixel(self, probe: RenderPixels | None, values: Float64Array, target: _Target) -> float:
         """The target's value at a pose, compared with its bounds; rendered in full if there is no probe."""
         if probe is None:
             return float(self.image(values, "jumps")[target.row, target.column, target.channel])
         if time.perf_counter() >= self.deadline:
-            raise _Enough
+            raise _BudgetSpentError
         where = np.array([[target.row, target.column]], np.int64)
         color = np.asarray(probe(values, where), np.float64)
         self.probes += 1
@@ -313,7 +313,7 @@ def _corners(box: ParameterBox, count: int, generator: np.random.Generator) -> F
     return np.where(bits == 1, np.array(box.upper), np.array(box.lower))
 
 
-def _ascend(record: _Record, twin: Twin, target: _Target, start: Float64Array) -> Float64Array:
+def _ascend(record: _ImageExtremes, twin: DifferentiableRender, target: _Target, start: Float64Array) -> Float64Array:
     """Projected gradient ascent of one pixel channel, in parameters scaled to [-1, 1]^d.
 
     Steps follow the normalised gradient; they double where the value grew and shrink to a quarter where not.
@@ -350,7 +350,7 @@ def _ascend(record: _Record, twin: Twin, target: _Target, start: Float64Array) -
     return record.box.at(scaled.numpy())
 
 
-def _jump(record: _Record, probe: Probe | None, target: _Target, generator: np.random.Generator) -> None:
+def _jump(record: _ImageExtremes, probe: RenderPixels | None, target: _Target, generator: np.random.Generator) -> None:
     """Look for a jump of the target on a random line through its pose, and render both sides of it."""
     low, high = np.array(record.box.lower), np.array(record.box.upper)
     direction = generator.normal(size=low.size) * (high - low)
@@ -393,9 +393,9 @@ def falsify(
     upper: ArrayLike,
     box: ParameterBox,
     render: Render,
-    twin: Twin | None = None,
+    twin: DifferentiableRender | None = None,
     *,
-    probe: Probe | None = None,
+    probe: RenderPixels | None = None,
     poses: int = 200,
     seconds: float = float("inf"),
     seed: int = 0,
@@ -426,20 +426,20 @@ def falsify(
     if unknown:
         raise ValueError(f"unknown strategies {sorted(unknown)}; there are {', '.join(STRATEGIES)}")
     began = time.perf_counter()
-    record = _Record(lower, upper, box, render, poses, began + seconds)
+    record = _ImageExtremes(lower, upper, box, render, poses, began + seconds)
     generator = np.random.default_rng(seed)
     used = [name for name in strategies if name != "ascent" or twin is not None]
     try:
         _search(record, twin, probe, generator, np.zeros((0, 0)) if starts is None else np.asarray(starts), used)
-    except _Enough:
+    except _BudgetSpentError:
         pass
     return record.attack(time.perf_counter() - began)
 
 
 def _search(
-    record: _Record,
-    twin: Twin | None,
-    probe: Probe | None,
+    record: _ImageExtremes,
+    twin: DifferentiableRender | None,
+    probe: RenderPixels | None,
     generator: np.random.Generator,
     starts: Float64Array,
     strategies: Sequence[str],

@@ -7,7 +7,7 @@ import torch
 
 from ns_abstract.geometry.box import Float64Array
 from ns_abstract.geometry.differentiable_pose import differentiable_pose
-from ns_abstract.geometry.poses import PoseSet
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import tile_grid
 from ns_abstract.methods.nerf.hsv import color_shift
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling, camera_rays
@@ -17,10 +17,10 @@ from ns_abstract.methods.splat.constants import Rasteriser
 from ns_abstract.methods.splat.reference import Reference
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.scene import SplatScene
-from ns_abstract.verify.attack.falsify import Probe, Render, Twin
+from ns_abstract.verify.attack.falsify import DifferentiableRender, Render, RenderPixels
 
 
-def compiled_renderer(scene: SplatScene, pose_set: PoseSet, rasteriser: Rasteriser) -> tuple[Render, Probe]:
+def compiled_renderer(scene: SplatScene, pose_set: PoseBox, rasteriser: Rasteriser) -> tuple[Render, RenderPixels]:
     """The compiled renderer of the set's camera, for `falsify`: whole images, and single pixels."""
     renderer = Renderer(activate(scene, rasteriser), rasteriser)
     camera, side = pose_set.camera, rasteriser.work_tile
@@ -39,8 +39,8 @@ def compiled_renderer(scene: SplatScene, pose_set: PoseSet, rasteriser: Rasteris
 
 
 def reference_renderer(
-    scene: SplatScene, pose_set: PoseSet, rasteriser: Rasteriser, dtype: torch.dtype = torch.float64
-) -> tuple[Render, Probe, Twin]:
+    scene: SplatScene, pose_set: PoseBox, rasteriser: Rasteriser, dtype: torch.dtype = torch.float64
+) -> tuple[Render, RenderPixels, DifferentiableRender]:
     """The reference renderer of the set's camera, for `falsify`: images, single pixels, and the twin."""
     reference = Reference(scene, rasteriser, dtype)
     camera, pose = pose_set.camera, differentiable_pose(pose_set)
@@ -59,7 +59,9 @@ def reference_renderer(
     return render, probe, twin
 
 
-def nerf_renderer(scene: NerfScene, pose_set: PoseSet, sampling: Sampling) -> tuple[Render, Probe, Twin]:
+def nerf_renderer(
+    scene: NerfScene, pose_set: PoseBox, sampling: Sampling
+) -> tuple[Render, RenderPixels, DifferentiableRender]:
     """The renderer of a NeRF at the set's camera, for `falsify`: images, single pixels, and the twin."""
     renderer = NerfRenderer(scene, sampling)
     camera, pose = pose_set.camera, differentiable_pose(pose_set)

@@ -8,18 +8,13 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.arithmetic.network_charges import DOUBLE_UNIT
-from ns_abstract.execution.ending import checkpoint
-from ns_abstract.verify.network.known import Known
-from ns_abstract.verify.network.layers import Activation, Linear
-from ns_abstract.verify.network.maxima import MaxPool
-from ns_abstract.verify.network.passages import Passage
-from ns_abstract.verify.network.products import Product
-from ns_abstract.verify.network.reached import Enough, Reached, Trace
-from ns_abstract.verify.network.rows import (
-    Columns,
+from ns_abstract.execution.cancellation import check_cancelled
+from ns_abstract.verify.network.bilinear import Product
+from ns_abstract.verify.network.coefficients import (
+    Coefficients,
     Float64,
     Int64,
-    Rows,
+    NodeColumns,
     charge,
     concretize,
     full,
@@ -27,14 +22,19 @@ from ns_abstract.verify.network.rows import (
     join,
     pass_activation,
 )
-from ns_abstract.verify.network.slopes import Chosen
+from ns_abstract.verify.network.intermediate_bounds import IntermediateBounds
+from ns_abstract.verify.network.layers import Activation, LinearLayer
+from ns_abstract.verify.network.max_pooling import MaxPool
+from ns_abstract.verify.network.relaxations import Relaxations
+from ns_abstract.verify.network.slope_optimisation import OptimisedSlopes
+from ns_abstract.verify.network.stopping import BackwardBounds, BackwardTrace, StoppingCriterion
 
 #: Bytes of rows that are worked on at a time: they should stay in a processor's cache.
 ROWS_AT_ONCE = 24 << 20
 
 
 @dataclass
-class Batch:
+class CoefficientBatch:
     """Coefficients that are being propagated backwards.
 
     Attributes:
@@ -47,17 +47,17 @@ class Batch:
         trace: A place for what rows are on the way.
     """
 
-    waiting: dict[int, Rows]
+    waiting: dict[int, Coefficients]
     cell: Int64
     total: Float64
     number: Int64
-    passage: Passage
-    chosen: Chosen | None = None
-    trace: Trace | None = None
+    passage: Relaxations
+    chosen: OptimisedSlopes | None = None
+    trace: BackwardTrace | None = None
 
-    def __getitem__(self, part: Any) -> Batch:
+    def __getitem__(self, part: Any) -> CoefficientBatch:
         waiting = {k: rows[part] for k, rows in self.waiting.items()}
-        return Batch(
+        return CoefficientBatch(
             waiting, self.cell[part], self.total[part], self.number[part], self.passage, self.chosen, self.trace
         )
 
@@ -66,7 +66,7 @@ class Batch:
         return sum(rows.value.nbytes for rows in self.waiting.values())
 
 
-class Backward:
+class BackwardPass:
     """Propagates coefficients backwards over the relaxations of the nodes, which it does not change.
 
     Args:
@@ -75,34 +75,42 @@ class Backward:
         deep: Whether the network's rows are rationed (N13); then those that are kept may end on the way, too.
     """
 
-    def __init__(self, known: Known, memory: int, deep: bool) -> None:
-        self.known, self.network = known, known.network
+    def __init__(self, intermediate: IntermediateBounds, memory: int, deep: bool) -> None:
+        self.intermediate, self.network = intermediate, intermediate.network
         self.memory, self.deep = memory, deep
 
     def bound(
         self,
         index: int,
-        rows: Rows,
+        rows: Coefficients,
         cell: Int64,
-        enough: Enough | None = None,
-        trace: Trace | None = None,
+        enough: StoppingCriterion | None = None,
+        trace: BackwardTrace | None = None,
         cut: int = 0,
-    ) -> Reached:
+    ) -> BackwardBounds:
         """Bounds of rows on node ``index``, relative to the reference.
 
         Those of which ``enough`` is known may stop before the image; ``trace`` takes in what rows are on the way.
         All of them end on the nodes up to ``cut`` (N18).
         """
-        found = Reached.unknown(len(cell), self.known.d)
-        passage = next(passage for passage in self.known.passages if passage.takes(rows))
-        batch = Batch({index: rows}, cell, np.zeros((len(cell), 2)), np.arange(len(cell)), passage)
+        bounds = BackwardBounds.unknown(len(cell), self.intermediate.d)
+        relaxations = next(relaxations for relaxations in self.intermediate.relaxations if relaxations.takes(rows))
+        batch = CoefficientBatch({index: rows}, cell, np.zeros((len(cell), 2)), np.arange(len(cell)), relaxations)
         batch.trace = trace
-        self.descend(index, index, batch, found, enough, cut)
-        return found
+        self.descend(index, index, batch, bounds, enough, cut)
+        return bounds
 
-    def descend(self, start: int, at: int, batch: Batch, found: Reached, enough: Enough | None, cut: int = 0) -> None:
+    def descend(
+        self,
+        start: int,
+        at: int,
+        batch: CoefficientBatch,
+        found: BackwardBounds,
+        enough: StoppingCriterion | None,
+        cut: int = 0,
+    ) -> None:
         """Pass a batch from node ``at`` on to the image, or to the nodes up to ``cut``."""
-        checkpoint()
+        check_cancelled()
         while at > cut:
             if at not in batch.waiting:
                 at -= 1
@@ -113,8 +121,14 @@ class Backward:
                     self.descend(start, at, batch[part], found, enough, cut)
                 return
             ends = enough is not None and (batch.trace is None or self.deep)
-            if enough is not None and ends and at != start and at in self.known.stops and len(batch.waiting) == 1:
-                self._bound_rows(at, batch, self.known.stops[at], found)
+            if (
+                enough is not None
+                and ends
+                and at != start
+                and at in self.intermediate.stops
+                and len(batch.waiting) == 1
+            ):
+                self._bound_rows(at, batch, self.intermediate.stops[at], found)
                 going_on = ~enough.done(found, batch.number)
                 if going_on.mean() < 0.75:
                     found.ended[batch.number[~going_on]] = at
@@ -128,7 +142,7 @@ class Backward:
                 here = full(here, node.layer.shape, force=True)
                 here.value.reshape(len(here.value), -1)[:, flat] += gained[batch.number]
                 batch.total[:, 0] += offset[batch.number]
-            if batch.chosen is not None and not isinstance(node.layer, Linear):
+            if batch.chosen is not None and not isinstance(node.layer, LinearLayer):
                 here = full(here, node.layer.shape, force=True)
                 batch.chosen.keep(at, here.value, batch.number, len(found.lower))
             gathered = batch.total.copy() if batch.trace is not None else batch.total
@@ -144,13 +158,13 @@ class Backward:
                 parts = [batch.passage.maxima[at].backward(here, node.layer, batch.cell, batch.total)]
             elif isinstance(node.layer, Product):
                 # every reader changes its rows in place
-                parts = [here, Rows(here.value.copy(), here.y, here.x)]
+                parts = [here, Coefficients(here.value.copy(), here.y, here.x)]
                 for part, lines in zip(parts, batch.passage.products[at], strict=True):
                     pass_activation(part.value, part.y, part.x, batch.cell, lines, batch.total)
             else:
-                if at == start or at not in self.known.folded:
+                if at == start or at not in self.intermediate.folded:
                     shape = grid(node.layer.shape)
-                    noise = batch.passage.noise[at].reshape(self.known.count, *shape).contiguous().numpy()
+                    noise = batch.passage.noise[at].reshape(self.intermediate.count, *shape).contiguous().numpy()
                     charge(here.value, here.y, here.x, batch.cell, noise, batch.total)
                 parts = node.layer.backward(here)
             if batch.trace is not None and (batch.trace.short or isinstance(node.layer, (MaxPool, Product))):
@@ -169,42 +183,42 @@ class Backward:
             batch.trace.reached[batch.number] = True
             if 0 in batch.waiting:
                 batch.trace.keep(0, batch.waiting[0], self.network.input_shape, batch.number)
-        self._bound_rows(0, batch, self.known.columns, found)
+        self._bound_rows(0, batch, self.intermediate.columns, found)
 
     def _depends(self, start: int, at: int) -> bool:
         """Whether what rows that start at node ``start`` gather at another one depends on the cell's ranges (N15)."""
         layer = self.network.nodes[at - 1].layer
-        charged = isinstance(layer, Linear) and at != start and at not in self.known.folded
+        charged = isinstance(layer, LinearLayer) and at != start and at not in self.intermediate.folded
         return charged or isinstance(layer, Activation)
 
-    def _bound_rows(self, at: int, batch: Batch, columns: Columns, found: Reached) -> None:
+    def _bound_rows(self, at: int, batch: CoefficientBatch, columns: NodeColumns, found: BackwardBounds) -> None:
         """Bounds of a batch whose rows are all on node ``at``."""
         count = len(batch.cell)
-        plane, box = np.zeros((count, 2, self.known.d + 1)), np.zeros((count, 2))
+        plane, box = np.zeros((count, 2, self.intermediate.d + 1)), np.zeros((count, 2))
         rows = batch.waiting.get(at)
         if rows is None:
             plane[:, :, -1] = box[:] = batch.total
         else:
             concretize(rows.value, rows.y, rows.x, batch.cell, columns, batch.total, plane, box)
-        lost = self.known.flush[batch.cell][:, None] * np.array([-1.0, 1.0])
+        lost = self.intermediate.flush[batch.cell][:, None] * np.array([-1.0, 1.0])
         plane[:, :, -1] += lost
         box += lost
         found.improve(batch.number, plane, box)
 
-    def _rest_rows(self, batch: Batch, found: Reached) -> None:
+    def _rest_rows(self, batch: CoefficientBatch, found: BackwardBounds) -> None:
         """Bounds of a batch whose rows rest on several nodes, of which forms are known (N18)."""
         count, total = len(batch.cell), batch.total
-        plane, box = np.zeros((count, 2, self.known.d + 1)), np.zeros((count, 2))
+        plane, box = np.zeros((count, 2, self.intermediate.d + 1)), np.zeros((count, 2))
         sizes = np.zeros(count)
         for at, rows in batch.waiting.items():
-            columns = self.known.stops[at] if at else self.known.columns
+            columns = self.intermediate.stops[at] if at else self.intermediate.columns
             one, two = np.zeros_like(plane), np.zeros_like(box)
             concretize(rows.value, rows.y, rows.x, batch.cell, columns, total, one, two)
             plane += one
             box += two
             sizes += np.abs(one).sum((1, 2)) + np.abs(two).sum(1)
             total = np.zeros_like(total)
-        lost = self.known.flush[batch.cell] + 2.0 * DOUBLE_UNIT * len(batch.waiting) * sizes
+        lost = self.intermediate.flush[batch.cell] + 2.0 * DOUBLE_UNIT * len(batch.waiting) * sizes
         lost = lost[:, None] * np.array([-1.0, 1.0])
         plane[:, :, -1] += lost
         box += lost

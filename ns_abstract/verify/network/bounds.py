@@ -7,20 +7,20 @@ from typing import Any
 
 import numpy as np
 
-from ns_abstract.verify.network.backward import Backward
-from ns_abstract.verify.network.forward import Forward
+from ns_abstract.verify.network.backward import BackwardPass
+from ns_abstract.verify.network.coefficient_source import CoefficientSource
+from ns_abstract.verify.network.coefficients import Float64
+from ns_abstract.verify.network.cost_model import WorkBudget
+from ns_abstract.verify.network.forward import ForwardPass
 from ns_abstract.verify.network.graph import Network, NetworkArithmetic
-from ns_abstract.verify.network.image import finite, middle_of, planes_of
-from ns_abstract.verify.network.intermediate import Intermediate
-from ns_abstract.verify.network.known import Known
-from ns_abstract.verify.network.outputs import Outputs
-from ns_abstract.verify.network.pooling import Pooling
-from ns_abstract.verify.network.propagation import Propagation
-from ns_abstract.verify.network.rows import Float64
-from ns_abstract.verify.network.schedule import Schedule
-from ns_abstract.verify.network.selection import Selection
-from ns_abstract.verify.network.sets import ImageSets, OutputBounds, Signs, Substitution
-from ns_abstract.verify.network.sharing import Sharing
+from ns_abstract.verify.network.image_sets import ActivationPhases, ImageSets, OutputBounds, Substitution
+from ns_abstract.verify.network.input_planes import finite, middle_of, planes_of
+from ns_abstract.verify.network.intermediate_bounds import IntermediateBounds
+from ns_abstract.verify.network.max_pool_propagation import MaxPoolPropagation
+from ns_abstract.verify.network.neuron_bounds import NeuronBounds
+from ns_abstract.verify.network.neuron_selection import NeuronSelection
+from ns_abstract.verify.network.output_bounds import OutputRows
+from ns_abstract.verify.network.propagation import ForwardPropagation
 from ns_abstract.verify.network.subnormals import subnormals_kept
 
 
@@ -35,7 +35,7 @@ def bound_outputs(
     memory: int = 1 << 30,
     arithmetic: NetworkArithmetic = "float32",
     slope_steps: int = 0,
-    assumed: Sequence[Mapping[int, Signs]] | None = None,
+    assumed: Sequence[Mapping[int, ActivationPhases]] | None = None,
 ) -> OutputBounds:
     """Lower bounds of ``rows @ network(x) + offset`` over every image set.
 
@@ -63,8 +63,10 @@ def bound_outputs(
     step = max(1, int(0.5 * memory) // by_cell)
     parts = []
     for first in range(0, images.count, step):
-        signs = None if assumed is None else assumed[first : first + step]
-        cells = _Cells(network, images[first : first + step], substitution, memory, arithmetic, slope_steps, signs)
+        phases = None if assumed is None else assumed[first : first + step]
+        cells = _NetworkBounds(
+            network, images[first : first + step], substitution, memory, arithmetic, slope_steps, phases
+        )
         parts.append(cells.outputs(rows, offset))
     if not parts:
         k, d = len(offset), images.dimensions
@@ -73,7 +75,7 @@ def bound_outputs(
     return OutputBounds(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
-class _Cells:
+class _NetworkBounds:
     """Bounds of one network over several cells: builds the passes and runs them over all nodes.
 
     Attributes:
@@ -89,24 +91,26 @@ class _Cells:
         memory: int,
         arithmetic: NetworkArithmetic = "float32",
         slope_steps: int = 0,
-        assumed: Sequence[Mapping[int, Signs]] | None = None,
-        sharing: Sharing | None = None,
+        assumed: Sequence[Mapping[int, ActivationPhases]] | None = None,
+        sharing: CoefficientSource | None = None,
     ) -> None:
-        sharing = Sharing() if sharing is None else sharing
+        sharing = CoefficientSource() if sharing is None else sharing
         fields, good = finite(images)
         middle = sharing.about(middle_of(fields))
         image = planes_of(fields, middle, network.input_shape, substitution)
-        self.known = known = sharing.known = Known(network, image, middle, good, arithmetic, assumed)
-        schedule = Schedule(network)
-        backward = Backward(known, memory, schedule.deep)
-        intermediate = Intermediate(known, backward, schedule, sharing)
-        selection = Selection(known, intermediate, schedule, sharing)
-        pooling = Pooling(known, backward, schedule, sharing)
-        propagation = Propagation(known, sharing, bool(slope_steps))
-        self.last = Forward(known, propagation, pooling, selection, schedule).run()
+        self.intermediate = intermediate = sharing.intermediate = IntermediateBounds(
+            network, image, middle, good, arithmetic, assumed
+        )
+        schedule = WorkBudget(network)
+        backward = BackwardPass(intermediate, memory, schedule.deep)
+        neuron_bounds = NeuronBounds(intermediate, backward, schedule, sharing)
+        selection = NeuronSelection(intermediate, neuron_bounds, schedule, sharing)
+        pooling = MaxPoolPropagation(intermediate, backward, schedule, sharing)
+        propagation = ForwardPropagation(intermediate, sharing, bool(slope_steps))
+        self.last = ForwardPass(intermediate, propagation, pooling, selection, schedule).run()
         if substitution == "end":
-            known.see(planes_of(fields, middle, network.input_shape, "everywhere"))
-        self._outputs = Outputs(known, backward, slope_steps)
+            intermediate.see(planes_of(fields, middle, network.input_shape, "everywhere"))
+        self._outputs = OutputRows(intermediate, backward, slope_steps)
 
     def outputs(self, rows: Any, offset: Float64) -> OutputBounds:
         """Bounds of ``rows @ y + offset`` in every cell."""

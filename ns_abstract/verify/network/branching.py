@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ns_abstract.execution.ending import checkpoint
+from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.verify.network.bounds import bound_outputs
 from ns_abstract.verify.network.graph import Network, NetworkArithmetic
-from ns_abstract.verify.network.sets import ImageSets, OutputBounds, Signs
+from ns_abstract.verify.network.image_sets import ActivationPhases, ImageSets, OutputBounds
 
 #: Branches that are bounded together.
 _TOGETHER = 16
@@ -21,7 +21,7 @@ _STEPS = 12
 
 
 @dataclass(frozen=True)
-class Branching:
+class BranchingResult:
     """The result of branch and bound.
 
     Attributes:
@@ -36,19 +36,19 @@ class Branching:
 
 
 @dataclass(frozen=True)
-class _Branch:
+class _PhaseBranch:
     """One branch: its assumed phases, its bound, and the neuron to split next (-1: none is left)."""
 
-    signs: Mapping[int, Signs]
+    phases: Mapping[int, ActivationPhases]
     value: float
     unit: tuple[int, int]
 
-    def halves(self) -> list[dict[int, Signs]]:
+    def halves(self) -> list[dict[int, ActivationPhases]]:
         """The same with either sign of the unit assumed besides."""
         node, place = self.unit
-        flat, side = self.signs.get(node, (np.zeros(0, np.int64), np.zeros(0)))
+        flat, side = self.phases.get(node, (np.zeros(0, np.int64), np.zeros(0)))
         flat = np.append(flat, np.int64(place))
-        return [{**self.signs, node: (flat, np.append(side, sign))} for sign in (1.0, -1.0)]
+        return [{**self.phases, node: (flat, np.append(side, sign))} for sign in (1.0, -1.0)]
 
 
 def branch(
@@ -62,7 +62,7 @@ def branch(
     memory: int = 1 << 30,
     arithmetic: NetworkArithmetic = "float32",
     enough: Callable[[], bool] = lambda: False,
-) -> Branching:
+) -> BranchingResult:
     """Try to prove that in every group some of ``rows @ network(x) + offset`` is positive, on one set of images.
 
     Whichever evaluation is meant, the input of a ReLU is not negative or not positive in it: where the bounds leave
@@ -78,41 +78,41 @@ def branch(
     """
     dense = np.asarray(rows.toarray() if hasattr(rows, "toarray") else rows, np.float64)
 
-    def bounded(group: Sequence[int], assumed: list[dict[int, Signs]]) -> list[_Branch]:
-        checkpoint()
-        found = bound_outputs(
-            network, _repeated(images, len(assumed)), dense[list(group)], offset[list(group)],
+    def bounded(group: Sequence[int], assumed: list[dict[int, ActivationPhases]]) -> list[_PhaseBranch]:
+        check_cancelled()
+        output_bounds = bound_outputs(
+            network, _repeat_cell(images, len(assumed)), dense[list(group)], offset[list(group)],
             memory=memory, arithmetic=arithmetic, slope_steps=_STEPS, assumed=assumed,
         )  # fmt: skip
-        return [_judged(found, number, signs) for number, signs in enumerate(assumed)]
+        return [_branch_of(output_bounds, number, phases) for number, phases in enumerate(assumed)]
 
     count, least = 0, np.inf
     for group in groups:
         if not len(group):
-            return Branching(False, count, -np.inf)
-        waiting: list[_Branch] = []
-        assumed: list[dict[int, Signs]] = [{}]
+            return BranchingResult(False, count, -np.inf)
+        waiting: list[_PhaseBranch] = []
+        assumed: list[dict[int, ActivationPhases]] = [{}]
         while assumed:
-            found = bounded(group, assumed)
+            branches = bounded(group, assumed)
             count += len(assumed)
-            least = min([least, *(entry.value for entry in found if entry.value > 0.0)])
-            waiting = sorted([*waiting, *(entry for entry in found if not entry.value > 0.0)], key=lambda e: e.value)
+            least = min([least, *(entry.value for entry in branches if entry.value > 0.0)])
+            waiting = sorted([*waiting, *(entry for entry in branches if not entry.value > 0.0)], key=lambda e: e.value)
             if waiting and (waiting[0].unit[0] < 0 or count + 2 > most or enough()):
-                return Branching(False, count, waiting[0].value)
+                return BranchingResult(False, count, waiting[0].value)
             taken, waiting = waiting[: _TOGETHER // 2], waiting[_TOGETHER // 2 :]
             assumed = [half for entry in taken for half in entry.halves()]
-    return Branching(True, count, least)
+    return BranchingResult(True, count, least)
 
 
-def _repeated(images: ImageSets, count: int) -> ImageSets:
+def _repeat_cell(images: ImageSets, count: int) -> ImageSets:
     """Return ``count`` copies of the single cell of ``images``."""
     return ImageSets(*(np.repeat(getattr(images, name), count, axis=0) for name in ImageSets.__dataclass_fields__))
 
 
-def _judged(found: OutputBounds, number: int, signs: Mapping[int, Signs]) -> _Branch:
+def _branch_of(found: OutputBounds, number: int, phases: Mapping[int, ActivationPhases]) -> _PhaseBranch:
     """A branch by the bounds of its group's rows, of which one has to be positive; NaN is minus infinity."""
     lower = np.where(np.isnan(found.lower[number]), -np.inf, found.lower[number])
     best = int(lower.argmax())
     assert found.loosest is not None
     node, place = found.loosest[number, best].tolist()
-    return _Branch(signs, float(lower[best]), (node, place))
+    return _PhaseBranch(phases, float(lower[best]), (node, place))

@@ -16,20 +16,20 @@ from ns_abstract.arithmetic.network_charges import LEAST_DIVISOR, OVERFLOW, gamm
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network.graph import Layer, Network, Node, as_double, item
 from ns_abstract.verify.network.layers import (
-    Channels,
+    ChannelEmbedding,
     Convolution,
     Gather,
     LeakyRelu,
-    Linear,
+    LinearLayer,
     Matrix,
     Pad,
-    Scale,
+    ScaleLayer,
     Shape,
     Sigmoid,
     Sum,
     Tanh,
 )
-from ns_abstract.verify.network.maxima import MaxPool
+from ns_abstract.verify.network.max_pooling import MaxPool
 
 #: Numbers that one item of a layer may have.
 _LARGEST = 1 << 26
@@ -40,7 +40,7 @@ _ONE = (1, 1)
 _TAPS = 32
 
 
-class Builder:
+class NetworkBuilder:
     """Collects the nodes of one network; every method adds layers and returns the index of the last.
 
     Errors say what is wrong; the reader of the file adds the file and the node.
@@ -71,19 +71,21 @@ class Builder:
             if k in needed:
                 needed.update(self.nodes[k - 1].inputs)
         numbers = {0: 0}
-        kept = []
+        nodes_kept = []
         for k, node in enumerate(self.nodes, 1):
             if k in needed:
-                kept.append(replace(node, inputs=tuple(numbers[i] for i in node.inputs)))
-                numbers[k] = len(kept)
+                nodes_kept.append(replace(node, inputs=tuple(numbers[i] for i in node.inputs)))
+                numbers[k] = len(nodes_kept)
         shape = self.shape(output)
         # the numbers are the same in the shape they had before
-        while kept and type(kept[-1].layer) is Linear and kept[-1].inputs[0] == len(kept) - 1:
-            before = kept[-1].layer.input_shapes[0]
-            kept.pop()
+        while (
+            nodes_kept and type(nodes_kept[-1].layer) is LinearLayer and nodes_kept[-1].inputs[0] == len(nodes_kept) - 1
+        ):
+            before = nodes_kept[-1].layer.input_shapes[0]
+            nodes_kept.pop()
             if len(shape) == 1 and len(before) == 3:
                 shape = before
-        return Network(self.path, self.input_shape, kept, shape, name)
+        return Network(self.path, self.input_shape, nodes_kept, shape, name)
 
     def _check_size(self, shape: Sequence[int]) -> None:
         if any(v < 1 for v in shape) or int(np.prod([float(v) for v in shape])) > _LARGEST:
@@ -106,7 +108,7 @@ class Builder:
                 raise InputError("holds numbers that are not finite", fix="train the network again")
             if isinstance(value, Tensor) and value.numel() and float(value.abs().max()) >= OVERFLOW:
                 raise InputError("holds numbers that float32 cannot compute with", fix="train the network again")
-        if isinstance(layer, Linear):
+        if isinstance(layer, LinearLayer):
             # refuses sums of which no digit is left
             gamma(layer.terms + layer.row_terms)
         self.nodes.append(Node("", "", layer, inputs))
@@ -225,7 +227,7 @@ class Builder:
         return self._add(layer, x)
 
     def scale(self, x: int, factor: np.ndarray, offset: np.ndarray | None, parts: float = 0.0) -> int:
-        """``factor * x + offset`` with constants that are spread over a batch of items; ``parts``: see `Scale`."""
+        """``factor * x + offset`` with constants that are spread over a batch of items; ``parts``: see `ScaleLayer`."""
         shape = self.shape(x)
         self.reserve(2.0 * float(np.prod(shape)))
         spread = []
@@ -238,12 +240,12 @@ class Builder:
             except ValueError:
                 raise InputError(f"constant {item(constant.shape)} with an item {item(shape)}") from None
             spread.append(as_double(fitted))
-        return self._add(Scale((shape,), shape, 3 + self._fused(x), 1, spread[0], spread[1], parts), x)
+        return self._add(ScaleLayer((shape,), shape, 3 + self._fused(x), 1, spread[0], spread[1], parts), x)
 
     def _fused(self, *inputs: int) -> int:
         """Roundings of sums that a program may start with what is added behind them (N2)."""
         layers = [self.nodes[k - 1].layer for k in inputs if k]
-        return max((layer.terms for layer in layers if isinstance(layer, Linear)), default=0)
+        return max((layer.terms for layer in layers if isinstance(layer, LinearLayer)), default=0)
 
     def batch_norm(
         self, x: int, scale: np.ndarray, shift: np.ndarray, mean: np.ndarray, variance: np.ndarray, epsilon: float
@@ -277,7 +279,7 @@ class Builder:
         """The same numbers in another shape."""
         if tuple(shape) == self.shape(x):
             return x
-        return self._add(Linear((self.shape(x),), tuple(shape)), x)
+        return self._add(LinearLayer((self.shape(x),), tuple(shape)), x)
 
     def _gather(self, x: int, index: np.ndarray, fill: float) -> int:
         flat = torch.from_numpy(np.ascontiguousarray(index).reshape(-1).astype(np.int64))
@@ -339,7 +341,7 @@ class Builder:
         total, parts, done = sum(s[axis] for s in shapes), [], 0
         for source, shape in zip(sources, shapes, strict=True):
             if axis == 0 and len(shape) == 3:
-                parts.append(self._add(Channels((shape,), (total, *shape[1:]), 0, 1, done), source))
+                parts.append(self._add(ChannelEmbedding((shape,), (total, *shape[1:]), 0, 1, done), source))
             else:
                 before, after = [0] * len(shape), [0] * len(shape)
                 before[axis], after[axis] = done, total - done - shape[axis]

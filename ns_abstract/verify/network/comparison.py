@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from ns_abstract.io.errors import InputError
+from ns_abstract.verify.network.activations import ScalarFunction
 from ns_abstract.verify.network.bounds import bound_outputs
-from ns_abstract.verify.network.curves import Curve
+from ns_abstract.verify.network.composite_activations import Quantised
 from ns_abstract.verify.network.graph import Network
+from ns_abstract.verify.network.image_sets import ImageSets
 from ns_abstract.verify.network.layers import Activation
-from ns_abstract.verify.network.maps import Variance
-from ns_abstract.verify.network.recognised import Quantised
-from ns_abstract.verify.network.sets import ImageSets
+from ns_abstract.verify.network.sparse_layers import Variance
 
 #: One output, flattened, for one image [1, ...].
 Run = Callable[[np.ndarray], np.ndarray]
@@ -54,18 +54,18 @@ def compare(network: Network, run: Run, images: Iterable[np.ndarray], *, usual: 
         except Exception as error:  # the other program's own
             raise InputError(f"cannot be run: {error}", file=path, fix="export the network again") from None
         with torch.no_grad():
-            found = network(torch.from_numpy(image).double())[0].numpy()
-        if expected.shape != found.shape:
-            raise InputError(f"has {expected.size} outputs when run, {found.size} when read", file=path)
-        if not np.isfinite(expected).all() or not np.isfinite(found).all():
+            computed = network(torch.from_numpy(image).double())[0].numpy()
+        if expected.shape != computed.shape:
+            raise InputError(f"has {expected.size} outputs when run, {computed.size} when read", file=path)
+        if not np.isfinite(expected).all() or not np.isfinite(computed).all():
             if not usual:
                 continue
             raise InputError("computes numbers that are not finite", file=path, fix="train the network again")
-        allowed = _DIFFERENCE * max(1.0 if usual else 0.0, float(np.abs(expected).max()), float(np.abs(found).max()))
+        allowed = _DIFFERENCE * max(1.0 if usual else 0.0, float(np.abs(expected).max()), float(np.abs(computed).max()))
         if any(isinstance(node.layer, Quantised) for node in network.nodes):
             # a rounding that falls the other way moves a value by a step
             allowed = _STEPPED * allowed
-        difference = float(np.abs(expected - found).max())
+        difference = float(np.abs(expected - computed).max())
         if difference <= allowed:
             continue
         if not usual and any(isinstance(node.layer, Variance) for node in network.nodes):
@@ -75,7 +75,7 @@ def compare(network: Network, run: Run, images: Iterable[np.ndarray], *, usual: 
             continue
         with torch.no_grad():
             single = network(torch.from_numpy(image))[0].double().numpy()
-        rounded = float(np.abs(single - found).max())
+        rounded = float(np.abs(single - computed).max())
         if not difference <= _ROUNDED * rounded + (0.0 if usual else _STRANGE) and np.isfinite(rounded):
             raise InputError(
                 f"computes something else when run: outputs differ by {difference:.3g}",
@@ -95,9 +95,11 @@ def _within(network: Network, image: np.ndarray, expected: np.ndarray) -> bool:
     flat = image.astype(np.float64).reshape(1, -1)
     still = np.zeros((1, flat.shape[1], 1))
     rows = np.concatenate([np.eye(expected.size), -np.eye(expected.size)])
-    found = bound_outputs(network, ImageSets(still, flat, still, flat, flat, flat), rows, np.zeros(len(rows))).lower[0]
-    low, high = found[: expected.size], -found[expected.size :]
-    return bool(np.isfinite(found).all() and (low <= expected).all() and (expected <= high).all())
+    lower_bounds = bound_outputs(
+        network, ImageSets(still, flat, still, flat, flat, flat), rows, np.zeros(len(rows))
+    ).lower[0]
+    low, high = lower_bounds[: expected.size], -lower_bounds[expected.size :]
+    return bool(np.isfinite(lower_bounds).all() and (low <= expected).all() and (expected <= high).all())
 
 
 def probes(network: Network) -> tuple[Iterator[np.ndarray], Iterator[np.ndarray]]:
@@ -114,7 +116,7 @@ def _usual(network: Network) -> Iterator[np.ndarray]:
 def _strange(network: Network) -> Iterator[np.ndarray]:
     generator = np.random.default_rng(1)
     shape, end = (1, *network.input_shape), time.monotonic() + _SECONDS
-    sides = _Sides(network)
+    sides = _VisitedPhases(network)
     fixed = [np.zeros(shape), np.ones(shape), -np.ones(shape)]
     fixed += [generator.normal(size=shape) * size for size in (1.0, 2.0**-60, 16.0, 256.0)]
     for image in fixed:
@@ -135,7 +137,7 @@ def _strange(network: Network) -> Iterator[np.ndarray]:
         yield image.numpy()
 
 
-class _Sides:
+class _VisitedPhases:
     """Records which activation phases the test inputs have visited."""
 
     def __init__(self, network: Network) -> None:
@@ -150,7 +152,7 @@ class _Sides:
             inputs = [values[index] for index in node.inputs]
             values.append(node.layer(inputs))
             if isinstance(node.layer, Activation):
-                kinks = node.layer.breaks if isinstance(node.layer, Curve) else (0.0,)
+                kinks = node.layer.breaks if isinstance(node.layer, ScalarFunction) else (0.0,)
                 for kink in kinks:
                     if np.isfinite(kink):
                         yield (k, kink), inputs[0] - kink
@@ -180,5 +182,5 @@ class _Sides:
         total = torch.stack(wanted).sum()
         if not total.requires_grad:
             return None
-        (found,) = torch.autograd.grad(total, image)
-        return torch.nan_to_num(found)
+        (gradient,) = torch.autograd.grad(total, image)
+        return torch.nan_to_num(gradient)

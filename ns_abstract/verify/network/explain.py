@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from ns_abstract.io.errors import InputError
+from ns_abstract.verify.network.cost_model import cost_model_of
 from ns_abstract.verify.network.graph import Network, item
-from ns_abstract.verify.network.layers import Convolution, Linear, Matrix
-from ns_abstract.verify.network.maps import Sparse, TransposedConvolution
-from ns_abstract.verify.network.schedule import costs_of
+from ns_abstract.verify.network.layers import Convolution, LinearLayer, Matrix
+from ns_abstract.verify.network.sparse_layers import SparseMatrix, TransposedConvolution
 
 #: Numbers of float64 that every number of every layer takes in one cell, beside three for each parameter.
 _NUMBERS = 8
@@ -35,7 +35,7 @@ def products(network: Network, index: int) -> float:
         return size * layer.weight.shape[1]
     if isinstance(layer, TransposedConvolution):
         return float(np.prod(layer.input_shapes[0])) * float(np.prod(layer.weight.shape[1:]))
-    if isinstance(layer, Sparse):
+    if isinstance(layer, SparseMatrix):
         return float(layer.weight.numel())
     return size
 
@@ -45,7 +45,7 @@ def estimate(network: Network, dimensions: int) -> tuple[float, float, bool]:
     count = len(network.nodes)
     sizes = [float(np.prod(network.shape(k))) for k in range(count + 1)]
     forwards = 2.0 * sum(products(network, k) for k in range(1, count + 1)) * (1 + dimensions)
-    costs = costs_of(network)
+    costs = cost_model_of(network)
     rows = costs.foreseen(_OPEN, _DEEP_OPEN)
     many = costs.deep and not rows.given_up
     memory = sum(sizes) * 8 * (3 * dimensions + _NUMBERS) + (_MANY_ROWS if many else _FEW_ROWS)
@@ -80,7 +80,7 @@ def explain(network: Network, dimensions: int = 2) -> Sequence[str]:
     lines = [f"{network.source}: {item(network.input_shape)} -> {item(network.output_shape)}"]
     for k, node in enumerate(network.nodes, 1):
         kind = type(node.layer).__name__
-        kind = "Reshape" if type(node.layer) is Linear else kind
+        kind = "Reshape" if type(node.layer) is LinearLayer else kind
         inputs = ", ".join(map(str, node.inputs))
         lines.append(f"{k:5d}  {kind:22s} {item(node.layer.shape):>14s}  of {inputs:12s} {node.op} {node.name}")
     total = sum(float(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1))
@@ -93,7 +93,7 @@ def explain(network: Network, dimensions: int = 2) -> Sequence[str]:
     )
     if given_up:
         lines.append("deep: rows for its units cost more than they may, so they are given up and bounds are wide")
-    elif costs_of(network).planned:
+    elif cost_model_of(network).planned:
         lines.append(
             "deep: rows end on the way; of sets for which that leaves nothing known they are given up after seconds"
         )

@@ -11,7 +11,7 @@ from torch import Tensor
 from ns_abstract.arithmetic.network_charges import OWN_FEW, UP
 
 
-class Interval(NamedTuple):
+class NodeInterval(NamedTuple):
     """Lower and upper bounds of a node's values, [m, *shape]."""
 
     lower: Tensor
@@ -28,7 +28,7 @@ class Interval(NamedTuple):
 
 
 @dataclass
-class Form:
+class NodeForm:
     """The affine form ``z = reference + c + a p + e``, |e| <= r, of a node's values in every cell (N1).
 
     Attributes:
@@ -53,15 +53,15 @@ class Form:
         return torch.maximum(self.lower.abs(), self.upper.abs())
 
     @property
-    def interval(self) -> Interval:
+    def interval(self) -> NodeInterval:
         """What z is at least and at most."""
         room = OWN_FEW * self.reference.abs()
         low = self.reference + self.lower - room - OWN_FEW * self.lower.abs()
-        return Interval(low, self.reference + self.upper + room + OWN_FEW * self.upper.abs())
+        return NodeInterval(low, self.reference + self.upper + room + OWN_FEW * self.upper.abs())
 
     @staticmethod
-    def ranged(reference: Tensor, c: Tensor, a: Tensor, r: Tensor, active: Tensor | None = None) -> Form:
+    def ranged(reference: Tensor, c: Tensor, a: Tensor, r: Tensor, active: Tensor | None = None) -> NodeForm:
         """With the range of the form itself."""
         radius = (a.abs().sum(1) + r) * UP + c.abs() * OWN_FEW
         active = torch.ones_like(c, dtype=torch.bool) if active is None else active
-        return Form(reference, c, a, r, c - radius, c + radius, active)
+        return NodeForm(reference, c, a, r, c - radius, c + radius, active)

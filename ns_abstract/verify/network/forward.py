@@ -8,19 +8,19 @@ import numpy as np
 import torch
 
 from ns_abstract.arithmetic.network_charges import SPARE, UNIT
-from ns_abstract.verify.network.forms import Form
-from ns_abstract.verify.network.known import Known
+from ns_abstract.verify.network.bilinear import Product
+from ns_abstract.verify.network.cost_model import WorkBudget
+from ns_abstract.verify.network.forms import NodeForm
+from ns_abstract.verify.network.intermediate_bounds import IntermediateBounds
 from ns_abstract.verify.network.layers import Activation, LeakyRelu
-from ns_abstract.verify.network.maxima import MaxPool
-from ns_abstract.verify.network.pooling import Pooling
-from ns_abstract.verify.network.products import Product
-from ns_abstract.verify.network.propagation import Propagation
-from ns_abstract.verify.network.schedule import Schedule
-from ns_abstract.verify.network.selection import Selection
-from ns_abstract.verify.network.slopes import Held
+from ns_abstract.verify.network.max_pool_propagation import MaxPoolPropagation
+from ns_abstract.verify.network.max_pooling import MaxPool
+from ns_abstract.verify.network.neuron_selection import NeuronSelection
+from ns_abstract.verify.network.propagation import ForwardPropagation
+from ns_abstract.verify.network.slope_optimisation import SplitNeurons
 
 
-class Forward:
+class ForwardPass:
     """Propagates forms through the nodes in order and refines intermediate bounds.
 
     Args:
@@ -31,16 +31,21 @@ class Forward:
     """
 
     def __init__(
-        self, known: Known, propagation: Propagation, pooling: Pooling, selection: Selection, schedule: Schedule
+        self,
+        intermediate: IntermediateBounds,
+        propagation: ForwardPropagation,
+        pooling: MaxPoolPropagation,
+        selection: NeuronSelection,
+        schedule: WorkBudget,
     ) -> None:
-        self.known, self.network = known, known.network
+        self.intermediate, self.network = intermediate, intermediate.network
         self.propagation, self.pooling, self.selection = propagation, pooling, selection
         self.schedule = schedule
 
-    def run(self) -> Form:
+    def run(self) -> NodeForm:
         """Lines and rounding of every node; returns what is known of the last one."""
-        forms: list[Form | None] = [self.known.image_form()]
-        self.known.forms = forms
+        forms: list[NodeForm | None] = [self.intermediate.image_form()]
+        self.intermediate.forms = forms
         if self.schedule.planned:
             self._learn(0, False)
         left = list(self.network.readers)
@@ -55,19 +60,22 @@ class Forward:
                 # what is known better of the input is also known to its other readers
                 source = node.inputs[0]
                 inputs[0] = self._assume(source, inputs[0])
-                open_, apart = node.layer.open(*inputs[0].interval), node.layer.apart(*inputs[0].interval)
-                better = self.selection.better(source, inputs[0], open_, apart, node.layer)
+                unstable, apart = (
+                    node.layer.unstable(*inputs[0].interval),
+                    node.layer.relaxation_gap(*inputs[0].interval),
+                )
+                better = self.selection.better(source, inputs[0], unstable, apart, node.layer)
                 forms[source] = inputs[0] = self._assume(source, better)
                 if isinstance(node.layer, LeakyRelu):
-                    self.selection.unsure = float(node.layer.open(*inputs[0].interval).double().mean())
+                    self.selection.unsure = float(node.layer.unstable(*inputs[0].interval).double().mean())
                 forms.append(self.propagation.activation(k, source, node.layer, inputs[0]))
                 if self.network.depth[source] > 1:
-                    self.known.stops[source] = self.known.stop(source, inputs[0])
+                    self.intermediate.stops[source] = self.intermediate.stop(source, inputs[0])
             elif isinstance(node.layer, Product):
                 intervals = inputs[0].interval, inputs[1].interval
-                open_, apart = node.layer.open(*intervals), node.layer.apart(*intervals)
+                unstable, apart = node.layer.unstable(*intervals), node.layer.relaxation_gap(*intervals)
                 for position, source in enumerate(node.inputs):
-                    forms[source] = inputs[position] = self.selection.better(source, inputs[position], open_, apart)
+                    forms[source] = inputs[position] = self.selection.better(source, inputs[position], unstable, apart)
                 forms.append(self.propagation.product(k, node.inputs, node.layer, inputs[0], inputs[1]))
             elif isinstance(node.layer, MaxPool):
                 forms.append(self.pooling.maximum(k, node.inputs[0], node.layer, inputs[0]))
@@ -83,12 +91,12 @@ class Forward:
                     self._leave(index)
         end = forms[last]
         assert end is not None
-        self.known.forms = []
+        self.intermediate.forms = []
         return end
 
     def _learn(self, index: int, cut: bool) -> None:
         """Tell the schedule how wide bounds of node ``index`` are; ``cut``: those of numbers that are not cut off."""
-        form = self.known.forms[index]
+        form = self.intermediate.forms[index]
         assert form is not None
         r = form.r
         if cut:
@@ -98,24 +106,24 @@ class Forward:
 
     def _leave(self, index: int) -> None:
         """Node ``index`` has been read; rows of later ones may end there (N18)."""
-        form, self.known.forms[index] = self.known.forms[index], None
-        if index in self.schedule.rests and index not in self.known.stops:
+        form, self.intermediate.forms[index] = self.intermediate.forms[index], None
+        if index in self.schedule.rests and index not in self.intermediate.stops:
             assert form is not None
-            self.known.stops[index] = self.known.stop(index, form)
+            self.intermediate.stops[index] = self.intermediate.stop(index, form)
 
-    def _assume(self, source: int, z: Form) -> Form:
+    def _assume(self, source: int, z: NodeForm) -> NodeForm:
         """What is known of node ``source`` where its numbers have the signs that are assumed (N16)."""
-        if self.known.assumed is None or not any(source in signs for signs in self.known.assumed):
+        if self.intermediate.assumed is None or not any(source in phases for phases in self.intermediate.assumed):
             return z
         lower, upper = (v.flatten(1).clone() for v in (z.lower, z.upper))
         least, most = (v.flatten(1).numpy() for v in z.interval)
         reference, width = z.reference.flatten(1), z.width.flatten(1).numpy()
-        for cell, signs in enumerate(self.known.assumed):
-            if source not in signs or not self.known.good[cell]:
+        for cell, phases in enumerate(self.intermediate.assumed):
+            if source not in phases or not self.intermediate.good[cell]:
                 continue
-            flat, side = signs[source]
+            flat, side = phases[source]
             if bool(np.where(side > 0.0, most[cell, flat] < 0.0, least[cell, flat] > 0.0).any()):
-                self.known.vacant[cell] = True
+                self.intermediate.infeasible[cell] = True
                 continue
             at, positive = torch.from_numpy(flat), torch.from_numpy(side > 0.0)
             zero = -reference[cell, at]
@@ -123,7 +131,7 @@ class Forward:
             lower[cell, at] = torch.where(positive, torch.minimum(torch.maximum(low, zero), high), low)
             upper[cell, at] = torch.where(positive, high, torch.maximum(torch.minimum(high, zero), low))
             noise = UNIT * (SPARE + self.network.readers[source]) * width[cell, flat]
-            if self.known.rounds(source):
-                noise = noise + self.known.passages[0].noise[source].flatten(1).numpy()[cell, flat]
-            self.known.held[cell][source] = Held(flat, side, -zero.numpy(), noise)
+            if self.intermediate.rounds(source):
+                noise = noise + self.intermediate.relaxations[0].noise[source].flatten(1).numpy()[cell, flat]
+            self.intermediate.split[cell][source] = SplitNeurons(flat, side, -zero.numpy(), noise)
         return replace(z, lower=lower.reshape(z.lower.shape), upper=upper.reshape(z.upper.shape))

@@ -12,12 +12,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ns_abstract.verify.network.curves import Assumed
-from ns_abstract.verify.network.layers import Activation, Linear, Scale, Shape, Sigmoid, Tanh
-from ns_abstract.verify.network.maxima import MaxPool
-from ns_abstract.verify.network.products import Product
+from ns_abstract.verify.network.activations import LibraryFunction
+from ns_abstract.verify.network.bilinear import Product
+from ns_abstract.verify.network.layers import Activation, LinearLayer, ScaleLayer, Shape, Sigmoid, Tanh
+from ns_abstract.verify.network.max_pooling import MaxPool
 
-Layer = Linear | Activation | Product | MaxPool
+Layer = LinearLayer | Activation | Product | MaxPool
 
 #: Whether bounds hold for every float32 evaluation and the exact network, or for that alone.
 NetworkArithmetic = Literal["float32", "real"]
@@ -78,8 +78,8 @@ class Network:
         self.output = output
 
     def __getstate__(self) -> dict[str, Any]:
-        kept = ("source", "input_shape", "nodes", "output_shape", "output")
-        return {name: self.__dict__[name] for name in kept}
+        fields = ("source", "input_shape", "nodes", "output_shape", "output")
+        return {name: self.__dict__[name] for name in fields}
 
     @property
     def input_size(self) -> int:
@@ -96,7 +96,7 @@ class Network:
         if arithmetic == "real":
             return _REAL
         sigmoidal = any(isinstance(node.layer, (Sigmoid, Tanh)) for node in self.nodes)
-        elementary = any(isinstance(node.layer, Assumed) for node in self.nodes)
+        elementary = any(isinstance(node.layer, LibraryFunction) for node in self.nodes)
         return (*GUARANTEE, *[_SIGMOIDAL] * sigmoidal, *[_ELEMENTARY] * elementary)
 
     def shape(self, index: int) -> Shape:
@@ -137,7 +137,7 @@ class Network:
                 # siblings that read one node, too: what scales it may be folded into each
                 if plain[k] and (plain[index] or not index):
                     groups[group(k)] = group(index)
-        marked = {group(k) for k, node in enumerate(self.nodes, 1) if isinstance(node.layer, Scale)}
+        marked = {group(k) for k, node in enumerate(self.nodes, 1) if isinstance(node.layer, ScaleLayer)}
         return frozenset(k for k in range(1, len(self.nodes) + 1) if plain[k] and group(k) in marked)
 
     def __call__(self, images: Tensor) -> Tensor:

@@ -2,10 +2,10 @@
 
 See design.md, N3, N4.
 
-A layer is linear (`Linear` and the classes built on it) or acts on every number by itself (`Activation`).
+A layer is linear (`LinearLayer` and the classes built on it) or acts on every number by itself (`Activation`).
 A linear layer has three faces that share one matrix W: the concrete ``W x + bias``, its magnitude
 ``|W| x`` (for radii and for rounding), and its transpose ``rows W`` on windows of rows
-(`ns_abstract.verify.network.rows`). An activation has its concrete value and lines that enclose it over
+(`ns_abstract.verify.network.coefficients`). An activation has its concrete value and lines that enclose it over
 an interval. Labels N1, N2, ... are those of docs/design.md.
 """
 
@@ -31,13 +31,13 @@ from ns_abstract.arithmetic.network_charges import (
     OWN_SUMS,
     SLOPES_DOWN,
 )
-from ns_abstract.verify.network.rows import Rows, full, grid, interleave, unflatten
+from ns_abstract.verify.network.coefficients import Coefficients, full, grid, interleave, unflatten
 
 Shape = tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False)
-class Linear:
+class LinearLayer:
     """A linear layer; the base class passes its input on in another shape.
 
     Attributes:
@@ -85,7 +85,7 @@ class Linear:
         """What the network is off the layer's numbers in real arithmetic, too, for inputs of at most ``sizes``."""
         return 0.0
 
-    def backward(self, rows: Rows) -> list[Rows]:
+    def backward(self, rows: Coefficients) -> list[Coefficients]:
         """Rows on every input for rows on the output; may reuse their memory."""
         return [unflatten(rows, self.shape, self.input_shapes[0])]
 
@@ -95,7 +95,7 @@ class Linear:
 
 
 @dataclass(frozen=True, eq=False)
-class Weighted(Linear):
+class Weighted(LinearLayer):
     """A layer of sums of products: ``weight`` and ``offset``, float64; None: no offset."""
 
     weight: Tensor = field(default_factory=lambda: torch.zeros(0))
@@ -175,14 +175,14 @@ class Convolution(Weighted):
         if kh == kw == 1:
             near = functional.conv2d(value, weight.transpose(0, 1))
             size = (near.shape[2] - 1) * s + 1, (near.shape[3] - 1) * t + 1
-            found = torch.zeros((*near.shape[:2], *size), dtype=value.dtype)
-            found[:, :, ::s, ::t] = near
-            return found
+            result = torch.zeros((*near.shape[:2], *size), dtype=value.dtype)
+            result[:, :, ::s, ::t] = near
+            return result
         high, wide = phases.shape[2:]
-        found = functional.conv2d(value, phases, padding=(high - 1, wide - 1)).numpy()
+        result = functional.conv2d(value, phases, padding=(high - 1, wide - 1)).numpy()
         size = (value.shape[2] - 1) * s + kh, (value.shape[3] - 1) * t + kw
-        whole = np.empty((len(value), self.weight.shape[1], *size), found.dtype)
-        interleave(found, s, t, whole)
+        whole = np.empty((len(value), self.weight.shape[1], *size), result.dtype)
+        interleave(result, s, t, whole)
         return torch.from_numpy(whole)
 
     def roundings(self, active: Sequence[Tensor]) -> Tensor | int:
@@ -213,7 +213,7 @@ class Convolution(Weighted):
         spread = high + (kh - 1) * self.dilation[0], wide + (kw - 1) * self.dilation[1]
         return self.stride == (1, 1) and spread == (height + 2 * top, width + 2 * left)
 
-    def backward(self, rows: Rows) -> list[Rows]:
+    def backward(self, rows: Coefficients) -> list[Coefficients]:
         if self._trims and rows.covers(self.shape):
             # nothing outside of the map is computed
             value = torch.from_numpy(rows.value)
@@ -224,10 +224,10 @@ class Convolution(Weighted):
                 groups=self.groups,
                 dilation=self.dilation,
             )
-            return [Rows.whole(whole.numpy())]
+            return [Coefficients.whole(whole.numpy())]
         value = self._transposed(torch.from_numpy(rows.value)).numpy()
         y, x = rows.y * self.stride[0] - self.pads[0], rows.x * self.stride[1] - self.pads[1]
-        return [full(Rows(value, y, x), self.input_shapes[0])]
+        return [full(Coefficients(value, y, x), self.input_shapes[0])]
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,16 +247,16 @@ class Matrix(Weighted):
     def magnitude(self, inputs: Sequence[Tensor]) -> Tensor:
         return inputs[0] @ self.weight.abs().to(inputs[0].dtype).T
 
-    def backward(self, rows: Rows) -> list[Rows]:
+    def backward(self, rows: Coefficients) -> list[Coefficients]:
         whole = full(rows, self.shape, force=True)
         count = whole.value.shape[0]
         value = torch.from_numpy(whole.value).reshape(count, *self.shape)
         value = value @ self.weight_for(value)
-        return [Rows.whole(value.numpy().reshape(count, *grid(self.input_shapes[0])))]
+        return [Coefficients.whole(value.numpy().reshape(count, *grid(self.input_shapes[0])))]
 
 
 @dataclass(frozen=True, eq=False)
-class Scale(Linear):
+class ScaleLayer(LinearLayer):
     """``factor * x + offset`` with constants; both [*shape] float64 (batch normalisation, Mul, Add, ...).
 
     Attributes:
@@ -282,14 +282,14 @@ class Scale(Linear):
     def magnitude(self, inputs: Sequence[Tensor]) -> Tensor:
         return inputs[0] * self.factor.abs().to(inputs[0].dtype)
 
-    def backward(self, rows: Rows) -> list[Rows]:
+    def backward(self, rows: Coefficients) -> list[Coefficients]:
         factor = self.factor.expand(self.shape).reshape(grid(self.shape)).numpy()
         rows.scale(factor.astype(rows.value.dtype))
         return [rows]
 
 
 @dataclass(frozen=True, eq=False)
-class Sum(Linear):
+class Sum(LinearLayer):
     """``sum_i signs[i] x_i``, signs 1 or -1."""
 
     signs: tuple[int, ...] = (1, 1)
@@ -307,16 +307,16 @@ class Sum(Linear):
             total = total + value
         return total
 
-    def backward(self, rows: Rows) -> list[Rows]:
+    def backward(self, rows: Coefficients) -> list[Coefficients]:
         # rows are changed in place further on, so every input gets its own
-        copies = [Rows(rows.value * rows.value.dtype.type(sign), rows.y, rows.x) for sign in self.signs[1:]]
+        copies = [Coefficients(rows.value * rows.value.dtype.type(sign), rows.y, rows.x) for sign in self.signs[1:]]
         if self.signs[0] < 0:
             np.negative(rows.value, out=rows.value)
         return [rows, *copies]
 
 
 @dataclass(frozen=True, eq=False)
-class Pad(Linear):
+class Pad(LinearLayer):
     """A constant around the map: ``pads`` top, left, bottom, right (negative ones cut), and its ``value``."""
 
     pads: tuple[int, int, int, int] = (0, 0, 0, 0)
@@ -333,12 +333,12 @@ class Pad(Linear):
         top, left, bottom, right = self.pads
         return functional.pad(inputs[0], (left, right, top, bottom))
 
-    def backward(self, rows: Rows) -> list[Rows]:
-        return [full(Rows(rows.value, rows.y - self.pads[0], rows.x - self.pads[1]), self.input_shapes[0])]
+    def backward(self, rows: Coefficients) -> list[Coefficients]:
+        return [full(Coefficients(rows.value, rows.y - self.pads[0], rows.x - self.pads[1]), self.input_shapes[0])]
 
 
 @dataclass(frozen=True, eq=False)
-class Channels(Linear):
+class ChannelEmbedding(LinearLayer):
     """Places the input's channels among channels of zeros, from number ``first`` on."""
 
     first: int = 0
@@ -347,13 +347,13 @@ class Channels(Linear):
         after = self.shape[0] - self.input_shapes[0][0] - self.first
         return functional.pad(inputs[0], (0, 0, 0, 0, self.first, after))
 
-    def backward(self, rows: Rows) -> list[Rows]:
+    def backward(self, rows: Coefficients) -> list[Coefficients]:
         part = rows.value[:, self.first : self.first + self.input_shapes[0][0]]
-        return [Rows(np.ascontiguousarray(part), rows.y, rows.x)]
+        return [Coefficients(np.ascontiguousarray(part), rows.y, rows.x)]
 
 
 @dataclass(frozen=True, eq=False)
-class Gather(Linear):
+class Gather(LinearLayer):
     """Gathers numbers of the input by index.
 
     Attributes:
@@ -374,18 +374,18 @@ class Gather(Linear):
         chosen = inputs[0].flatten(1)[:, self.index.clamp(min=0)]
         return (chosen * (self.index >= 0).to(chosen.dtype)).reshape(-1, *self.shape)
 
-    def backward(self, rows: Rows) -> list[Rows]:
+    def backward(self, rows: Coefficients) -> list[Coefficients]:
         whole = full(rows, self.shape, force=True)
         count = whole.value.shape[0]
-        given = torch.from_numpy(whole.value).reshape(count, -1)
-        value = torch.zeros((count, int(np.prod(self.input_shapes[0]))), dtype=given.dtype)
-        kept = self.index >= 0
-        value.index_add_(1, self.index[kept], given[:, kept])
-        return [Rows.whole(value.numpy().reshape(count, *grid(self.input_shapes[0])))]
+        flat = torch.from_numpy(whole.value).reshape(count, -1)
+        value = torch.zeros((count, int(np.prod(self.input_shapes[0]))), dtype=flat.dtype)
+        used = self.index >= 0
+        value.index_add_(1, self.index[used], flat[:, used])
+        return [Coefficients.whole(value.numpy().reshape(count, *grid(self.input_shapes[0])))]
 
 
 @dataclass(frozen=True)
-class Lines:
+class LinearRelaxation:
     """The linear relaxation of an activation over an interval: lines ``slope * z + offset``, float64, shaped as z."""
 
     lower_slope: Tensor
@@ -418,23 +418,23 @@ class Activation:
         """The concrete value."""
         raise AssertionError
 
-    def open(self, lower: Tensor, upper: Tensor) -> Tensor:
+    def unstable(self, lower: Tensor, upper: Tensor) -> Tensor:
         """Where better bounds of the input would give better lines."""
         raise AssertionError
 
-    def apart(self, lower: Tensor, upper: Tensor) -> Tensor | None:
-        """How far the lines of N3 are apart, as a part of the interval; None where `open` says all."""
+    def relaxation_gap(self, lower: Tensor, upper: Tensor) -> Tensor | None:
+        """How far the lines of N3 are apart, as a part of the interval; None where `unstable` says all."""
         return None
 
-    def lines(self, lower: Tensor, upper: Tensor) -> Lines:
+    def lines(self, lower: Tensor, upper: Tensor) -> LinearRelaxation:
         """A lower and an upper line over [lower, upper], each the best by itself (N4)."""
         raise AssertionError
 
-    def band(self, lower: Tensor, upper: Tensor) -> Lines:
+    def band(self, lower: Tensor, upper: Tensor) -> LinearRelaxation:
         """Two parallel lines (N3): the same tensor is both slopes."""
         raise AssertionError
 
-    def offsets(self, slope: Tensor, lower: Tensor, upper: Tensor, band: Lines) -> tuple[Tensor, Tensor]:
+    def offsets(self, slope: Tensor, lower: Tensor, upper: Tensor, band: LinearRelaxation) -> tuple[Tensor, Tensor]:
         """What the function less ``slope * z`` is at least and at most between, but for rounding.
 
         ``band``: two parallel lines, of which it is taken.
@@ -463,14 +463,14 @@ class LeakyRelu(Activation):
         size = torch.maximum(lower.abs(), upper.abs())
         return AFFINE * self.alpha * size + FUNCTION_FLUSHES * FLUSH * (1.0 + size)
 
-    def open(self, lower: Tensor, upper: Tensor) -> Tensor:
+    def unstable(self, lower: Tensor, upper: Tensor) -> Tensor:
         return (lower < 0.0) & (upper > 0.0)
 
-    def offsets(self, slope: Tensor, lower: Tensor, upper: Tensor, band: Lines) -> tuple[Tensor, Tensor]:
+    def offsets(self, slope: Tensor, lower: Tensor, upper: Tensor, band: LinearRelaxation) -> tuple[Tensor, Tensor]:
         # convex: most at an end, least there or at the kink
         ends = [torch.where(z >= 0.0, (1.0 - slope) * z, (self.alpha - slope) * z) for z in (lower, upper)]
         least = torch.minimum(*ends)
-        return torch.where(self.open(lower, upper), least.clamp(max=0.0), least), torch.maximum(*ends)
+        return torch.where(self.unstable(lower, upper), least.clamp(max=0.0), least), torch.maximum(*ends)
 
     def _chord(self, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
         """Slope and offset of an upper line: the chord where open, the function itself elsewhere."""
@@ -481,18 +481,18 @@ class LeakyRelu(Activation):
         # convex: above both ends is above everywhere between
         offset = torch.maximum(ends[0] - slope * lower, ends[1] - slope * upper)
         size = slope * torch.maximum(lower.abs(), upper.abs())
-        return slope, torch.where(self.open(lower, upper), offset + OWN_LINE * size, torch.zeros_like(offset))
+        return slope, torch.where(self.unstable(lower, upper), offset + OWN_LINE * size, torch.zeros_like(offset))
 
-    def lines(self, lower: Tensor, upper: Tensor) -> Lines:
+    def lines(self, lower: Tensor, upper: Tensor) -> LinearRelaxation:
         slope, offset = self._chord(lower, upper)
         # any line alpha..1 through the origin is below; the larger area is cut off by the steeper half
         below = torch.where(upper > -lower, torch.ones_like(lower), torch.full_like(lower, self.alpha))
-        below = torch.where(self.open(lower, upper), below, slope)
-        return Lines(below, torch.zeros_like(offset), slope, offset)
+        below = torch.where(self.unstable(lower, upper), below, slope)
+        return LinearRelaxation(below, torch.zeros_like(offset), slope, offset)
 
-    def band(self, lower: Tensor, upper: Tensor) -> Lines:
+    def band(self, lower: Tensor, upper: Tensor) -> LinearRelaxation:
         slope, offset = self._chord(lower, upper)
-        return Lines(slope, torch.zeros_like(offset), slope, offset)
+        return LinearRelaxation(slope, torch.zeros_like(offset), slope, offset)
 
 
 class _Sigmoidal(Activation):
@@ -506,17 +506,17 @@ class _Sigmoidal(Activation):
     def slope(self, z: Tensor) -> Tensor:
         raise AssertionError
 
-    def open(self, lower: Tensor, upper: Tensor) -> Tensor:
+    def unstable(self, lower: Tensor, upper: Tensor) -> Tensor:
         return lower < upper
 
-    def band(self, lower: Tensor, upper: Tensor) -> Lines:
+    def band(self, lower: Tensor, upper: Tensor) -> LinearRelaxation:
         # with the least slope in the interval (at an end), f(z) - slope z does not decrease
         slope = torch.minimum(self.slope(lower), self.slope(upper)) * SLOPES_DOWN
         room = self.room + OWN_LINE * slope * torch.maximum(lower.abs(), upper.abs())
         low, high = self.function(lower) - slope * lower, self.function(upper) - slope * upper
-        return Lines(slope, low - room, slope, high + room)
+        return LinearRelaxation(slope, low - room, slope, high + room)
 
-    def lines(self, lower: Tensor, upper: Tensor) -> Lines:
+    def lines(self, lower: Tensor, upper: Tensor) -> LinearRelaxation:
         band = self.band(lower, upper)
         width = upper - lower
         middle = 0.5 * (lower + upper)
@@ -533,7 +533,7 @@ class _Sigmoidal(Activation):
         touch = self.function(middle) - tangent * middle
         slack = room + OWN_FUNCTION * tangent * width
         convex, concave = upper <= 0.0, lower >= 0.0
-        return Lines(
+        return LinearRelaxation(
             torch.where(convex, tangent, torch.where(concave, chord, band.lower_slope)),
             torch.where(convex, touch - slack, torch.where(concave, chord_low, band.lower_offset)),
             torch.where(convex, chord, torch.where(concave, tangent, band.upper_slope)),

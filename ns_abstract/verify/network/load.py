@@ -14,7 +14,7 @@ from ns_abstract.io.jsonio import file_size, show
 from ns_abstract.verify.network.comparison import Run, compare, probes
 from ns_abstract.verify.network.graph import Network
 from ns_abstract.verify.network.onnx_file import read_onnx
-from ns_abstract.verify.network.onnx_graph import Asked
+from ns_abstract.verify.network.onnx_graph import ReadRequest
 from ns_abstract.verify.network.onnx_tensors import PACKED, unpacked_model
 from ns_abstract.verify.network.subnormals import subnormals_kept
 
@@ -47,7 +47,7 @@ def load_network(
     name = path.name.lower()
     if not name.endswith((".onnx", PACKED)):
         raise InputError(f"has the ending {path.suffix!r}", file=path, fix=_instead(path))
-    network = read_onnx(path, Asked(output, vector, picture, layout == "NHWC"))
+    network = read_onnx(path, ReadRequest(output, vector, picture, layout == "NHWC"))
     run = onnx_runner(path, network.output, network.input_shape)
     usual, strange = probes(network)
     compare(network, run, usual)
@@ -108,7 +108,7 @@ def onnx_runner(path: Path, output: str = "", shape: Sequence[int] | None = None
 
     def run(image: np.ndarray) -> np.ndarray:
         image = (image[0] if alone else np.repeat(image, copies, 0)).astype(kind)
-        found = np.asarray(session.run(names, {wanted.name: image})[0])
-        return (found[0] if copies > 1 else found).reshape(-1)
+        output = np.asarray(session.run(names, {wanted.name: image})[0])
+        return (output[0] if copies > 1 else output).reshape(-1)
 
     return run

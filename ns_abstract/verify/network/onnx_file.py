@@ -5,16 +5,16 @@ from __future__ import annotations
 from pathlib import Path
 
 from ns_abstract.verify.network.graph import Network
-from ns_abstract.verify.network.onnx_graph import Asked, Reader, operator_set
+from ns_abstract.verify.network.onnx_graph import OnnxReader, ReadRequest, operator_set
 from ns_abstract.verify.network.onnx_rules import RULES
 from ns_abstract.verify.network.onnx_tensors import parse_model
 
 
-def read_onnx(path: Path, asked: Asked | None = None) -> Network:
+def read_onnx(path: Path, asked: ReadRequest | None = None) -> Network:
     """The network in an ONNX file, up to the output that is asked for.
 
     Raises:
         InputError: The file cannot be read, or uses what is not supported; names node, operator and attribute.
     """
     model = parse_model(path)
-    return Reader(path, model.graph, operator_set(model, path), RULES, asked or Asked()).network()
+    return OnnxReader(path, model.graph, operator_set(model, path), RULES, asked or ReadRequest()).network()

@@ -139,7 +139,7 @@ def fold(node: onnx.NodeProto, values: Sequence[np.ndarray | None], opset: int) 
     )
     try:
         with np.errstate(all="ignore"):
-            found = ReferenceEvaluator(model).run(None, dict(zip(names, present, strict=True)))
+            results = ReferenceEvaluator(model).run(None, dict(zip(names, present, strict=True)))
     except Exception as error:  # the reference operators raise whatever they meet
         raise InputError(f"cannot be computed ({error})", fix="check its constants") from None
-    return [np.asarray(v) for v in found]  # type: ignore[union-attr]
+    return [np.asarray(v) for v in results]  # type: ignore[union-attr]

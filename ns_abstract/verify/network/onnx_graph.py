@@ -12,8 +12,8 @@ import onnx
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import show
-from ns_abstract.verify.network.compose import Composer
-from ns_abstract.verify.network.enclosed import Enclosed, arithmetic, fold_enclosed
+from ns_abstract.verify.network.composite_layers import CompositeBuilder
+from ns_abstract.verify.network.constant_enclosures import EnclosedConstant, arithmetic, fold_enclosed
 from ns_abstract.verify.network.graph import Network
 from ns_abstract.verify.network.layers import Shape
 from ns_abstract.verify.network.onnx_choices import without_choices
@@ -25,7 +25,7 @@ _OPSETS = range(7, 24)
 #: Outputs that a message names.
 _NAMED = 8
 
-Rule = Callable[["Reader", onnx.NodeProto, "Attributes"], None]
+Rule = Callable[["OnnxReader", onnx.NodeProto, "Attributes"], None]
 
 
 def operator_set(model: onnx.ModelProto, path: Path) -> int:
@@ -100,7 +100,7 @@ _BY_ITEM = frozenset(
 )
 
 
-class Asked(NamedTuple):
+class ReadRequest(NamedTuple):
     """Which output of a file is read, and how its input is shaped.
 
     Attributes:
@@ -120,7 +120,7 @@ class Asked(NamedTuple):
 _PICKS = frozenset(("ArgMax", "ArgMin", "TopK"))
 
 
-class Value(NamedTuple):
+class TensorValue(NamedTuple):
     """A tensor of the graph: a node of the network, and the tensor's shape in the file for a batch of 1."""
 
     index: int
@@ -137,15 +137,17 @@ class Value(NamedTuple):
         return len(self.whole) - len(self.item)
 
 
-class Reader:
+class OnnxReader:
     """Turns the nodes of one ONNX graph into layers."""
 
-    def __init__(self, path: Path, graph: onnx.GraphProto, opset: int, rules: dict[str, Rule], asked: Asked) -> None:
+    def __init__(
+        self, path: Path, graph: onnx.GraphProto, opset: int, rules: dict[str, Rule], asked: ReadRequest
+    ) -> None:
         self.path, self.graph, self.opset, self.rules = path, graph, opset, rules
         self.stored = StoredTensors(path)
         self.constants: dict[str, np.ndarray] = {}
         #: constants that evaluations may round differently; `constants` holds numbers within
-        self.enclosed: dict[str, Enclosed] = {}
+        self.enclosed: dict[str, EnclosedConstant] = {}
         for tensor in graph.initializer:
             self.constants[tensor.name] = self.stored.array(tensor, f"initializer {tensor.name}")
         if graph.sparse_initializer:
@@ -154,10 +156,10 @@ class Reader:
         self.batch = 1
         self.input_name, image = self._input(asked)
         self.output = self._chosen(asked.output)
-        self.builder = Composer(path, image.item)
-        self.values: dict[str, Value] = {self.input_name: image}
+        self.builder = CompositeBuilder(path, image.item)
+        self.values: dict[str, TensorValue] = {self.input_name: image}
         #: whether a value is above a number: what the exporter makes of softplus
-        self.above: dict[str, tuple[Value, float]] = {}
+        self.above: dict[str, tuple[TensorValue, float]] = {}
         #: scale and zero of values that are rounded to steps, until they are dequantised
         self.quantised: dict[str, tuple[float, int]] = {}
         #: numbers of a value that a mask has set to minus infinity, in its whole shape; they stand as they were before
@@ -167,7 +169,7 @@ class Reader:
         name = node.name or (node.output[0] if node.output else "")
         return InputError(problem, file=self.path, field=f"node {name} ({node.op_type})", fix=fix)
 
-    def _input(self, asked: Asked) -> tuple[str, Value]:
+    def _input(self, asked: ReadRequest) -> tuple[str, TensorValue]:
         inputs = [value for value in self.graph.input if value.name not in self.constants]
         if len(inputs) != 1:
             raise InputError(f"has {len(inputs)} inputs", file=self.path, field="graph.input", fix="one image expected")
@@ -185,21 +187,21 @@ class Reader:
                 if not side.HasField("dim_value") or side.dim_value < 0:
                     sizes[place] = size
         if asked.vector and len(sizes) == 1 and sizes[0] > 0:
-            return value.name, Value(0, tuple(sizes))
+            return value.name, TensorValue(0, tuple(sizes))
         if len(sizes) == 4 and sizes[0] > 1:
             self.batch, sizes[0] = sizes[0], 1
         if len(sizes) > 1 and sizes[0] > 1 and min(sizes) > 0:
             # no batch of pictures: the whole tensor is the item
-            return value.name, Value(0, tuple(sizes))
+            return value.name, TensorValue(0, tuple(sizes))
         if len(sizes) < 2 or sizes[0] not in (0, 1) or min(sizes[1:]) < 1:
-            shown = [d.dim_value if d.HasField("dim_value") else d.dim_param or "?" for d in kind.shape.dim]
+            dimensions = [d.dim_value if d.HasField("dim_value") else d.dim_param or "?" for d in kind.shape.dim]
             raise InputError(
-                f"has shape {shown}",
+                f"has shape {dimensions}",
                 file=self.path,
                 field=field,
                 fix="export with all sizes but the batch fixed, or say height and width in preprocess.resize",
             )
-        return value.name, Value(0, (1, *sizes[1:]))
+        return value.name, TensorValue(0, (1, *sizes[1:]))
 
     def network(self) -> Network:
         """The network up to the chosen output; nodes that it does not depend on are not read."""
@@ -274,27 +276,27 @@ class Reader:
                 return
             with np.errstate(all="ignore"):
                 within = [self.enclosed.get(n, v) for n, v in zip(node.input, values, strict=True)]
-                found = fold_enclosed(node, within, self.opset)
+                folded = fold_enclosed(node, within, self.opset)
             names = [name for name in node.output if name]
-            self.enclosed |= {n: v for n, v in zip(names, found, strict=False) if isinstance(v, Enclosed)}
-            self.fold(node, *(v.value if isinstance(v, Enclosed) else v for v in found))
+            self.enclosed |= {n: v for n, v in zip(names, folded, strict=False) if isinstance(v, EnclosedConstant)}
+            self.fold(node, *(v.value if isinstance(v, EnclosedConstant) else v for v in folded))
             return
         rule = self.rules.get(kind)
         if rule is None:
             near = difflib.get_close_matches(kind, self.rules, 5, 0.0)
-            known = f"{len(self.rules)} operators are, the nearest by name {', '.join(near)}"
+            advice = f"{len(self.rules)} operators are, the nearest by name {', '.join(near)}"
             if kind in _PICKS:
-                known = (
+                advice = (
                     f"make its input {node.input[0]!r} the network's output: properties compare the scores themselves"
                 )
-            raise InputError("operator is not supported", fix=_INSTEAD.get(kind, known))
+            raise InputError("operator is not supported", fix=_INSTEAD.get(kind, advice))
         attributes = Attributes(self, node)
         rule(self, node, attributes)
         attributes.done()
 
     # what rules use
 
-    def value(self, node: onnx.NodeProto, position: int = 0) -> Value:
+    def value(self, node: onnx.NodeProto, position: int = 0) -> TensorValue:
         """What makes input ``position``, which must depend on the image."""
         name = node.input[position] if position < len(node.input) else ""
         if name in self.dropped and node.op_type != "Softmax":
@@ -328,20 +330,20 @@ class Reader:
         if name in self.enclosed and not doubtful:
             problem = f"input {position} ({name}) is a constant that rounding changes"
             raise InputError(problem, fix="fold constants when exporting, in float64")
-        found = self.constants[name]
-        if found.dtype.kind == "f" and node.op_type != "Add" and np.isneginf(found).any():
+        constant = self.constants[name]
+        if constant.dtype.kind == "f" and node.op_type != "Add" and np.isneginf(constant).any():
             raise InputError(f"input {position} ({name}) holds minus infinity", fix="mask right before a Softmax")
-        return found
+        return constant
 
-    def doubts(self, node: onnx.NodeProto, position: int) -> Enclosed | None:
+    def doubts(self, node: onnx.NodeProto, position: int) -> EnclosedConstant | None:
         """Enclosures of a constant input that rounding changes."""
         return self.enclosed.get(node.input[position]) if position < len(node.input) else None
 
     def weight(self, node: onnx.NodeProto, position: int, doubtful: bool = False) -> np.ndarray:
-        found = self.constant(node, position, None, doubtful)
-        if found is None:
+        constant = self.constant(node, position, None, doubtful)
+        if constant is None:
             raise InputError(f"input {position} is missing", fix="export the network again")
-        return found
+        return constant
 
     def result(self, node: onnx.NodeProto, index: int, whole: Shape | None = None, output: int = 0) -> None:
         """Name an output of the node: items of node ``index``, of shape ``whole`` for a batch of 1."""
@@ -349,10 +351,10 @@ class Reader:
             if any(node.output[1:]):
                 raise InputError("has several outputs", fix="only the first is supported")
             whole = (1, *self.builder.shape(index))
-        value = Value(index, tuple(whole))
+        value = TensorValue(index, tuple(whole))
         if self.batch > 1 and not value.batched:
             raise InputError(f"mixes the {self.batch} items of a batch", fix="export with a batch of 1")
-        value = Value(self.builder.reshape(index, value.item), value.whole)
+        value = TensorValue(self.builder.reshape(index, value.item), value.whole)
         self.builder.name(value.index, node.name or node.output[0], node.op_type)
         self.values[node.output[output]] = value
 
@@ -365,7 +367,7 @@ class Reader:
 class Attributes:
     """A node's attributes; every one must be read or the node is refused."""
 
-    def __init__(self, reader: Reader, node: onnx.NodeProto) -> None:
+    def __init__(self, reader: OnnxReader, node: onnx.NodeProto) -> None:
         self.reader, self.node = reader, node
         self.found = {a.name: a for a in node.attribute}
         self.asked: set[str] = set()
@@ -409,9 +411,9 @@ def _named(shapes: Mapping[str, Sequence[object]]) -> str:
 
 def _outer_names(node: onnx.NodeProto) -> set[str]:
     """Names that the graphs inside a node may read from around it."""
-    found: set[str] = set()
+    names: set[str] = set()
     for attribute in node.attribute:
         for graph in (*attribute.graphs, *([attribute.g] if attribute.HasField("g") else [])):
             for inner in graph.node:
-                found.update(inner.input, _outer_names(inner))
-    return found
+                names.update(inner.input, _outer_names(inner))
+    return names

@@ -7,16 +7,16 @@ import onnx
 
 from ns_abstract.arithmetic.network_charges import LEAST_DIVISOR
 from ns_abstract.io.errors import InputError
-from ns_abstract.verify.network.enclosed import Enclosed, enclosed, scaled_integers
-from ns_abstract.verify.network.onnx_graph import Attributes, Reader
-from ns_abstract.verify.network.recognised import Quantised
+from ns_abstract.verify.network.composite_activations import Quantised
+from ns_abstract.verify.network.constant_enclosures import EnclosedConstant, exact_constant, scaled_integers
+from ns_abstract.verify.network.onnx_graph import Attributes, OnnxReader
 
 _RANGES = {
     np.dtype(kind): (np.iinfo(kind).min, np.iinfo(kind).max) for kind in (np.int8, np.uint8, np.int16, np.uint16)
 }
 
 
-def dequantize(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def dequantize(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     """``(q - zero) scale``: of constants a constant, of values what their `quantize` has left."""
     axis = int(a.get("axis", 1))
     a.only("block_size", 0)
@@ -27,19 +27,19 @@ def dequantize(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
         if q.dtype.kind not in "iu":
             raise InputError(f"reads type {q.dtype}", fix="store integers")
         number = q.astype(np.int64) - (0 if zero is None else _along(zero.astype(np.int64), q.ndim, axis))
-        found = scaled_integers(number, enclosed(_along(scale, q.ndim, axis)))
-        if isinstance(found, Enclosed):
-            r.enclosed[node.output[0]] = found
-        r.fold(node, found.value if isinstance(found, Enclosed) else found)
+        dequantised = scaled_integers(number, exact_constant(_along(scale, q.ndim, axis)))
+        if isinstance(dequantised, EnclosedConstant):
+            r.enclosed[node.output[0]] = dequantised
+        r.fold(node, dequantised.value if isinstance(dequantised, EnclosedConstant) else dequantised)
         return
-    given = r.quantised.get(node.input[0])
+    quantised = r.quantised.get(node.input[0])
     own = _scalar(scale), 0 if zero is None else int(np.reshape(zero, -1)[0])
-    if given is None or given != own:
+    if quantised is None or quantised != own:
         raise InputError("has another scale than the QuantizeLinear before it", fix="quantise with one scale a value")
     r.values[node.output[0]] = r.values[node.input[0]]
 
 
-def quantize(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def quantize(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     """A value rounded to steps; what reads it must dequantise it."""
     a.ignore("axis", "saturate", "output_dtype")
     a.only("block_size", 0)

@@ -11,15 +11,15 @@ import onnx
 
 from ns_abstract.arithmetic.network_charges import LEAST_DIVISOR
 from ns_abstract.io.errors import InputError
-from ns_abstract.verify.network import curves
-from ns_abstract.verify.network.compose import Composer, interpolation
-from ns_abstract.verify.network.doubtful import Doubts
-from ns_abstract.verify.network.enclosed import Enclosed
+from ns_abstract.verify.network import activations
+from ns_abstract.verify.network.composite_layers import CompositeBuilder, interpolation
+from ns_abstract.verify.network.constant_enclosures import EnclosedConstant
+from ns_abstract.verify.network.contractions import Operand, concatenated, einsum, matmul
 from ns_abstract.verify.network.graph import item
+from ns_abstract.verify.network.inexact_constants import ConstantIntervals
 from ns_abstract.verify.network.layers import Shape
-from ns_abstract.verify.network.onnx_graph import Attributes, Reader, Rule, Value
+from ns_abstract.verify.network.onnx_graph import Attributes, OnnxReader, Rule, TensorValue
 from ns_abstract.verify.network.onnx_quantised import dequantize, quantize
-from ns_abstract.verify.network.operands import Operand, einsum, joined, matmul
 
 #: A mask that adds less than this takes a number out of a softmax: in float32 its exponential is zero.
 _DROPPED = -3e38
@@ -27,8 +27,8 @@ _DROPPED = -3e38
 
 def _ints(a: Attributes, name: str, line: bool, default: int | None = None, beside: int = 1) -> Any:
     """Two numbers of a window operator; of one along a line ``beside`` is the other."""
-    found = a.ints(name, 1 if line else 2, default)
-    return (*found, beside) if line and found is not None else found
+    values = a.ints(name, 1 if line else 2, default)
+    return (*values, beside) if line and values is not None else values
 
 
 def _pads(
@@ -54,7 +54,7 @@ def _pads(
     return ends[0][0], ends[1][0], ends[0][1], ends[1][1]
 
 
-def _map(r: Reader, x: int) -> tuple[int, bool]:
+def _map(r: OnnxReader, x: int) -> tuple[int, bool]:
     """An item as a map of rows and columns; one of channels along a line [C, L] is a map [C, L, 1]."""
     shape = r.builder.shape(x)
     if len(shape) == 2:
@@ -62,13 +62,13 @@ def _map(r: Reader, x: int) -> tuple[int, bool]:
     return x, False
 
 
-def _mapped(r: Reader, node: onnx.NodeProto, index: int, line: bool) -> None:
+def _mapped(r: OnnxReader, node: onnx.NodeProto, index: int, line: bool) -> None:
     """Name the result of a window operator."""
     shape = r.builder.shape(index)
     r.result(node, r.builder.reshape(index, shape[:2]) if line else index)
 
 
-def _conv(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _conv(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x, weight, bias = r.source(node), r.weight(node, 1, True), r.constant(node, 2, None, True)
     shape = r.builder.shape(x)
     if (weight.ndim, len(shape)) not in ((4, 3), (3, 2)):
@@ -86,7 +86,7 @@ def _conv(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     _mapped(r, node, index, line)
 
 
-def _pool_window(r: Reader, node: onnx.NodeProto, a: Attributes):
+def _pool_window(r: OnnxReader, node: onnx.NodeProto, a: Attributes):
     x, line = _map(r, r.source(node))
     shape = r.builder.shape(x)
     if len(shape) != 3:
@@ -100,7 +100,7 @@ def _pool_window(r: Reader, node: onnx.NodeProto, a: Attributes):
     return x, kernel, stride, dilation, pads, more, line
 
 
-def _average_pool(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _average_pool(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x, kernel, stride, dilation, pads, more, line = _pool_window(r, node, a)
     if dilation != (1, 1):
         raise InputError(f"attribute dilations = {list(dilation)} is not supported", fix="only 1 is")
@@ -108,19 +108,19 @@ def _average_pool(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     _mapped(r, node, r.builder.average_windows(x, kernel, stride, pads, more, counted), line)
 
 
-def _max_pool(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _max_pool(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x, kernel, stride, dilation, pads, more, line = _pool_window(r, node, a)
     a.ignore("storage_order")  # of the second output, which is refused where it is read
     pads = (*pads[:2], pads[2] + more[0], pads[3] + more[1])
     _mapped(r, node, r.builder.max_pool(x, kernel, stride, dilation, pads), line)
 
 
-def _global_average(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _global_average(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x = r.source(node)
     r.result(node, r.builder.reduce(x, list(range(1, len(r.builder.shape(x)))), True, True))
 
 
-def _gemm(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _gemm(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x, weight, bias = r.value(node), r.weight(node, 1, True), r.constant(node, 2, None, True)
     a.only("transA", 0)
     alpha, beta = float(a.get("alpha", 1.0)), float(a.get("beta", 1.0))
@@ -140,7 +140,7 @@ def _gemm(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     r.result(node, index, (*x.whole[:-1], matrix.shape[0]))
 
 
-def _batch_norm(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _batch_norm(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x = r.source(node)
     a.only("training_mode", 0)
     a.only("spatial", 1)
@@ -149,50 +149,50 @@ def _batch_norm(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     r.result(node, r.builder.batch_norm(x, scale, shift, mean, variance, float(a.get("epsilon", 1e-5))))
 
 
-def _unary(make: Callable[[Composer, int, Attributes], int]) -> Rule:
+def _unary(make: Callable[[CompositeBuilder, int, Attributes], int]) -> Rule:
     """A function of every number, whatever the shape."""
 
-    def rule(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+    def rule(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
         x = r.value(node)
         r.result(node, make(r.builder, x.index, a), x.whole)
 
     return rule
 
 
-def _curve(kind: Callable[..., curves.Curve]) -> Rule:
+def _curve(kind: Callable[..., activations.ScalarFunction]) -> Rule:
     return _unary(lambda builder, x, a: builder.curve(x, kind))
 
 
-def _clip(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _clip(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x = r.value(node)
     limits = []
     for position, (name, default) in enumerate((("min", -math.inf), ("max", math.inf)), 1):
-        found = a.get(name)
-        limits.append(float(np.reshape(r.constant(node, position, default), -1)[0] if found is None else found))
+        limit = a.get(name)
+        limits.append(float(np.reshape(r.constant(node, position, default), -1)[0] if limit is None else limit))
     r.result(node, r.builder.clip(x.index, *limits), x.whole)
 
 
-def _elu(b: Composer, x: int, a: Attributes) -> int:
-    return b.curve(x, curves.Elu, alpha=_positive(a, "alpha", 1.0))
+def _elu(b: CompositeBuilder, x: int, a: Attributes) -> int:
+    return b.curve(x, activations.Elu, alpha=_positive(a, "alpha", 1.0))
 
 
-def _celu(b: Composer, x: int, a: Attributes) -> int:
+def _celu(b: CompositeBuilder, x: int, a: Attributes) -> int:
     alpha = _positive(a, "alpha", 1.0)
-    return b.curve(x, curves.Elu, alpha=alpha, width=alpha)
+    return b.curve(x, activations.Elu, alpha=alpha, width=alpha)
 
 
-def _selu(b: Composer, x: int, a: Attributes) -> int:
+def _selu(b: CompositeBuilder, x: int, a: Attributes) -> int:
     alpha, gamma = _positive(a, "alpha", 1.67326319217681884765625), _positive(a, "gamma", 1.05070102214813232421875)
-    return b.curve(x, curves.Elu, alpha=alpha, scale=gamma)
+    return b.curve(x, activations.Elu, alpha=alpha, scale=gamma)
 
 
-def _hard_sigmoid(b: Composer, x: int, a: Attributes) -> int:
-    return b.curve(x, curves.Clip, factor=_positive(a, "alpha", 0.2), offset=float(a.get("beta", 0.5)))
+def _hard_sigmoid(b: CompositeBuilder, x: int, a: Attributes) -> int:
+    return b.curve(x, activations.Clip, factor=_positive(a, "alpha", 0.2), offset=float(a.get("beta", 0.5)))
 
 
-def _gelu(b: Composer, x: int, a: Attributes) -> int:
+def _gelu(b: CompositeBuilder, x: int, a: Attributes) -> int:
     a.only("approximate", "none", "tanh")
-    return b.curve(x, curves.GeluTanh if a.get("approximate", "none") == "tanh" else curves.Gelu)
+    return b.curve(x, activations.GeluTanh if a.get("approximate", "none") == "tanh" else activations.Gelu)
 
 
 def _positive(a: Attributes, name: str, default: float) -> float:
@@ -202,12 +202,12 @@ def _positive(a: Attributes, name: str, default: float) -> float:
     return value
 
 
-def _prelu(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _prelu(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x = r.value(node)
     r.result(node, r.builder.prelu(x.index, r.weight(node, 1)), x.whole)
 
 
-def _cast(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _cast(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x = r.value(node)
     a.ignore("saturate")
     if a.get("to") not in (onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE):
@@ -217,11 +217,11 @@ def _cast(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     r.values[node.output[0]] = x
 
 
-def _identity(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _identity(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     r.values[node.output[0]] = r.value(node)
 
 
-def _dropout(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _dropout(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     a.ignore("ratio", "seed")
     a.only("is_test", 1)
     training = r.constant(node, 2)
@@ -232,7 +232,7 @@ def _dropout(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     r.values[node.output[0]] = r.value(node)
 
 
-def _constant(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _constant(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     value = a.get("value")
     if value is not None:
         r.fold(node, r.stored.array(value, f"node {node.name} (Constant)"))
@@ -250,34 +250,34 @@ def _constant(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     raise InputError("holds no number", fix="only value, value_float(s) and value_int(s) are read")
 
 
-def _shape(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _shape(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     whole = r.value(node).whole
     start, end = int(a.get("start", 0)), a.get("end")
     r.fold(node, np.array(whole[slice(start, None if end is None else int(end))], np.int64))
 
 
-def _number(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _number(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     r.fold(node, np.array(math.prod(r.value(node).whole), np.int64))
 
 
 # ---------------------------------------------------------------- two values
 
 
-def _binary(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _binary(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     kind = node.op_type
     a.ignore("axis", "broadcast")
     one, two = (_operand(r, node, k, True) for k in range(2))
-    if isinstance(one, Value) and isinstance(two, Value):
+    if isinstance(one, TensorValue) and isinstance(two, TensorValue):
         r.result(node, *_both(r.builder, kind, one, two))
         return
-    own = r.doubts(node, 1 if isinstance(one, Value) else 0)
-    if isinstance(one, Value):
+    own = r.doubts(node, 1 if isinstance(one, TensorValue) else 0)
+    if isinstance(one, TensorValue):
         value, constant = one, np.asarray(two, np.float64)
     else:
-        assert isinstance(two, Value)
+        assert isinstance(two, TensorValue)
         value, constant = two, np.asarray(one, np.float64)
     x, whole = _spread(r.builder, value, constant.shape)
-    if kind == "Div" and not isinstance(one, Value):
+    if kind == "Div" and not isinstance(one, TensorValue):
         kind, x = "Mul", r.builder.reciprocal(x)
     factor, offset = np.ones(()), None
     if kind == "Mul":
@@ -293,8 +293,8 @@ def _binary(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
             r.dropped[node.output[0]] = np.broadcast_to(dropped, whole)
         offset = np.where(dropped, 0.0, constant)
     else:
-        factor = np.ones(()) if isinstance(one, Value) else -np.ones(())
-        offset = -constant if isinstance(one, Value) else constant
+        factor = np.ones(()) if isinstance(one, TensorValue) else -np.ones(())
+        offset = -constant if isinstance(one, TensorValue) else constant
     index = r.builder.scale(x, factor, offset)
     if own is not None:
         off = _doubts(own, r.builder.shape(x))
@@ -302,24 +302,24 @@ def _binary(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     r.result(node, index, whole)
 
 
-def _doubts(constant: Enclosed | None, shape: Shape | None = None) -> Doubts | None:
+def _doubts(constant: EnclosedConstant | None, shape: Shape | None = None) -> ConstantIntervals | None:
     """Doubts of a constant, spread to an item or given the shape of weights."""
     if constant is None:
         return None
-    found = constant.doubts
+    intervals = constant.doubts
     if shape is None:
-        return found
-    if found[0].size == math.prod(shape):
-        return found[0].reshape(shape), found[1].reshape(shape)
-    real, single = (np.broadcast_to(part, (1, *shape))[0] for part in found)
+        return intervals
+    if intervals[0].size == math.prod(shape):
+        return intervals[0].reshape(shape), intervals[1].reshape(shape)
+    real, single = (np.broadcast_to(part, (1, *shape))[0] for part in intervals)
     return real, single
 
 
-def _operand(r: Reader, node: onnx.NodeProto, position: int, doubtful: bool = False) -> Value | np.ndarray:
+def _operand(r: OnnxReader, node: onnx.NodeProto, position: int, doubtful: bool = False) -> TensorValue | np.ndarray:
     return r.value(node, position) if r.moves(node, position) else r.weight(node, position, doubtful)
 
 
-def _spread(b: Composer, value: Value, shape: Sequence[int]) -> tuple[int, Shape]:
+def _spread(b: CompositeBuilder, value: TensorValue, shape: Sequence[int]) -> tuple[int, Shape]:
     """The value repeated to what a constant of ``shape`` makes of it."""
     try:
         whole = np.broadcast_shapes(value.whole, tuple(shape))
@@ -328,17 +328,17 @@ def _spread(b: Composer, value: Value, shape: Sequence[int]) -> tuple[int, Shape
     return _to(b, value, whole), whole
 
 
-def _to(b: Composer, value: Value, whole: Shape) -> int:
+def _to(b: CompositeBuilder, value: TensorValue, whole: Shape) -> int:
     """The value repeated to a shape, as an item of what will have that shape."""
     if value.whole == tuple(whole):
         return value.index
     grown = (1,) * (len(whole) - len(value.whole)) + value.whole
-    after = Value(0, tuple(whole)).item
+    after = TensorValue(0, tuple(whole)).item
     before = grown[len(whole) - len(after) :]
     return b.spread(b.reshape(value.index, before), after)
 
 
-def _both(b: Composer, kind: str, one: Value, two: Value) -> tuple[int, Shape]:
+def _both(b: CompositeBuilder, kind: str, one: TensorValue, two: TensorValue) -> tuple[int, Shape]:
     try:
         whole = np.broadcast_shapes(one.whole, two.whole)
     except ValueError:
@@ -347,60 +347,60 @@ def _both(b: Composer, kind: str, one: Value, two: Value) -> tuple[int, Shape]:
     if kind in ("Add", "Sub"):
         return b.sum((first, second), (1, 1 if kind == "Add" else -1)), whole
     if kind == "Div":
-        return b.product(first, _to(b, Value(b.reciprocal(two.index), two.whole), whole)), whole
+        return b.product(first, _to(b, TensorValue(b.reciprocal(two.index), two.whole), whole)), whole
     return b.product(first, second), whole
 
 
-def _variadic(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _variadic(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     """Max, Min and Sum of any number of values and constants."""
     kind = node.op_type
     result = r.value(node, next(k for k in range(len(node.input)) if r.moves(node, k)))
     done = False
     for k in range(len(node.input)):
         other = _operand(r, node, k)
-        if isinstance(other, Value):
+        if isinstance(other, TensorValue):
             if other is result and not done:
                 done = True
                 continue
             if kind == "Sum":
-                result = Value(*_both(r.builder, "Add", result, other))
+                result = TensorValue(*_both(r.builder, "Add", result, other))
                 continue
             whole = np.broadcast_shapes(result.whole, other.whole)
             parts = _to(r.builder, result, whole), _to(r.builder, other, whole)
-            result = Value(r.builder.extreme(parts, kind == "Max"), whole)
+            result = TensorValue(r.builder.extreme(parts, kind == "Max"), whole)
             continue
         x, whole = _spread(r.builder, result, other.shape)
         constant = np.asarray(other, np.float64)
         if kind == "Sum":
-            result = Value(r.builder.scale(x, np.ones(()), constant), whole)
+            result = TensorValue(r.builder.scale(x, np.ones(()), constant), whole)
             continue
         # max(x, c) = c + relu(x - c), min(x, c) = c - relu(c - x)
         sign = np.asarray(1.0 if kind == "Max" else -1.0)
         above = r.builder.leaky_relu(r.builder.scale(x, sign, -sign * constant), 0.0)
-        result = Value(r.builder.scale(above, sign, constant), whole)
+        result = TensorValue(r.builder.scale(above, sign, constant), whole)
     r.result(node, result.index, result.whole)
 
 
-def _pow(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _pow(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x, exponent = r.value(node), np.asarray(r.weight(node, 1), np.float64)
     if exponent.size != 1:
         raise InputError(f"exponents {item(exponent.shape)} are not supported", fix="use one exponent")
     r.result(node, r.builder.power(x.index, float(exponent.reshape(-1)[0])), x.whole)
 
 
-def _greater(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _greater(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     limit = np.asarray(r.weight(node, 1), np.float64)
     if limit.size != 1:
         raise InputError("compares with several numbers", fix="only softplus of torch's exporter is read")
     r.above[node.output[0]] = r.value(node), float(limit.reshape(-1)[0])
 
 
-def _is_nan(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _is_nan(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     # a cell in which a number may not be finite is unknown
     r.fold(node, np.zeros(r.value(node).whole, bool))
 
 
-def _where(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _where(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     if node.input[0] in r.above:
         value, limit = r.above[node.input[0]]
         straight, curved = r.value(node, 1), r.value(node, 2)
@@ -411,11 +411,11 @@ def _where(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
         return
     chosen = np.asarray(r.weight(node, 0), bool)
     parts = [_operand(r, node, k) for k in (1, 2)]
-    shapes = [chosen.shape, *(p.whole if isinstance(p, Value) else p.shape for p in parts)]
+    shapes = [chosen.shape, *(p.whole if isinstance(p, TensorValue) else p.shape for p in parts)]
     whole = np.broadcast_shapes(*shapes)
     moving, offset = [], np.zeros(whole)
     for part, mask in zip(parts, (chosen, ~chosen), strict=True):
-        if isinstance(part, Value):
+        if isinstance(part, TensorValue):
             moving.append(r.builder.scale(_to(r.builder, part, whole), mask.astype(np.float64), None))
         else:
             offset = offset + np.where(mask, np.asarray(part, np.float64), 0.0)
@@ -423,11 +423,11 @@ def _where(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     r.result(node, r.builder.scale(index, np.ones(()), offset) if offset.any() else index, whole)
 
 
-def _given(operand: Value | np.ndarray) -> Operand:
-    return (operand.index, operand.whole) if isinstance(operand, Value) else (operand, operand.shape)
+def _given(operand: TensorValue | np.ndarray) -> Operand:
+    return (operand.index, operand.whole) if isinstance(operand, TensorValue) else (operand, operand.shape)
 
 
-def _matmul(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _matmul(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     if r.batch > 1 and (r.moves(node, 1) or r.weight(node, 1).ndim > 2):
         raise InputError(f"multiplies within a batch of {r.batch} items", fix="export with a batch of 1")
     own = r.doubts(node, 1)
@@ -438,30 +438,30 @@ def _matmul(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     r.result(node, *result)
 
 
-def _einsum(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
-    given = [_given(_operand(r, node, k)) for k in range(len(node.input))]
-    r.result(node, *einsum(r.builder, str(a.get("equation", "")), given))
+def _einsum(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
+    operands = [_given(_operand(r, node, k)) for k in range(len(node.input))]
+    r.result(node, *einsum(r.builder, str(a.get("equation", "")), operands))
 
 
 # ---------------------------------------------------------------- shapes
 
 
-def _places(r: Reader, value: Value) -> np.ndarray:
+def _places(r: OnnxReader, value: TensorValue) -> np.ndarray:
     """Flat positions in the shape that the file sees."""
     return r.builder.positions(value.index).reshape(value.whole)
 
 
-def _moved(r: Reader, node: onnx.NodeProto, value: Value, places: np.ndarray, output: int = 0) -> None:
+def _moved(r: OnnxReader, node: onnx.NodeProto, value: TensorValue, places: np.ndarray, output: int = 0) -> None:
     """An output that holds the numbers at flat positions of a value."""
     if places.size == 0:
         raise InputError(f"nothing is left of {item(value.whole)}", fix="check the constants")
     index = value.index
     if places.size != math.prod(value.whole) or not np.array_equal(places.reshape(-1), np.arange(places.size)):
-        index = r.builder.rearranged(index, places.reshape(Value(0, places.shape or (1,)).item))
+        index = r.builder.rearranged(index, places.reshape(TensorValue(0, places.shape or (1,)).item))
     r.result(node, index, places.shape or (1,), output)
 
 
-def _flatten(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _flatten(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x, axis = r.value(node), int(a.get("axis", 1))
     if not -len(x.whole) <= axis <= len(x.whole):
         raise InputError(f"attribute axis = {axis} of {item(x.whole)}", fix="use 1")
@@ -471,7 +471,7 @@ def _flatten(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     r.result(node, x.index, (math.prod(x.whole[:axis]), math.prod(x.whole[axis:])))
 
 
-def _reshape(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _reshape(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x = r.value(node)
     target = [int(v) for v in np.atleast_1d(r.weight(node, 1))]
     if 0 in target:
@@ -493,20 +493,20 @@ def _reshape(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     r.result(node, x.index, tuple(total // rest if v == -1 else v for v in target))
 
 
-def _axes(r: Reader, node: onnx.NodeProto, a: Attributes, rank: int) -> list[int] | None:
+def _axes(r: OnnxReader, node: onnx.NodeProto, a: Attributes, rank: int) -> list[int] | None:
     """Axes of the shape that the file sees, from an attribute or the second input."""
     axes = a.get("axes")
     if axes is None:
         axes = r.constant(node, 1)
     if axes is None:
         return None
-    found = [int(v) for v in np.atleast_1d(axes)]
-    if any(not -rank <= v < rank for v in found) or len({v % rank for v in found}) != len(found):
-        raise InputError(f"axes {found} of {rank}", fix="check the axes")
-    return sorted(v % rank for v in found)
+    numbers = [int(v) for v in np.atleast_1d(axes)]
+    if any(not -rank <= v < rank for v in numbers) or len({v % rank for v in numbers}) != len(numbers):
+        raise InputError(f"axes {numbers} of {rank}", fix="check the axes")
+    return sorted(v % rank for v in numbers)
 
 
-def _squeeze(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _squeeze(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x = r.value(node)
     axes = _axes(r, node, a, len(x.whole))
     axes = [k for k, n in enumerate(x.whole) if n == 1] if axes is None else axes
@@ -515,7 +515,7 @@ def _squeeze(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     r.result(node, x.index, tuple(n for k, n in enumerate(x.whole) if k not in axes) or (1,))
 
 
-def _unsqueeze(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _unsqueeze(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x = r.value(node)
     named = a.get("axes")
     count = np.size(r.weight(node, 1) if named is None else named)
@@ -525,7 +525,7 @@ def _unsqueeze(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     r.result(node, x.index, tuple(shape))
 
 
-def _transpose(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _transpose(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x = r.value(node)
     rank = len(x.whole)
     order = [int(v) for v in a.get("perm", range(rank - 1, -1, -1))]
@@ -534,7 +534,7 @@ def _transpose(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     _moved(r, node, x, _places(r, x).transpose(order))
 
 
-def _pad(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _pad(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x = r.source(node)
     rank = 1 + len(r.builder.shape(x))
     mode, pads = a.get("mode", "constant"), a.get("pads")
@@ -559,26 +559,26 @@ def _pad(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     r.result(node, r.builder.pad(x, before, after, mode, float(np.asarray(value).reshape(-1)[0])))
 
 
-def _concat(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _concat(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     axis = a.get("axis")
     parts = [_operand(r, node, k) for k in range(len(node.input))]
-    wholes = [p.whole if isinstance(p, Value) else p.shape for p in parts]
+    wholes = [p.whole if isinstance(p, TensorValue) else p.shape for p in parts]
     rank = len(wholes[0])
     if axis is None or not -rank <= axis < rank:
         raise InputError(f"attribute axis = {axis} is not supported", fix="name an axis of the item")
     axis %= rank
     if any(len(w) != rank or w[:axis] + w[axis + 1 :] != wholes[0][:axis] + wholes[0][axis + 1 :] for w in wholes):
         raise InputError(f"shapes {[item(w) for w in wholes]} do not fit", fix="check the axis")
-    values = [p for p in parts if isinstance(p, Value)]
+    values = [p for p in parts if isinstance(p, TensorValue)]
     if len(values) == len(parts) and axis > 0 and all(v.batched for v in values):
         r.result(node, r.builder.concat([v.index for v in values], axis - 1))
         return
     if axis == 0 and all(v.batched for v in values):
         raise InputError("attribute axis = 0 is not supported", fix="the batch, axis 0, must stay")
-    r.result(node, *joined(r.builder, [_given(p) for p in parts], axis))
+    r.result(node, *concatenated(r.builder, [_given(p) for p in parts], axis))
 
 
-def _slice(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _slice(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x = r.value(node)
     starts, ends = a.get("starts"), a.get("ends")
     if starts is None:
@@ -605,7 +605,7 @@ def _slice(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
         _moved(r, node, x, _places(r, x)[tuple(chosen)])
 
 
-def _part(r: Reader, node: onnx.NodeProto, x: Value, chosen: Sequence[slice], output: int = 0) -> None:
+def _part(r: OnnxReader, node: onnx.NodeProto, x: TensorValue, chosen: Sequence[slice], output: int = 0) -> None:
     """Part of an item."""
     if not x.batched:
         _moved(r, node, x, _places(r, x)[tuple(chosen)], output)
@@ -614,7 +614,7 @@ def _part(r: Reader, node: onnx.NodeProto, x: Value, chosen: Sequence[slice], ou
     r.result(node, index, (1, *r.builder.shape(index)), output)
 
 
-def _split(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _split(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x = r.value(node)
     axis, rank = int(a.get("axis", 0)), len(x.whole)
     if not -rank <= axis < rank:
@@ -640,7 +640,7 @@ def _split(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
         done += length
 
 
-def _gather(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _gather(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x, indices = r.value(node), np.asarray(r.weight(node, 1))
     axis, rank = int(a.get("axis", 0)), len(x.whole)
     if not -rank <= axis < rank:
@@ -652,7 +652,7 @@ def _gather(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     _moved(r, node, x, np.take(_places(r, x), indices, axis))
 
 
-def _gather_nd(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _gather_nd(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x, indices = r.value(node), np.asarray(r.weight(node, 1))
     a.only("batch_dims", 0)
     count = indices.shape[-1] if indices.ndim else 0
@@ -665,19 +665,19 @@ def _gather_nd(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     _moved(r, node, x, _places(r, x)[tuple(np.moveaxis(indices, -1, 0))])
 
 
-def _expand(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _expand(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x, shape = r.value(node), [int(v) for v in np.atleast_1d(r.weight(node, 1))]
     index, whole = _spread(r.builder, x, shape)
     r.result(node, index, whole)
 
 
-def _tile(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _tile(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x, repeats = r.value(node), [int(v) for v in np.atleast_1d(r.weight(node, 1))]
     r.builder.reserve(float(math.prod(x.whole)) * math.prod(float(max(0, v)) for v in repeats))
     _moved(r, node, x, np.tile(_places(r, x), repeats))
 
 
-def _depth_to_space(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _depth_to_space(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x = r.value(node)
     size, mode = int(a.get("blocksize", 0)), a.get("mode", "DCR")
     n, c, h, w = x.whole if len(x.whole) == 4 else (0, 0, 0, 0)
@@ -699,7 +699,7 @@ def _depth_to_space(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     _moved(r, node, x, places.reshape(n, rest, h * size, w * size))
 
 
-def _resize(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _resize(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x = r.source(node)
     shape = r.builder.shape(x)
     if len(shape) != 3:
@@ -748,7 +748,7 @@ def _resize(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
 # ---------------------------------------------------------------- windows, means and norms
 
 
-def _conv_transpose(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _conv_transpose(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     (x, line), weight, bias = _map(r, r.source(node)), r.weight(node, 1, True), r.constant(node, 2, None, True)
     weight = weight.reshape(*weight.shape, *[1] * line)
     a.only("auto_pad", "NOTSET", "VALID")
@@ -765,13 +765,13 @@ def _conv_transpose(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     _mapped(r, node, index, line)
 
 
-def _squared(b: Composer, x: int) -> int:
-    return b.curve(x, curves.Power, exponent=2)
+def _squared(b: CompositeBuilder, x: int) -> int:
+    return b.curve(x, activations.Power, exponent=2)
 
 
 #: What is summed up, and whether the root of the sum is taken.
-_SUMMED: dict[str, tuple[Callable[[Composer, int], int] | None, bool]] = {
-    "ReduceL1": (lambda b, x: b.curve(x, curves.Abs), False),
+_SUMMED: dict[str, tuple[Callable[[CompositeBuilder, int], int] | None, bool]] = {
+    "ReduceL1": (lambda b, x: b.curve(x, activations.Abs), False),
     "ReduceL2": (_squared, True),
     "ReduceMean": (None, False),
     "ReduceSum": (None, False),
@@ -779,7 +779,7 @@ _SUMMED: dict[str, tuple[Callable[[Composer, int], int] | None, bool]] = {
 }
 
 
-def _reduce(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _reduce(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x = r.value(node)
     kind, rank = node.op_type, len(x.whole)
     axes = _axes(r, node, a, rank)
@@ -801,12 +801,12 @@ def _reduce(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     r.result(node, index, whole if keep else tuple(n for k, n in enumerate(whole) if k not in axes) or (1,))
 
 
-def _global_max(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _global_max(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x = r.source(node)
     r.result(node, r.builder.greatest(x, list(range(1, len(r.builder.shape(x)))), True))
 
 
-def _softmax(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _softmax(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x = r.value(node)
     rank = len(x.whole)
     axis = int(a.get("axis", -1 if r.opset >= 13 else 1))
@@ -824,7 +824,7 @@ def _softmax(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     r.result(node, index, x.whole)
 
 
-def _layer_norm(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _layer_norm(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x = r.value(node)
     rank = len(x.whole)
     axis = int(a.get("axis", -1)) % rank
@@ -837,7 +837,7 @@ def _layer_norm(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     r.result(node, r.builder.shift(index, r.constant(node, 2)), x.whole)
 
 
-def _group_norm(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
+def _group_norm(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x = r.source(node)
     shape = r.builder.shape(x)
     channels = shape[0]
@@ -850,17 +850,17 @@ def _group_norm(r: Reader, node: onnx.NodeProto, a: Attributes) -> None:
     index = r.builder.reshape(index, shape)
     parts = []
     for k in (1, 2):
-        found = np.asarray(r.weight(node, k), np.float64)
-        if found.shape not in ((channels,), (groups,)):
+        weights = np.asarray(r.weight(node, k), np.float64)
+        if weights.shape not in ((channels,), (groups,)):
             raise InputError(
-                f"input {k} {item(found.shape)} of {channels} channels", fix="one number a channel expected"
+                f"input {k} {item(weights.shape)} of {channels} channels", fix="one number a channel expected"
             )
-        parts.append(np.repeat(found, channels // found.size).reshape(-1, *[1] * (len(shape) - 1)))
+        parts.append(np.repeat(weights, channels // weights.size).reshape(-1, *[1] * (len(shape) - 1)))
     r.result(node, r.builder.shift(r.builder.scale(index, parts[0], None), parts[1]))
 
 
 RULES: dict[str, Rule] = {
-    "Abs": _curve(curves.Abs),
+    "Abs": _curve(activations.Abs),
     "Add": _binary,
     "AveragePool": _average_pool,
     "BatchNormalization": _batch_norm,
@@ -877,8 +877,8 @@ RULES: dict[str, Rule] = {
     "Dropout": _dropout,
     "Einsum": _einsum,
     "Elu": _unary(_elu),
-    "Erf": _curve(curves.Erf),
-    "Exp": _curve(curves.Exp),
+    "Erf": _curve(activations.Erf),
+    "Exp": _curve(activations.Exp),
     "Expand": _expand,
     "Flatten": _flatten,
     "Gather": _gather,
@@ -890,7 +890,7 @@ RULES: dict[str, Rule] = {
     "Greater": _greater,
     "GroupNormalization": _group_norm,
     "HardSigmoid": _unary(_hard_sigmoid),
-    "HardSwish": _curve(curves.HardSwish),
+    "HardSwish": _curve(activations.HardSwish),
     "Identity": _identity,
     "InstanceNormalization": _group_norm,
     "IsNaN": _is_nan,
@@ -902,7 +902,7 @@ RULES: dict[str, Rule] = {
     "Max": _variadic,
     "MaxPool": _max_pool,
     "Min": _variadic,
-    "Mish": _curve(curves.Mish),
+    "Mish": _curve(activations.Mish),
     "Mul": _binary,
     "Neg": _unary(lambda b, x, a: b.scale(x, -np.ones(()), None)),
     "PRelu": _prelu,
@@ -926,7 +926,7 @@ RULES: dict[str, Rule] = {
     "Size": _number,
     "Slice": _slice,
     "Softmax": _softmax,
-    "Softplus": _curve(curves.Softplus),
+    "Softplus": _curve(activations.Softplus),
     "Softsign": _unary(lambda b, x, a: b.softsign(x)),
     "SpaceToDepth": _depth_to_space,
     "Split": _split,

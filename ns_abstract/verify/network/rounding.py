@@ -20,12 +20,12 @@ from ns_abstract.arithmetic.network_charges import (
     UP,
     gamma,
 )
-from ns_abstract.verify.network.forms import Form
+from ns_abstract.verify.network.forms import NodeForm
 from ns_abstract.verify.network.graph import Network
-from ns_abstract.verify.network.layers import Linear, Scale, Sum, Weighted
-from ns_abstract.verify.network.maps import Variance
-from ns_abstract.verify.network.maxima import MaxPool
-from ns_abstract.verify.network.sums import partial_sums
+from ns_abstract.verify.network.layers import LinearLayer, ScaleLayer, Sum, Weighted
+from ns_abstract.verify.network.max_pooling import MaxPool
+from ns_abstract.verify.network.partial_sums import partial_sums
+from ns_abstract.verify.network.sparse_layers import Variance
 
 #: A preference: sums of fewer additions gain too little by their partial sums to pay for them.
 _LONG = 256
@@ -61,7 +61,7 @@ class Rounding:
         #: by node, where a program may fold shifts into the next layer: their sizes together, one item (N21)
         self.shifts: dict[int, Tensor] = {}
 
-    def groupings(self, k: int, sources: tuple[int, ...], layer: Linear, sizes: list[Tensor]) -> Extremes:
+    def groupings(self, k: int, sources: tuple[int, ...], layer: LinearLayer, sizes: list[Tensor]) -> Extremes:
         """`Extremes` of linear node k, for inputs of at most ``sizes`` [m or 1, *input_shapes[i]]; kept for readers."""
         most = [size.flatten(1).amax(1) for size in sizes]
         before = [self._before(i, size) for i, size in zip(sources, most, strict=True)]
@@ -76,8 +76,8 @@ class Rounding:
         else:
             scales, sums = layer.gain * scales, layer.gain * sums
         offset = 0.0 if layer.bias is None else float(layer.bias.abs().max())
-        found = self.extremes[k] = Extremes(scales + offset, sums + offset)
-        return found
+        extremes = self.extremes[k] = Extremes(scales + offset, sums + offset)
+        return extremes
 
     def multiplied(self, k: int, sources: tuple[int, ...], sizes: list[Tensor]) -> Extremes:
         """`Extremes` of product node k: either factor's scales may be the other's (N21)."""
@@ -85,8 +85,8 @@ class Rounding:
         one, two = (self._before(i, size) for i, size in zip(sources, most, strict=True))
         scales = (one.scales + most[0] + 1.0) * (two.scales + most[1] + 1.0)
         sums = one.sums * (two.scales + most[1] + 1.0) + two.sums * (one.scales + most[0] + 1.0)
-        found = self.extremes[k] = Extremes(scales, sums)
-        return found
+        extremes = self.extremes[k] = Extremes(scales, sums)
+        return extremes
 
     def _before(self, index: int, like: Tensor) -> Extremes:
         """`Extremes` of what a node reads; positive scales pass maxima."""
@@ -101,26 +101,26 @@ class Rounding:
         return extremes.scales + extremes.sums < OVERFLOW
 
     @staticmethod
-    def flushed(extremes: Extremes, layer: Linear) -> Tensor:
+    def flushed(extremes: Extremes, layer: LinearLayer) -> Tensor:
         """[m or 1, 1, ...] what flushes to zero may cost in all groupings (N21)."""
         lost = FLUSHES * FLUSH * (extremes.scales + extremes.sums + layer.gain + 1.0) * MAGNITUDES_UP
         return lost.reshape(-1, *[1] * len(layer.shape))
 
-    def shifted(self, k: int, sources: tuple[int, ...], layer: Linear) -> Tensor | float:
+    def shifted(self, k: int, sources: tuple[int, ...], layer: LinearLayer) -> Tensor | float:
         """What folding shifts before node k into its sums costs besides, one item (N21)."""
-        given = [self.shifts.get(i) for i in sources]
-        if isinstance(layer, Scale):
-            carried = 0.0 if given[0] is None else given[0] * layer.factor.abs()
+        input_shifts = [self.shifts.get(i) for i in sources]
+        if isinstance(layer, ScaleLayer):
+            carried = 0.0 if input_shifts[0] is None else input_shifts[0] * layer.factor.abs()
             own = 0.0 if layer.offset is None else layer.offset.abs()
-            if given[0] is not None or layer.offset is not None:
+            if input_shifts[0] is not None or layer.offset is not None:
                 self.shifts[k] = torch.as_tensor(carried + own).expand(layer.shape)
             return 0.0
-        if all(shift is None for shift in given):
+        if all(shift is None for shift in input_shifts):
             return 0.0
         shapes = layer.input_shapes
         parts = [
             torch.zeros((1, *shape), dtype=torch.float64) if shift is None else shift[None].contiguous()
-            for shift, shape in zip(given, shapes, strict=True)
+            for shift, shape in zip(input_shifts, shapes, strict=True)
         ]
         moved = layer.magnitude(parts)[0] * MAGNITUDES_UP
         if not isinstance(layer, Weighted):
@@ -134,8 +134,8 @@ class Rounding:
         self,
         k: int,
         sources: tuple[int, ...],
-        layer: Linear,
-        inputs: list[Form],
+        layer: LinearLayer,
+        inputs: list[NodeForm],
         size: Tensor,
         end: Callable[[], Tensor],
     ) -> Tensor:
@@ -147,7 +147,7 @@ class Rounding:
         folding = FOLDING if k in self.network.scaled else 0
         few = gamma(folding + PRODUCTS + len(inputs)) * size
         few = few + (shifts := self.shifted(k, sources, layer))
-        if isinstance(layer, Scale):
+        if isinstance(layer, ScaleLayer):
             # sums before it may start with the offset
             first = torch.zeros(()) if layer.bias is None else layer.bias.abs()
             return gamma(count) * first * (1.0 + gamma(count + FOLDING)) + few
@@ -175,12 +175,12 @@ class Rounding:
         together = partial_sums(count, peak, squares, end())
         return gamma(1) * (together + count * gamma(count + FOLDING + 1) * size) + few
 
-    def _count(self, sources: tuple[int, ...], layer: Linear, inputs: list[Form]) -> Tensor | int:
+    def _count(self, sources: tuple[int, ...], layer: LinearLayer, inputs: list[NodeForm]) -> Tensor | int:
         """Roundings that a layer's sums may suffer; what is added behind sums may be added within them (N2)."""
-        if not isinstance(layer, (Scale, Sum)):
+        if not isinstance(layer, (ScaleLayer, Sum)):
             return layer.roundings([f.active for f in inputs])
         before = [self.network.nodes[i - 1].layer for i in sources if i]
-        most = max((b.terms for b in before if isinstance(b, Linear)), default=0)
+        most = max((b.terms for b in before if isinstance(b, LinearLayer)), default=0)
         counts = [torch.as_tensor(self.terms[i], dtype=torch.float64) for i in sources if i in self.terms]
-        found = torch.as_tensor(float(layer.terms - most), dtype=torch.float64)
-        return found + functools.reduce(torch.maximum, counts) if counts else found
+        count = torch.as_tensor(float(layer.terms - most), dtype=torch.float64)
+        return count + functools.reduce(torch.maximum, counts) if counts else count

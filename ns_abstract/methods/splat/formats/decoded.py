@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError, visible
 from ns_abstract.io.memory import check_memory
-from ns_abstract.methods.overrides import Overrides, chosen
-from ns_abstract.methods.splat.rows import StoredRows, coordinates_note, drawable
+from ns_abstract.methods.overrides import Overrides, assumption_of
+from ns_abstract.methods.splat.drawable import StoredGaussians, coordinates_note, drawable
 from ns_abstract.methods.splat.scene import DataparserTransform, SplatScene
 
 #: Band 0 of the spherical harmonics, by which colours become coefficients.
@@ -59,7 +59,7 @@ class DecodedSplats:
 
     format: str
     files: tuple[Path, ...]
-    rows: StoredRows
+    rows: StoredGaussians
     fields: dict[str, str]
     mode: str | None = None
     mode_origin: str = ""
@@ -83,8 +83,8 @@ def scene_of(decoded: DecodedSplats, overrides: Overrides) -> SplatScene:
     if decoded.mode is None and overrides.rasterize_mode is None:
         notes.append("assumed classic: nothing in the file says how it was rasterised (--rasterize-mode says it)")
     assumptions = (
-        chosen("rasterize_mode", overrides.rasterize_mode, "--rasterize-mode", mode, origin),
-        chosen("background", overrides.background, "--background", background, behind),
+        assumption_of("rasterize_mode", overrides.rasterize_mode, "--rasterize-mode", mode, origin),
+        assumption_of("background", overrides.background, "--background", background, behind),
         Assumption("units", "those of the file", f"default: {decoded.format} says nothing"),
         Assumption("decoded from", f"{decoded.format}, sha256 {_sha256(decoded.files)}", visible(file.name)),
         Assumption("decoded arrays", f"sha256 {_digest(decoded.rows)}", "docs/formats.md"),
@@ -117,7 +117,7 @@ def reserve(count: int, bands: int, file: Path, more: int = 0) -> None:
 
 def float32_rows(
     means: Any, log_scales: Any, quats: Any, opacity_logits: Any, colors: Any, rest: Any | None = None
-) -> StoredRows:
+) -> StoredGaussians:
     """Rows rounded once to float32.
 
     Args:
@@ -135,7 +135,7 @@ def float32_rows(
         if rest is not None:
             sh[:, 1:] = rest
         arrays = [np.ascontiguousarray(value, np.float32) for value in (means, log_scales, quats, opacity_logits)]
-    return StoredRows(arrays[0], arrays[1], arrays[2], arrays[3], sh)
+    return StoredGaussians(arrays[0], arrays[1], arrays[2], arrays[3], sh)
 
 
 def opacity_logits(values: Bytes) -> NDArray[np.float64]:
@@ -216,7 +216,7 @@ def _sha256(files: tuple[Path, ...]) -> str:
     return digest.hexdigest()
 
 
-def _digest(rows: StoredRows) -> str:
+def _digest(rows: StoredGaussians) -> str:
     digest = hashlib.sha256()
     for array in vars(rows).values():
         digest.update(np.ascontiguousarray(array).tobytes())

@@ -1,0 +1,516 @@
+"""The memory layout of a block of pixels in the pixel stage (design.md, B1-B12).
+
+A fragment is one Gaussian on one pixel: what is known of its alpha, and of the light before and behind it. Fragments
+lie one after the other; each pixel lists those that may contribute to it, nearest first, with the places of their
+colours in a palette and of the rows that tell how far reordering may move them.
+
+`Buffers` own the memory; a `PixelBlock` is what kernels are given, with pointers to it in place of arrays.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from ns_abstract.arithmetic.rounding import UP
+from ns_abstract.arithmetic.simd.intrinsics import pointer
+from ns_abstract.arithmetic.simd.lanes import bits, maximum, minimum, where
+from ns_abstract.methods.splat.lists import BLOCK, PIXELS
+
+assert PIXELS == 64 and BLOCK == 8
+
+
+#: Lanes that are looked at together where they are fragments of one pixel.
+CROSSING_LANES = 8
+#: List entries that are looked at together: no step waits for the one before.
+BATCH = 8
+
+# What is known of each pixel lies in flat rows: row r holds its lanes at r * PIXELS .. r * PIXELS + PIXELS - 1. Light
+# that passes the fragments listed so far at its least and most; last list position that may still change places; what
+# a stop that is ignored may hide, and what any stop so far may leave; light that comes to what is missing; what stops
+# at fragments of uncertain order may leave; 0, 1, 2, ...
+TLO, THI, LAST, RHO, LOST, OPEN, HIDDEN, NUMBERS = range(0, 8 * PIXELS, PIXELS)
+ROWS = 8
+#: Columns of a fragment: bounds of alpha, middle and half-width of the range of its curvature, alpha's coefficients and
+#: then its radius; where curvature is kept (B10), coefficients of products of two parameters follow, and the alpha up
+#: to which the fragment may be skipped, or 0 (`crossing_column`).
+ALPHA_LOW, ALPHA_HIGH, BEND, BEND_SPREAD, FORM = range(5)
+#: Where pixels are bounded over parts of the cell (B12), a fragment is bounds of alpha and then: centres of y1 and y2,
+#: their slopes, parameter by parameter, their radii over a part; alpha at exponent 0, at its least and its most; and
+#: the alpha below which the fragment may be skipped.
+EXPONENT = 2
+#: Exponents are cut here; exp(-60) is far below any threshold.
+EXPONENT_CUT = 60.0
+#: What a list tells of the light at a fragment: behind it at its least, before it at its most.
+LEFT, LIGHT = range(2)
+#: Columns of an entry of a pixel's list: the fragment's number, its list position, its row of moves; one is spare.
+LISTED = 4
+#: Columns of a row of moves: by how much reordering may lower and raise the pixel, found from sums and from maxima.
+MOVES = 16
+#: Rows of `ThresholdCrossings` before the forms, and beside the slopes of their restrictions to a part of the box.
+CROSSING_FORM, CROSSING_RESTRICTED = 11, 13
+#: Fragments that each pixel's list has room for at first.
+_CAPACITY = 256
+#: Room for list positions at first.
+_POSITIONS = 1024
+
+
+class BlockPlace(NamedTuple):
+    """A block's first pixel in the picture, its tile's column and row, and the set of its pixels that are wanted."""
+
+    x0: int
+    y0: int
+    tile_x: int
+    tile_y: int
+    wanted: int
+
+
+class Fragments(NamedTuple):
+    """The fragments of a block's pixels.
+
+    Attributes:
+        values: [PIXELS capacity, width] fragments; the columns are ALPHA_LOW .. FORM + m, and
+            ``bends`` more.
+        width: Numbers of a fragment.
+        bends: Coefficients of products of two parameters that are kept beside forms of order 1.
+        jump: See `crossing_column`.
+        parts: Parts of the cell that pixels are bounded over; 0: fragments have forms.
+        lists: [PIXELS, capacity, LISTED] each pixel's fragments, nearest first.
+        light: [PIXELS, capacity, 2] the light at each: see `LEFT`.
+        lengths: [PIXELS] of the lists.
+        capacity: Fragments that each list has room for.
+        per_pixel: [ROWS, PIXELS] what is known of each pixel.
+    """
+
+    values: np.ndarray
+    width: int
+    bends: int
+    jump: int
+    parts: int
+    lists: np.ndarray
+    light: np.ndarray
+    lengths: np.ndarray
+    capacity: int
+    per_pixel: np.ndarray
+
+
+class Palette(NamedTuple):
+    """Colours of a block's list; each is rows of three channels and one of the depth, if that is asked for.
+
+    Attributes:
+        values: [entries, forms + 3, 4] coefficients, radius, lower and upper bound over the cell.
+        forms: Coefficients of a colour.
+        background: [4].
+        unseen: [2, 4] darkest and brightest of what fragments that were left out show.
+    """
+
+    values: np.ndarray
+    forms: int
+    background: np.ndarray
+    unseen: np.ndarray
+
+
+class ListEntries(NamedTuple):
+    """Properties of each position of a block's list; [entries] all.
+
+    Attributes:
+        pixels: The set of the block's pixels that may be reached; valid where ``asked`` is 1.
+        asked: Whether ``pixels`` was found.
+        depth_radius: How far in depth the Gaussian may move against the block's central ray (O1).
+        depth: At the cell's middle.
+        far: Positions that reach further than most, in order; later the group that a position belongs to (O4).
+        first, last: Nearest and farthest position whose depth order against this one is uncertain, or itself.
+    """
+
+    pixels: np.ndarray
+    asked: np.ndarray
+    depth_radius: np.ndarray
+    depth: np.ndarray
+    far: np.ndarray
+    first: np.ndarray
+    last: np.ndarray
+
+
+class Reordering(NamedTuple):
+    """Which fragments of a block may change places. A list position that takes part in that has a slot.
+
+    Attributes:
+        pairs: [pair_limit, 2] list positions of uncertain order, the nearer at the middle first.
+        pair_limit: Room for pairs.
+        slots: [entries] number of a position's slot; -1: its order is certain.
+        owners: [slots] list positions.
+        drawn: [2 capacity] the set of pixels that a slot is drawn on.
+        places: [2 capacity, PIXELS] a slot's place in their lists.
+        moves: [32 capacity, MOVES] see `MOVES`; row 0 is for fragments that do not move.
+    """
+
+    pairs: np.ndarray
+    pair_limit: int
+    slots: np.ndarray
+    owners: np.ndarray
+    drawn: np.ndarray
+    places: np.ndarray
+    moves: np.ndarray
+
+
+class ThresholdCrossings(NamedTuple):
+    """Fragments of one pixel whose alpha crosses the threshold within the cell (B11), farthest first.
+
+    Attributes:
+        entries: [capacity] where they stand in the pixel's list.
+        distances: [capacity, 8] by channel, the least and then the greatest of its colour minus what is behind.
+        rows: [jump_rows, room] numbers of each, see `threshold_crossings`.
+        room: Whole lanes.
+    """
+
+    entries: np.ndarray
+    distances: np.ndarray
+    rows: np.ndarray
+    room: int
+
+
+class FragmentBatch(NamedTuple):
+    """Scratch for `BATCH` list positions on the pixels that they may reach, one after the other.
+
+    Attributes:
+        offset_x, offset_y: [BATCH PIXELS] pixel centre minus mean, pixels.
+        pixels: [BATCH PIXELS] numbers of the pixels.
+        begins: [BATCH + 1] where the pixels of each begin.
+        found: [BATCH] the set of those of its pixels on which alpha may reach the threshold.
+        rows: [width + 2 m, 8] columns of eight fragments, then scratch.
+    """
+
+    offset_x: np.ndarray
+    offset_y: np.ndarray
+    pixels: np.ndarray
+    begins: np.ndarray
+    found: np.ndarray
+    rows: np.ndarray
+
+
+class PixelBlock(NamedTuple):
+    """A block as kernels take it: pointers to `Buffers`.
+
+    Attributes:
+        shifted: Depths of one pixel's list against its own reference (see `depths`).
+        part_ends: [6, 8] scratch: least of three channels, and most, over parts of the cell.
+        sums: [3 m + bends + 5, 4] scratch by channel: polynomials, then what `blend` and `depths` need beside them.
+        ray: [3] the block's central ray at the cell's middle, world axes, of unit depth.
+    """
+
+    fragments: Fragments
+    palette: Palette
+    shifted: Palette
+    entries: ListEntries
+    reordering: Reordering
+    batch: FragmentBatch
+    jumps: ThresholdCrossings
+    part_ends: np.ndarray
+    sums: np.ndarray
+    ray: np.ndarray
+
+
+class Buffers(NamedTuple):
+    """Memory of a thread's blocks; the fields are those of `PixelBlock` and its parts."""
+
+    per_pixel: np.ndarray
+    offsets: np.ndarray
+    pixels: np.ndarray
+    batch: np.ndarray
+    rows: np.ndarray
+    lengths: np.ndarray
+    background: np.ndarray
+    nothing: np.ndarray
+    unseen: np.ndarray
+    part_ends: np.ndarray
+    sums: np.ndarray
+    ray: np.ndarray
+    positions: np.ndarray
+    depths: np.ndarray
+    palette: np.ndarray
+    shifted: np.ndarray
+    values: np.ndarray
+    lists: np.ndarray
+    light: np.ndarray
+    drawn: np.ndarray
+    places: np.ndarray
+    moves: np.ndarray
+    pairs: np.ndarray
+    skipped: np.ndarray
+    distances: np.ndarray
+    jumps: np.ndarray
+
+
+@njit(cache=True, error_model="numpy")
+def bends_of(shape):
+    """Coefficients of products of two parameters that pixels keep beside the Gaussians' forms (design.md, B10)."""
+    return 0 if shape.order == 2 else shape.dimensions * (shape.dimensions + 1) // 2
+
+
+@njit(cache=True, error_model="numpy")
+def fragment_width(shape):
+    """Numbers of a fragment of forms of ``shape``: whole cache lines."""
+    if shape.parts > 0:
+        return -(-(exponent_ends(shape.monomials) + 5) // 8) * 8
+    return -(-max(FORM + shape.monomials + 1 + bends_of(shape), crossing_column(shape) + 1) // 8) * 8
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def exponent_ends(m):
+    """Where in a fragment the radii stand that follow the exponent's slopes, see `EXPONENT`."""
+    return EXPONENT + 2 * m
+
+
+@njit(cache=True, error_model="numpy")
+def crossing_column(shape):
+    """Where a fragment tells up to which alpha it may be skipped: one parameter's need no range of their curvature."""
+    return BEND if shape.order == 2 else FORM + shape.monomials + 1 + bends_of(shape)
+
+
+@njit(cache=True, error_model="numpy")
+def crossing_rows(shape):
+    """Rows of `ThresholdCrossings` (see `threshold_crossings`)."""
+    d = shape.dimensions
+    return CROSSING_FORM + 1 + 2 * d + d * (d + 1) // 2 + CROSSING_RESTRICTED
+
+
+@njit(cache=True, error_model="numpy")
+def _crossing_columns(shape, capacity):
+    """Columns of `ThresholdCrossings`: channels, then ``capacity``; the last row holds what a part needs."""
+    return max(CROSSING_LANES + -(-capacity // CROSSING_LANES) * CROSSING_LANES, 20 * shape.dimensions + 80)
+
+
+@njit(cache=True, error_model="numpy")
+def _aligned(size):
+    """Uninitialised doubles that begin with a cache line."""
+    memory = np.empty(size + 7)
+    start = -(memory.ctypes.data // 8) % 8
+    return memory[start : start + size]
+
+
+@njit(cache=True, error_model="numpy")
+def new_buffers(shape, forms, pair_limit, background):
+    """Memory for fragments of ``shape``, colours of ``forms`` coefficients and ``pair_limit`` pairs."""
+    per_pixel = np.zeros(ROWS * PIXELS)
+    per_pixel[NUMBERS : NUMBERS + BLOCK] = np.arange(BLOCK)
+    behind = np.zeros(4)
+    behind[:3] = background
+    m, width = shape.monomials, fragment_width(shape)
+    return Buffers(
+        per_pixel=per_pixel,
+        offsets=np.zeros((2, BATCH * PIXELS + 8)),
+        pixels=np.empty(BATCH * PIXELS, np.uint8),
+        batch=np.empty((2, BATCH + 1), np.int64),
+        rows=np.zeros((width + 2 * m, 8)),
+        lengths=np.empty(PIXELS, np.uint32),
+        background=behind,
+        nothing=np.zeros(4),
+        unseen=np.zeros(8),
+        part_ends=np.empty(48),
+        sums=np.zeros(4 * (3 * m + 5 + bends_of(shape))),
+        ray=np.empty(3),
+        positions=np.empty((7, _POSITIONS), np.int64),
+        depths=np.empty((2, _POSITIONS)),
+        palette=np.zeros(_POSITIONS * color_size(forms)),
+        shifted=np.zeros(_POSITIONS * color_size(forms)),
+        values=_aligned(_CAPACITY * PIXELS * width),
+        lists=np.empty((PIXELS, _CAPACITY, LISTED), np.uint32),
+        light=np.empty((PIXELS, _CAPACITY, 2)),
+        drawn=np.empty(2 * _CAPACITY, np.int64),
+        places=np.empty((2 * _CAPACITY, PIXELS), np.uint32),
+        moves=np.empty((32 * _CAPACITY, MOVES)),
+        pairs=np.empty((pair_limit, 2), np.int64),
+        skipped=np.empty(_CAPACITY, np.int64),
+        distances=np.empty(8 * _CAPACITY),
+        jumps=np.zeros((crossing_rows(shape), _crossing_columns(shape, _CAPACITY))),
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def resized(old, positions, capacity, shape, forms):
+    """``old`` buffers with room for lists of ``positions`` and ``capacity`` fragments by pixel, where that is more."""
+    places, depths, palette, shifted = old.positions, old.depths, old.palette, old.shifted
+    if positions > places.shape[1]:
+        places, depths = np.empty((7, positions), np.int64), np.empty((2, positions))
+        palette = np.zeros(positions * color_size(forms))
+        shifted = np.zeros(positions * color_size(forms))
+    values, lists, light, drawn, of_slots, moves = (
+        old.values, old.lists, old.light, old.drawn, old.places, old.moves,
+    )  # fmt: skip
+    skipped, distances, jumps = old.skipped, old.distances, old.jumps
+    if capacity > lists.shape[1]:
+        values = _aligned(capacity * PIXELS * fragment_width(shape))
+        lists = np.empty((PIXELS, capacity, LISTED), np.uint32)
+        light = np.empty((PIXELS, capacity, 2))
+        drawn = np.empty(2 * capacity, np.int64)
+        of_slots = np.empty((2 * capacity, PIXELS), np.uint32)
+        moves = np.empty((32 * capacity, MOVES))
+        skipped, distances = np.empty(capacity, np.int64), np.empty(8 * capacity)
+        jumps = np.zeros((crossing_rows(shape), _crossing_columns(shape, capacity)))
+    return Buffers(
+        per_pixel=old.per_pixel,
+        offsets=old.offsets,
+        pixels=old.pixels,
+        batch=old.batch,
+        rows=old.rows,
+        lengths=old.lengths,
+        background=old.background,
+        nothing=old.nothing,
+        unseen=old.unseen,
+        part_ends=old.part_ends,
+        sums=old.sums,
+        ray=old.ray,
+        positions=places,
+        depths=depths,
+        palette=palette,
+        shifted=shifted,
+        values=values,
+        lists=lists,
+        light=light,
+        drawn=drawn,
+        places=of_slots,
+        moves=moves,
+        pairs=old.pairs,
+        skipped=skipped,
+        distances=distances,
+        jumps=jumps,
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def block_of(buffers, shape, forms):
+    """The block that lies in ``buffers``, which the caller keeps alive for as long as it is used."""
+    positions, depths = buffers.positions, buffers.depths
+    fragments = Fragments(
+        pointer(buffers.values),
+        fragment_width(shape),
+        bends_of(shape),
+        crossing_column(shape),
+        shape.parts,
+        pointer(buffers.lists),
+        pointer(buffers.light),
+        pointer(buffers.lengths),
+        buffers.lists.shape[1],
+        pointer(buffers.per_pixel),
+    )
+    palette = Palette(pointer(buffers.palette), forms, pointer(buffers.background), pointer(buffers.unseen))
+    # sums that begin at 0 and do not know what else is behind
+    shifted = Palette(pointer(buffers.shifted), forms, pointer(buffers.nothing), pointer(buffers.unseen))
+    entries = ListEntries(
+        pointer(positions[0]),
+        pointer(positions[1]),
+        pointer(depths[0]),
+        pointer(depths[1]),
+        pointer(positions[2]),
+        pointer(positions[3]),
+        pointer(positions[4]),
+    )
+    reordering = Reordering(
+        pointer(buffers.pairs),
+        buffers.pairs.shape[0],
+        pointer(positions[5]),
+        pointer(positions[6]),
+        pointer(buffers.drawn),
+        pointer(buffers.places),
+        pointer(buffers.moves),
+    )
+    batch = FragmentBatch(
+        pointer(buffers.offsets[0]),
+        pointer(buffers.offsets[1]),
+        pointer(buffers.pixels),
+        pointer(buffers.batch[0]),
+        pointer(buffers.batch[1]),
+        pointer(buffers.rows),
+    )
+    jumps = ThresholdCrossings(
+        pointer(buffers.skipped), pointer(buffers.distances), pointer(buffers.jumps), buffers.jumps.shape[1]
+    )
+    return PixelBlock(
+        fragments,
+        palette,
+        shifted,
+        entries,
+        reordering,
+        batch,
+        jumps,
+        pointer(buffers.part_ends),
+        pointer(buffers.sums),
+        pointer(buffers.ray),
+    )
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def parabola(slope, bend):
+    """Range of +-slope p + bend p^2 over p in [-1, 1], up to rounding, of lanes (design.md, A4)."""
+    bottom, top = bend - slope, bend + slope
+    # the vertex counts where it lies inside [-1, 1]
+    inside = slope < 2.0 * abs(bend)
+    if bits(inside) != 0:
+        vertex = -0.25 * (slope * slope) / where(bend != 0.0, bend, 1.0)
+        bottom = where(inside, minimum(bottom, vertex), bottom)
+        top = where(inside, maximum(top, vertex), top)
+    return bottom, top
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def longest_list(lengths):
+    """The largest of the pixels' ``lengths``."""
+    longest = 0
+    for q in range(PIXELS):
+        longest = max(longest, int(lengths[q]))
+    return longest
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def set_unknown(fragments, at, high, m):
+    """Let the fragment at ``at`` have any alpha from 0 to ``high``."""
+    values = fragments.values
+    values[at + ALPHA_LOW] = 0.0
+    values[at + ALPHA_HIGH] = high
+    if fragments.parts > 0:
+        for k in range(EXPONENT, exponent_ends(m)):
+            values[at + k] = 0.0
+        ends = at + exponent_ends(m)
+        values[ends], values[ends + 1] = 0.0, 0.0
+        values[ends + 2], values[ends + 3], values[ends + 4] = (0.0, 1.0, 0.0)
+        return
+    for k in range(FORM + m + 1, FORM + m + 1 + fragments.bends):
+        values[at + k] = 0.0
+    values[at + BEND] = 0.0
+    values[at + BEND_SPREAD] = 0.0
+    values[at + fragments.jump] = 0.0
+    values[at + FORM] = 0.5 * high
+    for k in range(1, m):
+        values[at + FORM + k] = 0.0
+    values[at + FORM + m] = 0.5 * high * UP
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def crossing_of(fragments, at):
+    """By how much alpha of the fragment at ``at`` may fall where it is skipped; half of it is in its form (B4, B11)."""
+    return min(fragments.values[at + fragments.jump], fragments.values[at + ALPHA_HIGH])
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def color_size(forms):
+    """Numbers of one colour of the palette."""
+    return 4 * (forms + 3)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def color_ends(forms):
+    """Where in a colour of the palette its lower bound stands, before its upper one."""
+    return 4 * (forms + 1)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def listed_fragment(fragments, entry, forms):
+    """Where a pixel's fragment stands, its colour in the palette and its row of moves (0: none)."""
+    lists, at = fragments.lists, LISTED * entry
+    return (
+        int(lists[at]) * fragments.width,
+        int(lists[at + 1]) * color_size(forms),
+        MOVES * int(lists[at + 2]),
+    )

@@ -1,0 +1,644 @@
+"""Float errors, pixel regions and tile ranges of projected Gaussians (design.md, G5-G12).
+
+For every Gaussian that some pose of the cell may show, one record is written:
+
+    0, 1   mean in pixels at the cell's middle (the point pixel offsets are taken from)
+    2, 3   lower and upper opacity
+    4      kappa: relative error of the exponent that float evaluation may add
+    5      1 where nothing but the opacity is known ("unbounded"), else 0
+    6      exponent from which on alpha is below the threshold, however it is evaluated (B4); -1 if unbounded
+    7 ..   of the forms P, Q, S, W1, W2: how far each may be from its centre, for pixels that surely see nothing
+    12 ..  forms P, Q, S, W1, W2 (and K if antialiased; 0 where the opacity is compensated), each m coefficients and
+           a radius
+
+so that for a pixel at offset (ax, ay) from the mean
+
+    y1 = P ax - Q ay - W1,   y2 = S ay - W2,   alpha = opacity exp(-(y1^2 + y2^2)/2 - K).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numba import njit
+
+from ns_abstract.arithmetic.rounding import (
+    COMPENSATION_ROUNDING,
+    ELLIPSE_ERROR,
+    ELLIPSE_SHARPNESS,
+    ELLIPSE_SPAN,
+    ELLIPSE_TIPS,
+    LOGARITHM_ROOM,
+    REGION,
+    ROOT_ROUNDING,
+    SECOND_ORDER,
+    UP,
+    Charges,
+)
+
+#: Lanes of one block of the compiled stage.
+LANES = 32
+
+
+@dataclass(frozen=True)
+class RecordTuning:
+    """From where on Gaussians are looked at more closely. None of them decides whether a bound holds."""
+
+    #: The squared compensation from which on its logarithm is used.
+    least_square: float = 1e-60
+    #: Part of the near plane's depth from which on a Gaussian is projected over all of a cell, also where it is not
+    #: drawn.
+    in_front: float = 2.0**-4
+    #: Relative error of a covariance, as its entries' errors tell, beyond which that of its factors is looked at.
+    factors_matter: float = 2.0**-10
+
+
+_LEAST_SQUARE = RecordTuning.least_square
+_IN_FRONT = RecordTuning.in_front
+_FACTORS_MATTER = RecordTuning.factors_matter
+
+
+# columns of a record before its forms
+MEAN_X, MEAN_Y, OPACITY_LOW, OPACITY_HIGH, KAPPA, UNBOUNDED, EXPONENT_LIMIT, SPREAD = range(8)
+FORMS = SPREAD + 5
+
+
+@njit(cache=True, error_model="numpy")
+def columns(count, m):
+    """Columns of a record of ``count`` forms of ``m`` monomials: whole cache lines."""
+    return -(-(FORMS + count * (m + 1)) // 8) * 8
+
+
+# Scratch of a block is flat: row r holds its lanes at r * LANES .. r * LANES + LANES - 1. With constant offsets the
+# compiler sees that rows do not overlap, so that long loops over lanes become vector code.
+(
+    # means minus origin; principal axes by column; float error of their covariance; |mean|, half-width of its range
+    V0, V1, V2,
+    B00, B10, B20, B01, B11, B21, B02, B12, B22,
+    N0, N1, N2, N3, N4, N5, N6, N7, N8, N9, N10, N11,
+    M0, M1, M2, R0, R1, R2,
+    # ends of the opacity's range, exponent at which it reaches the threshold
+    OPLOW, OPHIGH, OPLIMIT,
+    # largest standard deviation
+    EXTENT,
+    # bounds that the projection leaves: depth, ratios, scaled covariance entries, determinant, half difference,
+    # squared compensation, magnitude of the third row of rotation times axes
+    ZLO, ZHI, ULO, UHI, VLO, VHI, ALO, AHI, CLO, CHI, BLO, BHI, DLO, DHI, LO, HI, SQLO, SQHI, DEEP0, DEEP1, DEEP2,
+    # depth and mean in pixels from the middle of the view, at the cell's middle
+    Z0, X0, Y0,
+    # float errors of the coordinates, what a range of means adds to them
+    EX, EY, EZ, SX, SY, SZ,
+    # what `float_errors` leaves: depth, means and their errors; clamped ratios' sizes, what their errors move in
+    # pixels by unit of depth, relative error of an entry of J
+    ZLOW, ZHIGH, MXLO, MXHI, MYLO, MYHI, EMX, EMY, RATIOX, RATIOY, JUMPX, JUMPY, RELJ,
+    # the covariance and its errors
+    A, B, C, DET, EA, EB, EC, EDET, RHIGH, RLOW, ETA, EW, TAME,
+    # of G = J R M by row: squared sizes, errors of the factors; errors in G G^T
+    ROWX, ROWY, MOVEX, MOVEY, GRAMA, GRAMB, GRAMC,
+    # what `compensations` leaves: bound of the compensation, bounds of the factor beside its form, whether there is no
+    # form, logarithms of the upper bounds
+    CTOP, CLOW, CHIGH, FORMLESS, CTOPLOG, CHIGHLOG,
+    # what `regions` leaves beside columns of the record: state, box and tiles
+    GONE, FINITE, FRONT, PLACED, KNOWN, REGIONLIMIT, BOX0, BOX1, BOX2, BOX3, T0, T1, T2, T3, T4, T5, T6, T7,
+) = range(0, 121 * LANES, LANES)  # fmt: skip
+# a record, column by column
+RECORD = T7 + LANES
+R_MEAN_X, R_MEAN_Y, R_OPACITY_LOW, R_OPACITY_HIGH, R_KAPPA, R_UNBOUNDED, R_EXPONENT_LIMIT, R_SPREAD = (
+    RECORD + column * LANES
+    for column in (MEAN_X, MEAN_Y, OPACITY_LOW, OPACITY_HIGH, KAPPA, UNBOUNDED, EXPONENT_LIMIT, SPREAD)
+)
+# its forms, four rows each where there is one parameter, and behind them the determinant
+FP, FQ, FS, FW1, FW2, FK, FD = range(RECORD + FORMS * LANES, RECORD + (FORMS + 28) * LANES, 4 * LANES)
+
+
+@njit(cache=True, error_model="numpy")
+def table_rows(width):
+    """Rows of the scratch for records of ``width`` columns."""
+    return RECORD // LANES + max(width, (FD - RECORD) // LANES + 4)
+
+
+@njit(cache=True, error_model="numpy")
+def gather_means(candidates, block, scene, origin, s):
+    """Copy the means of the Gaussians ``block`` to the rows V0 .. V2, M0 .. R2; lanes in excess repeat the last one."""
+    means, mean_radius = scene.means, scene.mean_radius
+    filled = block.shape[0]
+    for q in range(LANES):
+        i = candidates[block[min(q, filled - 1)]]
+        for k in range(3):
+            s[V0 + k * LANES + q] = means[i, k] - origin[k]
+            s[M0 + k * LANES + q] = abs(means[i, k])
+            s[R0 + k * LANES + q] = mean_radius[i, k] if mean_radius.shape[0] > 0 else 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def gather(candidates, block, scene, origin, s):
+    """Copy what the Gaussians ``block`` are made of to the rows V0 .. OPLIMIT; lanes in excess repeat the last one."""
+    gather_means(candidates, block, scene, origin, s)
+    axes, noise, opacity_low, opacity_high, exponent_limits = (
+        scene.axes, scene.noise, scene.opacity_low, scene.opacity_high, scene.exponent_limits,
+    )  # fmt: skip
+    filled = block.shape[0]
+    for q in range(LANES):
+        i = candidates[block[min(q, filled - 1)]]
+        for column in range(3):
+            for k in range(3):
+                s[B00 + (3 * column + k) * LANES + q] = axes[i, k, column]
+        for k in range(12):
+            s[N0 + k * LANES + q] = noise[i, k]
+        s[OPLOW + q] = opacity_low[i]
+        s[OPHIGH + q] = opacity_high[i]
+        s[OPLIMIT + q] = exponent_limits[i]
+
+
+@njit(cache=True, error_model="numpy")
+def coordinate_errors(s, n, poses, charges):
+    """Float errors of the camera coordinates and what ranges of means add to them (G2, S2): rows EX .. SZ."""
+    rotation_magnitude, camera_magnitude = poses.rotation_magnitude, poses.camera_magnitude
+    c0, c1, c2 = camera_magnitude[0], camera_magnitude[1], camera_magnitude[2]
+    for row in range(3):
+        r0, r1, r2 = rotation_magnitude[3 * row], rotation_magnitude[3 * row + 1], rotation_magnitude[3 * row + 2]
+        error, spread = EX + row * LANES, SX + row * LANES
+        for q in range(n):
+            total = (
+                r0 * (s[M0 + q] + s[R0 + q] + c0)
+                + r1 * (s[M1 + q] + s[R1 + q] + c1)
+                + r2 * (s[M2 + q] + s[R2 + q] + c2)
+            )
+            s[error + q] = charges.camera_coordinate * total * UP
+        for q in range(n):
+            s[spread + q] = (r0 * s[R0 + q] + r1 * s[R1 + q] + r2 * s[R2 + q]) * UP
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _rotation_row(magnitude, k):
+    """Upper bounds of the absolute entries of row ``k`` of the rotation."""
+    return magnitude[3 * k], magnitude[3 * k + 1], magnitude[3 * k + 2]
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _scaled_row(j, ratio, r, r2):
+    """Upper bounds of the absolute entries of a row of J R, from those of the rotation's row ``r`` and third row."""
+    return j * (r[0] + ratio * r2[0]), j * (r[1] + ratio * r2[1]), j * (r[2] + ratio * r2[2])
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _applied(f00, f11, f22, f01, f02, f12, g):
+    """A symmetric matrix times a vector."""
+    return (
+        f00 * g[0] + f01 * g[1] + f02 * g[2],
+        f01 * g[0] + f11 * g[1] + f12 * g[2],
+        f02 * g[0] + f12 * g[1] + f22 * g[2],
+    )
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _dot(a, b):
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def view_limits(rules, camera):
+    """Largest absolute ratios x/z and y/z that the Jacobian is evaluated at; infinite without a margin."""
+    fx, fy, cx, cy, width, height = camera
+    margin = rules.view_margin
+    if margin < 0.0:
+        return np.inf, np.inf
+    limit_x = max(cx, width - cx) / fx + margin * 0.5 * width / fx
+    limit_y = max(cy, height - cy) / fy + margin * 0.5 * height / fy
+    return limit_x, limit_y
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _axis_sizes(s, k, q):
+    """Absolute entries of principal axis ``k``."""
+    at = B00 + 3 * k * LANES + q
+    return abs(s[at]), abs(s[at + LANES]), abs(s[at + 2 * LANES])
+
+
+@njit(cache=True, error_model="numpy")
+def float_errors(s, n, rules, camera, charges, rotation_magnitude):
+    """Float errors of mean, covariance and exponent, and the radius' range (design.md, G5-G8): rows ZLOW .. GRAMC.
+
+    Numbers of Gaussians that may come too near are of no use; `regions` does not look at them. The compiler makes
+    vector code of the loops as they stand: lanes are Gaussians.
+    """
+    _mean_errors(s, n, rules, camera, charges)
+    _covariance_errors(s, n, camera, charges, rotation_magnitude)
+    _radius_ranges(s, n, rules, charges)
+    if rules.antialiased or _any_sharp(s, n):
+        _factor_errors(s, n, rules, camera, charges, rotation_magnitude)
+    for q in range(n):
+        a, c, det = s[A + q], s[C + q], s[DET + q]
+        s[ETA + q] = (s[ETA + q] + charges.conic * (a * c) / det) * SECOND_ORDER
+        # float error of the mean, in units of y
+        s[EW + q] = (np.sqrt(c / det) * s[EMX + q] + np.sqrt(a / det) * s[EMY + q]) * SECOND_ORDER
+
+
+@njit(cache=True, error_model="numpy")
+def _mean_errors(s, n, rules, camera, charges):
+    """Depth and mean with their errors, and errors of the Jacobian (design.md, G5, G6): rows ZLOW .. RELJ."""
+    fx, fy, cx, cy, _, _ = camera
+    limit_x, limit_y = view_limits(rules, camera)
+    clamp_x, clamp_y = 0.0, 0.0
+    if rules.view_margin >= 0.0:
+        clamp_x, clamp_y = charges.clamp * limit_x, charges.clamp * limit_y
+    for q in range(n):
+        error_z = s[EZ + q]
+        z_low = s[ZLO + q] - error_z
+        s[ZLOW + q] = z_low
+        s[ZHIGH + q] = s[ZHI + q] + error_z
+        ratio_x = max(abs(s[ULO + q]), abs(s[UHI + q]))
+        ratio_y = max(abs(s[VLO + q]), abs(s[VHI + q]))
+        # G5: reciprocal of depth, means
+        relative_z = error_z / z_low
+        relative_rz = relative_z + charges.reciprocal_depth
+        error_u = s[EX + q] / z_low + ratio_x * (relative_rz + charges.ratio)
+        error_v = s[EY + q] / z_low + ratio_y * (relative_rz + charges.ratio)
+        error_mean_x = fx * error_u + charges.mean * (fx * ratio_x + abs(cx))
+        error_mean_y = fy * error_v + charges.mean * (fy * ratio_y + abs(cy))
+        s[EMX + q], s[EMY + q] = error_mean_x, error_mean_y
+        s[MXLO + q] = fx * s[ULO + q] + cx - error_mean_x * REGION
+        s[MXHI + q] = fx * s[UHI + q] + cx + error_mean_x * REGION
+        s[MYLO + q] = fy * s[VLO + q] + cy - error_mean_y * REGION
+        s[MYHI + q] = fy * s[VHI + q] + cy + error_mean_y * REGION
+        # clamped ratios
+        s[RATIOX + q] = min(ratio_x, limit_x)
+        s[RATIOY + q] = min(ratio_y, limit_y)
+        s[JUMPX + q] = fx / z_low * (min(error_u, 2.0 * limit_x) + clamp_x)
+        s[JUMPY + q] = fy / z_low * (min(error_v, 2.0 * limit_y) + clamp_y)
+        s[RELJ + q] = relative_z + 2.0 * relative_rz + charges.jacobian
+
+
+@njit(cache=True, error_model="numpy")
+def _covariance_errors(s, n, camera, charges, rotation_magnitude):
+    """The covariance and its errors, from the rows of `_mean_errors` (design.md, G6): rows A .. EC, TAME."""
+    r0, r1 = _rotation_row(rotation_magnitude, 0), _rotation_row(rotation_magnitude, 1)
+    r2 = _rotation_row(rotation_magnitude, 2)
+    for q in range(n):
+        z_low, z_high = s[ZLOW + q], s[ZHIGH + q]
+        jump_x, jump_y, relative_j = s[JUMPX + q], s[JUMPY + q], s[RELJ + q]
+        g_x = _scaled_row(camera.fx / z_low, s[RATIOX + q], r0, r2)
+        g_y = _scaled_row(camera.fy / z_low, s[RATIOY + q], r1, r2)
+        # F bounds the error of the world covariance and all later roundings
+        grow = relative_j * (2.0 + relative_j)
+        f00 = s[N0 + q] + grow * s[N6 + q]
+        f11 = s[N1 + q] + grow * s[N7 + q]
+        f22 = s[N2 + q] + grow * s[N8 + q]
+        f01 = s[N3 + q] + grow * s[N9 + q]
+        f02 = s[N4 + q] + grow * s[N10 + q]
+        f12 = s[N5 + q] + grow * s[N11 + q]
+        deep0, deep1, deep2 = s[DEEP0 + q], s[DEEP1 + q], s[DEEP2 + q]
+        variance = deep0 * deep0 + deep1 * deep1 + deep2 * deep2
+        variance += f00 * r2[0] * r2[0] + f11 * r2[1] * r2[1] + f22 * r2[2] * r2[2]
+        variance += 2.0 * (f01 * r2[0] * r2[1] + f02 * r2[0] * r2[2] + f12 * r2[1] * r2[2])
+        h_x = _applied(f00, f11, f22, f01, f02, f12, g_x)
+        h_y = _applied(f00, f11, f22, f01, f02, f12, g_y)
+        z2_low = z_low * z_low
+        z2_high = z_high * z_high
+        a = s[AHI + q] / z2_low
+        c = s[CHI + q] / z2_low
+        b = max(abs(s[BLO + q]), abs(s[BHI + q])) / z2_low
+        deep, root_a, root_c = np.sqrt(variance), np.sqrt(a), np.sqrt(c)
+        # of what an entry is made of, of the ratios in J, of its last sum
+        error_a = _dot(g_x, h_x) + 2.0 * jump_x * deep * root_a + jump_x * jump_x * variance + charges.blur * a
+        error_c = _dot(g_y, h_y) + 2.0 * jump_y * deep * root_c + jump_y * jump_y * variance + charges.blur * c
+        error_b = _dot(g_x, h_y) + deep * (jump_x * root_c + jump_y * root_a) + jump_x * jump_y * variance
+        error_a, error_c, error_b = (
+            error_a * SECOND_ORDER,
+            error_c * SECOND_ORDER,
+            (error_b + charges.blur * b) * SECOND_ORDER,
+        )
+        s[A + q], s[B + q], s[C + q] = a, b, c
+        s[DET + q] = s[DLO + q] / (z2_high * z2_high)
+        s[EA + q], s[EB + q], s[EC + q] = error_a, error_b, error_c
+        # what is not finite, or not a number, in any of them is not so in the sum
+        s[TAME + q] = a + c + error_a + error_b + error_c
+
+
+@njit(cache=True, error_model="numpy")
+def _radius_ranges(s, n, rules, charges):
+    """The determinant's error, the radius' range (design.md, G8) and G7's first bound: EDET, RHIGH, RLOW, ETA."""
+    for q in range(n):
+        z_low, z_high = s[ZLOW + q], s[ZHIGH + q]
+        z2_low = z_low * z_low
+        z2_high = z_high * z_high
+        a, b, c, det = s[A + q], s[B + q], s[C + q], s[DET + q]
+        error_a, error_b, error_c = s[EA + q], s[EB + q], s[EC + q]
+        # lambda_max = (a + c)/2 + sqrt(max(floor, ((a - c)/2)^2 + b^2))
+        difference = max(abs(s[LO + q]), abs(s[HI + q])) / z2_low
+        nearest = max(0.0, s[LO + q], -s[HI + q]) / z2_high
+        b_nearest = max(0.0, s[BLO + q], -s[BHI + q]) / z2_high
+        half_high = 0.5 * (a + c)
+        half_low = 0.5 * (max(s[ALO + q], 0.0) + max(s[CLO + q], 0.0)) / z2_high
+        error_half = 0.5 * (error_a + error_c) + charges.half_trace * half_high
+        error_det = (
+            c * error_a + a * error_c + 2.0 * b * error_b + error_a * error_c + error_b * error_b
+            + charges.determinant * (a * c + b * b)
+        ) * SECOND_ORDER  # fmt: skip
+        error_disc = 2.0 * half_high * error_half + error_half * error_half + error_det
+        error_disc += charges.discriminant * half_high * half_high
+        disc_high = max(rules.discriminant_min, difference * difference + b * b + error_disc)
+        disc_low = max(rules.discriminant_min, nearest * nearest + b_nearest * b_nearest - error_disc)
+        top_high = (half_high + error_half + np.sqrt(disc_high)) * (1.0 + charges.radius)
+        top_low = max(0.0, half_low - error_half + np.sqrt(disc_low)) * (1.0 - charges.radius)
+        # np.ceil: math.ceil is an int64, which a huge Gaussian overflows
+        s[RHIGH + q] = np.ceil(rules.radius_sigmas * np.sqrt(top_high) * (1.0 + charges.radius) * REGION)
+        s[RLOW + q] = np.ceil(rules.radius_sigmas * np.sqrt(top_low) * (1.0 - charges.radius) / REGION)
+        s[EDET + q] = error_det
+        s[ETA + q] = (c * error_a + 2.0 * (np.sqrt(a) * np.sqrt(c)) * error_b + a * error_c) / det
+
+
+@njit(cache=True, error_model="numpy")
+def _any_sharp(s, n):
+    """Whether any of the row ETA is above `_FACTORS_MATTER`."""
+    any_above = False
+    for q in range(n):
+        any_above = any_above | (s[ETA + q] > _FACTORS_MATTER)
+    return any_above
+
+
+@njit(cache=True, error_model="numpy")
+def _factor_errors(s, n, rules, camera, charges, rotation_magnitude):
+    """G7's second bound, from the errors of the factors of G = J R M (design.md, G7, G11): ETA, EDET, ROWX .. GRAMC.
+
+    The errors are those of the factors, row by row, and of the products in G G^T. Not antialiased, only what is above
+    `_FACTORS_MATTER` is replaced, so that a Gaussian's bounds do not depend on those beside it.
+    """
+    r0, r1 = _rotation_row(rotation_magnitude, 0), _rotation_row(rotation_magnitude, 1)
+    r2 = _rotation_row(rotation_magnitude, 2)
+    enough = -1.0 if rules.antialiased else _FACTORS_MATTER
+    for q in range(n):
+        z_low, jump_x, jump_y = s[ZLOW + q], s[JUMPX + q], s[JUMPY + q]
+        a, b, c, det = s[A + q], s[B + q], s[C + q], s[DET + q]
+        g_x = _scaled_row(camera.fx / z_low, s[RATIOX + q], r0, r2)
+        g_y = _scaled_row(camera.fy / z_low, s[RATIOY + q], r1, r2)
+        relative = SECOND_ORDER * (s[RELJ + q] + charges.rotation)
+        more = 1.0 + relative
+        sum_x = (g_x[0] + g_x[1] + g_x[2] + jump_x * (r2[0] + r2[1] + r2[2])) * more
+        sum_y = (g_y[0] + g_y[1] + g_y[2] + jump_y * (r2[0] + r2[1] + r2[2])) * more
+        move_x, move_y, gram_a, gram_b, gram_c, row_x, row_y = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+        for k in range(3):
+            axis = _axis_sizes(s, k, q)
+            entry = charges.rotation_entry * np.sqrt(_dot(axis, axis))
+            size_x, size_y = _dot(g_x, axis), _dot(g_y, axis)
+            near = s[DEEP0 + k * LANES + q] * more
+            whole = _dot(r2, axis) * more
+            e_x = relative * size_x + sum_x * entry + jump_x * near
+            e_y = relative * size_y + sum_y * entry + jump_y * near
+            t_x = more * size_x + sum_x * entry + jump_x * whole
+            t_y = more * size_y + sum_y * entry + jump_y * whole
+            move_x, move_y = move_x + e_x * e_x, move_y + e_y * e_y
+            row_x, row_y = row_x + size_x * size_x, row_y + size_y * size_y
+            gram_a, gram_b, gram_c = gram_a + t_x * t_x, gram_b + t_x * t_y, gram_c + t_y * t_y
+        move_x, move_y = np.sqrt(move_x), np.sqrt(move_y)
+        gram_a = charges.gram * gram_a + charges.flush * (sum_x * sum_x + 1.0)
+        gram_b = charges.gram * gram_b + charges.flush * (sum_x * sum_y + 1.0)
+        gram_c = charges.gram * gram_c + charges.flush * (sum_y * sum_y + 1.0)
+        s[ROWX + q], s[ROWY + q], s[MOVEX + q], s[MOVEY + q] = row_x, row_y, move_x, move_y
+        s[GRAMA + q], s[GRAMB + q], s[GRAMC + q] = gram_a, gram_b, gram_c
+        # relative errors of the covariance and of its determinant
+        moved = np.sqrt(c / det) * move_x + np.sqrt(a / det) * move_y
+        gram = c * (gram_a + charges.blur * a) + 2.0 * (np.sqrt(a) * np.sqrt(c)) * gram_b
+        gram = gram + a * (gram_c + charges.blur * c)
+        eta = min(s[ETA + q], (moved * (2.0 + moved) + gram / det) * SECOND_ORDER)
+        products = charges.determinant * (a * c + b * b)
+        error_det = min(s[EDET + q], (eta * (2.0 + eta) * det + products) * SECOND_ORDER)
+        replaced = s[ETA + q] > enough
+        s[EDET + q] = error_det if replaced else s[EDET + q]
+        s[ETA + q] = eta if replaced else s[ETA + q]
+
+
+@njit(cache=True, error_model="numpy")
+def compensations(s, n, rules, charges):
+    """Bounds of the compensation as it is computed (design.md, G11, G12): rows CTOP .. CHIGHLOG, from `float_errors`.
+
+    CTOP bounds it over the cell. Its form leaves a factor between CLOW and CHIGH; where FORMLESS is 1 that is the
+    compensation itself, because its logarithm is not known well enough.
+    """
+    eps2d, least, flush = rules.eps2d, rules.compensation_min, charges.flush
+    # and the rounding below
+    shrink = 1.0 - charges.compensation - COMPENSATION_ROUNDING
+    grow = 1.0 + charges.compensation + COMPENSATION_ROUNDING
+    for q in range(n):
+        move_x, move_y = s[MOVEX + q], s[MOVEY + q]
+        error_a, error_b, error_c = s[GRAMA + q], s[GRAMB + q], s[GRAMC + q]
+        # the covariance before the blur
+        a = np.sqrt(min(s[ROWX + q], max(0.0, s[A + q] * REGION - eps2d)))
+        c = np.sqrt(min(s[ROWY + q], max(0.0, s[C + q] * REGION - eps2d)))
+        det, spread = s[DET + q], s[EDET + q] / s[DET + q]
+        moved = SECOND_ORDER * (move_x * c + a * move_y + move_x * move_y) / np.sqrt(det)
+        a, c = (a + move_x) * (a + move_x), (c + move_y) * (c + move_y)
+        error = c * error_a + a * error_c + 2.0 * np.sqrt(a * c) * error_b + error_a * error_c + error_b * error_b
+        error = SECOND_ORDER * (error + charges.determinant * (a + error_a) * (c + error_c) + flush) / det
+        # the square of the compensation lies in [0, 1]; bounds that are no numbers say nothing
+        low = s[SQLO + q] if s[SQLO + q] > 0.0 else 0.0
+        high = s[SQHI + q] if s[SQHI + q] < 1.0 else 1.0
+        low_root, high_root = np.sqrt(low), np.sqrt(high)
+        bottom = max(0.0, low_root * (1.0 - ROOT_ROUNDING) - moved)
+        bottom = np.sqrt(max(0.0, bottom * bottom - error) / (1.0 + spread)) * shrink
+        top = high_root * (1.0 + ROOT_ROUNDING) + moved
+        top = np.sqrt((top * top + error) / (1.0 - spread)) * grow
+        change = (moved * (2.0 * low_root + moved) + error) / low
+        # 1.6.0 has a least factor
+        formed = (low > _LEAST_SQUARE) & (change < 0.25) & (0.45 * low > least * least)
+        bottom = max(bottom, least * (1.0 - charges.compensation))
+        top = max(top, least * (1.0 + charges.compensation))
+        s[CTOP + q] = top if top < np.inf else np.inf
+        s[CLOW + q] = np.sqrt((1.0 - change) / (1.0 + spread)) * shrink if formed else bottom
+        s[CHIGH + q] = np.sqrt((1.0 + change) / (1.0 - spread)) * grow if formed else top
+        s[FORMLESS + q] = 0.0 if formed else 1.0
+    # the logarithm is no vector code
+    for q in range(n):
+        s[CTOPLOG + q] = np.log(s[CTOP + q] * REGION)
+        s[CHIGHLOG + q] = np.log(s[CHIGH + q] * REGION)
+
+
+def exponent_limits(opacity_high: np.ndarray, alpha_min: float, charges: Charges) -> np.ndarray:
+    """Exponents [N] from which on opacities [N] leave less than ``alpha_min``, however they are evaluated (B4)."""
+    with np.errstate(divide="ignore"):
+        exponent = np.log(opacity_high * (1.0 + charges.opacity) * (1.0 + charges.exponent_limit) / alpha_min)
+    # room for the rounding of the exponential, which grows more slowly than the exponent's own error
+    return exponent * REGION + LOGARITHM_ROOM
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _within(x, most):
+    return min(max(x, 0.0), most)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def ellipse_is_met(sharpness, widest, thinnest, eta, span, charges):
+    """Whether a Gaussian shows hardly anything in tiles that rounding may miss (design.md, G12), by its covariance.
+
+    ``sharpness`` is det / (a c), ``widest`` and ``thinnest`` bound a and c, ``span`` the coordinates in pixels.
+    """
+    unit = 0.125 * charges.tile
+    steep = 16.0 * unit * span * np.sqrt(widest / thinnest) < 0.25
+    tips = (sharpness * sharpness > ELLIPSE_SHARPNESS * unit) & (
+        sharpness * np.sqrt(thinnest) > ELLIPSE_TIPS * unit * span
+    )
+    return steep & tips & (eta < ELLIPSE_ERROR) & (span < ELLIPSE_SPAN)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def largest_extent(s, q):
+    """Upper bound of the largest standard deviation of one lane's Gaussian, up to rounding."""
+    total = 0.0
+    for k in range(9):
+        entry = s[B00 + k * LANES + q]
+        total += entry * entry
+    return np.sqrt(total)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def projected_stretch(rules, camera):
+    """Upper bound of the norm of z J, up to rounding; 0 where no float32 program is modelled (the paper's rules)."""
+    if rules.view_margin < 0.0:
+        return 0.0
+    fx, fy, _, _, _, _ = camera
+    limit_x, limit_y = view_limits(rules, camera)
+    return np.sqrt(fx * fx * (1.0 + limit_x * limit_x) + fy * fy * (1.0 + limit_y * limit_y)) * REGION
+
+
+@njit(cache=True, error_model="numpy")
+def regions(s, n, rules, camera, charges):
+    """Compute regions and tile ranges from the rows of `float_errors` (design.md, G5-G12): rows GONE .. T7.
+
+    GONE is 1 where no pose shows it, KNOWN where its forms may be relied on. The others may cover every pixel. Of a
+    record: the opacities, kappa and the exponent from which on alpha is below the threshold.
+    """
+    _tile_ranges(s, n, rules, camera, charges)
+    _opacities(s, n, rules, charges)
+    _pixel_boxes(s, n, rules, camera)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _tile_side(rules):
+    """Side of a tile, pixels: the program's, or that of the work's division where it has none."""
+    return rules.tile_size if rules.tile_size > 0.0 else float(rules.work_tile)
+
+
+@njit(cache=True, error_model="numpy")
+def _tile_ranges(s, n, rules, camera, charges):
+    """Tiles of the program (design.md, G8, G9, G12): rows T0 .. T7, GONE, FINITE, FRONT, PLACED."""
+    near, far, room, ellipse = rules.near, rules.far, rules.tile_room, rules.ellipse_tiles
+    width, height = camera.width, camera.height
+    cut = rules.tile_size > 0.0
+    side = _tile_side(rules)
+    across, down = np.ceil(width / side), np.ceil(height / side)
+    # below it no product of entries of a covariance overflows (G9)
+    safe = near * np.sqrt(np.sqrt(charges.overflow)) * 0.5
+    stretch = projected_stretch(rules, camera)
+    for q in range(n):
+        a, c = s[A + q], s[C + q]
+        mean_x_low, mean_x_high, mean_y_low, mean_y_high = s[MXLO + q], s[MXHI + q], s[MYLO + q], s[MYHI + q]
+        z_high = s[ZHIGH + q]
+        # well in front of the camera; products of covariances that may overflow leave nothing known
+        front = (s[ZLOW + q] >= near * _IN_FRONT) & (z_high < np.inf)
+        # at some pose the near or the far plane hides it
+        cut_off = (s[ZLOW + q] < near * (1.0 + charges.near)) | (z_high > far)
+        front = front & (a * c < charges.overflow) & (s[TAME + q] < np.inf)
+        largest = largest_extent(s, q)
+        finite = (front | (largest * stretch < safe)) & (
+            largest * largest * max(1.0, stretch / near) < charges.overflow
+        )
+        front = front & finite
+        radius_high, radius_low = s[RHIGH + q], s[RLOW + q]
+        snap_x = charges.tile * (abs(mean_x_low) + abs(mean_x_high) + radius_high)
+        snap_y = charges.tile * (abs(mean_y_low) + abs(mean_y_high) + radius_high)
+        left, right = mean_x_low - radius_high - snap_x, mean_x_high + radius_high + snap_x
+        top, bottom = mean_y_low - radius_high - snap_y, mean_y_high + radius_high + snap_y
+        # a place that is not finite is no number in some of these
+        placed = front & (right - left < np.inf) & (bottom - top < np.inf)
+        bounded = placed & (cut | (room > 0.0))
+        # image-border culls of fully_fused_projection_fwd.cu:171-180
+        gone = bounded & ((right <= 0.0) | (left >= width) | (bottom <= 0.0) | (top >= height))
+        # the tiles of an ellipse come from the conic, which may be wrong by any amount
+        boxed = bounded & (not ellipse)
+        s[T0 + q] = np.floor(_within(left / side, across)) if boxed else 0.0
+        s[T1 + q] = np.ceil(_within(right / side, across)) if boxed else across
+        s[T2 + q] = np.floor(_within(top / side, down)) if boxed else 0.0
+        s[T3 + q] = np.ceil(_within(bottom / side, down)) if boxed else down
+        # surely hit: the tile range of every mean and radius contains it
+        left, right = mean_x_high - radius_low + snap_x, mean_x_low + radius_low - snap_x
+        top, bottom = mean_y_high - radius_low + snap_y, mean_y_low + radius_low - snap_y
+        sure = placed & cut & (left < width) & (top < height) & (right > 0.0) & (bottom > 0.0)
+        whole = front & (not cut)
+        if room > 0.0:
+            # G12: where rounding moves a box or an ellipse by less than half a pixel
+            span = radius_high + max(abs(mean_x_low), abs(mean_x_high)) + max(abs(mean_y_low), abs(mean_y_high))
+            whole = whole & (s[ETA + q] * (1.0 + 4.0 * s[ETA + q]) < 0.05) & (8.0 * charges.tile * span < 1.0)
+            if ellipse:
+                thinnest = max(min(s[ALO + q], s[CLO + q]), 0.0) / (z_high * z_high)
+                sharpness = s[DET + q] / (a * c)
+                whole = whole & ellipse_is_met(sharpness, max(a, c), thinnest, s[ETA + q], span, charges)
+        s[T4 + q] = np.floor(_within(left / side, across)) if sure else 0.0
+        last = np.ceil(_within(right / side, across)) if sure else (across if whole else 0.0)
+        s[T5 + q] = s[T4 + q] if cut_off else last
+        s[T6 + q] = np.floor(_within(top / side, down)) if sure else 0.0
+        s[T7 + q] = np.ceil(_within(bottom / side, down)) if sure else (down if whole else 0.0)
+        s[GONE + q], s[FINITE + q] = 1.0 if gone else 0.0, 1.0 if finite else 0.0
+        s[FRONT + q], s[PLACED + q] = 1.0 if front else 0.0, 1.0 if placed else 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def _opacities(s, n, rules, charges):
+    """Opacities, kappa and exponents (design.md, G7, G9, G11): KNOWN, GONE, columns of the record, REGIONLIMIT."""
+    alpha_min, antialiased = rules.alpha_min, rules.antialiased
+    for q in range(n):
+        det = s[DET + q]
+        finite = s[FINITE + q] != 0.0
+        # G7: relative error of the exponent
+        sharp_enough = (s[FRONT + q] != 0.0) & (det > 0.0) & (s[EDET + q] < 0.5 * det)
+        kappa = s[ETA + q]
+        region_is_known = (s[PLACED + q] != 0.0) & sharp_enough & (kappa < 0.25)
+        kappa = kappa * (1.0 + 4.0 * kappa)
+        lower = s[OPLOW + q] * (1.0 - charges.opacity)
+        upper = s[OPHIGH + q] * (1.0 + charges.opacity)
+        limit = s[OPLIMIT + q]
+        region_limit = limit
+        gone = s[GONE + q] != 0.0
+        if antialiased:
+            # G11; where the determinant may vanish, nothing is known of the compensation
+            region_is_known = region_is_known & (s[CTOP + q] < np.inf)
+            region_limit = limit + s[CTOPLOG + q]
+            limit = limit + s[CHIGHLOG + q]
+            all_of_it = min(1.0, upper * s[CTOP + q]) if sharp_enough & (s[CTOP + q] < np.inf) else 1.0
+            gone = gone | (all_of_it * (1.0 + charges.exponent_limit) < alpha_min)
+            lower = lower * s[CLOW + q] if region_is_known else lower
+            upper = upper * s[CHIGH + q] if region_is_known else all_of_it
+        # a minimum with a number is a number: an exponent that is none leaves the largest alpha
+        upper = upper if finite else max(1.0, upper)
+        gone = (gone & finite) | (region_is_known & (region_limit < 0.0))
+        s[R_OPACITY_LOW + q] = lower
+        s[R_OPACITY_HIGH + q] = upper
+        s[R_KAPPA + q] = kappa if region_is_known else 0.0
+        s[R_EXPONENT_LIMIT + q] = limit / (1.0 - kappa) if region_is_known else -1.0
+        s[REGIONLIMIT + q] = region_limit / (1.0 - kappa)
+        s[GONE + q], s[KNOWN + q] = 1.0 if gone else 0.0, 1.0 if region_is_known else 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def _pixel_boxes(s, n, rules, camera):
+    """Pixels where alpha may reach the threshold (design.md, G9): rows BOX0 .. BOX3, GONE, and fewer tiles."""
+    width, height = camera.width, camera.height
+    side = _tile_side(rules)
+    for q in range(n):
+        region_is_known = s[KNOWN + q] != 0.0
+        extent_x = np.sqrt(2.0 * s[REGIONLIMIT + q] * s[A + q]) * REGION
+        extent_y = np.sqrt(2.0 * s[REGIONLIMIT + q] * s[C + q]) * REGION
+        left, right = s[MXLO + q] - extent_x, s[MXHI + q] + extent_x
+        top, bottom = s[MYLO + q] - extent_y, s[MYHI + q] + extent_y
+        # no pixel centre inside
+        outside = region_is_known & ((right < 0.5) | (left > width - 0.5) | (bottom < 0.5) | (top > height - 0.5))
+        s[GONE + q] = 1.0 if outside else s[GONE + q]
+        s[BOX0 + q] = left if region_is_known else -np.inf
+        s[BOX1 + q] = right if region_is_known else np.inf
+        s[BOX2 + q] = top if region_is_known else -np.inf
+        s[BOX3 + q] = bottom if region_is_known else np.inf
+        # tiles without such pixels need not look at it
+        s[T0 + q] = max(s[T0 + q], np.floor(max(left - 0.5, 0.0) / side)) if region_is_known else s[T0 + q]
+        s[T1 + q] = min(s[T1 + q], np.floor(min(right - 0.5, width) / side) + 1.0) if region_is_known else s[T1 + q]
+        s[T2 + q] = max(s[T2 + q], np.floor(max(top - 0.5, 0.0) / side)) if region_is_known else s[T2 + q]
+        s[T3 + q] = min(s[T3 + q], np.floor(min(bottom - 0.5, height) / side) + 1.0) if region_is_known else s[T3 + q]

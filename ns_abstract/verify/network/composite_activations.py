@@ -1,0 +1,97 @@
+"""Activations that a graph writes out with constants of its own, bounded with these constants.
+
+A file's 0.70710677 is not ``1 / sqrt(2)``. In exact arithmetic the difference may decide a verdict, so that the
+curves here take the file's numbers (docs/design.md, N24).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from ns_abstract.arithmetic.network_charges import OWN_QUOTIENTS, STEPS, SWITCH
+from ns_abstract.verify.network import activations
+
+
+def _far(lower: Tensor, upper: Tensor) -> Tensor:
+    return torch.maximum(lower.abs(), upper.abs())
+
+
+@dataclass(frozen=True, eq=False)
+class ScaledGelu(activations.Gelu):
+    """``z (1 + erf(rate z / sqrt(2))) / 2``: GELU of ``rate z``, divided by ``rate``."""
+
+    rate: float = 1.0
+
+    @property
+    def breaks(self) -> tuple[float, ...]:
+        return tuple(point / self.rate for point in super().breaks)
+
+    def function(self, z: Tensor) -> Tensor:
+        return super().function(self.rate * z) / self.rate
+
+    def slope(self, z: Tensor) -> Tensor:
+        return super().slope(self.rate * z)
+
+    def missing(self, lower: Tensor, upper: Tensor) -> Tensor | float:
+        return OWN_QUOTIENTS * _far(lower, upper)
+
+
+@dataclass(frozen=True, eq=False)
+class GatedClip(activations.HardSwish):
+    """``z min(max(factor z + offset, 0), 1)``."""
+
+    factor: float = 1.0 / 6.0
+    offset: float = 0.5
+
+    @property
+    def breaks(self) -> tuple[float, ...]:
+        return -self.offset / self.factor, (1.0 - self.offset) / self.factor
+
+    def function(self, z: Tensor) -> Tensor:
+        return z * (self.factor * z + self.offset).clamp(0.0, 1.0)
+
+    def slope(self, z: Tensor) -> Tensor:
+        return 2.0 * self.factor * z + self.offset
+
+    def missing(self, lower: Tensor, upper: Tensor) -> Tensor | float:
+        return OWN_QUOTIENTS * _far(lower, upper)
+
+
+@dataclass(frozen=True, eq=False)
+class SwitchedSoftplus(activations.Softplus):
+    """``log(1 + exp(z))`` up to ``limit``, and above it a straight line that is ``excess`` off z, relatively."""
+
+    limit: float = math.inf
+    excess: float = 0.0
+
+    def missing(self, lower: Tensor, upper: Tensor) -> Tensor | float:
+        # softplus is less than exp(-z) above its argument
+        gap = math.exp(-self.limit) * SWITCH + (self.excess + OWN_QUOTIENTS) * _far(lower, upper)
+        return torch.where(upper >= self.limit * (2.0 - SWITCH), gap, torch.zeros_like(gap))
+
+
+@dataclass(frozen=True, eq=False)
+class Quantised(activations.Clip):
+    """``step * min(max(round(z / step), low), high)``, enclosed by the clipped z and half a step (N25).
+
+    `function` is the clipped z; a call gives the steps, whose gradient is that of the clipped z.
+    ``least`` and ``most`` are ``step * low`` and ``step * high``.
+    """
+
+    step: float = 1.0
+
+    def missing(self, lower: Tensor, upper: Tensor) -> Tensor | float:
+        # places, quotients and products of float32 move a number by less than the second part
+        largest = max(abs(self.least), abs(self.most))
+        return 0.5 * self.step * SWITCH + STEPS * largest
+
+    def __call__(self, inputs: Sequence[Tensor]) -> Tensor:
+        z = inputs[0]
+        plain = self.function(z)
+        stepped = (torch.round(z / self.step) * self.step).clamp(self.least, self.most)
+        return plain + (stepped - plain).detach()

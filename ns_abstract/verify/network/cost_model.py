@@ -1,0 +1,516 @@
+"""The cost model of backward passes and of refined neurons (docs/design.md, N13, N17, N18)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
+from functools import cached_property
+from typing import NamedTuple, TypeVar
+
+import numpy as np
+import torch
+
+from ns_abstract.verify.network.bilinear import Product
+from ns_abstract.verify.network.coefficients import grid
+from ns_abstract.verify.network.graph import Network
+from ns_abstract.verify.network.layers import (
+    Activation,
+    ChannelEmbedding,
+    Convolution,
+    LeakyRelu,
+    LinearLayer,
+    Matrix,
+    Pad,
+    ScaleLayer,
+    Sum,
+)
+from ns_abstract.verify.network.max_pooling import MaxPool
+from ns_abstract.verify.network.sparse_layers import PairwiseDifferences, SparseMatrix, TransposedConvolution
+
+#: Products of a convolution in the time in which a kernel passes one number of a row.
+_PASSING = 40.0
+#: A network is deep if rows for all of its numbers take more products than this; about a minute of one core.
+_DEEP = 2e12
+#: Products that rows for inner nodes may take in one cell of a deep network; about three minutes of one core.
+_ALLOWED = 5e12
+#: Products that rows may take in one cell of a network whose rows end by plan; about six minutes of one core.
+_PLANNED = 1.5e13
+#: Where rows for all numbers take so many times more than is allowed, they end by plan.
+_OVER = 1.5
+#: Layers that forms pass well, as a rule.
+_TIGHT = 4
+#: Part of a node's numbers past which all of them are bounded by rows.
+_RENEW = 0.01
+#: Part of what is allowed that rows of one node may take whatever is open.
+_CHEAP = 0.03
+#: Part of widths that these have to leave at most.
+_WORTH = 0.1
+#: Widths, as a part of a node's numbers, that rows of dearer nodes need not improve.
+_ENOUGH = 0.03
+#: Parts of widths and of signs not found out past which rows are given up.
+_KEPT, _LOST = 0.9, 0.9
+#: Part of a node's numbers that have to be open for that to end all.
+_MOST = 0.5
+#: Plans that are compared at first, and to either side of one made before; in the first of them rows for all numbers
+#: cost so much (a logarithm of widths). By how much rows have to be the better.
+_STEPS, _LIKE, _DEAREST, _CLOSE = 64, 6, 2.0**18, 0.1
+#: Factor between the prices of two ways.
+_APART = 1.2
+#: Part of its inputs that an activation passes on.
+_ACTIVE = 0.5
+#: Width, as a part of a node's numbers, that is close enough.
+_FINE = 1e-4
+#: What an activation adds to bounds of its input relative to these and to numbers' sizes, and rows of themselves.
+_BENDS, _ROUNDS = 0.1, 5e-5
+#: How loose an image's form is taken to be where nothing is known; past the other nothing is foreseen.
+_USUAL, _HUGE = 1e-8, 1e100
+#: Width of bounds, as a part of numbers, past which nothing is worth any rows if it is foreseen.
+_HOPELESS = 1e3
+#: Ways that are tried, and numbers of a node that they are tried with.
+_TRIED, TRIALS = 6, 32
+#: Layers whose rows stay in their windows.
+_WINDOWED = (Activation, ChannelEmbedding, Pad, Product, ScaleLayer, Sum)
+
+
+Part = TypeVar("Part")
+
+
+class BackwardRoute(NamedTuple):
+    """The route of a neuron's backward pass: where it stops and what it costs.
+
+    Attributes:
+        cut: It passes through the nodes behind this one and ends on those up to it; 0: it ends on the image.
+        price: Products it takes.
+        rests: By node that it is on then: what its coefficients are together, about.
+        passed: The same of nodes before an activation or a product that it passes through.
+        maxima: The same of maxima that it passes through.
+    """
+
+    cut: int
+    price: float
+    rests: tuple[tuple[int, float], ...]
+    passed: tuple[tuple[int, float], ...]
+    maxima: tuple[tuple[int, float], ...]
+
+    def spread(self, intermediate: list[float], size: float) -> float:
+        """How wide its bounds are, about, if those of earlier nodes are as wide as ``known``, of numbers ``size``."""
+        total = 0.0
+        for at, sum_ in self.rests:
+            total += sum_ * intermediate[at]
+        for at, sum_ in self.passed:
+            total += sum_ * intermediate[at] * (_BENDS * intermediate[at] / size + _ROUNDS)
+        for at, sum_ in self.maxima:
+            # where numbers are as good as equal, nothing is known of the greatest but its bounds
+            total += sum_ * intermediate[at]
+        return total
+
+
+class RefinementPlan(NamedTuple):
+    """Which neurons of a network are refined in a cell (N18).
+
+    Attributes:
+        ways: By node: how rows for all of its numbers go back.
+        products: What they take together.
+        widest: How wide bounds of a node are foreseen to be at most.
+        rate: What a product costs in logarithms of widths.
+        step: Which of the plans compared it is.
+    """
+
+    ways: dict[int, BackwardRoute]
+    products: float
+    widest: float
+    rate: float
+    step: int
+
+
+class CostEstimate(NamedTuple):
+    """The estimated cost of a cell's backward passes.
+
+    Attributes:
+        products: Of all rows.
+        numbers: How many numbers are bounded by rows that end by plan.
+        given_up: Whether rows are given up before the end.
+    """
+
+    products: float
+    numbers: float
+    given_up: bool
+
+
+class CostModel:
+    """Estimates the multiplications of backward passes through one network."""
+
+    def __init__(self, network: Network) -> None:
+        self.network = network
+        self._ways: dict[int, list[BackwardRoute]] = {}
+
+    def row(self, index: int) -> float:
+        """Products that a row of one number of node ``index`` takes to the image."""
+        return self.ways(index)[-1].price
+
+    def ways(self, index: int) -> list[BackwardRoute]:
+        """How a row of one number of node ``index`` may go back, the shortest way first; the last is to the image."""
+        if index not in self._ways:
+            self._ways[index] = self._passed(index)
+        return self._ways[index]
+
+    @cached_property
+    def _ends(self) -> set[int]:
+        """Nodes that rows may be cut at: those that rows are for, and maxima."""
+        ends = set()
+        for k, node in enumerate(self.network.nodes, 1):
+            if isinstance(node.layer, MaxPool):
+                ends.add(k)
+            if isinstance(node.layer, (Activation, Product)):
+                ends.update(node.inputs)
+        return ends
+
+    @cached_property
+    def rests(self) -> set[int]:
+        """Nodes that rows of any node may rest on, but for the image."""
+        last = [0] * (len(self.network.nodes) + 1)
+        for k, node in enumerate(self.network.nodes, 1):
+            for source in node.inputs:
+                last[source] = k
+        rests: set[int] = set()
+        for cut in self._ends:
+            rests.update(k for k in range(1, cut + 1) if last[k] > cut)
+        return rests
+
+    def _passed(self, index: int) -> list[BackwardRoute]:
+        """The same, window by window."""
+        # rows and columns of a window, channels in use, and the coefficients' squares together
+        windows, total, ways = {index: (1, 1, 1.0, 1.0)}, 0.0, []
+        passed: list[tuple[int, float]] = []
+        maxima: list[tuple[int, float]] = []
+        for at in range(index, 0, -1):
+            if at != index and at in self._ends:
+                way = self._way(at, windows, total, passed, maxima)
+                if not ways or way.price > _APART * ways[-1].price:
+                    ways.append(way)
+            if at not in windows:
+                continue
+            h, w, used, squares = windows.pop(at)
+            if at != index and at in self._ends:
+                chosen = maxima if isinstance(self.network.nodes[at - 1].layer, MaxPool) else passed
+                chosen.append((at, _together(h * w * used, squares)))
+            node = self.network.nodes[at - 1]
+            layer = node.layer
+            channels = grid(self.network.shape(at))[0]
+            total += _PASSING * channels * h * w
+            squares *= self._sizes[at][1]
+            if isinstance(layer, Convolution):
+                groups = layer.groups
+                used = min(groups, max(used, 1.0)) * (grid(layer.input_shapes[0])[0] / groups)
+            elif isinstance(layer, Activation):
+                used *= _ACTIVE
+            elif isinstance(layer, LinearLayer) and layer.mixes:
+                used = float(max(grid(self.network.shape(source))[0] for source in node.inputs))
+            whole = False
+            if isinstance(layer, Convolution):
+                total += float(layer.weight.numel()) * h * w
+                size = layer.weight.shape[2:]
+                h, w = (
+                    (n - 1) * s + (k - 1) * d + 1
+                    for n, s, k, d in zip((h, w), layer.stride, size, layer.dilation, strict=True)
+                )
+            elif isinstance(layer, MaxPool):
+                extent = layer.steps.max(0) + 1
+                h, w = ((n - 1) * s + int(e) for n, s, e in zip((h, w), layer.stride, extent, strict=True))
+            elif isinstance(layer, Matrix):
+                total += float(np.prod(layer.shape)) * layer.weight.shape[1]
+                whole = True
+            elif isinstance(layer, TransposedConvolution):
+                total += float(np.prod(layer.input_shapes[0])) * float(np.prod(layer.weight.shape[1:]))
+                whole = True
+            elif isinstance(layer, (SparseMatrix, PairwiseDifferences)):
+                entries = layer.weight.numel() if isinstance(layer, SparseMatrix) else 2 * int(np.prod(layer.shape))
+                total += _PASSING * float(entries)
+                whole = True
+            elif not isinstance(layer, _WINDOWED):
+                assert isinstance(layer, LinearLayer)
+                whole = True
+            for source in node.inputs:
+                _, height, width = grid(self.network.shape(source))
+                size = (height, width) if whole or h * w >= height * width else (h, w)
+                window = windows.get(source, (0, 0, 0.0, 0.0))
+                windows[source] = (
+                    max(window[0], size[0]),
+                    max(window[1], size[1]),
+                    max(window[2], min(used, grid(self.network.shape(source))[0])),
+                    window[3] + squares,
+                )
+        ways.append(self._way(0, windows, total, passed, maxima))
+        return ways
+
+    def _way(
+        self,
+        cut: int,
+        windows: dict[int, tuple[int, int, float, float]],
+        total: float,
+        passed: list[tuple[int, float]],
+        maxima: list[tuple[int, float]],
+    ) -> BackwardRoute:
+        """Rows that have got to ``windows``, and are bounded there."""
+        bounded = sum(grid(self.network.shape(at))[0] * h * w for at, (h, w, _, _) in windows.items())
+        sums = {at: _together(h * w * used, squares) for at, (h, w, used, squares) in windows.items()}
+        return BackwardRoute(cut, total + _PASSING * bounded, tuple(sums.items()), tuple(passed), tuple(maxima))
+
+    @cached_property
+    def _sizes(self) -> list[tuple[float, float]]:
+        """By node: sums of the sizes and of the squares of what one number of it takes of others, on average."""
+        sizes = [(1.0, 1.0)]
+        for node in self.network.nodes:
+            layer = node.layer
+            if isinstance(layer, (Convolution, Matrix)):
+                weight, count = layer.weight, float(layer.weight.shape[0])
+            elif isinstance(layer, TransposedConvolution):
+                weight = layer.weight
+                count = float(np.prod(layer.shape)) / float(np.prod(layer.input_shapes[0][1:]))
+            elif isinstance(layer, SparseMatrix):
+                weight, count = layer.weight, float(np.prod(layer.shape))
+            elif isinstance(layer, ScaleLayer):
+                weight, count = layer.factor, float(layer.factor.numel())
+            elif isinstance(layer, PairwiseDifferences):
+                sizes.append((2.0, 2.0))
+                continue
+            else:
+                part = _ACTIVE if isinstance(layer, Activation) else 1.0
+                sizes.append((part, part))
+                continue
+            sizes.append((float(weight.abs().sum()) / count, float(weight.square().sum()) / count))
+        return sizes
+
+    @cached_property
+    def bounded(self) -> dict[int, float]:
+        """By node before an activation or a product: how many of its numbers rows are for, about."""
+        costs: dict[int, float] = {}
+        for node in self.network.nodes:
+            if isinstance(node.layer, (Activation, Product)):
+                # what is certainly cut off needs no rows
+                cut = isinstance(node.layer, LeakyRelu) and node.layer.alpha == 0.0
+                for source in node.inputs:
+                    if self.network.depth[source] > 1:
+                        size = float(np.prod(self.network.shape(source))) * (0.5 if cut else 1.0)
+                        costs[source] = max(size, costs.get(source, 0.0))
+        return costs
+
+    def plan(
+        self,
+        allowed: float,
+        intermediate: list[float],
+        size: float,
+        bounded: dict[int, float] | None = None,
+        near: int | None = None,
+    ) -> RefinementPlan:
+        """The cheapest ways of rows that keep all bounds close enough, or else as close as they can be kept.
+
+        Args:
+            allowed: Products that they may take together.
+            known: How wide bounds of the first nodes are.
+            size: What numbers of nodes are about.
+            bounded: `CostModel.bounded`, as far as it is known better.
+            near: `RefinementPlan.step` of a plan that was made before; only plans like it are compared.
+        """
+        best, bounded = None, bounded or self.bounded
+        first, past = (0, _STEPS) if near is None else (max(0, near - _LIKE), min(_STEPS, near + _LIKE + 1))
+        for step in range(first, past):
+            plan = self._plan(step, intermediate, size, bounded)
+            if best is None or (plan.products <= allowed and plan.widest < best.widest):
+                best = plan
+            if best.widest <= _FINE * size:
+                break
+        assert best is not None
+        return best
+
+    def _plan(self, step: int, intermediate: list[float], size: float, bounded: dict[int, float]) -> RefinementPlan:
+        """The plan in which every node takes the way that is best for what a product costs."""
+        spread, ways, total, widest = list(intermediate), {}, 0.0, 0.0
+        rate = _DEAREST / self.total * 2.0 ** (-0.5 * step)
+        for k in range(len(intermediate), len(self.network.nodes) + 1):
+            node = self.network.nodes[k - 1]
+            near = max(spread[source] for source in node.inputs)
+            if isinstance(node.layer, Activation):
+                near *= 1.0 + _BENDS * near / size
+            near = min(near * self._sizes[k][0], _HUGE)
+            count = bounded.get(k)
+            if count is not None:
+                score = _log(near) - _CLOSE
+                for way in self.ways(k):
+                    widths = way.spread(spread, size)
+                    value = _log(widths) + rate * count * way.price
+                    if value < score:
+                        score, near, ways[k] = value, widths, way
+                widest = max(widest, near)
+            if k in ways:
+                total += count * ways[k].price
+            spread.append(near)
+        return RefinementPlan(ways, total, widest, rate, step)
+
+    @cached_property
+    def nodes(self) -> list[tuple[int, float]]:
+        """Nodes before an activation or a product, and the products that rows for all of their numbers take."""
+        nodes = []
+        for node in self.network.nodes:
+            if isinstance(node.layer, (Activation, Product)) and self.network.depth[node.inputs[0]] > 1:
+                for source in dict.fromkeys(node.inputs):
+                    nodes.append((source, float(np.prod(self.network.shape(source))) * self.row(source)))
+        return nodes
+
+    @cached_property
+    def total(self) -> float:
+        """Products that rows for every number before an activation or a product take."""
+        return sum(products for _, products in self.nodes)
+
+    @property
+    def deep(self) -> bool:
+        """Whether rows are rationed (N13)."""
+        return self.total > _DEEP
+
+    @property
+    def planned(self) -> bool:
+        """Whether rows for all numbers cost so much that each is passed back as far as it pays (N18)."""
+        return self.total > max(_DEEP, _OVER * _ALLOWED)
+
+    def foreseen(self, part: float, deep: float) -> CostEstimate:
+        """What rows of one cell will take (N13).
+
+        Args:
+            part, deep: Part of all numbers that are bounded by rows, in other networks and in deep ones.
+        """
+        if not self.deep:
+            return CostEstimate(part * self.total, 0.0, False)
+        if self.planned:
+            plan = self.plan(_PLANNED, [_USUAL], 1.0)
+            if plan.widest > _HOPELESS:
+                return CostEstimate(0.0, 0.0, True)
+            return CostEstimate(plan.products, sum(self.bounded[k] for k in plan.ways), False)
+        taken = [(index, deep * products) for index, products in self.nodes if self.network.depth[index] > _TIGHT]
+        share = min(1.0, _ALLOWED / max(1.0, sum(products for _, products in taken)))
+        # where a sign is not all that is asked, numbers have two rows
+        phases = {node.inputs[0] for node in self.network.nodes if isinstance(node.layer, LeakyRelu)}
+        return CostEstimate(share * sum(n if k in phases else 2.0 * n for k, n in taken), 0.0, False)
+
+
+class WorkBudget:
+    """Decides from the work spent on a cell whether further backward passes pay."""
+
+    def __init__(self, network: Network) -> None:
+        self.network = network
+        self.costs = cost_model_of(network)
+        self.deep = self.costs.deep
+        self.planned = self.costs.planned
+        self.left = _PLANNED if self.planned else _ALLOWED
+        self._bounded = dict(self.costs.bounded) if self.planned else {}
+        self._spread: list[float] = []
+        self._size = 1.0
+        self._step: int | None = None
+
+    @property
+    def rests(self) -> set[int]:
+        """Nodes whose bounds rows of later ones may end on."""
+        return self.costs.rests if self.planned else set()
+
+    def learns(self, index: int, radius: float, size: float) -> None:
+        """Forms of node ``index``, the next or an earlier one, are so loose (N1), and its numbers of this size."""
+        self._spread[index:] = [radius, *self._spread[index + 1 :]]
+        self._size = size or self._size
+
+    def ways(self, index: int, count: int) -> tuple[list[BackwardRoute], float]:
+        """Ways of rows for ``count`` numbers of node ``index`` that are worth a trial, and what a product costs (N18).
+
+        There are none if its form is as good, or nothing will be known in the end.
+        """
+        self._bounded[index] = float(count)
+        plan = self.costs.plan(max(self.left, 1.0), self._spread[:index], self._size, self._bounded, self._step)
+        self._step = plan.step
+        if plan.widest > _HOPELESS * self._size:
+            self.left = 0.0
+        if index not in plan.ways:
+            return [], plan.rate
+        ways = [way for way in self.costs.ways(index) if count * way.price <= self.left]
+        ways.sort(key=lambda way: _log(way.spread(self._spread, self._size)) + plan.rate * count * way.price)
+        return ways[:_TRIED], plan.rate
+
+    def nearest(self, index: int, count: int) -> BackwardRoute | None:
+        """The longest way of ``count`` rows of node ``index``, of those that are cheap; what it takes is taken."""
+        best = None
+        for way in self.costs.ways(index):
+            if count * way.price < _CHEAP * self.left:
+                best = way
+        if best is not None:
+            self.left -= count * best.price
+        return best
+
+    def renews(self, part: float, products: float) -> bool:
+        """Whether all numbers of a node are bounded by rows, for ``products``, if ``part`` of them is open."""
+        return part > _RENEW or products < self._cheap
+
+    @property
+    def _cheap(self) -> float:
+        """Products that rows of one node may take whatever is open: fewer where not all rows can be afforded."""
+        return _CHEAP * _ALLOWED * min(1.0, _ALLOWED / self.costs.total)
+
+    def suffices(self, products: float) -> float:
+        """Width, as a part of a node's numbers, at which rows for all of them may end on the way (N17)."""
+        return 0.0 if products < self._cheap else _ENOUGH
+
+    def takes(self, products: float) -> bool:
+        """Whether so many products are left; they are taken then."""
+        if products > self.left:
+            return False
+        self.left -= products
+        return True
+
+    def spares(self, products: float) -> None:
+        """So many products were not taken after all."""
+        self.left += products
+
+    def gains(self, kept: float, part: float) -> bool:
+        """Whether rows for all numbers are worth it that leave so large a part of widths, if ``part`` is open."""
+        return part > _RENEW or kept < _WORTH
+
+    def vain(self, kept: float, unstable: float, part: float) -> bool:
+        """Leave a node as it is if rows leave so large a part of widths, or of signs not found out.
+
+        Where most of it is open, ``part``, the nodes behind it are given up, too.
+        """
+        hopeless = kept > _KEPT or unstable > _LOST
+        if hopeless and part > _MOST:
+            self.left = 0.0
+        return hopeless
+
+
+def _log(value: float) -> float:
+    """Its logarithm; of nothing a very small number's."""
+    return float(np.log(max(value, 2.0**-1000)))
+
+
+def _together(count: float, squares: float) -> float:
+    """Sizes of so many normally distributed numbers, of whose squares the sum is known, together."""
+    return float(np.sqrt(2.0 / np.pi * count * squares))
+
+
+def cost_model_of(network: Network) -> CostModel:
+    """The costs of a network, worked out once."""
+    costs = network.__dict__.get("_costs")
+    if costs is None:
+        costs = network.__dict__["_costs"] = CostModel(network)
+    return costs
+
+
+def on_threads(work: Callable[[int], Part], parts: Iterable[int], threads: int) -> Iterator[Part]:
+    """Return ``work`` of every part, in order, computed by several threads."""
+    if threads < 2:
+        yield from map(work, parts)
+        return
+    with ThreadPoolExecutor(threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        # every part in a copy of the context, which says when work is to be given up
+        waiting = [pool.submit(copy_context().run, work, part) for part in parts]
+        try:
+            for result in waiting:
+                yield result.result()
+        finally:
+            for result in waiting:
+                result.cancel()

@@ -1,0 +1,132 @@
+"""Intermediate bounds and relaxations of all nodes over several cells (docs/design.md, N1, N16, N18)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ns_abstract.arithmetic.network_charges import DOUBLE_UNIT, OWN_LINE, UNIT
+from ns_abstract.verify.network.coefficients import Float64, NodeColumns, columns_of, grid
+from ns_abstract.verify.network.cost_model import BackwardRoute
+from ns_abstract.verify.network.forms import NodeForm
+from ns_abstract.verify.network.graph import Network, NetworkArithmetic
+from ns_abstract.verify.network.image_sets import ActivationPhases
+from ns_abstract.verify.network.input_planes import ImagePlanes, form_of
+from ns_abstract.verify.network.relaxations import Relaxations, ReusedRelaxation
+from ns_abstract.verify.network.slope_optimisation import SplitNeurons, UnstableNeurons
+
+
+class IntermediateBounds:
+    """Forms and relaxations of the nodes: the forward pass adds to them, the backward pass reads them.
+
+    Args:
+        network: The network.
+        image: What is known of the image.
+        middle: [m, n] the images' reference.
+        good: [m] cells that are not given up; changed in place.
+        arithmetic, assumed: As in `ns_abstract.verify.network.bound_outputs`.
+
+    Attributes:
+        count, d: Cells m and parameters d.
+        single: Whether the network's evaluation in float32 is bounded.
+        image, columns: The image as planes, and as rows are bounded on it.
+        vacant: [m] cells without an image that has the signs assumed.
+        flush: [m] what flushes to zero may lose on the way of any row.
+        passages: What rows take on their way; rows of outputs take the last, the others the first.
+        folded: Nodes whose rounding is in that of their only reader.
+        forms: By node: what is known of it, while other nodes read it.
+        stops: By node: what rows may stop at.
+        open: By node: units whose lower lines may have other slopes.
+        held: By cell and node: what rows take of signs that are assumed.
+        offered: By node: lines with slopes of another cell's rows.
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        image: ImagePlanes,
+        middle: Float64,
+        good: np.ndarray,
+        arithmetic: NetworkArithmetic,
+        assumed: Sequence[Mapping[int, ActivationPhases]] | None,
+    ) -> None:
+        self.network, self.middle, self.good, self.assumed = network, middle, good, assumed
+        self.count, self.d = len(middle), image.slopes.shape[-1]
+        self.single = arithmetic == "float32"
+        self.infeasible, self.flush = np.zeros(self.count, bool), np.zeros(self.count)
+        self.see(image)
+        # every number is passed by a few times at most
+        numbers = sum(int(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1))
+        sums = 4.0 * DOUBLE_UNIT * (numbers + len(network.nodes))
+        self.relaxations = [Relaxations(torch.float32, UNIT, sums)]
+        if not self.single:
+            # beside the rounding of a float32 network that of rows is little
+            self.relaxations.append(Relaxations(torch.float64, DOUBLE_UNIT, sums))
+        self.folded: set[int] = set()
+        self.forms: list[NodeForm | None] = []
+        self.stops: dict[int, NodeColumns] = {}
+        self.unstable: dict[int, UnstableNeurons] = {}
+        self.split: list[dict[int, SplitNeurons]] = [{} for _ in range(self.count)]
+        self.reused_relaxations: dict[int, ReusedRelaxation] = {}
+
+    def see(self, image: ImagePlanes) -> None:
+        """Take this for what is known of the image."""
+        self.image, self.columns = image, columns_of(*image)
+
+    def image_form(self) -> NodeForm:
+        """The image as a form."""
+        form = form_of(self.image, self.middle, self.network.input_shape)
+        lower, upper = torch.from_numpy(self.image.lower), torch.from_numpy(self.image.upper)
+        return self.within(form, lower.reshape(form.c.shape), upper.reshape(form.c.shape))
+
+    def rounds(self, source: int) -> bool:
+        """Whether rows are charged on node ``source``."""
+        return source in self.relaxations[0].noise
+
+    def within(self, form: NodeForm, lower: Tensor, upper: Tensor) -> NodeForm:
+        """The form with bounds that are known besides; a cell without values in it is given up."""
+        low, high = torch.maximum(form.lower, lower), torch.minimum(form.upper, upper)
+        fine = low <= high
+        for part in (form.reference, form.c, form.r, form.a):
+            # sums are finite unless a number, or they, are not
+            if not bool(torch.isfinite(part.sum())):
+                finite = torch.isfinite(part)
+                fine = fine & (finite.all(1) if part.ndim > fine.ndim else finite)
+        good = fine.reshape(self.count, -1).all(1)
+        if self.assumed is not None and not bool(good.all()):
+            # bounds that hold for all images with these signs contradict each other: there are none (N16)
+            crossed = torch.isfinite(low) & torch.isfinite(high) & (low > high)
+            has_phases = np.array([len(phases) > 0 for phases in self.assumed]) & self.good
+            self.infeasible |= has_phases & crossed.reshape(self.count, -1).any(1).numpy()
+        self.good &= good.numpy()
+        form_within = NodeForm(form.reference, form.c, form.a, form.r, low, high, form.active)
+        if bool(good.all()):
+            return form_within
+
+        # what is given up must not slow the others down with NaN
+        def clear(t: Tensor) -> Tensor:
+            return torch.where(good.reshape(-1, *[1] * (t.ndim - 1)), t, torch.zeros_like(t))
+
+        return NodeForm(*(clear(getattr(form_within, name)) for name in NodeForm.__dataclass_fields__))
+
+    def stop(self, index: int, form: NodeForm) -> NodeColumns:
+        """What is known of node ``index``, for rows that arrive there."""
+        m, d, shape = self.count, self.d, grid(self.network.shape(index))
+        room = OWN_LINE * (form.c.abs() + form.r)
+        slopes = form.a.movedim(1, -1).reshape(m, 1, *shape, d).expand(m, 2, *shape, d)
+        offsets = torch.stack([form.c - form.r - room, form.c + form.r + room], 1)
+        sizes = (m, 2, *shape, d), (m, 2, *shape), (m, *shape), (m, *shape)
+        arrays = zip((slopes, offsets, form.lower, form.upper), sizes, strict=True)
+        return columns_of(*(t.reshape(size).numpy() for t, size in arrays))
+
+    def ready(self, way: BackwardRoute) -> int:
+        """Where rows of a way end, when all is known that they end on."""
+        for at, _ in way.rests:
+            if at and at not in self.stops:
+                form = self.forms[at]
+                assert form is not None
+                self.stops[at] = self.stop(at, form)
+        return way.cut

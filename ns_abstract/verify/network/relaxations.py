@@ -1,0 +1,104 @@
+"""Linear relaxations and rounding errors that the backward pass applies (docs/design.md, N2, N4, N9, N12)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ns_abstract.verify.network.coefficients import Coefficients, Float64, Int64, pass_maximum
+from ns_abstract.verify.network.max_pooling import MaxPool
+from ns_abstract.verify.network.rounding import outward
+
+
+class MaxPoolPlanes(NamedTuple):
+    """Planes of pooling windows as the backward pass applies them (N12).
+
+    Attributes:
+        winner: [m, C, H, W] int16, the number that the lower plane follows.
+        which: [m, C, H, W] int32, rows of ``slopes``; -1 where the winner is the maximum.
+        slopes: [U, K] of upper planes; of the rows' type, as offsets are.
+        offsets: [4, m, C, H, W]: lower and upper for coefficients that are not negative, upper and lower
+            for negative ones.
+    """
+
+    winner: np.ndarray
+    which: np.ndarray
+    slopes: np.ndarray
+    offsets: np.ndarray
+
+    def forward(self, layer: MaxPool, cell: int, rows: Tensor, inputs: list[Tensor]) -> Tensor:
+        """The planes that ``rows`` [R, C, H, W] take, of inputs [R, C, H', W'] of one cell."""
+        taps = layer.taps(inputs[0], 0.0)
+        winner = torch.from_numpy(self.winner[cell].astype(np.int64)).flatten(1)[None, :, None]
+        value = taps.gather(2, winner.expand(len(taps), -1, -1, -1))[:, :, 0]
+        offsets = torch.from_numpy(self.offsets[:, cell]).flatten(2)
+        which = torch.from_numpy(self.which[cell].astype(np.int64)).flatten(1)
+        a = rows.flatten(2)
+        if len(self.slopes):
+            slopes = torch.from_numpy(self.slopes)[which.clamp(min=0)].movedim(2, 1)
+            value = torch.where((a >= 0.0) | (which < 0), value, (taps * slopes).sum(2))
+        return value + torch.where(a >= 0.0, offsets[0], offsets[2])
+
+    def backward(self, rows: Coefficients, layer: MaxPool, cell: Int64, total: Float64) -> Coefficients:
+        """Rows on the input; what they gather on the way goes to ``total`` [R, 2]."""
+        height, width = rows.value.shape[2:]
+        (down, right), extent = layer.stride, layer.steps.max(0) + 1
+        size = (height - 1) * down + int(extent[0]), (width - 1) * right + int(extent[1])
+        target = np.zeros((*rows.value.shape[:2], *size), rows.value.dtype)
+        pass_maximum(rows.value, rows.y, rows.x, cell, *self, layer.steps, layer.stride, total, target)
+        return Coefficients(target, rows.y * down - layer.pads[0], rows.x * right - layer.pads[1])
+
+
+class ReusedRelaxation(NamedTuple):
+    """The relaxation of an activation around slopes that another cell's coefficients use (N15).
+
+    Attributes:
+        lines: [6, m, C, H, W] float32 as `pass_activation` takes them.
+        tilts: [2, m, d, n] slopes in the parameters of what is between the offsets, for rows of either sign.
+    """
+
+    lines: np.ndarray
+    tilts: Float64
+
+
+@dataclass
+class Relaxations:
+    """The relaxations of all nodes for coefficients of one float type, and that type's own rounding (N2).
+
+    Attributes:
+        dtype: Of rows, slopes and offsets.
+        unit: Its unit roundoff.
+        sums: What their sums of offsets in float64 lose, relatively.
+        lines: By activation, [6, m, C, H, W] as `pass_activation` takes them.
+        products: By product: the same for its first and its second factor.
+        maxima: By maximum.
+        noise: By linear layer: rounding of the network and of rows, [m, *shape] float64.
+    """
+
+    dtype: torch.dtype
+    unit: float
+    sums: float
+    lines: dict[int, np.ndarray] = field(default_factory=dict)
+    products: dict[int, tuple[np.ndarray, ...]] = field(default_factory=dict)
+    maxima: dict[int, MaxPoolPlanes] = field(default_factory=dict)
+    noise: dict[int, Tensor] = field(default_factory=dict)
+
+    @property
+    def number(self) -> type[np.floating[Any]]:
+        """The type as numpy has it."""
+        return np.float32 if self.dtype == torch.float32 else np.float64
+
+    def takes(self, rows: Coefficients) -> bool:
+        """Whether rows are of this type."""
+        return rows.value.dtype == self.number
+
+    def outward(self, value: Tensor, side: float) -> Tensor:
+        """An offset as rows take it, farther out by what their sums of offsets may lose."""
+        if self.dtype == torch.float32:
+            # half a unit of float32 is more than that, up to 2^26 numbers
+            return outward(value, side)
+        return value + side * self.sums * value.abs()

@@ -1,0 +1,254 @@
+"""Sparse linear layers: sparse matrices, pairwise differences, transposed convolutions.
+
+See docs/design.md, N11, N19; the plain ones are in `ns_abstract.verify.network.layers`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from ns_abstract.arithmetic.network_charges import (
+    FLUSH,
+    FLUSHES,
+    FOLDING,
+    MAGNITUDES_UP,
+    OWN_LINE,
+    OWN_POSITIONS,
+    UP,
+    VARIANCE_PASSES,
+    gamma,
+)
+from ns_abstract.verify.network.coefficients import Coefficients, full, grid
+from ns_abstract.verify.network.forms import NodeForm
+from ns_abstract.verify.network.layers import LinearLayer, Weighted
+
+
+def _none() -> Tensor:
+    return torch.zeros(0)
+
+
+@dataclass(frozen=True, eq=False)
+class SparseMatrix(LinearLayer):
+    """A sparse matrix applied to the flattened item: means over axes, resizing, differences.
+
+    Attributes:
+        to, source: [E] int64 positions in the output and in the input.
+        weight: [E] float64.
+        offset: [*shape] float64 or None.
+    """
+
+    to: Tensor = field(default_factory=_none)
+    source: Tensor = field(default_factory=_none)
+    weight: Tensor = field(default_factory=_none)
+    offset: Tensor | None = None
+    mixes: ClassVar[bool] = True
+
+    @property
+    def bias(self) -> Tensor | None:
+        return self.offset
+
+    @cached_property
+    def gain(self) -> float:
+        return max(1, self.terms) * (1.0 + float(self.weight.abs().max()))
+
+    @cached_property
+    def _sizes(self) -> tuple[int, int]:
+        return int(np.prod(self.shape)), int(np.prod(self.input_shapes[0]))
+
+    def _stored(self, places: Tensor, values: Tensor) -> Tensor:
+        return torch.sparse_coo_tensor(places, values, self._sizes, check_invariants=True).coalesce()
+
+    @cached_property
+    def _matrix(self) -> Tensor:
+        return self._stored(torch.stack([self.to, self.source]), self.weight)
+
+    @cached_property
+    def _single(self) -> Tensor:
+        """[in, out] float32, for rows."""
+        return self._matrix.t().float().coalesce()
+
+    def weight_for(self, rows: Tensor) -> Tensor:
+        """[in, out] weights in the rows' type."""
+        return self._single if rows.dtype == torch.float32 else self._matrix.t()
+
+    def _rows(self, value: Tensor) -> Tensor:
+        """Rows [R, in] for ``value`` [R, out]."""
+        return torch.sparse.mm(self.weight_for(value), value.T).T
+
+    @cached_property
+    def _absolute(self) -> Tensor:
+        matrix = self._matrix
+        return self._stored(matrix.indices(), matrix.values().abs())
+
+    def apply(self, inputs: Sequence[Tensor]) -> Tensor:
+        return torch.sparse.mm(self._matrix.to(inputs[0].dtype), inputs[0].flatten(1).T).T.reshape(-1, *self.shape)
+
+    def magnitude(self, inputs: Sequence[Tensor]) -> Tensor:
+        return torch.sparse.mm(self._absolute.to(inputs[0].dtype), inputs[0].flatten(1).T).T.reshape(-1, *self.shape)
+
+    def backward(self, rows: Coefficients) -> list[Coefficients]:
+        whole = full(rows, self.shape, force=True)
+        count = whole.value.shape[0]
+        value = self._rows(torch.from_numpy(whole.value).reshape(count, -1))
+        return [Coefficients.whole(value.contiguous().numpy().reshape(count, *grid(self.input_shapes[0])))]
+
+
+@dataclass(frozen=True, eq=False)
+class Variance(SparseMatrix):
+    """The variance: means of squares of centred numbers (first input) of the numbers in the second input.
+
+    A program may work the variance out as mean of squares minus square of the mean: what that loses is
+    relative to the numbers and not to their spread (N11).
+    """
+
+    def spare(self, sizes: Sequence[Tensor]) -> Tensor | float:
+        return gamma(VARIANCE_PASSES * self.terms) * self._means(sizes[1].square()) * UP + FLUSHES * FLUSH
+
+    def least(self, squares: NodeForm, x: NodeForm, single: bool) -> Tensor:
+        """[m, *shape] what the variance is at least, with its rounding if ``single``, but for flushes (N11).
+
+        Squares are not negative, and one pass loses a part of the variance itself and of the square of the mean.
+        """
+        low = self._means(squares.interval.lower.clamp(min=0.0)) * (2.0 - MAGNITUDES_UP)
+        if not single:
+            return low
+        reach = self._means(x.reference + x.c).abs() + self._means(x.r)
+        reach = reach + self._means(x.a.flatten(0, 1)).unflatten(0, x.a.shape[:2]).abs().sum(1)
+        ends = torch.maximum(*(self._means(end).abs() for end in x.interval))
+        reach = torch.minimum(reach, ends) * MAGNITUDES_UP + OWN_LINE * self._means(x.interval.size)
+        relative = gamma((1 + VARIANCE_PASSES) * self.terms + FOLDING)
+        return low * (1.0 - relative) - gamma(VARIANCE_PASSES * self.terms) * reach.square() * UP
+
+    def _means(self, value: Tensor) -> Tensor:
+        return torch.sparse.mm(self._absolute, value.flatten(1).T).T.reshape(-1, *self.shape)
+
+    def backward(self, rows: Coefficients) -> list[Coefficients]:
+        coefficients = super().backward(rows)
+        shape = (coefficients[0].value.shape[0], *grid(self.input_shapes[1]))
+        return [*coefficients, Coefficients.whole(np.zeros(shape, rows.value.dtype))]
+
+
+@dataclass(frozen=True, eq=False)
+class Resize(SparseMatrix):
+    """A resized map: rows and columns are interpolated; programs compute their positions in float32.
+
+    Attributes:
+        rows, columns: [2, out, in] sizes of the weights along an axis, and what they may be off.
+    """
+
+    rows: Tensor = field(default_factory=_none)
+    columns: Tensor = field(default_factory=_none)
+
+    def spare(self, sizes: Sequence[Tensor]) -> Tensor | float:
+        (own, off), (across, apart) = self.rows, self.columns
+        return off @ sizes[0] @ (across + apart).T + own @ sizes[0] @ apart.T
+
+    def inexact(self, sizes: Sequence[Tensor]) -> Tensor | float:
+        # places and polynomials are rounded by float64 in the same way
+        return OWN_POSITIONS * self.spare(sizes)
+
+
+@dataclass(frozen=True, eq=False)
+class PairwiseDifferences(LinearLayer):
+    """``x_j - x_i`` for all i and j along an axis of the item: j is a new last axis; zero where they are the same.
+
+    As a sparse matrix they would take some hundred bytes each.
+
+    Attributes:
+        axis: The axis of the item.
+    """
+
+    axis: int = 0
+    mixes: ClassVar[bool] = True
+
+    @cached_property
+    def gain(self) -> float:
+        return 2.0 * max(1, self.terms)
+
+    @cached_property
+    def _apart(self) -> Tensor:
+        """[*shape] 0 where i and j are the same, else 1; a view of few numbers."""
+        ones = [1] * len(self.input_shapes[0])
+        count = ones[self.axis] = self.shape[-1]
+        return (1.0 - torch.eye(count, dtype=torch.float64)).reshape(*ones, count)
+
+    def _others(self, x: Tensor) -> Tensor:
+        """x_j at i and j."""
+        last = x.movedim(self.axis + 1, -1)
+        return last[..., None, :].expand(*last.shape, last.shape[-1]).movedim(-2, self.axis + 1)
+
+    def apply(self, inputs: Sequence[Tensor]) -> Tensor:
+        return self._others(inputs[0]) - inputs[0][..., None]
+
+    def magnitude(self, inputs: Sequence[Tensor]) -> Tensor:
+        return (self._others(inputs[0]) + inputs[0][..., None]) * self._apart.to(inputs[0].dtype)
+
+    def backward(self, rows: Coefficients) -> list[Coefficients]:
+        whole = full(rows, self.shape, force=True)
+        count = whole.value.shape[0]
+        value = torch.from_numpy(whole.value).reshape(count, *self.shape)
+        value = value * self._apart.to(value.dtype)
+        result = value.sum(self.axis + 1).movedim(-1, self.axis + 1) - value.sum(-1)
+        return [Coefficients.whole(result.contiguous().numpy().reshape(count, *grid(self.input_shapes[0])))]
+
+
+@dataclass(frozen=True, eq=False)
+class TransposedConvolution(Weighted):
+    """Two-dimensional transposed convolution; nearest upsampling by whole factors is one.
+
+    Attributes:
+        weight: [Cin, Cout / groups, kh, kw] float64.
+        offset: [Cout] float64 or None.
+        stride, dilation: (rows, columns).
+        pads: top, left; cut from the result.
+        more: Rows and columns that the result has at its end besides.
+        groups: As in ONNX.
+    """
+
+    stride: tuple[int, int] = (1, 1)
+    dilation: tuple[int, int] = (1, 1)
+    pads: tuple[int, int] = (0, 0)
+    groups: int = 1
+
+    @property
+    def bias(self) -> Tensor | None:
+        return None if self.offset is None else self.offset[:, None, None]
+
+    def _spread(self, x: Tensor, weight: Tensor) -> Tensor:
+        whole = functional.conv_transpose2d(
+            x, weight.to(x.dtype), None, self.stride, groups=self.groups, dilation=self.dilation
+        )
+        top, left = self.pads
+        height, width = self.shape[1:]
+        missing = max(0, top + height - whole.shape[2]), max(0, left + width - whole.shape[3])
+        if any(missing):
+            whole = functional.pad(whole, (0, missing[1], 0, missing[0]))
+        return whole[:, :, top : top + height, left : left + width]
+
+    def apply(self, inputs: Sequence[Tensor]) -> Tensor:
+        return self._spread(inputs[0], self.weight)
+
+    def magnitude(self, inputs: Sequence[Tensor]) -> Tensor:
+        return self._spread(inputs[0], self.weight.abs())
+
+    def backward(self, rows: Coefficients) -> list[Coefficients]:
+        value = torch.from_numpy(full(rows, self.shape, force=True).value)
+        _, height, width = self.input_shapes[0]
+        need = [
+            (n - 1) * s + (k - 1) * d + 1
+            for n, s, k, d in zip((height, width), self.stride, self.weight.shape[2:], self.dilation, strict=True)
+        ]
+        top, left = self.pads
+        bottom, right = need[0] - top - value.shape[2], need[1] - left - value.shape[3]
+        # negative pads cut what no input reaches
+        value = functional.pad(value, (left, right, top, bottom))
+        result = functional.conv2d(value, self.weight_for(value), None, self.stride, 0, self.dilation, self.groups)
+        return [Coefficients.whole(result.numpy())]
