@@ -48,7 +48,6 @@ Vector = list[Any]
 #: What is not measured here, and why.
 UNMEASURED = {
     "overflow": "a limit, no error",
-    "weight norm": "of .pt2 files",
     "share of a sum that is cut off": "of real arithmetic",
     "switched softplus": "of real arithmetic",
     "functions with constants of the file": "of real arithmetic",

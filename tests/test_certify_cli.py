@@ -797,10 +797,15 @@ def test_ring_strip_plane_and_bars() -> None:
         ]
 
     frames = [entry(0, "azimuth"), entry(1, "x"), entry(2, "x", "y"), entry(3, "x", "y", "z")]
-    drawn = page._map({"frames": frames}, {k: rows(max(1, k)) for k in range(4)}, {})
+
+    def shown(cells: dict[int, list[dict[str, Any]]], numbers: dict[tuple[int, int], int]) -> str:
+        maps, bars = page.verdict_drawings(frames, cells, numbers)
+        return "".join(drawing[0] for drawing in (*maps, *bars))
+
+    drawn = shown({k: rows(max(1, k)) for k in range(4)}, {})
     assert "data-cell" not in drawn
     numbers = page._numbered({"frames": frames}, cells := {k: rows(max(1, k)) for k in range(4)})
-    each = page._map({"frames": frames}, cells, numbers)
+    each = shown(cells, numbers)
     # every cell of rings, strips and planes; a bar has the first of each verdict
     assert sorted(map(int, re.findall(r'data-cell="(\d+)"', each))) == [*range(13), 14, 15]
     assert drawn.count("<svg") == 4

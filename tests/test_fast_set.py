@@ -14,7 +14,7 @@ FILES = sorted(path.name for path in TESTS.glob("test_*.py"))
 #: Of one whole session of a user each, which is slow or nothing.
 WHOLE = {"test_browser.py", "test_tutorial.py"}
 #: Sources whose planted faults show in a certified loop alone, which takes seconds.
-LOOPS = {"api/reaching.py", "reach/film.py"}
+LOOPS = {"api/loop_job.py", "reach/film.py"}
 
 
 @cache

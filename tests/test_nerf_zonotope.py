@@ -10,6 +10,7 @@ import pytest
 import torch
 from nerfs import raw_outputs, tiny_weights
 
+from ns_abstract.arithmetic.rounding import UNIT64
 from ns_abstract.arithmetic.simd.lanes import LINE
 from ns_abstract.methods.nerf import relu_kernel, zonotope
 from ns_abstract.methods.nerf.bounds import basis_of
@@ -269,7 +270,7 @@ def test_columns_in_float32_are_charged(scale: float) -> None:
     )  # fmt: skip
     after = field._linear(pieces, layer, NOTHING)
     wide = field._linear(pieces, replace(layer, narrow=None), NOTHING)
-    bias = 4.0 * zonotope.UNIT64 * (layer.bias.abs() + after.poly[:, 0].abs())
+    bias = 4.0 * UNIT64 * (layer.bias.abs() + after.poly[:, 0].abs())
     away = zonotope.column_sums(after.columns.double() - wide.columns, after.owner, 16)
     assert (away > 0.0).any() and (away <= after.box - bias).all()
     if scale == 1.0:

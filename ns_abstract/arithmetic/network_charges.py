@@ -128,8 +128,6 @@ OTHER_LIBRARY = 8.0
 EXACT = FloatFormat(OWN_CONSTANT, 0.0, 2.0**1000)
 #: How far a constant may be off, where what is off multiplies it: second order, far less than a sixteenth.
 DOUBTS_UP = 1.0 + 2.0**-4
-#: A weight norm: squares, their root, quotient, product: 5; 11 to spare, beside its sum. In float64: 2^9 units.
-WEIGHT_NORM, OWN_WEIGHT_NORM = 16.0, 2.0**9 * DOUBLE_UNIT
 #: A file's numbers divided in float64, where a function is recognised: up to 2^4 roundings; as many to spare.
 OWN_QUOTIENTS = 2.0**5 * DOUBLE_UNIT
 

@@ -135,13 +135,6 @@ SUMS = (
         _CONSTANTS + _SUMS + _FLUSHED,
         "N23",
     ),
-    Row(
-        "weight norm",
-        (),
-        "gamma(n + WEIGHT_NORM) of the weights",
-        _SUMS + "a norm within LEAST_DIVISOR and OVERFLOW when squared",
-        "N23",
-    ),
 )
 
 #: Functions of one number; their expressions are Python.

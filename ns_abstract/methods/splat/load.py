@@ -93,7 +93,7 @@ def load_scene(path: str | os.PathLike[str], overrides: Overrides | None = None)
         if path.suffix.lower() == ".json":
             lod = path.name == "lod-meta.json"
             fix = f"convert with: splat-transform {path.name} out.ply" if lod else _FIX
-            what = "the index of a scene in levels of detail" if lod else "a .json file is not a scene"
+            what = "the index of a SOG scene in levels of detail" if lod else "a .json file is not a scene"
             raise InputError(what, file=path, fix=fix)
         if path.suffix.lower() in (".ckpt", ".pt", ".pth"):
             raise InputError(f"a {path.suffix} file is not a scene", file=path, fix=_FIX)

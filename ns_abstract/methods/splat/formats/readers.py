@@ -31,9 +31,7 @@ def _is_spz(path: Path, head: bytes) -> bool:
 
 
 def _is_sog(path: Path, head: bytes) -> bool:
-    if head.startswith(b"PK\x03\x04") and path.suffix.lower() in (".sog", ".zip"):
-        return True
-    return path.name == sog.META
+    return path.name == sog.META or (head.startswith(b"PK\x03\x04") and sog.is_archive(path))
 
 
 _FORMATS = (

@@ -46,6 +46,15 @@ _FIELDS = {name: name for name in ("scales", "quats")} | {"opacities": "sh0", "c
 _PICTURE_SPARE = 2**16
 
 
+def is_archive(path: Path) -> bool:
+    """Whether a zip archive holds the description of a SOG scene; a damaged one is judged by its name."""
+    try:
+        with zipfile.ZipFile(path) as archive:
+            return any(name.rpartition("/")[2] == META for name in archive.namelist())
+    except (OSError, zipfile.BadZipFile, ValueError, RuntimeError):
+        return path.suffix.lower() == ".sog"
+
+
 def decode_sog(path: Path, overrides: Overrides) -> DecodedSplats:
     """The Gaussians of a SOG scene.
 
