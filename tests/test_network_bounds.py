@@ -420,10 +420,10 @@ import sys
 from pathlib import Path
 import numpy as np, torch
 from onnx_files import image_sets
-from ns_abstract.verify.network import bound_outputs, load_network, schedule
+from ns_abstract.verify.network import bound_outputs, load_network, cost_model
 from ns_abstract.verify.network.explain import estimate
 torch.set_num_threads(1)
-schedule._DEEP = schedule._OVER = 0.0
+cost_model._DEEP = cost_model._OVER = 0.0
 
 def peak(name):
     line = next(v for v in Path("/proc/self/status").read_text().splitlines() if v.startswith(name))
@@ -433,9 +433,9 @@ network = load_network(Path(sys.argv[1]))
 images = image_sets(network.input_shape, 1, 2, 1e-4, 1e-4)
 small = image_sets(network.input_shape, 1, 2, 1e-30, 1e-31)
 rows = np.eye(3)
-schedule._PLANNED = 0.0
+cost_model._PLANNED = 0.0
 bound_outputs(network, small, rows, np.zeros(3), arithmetic="real")
-schedule._PLANNED = float(sys.argv[3])
+cost_model._PLANNED = float(sys.argv[3])
 before = peak("VmRSS")
 Path("/proc/self/clear_refs").write_text("5")
 found = bound_outputs(network, images, rows, np.zeros(3), memory=int(sys.argv[2]), arithmetic="real")

@@ -58,7 +58,7 @@ _CONSTANTS = "constants folded by the exporter, by the program when it loads, or
 SUMS = (
     Row(
         "layer of sums: fully connected, (transposed) convolution, mean, average pooling",
-        ("Matrix", "Convolution", "TransposedConvolution", "Sparse", "Differences"),
+        ("Matrix", "Convolution", "TransposedConvolution", "SparseMatrix", "PairwiseDifferences"),
         "gamma(n) (P + gamma(n + FOLDING + 1) S) + gamma(PRODUCTS + q) S, FOLDING more where a scale is connected",
         _SUMS + _FOLDED + _FLUSHED,
         "N2, N20",
@@ -72,7 +72,7 @@ SUMS = (
     ),
     Row(
         "scale, shift, batch normalisation",
-        ("Scale",),
+        ("ScaleLayer",),
         "gamma(n) |offset| (1 + gamma(n + FOLDING)) + gamma(FOLDING + PRODUCTS + q) S",
         _FOLDED + "a sum before it that starts with the shift, " + _FLUSHED,
         "N2, N21",
@@ -86,7 +86,17 @@ SUMS = (
     ),
     Row(
         "flushed numbers of every linear layer",
-        ("Linear", "Pad", "Channels", "Gather", "Matrix", "Convolution", "Scale", "Sum", "Sparse"),
+        (
+            "LinearLayer",
+            "Pad",
+            "ChannelEmbedding",
+            "Gather",
+            "Matrix",
+            "Convolution",
+            "ScaleLayer",
+            "Sum",
+            "SparseMatrix",
+        ),
         "FLUSHES FLUSH (A + B + g + 1)",
         _FLUSHED + ", for scales that are grouped in any way",
         "N21",
@@ -101,7 +111,7 @@ SUMS = (
     ),
     Row(
         "resized map",
-        ("Resized",),
+        ("Resize",),
         "POSITION (|place| + 1) times the interpolant's slope, POLYNOMIAL of cubic weights; OWN_POSITIONS of that with "
         "real arithmetic",
         "places by quotients or reciprocal scales, rows before columns or together",
@@ -130,7 +140,7 @@ SUMS = (
     ),
     Row(
         "computed constants",
-        ("Doubtful", "DoubtfulConvolution", "DoubtfulMatrix", "DoubtfulScale", "DoubtfulTransposed"),
+        ("InexactLayer", "InexactConvolution", "InexactMatrix", "InexactScale", "InexactTransposedConvolution"),
         "gamma(n + CONSTANT_SUMS) of sums, ONCE of one operation, LIBRARY, OTHER_LIBRARY; ONCE_FLUSHES flushed numbers",
         _CONSTANTS + _SUMS + _FLUSHED,
         "N23",
@@ -186,7 +196,7 @@ FUNCTIONS = (
     ),
     Row(
         "reciprocal, quotient",
-        ("Reciprocal", "Share"),
+        ("Reciprocal", "SoftmaxReciprocal"),
         "QUOTIENT / min(abs(lower), abs(upper)) + FUNCTION_FLUSHES * FLUSH",
         "a division, or a reciprocal and a product, " + _FLUSHED,
         "N10, N21",
@@ -223,7 +233,7 @@ FUNCTIONS = (
     ),
     Row(
         "share of a sum that is cut off",
-        ("Share",),
+        ("SoftmaxReciprocal",),
         "LOST_SHARE * (upper > exp(30) / 2)",
         "sums of exponentials that overflow or do not",
         "N11",
