@@ -39,6 +39,7 @@ from nerfs import tiny_scene
 from ns_abstract.api.cell_search import CellSearch
 from ns_abstract.api.certification import CertifySettings, open_certification
 from ns_abstract.api.certifying import CertificateQuestion
+from ns_abstract.api.compiling import compile_beside
 from ns_abstract.api.files import Settings, open_job
 from ns_abstract.geometry.keyframe_cameras import path_json
 from ns_abstract.io.atomic import write_json
@@ -131,6 +132,7 @@ def write_search(files: dict[str, Path]) -> None:
     settings = CertifySettings(files["config"], files["path"], files["net"], files["prop"], files["spec"])
     job = open_certification(settings)
     # kernels are compiled here, which no case is charged for
+    compile_beside(job.job, 0)
     job.job.warm_up(0)
     question = CertificateQuestion(job, [0, 1], {}, ("ns-abstract-certify",))
     search = CellSearch(question, files["search"])
