@@ -194,7 +194,7 @@ original_ends = strips_module.PoseStrips._part_ends
 @pytest.mark.parametrize(
     ("target", "name", "fault"),
     [
-        (planes_module, "united", half_a_part),
+        (planes_module, "unite_parts", half_a_part),
         (planes_module, "_offset", other_offset),
         (strips_module.PoseStrips, "_part_ends", a_quarter_strip_on),
     ],

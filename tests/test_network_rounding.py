@@ -411,5 +411,5 @@ def test_scales_that_may_be_folded(tmp_path: Path) -> None:
     f.conv(2, 2)
     network = load_network(f.write(tmp_path / "net.onnx"))
     kinds = [type(node.layer).__name__ for node in network.nodes]
-    assert kinds == ["Convolution", "LeakyRelu", "Convolution", "Gather", "Scale", "LeakyRelu", "Convolution"]
+    assert kinds == ["Convolution", "LeakyRelu", "Convolution", "Gather", "ScaleLayer", "LeakyRelu", "Convolution"]
     assert network.scaled == {3, 4, 5}
