@@ -12,9 +12,9 @@ from conftest import blob_scene
 
 import ns_abstract as nsa
 from ns_abstract.api.files import Settings, open_job
-from ns_abstract.geometry.camera_files import RunFrame
 from ns_abstract.geometry.camera_path import load_camera_path
 from ns_abstract.geometry.keyframe_cameras import look_at
+from ns_abstract.geometry.transform import DataparserTransform
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.write import write_splatfacto_run
 
@@ -58,7 +58,7 @@ def test_cameras_of_inria_see_along_their_own_rays(tmp_path: Path) -> None:
 def test_cameras_of_a_data_set_are_moved_to_the_frame_of_the_run(tmp_path: Path) -> None:
     turn = np.asarray(look_at((0.0, 0.0, 0.0), (1.0, 2.0, 0.5)))[:3, :3]
     matrix, scale = np.column_stack([turn, [0.3, -0.1, 0.2]]), 0.25
-    frame = RunFrame(matrix, scale)
+    frame = DataparserTransform(matrix, scale)
     file = save(tmp_path / "transforms.json", transforms())
     camera = load_camera_path(file, 1, frame).cameras[0]
     np.testing.assert_allclose(camera.camera_to_world[:, 3], scale * (turn @ POSE[:, 3] + matrix[:, 3]), atol=1e-15)
@@ -70,7 +70,7 @@ def test_cameras_of_a_data_set_are_moved_to_the_frame_of_the_run(tmp_path: Path)
     posed = np.vstack([applied, [0, 0, 0, 1]]) @ np.vstack([POSE, [0, 0, 0, 1]])
     value = transforms(applied_transform=applied.tolist(), applied_scale=2.0)
     value["frames"][0]["transform_matrix"] = posed.tolist()
-    moved = load_camera_path(save(file, value), 1, RunFrame(both, 2.0 * scale)).cameras[0]
+    moved = load_camera_path(save(file, value), 1, DataparserTransform(both, 2.0 * scale)).cameras[0]
     inner = matrix @ posed
     np.testing.assert_allclose(moved.camera_to_world[:, :3], inner[:, :3], atol=1e-14)
     np.testing.assert_allclose(moved.camera_to_world[:, 3], scale * inner[:, 3], atol=1e-14)
@@ -127,7 +127,7 @@ BAD: dict[str, tuple[Any, str]] = {
 def test_bad_cameras_end_in_one_line(name: str, tmp_path: Path) -> None:
     value, mention = BAD[name]
     with pytest.raises(InputError) as caught:
-        load_camera_path(save(tmp_path / "file.json", value), 1, RunFrame(np.eye(3, 4), 1.0))
+        load_camera_path(save(tmp_path / "file.json", value), 1, DataparserTransform(np.eye(3, 4), 1.0))
     assert mention in str(caught.value) and "file.json" in str(caught.value) and caught.value.fix
 
 

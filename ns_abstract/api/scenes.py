@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ns_abstract.geometry.camera_files import RunFrame
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
+from ns_abstract.geometry.transform import DataparserTransform
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.load import open_scene
@@ -93,12 +93,11 @@ class Scene:
         return tuple(self.method().notes)
 
     @property
-    def run_frame(self) -> RunFrame | None:
+    def run_frame(self) -> DataparserTransform | None:
         """From the frame of the run's data set to the run's; None where the scene is no run."""
         if self.source.file.is_file() and self.source.file.suffix.lower() not in (".yml", ".yaml"):
             return None
-        transform = self._content.dataparser
-        return RunFrame(transform.matrix, transform.scale)
+        return self._content.dataparser
 
     @property
     def assumptions(self) -> tuple[Assumption, ...]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ns_abstract.geometry.transform import DataparserTransform
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import InputTuning, is_number, show
 
@@ -40,20 +41,6 @@ class FileCamera:
     height: Any
 
 
-@dataclass(frozen=True)
-class RunFrame:
-    """From a data set's frame to a run's: ``x_run = scale * (matrix[:, :3] @ x + matrix[:, 3])``."""
-
-    matrix: NDArray[np.float64]
-    scale: float
-
-    def pose(self, camera_to_world: NDArray[np.float64]) -> NDArray[np.float64]:
-        """A pose [4, 4] of the data set in the run's frame, [3, 4]."""
-        moved = self.matrix @ camera_to_world
-        moved[:, 3] *= self.scale
-        return moved
-
-
 def is_inria(root: Any) -> bool:
     """Whether a parsed file is Inria's ``cameras.json``."""
     return isinstance(root, list) and bool(root) and all(isinstance(e, dict) and "rotation" in e for e in root)
@@ -76,7 +63,7 @@ def inria_cameras(root: list[dict[str, Any]]) -> Iterator[FileCamera]:
         yield FileCamera(field, pose.tolist(), focal[0], focal[1], sides[0] / 2, sides[1] / 2, width, height)
 
 
-def transforms_cameras(root: Mapping[str, Any], frame: RunFrame | None) -> Iterator[FileCamera]:
+def transforms_cameras(root: Mapping[str, Any], frame: DataparserTransform | None) -> Iterator[FileCamera]:
     """The cameras of a data set's ``transforms.json``, in the frame of a run that was trained on it.
 
     Args:
@@ -101,8 +88,7 @@ def transforms_cameras(root: Mapping[str, Any], frame: RunFrame | None) -> Itera
     applied_scale = _number(root.get("applied_scale", 1.0), "applied_scale")
     if not applied_scale > 0:
         raise InputError(f"found {show(applied_scale)}", field="applied_scale", fix="write a number above 0")
-    matrix = frame.matrix @ np.linalg.inv(applied)
-    undone = RunFrame(matrix, frame.scale / applied_scale)
+    undone = DataparserTransform(frame.matrix @ np.linalg.inv(applied), frame.scale / applied_scale)
     for i, entry in enumerate(frames):
         field = f"frames[{i}]"
         if not isinstance(entry, dict):

@@ -12,8 +12,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ns_abstract.geometry.camera_files import FileCamera, RunFrame, inria_cameras, is_inria, transforms_cameras
+from ns_abstract.geometry.camera_files import FileCamera, inria_cameras, is_inria, transforms_cameras
 from ns_abstract.geometry.path_keys import ENTRY, KEYFRAME, PATH
+from ns_abstract.geometry.transform import DataparserTransform
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import InputTuning, is_moderate, is_number, load_json, parse_json, show
 from ns_abstract.io.keys import sentence
@@ -154,7 +155,7 @@ class CameraPath:
 
 
 def load_camera_path(
-    path: str | os.PathLike[str], downscale_factor: float = 1, run_frame: RunFrame | None = None
+    path: str | os.PathLike[str], downscale_factor: float = 1, run_frame: DataparserTransform | None = None
 ) -> CameraPath:
     """Read the JSON that Nerfstudio's viewer writes, Inria's ``cameras.json`` or a data set's ``transforms.json``.
 

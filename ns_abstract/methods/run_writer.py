@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ns_abstract.geometry.keyframe_cameras import KeyframeCamera, ring
+from ns_abstract.geometry.transform import DataparserTransform
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
-from ns_abstract.methods.transform import DataparserTransform
 
 STEP = 29999  # the last of Splatfacto's 30,000 steps
 

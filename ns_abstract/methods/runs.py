@@ -21,13 +21,13 @@ import yaml.composer
 import yaml.constructor
 from numpy.typing import NDArray
 
+from ns_abstract.geometry.transform import DataparserTransform
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError, first_line, visible
 from ns_abstract.io.jsonio import FIX_ACCESS, InputTuning, file_size, is_number, load_json, read_text, show
 from ns_abstract.io.kinds import refuse_other_kind
 from ns_abstract.methods.checkpoint import RECOPY, read_checkpoint
 from ns_abstract.methods.overrides import assumption_of
-from ns_abstract.methods.transform import DataparserTransform
 
 CONFIG_NAME = "config.yml"
 TRANSFORMS_NAME = "dataparser_transforms.json"

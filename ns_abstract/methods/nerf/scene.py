@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ns_abstract.geometry.transform import DataparserTransform
 from ns_abstract.io.assumptions import Assumption
-from ns_abstract.methods.transform import DataparserTransform
 
 if TYPE_CHECKING:
     from ns_abstract.methods.nerf.occupancy import OccupancyGrid

@@ -8,8 +8,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from ns_abstract.geometry.transform import DataparserTransform
 from ns_abstract.io.assumptions import Assumption
-from ns_abstract.methods.transform import DataparserTransform
 
 Float32Array = NDArray[np.float32]
 Float64Array = NDArray[np.float64]

@@ -18,3 +18,9 @@ class DataparserTransform:
 
     matrix: NDArray[np.float64] = field(default_factory=lambda: np.eye(3, 4))  # [3, 4]
     scale: float = 1.0
+
+    def pose(self, camera_to_world: NDArray[np.float64]) -> NDArray[np.float64]:
+        """A pose [4, 4] of the data set in the run's frame, [3, 4]."""
+        moved = self.matrix @ camera_to_world
+        moved[:, 3] *= self.scale
+        return moved
