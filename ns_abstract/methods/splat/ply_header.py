@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import re
+import warnings
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import file_size, show
@@ -168,6 +170,29 @@ def standard_header(declared: PlyDeclaration, path: Path) -> PlyHeader:
     unused = [name for name in vertex.types if name not in used and not name.startswith("f_rest_")]
     others = [f"element {element.name}" for element in declared.elements if element is not vertex]
     return PlyHeader(vertex, bands, declared.mode, declared.comment, (*unused, *others))
+
+
+def read_elements(path: Path, elements: list[PlyElement]) -> dict[str, Any]:
+    """Tables of the named elements, as numpy's structured arrays.
+
+    Raises:
+        InputError: The file is damaged.
+    """
+    import plyfile
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            data = plyfile.PlyData.read(str(path))
+        tables = {element.name: data[element.name].data for element in elements}
+        if any(len(tables[e.name]) != e.count or tables[e.name].dtype.names != tuple(e.types) for e in elements):
+            raise ValueError("ambiguous header")
+        return tables
+    except MemoryError:
+        raise
+    except Exception as error:  # numpy and plyfile raise many types on damaged files
+        text = " ".join(str(error).split())[:160] or type(error).__name__
+        raise InputError(f"damaged .ply: {text}", file=path, fix=FIX) from None
 
 
 def _comments(text: str, path: Path, mode_given: bool) -> tuple[str | None, str]:

@@ -2,25 +2,23 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ns_abstract.io.errors import InputError, visible
+from ns_abstract.io.errors import visible
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.splat.formats import inria
 from ns_abstract.methods.splat.formats.compressed_ply import decode_compressed_ply, is_compressed
 from ns_abstract.methods.splat.formats.decoded import DecodedSplats, float32_rows, scene_of
 from ns_abstract.methods.splat.ply_header import (
     FILTER,
-    FIX,
     GROUPS,
-    PlyElement,
     PlyHeader,
     read_declaration,
+    read_elements,
     standard_header,
 )
 from ns_abstract.methods.splat.scene import Float32Array, SplatScene
@@ -54,7 +52,7 @@ def load_ply(path: Path, overrides: Overrides) -> SplatScene:
 
 
 def _decode(path: Path, header: PlyHeader) -> DecodedSplats:
-    vertex = _read_vertex(path, header.vertex)
+    vertex = read_elements(path, [header.vertex])[header.vertex.name]
     arrays = {name: _columns(vertex, columns) for name, columns in GROUPS.items()}
     count, bands = arrays["means"].shape[0], header.bands
     rest = _columns(vertex, tuple(f"f_rest_{i}" for i in range(3 * (bands - 1))))
@@ -106,23 +104,6 @@ def filtered(
     return np.where(same[:, None], log_scales, scales_and_opacities[0]), np.where(
         same, opacity_logits, scales_and_opacities[1]
     )
-
-
-def _read_vertex(path: Path, element: PlyElement) -> Any:
-    import plyfile
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            vertex = plyfile.PlyData.read(str(path))["vertex"].data
-            if len(vertex) != element.count or vertex.dtype.names != tuple(element.types):
-                raise ValueError("ambiguous header")
-            return vertex
-    except MemoryError:
-        raise
-    except Exception as error:  # numpy and plyfile raise many types on damaged files
-        text = " ".join(str(error).split())[:160] or type(error).__name__
-        raise InputError(f"damaged .ply: {text}", file=path, fix=FIX) from None
 
 
 def _columns(vertex: Any, names: tuple[str, ...]) -> Float32Array:

@@ -13,9 +13,9 @@ import numpy as np
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import file_size
 from ns_abstract.methods.overrides import Overrides
+from ns_abstract.methods.splat.activate import SH_C0
 from ns_abstract.methods.splat.formats.decoded import (
     AXES,
-    SH_C0,
     DecodedSplats,
     float32_rows,
     opacity_logits,

@@ -7,7 +7,6 @@ stands for the middle of its interval, ((b + 1/2) / 256 - 1/2) 8, but for 0 and 
 
 from __future__ import annotations
 
-import warnings
 from pathlib import Path
 from typing import Any
 
@@ -15,15 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ns_abstract.io.errors import InputError, visible
+from ns_abstract.methods.splat.activate import SH_C0
 from ns_abstract.methods.splat.formats.decoded import (
-    SH_C0,
     DecodedSplats,
     float32_rows,
     opacity_logits,
     reserve,
     smallest_three,
 )
-from ns_abstract.methods.splat.ply_header import DEGREES, PlyElement
+from ns_abstract.methods.splat.ply_header import DEGREES, PlyElement, read_elements
 
 #: Gaussians a chunk.
 CHUNK = 256
@@ -58,7 +57,7 @@ def decode_compressed_ply(path: Path, elements: list[PlyElement], mode: str | No
     """
     count, bands = _check(elements, path)
     reserve(count, bands, path, 32 * count)
-    table = _read(path, elements)
+    table = read_elements(path, elements)
     vertex, chunk = table["vertex"], table["chunk"]
     limits = {name: chunk[name].astype(np.float64) for name in chunk.dtype.names}
     of = np.arange(count) // CHUNK
@@ -142,21 +141,3 @@ def _check(elements: list[PlyElement], path: Path) -> tuple[int, int]:
     if sh.count != vertex.count:
         raise InputError(f"{sh.count} rows, expected {vertex.count}", file=path, field="element sh", fix=_FIX)
     return vertex.count, len(names) // 3 + 1
-
-
-def _read(path: Path, elements: list[PlyElement]) -> dict[str, Any]:
-    import plyfile
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            data = plyfile.PlyData.read(str(path))
-        table = {element.name: data[element.name].data for element in elements}
-        if any(len(table[e.name]) != e.count or table[e.name].dtype.names != tuple(e.types) for e in elements):
-            raise ValueError("ambiguous header")
-        return table
-    except MemoryError:
-        raise
-    except Exception as error:  # numpy and plyfile raise many types on damaged files
-        text = " ".join(str(error).split())[:160] or type(error).__name__
-        raise InputError(f"damaged .ply: {text}", file=path, fix=_FIX) from None

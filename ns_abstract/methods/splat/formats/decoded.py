@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import hashlib
 import io
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,8 +25,6 @@ from ns_abstract.methods.overrides import Overrides, assumption_of
 from ns_abstract.methods.splat.drawable import StoredGaussians, coordinates_note, drawable
 from ns_abstract.methods.splat.scene import DataparserTransform, SplatScene
 
-#: Band 0 of the spherical harmonics, by which colours become coefficients.
-SH_C0 = 0.28209479177387814
 #: Gaussians of 2-D splatting, and what can be done about them.
 TWO_D = "2-D Gaussians, drawn by another rasteriser"
 RENDER_ELSEWHERE = "render it with the program that trained it, or train Gaussians that gsplat's rasteriser draws"
@@ -34,7 +33,6 @@ AXES = (
     "same axes"
 )
 _OPAQUE = 40.0
-_DEGREES = {1: 0, 4: 1, 9: 2, 16: 3}
 #: Bytes a Gaussian takes while it is decoded: float64 and float32 copies of 11 numbers and 3 a band.
 _BYTES_BY_NUMBER = 16
 
@@ -92,7 +90,7 @@ def scene_of(decoded: DecodedSplats, overrides: Overrides) -> SplatScene:
     return SplatScene(
         **vars(rows),
         color_model="sh",
-        sh_degree=_DEGREES[rows.sh.shape[1]],
+        sh_degree=math.isqrt(rows.sh.shape[1]) - 1,
         rasterize_mode=cast(Literal["classic", "antialiased"], assumptions[0].value),
         background=np.array(overrides.background or background, np.float32),
         dataparser=DataparserTransform(),

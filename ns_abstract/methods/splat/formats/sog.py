@@ -232,7 +232,7 @@ def _names(meta: Any, file: Path) -> list[str]:
     """The pictures that a description names: plain names, each once."""
     if not isinstance(meta, dict):
         raise InputError("the top level is not a mapping", file=file, fix=_FIX)
-    if "lodLevels" in meta or file.name == "lod-meta.json":
+    if "lodLevels" in meta:
         fix = f"convert with: splat-transform {file.name} out.ply"
         raise InputError("the index of a scene in levels of detail", file=file, fix=fix)
     names: list[str] = []
