@@ -57,7 +57,7 @@ class Examiner(Protocol):
         Depends on the cells alone. "certified" means a proved lower bound above 0 of the margin of every picture.
 
         Raises:
-            AbandonedError: There is no time for it.
+            WorkCancelledError: There is no time for it.
         """
         ...
 

@@ -45,7 +45,6 @@ class CertificateReport:
         self.shown: list[dict[str, Any]] = []
         self.seen: dict[tuple[int, int], dict[str, Any]] = {}
         self.cameras: CameraDrawings | None = None
-        #: certified cells bounded in weaker ways, too
 
     def document(self, store: Store, state: str) -> tuple[dict[str, Any], dict[int, list[dict[str, Any]]]]:
         """Content of report.json, and the cells by frame."""
@@ -185,7 +184,7 @@ class CertificateReport:
         """PNG of the picture at parameter values in the order of all parameters.
 
         Raises:
-            AbandonedError: There is no time for more pictures.
+            WorkCancelledError: There is no time for more pictures.
         """
         known = dict(zip((name for name, _ in self.job.parameters), values, strict=True))
         pictures = self.job.pictures(frame)

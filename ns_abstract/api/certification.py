@@ -118,7 +118,7 @@ class FramePictures:
         poses: The frame's set.
         picture: Whether the network is shown floats or rounded pictures.
         response: The cameras that may show them; None: one that shows what is rendered.
-        slanted: Whether parameters may be counted otherwise than the set does, where that is tighter (P2).
+        sheared: Whether parameters may be counted otherwise than the set does, where that is tighter (P2).
     """
 
     def __init__(

@@ -40,7 +40,7 @@ from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.eight_bit import Picture
 from ns_abstract.verify.network import NetworkArithmetic
 from ns_abstract.verify.network.explain import check_cell
-from ns_abstract.verify.scene_margin import CAMERA_KINDS, KINDS, PLACES, ProveCell, VariationKind, check_scenes
+from ns_abstract.verify.scene_margin import ProveCell, VariationKind, bounded_kinds, check_scenes
 from ns_abstract.verify.store import Store, fractions
 
 #: Seconds that pictures for the last report may take beyond the budget, where they are made ray by ray.
@@ -170,7 +170,7 @@ class CertificateQuestion(CellQuestion[CertifyProgress]):
         search.deadline = search.deadline.extended(_LAST)
 
     def varied_scenes(self) -> tuple[Sequence[VariationKind], Callable[[VariationKind], ProveCell]]:
-        return (*KINDS, *CAMERA_KINDS, *(kind for kind in PLACES if self.job.places(kind))), self.job.settle
+        return bounded_kinds(self.job.places), self.job.settle
 
     def progress(self, store: Store) -> CertifyProgress:
         shares = [fractions(tally) for tally in store.tallies()]

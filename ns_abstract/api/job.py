@@ -200,7 +200,7 @@ class Job:
         """Refine some tiles of frame ``index``, or all of them; ``known`` is what was found of it before.
 
         Raises:
-            AbandonedError: ``stopped`` was true, or the time was over, before a first picture was there.
+            WorkCancelledError: ``stopped`` was true, or the time was over, before a first picture was there.
         """
         # kept leaves are boxes of the set's parameters
         frame = self.frame(index, sheared=not keep_leaves)

@@ -33,7 +33,7 @@ class Margins:
         cells: What is certified.
         settle: Bounds and attacks cells for scenes of a kind.
         store: Keeps what is settled, for a command that goes on; what it holds is not settled again.
-        told: Told every margin as it is found.
+        on_progress: Told every margin as it is found.
     """
 
     def __init__(

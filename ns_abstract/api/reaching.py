@@ -28,7 +28,7 @@ from ns_abstract.io.assumptions import Assumption
 from ns_abstract.reach.search import QUESTIONS
 from ns_abstract.verify.cells import CellGrid
 from ns_abstract.verify.network import NetworkArithmetic
-from ns_abstract.verify.scene_margin import CAMERA_KINDS, KINDS, PLACES, ProveCell, VariationKind
+from ns_abstract.verify.scene_margin import ProveCell, VariationKind, bounded_kinds
 from ns_abstract.verify.store import Store, fractions
 
 #: Parts of the time for random runs, for tubes that the report shows, and for a film.
@@ -97,7 +97,7 @@ class LoopQuestion(CellQuestion[ReachProgress]):
             self.reports.make_film(search.store, deadline)
 
     def varied_scenes(self) -> tuple[Sequence[VariationKind], Callable[[VariationKind], ProveCell]]:
-        return (*KINDS, *CAMERA_KINDS, *(kind for kind in PLACES if self.job.places(kind))), self.job.settle
+        return bounded_kinds(self.job.places), self.job.settle
 
     def margin_rows(self, rows: dict[int, list[Row]]) -> tuple[dict[int, list[Row]], dict[str, Any]]:
         # the strongest question of which anything is certified

@@ -24,7 +24,7 @@ Examine = Callable[[int, CellGrid, tuple[Cell, ...]], BlockResult]
 def periodic_report(
     store: Store, on_progress: Callable[[], object], report: Callable[[], object] = lambda: None
 ) -> Callable[[float], None]:
-    """Return what a search does between results: now and then a point of the trace and ``told``, rarely ``report``."""
+    """Return what a search does between results: often a point of the trace and ``on_progress``, rarely ``report``."""
     traced = reported = time.perf_counter()
 
     def between(instant: float) -> None:

@@ -40,7 +40,7 @@ class _PoseRenderer:
         """The picture at values of all parameters, the network's outputs and the margin.
 
         Raises:
-            AbandonedError: There is no time for it.
+            WorkCancelledError: There is no time for it.
         """
         check_cancelled()
         if frame not in self._frames:
@@ -84,7 +84,7 @@ def look_closer(
         job: What is certified.
         entries: Frames of report.json.
         rows: Cells by frame.
-        kept: The stored image of a counterexample, by frame and pose.
+        cached: The stored image of a counterexample, by frame and pose.
         over: Whether no more pictures are to be rendered; `SECONDS` from now none are, either.
     """
     end = time.perf_counter() + SECONDS

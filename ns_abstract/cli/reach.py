@@ -97,14 +97,14 @@ def reach(options: Reach) -> int:
                 scene_margin=options.scene_margin,
                 on_open=lambda store: compile_beside(job.job, 0) if options.where.engine == "local" else None,
                 on_progress=on_progress,
-                on_margin=lambda reach_run: console.print(
-                    f"scene margin: {reach_run.sentence}", markup=False, soft_wrap=True
+                on_margin=lambda margin: console.print(
+                    f"scene margin: {margin.sentence}", markup=False, soft_wrap=True
                 ),
             ),
         )
-        for question, entry in document["questions"].items():
+        for name, entry in document["questions"].items():
             console.print(
-                f"{question}: certified {percent(entry['certified'])}, falsified {percent(entry['falsified'])}, "
+                f"{name}: certified {percent(entry['certified'])}, falsified {percent(entry['falsified'])}, "
                 f"unknown {percent(entry['unknown'])}; {percent(entry['simulated']['went_well'])} of "
                 f"{entry['simulated']['runs']} random runs went well",
                 markup=False,

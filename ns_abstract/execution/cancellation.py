@@ -21,7 +21,7 @@ def _never() -> bool:
     return False
 
 
-_cancelled: ContextVar[Callable[[], bool]] = ContextVar("over", default=_never)
+_cancelled: ContextVar[Callable[[], bool]] = ContextVar("cancelled", default=_never)
 
 
 class Deadline:
@@ -62,10 +62,10 @@ class Deadline:
 
     @contextmanager
     def enforced(self) -> Iterator[None]:
-        """Inside the block, work that asks `check_cancelled` is given up once the deadline is reached.
+        """Cancel work inside the block, at its next `check_cancelled`, once the deadline is reached.
 
         Raises:
-            AbandonedError: At a checkpoint after it.
+            WorkCancelledError: It is reached.
         """
         with cancel_when(self):
             yield
@@ -90,7 +90,7 @@ def check_cancelled() -> None:
     """Raise `WorkCancelledError` if the current work is cancelled; long loops call it about once a second.
 
     Raises:
-        AbandonedError: It is given up.
+        WorkCancelledError: It is.
     """
     if is_cancelled():
         raise WorkCancelledError

@@ -90,7 +90,7 @@ def along(reacher: TubeBuilder, method: Method, size: tuple[int, int], tube: Tub
         tube: Of the loop.
 
     Raises:
-        AbandonedError: There is no time for more.
+        WorkCancelledError: There is no time for more.
     """
     camera = reacher.loop.camera
     poses = camera.poses(size)

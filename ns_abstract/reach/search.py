@@ -257,7 +257,7 @@ class LoopSearch:
 
         Raises:
             ContradictionError: A run leaves its tube: the program has a fault.
-            AbandonedError: There is no time for it (`ns_abstract.execution.cancellation`).
+            WorkCancelledError: There is no time for it (`ns_abstract.execution.cancellation`).
         """
         question = QUESTIONS[number]
         begin = time.perf_counter()

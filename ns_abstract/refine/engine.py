@@ -134,7 +134,7 @@ class Refinement:
         """Refine until the goal is reached; sound whenever it ends.
 
         Raises:
-            AbandonedError: ``stopped`` was true before a first picture was there.
+            WorkCancelledError: ``stopped`` was true before a first picture was there.
         """
         return self._result(self._work())
 

@@ -224,7 +224,7 @@ class Frame(Protocol):
         """What was left out for this frame and why, one sentence each.
 
         Args:
-            shown: Number of scene elements that some cell shows, if they are told apart.
+            visible: Number of scene elements that some cell shows, if they are told apart.
             lower: [H, W, 3] what refinement found.
             upper: [H, W, 3] likewise.
         """
@@ -274,7 +274,7 @@ class RayFrame(Frame, Protocol):
                 where rays could be refined.
 
         Raises:
-            AbandonedError: There is no time for it.
+            WorkCancelledError: There is no time for it.
         """
         ...
 
@@ -350,7 +350,7 @@ class Method(Protocol):
 
         Args:
             poses: Its set.
-            slanted: Its box may count parameters otherwise than the set does, where that is tighter.
+            sheared: Its box may count parameters otherwise than the set does, where that is tighter.
             layers: Whether accumulation and expected depth stand behind the colours.
 
         Raises:

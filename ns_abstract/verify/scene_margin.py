@@ -107,6 +107,11 @@ TURN = VariationKind(
 PLACES = (REGISTRATION, TURN)
 
 
+def bounded_kinds(places: Callable[[VariationKind], bool]) -> tuple[VariationKind, ...]:
+    """All kinds of variation, of the whole scene those that ``places`` says can be bounded beside the pose."""
+    return (*KINDS, *CAMERA_KINDS, *(kind for kind in PLACES if places(kind)))
+
+
 @dataclass(frozen=True)
 class CellOutcome:
     """The outcome of a cell for all scenes of a set.

@@ -223,7 +223,7 @@ class Search:
 
         Raises:
             ContradictionError: A cell was proved and has a counterexample: the program has a fault.
-            AbandonedError: There is no time for it (`ns_abstract.execution.cancellation`).
+            WorkCancelledError: There is no time for it (`ns_abstract.execution.cancellation`).
         """
         begin = time.perf_counter()
         samples = [_CellSamples(cell, self.grid.box_of(cell)) for cell in block]

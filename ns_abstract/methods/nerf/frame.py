@@ -321,7 +321,7 @@ class NerfFrame:
         """`NerfBounds.rays` with the arguments of each call, side by side where there are several.
 
         Raises:
-            AbandonedError: There is no time for all of them.
+            WorkCancelledError: There is no time for all of them.
         """
         parts = [part for part in self._tried(calls) if part is not None]
         if len(parts) < len(calls):
@@ -371,7 +371,7 @@ class NerfFrame:
                 where rays could be refined.
 
         Raises:
-            AbandonedError: There is no time for it.
+            WorkCancelledError: There is no time for it.
         """
 
         def weights() -> np.ndarray | None:

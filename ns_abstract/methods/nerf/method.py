@@ -136,7 +136,7 @@ class NerfMethod:
         return f"vanilla NeRF, {self.scene.fine.text}"
 
     def frame(self, poses: PoseBox, sheared: bool = False, layers: bool = False) -> NerfFrame:
-        """One frame, ready for refinement; its cells are never ``slanted``.
+        """One frame, ready for refinement; its cells are never ``sheared``.
 
         Raises:
             InputError: Layers are asked for: a NeRF's depth is a median.

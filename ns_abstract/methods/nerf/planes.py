@@ -100,7 +100,7 @@ def _slopes(rows: Float64Array, centre: Float64Array, half: Float64Array) -> Flo
 
 
 def _least(offset, reach: Float64Array, least_known: Float64Array) -> Float64Array:
-    """Where the convex ``offset`` is about least on [-reach, reach]; no worse than at ``known`` and at 0."""
+    """Where the convex ``offset`` is about least on [-reach, reach]; no worse than at ``least_known`` and at 0."""
     low, high = -reach, reach.copy()
     inner = [high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)]
     values = [offset(place) for place in inner]

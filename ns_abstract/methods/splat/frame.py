@@ -152,7 +152,7 @@ class SplatFrame:
         pose_set: The poses.
         order: Order of the forms: 1, or 2 for one parameter, which is the default for it.
         varied: The scenes of the set; None: ``splats`` alone.
-        slanted: Whether cells may be slanted, so that rotations make up for what other parameters move (P2). Their
+        sheared: Whether cells may be slanted, so that rotations make up for what other parameters move (P2). Their
             parameters are then not those of ``pose_set``.
         layers: Whether accumulation and expected depth stand behind the colours, in renders and bounds.
         reference: Makes the renderer with gradients, for steps of `scene_samples`.

@@ -95,7 +95,7 @@ class SplatMethod:
         return f"{self.scene.count:,} Gaussians{' alone, of a model that may draw more' if self.scene.alone else ''}"
 
     def frame(self, poses: PoseBox, sheared: bool = False, layers: bool = False) -> SplatFrame:
-        """One frame, ready for refinement; ``slanted``, ``layers``: see `SplatFrame`.
+        """One frame, ready for refinement; ``sheared``, ``layers``: see `SplatFrame`.
 
         Raises:
             InputError: Layers of the paper's renderer, which has none.

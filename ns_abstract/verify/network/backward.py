@@ -70,7 +70,7 @@ class BackwardPass:
     """Propagates coefficients backwards over the relaxations of the nodes, which it does not change.
 
     Args:
-        known: What is known so far.
+        intermediate: What is known so far.
         memory: Bytes to stay within, roughly.
         deep: Whether the network's rows are rationed (N13); then those that are kept may end on the way, too.
     """

@@ -79,7 +79,7 @@ class _NetworkBounds:
     """Bounds of one network over several cells: builds the passes and runs them over all nodes.
 
     Attributes:
-        known: What is known of the nodes.
+        intermediate: What is known of the nodes.
         last: The form of the last one.
     """
 

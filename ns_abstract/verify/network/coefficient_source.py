@@ -18,7 +18,7 @@ class CoefficientSource:
     """Bounds every cell by itself; subclasses store coefficients for other cells or reuse stored ones.
 
     Attributes:
-        known: What is known of the cells, before anything but `about` is asked.
+        intermediate: What is known of the cells, before anything but `about` is asked.
     """
 
     intermediate: IntermediateBounds

@@ -380,7 +380,7 @@ def concretize(value, y, x, cell, intermediate, total, plane, box):
 
     Args:
         value, y, x, cell: Rows.
-        known: `NodeColumns` of the node.
+        intermediate: `NodeColumns` of the node.
         total: [R, 2] what the rows gathered on their way.
         plane: [R, 2, d + 1] becomes slopes and offset of planes below and above.
         box: [R, 2] becomes a lower and an upper bound from the intervals alone.

@@ -94,7 +94,7 @@ class BackwardRoute(NamedTuple):
     maxima: tuple[tuple[int, float], ...]
 
     def spread(self, intermediate: list[float], size: float) -> float:
-        """How wide its bounds are, about, if those of earlier nodes are as wide as ``known``, of numbers ``size``."""
+        """About how wide its bounds are where earlier nodes' are as wide as ``intermediate``, of numbers ``size``."""
         total = 0.0
         for at, sum_ in self.rests:
             total += sum_ * intermediate[at]
@@ -308,7 +308,7 @@ class CostModel:
 
         Args:
             allowed: Products that they may take together.
-            known: How wide bounds of the first nodes are.
+            intermediate: How wide bounds of the first nodes are.
             size: What numbers of nodes are about.
             bounded: `CostModel.bounded`, as far as it is known better.
             near: `RefinementPlan.step` of a plan that was made before; only plans like it are compared.

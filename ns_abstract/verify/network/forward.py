@@ -24,7 +24,7 @@ class ForwardPass:
     """Propagates forms through the nodes in order and refines intermediate bounds.
 
     Args:
-        known: What is known, to begin with of the image alone.
+        intermediate: What is known, to begin with of the image alone.
         propagation, pooling: Pass forms through a node.
         selection: Bounds its inputs better before.
         schedule: Learns how wide bounds are.

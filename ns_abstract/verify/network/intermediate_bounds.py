@@ -33,15 +33,15 @@ class IntermediateBounds:
         count, d: Cells m and parameters d.
         single: Whether the network's evaluation in float32 is bounded.
         image, columns: The image as planes, and as rows are bounded on it.
-        vacant: [m] cells without an image that has the signs assumed.
+        infeasible: [m] cells without an image that has the signs assumed.
         flush: [m] what flushes to zero may lose on the way of any row.
-        passages: What rows take on their way; rows of outputs take the last, the others the first.
+        relaxations: What rows take on their way; rows of outputs take the last, the others the first.
         folded: Nodes whose rounding is in that of their only reader.
         forms: By node: what is known of it, while other nodes read it.
         stops: By node: what rows may stop at.
-        open: By node: units whose lower lines may have other slopes.
-        held: By cell and node: what rows take of signs that are assumed.
-        offered: By node: lines with slopes of another cell's rows.
+        unstable: By node: units whose lower lines may have other slopes.
+        split: By cell and node: what rows take of signs that are assumed.
+        reused_relaxations: By node: lines with slopes of another cell's rows.
     """
 
     def __init__(

@@ -45,7 +45,7 @@ class MaxPoolPropagation:
     """Propagates forms through max pooling and bounds differences of its inputs.
 
     Args:
-        known: What is known so far; rows that pass the maxima find their planes there.
+        intermediate: What is known so far; rows that pass the maxima find their planes there.
         backward: Passes rows of differences back over it.
         schedule: What rows cost.
         sharing: Whose winners are followed.

@@ -18,7 +18,7 @@ class NeuronBounds:
     """Bounds chosen neurons of a node by backward passes of their own.
 
     Args:
-        known: What is known so far.
+        intermediate: What is known so far.
         backward: Passes rows back over it.
         schedule: What rows cost.
         sharing: Takes notice of the rows.

@@ -30,7 +30,7 @@ class NeuronSelection:
     """Chooses the neurons whose bounds are refined; plays no part in soundness.
 
     Args:
-        known: What is known so far.
+        neuron_bounds: What is known so far.
         intermediate: Bounds the numbers that are chosen.
         schedule: What rows cost, and how many of them a deep network is worth.
         sharing: What other cells say of a node before.

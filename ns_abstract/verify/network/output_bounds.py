@@ -33,7 +33,7 @@ class OutputRows:
     """Bounds linear functions of the outputs once all intermediate bounds are there.
 
     Args:
-        known: What is known of the nodes.
+        intermediate: What is known of the nodes.
         backward: Passes rows back over it.
         slope_steps: As in `ns_abstract.verify.network.bound_outputs`.
     """

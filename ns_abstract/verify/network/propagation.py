@@ -38,7 +38,7 @@ class ForwardPropagation:
     """Propagates forms through single nodes.
 
     Args:
-        known: What is known so far; rows that pass the nodes find lines and rounding there.
+        intermediate: What is known so far; rows that pass the nodes find lines and rounding there.
         sharing: References, sizes and slopes of other cells.
         chooses: Whether rows of outputs choose slopes of their own (N14).
     """

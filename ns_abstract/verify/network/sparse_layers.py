@@ -209,7 +209,6 @@ class TransposedConvolution(Weighted):
         offset: [Cout] float64 or None.
         stride, dilation: (rows, columns).
         pads: top, left; cut from the result.
-        more: Rows and columns that the result has at its end besides.
         groups: As in ONNX.
     """
 
