@@ -5,6 +5,8 @@ The public names; each is imported when it is first used.
 
 from __future__ import annotations
 
+import sys
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 from ns_abstract.io import version as _version
@@ -64,10 +66,19 @@ def __getattr__(name: str) -> object:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     from importlib import import_module
 
-    home = import_module(f"{__name__}.{_HOME[name]}")
-    # all of them: importing a folder of the same name (reach) has put that there
-    globals().update({entry: getattr(home, entry) for entry in _HOMES[_HOME[name]]})
+    globals()[name] = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
     return globals()[name]
+
+
+class _Interface(ModuleType):
+    """This package; importing a folder of the same name as a function (check, reach) does not take its place."""
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if not (name in _HOME and isinstance(value, ModuleType)):
+            super().__setattr__(name, value)
+
+
+sys.modules[__name__].__class__ = _Interface
 
 
 def __dir__() -> list[str]:

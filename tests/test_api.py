@@ -372,8 +372,13 @@ def test_import_is_light() -> None:
 
 @pytest.mark.slow
 def test_a_function_is_not_hidden_by_the_folder_of_its_name() -> None:
-    code = "from ns_abstract import ReachResult; from ns_abstract import reach; reach.__call__"
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+    lines = (
+        "from ns_abstract import ReachResult; from ns_abstract import reach; reach.__call__",
+        "import ns_abstract.reach.loop, ns_abstract as nsa; nsa.reach.__call__",
+        "import ns_abstract.check.audit, ns_abstract as nsa; nsa.check.__call__",
+    )
+    for code in lines:
+        subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
 
 
 def test_version_is_that_of_the_package() -> None:

@@ -22,7 +22,6 @@ from scene_files import ply
 
 import ns_abstract as nsa
 from ns_abstract.api.checking import check
-from ns_abstract.api.reaching import reach
 from ns_abstract.check.fields import CheckedField
 from ns_abstract.check.forms import FirstOrderForm
 from ns_abstract.check.inputs import BadInput, read_poses, read_scene
@@ -264,7 +263,7 @@ def test_a_loop_is_proved_again_and_other_sets_are_not(tmp_path: Path) -> None:
     del about["goal"]
     loop.write_text(json.dumps(about))
     out = tmp_path / "out"
-    reach(nsa.load_scene(config), loop, time_budget=60.0, output_dir=out)
+    nsa.reach(nsa.load_scene(config), loop, time_budget=60.0, output_dir=out)
     file = out / "report.json"
     document = json.loads(file.read_text())
     document["settings"] |= {"load_config": str(config), "loop": str(loop)}
