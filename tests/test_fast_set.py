@@ -13,8 +13,8 @@ TESTS = Path(__file__).resolve().parent
 FILES = sorted(path.name for path in TESTS.glob("test_*.py"))
 #: Of one whole session of a user each, which is slow or nothing.
 WHOLE = {"test_browser.py", "test_tutorial.py"}
-#: Sources whose planted faults show in a certified loop, or in pictures of gsplat's kernels, alone: seconds.
-LOOPS = {"api/loop_job.py", "methods/splat/drawable.py", "reach/film.py"}
+#: Sources whose planted faults show in a certified loop alone, which takes seconds.
+LOOPS = {"api/loop_job.py", "reach/film.py"}
 
 
 @cache

@@ -102,7 +102,7 @@ DRAWN = {
 }
 
 
-@pytest.mark.slow
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("case", DRAWN)
 def test_gaussians_that_would_be_drawn_are_left_out_where_that_is_asked_for(tmp_path: Path, case: str) -> None:
     from ns_abstract.cli.export import Ply, export
