@@ -23,7 +23,7 @@ from scene_files import ply
 import ns_abstract as nsa
 from ns_abstract.api.checking import check
 from ns_abstract.check.fields import CheckedField
-from ns_abstract.check.forms import FirstOrderForm
+from ns_abstract.check.forms import Affine
 from ns_abstract.check.inputs import BadInput, read_poses, read_scene
 from ns_abstract.check.networks import CheckedNetwork
 from ns_abstract.check.poses import CheckedCamera, Poses
@@ -99,7 +99,7 @@ def test_networks_are_enclosed(radius: float, tmp_path: Path) -> None:
     session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
     c, g = rng.random((1, 3, 8, 8), np.float32).astype(np.float64), radius * rng.normal(size=(2, 1, 3, 8, 8))
     # what rounding the input to float32 moves it by is part of the set
-    form = FirstOrderForm(c, g, np.full(c.shape, 0.1 * radius + 4e-7))
+    form = Affine(c, g, np.full(c.shape, 0.1 * radius + 4e-7))
     network, exact = CheckedNetwork(file, None, FLOAT), CheckedNetwork(file, None, 0.0)
     rows = torch.tensor([[1.0, -1.0, 0.0], [0.0, 0.5, 2.0]], dtype=torch.float64)
     outputs, least, most = network.outputs(form), network.least(form, rows), -network.least(form, -rows)
@@ -122,7 +122,7 @@ def test_a_float32_network_leaves_the_exact_one(tmp_path: Path) -> None:
     file, c = pooled(tmp_path / "net.onnx"), np.random.default_rng(3).random((64, 3, 8, 8)).astype(np.float32)
     session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
     y = np.asarray(session.run(None, {"image": c})[0], np.float64)
-    form = FirstOrderForm(c.astype(np.float64), np.zeros((0, *c.shape)), np.zeros(c.shape))
+    form = Affine(c.astype(np.float64), np.zeros((0, *c.shape)), np.zeros(c.shape))
     for unit, holds in ((FLOAT, True), (0.0, False)):
         low, high = CheckedNetwork(file, None, unit).outputs(form).range()
         assert bool(((low <= y) & (y <= high)).all()) == holds
@@ -318,7 +318,7 @@ def test_neurons_that_bend_are_enclosed() -> None:
     from ns_abstract.check.fields import _Zonotope
 
     rng = np.random.default_rng(0)
-    form = FirstOrderForm(rng.normal(size=(1, 2, 5)), 0.3 * rng.normal(size=(2, 1, 2, 5)), 0.1 * rng.random((1, 2, 5)))
+    form = Affine(rng.normal(size=(1, 2, 5)), 0.3 * rng.normal(size=(2, 1, 2, 5)), 0.1 * rng.random((1, 2, 5)))
     weight, bias = rng.normal(size=(6, 5)), rng.normal(size=6)
     found = _Zonotope.of(form).layer(weight, bias).bent().layer(weight[:, :5].T @ np.eye(6)[:6, :6], bias[:5]).form(2)
     for _ in range(200):

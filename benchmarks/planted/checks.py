@@ -10,7 +10,7 @@ CHECKS = (
     Fault(
         "checker: squares forget what is quadratic",
         _FORMS,
-        "FirstOrderForm.square",
+        "Affine.square",
         "0.5 * a * a",
         "0.0 * a",
         "test_check.py::test_forms_contain_exact_values[square]",
@@ -18,7 +18,7 @@ CHECKS = (
     Fault(
         "checker: functions are taken to be straight",
         _FORMS,
-        "FirstOrderForm.composed",
+        "Affine.composed",
         "np.maximum(high, 0.0) * (w * w)",
         "0.0 * w",
         "test_check.py::test_forms_contain_exact_values[exponential]",

@@ -2,16 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 
-from ns_abstract.check.forms import FirstOrderForm, U, total
+from ns_abstract.check.forms import Affine, Array, U, total
 from ns_abstract.check.poses import CameraForms, CheckedCamera
 from ns_abstract.check.splats import from_the_back, wide
-
-Array = Any
 
 #: Neurons of a layer and sample that keep a symbol of their own where they may bend; boxes that are looked at together.
 SYMBOLS, TOGETHER = 256, 4
@@ -46,7 +42,7 @@ class CheckedField:
         widths = self.base[0][0].shape[1], self.head[0][0].shape[1] - self.base[-1][0].shape[0]
         self.counts = tuple(((w - 3) // 6, m) for w, m in zip(widths, (8.0, 4.0), strict=True))
 
-    def pixels(self, cam: CheckedCamera, view: CameraForms, pixel: tuple[Array, Array]) -> FirstOrderForm:
+    def pixels(self, cam: CheckedCamera, view: CameraForms, pixel: tuple[Array, Array]) -> Affine:
         """Colours [B, 3] before the clamp of one pixel over each of B boxes."""
         ray = ((pixel[1] + 0.5 - cam.cx) / cam.fx, -(pixel[0] + 0.5 - cam.cy) / cam.fy, -np.ones(len(pixel[0])))
         along = [total(e * v for e, v in zip(row, ray, strict=True)) for row in view.turn]
@@ -64,9 +60,9 @@ class CheckedField:
             some = [[e.of(lambda a, k=k: a[..., k : k + TOGETHER, :]) for e in es] for es in (places, along)]
             with np.errstate(all="ignore"):
                 parts.append(self._ray(some[0], some[1], lengths))
-        return FirstOrderForm(*(np.concatenate([getattr(p, name) for p in parts], axis=-2) for name in ("c", "g", "r")))
+        return Affine(*(np.concatenate([getattr(p, name) for p in parts], axis=-2) for name in ("c", "g", "r")))
 
-    def _ray(self, places: list[FirstOrderForm], along: list[FirstOrderForm], lengths: Array) -> FirstOrderForm:
+    def _ray(self, places: list[Affine], along: list[Affine], lengths: Array) -> Affine:
         d, (position, direction) = (
             len(places[0].g),
             (_encoded(e, *n) for e, n in zip((places, along), self.counts, strict=True)),
@@ -98,14 +94,14 @@ class CheckedField:
         return from_the_back(alpha, color, np.ones(alpha.c.shape, bool), np.array(self.background), 0.0)
 
 
-def _encoded(x: list[FirstOrderForm], count: int, most: float) -> FirstOrderForm:
+def _encoded(x: list[Affine], count: int, most: float) -> Affine:
     """Sines and cosines of three coordinates [B, S], coordinate outside and frequency inside, and the coordinates."""
     # the float32 powers that nerfstudio computes
     frequencies = (2.0 ** torch.linspace(0.0, most, count)).double().tolist()
     angles = [wide(e) * (2.0 * np.pi * f) for e in x for f in frequencies]
     waves = [e.sine() for e in angles]
     parts = [*(s for s, _ in waves), *(c for _, c in waves), *(wide(e) for e in x)]
-    return FirstOrderForm(*(np.concatenate([getattr(p, name) for p in parts], axis=-1) for name in ("c", "g", "r")))
+    return Affine(*(np.concatenate([getattr(p, name) for p in parts], axis=-1) for name in ("c", "g", "r")))
 
 
 class _Zonotope:
@@ -115,7 +111,7 @@ class _Zonotope:
         self.c, self.g, self.r = c, g, r
 
     @classmethod
-    def of(cls, form: FirstOrderForm) -> _Zonotope:
+    def of(cls, form: Affine) -> _Zonotope:
         own = np.eye(form.c.shape[-1])[:, None, None] * form.r
         return cls(form.c, np.concatenate([form.g, own]), 0.0 * form.r)
 
@@ -159,8 +155,7 @@ class _Zonotope:
             return _Zonotope(c, np.concatenate([slope * self.g, own]), r)
         return _Zonotope(c, slope * self.g, r)
 
-    def form(self, d: int) -> FirstOrderForm:
+    def form(self, d: int) -> Affine:
         """Without the symbols behind the first d."""
-        return FirstOrderForm(
-            self.c, self.g[:d], (np.abs(self.g[d:]).sum(axis=0) + self.r) * (1.0 + 2.0 * U * (len(self.g) + 8))
-        )
+        radius = np.abs(self.g[d:]).sum(axis=0) + self.r
+        return Affine(self.c, self.g[:d], radius * (1.0 + 2.0 * U * (len(self.g) + 8)))

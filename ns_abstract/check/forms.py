@@ -18,7 +18,7 @@ FUNCTION = 8.0
 Array = Any
 
 
-class FirstOrderForm:
+class Affine:
     """Arrays ``c`` [...], ``g`` [d, ...] and ``r`` [...] of equal trailing shape; several functions side by side."""
 
     __slots__ = ("c", "g", "r")
@@ -27,7 +27,7 @@ class FirstOrderForm:
         self.c, self.g, self.r = c, g, r
 
     @classmethod
-    def constant(cls, c: Array, like: FirstOrderForm, r: Array = 0.0) -> FirstOrderForm:
+    def constant(cls, c: Array, like: Affine, r: Array = 0.0) -> Affine:
         """``c`` within ``r``, of the shape of ``like``."""
         shape = like.c.shape
         return cls(np.broadcast_to(np.float64(c), shape), np.zeros_like(like.g), np.broadcast_to(np.float64(r), shape))
@@ -51,29 +51,29 @@ class FirstOrderForm:
         """The largest absolute value."""
         return np.abs(self.c) + self.width
 
-    def wider(self, r: Array) -> FirstOrderForm:
+    def wider(self, r: Array) -> Affine:
         """The form with an error that is larger by ``r``."""
-        return FirstOrderForm(self.c, self.g, (self.r + r) * (1.0 + 2.0 * U))
+        return Affine(self.c, self.g, (self.r + r) * (1.0 + 2.0 * U))
 
-    def __neg__(self) -> FirstOrderForm:
-        return FirstOrderForm(-self.c, -self.g, self.r)
+    def __neg__(self) -> Affine:
+        return Affine(-self.c, -self.g, self.r)
 
-    def __add__(self, other: FirstOrderForm | float | Array) -> FirstOrderForm:
-        if not isinstance(other, FirstOrderForm):
+    def __add__(self, other: Affine | float | Array) -> Affine:
+        if not isinstance(other, Affine):
             c = self.c + other
-            return FirstOrderForm(c, self.g, self.r + (2.0 * U * np.abs(c) + TINY))
+            return Affine(c, self.g, self.r + (2.0 * U * np.abs(c) + TINY))
         c, g = self.c + other.c, self.g + other.g
         size = np.abs(c) + np.abs(g).sum(axis=0)
-        return FirstOrderForm(c, g, (self.r + other.r + 4.0 * U * size) * (1.0 + 4.0 * U) + TINY)
+        return Affine(c, g, (self.r + other.r + 4.0 * U * size) * (1.0 + 4.0 * U) + TINY)
 
-    def __sub__(self, other: FirstOrderForm | float | Array) -> FirstOrderForm:
+    def __sub__(self, other: Affine | float | Array) -> Affine:
         return self + (-other)
 
-    def __mul__(self, other: FirstOrderForm | float | Array) -> FirstOrderForm:
-        if not isinstance(other, FirstOrderForm):
+    def __mul__(self, other: Affine | float | Array) -> Affine:
+        if not isinstance(other, Affine):
             c, g = self.c * other, self.g * other
             size = np.abs(c) + np.abs(g).sum(axis=0)
-            return FirstOrderForm(c, g, (self.r * np.abs(other) + 4.0 * U * size) * (1.0 + 4.0 * U) + TINY)
+            return Affine(c, g, (self.r * np.abs(other) + 4.0 * U * size) * (1.0 + 4.0 * U) + TINY)
         # (g . s)(h . s) has g_k h_k s_k^2 with s_k^2 in [0, 1]
         half = 0.5 * self.g * other.g
         a, b = self.slope, other.slope
@@ -82,19 +82,19 @@ class FirstOrderForm:
         g = self.c * other.g + other.c * self.g
         # sum |half| is at most half of a b, so that the difference keeps half of it
         r = (a * b - np.abs(half).sum(axis=0)) + p * other.r + q * self.r + self.r * other.r + 32.0 * U * p * q
-        return FirstOrderForm(c, g, r * (1.0 + 32.0 * U) + TINY)
+        return Affine(c, g, r * (1.0 + 32.0 * U) + TINY)
 
     __radd__, __rmul__ = __add__, __mul__
 
-    def square(self) -> FirstOrderForm:
+    def square(self) -> Affine:
         """The form of the square."""
         a = self.slope
         p, half = np.abs(self.c) + a, 0.5 * a * a
         # (g . s)^2 lies in [0, a^2]
         r = half + self.r * (2.0 * p + self.r) + 32.0 * U * p * p
-        return FirstOrderForm(self.c * self.c + half, 2.0 * self.c * self.g, r * (1.0 + 32.0 * U) + TINY)
+        return Affine(self.c * self.c + half, 2.0 * self.c * self.g, r * (1.0 + 32.0 * U) + TINY)
 
-    def composed(self, f: Array, slope: Array, low: Array, high: Array, bad: Array = False) -> FirstOrderForm:
+    def composed(self, f: Array, slope: Array, low: Array, high: Array, bad: Array = False) -> Affine:
         """The form of a function with value ``f`` and slope at the centre, half its second derivative in [low, high].
 
         The remainder of Taylor's formula is ``t^2`` times half the second derivative, ``t^2`` in [0, width^2]. The
@@ -106,30 +106,30 @@ class FirstOrderForm:
         r = (np.abs(slope) * self.r + 0.5 * (high - low) + 4.0 * FUNCTION * U * size) * (1.0 + 32.0 * U) + TINY
         bad = bad | ~(np.isfinite(r) & np.isfinite(f))
         f = f + 0.5 * (high + low)
-        return FirstOrderForm(np.where(bad, 0.0, f), np.where(bad, 0.0, slope * self.g), np.where(bad, np.inf, r))
+        return Affine(np.where(bad, 0.0, f), np.where(bad, 0.0, slope * self.g), np.where(bad, np.inf, r))
 
-    def reciprocal(self) -> FirstOrderForm:
+    def reciprocal(self) -> Affine:
         """1 / x; unbounded where the form is not surely above 0."""
         low, high = self.range()
         bad = ~(low > 0.0)
         low, high, c = (np.where(bad, 1.0, v) for v in (low, high, self.c))
         return self.composed(1.0 / c, -1.0 / (c * c), high**-3.0, low**-3.0 * (1.0 + 16.0 * U), bad)
 
-    def root(self) -> FirstOrderForm:
+    def root(self) -> Affine:
         """The square root; unbounded where the form is not surely above 0."""
         low = self.range()[0]
         bad = ~(low > 0.0)
         low, f = np.where(bad, 1.0, low), np.sqrt(np.where(bad, 1.0, self.c))
         return self.composed(f, 0.5 / f, -0.125 * low**-1.5 * (1.0 + 32.0 * U), 0.0 * f, bad)
 
-    def exp(self) -> FirstOrderForm:
+    def exp(self) -> Affine:
         """The exponential."""
         high = self.range()[1]
         f = np.exp(np.minimum(self.c, 700.0))
         top = 0.5 * np.exp(np.minimum(high, 700.0)) * (1.0 + 16.0 * FUNCTION * U)
         return self.composed(f, f, 0.0 * f, top, ~(high <= 690.0))
 
-    def sine(self) -> tuple[FirstOrderForm, FirstOrderForm]:
+    def sine(self) -> tuple[Affine, Affine]:
         """Sine and cosine."""
         s, c = np.sin(self.c), np.cos(self.c)
         half, room = 0.5 * (1.0 + 8.0 * U), 0.5 * self.width + 1e-15
@@ -138,40 +138,38 @@ class FirstOrderForm:
         a, b = (self.composed(f, slope, *end) for f, slope, end in zip((s, c), (c, -s), ends, strict=True))
         return a, b
 
-    def boxed(self, where: Array, low: Array, high: Array) -> FirstOrderForm:
+    def boxed(self, where: Array, low: Array, high: Array) -> Affine:
         """The form, but the interval [low, high] ``where`` that is asked for."""
         middle = 0.5 * (low + high)
         radius = np.maximum(high - middle, middle - low) * (1.0 + 4.0 * U) + TINY
-        return FirstOrderForm(
-            np.where(where, middle, self.c), np.where(where, 0.0, self.g), np.where(where, radius, self.r)
-        )
+        return Affine(np.where(where, middle, self.c), np.where(where, 0.0, self.g), np.where(where, radius, self.r))
 
-    def clamped(self, low: float | Array, high: float | Array) -> FirstOrderForm:
+    def clamped(self, low: float | Array, high: float | Array) -> Affine:
         """The form of the value limited to [low, high]: itself where no limit is met, else an interval."""
         least, most = self.range()
         met = ~((least >= low) & (most <= high))
         return self.boxed(met, np.clip(least, low, high), np.clip(most, low, high))
 
-    def of(self, pick: Any) -> FirstOrderForm:
+    def of(self, pick: Any) -> Affine:
         """The form of what ``pick`` makes of its arrays, whose axes it must count from the last one."""
-        return FirstOrderForm(pick(self.c), pick(self.g), pick(self.r))
+        return Affine(pick(self.c), pick(self.g), pick(self.r))
 
 
-def parameters(middle: Array, half: Array) -> list[FirstOrderForm]:
+def parameters(middle: Array, half: Array) -> list[Affine]:
     """The d parameters over the boxes ``middle`` +- ``half`` [B, d], as forms [B]; a constant if there is none."""
     d = middle.shape[1]
     g = np.eye(d)[:, :, None] * half.T[:, None]
     room = 4.0 * U * (np.abs(middle) + half)
-    forms = [FirstOrderForm(middle[:, k], g[:, k], room[:, k]) for k in range(d)]
-    return forms or [FirstOrderForm(np.zeros(len(middle)), np.zeros((0, len(middle))), np.zeros(len(middle)))]
+    forms = [Affine(middle[:, k], g[:, k], room[:, k]) for k in range(d)]
+    return forms or [Affine(np.zeros(len(middle)), np.zeros((0, len(middle))), np.zeros(len(middle)))]
 
 
-def product(a: list[list[FirstOrderForm]], b: list[list[FirstOrderForm]]) -> list[list[FirstOrderForm]]:
+def product(a: list[list[Affine]], b: list[list[Affine]]) -> list[list[Affine]]:
     """Matrix product of forms."""
     return [[total(row[k] * b[k][j] for k in range(len(b))) for j in range(len(b[0]))] for row in a]
 
 
-def total(items: Any) -> FirstOrderForm:
+def total(items: Any) -> Affine:
     """Sum of forms."""
     first, *rest = items
     for item in rest:
@@ -179,7 +177,7 @@ def total(items: Any) -> FirstOrderForm:
     return first
 
 
-def rotation(axis: Array, angle: FirstOrderForm, error: float = 0.0) -> list[list[FirstOrderForm]]:
+def rotation(axis: Array, angle: Affine, error: float = 0.0) -> list[list[Affine]]:
     """Right-handed rotation about the unit vector ``axis``: I + sin K + (1 - cos) K^2, entries within ``error``."""
     x, y, z = (float(v) for v in axis)
     k = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -188,6 +186,6 @@ def rotation(axis: Array, angle: FirstOrderForm, error: float = 0.0) -> list[lis
     return [[(s * k[i, j] + rest * kk[i, j] + one[i, j]).wider(error) for j in range(3)] for i in range(3)]
 
 
-def fixed(matrix: Array, like: FirstOrderForm, r: float = 0.0) -> list[list[FirstOrderForm]]:
+def fixed(matrix: Array, like: Affine, r: float = 0.0) -> list[list[Affine]]:
     """A matrix of numbers as forms."""
-    return [[FirstOrderForm.constant(v, like, r) for v in row] for row in np.atleast_2d(matrix)]
+    return [[Affine.constant(v, like, r) for v in row] for row in np.atleast_2d(matrix)]

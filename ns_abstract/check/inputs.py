@@ -273,13 +273,9 @@ def given_set(settings: dict[str, Any], moved: Path | None) -> dict[str, Any] | 
     """The perturbation object that the options name; None: the path's own."""
     axes = {"translation": SHIFTS, "rotation": tuple(TURNS)}
     if any(settings.get(name) is not None for name in axes):
-        perturbation: dict[str, Any] = {
-            name: settings.get(name) for name in ("units", "angle_units") if settings.get(name)
-        }
+        units: dict[str, Any] = {name: settings.get(name) for name in ("units", "angle_units") if settings.get(name)}
         radii = {name: settings[name] for name in axes if settings.get(name) is not None}
-        return perturbation | {
-            n: dict(zip(axes[n], v if len(v) == 3 else list(v) * 3, strict=True)) for n, v in radii.items()
-        }
+        return units | {n: dict(zip(axes[n], v if len(v) == 3 else list(v) * 3, strict=True)) for n, v in radii.items()}
     file = moved or settings.get("perturbation_filename")
     if file is None:
         return None

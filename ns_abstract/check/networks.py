@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ns_abstract.check.forms import FirstOrderForm, U
+from ns_abstract.check.forms import Affine, U
 
 #: Bytes of a file that are read, and neurons of a layer that are bounded again, at most.
 _MOST_BYTES, MOST_ROWS = 1 << 30, 4096
@@ -89,9 +89,7 @@ class CheckedNetwork:
         own = (layer.terms + 4.0) * self.unit if layer.terms else 0.0
         return own + 4.0 * U * (math.prod(shape[1:]) + 2.0 * layer.terms + 32.0)
 
-    def forward(
-        self, picture: FirstOrderForm, closely: bool = True
-    ) -> tuple[dict[str, NodeBounds], dict[str, tuple[Tensor, Tensor]]]:
+    def forward(self, picture: Affine, closely: bool = True) -> tuple[dict[str, NodeBounds], dict[str, Any]]:
         """What is known of all tensors over pictures [B, C, H, W], and the ends of ReLUs' inputs.
 
         Args:
@@ -128,12 +126,12 @@ class CheckedNetwork:
             known[layer.output] = NodeBounds(c, g, r, size)
         return known, ends
 
-    def outputs(self, picture: FirstOrderForm) -> FirstOrderForm:
+    def outputs(self, picture: Affine) -> Affine:
         """The outputs [B, n] as forms."""
         c, g, r, _ = self.forward(picture)[0][self.output]
-        return FirstOrderForm(c.flatten(1).numpy(), g.flatten(2).numpy(), r.flatten(1).numpy())
+        return Affine(c.flatten(1).numpy(), g.flatten(2).numpy(), r.flatten(1).numpy())
 
-    def least(self, picture: FirstOrderForm, rows: Tensor) -> Tensor:
+    def least(self, picture: Affine, rows: Tensor) -> Tensor:
         """Lower bounds [B, m] of ``rows`` [m, n] times the outputs over pictures [B, C, H, W]."""
         return self._back(*self.forward(picture), self.output, rows)
 

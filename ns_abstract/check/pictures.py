@@ -7,12 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ns_abstract.check.forms import FirstOrderForm
+from ns_abstract.check.forms import Affine, Array
 from ns_abstract.check.poses import Poses
 from ns_abstract.check.results import StoredCells
 from ns_abstract.check.splats import FLOAT, ActivatedScene, meeting, pixels, reaches
 
-Array = Any
 Verdict = tuple[bool | None, str, dict[str, Any]]
 
 #: Boxes times Gaussians that are looked at together, and boxes of one claim before it is given up.
@@ -39,7 +38,7 @@ class ClaimedBounds(NamedTuple):
     high: Array
     planes: tuple[tuple[Array, float], ...]
 
-    def excess(self, centre: Array, half: Array, form: FirstOrderForm) -> tuple[Array, Array]:
+    def excess(self, centre: Array, half: Array, form: Affine) -> tuple[Array, Array]:
         """By how much pictures may lie [B] below the lower and above the upper bounds, over boxes [B, d]."""
         c, g, r, found = form.c, form.g, form.r, []
         for side, (plane, constant) in zip((1.0, -1.0), self.planes, strict=True):
@@ -165,7 +164,7 @@ class Picture:
 
     def _forms(
         self, low: Array, high: Array, index: Array, claim: PixelClaim, unit: float
-    ) -> tuple[FirstOrderForm, Array, Array]:
+    ) -> tuple[Affine, Array, Array]:
         view = self.poses.view(low, high)
         pixel = np.full(len(low), claim.row), np.full(len(low), claim.column)
         if isinstance(self.scene, ActivatedScene):
@@ -185,7 +184,7 @@ class Picture:
         hopeless = (np.maximum(*bounds.excess(points, zero, form)) > 0.0).any()
         for side, sign in (("lower", 1.0), ("upper", -1.0)):
             # the least picture above the upper bound, the largest below the lower one
-            shifted = FirstOrderForm(form.c + sign * 2.0 * error, 0.0 * form.g, error)
+            shifted = Affine(form.c + sign * 2.0 * error, 0.0 * form.g, error)
             out = bounds.excess(points, zero, shifted)[side == "upper"] - 4e-13 * (1.0 + np.abs(form.c))
             k = int(np.argmax(np.where(np.isfinite(out) & np.isfinite(error), out, -1.0)))
             if np.isfinite(out[k]) and out[k] > 0.0 and np.isfinite(error[k]):

@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
-from ns_abstract.check.forms import FirstOrderForm, U, fixed, parameters, product, rotation
-
-Array = Any
+from ns_abstract.check.forms import Affine, Array, U, fixed, parameters, product, rotation
 
 SHIFTS, TURNS = ("x", "y", "z"), {"yaw": (0.0, 1.0, 0.0), "pitch": (1.0, 0.0, 0.0), "roll": (0.0, 0.0, 1.0)}
 #: Rounding of what is computed once from keyframes and axes, by entry.
@@ -49,22 +46,22 @@ class Poses:
     orbit: tuple[Array, Array] | None = None
     following: Array | None = None
 
-    def given(self, low: Array, high: Array) -> dict[str, FirstOrderForm]:
+    def given(self, low: Array, high: Array) -> dict[str, Affine]:
         """The parameters by name over the boxes [B, d]."""
         middle = 0.5 * (low + high)
         free = parameters(middle, np.maximum(high - middle, middle - low) * (1.0 + 4.0 * U))
-        found = {"": FirstOrderForm.constant(0.0, free[0])} | dict(zip(self.names, free, strict=False))
-        return found | {name: FirstOrderForm.constant(v, free[0]) for name, v in self.values.items()}
+        found = {"": Affine.constant(0.0, free[0])} | dict(zip(self.names, free, strict=False))
+        return found | {name: Affine.constant(v, free[0]) for name, v in self.values.items()}
 
     def view(self, low: Array, high: Array) -> CameraForms:
         """The cameras over the boxes [B, d]."""
         return CameraForms(*self.posed(self.given(low, high)), self.camera.pose)
 
-    def posed(self, p: dict[str, FirstOrderForm]) -> tuple[list[list[FirstOrderForm]], list[FirstOrderForm]]:
+    def posed(self, p: dict[str, Affine]) -> tuple[list[list[Affine]], list[Affine]]:
         """Camera-to-world rotation and position at the parameters."""
         zero, pose = p[""], self.camera.pose
         if self.following is None:
-            turn, place = fixed(pose[:, :3], zero), [FirstOrderForm.constant(v, zero) for v in pose[:, 3]]
+            turn, place = fixed(pose[:, :3], zero), [Affine.constant(v, zero) for v in pose[:, 3]]
         else:
             first, last = _nearest_rotation(pose[:, :3]), _nearest_rotation(self.following[:, :3])
             axis, angle = _axis_angle(first.T @ last)
@@ -96,7 +93,7 @@ class CameraForms:
         stretch: By how much the keyframe's matrix is no rotation.
     """
 
-    def __init__(self, turn: list[list[FirstOrderForm]], place: list[FirstOrderForm], keyframe: Array) -> None:
+    def __init__(self, turn: list[list[Affine]], place: list[Affine], keyframe: Array) -> None:
         square = keyframe[:, :3] @ keyframe[:, :3].T
         self.stretch = np.full(len(place[0].c), float(np.linalg.norm(square - np.eye(3))) + _BASE)
         # OpenGL to OpenCV: y and z change their sign

@@ -12,10 +12,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ns_abstract.check.forms import TINY, FirstOrderForm, U, total
+from ns_abstract.check.forms import TINY, Affine, Array, U, total
 from ns_abstract.check.poses import CameraForms, CheckedCamera
-
-Array = Any
 
 NEAR, FAR, BLUR, MARGIN, TILE = 0.01, 1e10, 0.3, 0.3, 16
 LEAST_ALPHA, STOP = 1.0 / 255.0, 1e-4
@@ -129,12 +127,12 @@ def meeting(ends: Array, row: int, column: int) -> Array:
     return np.flatnonzero((ends[:, 0] <= x) & (ends[:, 1] >= x) & (ends[:, 2] <= y) & (ends[:, 3] >= y))
 
 
-def wide(form: FirstOrderForm) -> FirstOrderForm:
+def wide(form: Affine) -> Affine:
     """Forms [B] as forms [B, 1]."""
     return form.of(lambda a: a[..., None])
 
 
-def _points(splats: ActivatedScene, view: CameraForms, index: Array, unit: float) -> list[FirstOrderForm]:
+def _points(splats: ActivatedScene, view: CameraForms, index: Array, unit: float) -> list[Affine]:
     """Camera coordinates [B, n] of the means.
 
     In float32 the pose is rounded, R C and R mu are sums of three: less than 8 units of |R| (|mu| + |C|).
@@ -152,9 +150,9 @@ def _points(splats: ActivatedScene, view: CameraForms, index: Array, unit: float
 class _PixelFragments(NamedTuple):
     """Alphas and depths [B, n] and colours [B, n, 3] of Gaussians, and which may show at all."""
 
-    alpha: FirstOrderForm
-    color: FirstOrderForm
-    depth: FirstOrderForm
+    alpha: Affine
+    color: Affine
+    depth: Affine
     shows: Array
     motion: Array
 
@@ -166,13 +164,13 @@ class ProjectedForms(NamedTuple):
     ``kappa`` the exponent's relative error there; ``color`` [B, n, 3].
     """
 
-    centre: list[FirstOrderForm]
-    axes: list[list[FirstOrderForm]]
-    squares: list[FirstOrderForm]
-    inverse: FirstOrderForm
-    opacity: FirstOrderForm
-    color: FirstOrderForm
-    depth: FirstOrderForm
+    centre: list[Affine]
+    axes: list[list[Affine]]
+    squares: list[Affine]
+    inverse: Affine
+    opacity: Affine
+    color: Affine
+    depth: Affine
     errors: list[Array]
     kappa: Array
 
@@ -182,7 +180,7 @@ class ProjectedForms(NamedTuple):
         def pick(part: Any) -> Any:
             if isinstance(part, list):
                 return [pick(e) for e in part]
-            return part.of(lambda a: a[..., 0, index]) if isinstance(part, FirstOrderForm) else part[0, index]
+            return part.of(lambda a: a[..., 0, index]) if isinstance(part, Affine) else part[0, index]
 
         rest = {name: pick(getattr(self, name)) for name in self._fields if name != "color"}
         return ProjectedForms(**rest, color=self.color.of(lambda a: a[..., 0, index, :]))
@@ -218,7 +216,7 @@ def projected(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, at:
         h = [(iz * f).size() * (1.0 + e.size()) for e, f in zip(slopes, (cam.fx, cam.fy), strict=True)]
         errors, kappa, error = _rounded(det, (mm, nn), h, sizes)
         flat, det = flat.wider(error), det.wider(error)
-    opacity = FirstOrderForm.constant(splats.opacity[at], z, 32.0 * U * splats.opacity[at])
+    opacity = Affine.constant(splats.opacity[at], z, 32.0 * U * splats.opacity[at])
     if splats.antialiased:
         opacity = opacity * _factor(flat, det, splats.rules.least_factor, unit)
     color = _colors(splats, view, at, z, unit)
@@ -262,7 +260,7 @@ def _fragments(
     return _PixelFragments(alpha, p.color, z, shows, motion)
 
 
-def _rounded(det: FirstOrderForm, squares: Any, h: list[Array], sizes: Array) -> tuple[list[Array], Array, Array]:
+def _rounded(det: Affine, squares: Any, h: list[Array], sizes: Array) -> tuple[list[Array], Array, Array]:
     """Errors in float32 of the covariance's entries (xx, yy, xy), of the exponent (relative) and of determinants.
 
     The covariance J R M M^T R^T J^T is a sum of products of factors that err by 12 (J), 2 (R) and 64 units of a scale
@@ -282,7 +280,7 @@ def _rounded(det: FirstOrderForm, squares: Any, h: list[Array], sizes: Array) ->
     return [ea, ec, eb], kappa, error
 
 
-def _factor(flat: FirstOrderForm, det: FirstOrderForm, least: float, unit: float) -> FirstOrderForm:
+def _factor(flat: Affine, det: Affine, least: float, unit: float) -> Affine:
     """The opacity's factor sqrt(max(0, det before / det after the blur)), not below ``least``."""
     (low, high), (dlow, dhigh) = flat.range(), det.range()
     room, limit = ROOM + 16.0 * unit, 1.0 if not unit else 1e3
@@ -322,15 +320,15 @@ def _tiles(cam: CheckedCamera, pixel: Any, centre: Any, squares: Any, unit: floa
     return maybe, certain
 
 
-def _colors(splats: ActivatedScene, view: CameraForms, at: Array, like: FirstOrderForm, unit: float) -> FirstOrderForm:
+def _colors(splats: ActivatedScene, view: CameraForms, at: Array, like: Affine, unit: float) -> Affine:
     """Colours [B, n, 3]."""
     sh = splats.sh[at]
     flat = like.of(lambda a: np.broadcast_to(a[..., None], (*a.shape, 3)))
     if splats.sigmoid:
         value = 1.0 / (1.0 + np.exp(-sh[..., 0, :]))
-        return FirstOrderForm.constant(value, flat, (32.0 * U + 16.0 * unit) * value)
+        return Affine.constant(value, flat, (32.0 * U + 16.0 * unit) * value)
     size = np.abs(sh[..., 0, :]) + 1.0
-    color = FirstOrderForm.constant(0.28209479177387814 * sh[..., 0, :] + 0.5, flat, (8.0 * U + 4.0 * unit) * size)
+    color = Affine.constant(0.28209479177387814 * sh[..., 0, :] + 0.5, flat, (8.0 * U + 4.0 * unit) * size)
     if splats.degree and np.any(sh[..., 1:, :]):
         (x, y, z), error = _directions(splats, view, at, unit)
         bands = [y * -0.4886025119029199, z * 0.4886025119029199, x * -0.4886025119029199]
@@ -356,9 +354,7 @@ def _colors(splats: ActivatedScene, view: CameraForms, at: Array, like: FirstOrd
     return color.clamped(0.0, np.inf)
 
 
-def _directions(
-    splats: ActivatedScene, view: CameraForms, at: Array, unit: float
-) -> tuple[list[FirstOrderForm], Array]:
+def _directions(splats: ActivatedScene, view: CameraForms, at: Array, unit: float) -> tuple[list[Affine], Array]:
     """Unit vectors from the camera to the means, world axes, and how far those in float32 may be from them.
 
     Version 1.6.0 takes -R^T t with the view matrix, which differs where a keyframe's rotation is not orthonormal.
@@ -373,7 +369,7 @@ def _directions(
     return [e * inverse for e in parts], np.where(np.isfinite(error), error, np.inf if unit else 0.0)
 
 
-def blended(f: _PixelFragments, background: Array, unit: float) -> tuple[FirstOrderForm, Array]:
+def blended(f: _PixelFragments, background: Array, unit: float) -> tuple[Affine, Array]:
     """The blended colours [B, 3] before the clamp, and which of the fragments [B, n] matter."""
     # those that do not show stand behind all others
     order = np.argsort(np.where(f.shows, f.depth.c, np.inf), axis=1, kind="stable")
@@ -419,13 +415,13 @@ def blended(f: _PixelFragments, background: Array, unit: float) -> tuple[FirstOr
         rest = 0.5 * (upper - lower) * (1.0 + ROOM) + 8.0 * U * (np.abs(form.c) + 1.0)
         middle = 0.5 * (lower + upper)
     bad = ~np.isfinite(rest)
-    form = FirstOrderForm(form.c + np.where(bad, 0.0, middle), form.g, form.r + np.where(bad, np.inf, rest))
+    form = Affine(form.c + np.where(bad, 0.0, middle), form.g, form.r + np.where(bad, np.inf, rest))
     keep = np.zeros((count, n), bool)
     np.put_along_axis(keep, order, (place[:, :-1] < end + 1) & shows, 1)
     return form, keep
 
 
-def _groups(depth: FirstOrderForm, shows: Array) -> tuple[Array, Array, Array]:
+def _groups(depth: Affine, shows: Array) -> tuple[Array, Array, Array]:
     """[B, n + 1] whether all in front of a place in the order is surely in front of all behind it; ranges of depth."""
     n = shows.shape[1]
     weight = shows / np.maximum(shows.sum(axis=1, keepdims=True), 1)
@@ -440,9 +436,7 @@ def _groups(depth: FirstOrderForm, shows: Array) -> tuple[Array, Array, Array]:
     return clean, low, high
 
 
-def from_the_back(
-    alpha: FirstOrderForm, color: FirstOrderForm, inside: Array, background: Array, unit: float
-) -> FirstOrderForm:
+def from_the_back(alpha: Affine, color: Affine, inside: Array, background: Array, unit: float) -> Affine:
     """The colours [B, 3] of fragments that are blended in the order of their centres.
 
     S' = S + alpha (C - S): errors of S are met by 1 - alpha, those of C by alpha. In float32 a fragment's light errs by
@@ -463,7 +457,7 @@ def from_the_back(
         r = (r + ra * (np.abs(d) + tilt) + s * tilt) * (1.0 + 16.0 * U) + 32.0 * U * size + TINY
         c, g = c + a * d, g + a * dg + da * d
     # what is outside of the colours is not known better than that
-    return FirstOrderForm(c, g, np.where(np.isfinite(r), r, np.inf)).wider((4.0 * n + 16.0) * unit * size)
+    return Affine(c, g, np.where(np.isfinite(r), r, np.inf)).wider((4.0 * n + 16.0) * unit * size)
 
 
 def _swaps(dlow: Array, dhigh: Array, inside: Array, most: Array, ah: Array, cl: Array, ch: Array) -> Any:
@@ -493,13 +487,9 @@ def _swaps(dlow: Array, dhigh: Array, inside: Array, most: Array, ah: Array, cl:
 
 
 def pixels(
-    splats: ActivatedScene,
-    cam: CheckedCamera,
-    view: CameraForms | ProjectedForms,
-    index: Array,
-    pixel: tuple[Array, Array],
-    unit: float = 0.0,
-) -> tuple[FirstOrderForm, Array, Array]:
+    splats: ActivatedScene, cam: CheckedCamera, view: CameraForms | ProjectedForms, index: Array,
+    pixel: tuple[Array, Array], unit: float = 0.0,
+) -> tuple[Affine, Array, Array]:  # fmt: skip
     """Colours [B, 3] before the clamp of one pixel over each of B boxes; which Gaussians matter [B, n]; their motion.
 
     The motion [d, B], in pixels, is what each parameter moves a Gaussian by at most, about.
@@ -518,24 +508,19 @@ def pixels(
         used = np.flatnonzero(f.shows.any(axis=0))
         if not len(used):
             plain = np.zeros((len(index), 3))
-            form = FirstOrderForm(
-                plain + splats.background, np.zeros((len(f.alpha.g), *plain.shape)), plain + 16.0 * unit
-            )
+            form = Affine(plain + splats.background, np.zeros((len(f.alpha.g), *plain.shape)), plain + 16.0 * unit)
             return form, f.shows, f.motion
         some = _PixelFragments(
-            f.alpha.of(lambda a: a[..., used]),
-            f.color.of(lambda a: a[..., used, :]),
-            f.depth.of(lambda a: a[..., used]),
-            f.shows[:, used],
-            f.motion,
-        )
+            f.alpha.of(lambda a: a[..., used]), f.color.of(lambda a: a[..., used, :]),
+            f.depth.of(lambda a: a[..., used]), f.shows[:, used], f.motion,
+        )  # fmt: skip
         form, keep = blended(some, splats.background, unit)
         kept = np.zeros(f.shows.shape, bool)
         kept[:, used] = keep
         return form, kept, f.motion
 
 
-def picture(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit: float) -> FirstOrderForm:
+def picture(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit: float) -> Affine:
     """The picture [H, W, 3] over one box of poses."""
     ends, columns, parts = reaches(splats, cam, view, unit), np.arange(cam.width), []
     inside = (ends[:, 0] <= cam.width) & (ends[:, 1] >= 0.0) & (ends[:, 2] <= cam.height) & (ends[:, 3] >= 0.0)
@@ -551,4 +536,4 @@ def picture(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit:
             place[: len(numbers)] = numbers
         part, pixel = whole.among(index), (np.full(cam.width, row), columns)
         parts.append(pixels(splats, cam, part, index, pixel, unit)[0].clamped(0.0, 1.0))
-    return FirstOrderForm(*(np.stack([getattr(p, name) for p in parts], axis=-3) for name in ("c", "g", "r")))
+    return Affine(*(np.stack([getattr(p, name) for p in parts], axis=-3) for name in ("c", "g", "r")))

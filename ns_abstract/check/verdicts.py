@@ -12,15 +12,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from ns_abstract.check.forms import FirstOrderForm, fixed, product, rotation, total
+from ns_abstract.check.forms import Affine, Array, fixed, product, rotation, total
 from ns_abstract.check.inputs import BadInput
 from ns_abstract.check.networks import CheckedNetwork
 from ns_abstract.check.pictures import FIRST, Verdict, divided, units
 from ns_abstract.check.poses import TURNS, CameraForms, CheckedCamera, Poses
 from ns_abstract.check.results import StoredCells
 from ns_abstract.check.splats import FLOAT, ActivatedScene, picture
-
-Array = Any
 
 #: Boxes whose pictures go through a network together.
 BATCH = 8
@@ -31,9 +29,7 @@ class _Verdicts(ABC):
 
     kinds: tuple[str, ...] = ("certified",)
 
-    def __init__(
-        self, cells: StoredCells, scene: Any, report: dict[str, Any], model: Path, about: dict[str, Any]
-    ) -> None:
+    def __init__(self, cells: StoredCells, scene: Any, report: dict[str, Any], model: Path, about: Any) -> None:
         self.cells, self.scene, self.units = cells, scene, units(scene, report)
         self.rows = [k for k, v in enumerate(cells.verdicts or []) if v[0] in self.kinds]
         self.count = len(self.rows)
@@ -75,10 +71,10 @@ class _Verdicts(ABC):
             width=int(width), height=int(height),
         )  # fmt: skip
 
-    def inputs(self, camera: CheckedCamera, views: list[CameraForms], unit: float) -> FirstOrderForm:
+    def inputs(self, camera: CheckedCamera, views: list[CameraForms], unit: float) -> Affine:
         """The network's inputs [B, 3, H, W] over boxes of poses, one view each."""
         parts = [picture(self.scene, camera, view, unit) for view in views]
-        image = FirstOrderForm(*(np.stack([getattr(p, name) for p in parts], axis=-4) for name in ("c", "g", "r")))
+        image = Affine(*(np.stack([getattr(p, name) for p in parts], axis=-4) for name in ("c", "g", "r")))
         image = image.of(lambda a: np.moveaxis(a, -1, -3))
         if self.shape.get("channels", "RGB") == "BGR":
             image = image.of(lambda a: a[..., ::-1, :, :])
@@ -141,7 +137,7 @@ class CheckedCertificate(_Verdicts):
         rows[:, self.label] += 1.0
         self.rivals = torch.cat([rows[: self.label], rows[self.label + 1 :]])
 
-    def _inputs(self, low: Array, high: Array, unit: float) -> FirstOrderForm:
+    def _inputs(self, low: Array, high: Array, unit: float) -> Affine:
         views = [self.poses.view(low[k : k + 1], high[k : k + 1]) for k in range(len(low))]
         return self.inputs(self.camera, views, unit)
 
@@ -170,14 +166,14 @@ class CheckedLoop(_Verdicts):
         self.camera = CheckedCamera(pose, focal, focal, width / 2.0, height / 2.0, int(width), int(height))
         self.steps, self.names = int(loop["steps"]), list(loop["state"])
 
-    def _state(self, low: Array, high: Array) -> list[FirstOrderForm]:
+    def _state(self, low: Array, high: Array) -> list[Affine]:
         poses = Poses(self.camera, self.cells.names)
         given, start = poses.given(low, high), self.loop["initial"]
         zero = given[""]
         ends = {n: v if isinstance(v, (int, float)) else v[0] for n, v in start.items()}
         return [given[n] if n in given else zero + float(ends[n]) for n in self.names]
 
-    def _view(self, x: list[FirstOrderForm]) -> CameraForms:
+    def _view(self, x: list[Affine]) -> CameraForms:
         about = self.loop["camera"]
         position = about.get("position") or {"offset": [0.0] * 3, "matrix": [[0.0] * len(x)] * 3}
         place = [_affine(row, x, o) for row, o in zip(position["matrix"], position["offset"], strict=True)]
@@ -187,7 +183,7 @@ class CheckedLoop(_Verdicts):
                 turn = product(turn, rotation(np.array(axis), _affine(about[name]["row"], x, about[name]["offset"])))
         return CameraForms(turn, place, self.camera.pose)
 
-    def _next(self, x: list[FirstOrderForm], unit: float) -> list[FirstOrderForm]:
+    def _next(self, x: list[Affine], unit: float) -> list[Affine]:
         law, control = self.loop["dynamics"], self.loop.get("control") or {}
         count = len(x[0].c)
         views = [self._view([e.of(lambda a, k=k: a[..., k : k + 1]) for e in x]) for k in range(count)]
@@ -228,11 +224,11 @@ class CheckedLoop(_Verdicts):
         return np.inf
 
 
-def _affine(row: Any, x: list[FirstOrderForm], constant: float) -> FirstOrderForm:
+def _affine(row: Any, x: list[Affine], constant: float) -> Affine:
     return total(e * float(v) for v, e in zip(row, x, strict=True)) + float(constant)
 
 
-def _outside(area: dict[str, Any], x: list[FirstOrderForm], names: list[str], inner: bool = False) -> Array:
+def _outside(area: dict[str, Any], x: list[Affine], names: list[str], inner: bool = False) -> Array:
     """How far states surely are outside of a closed set, or, negated, how far inside of an open box if ``inner``."""
     if "half_space" in area:
         return -(_affine(area["half_space"]["normal"], x, -float(area["half_space"]["at_least"])).range()[1])
