@@ -164,21 +164,21 @@ class CertificateReport:
         box = self.job.job.pose_sets[first].box
         middle = dict(zip(box.names, box.middle.tolist(), strict=True))
         wanted.append(("sample", f"frame {first}, middle of its set", first, [middle.get(n, 0.0) for n in names]))
-        proven = [(r["margin"], k, r) for k, found in rows.items() for r in found if r["verdict"] == "certified"]
+        proven = [(r["margin"], k, r) for k, cells in rows.items() for r in cells if r["verdict"] == "certified"]
         if proven:
             margin, frame, row = min(proven, key=lambda item: item[:2])
             pose = [0.5 * (a + b) for a, b in zip(row["lower"], row["upper"], strict=True)]
             wanted.append(("worst certified", f"frame {frame}, margin at least {margin:.4g}", frame, pose))
-        broken = [(_depth(row), frame, row) for frame, found in rows.items() for row in _worst(found)]
+        broken = [(_depth(row), frame, row) for frame, cells in rows.items() for row in _worst(cells)]
         for _, frame, row in sorted(broken, key=lambda item: item[:2])[:_IMAGES]:
             margin = row["margin"]
             text = f"frame {frame}, margin {'not a number' if margin is None else f'{margin:.4g}'}"
             wanted.append(("counterexample", text, frame, row["counterexample"]))
-        found = []
+        pictures = []
         with suppress(WorkCancelledError):
             for title, text, frame, values in wanted:
-                found.append({"title": title, "text": text, "png": self._drawn(frame, values, _PIXELS)})
-        return found
+                pictures.append({"title": title, "text": text, "png": self._drawn(frame, values, _PIXELS)})
+        return pictures
 
     def _drawn(self, frame: int, values: Sequence[float], side: int) -> bytes:
         """PNG of the picture at parameter values in the order of all parameters.
@@ -199,12 +199,12 @@ class CertificateReport:
     def _cell_pictures(self, rows: Mapping[int, list[dict[str, Any]]]) -> dict[tuple[int, int], dict[str, Any]]:
         """By frame and position, a picture of some cells: the same number of each verdict, evenly spread."""
         kinds = {
-            kind: [(frame, k) for frame, found in rows.items() for k, row in enumerate(found) if row["verdict"] == kind]
+            kind: [(frame, k) for frame, cells in rows.items() for k, row in enumerate(cells) if row["verdict"] == kind]
             for kind in ("certified", "falsified", "unknown")
         }
         share = _SEEN // max(1, sum(map(bool, kinds.values())))
         wanted = [key for keys in kinds.values() for key in keys[:: max(1, -(-len(keys) // share))]]
-        found = {}
+        pictures = {}
         with suppress(WorkCancelledError):
             for frame, k in wanted:
                 row = rows[frame][k]
@@ -212,8 +212,8 @@ class CertificateReport:
                 if values is None:
                     values = [0.5 * (a + b) for a, b in zip(row["lower"], row["upper"], strict=True)]
                     text = "one picture, at the cell's middle"
-                found[frame, k] = {"png": self._drawn(frame, values, _SEEN_PIXELS), "text": text}
-        return found
+                pictures[frame, k] = {"png": self._drawn(frame, values, _SEEN_PIXELS), "text": text}
+        return pictures
 
 
 def _image_at(file: Path, pose: np.ndarray) -> np.ndarray | None:

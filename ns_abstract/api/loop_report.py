@@ -107,7 +107,7 @@ class LoopReport:
         job, steps, box = self.job, [], self.job.loop.box
 
         def strongest(kind: Verdict | None) -> list[dict[str, Any]]:
-            return next((found for n in reversed(job.questions) if (found := store.leaves(n, kind))), [])
+            return next((leaves for n in reversed(job.questions) if (leaves := store.leaves(n, kind))), [])
 
         def volume(row: dict[str, Any]) -> float:
             return float(np.prod(np.subtract(row["upper"], row["lower"])))
@@ -128,10 +128,10 @@ class LoopReport:
         if not steps:
             self.film = {"skipped": "the work was interrupted" if deadline.request() else "the time ended first"}
             return
-        found = made(steps, cell.lower, cell.upper, row["verdict"])
-        ending, content = found.encoded()
-        self.film = {"file": store.keep(f"film.{ending}", content).name, **found.about}
-        self._strips = found.strips()
+        film = made(steps, cell.lower, cell.upper, row["verdict"])
+        ending, content = film.encoded()
+        self.film = {"file": store.keep(f"film.{ending}", content).name, **film.about}
+        self._strips = film.strips()
 
     def write(self, search: CellSearch[Any], state: str) -> dict[str, Any]:
         """Write report.json and report.html; returns the former's content."""

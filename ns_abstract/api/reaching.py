@@ -107,8 +107,8 @@ class LoopQuestion(CellQuestion[ReachProgress]):
     def progress(self, store: Store) -> ReachProgress:
         shares = {QUESTIONS[tally.frame]: fractions(tally) for tally in store.tallies()}
         last = shares[list(shares)[-1]]
-        known = {name: shares[name]["certified"] if name in shares else None for name in QUESTIONS}
-        return ReachProgress(known["safe"], known["reaches"], last["falsified"], last["open"], store.seconds)
+        certified = {name: shares[name]["certified"] if name in shares else None for name in QUESTIONS}
+        return ReachProgress(certified["safe"], certified["reaches"], last["falsified"], last["open"], store.seconds)
 
     def report(self, search: CellSearch[ReachProgress], state: str) -> dict[str, Any]:
         return self.reports.write(search, state)

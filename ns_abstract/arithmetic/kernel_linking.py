@@ -77,11 +77,11 @@ def install(done: Callable[[], object]) -> None:
             return compiled(compiler, args, return_type)
         _compilation.depth += 1
         try:
-            found = compiled(compiler, args, return_type)
+            result = compiled(compiler, args, return_type)
         finally:
             _compilation.depth -= 1
         _compilation.done()
-        return found
+        return result
 
     def customize_flags(compiler: Any, flags: Any) -> Any:
         flags = originals[_Compiler, "_customize_flags"](compiler, flags)
@@ -92,8 +92,8 @@ def install(done: Callable[[], object]) -> None:
     def compile_signature(kernel: Any, signature: Any) -> Any:
         with global_compiler_lock:
             args = tuple(sigutils.normalize_signature(signature)[0])
-            known = kernel.overloads.get(args)
-            if known is not None and _linked_only(known) and _compilation.depth == 0:
+            overload = kernel.overloads.get(args)
+            if overload is not None and _linked_only(overload) and _compilation.depth == 0:
                 # Python calls it now
                 del kernel.overloads[args]
             return originals[_Dispatcher, "compile"](kernel, signature)
@@ -130,14 +130,14 @@ def install(done: Callable[[], object]) -> None:
 
 def _all_linked(library: Any) -> list[Any]:
     """The libraries that ``library`` needs, each before what it needs itself: LLVM takes over only what is called."""
-    found: dict[Any, None] = {}
+    libraries: dict[Any, None] = {}
 
     def visit(other: Any) -> None:
-        if other not in found:
+        if other not in libraries:
             if other.linked_only or other is library:
                 for next_one in reversed(other._linking_libraries):
                     visit(next_one)
-            found[other] = None
+            libraries[other] = None
 
     visit(library)
-    return list(reversed(found))[1:]
+    return list(reversed(libraries))[1:]

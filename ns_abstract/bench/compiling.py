@@ -91,7 +91,7 @@ def recording() -> Iterator[_Recorder]:
     """What is compiled inside becomes rows."""
     from numba.core import event
 
-    found = _Recorder()
+    recorder = _Recorder()
 
     class Listener(event.Listener):
         def __init__(self, start: Callable[[Any], None], end: Callable[[Any], None]) -> None:
@@ -101,9 +101,9 @@ def recording() -> Iterator[_Recorder]:
 
         def on_end(self, event: Any) -> None: ...
 
-    compiled, locked = Listener(found.start, found.end), Listener(found.lock, found.unlock)
+    compiled, locked = Listener(recorder.start, recorder.end), Listener(recorder.lock, recorder.unlock)
     with event.install_listener("numba:compile", compiled), event.install_listener("numba:llvm_lock", locked):
-        yield found
+        yield recorder
 
 
 def _measured(recipe: Recipe[Any], poses: PoseBox) -> list[dict[str, Any]]:

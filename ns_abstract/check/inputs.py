@@ -125,8 +125,8 @@ def _read_run(file: Path, settings: dict[str, Any]) -> tuple[dict[str, Any], dic
         step = root.get("load_step") if settings.get("load_step") is None else settings["load_step"]
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, yaml.YAMLError):
         raise BadInput("cannot be read as a run's configuration", file) from None
-    found = ((re.fullmatch(r"step-(\d+)\.ckpt", p.name), p) for p in sorted(folder.glob("step-*.ckpt")))
-    names = {int(match[1]): p for match, p in found if match}
+    steps = ((re.fullmatch(r"step-(\d+)\.ckpt", p.name), p) for p in sorted(folder.glob("step-*.ckpt")))
+    names = {int(match[1]): p for match, p in steps if match}
     if not names or (step is not None and int(step) not in names):
         raise BadInput("no such checkpoint" if names else "no checkpoints", folder, fix="give the whole run folder")
     checkpoint = names[max(names) if step is None else int(step)]
@@ -158,10 +158,10 @@ def _read_splats(file: Path, settings: dict[str, Any]) -> tuple[Any, ...]:
         rest = rest.reshape(count, -1, 3)[:, : (degree + 1) ** 2 - 1]
         sh = np.concatenate([a["features_dc"].reshape(count, 1, 3), rest], axis=1)
         background = _color(model.get("background_color", "random"))
-        found = a["means"], a["scales"], a["quats"], a["opacities"].reshape(-1), sh
+        rows = a["means"], a["scales"], a["quats"], a["opacities"].reshape(-1), sh
     except (KeyError, ValueError, TypeError, AttributeError, ZeroDivisionError):
         raise BadInput("holds no Gaussians of Splatfacto", file) from None
-    return *found, model.get("rasterize_mode", "classic"), background, stored == 0, degree
+    return *rows, model.get("rasterize_mode", "classic"), background, stored == 0, degree
 
 
 def _read_ply(file: Path, settings: dict[str, Any]) -> tuple[Any, ...]:

@@ -143,7 +143,7 @@ class CheckedNetwork:
         shape = known[name].c.shape
         count, m = shape[0], len(rows)
         back = {name: rows.reshape(1, m, *shape[1:]).expand(count, m, *shape[1:])}
-        found = torch.zeros(count, m, dtype=torch.float64)
+        bound = torch.zeros(count, m, dtype=torch.float64)
 
         def against(row: Tensor, values: Tensor) -> Tensor:
             return (row * values[:, None]).flatten(2).sum(2)
@@ -153,23 +153,23 @@ class CheckedNetwork:
             if row is None:
                 continue
             size = known[layer.output].size
-            found = found - self._charge(layer, size.shape) * against(row.abs(), size)
+            bound = bound - self._charge(layer, size.shape) * against(row.abs(), size)
             before, f = known[layer.inputs[0]].c.shape[1:], layer.map
             if f is not None:
-                found = found + (row * layer.bias).flatten(2).sum(2)
+                bound = bound + (row * layer.bias).flatten(2).sum(2)
                 place = torch.zeros(count * m, *before, dtype=torch.float64, requires_grad=True)
                 (row,) = torch.autograd.grad(f(place), place, row.flatten(0, 1))
                 row = row.reshape(count, m, *before)
             elif len(layer.inputs) == 1:
                 above, below, lift = _lines(*ends[layer.output])
-                found = found + against(row.clamp(max=0.0), lift)
+                bound = bound + against(row.clamp(max=0.0), lift)
                 row = row * torch.where(row > 0.0, below[:, None], above[:, None])
             for source in layer.inputs:
                 back[source] = back[source] + row if source in back else row
         row, (c, g, r, size) = back[self.input], known[self.input]
-        slopes = sum((against(row, part).abs() for part in g), torch.zeros_like(found))
+        slopes = sum((against(row, part).abs() for part in g), torch.zeros_like(bound))
         rounding = 4.0 * U * (math.prod(size.shape[1:]) + len(g) + 32.0)
-        return found + against(row, c) - slopes - against(row.abs(), r + rounding * size) - 1e-30
+        return bound + against(row, c) - slopes - against(row.abs(), r + rounding * size) - 1e-30
 
 
 def _lines(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor, Tensor]:

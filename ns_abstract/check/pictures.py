@@ -40,7 +40,7 @@ class ClaimedBounds(NamedTuple):
 
     def excess(self, centre: Array, half: Array, form: Affine) -> tuple[Array, Array]:
         """By how much pictures may lie [B] below the lower and above the upper bounds, over boxes [B, d]."""
-        c, g, r, found = form.c, form.g, form.r, []
+        c, g, r, ends = form.c, form.g, form.r, []
         for side, (plane, constant) in zip((1.0, -1.0), self.planes, strict=True):
             fixed, end = (self.least, 0.0) if side > 0 else (self.most, 1.0)
             span = np.where(self.high > self.low, 0.5 * (self.high - self.low), 1.0)
@@ -54,8 +54,8 @@ class ClaimedBounds(NamedTuple):
             flat = side * (fixed - c) + (np.abs(g).sum(axis=0) + r) * (1.0 + 1e-13)
             both = np.maximum(linear, -1.0 if side * (fixed - end) <= 0.0 else flat)
             # not a number: nothing is known
-            found.append(np.where(np.isnan(both), np.inf, both))
-        return found[0], found[1]
+            ends.append(np.where(np.isnan(both), np.inf, both))
+        return ends[0], ends[1]
 
     def trivial(self) -> bool:
         """Whether the bounds are [0, 1] or wider."""
@@ -88,7 +88,7 @@ class Picture:
         a = self.cells.arrays
         height, width, _ = a["lower"].shape
         side = a["b_lower"].shape[1]
-        best, found = -1.0, PixelClaim(0, 0, 0, 0)
+        best, chosen = -1.0, PixelClaim(0, 0, 0, 0)
         for _ in range(8 if hunted else 1):
             while True:
                 cell = int(rng.integers(self.count))
@@ -99,8 +99,8 @@ class Picture:
             claim = PixelClaim(cell, row, column, int(rng.integers(3)))
             (_, b), (slope, c) = self.bounds(claim).planes
             interest = float((np.abs(slope).sum() + 1e-4) / max(c - b, 1e-7)) if np.any(slope) else 0.0
-            best, found = (interest, claim) if interest > best else (best, found)
-        return found
+            best, chosen = (interest, claim) if interest > best else (best, chosen)
+        return chosen
 
     def place(self, claim: PixelClaim) -> dict[str, Any]:
         """The claim for check.json."""

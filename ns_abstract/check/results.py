@@ -109,7 +109,7 @@ def _header(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> tuple[tuple[int
 
 def read_verdicts(folder: Path, report: dict[str, Any]) -> list[StoredCells]:
     """The cells of a certificate or a loop: by frame, or by question (0 safe, 1 reaches)."""
-    file, rows, total, found = folder / "cells.sqlite", 0, 0, {}
+    file, rows, total, by_frame = folder / "cells.sqlite", 0, 0, {}
     loop = report.get("kind") == "loop"
     try:
         sets: dict[int, Any] = dict.fromkeys((0, 1), report["parameters"]) if loop else {}
@@ -122,7 +122,7 @@ def read_verdicts(folder: Path, report: dict[str, Any]) -> list[StoredCells]:
         for number, *row in base.execute(f"SELECT {columns} FROM cells LIMIT {_ROWS}"):
             verdict, margin, example = row[3], row[4], json.loads(row[6] or "null")
             entry = (*map(json.loads, row[1:3]), "open" if number in left else verdict, margin, example)
-            found.setdefault(row[0], []).append(entry)
+            by_frame.setdefault(row[0], []).append(entry)
             if number not in left:
                 total += int.from_bytes(hashlib.sha256(json.dumps(row).encode()).digest(), "big")
                 rows += 1
@@ -130,7 +130,7 @@ def read_verdicts(folder: Path, report: dict[str, Any]) -> list[StoredCells]:
         if [rows, f"{total % (1 << 256):064x}"] != [report["cells_seal"][k] for k in ("rows", "sum")]:
             raise BadInput("does not hold the cells that the report names (cells_seal)", file, fix=_AGAIN)
         cells = []
-        for index, entries in sorted(found.items()):
+        for index, entries in sorted(by_frame.items()):
             names, low, high = ([p[k] for p in sets[index]] for k in ("name", "lower", "upper"))
             boxes = {
                 f"box_{s}": np.array([e[k] for e in entries], np.float64) for k, s in enumerate(("lower", "upper"))

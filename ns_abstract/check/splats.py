@@ -97,7 +97,7 @@ def reaches(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit:
     near = ~(zl > 0.5 * NEAR)
     zl = np.where(near, 1.0, zl)
     hidden = ~((zh >= NEAR * (1.0 - ROOM)) & ~(zl > FAR * (1.0 + ROOM)))
-    found = []
+    sides = []
     # in float32 a compensation may exceed 1 by rounding, and what is large may be drawn whatever its opacity
     opacity = splats.opacity * (1.0 + ROOM + 64.0 * unit) * (1.2 if unit and splats.antialiased else 1.0)
     faint = opacity < LEAST_ALPHA
@@ -115,10 +115,10 @@ def reaches(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit:
                 # exponents of small ones err by less than a tenth; those of large ones may be anything in their tiles
                 room = np.where(spread < 4.0, 1.06 * room, np.maximum(1.06 * room, 3.3 * spread) + 2.0 * TILE)
             open_ = near | ~np.isfinite(room)
-            found += [np.where(open_, -np.inf, f * least + centre - room - 1e-9)]
-            found += [np.where(open_, np.inf, f * most + centre + room + 1e-9)]
-    found[0] = np.where(hidden | faint, np.inf, found[0])
-    return np.stack(found, axis=1)
+            sides += [np.where(open_, -np.inf, f * least + centre - room - 1e-9)]
+            sides += [np.where(open_, np.inf, f * most + centre + room + 1e-9)]
+    sides[0] = np.where(hidden | faint, np.inf, sides[0])
+    return np.stack(sides, axis=1)
 
 
 def meeting(ends: Array, row: int, column: int) -> Array:

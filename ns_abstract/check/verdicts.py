@@ -195,14 +195,14 @@ class CheckedLoop(_Verdicts):
         ) else y  # fmt: skip
         if control.get("clip"):
             u = [a.clamped(*map(float, ends)) for a, ends in zip(u, control["clip"], strict=True)]
-        found = []
+        states = []
         for a, b, c, name in zip(law["A"], law["B"], law["c"], self.names, strict=True):
             push = (self.loop.get("disturbance") or {}).get(name, 0.0)
             least, most = (-push, push) if isinstance(push, (int, float)) else push
             e = _affine([*a, *b], [*x, *u], float(c)) + 0.5 * (least + most)
             # float64 evaluations of the law, too
-            found.append(e.wider(0.5 * (most - least) * (1.0 + 1e-12) + 1e-13 * (1.0 + e.size())))
-        return found
+            states.append(e.wider(0.5 * (most - least) * (1.0 + 1e-12) + 1e-13 * (1.0 + e.size())))
+        return states
 
     def margins(self, low: Array, high: Array, unit: float) -> Array:
         """Lower bounds [B] of how far all runs from boxes stay from going wrong."""

@@ -22,8 +22,8 @@ Where = Annotated[EngineOptions, _BESIDE]
 
 def stated(options: Any) -> dict[str, Any]:
     """All options of a command by name, as reports state them."""
-    found: dict[str, Any] = {}
+    options_by_name: dict[str, Any] = {}
     for entry in fields(options):
         value = getattr(options, entry.name)
-        found |= stated(value) if is_dataclass(value) else {entry.name: value}
-    return found
+        options_by_name |= stated(value) if is_dataclass(value) else {entry.name: value}
+    return options_by_name

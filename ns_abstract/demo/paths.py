@@ -32,12 +32,12 @@ def gate_views(count: int = 10, size: int = 200) -> list[KeyframeCamera]:
     along = rng.uniform(0.0, end, count)
     room = 1.1 - 0.5 * along / end
     across, up = (room * rng.uniform(-most, most, count) for most in (0.45, 0.3))
-    found = []
+    views = []
     for place in np.stack([along, across, up], axis=1):
         pose = look_at((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
         pose[:3, 3] = place
-        found.append(KeyframeCamera(pose, 60.0, size, size))
-    return found
+        views.append(KeyframeCamera(pose, 60.0, size, size))
+    return views
 
 
 def airfield_path(size: int = 200) -> dict[str, Any]:

@@ -204,7 +204,7 @@ class CameraDrawings:
 
     def plots(self, numbers: Mapping[tuple[int, int], int]) -> list[tuple[Markup, str, str]]:
         """From above and from the side: the plot, its title, and what of the scene it shows."""
-        found = []
+        drawings = []
         for view in self.views(PICTURE_WIDTH):
             x, y = plane_axes(view.window)
             shapes = []
@@ -215,8 +215,8 @@ class CameraDrawings:
                 shapes.append(f'<path class="{camera.verdict}"{data} d="{way}Z"/>')
             marks = f'<g class="frusta">{"".join(shapes)}</g>'
             plot = draw_plane(self.outside, view.window, view.nearest, marks, f"Cameras seen {view.title}")
-            found.append((plot, view.title, behind(self.outside, view.nearest, "cameras alone")))
-        return found
+            drawings.append((plot, view.title, behind(self.outside, view.nearest, "cameras alone")))
+        return drawings
 
     def html(self, numbers: Mapping[tuple[int, int], int]) -> Markup:
         """The page's part; cells with numbers, by frame and position, can be chosen."""

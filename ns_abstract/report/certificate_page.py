@@ -371,7 +371,7 @@ def _matrices(
         if cells.get(entry["index"]) and len(free_parameters(entry["parameters"])) > 2
     ]
     chosen = sorted(several, key=lambda entry: entry["coverage"]["certified"])[:_MOST_MATRICES]
-    found = [
+    drawings = [
         (
             matrix_svg(
                 maps_of(cells[entry["index"]], entry),
@@ -381,7 +381,7 @@ def _matrices(
         )
         for entry in sorted(chosen, key=lambda entry: entry["index"])
     ]
-    return found, len(several) - len(chosen)
+    return drawings, len(several) - len(chosen)
 
 
 def _bars(

@@ -57,14 +57,14 @@ def _command(parts: Sequence[Any]) -> str:
 
 @cache
 def _templates() -> Environment:
-    found = Environment(
+    environment = Environment(
         loader=FileSystemLoader(_FOLDER / "templates"),
         autoescape=True,
         trim_blocks=True,
         lstrip_blocks=True,
         undefined=StrictUndefined,
     )
-    found.filters |= {
+    environment.filters |= {
         "command": _command,
         "counted": counted,
         "number": number,
@@ -73,8 +73,8 @@ def _templates() -> Environment:
         "repr": repr,
         "uri": uri,
     }
-    found.globals["guarantee_of"] = _guarantee_of
-    return found
+    environment.globals["guarantee_of"] = _guarantee_of
+    return environment
 
 
 def fill(template: str, **values: Any) -> Markup:

@@ -35,9 +35,9 @@ _STYLE = (
 
 
 def _size(plot: str) -> tuple[float, float]:
-    found = re.search(r'width="([\d.]+)" height="([\d.]+)"', plot)
-    assert found is not None
-    return float(found.group(1)), float(found.group(2))
+    size = re.search(r'width="([\d.]+)" height="([\d.]+)"', plot)
+    assert size is not None
+    return float(size.group(1)), float(size.group(2))
 
 
 def standalone(plots: Sequence[Markup], text: str, covered: Mapping[str, float]) -> str:
@@ -96,17 +96,17 @@ def write_pictures(
         InputError: The folder cannot be written.
     """
     entries, covered = document["frames"], document["coverage"]
-    found: dict[str, str | None] = {}
+    files: dict[str, str | None] = {}
     if way := along_path(entries):
         _, ((plot, _),) = verdict_drawings(way, rows, {})
-        found["verdicts_path"] = standalone([plot], "from keyframe to keyframe", covered)
+        files["verdicts_path"] = standalone([plot], "from keyframe to keyframe", covered)
     else:
         for entry in entries[:MOST]:
-            found[f"verdicts_{entry['index']:05d}"] = _frame(entry, rows.get(entry["index"], ()))
+            files[f"verdicts_{entry['index']:05d}"] = _frame(entry, rows.get(entry["index"], ()))
     if cameras is not None and cameras.cells:
-        found["cameras"] = standalone([plot for plot, *_ in cameras.plots({})], "cameras of cells", covered)
+        files["cameras"] = standalone([plot for plot, *_ in cameras.plots({})], "cameras of cells", covered)
     written = []
-    for name, text in found.items():
+    for name, text in files.items():
         if text is None:
             continue
         try:

@@ -234,21 +234,21 @@ class StoreFile:
         if known != [(k, *names) for k, names in enumerate(parameters)]:
             raise self._damaged("its parameters are others")
         written = self._reported()
-        found = _Checksums()
+        checksums = _Checksums()
         cells = f"SELECT {CELL} FROM cells WHERE rowid NOT IN (SELECT value FROM json_each(?)) ORDER BY rowid"
         for row in self._base.execute(cells, self._left()):
-            found.cells.add(row)
-            if written and found.cells.rows == written[0] and found.cells.text != written[1]:
+            checksums.cells.add(row)
+            if written and checksums.cells.rows == written[0] and checksums.cells.text != written[1]:
                 raise self._damaged("the cells are not those of report.json: they were changed since")
         for row in self._base.execute(f"SELECT {BLOCK} FROM search_blocks"):
-            found.blocks.add(row)
+            checksums.blocks.add(row)
         for row in self._base.execute(f"SELECT {FRAME} FROM search_frames"):
-            found.frames.add(row)
+            checksums.frames.add(row)
         for row in self._base.execute(f"SELECT {SETTLED} FROM search_settled"):
-            found.settled.add(row)
-        if found.plain() != self._get("seals"):
+            checksums.settled.add(row)
+        if checksums.plain() != self._get("seals"):
             raise self._damaged("its content was changed since it was written")
-        self._seals = found
+        self._seals = checksums
 
     def _reported(self) -> tuple[int, str] | None:
         """Number and sum of the cells that report.json speaks of, if it is of this search."""
@@ -269,10 +269,10 @@ class StoreFile:
         try:
             # closing() does not commit: nothing is to be written
             with closing(sqlite3.connect(f"file:{quote(str(self.file.absolute()))}?mode=ro", uri=True)) as base:
-                known = dict(base.execute("SELECT name, sha256 FROM search_images"))
+                digests = dict(base.execute("SELECT name, sha256 FROM search_images"))
         except sqlite3.Error:
             return
-        for name, digest in known.items():
+        for name, digest in digests.items():
             file = self._place(name)
             if _digest(file) == digest:
                 file.unlink(missing_ok=True)

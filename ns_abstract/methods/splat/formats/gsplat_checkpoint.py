@@ -54,15 +54,15 @@ def checkpoint(folder: Path, step: int | None) -> Path | None:
     """
     for inner in (folder, folder / "ckpts"):
         names = (_NAME.fullmatch(file.name) for file in inner.iterdir()) if inner.is_dir() else ()
-        found = {(int(match[1]), int(match[2])): inner / match[0] for match in names if match is not None}
-        if found:
-            wanted = max(at for at, _ in found) if step is None else step
-            ranks = sorted(key for key in found if key[0] == wanted)
+        checkpoints = {(int(match[1]), int(match[2])): inner / match[0] for match in names if match is not None}
+        if checkpoints:
+            wanted = max(at for at, _ in checkpoints) if step is None else step
+            ranks = sorted(key for key in checkpoints if key[0] == wanted)
             if not ranks:
-                there = ", ".join(map(str, sorted({at for at, _ in found})[:20]))
+                there = ", ".join(map(str, sorted({at for at, _ in checkpoints})[:20]))
                 problem = f"names step {step}, there are {there}"
                 raise InputError(problem, file=inner, field="--load-step", fix="give one of these")
-            return found[ranks[0]]
+            return checkpoints[ranks[0]]
     return None
 
 

@@ -25,19 +25,19 @@ def point_cloud(folder: Path, iteration: int | None) -> Path:
     Raises:
         InputError: There is none.
     """
-    found = {}
+    clouds = {}
     outer = folder / "point_cloud"
     for inner in outer.iterdir() if outer.is_dir() else ():
         match = re.fullmatch(r"iteration_(\d{1,12})", inner.name)
         if match is not None and (inner / "point_cloud.ply").is_file():
-            found[int(match[1])] = inner / "point_cloud.ply"
-    if iteration is None and found:
-        return found[max(found)]
-    if iteration not in found:
-        there = f"there are {', '.join(map(str, sorted(found)[:20]))}" if found else "there are none"
+            clouds[int(match[1])] = inner / "point_cloud.ply"
+    if iteration is None and clouds:
+        return clouds[max(clouds)]
+    if iteration not in clouds:
+        there = f"there are {', '.join(map(str, sorted(clouds)[:20]))}" if clouds else "there are none"
         what = "point_cloud.ply" if iteration is None else f"iteration_{iteration}/point_cloud.ply"
         raise InputError(f"no {what}: {there}", file=outer, fix="give --load-step one of these, or the .ply itself")
-    return found[iteration]
+    return clouds[iteration]
 
 
 def arguments_beside(ply: Path) -> Path | None:

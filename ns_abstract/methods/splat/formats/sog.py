@@ -239,11 +239,11 @@ def _names(meta: Any, file: Path) -> list[str]:
     for section, count in {"means": 2, "scales": 1, "quats": 1, "sh0": 1, "shN": 2}.items():
         if section == "shN" and meta.get("shN") is None:
             continue
-        found = _item(meta, file, section, "files")
-        good = isinstance(found, list) and len(found) == count and all(isinstance(name, str) for name in found)
-        if not good or any(not name or Path(name).name != name or "\\" in name or "\0" in name for name in found):
+        files = _item(meta, file, section, "files")
+        good = isinstance(files, list) and len(files) == count and all(isinstance(name, str) for name in files)
+        if not good or any(not name or Path(name).name != name or "\\" in name or "\0" in name for name in files):
             raise InputError(f"expected {count} plain names", file=file, field=f"{section}.files", fix=_FIX)
-        names += found
+        names += files
     if len(set(names)) != len(names):
         raise InputError("a picture is named twice", file=file, field="files", fix=_FIX)
     return names
