@@ -58,6 +58,8 @@ def test_functions_within_a_kernel_have_no_machine_code() -> None:
     assert outer(np.array(values)) == by_hand(values) and store().functions >= done + 3
     assert [linked_only(function) for function in (inner, middle, outer)] == [[True], [True], [False]]
     # Python calls it, the second kernel links what has machine code now
+    middle.compile("float64(float64, float64)")
+    assert [linked_only(function) for function in (inner, middle)] == [[True], [False]]
     assert middle(0.1, 0.5) == by_hand([0.1])
     assert [linked_only(function) for function in (inner, middle)] == [[True], [False]]
 
