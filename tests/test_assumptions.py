@@ -72,7 +72,7 @@ def test_ply(blobs: Inputs, tmp_path: Path) -> None:
     write_ply(replace(blob_scene(), rasterize_mode="antialiased"), file)
     found = table(open_job(Settings(file, blobs.path, blobs.spec)).assumptions)
     assert found["rasterize_mode"][0] == "antialiased" and "comment" in found["rasterize_mode"][1]
-    assert found["background"] == ("0 0 0", "default: a .ply says nothing")
+    assert found["background"] == ("0 0 0", "default: the file says nothing")
     assert "load_step" not in found
 
 

@@ -274,8 +274,7 @@ def test_workers_are_asked_to_end_and_work_on(tmp_path: Path) -> None:
 PARENT = """
 import sys, time
 from pathlib import Path
-from ns_abstract.execution.engines import Here, Machine, Processes
-from ns_abstract.execution.stopping import StopRequest
+from ns_abstract.execution.engines import Processes
 from test_ending import count_checkpoints
 if __name__ == "__main__":
     engine = Processes(2)
@@ -369,8 +368,9 @@ def test_workers_end_with_a_killed_parent(tmp_path: Path) -> None:
     try:
         assert process.stdout is not None
         pids = [int(word) for word in process.stdout.readline().split()]
+        assert len(pids) == 2
         until(lambda: all((tmp_path / f"begun{k}").exists() for k in range(2)))
-        assert len(pids) == 2 and all(map(alive, pids))
+        assert all(map(alive, pids))
     finally:
         process.send_signal(signal.SIGKILL)
         process.wait()
@@ -447,10 +447,10 @@ def test_a_signal_ends_a_library_call() -> None:
     """Nothing runs between two lines of Python while a kernel is compiled."""
     code = """
 import ctypes
-from ns_abstract.cli.common import Stop
+from ns_abstract.cli.common import SignalStop
 library, mutex = ctypes.CDLL(None), ctypes.create_string_buffer(256)
 library.pthread_mutex_lock(mutex)
-stop = Stop()
+stop = SignalStop()
 def fail():
     print("saved", flush=True)
     raise OSError("disk full")

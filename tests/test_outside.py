@@ -381,7 +381,7 @@ def test_a_full_disk_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     def full(*_: Any) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("ns_abstract.verify.store.write_atomic", full)
+    monkeypatch.setattr("ns_abstract.verify.store_file.write_atomic", full)
     with pytest.raises(InputError, match="No space left"):
         store.keep("film.mp4", b"new")
     store.close()

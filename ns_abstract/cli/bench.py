@@ -456,6 +456,23 @@ def rows_of(
     ]
 
 
+#: The benchmarks by the name that the command line gives them, with their options where none is given.
+_DEFAULTS: dict[str, Any] = {
+    "cell": CellBenchmark(),
+    "compile": Compile(),
+    "tightness": Tightness(),
+    "soundness": Soundness(),
+    "plan": PlanBenchmark(),
+    "rules": RulesBenchmark(),
+    "rays": Rays(),
+    "scale": ScaleBenchmark(),
+    "certificates": Certificates(),
+    "loops": Loops(load_config=tyro.MISSING, loop=tyro.MISSING),
+    "stiff": Stiff(),
+    "vnnlib": Vnnlib(folder=tyro.MISSING),
+}
+
+
 def bench(
     options: CellBenchmark
     | Compile
@@ -511,7 +528,7 @@ def bench(
                 rows += rows_of(options, job, name)
             lines = markdown(rows).splitlines()
             print("\n".join(lines[0 if not printed else 2 + printed :]), flush=True)
-    kind = type(options).__name__.lower()
+    kind = next(name for name, default in _DEFAULTS.items() if type(default) is type(options))
     write(rows, options.output_dir, kind, _TITLES[kind])
     if results:
         from ns_abstract.bench.plots import save_curves
@@ -533,22 +550,7 @@ def bench(
 
 def main() -> None:
     """Entry point of the console script."""
-    kinds = tyro.extras.subcommand_type_from_defaults(
-        {
-            "cell": CellBenchmark(),
-            "compile": Compile(),
-            "tightness": Tightness(),
-            "soundness": Soundness(),
-            "plan": PlanBenchmark(),
-            "rules": RulesBenchmark(),
-            "rays": Rays(),
-            "scale": ScaleBenchmark(),
-            "certificates": Certificates(),
-            "loops": Loops(load_config=tyro.MISSING, loop=tyro.MISSING),
-            "stiff": Stiff(),
-            "vnnlib": Vnnlib(folder=tyro.MISSING),
-        }
-    )
+    kinds = tyro.extras.subcommand_type_from_defaults(_DEFAULTS)
     run(bench, lambda: tyro.cli(kinds, prog="ns-abstract-bench"))
 
 
