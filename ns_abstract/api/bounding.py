@@ -12,8 +12,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ns_abstract.api.job import Job
-from ns_abstract.api.poses import PoseSet
-from ns_abstract.api.scenes import Scene
+from ns_abstract.api.poses import PoseSet, pose_set
+from ns_abstract.api.scenes import Scene, checked_scene
 from ns_abstract.arithmetic.kernel_cache import store as kernels
 from ns_abstract.execution.cancellation import WorkCancelledError
 from ns_abstract.execution.engines import Engine, SerialEngine
@@ -22,6 +22,8 @@ from ns_abstract.execution.stopping import StopRequest, interruptible
 from ns_abstract.execution.threads import use_threads
 from ns_abstract.execution.worker_cache import Recipe, load
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.io.arguments import at_least, positive, whole
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.refine.engine import RefinementGoal, groups, shared_goal
@@ -361,21 +363,31 @@ class BoundResult:
         """
         save_frame(path, self.frame, status=self.status, about=self.about)
 
-    def _repr_html_(self) -> str:
+    def _lines(self) -> list[str]:
+        """The result in words."""
         box = self.parameters
         sides = [interval(*side) for side in zip(box.names, box.units, box.lower, box.upper, strict=True)]
         summary = f"mean gap {number(self.mpg)}, largest {number(self.xpg)}, ratio to real renders {number(self.ratio)}"
-        lines = [
+        return [
             summary if self.bounded else "no bounds but [0, 1] yet",
             f"{self.guarantee}; {self.cell_count} cells, {self.seconds:.1f} s; {self.status}",
             "; ".join(sides) or "one camera pose",
         ]
-        return frame_html(self.frame, lines)
+
+    def __str__(self) -> str:
+        height, width, _ = self.lower.shape
+        return "\n".join([f"abstract image, {width} x {height} pixels", *(f"  {line}" for line in self._lines())])
+
+    def __repr__(self) -> str:
+        return f"<BoundResult: {'; '.join(self._lines())}>"
+
+    def _repr_html_(self) -> str:
+        return frame_html(self.frame, self._lines())
 
 
 def bound(
     scene: Scene,
-    poses: PoseSet,
+    poses: PoseSet | PinholeCamera,
     *,
     target_ratio: float = 1.05,
     time_budget: float = 60.0,
@@ -393,7 +405,7 @@ def bound(
 
     Args:
         scene: The scene.
-        poses: The set.
+        poses: The set; a camera is the set of its one pose.
         target_ratio: The work is done when the mean gap is at most this many times the one of real renders.
         time_budget: Seconds, compiling at first use not counted.
         arithmetic: "float32": enclose every float32 evaluation of the renderer; "real": the real-number renderer and
@@ -409,14 +421,15 @@ def bound(
         InputError: An argument cannot be used.
         KeyboardInterrupt: Ctrl-C came before the first render, or twice.
     """
-    for name, value in (("target_ratio", target_ratio), ("time_budget", time_budget)):
-        if not 0.0 < value < float("inf"):
-            raise InputError(f"found {value}", field=name, fix="give a positive number")
-    if target_ratio < 1.0:
-        raise InputError(f"found {target_ratio}", field="target_ratio", fix="give a number of at least 1")
+    positive(time_budget, "time_budget")
+    at_least(target_ratio, 1.0, "target_ratio")
+    whole(workers, 1, "workers")
+    whole(seed, 0, "seed")
+    names = [outputs] if isinstance(outputs, str) else list(outputs)
+    pose_box = pose_set(poses).of(checked_scene(scene))
     job = Job(
-        scene, [poses.of(scene)], arithmetic=arithmetic, seed=seed, memory_limit=memory_limit, workers=workers,
-        layers=[name for name in outputs if name != "rgb"],
+        scene, [pose_box], arithmetic=arithmetic, seed=seed, memory_limit=memory_limit, workers=workers,
+        layers=[name for name in names if name != "rgb"],
     )  # fmt: skip
     with interruptible() as stop:
         results = bound_frames(

@@ -26,6 +26,7 @@ from ns_abstract.execution.stopping import StopRequest, interruptible
 from ns_abstract.execution.threads import use_threads
 from ns_abstract.execution.worker_cache import Recipe, load
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.io.arguments import positive, whole
 from ns_abstract.io.errors import InputError
 from ns_abstract.report.certificate import LastReport
 from ns_abstract.verify.cells import Cell, CellGrid
@@ -349,10 +350,8 @@ def check_arguments(request: Request, workers: int, output_dir: str | os.PathLik
     Raises:
         InputError: One of them.
     """
-    if not 0.0 < request.budget < float("inf"):
-        raise InputError(f"found {request.budget}", field="time_budget", fix="give a positive number")
-    if workers < 1:
-        raise InputError(f"found {workers}", field="workers", fix="give a number of at least 1")
+    positive(request.budget, "time_budget")
+    whole(workers, 1, "workers")
     if request.resume and output_dir is None:
         raise InputError("given without output_dir", field="resume", fix="give the folder to go on with")
 

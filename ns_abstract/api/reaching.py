@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -21,9 +20,10 @@ from ns_abstract.api.cell_search import (
 )
 from ns_abstract.api.loop_job import LoopJob, open_loop
 from ns_abstract.api.loop_report import LoopReport
-from ns_abstract.api.scenes import Scene
+from ns_abstract.api.scenes import Scene, checked_scene
 from ns_abstract.execution.cancellation import Deadline
 from ns_abstract.execution.engines import EngineName, started
+from ns_abstract.io.arguments import file_path
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.reach.search import QUESTIONS
 from ns_abstract.verify.cells import CellGrid
@@ -207,7 +207,7 @@ def reach(
     """
     request = Request(time_budget, resume, scene_margin=scene_margin)
     check_arguments(request, workers, output_dir)
-    job = open_loop(scene, Path(loop), arithmetic, network_arithmetic, workers)
+    job = open_loop(checked_scene(scene), file_path(loop, "loop"), arithmetic, network_arithmetic, workers)
     settings = {"time_budget": time_budget, "arithmetic": arithmetic, "workers": workers, "engine": engine}
     rows, document = answered(
         LoopQuestion(job, settings, ("ns_abstract.reach",), film=film),

@@ -11,7 +11,7 @@ import tyro
 
 from ns_abstract.cli.common import DONE, INTERRUPTED, SignalStop, plain_console, run
 from ns_abstract.cli.options import EngineOptions, Overrides, Program, ProgramOptions, SceneOverrides, Where, stated
-from ns_abstract.io.errors import InputError
+from ns_abstract.io.arguments import positive
 
 #: Seconds between lines of progress.
 _EVERY = 10.0
@@ -59,8 +59,7 @@ def reach(options: Reach) -> int:
     Raises:
         InputError: A file, a field or an option cannot be used.
     """
-    if not 0.0 < options.time_budget < float("inf"):
-        raise InputError(f"found {options.time_budget}", field="--time-budget", fix="give a positive number")
+    positive(options.time_budget, "--time-budget")
     options.where.check()
     stop = SignalStop()
     with stop.installed():
