@@ -28,7 +28,7 @@ from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.refine.engine import RefinementGoal, groups, shared_goal
 from ns_abstract.refine.result import ExtraOutput, FrameResult, Leaves, PartResult, TracePoint
-from ns_abstract.report.figures import interval, metrics, number, short_guarantee
+from ns_abstract.report.figures import ShownUnits, metrics, number, short_guarantee
 from ns_abstract.report.files import save_frame
 from ns_abstract.report.notebook import frame_html
 
@@ -366,7 +366,8 @@ class BoundResult:
     def _lines(self) -> list[str]:
         """The result in words."""
         box = self.parameters
-        sides = [interval(*side) for side in zip(box.names, box.units, box.lower, box.upper, strict=True)]
+        units = ShownUnits.of(self.about.get("scene", {}))
+        sides = [units.interval(*side) for side in zip(box.names, box.units, box.lower, box.upper, strict=True)]
         summary = f"mean gap {number(self.mpg)}, largest {number(self.xpg)}, ratio to real renders {number(self.ratio)}"
         return [
             summary if self.bounded else "no bounds but [0, 1] yet",

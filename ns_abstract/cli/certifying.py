@@ -48,6 +48,8 @@ class _Display:
 def _introduce(console: Console, job: Certification, about: CertifiedRun) -> None:
     method = job.job.method
     console.print(f"{method.name}: {method.content}; {job.network.source.name}; {about.sentence}", markup=False)
+    for warning in job.job.wide_turns:
+        console.print(f"warning: {warning}", markup=False, soft_wrap=True)
     for note in about.plan:
         console.print(f"  {note}", markup=False, soft_wrap=True)
 

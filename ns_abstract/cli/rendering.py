@@ -125,7 +125,9 @@ def _introduce(console: Console, job: Job, report: Report) -> None:
     method = job.method
     program = method.program
     console.print(f"{method.name}: {method.content}, {program['name']} {program['version']}", markup=False)
-    for note in (*method.notes, *job.notes, *job.plan):
+    for warning in job.wide_turns:
+        console.print(f"warning: {warning}", markup=False, soft_wrap=True)
+    for note in (*method.notes, *(note for note in job.notes if note not in job.wide_turns), *job.plan):
         console.print(f"  {note}", markup=False, soft_wrap=True)
     if report.kept:
         console.print(f"  kept from before: frames {listed(report.kept)}", markup=False, soft_wrap=True)
