@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -50,6 +51,9 @@ class Progress:
         cells: Cells bounded.
         covered: Part of the first cover that is done; nothing but [0, 1] is known below 1.
         mpg, mpg_witness: Mean pixel gap of the bounds and of what was really rendered.
+        frames: Frames of the whole work.
+        target_ratio: Where a frame is done.
+        elapsed, total_budget: Seconds spent on all frames, and seconds that they may take together.
     """
 
     frame: int
@@ -60,11 +64,33 @@ class Progress:
     covered: float
     mpg: float
     mpg_witness: float
+    frames: int = 1
+    target_ratio: float = 1.05
+    elapsed: float = 0.0
+    total_budget: float = math.inf
 
     @property
     def ratio(self) -> float:
         """How loose the bounds can be at most."""
         return self.mpg / self.mpg_witness if self.mpg_witness > 0.0 else float("inf")
+
+    @property
+    def done(self) -> float:
+        """Part of the work that is done: frames, and of the current one the part of its time to target or budget."""
+        left = max(0.0, self.budget - self.seconds)
+        goal = self.target_ratio - 1.0
+        if self.covered >= 1.0 and goal > 0.0:
+            # ratio - 1 falls about in proportion to 1 / time
+            left = min(left, self.seconds * max(0.0, (self.ratio - 1.0) / goal - 1.0))
+        part = self.seconds / (self.seconds + left) if self.seconds > 0.0 else 0.0
+        return min(1.0, (self.frames_done + part) / max(1, self.frames))
+
+    @property
+    def sentence(self) -> str:
+        """What is known of the current frame."""
+        if self.covered < 1.0:
+            return f"frame {self.frame}: covering the set, {self.covered:.0%}"
+        return f"frame {self.frame}: ratio to real renders {self.ratio:.3f}, target {self.target_ratio:g}"
 
 
 #: Told where the work stands; returning False ends it with what is known.
@@ -189,9 +215,10 @@ def bound_frames(
         def told(point: TracePoint, covered: float) -> None:
             on_progress(
                 Progress(
-                    part.index, done, point.seconds, goal.seconds, point.cells, covered, point.mpg, point.mpg_witness
+                    part.index, done, point.seconds, goal.seconds, point.cells, covered, point.mpg, point.mpg_witness,
+                    len(frames), target_ratio, budget - (deadline - perf_counter()), budget,
                 )
-            )
+            )  # fmt: skip
 
         try:
             return job.bound_part(
@@ -230,7 +257,16 @@ def bound_frames(
             finished_parts.setdefault(index, []).append(result)
             if len(finished_parts[index]) == expected[index]:
                 done += 1
-                yield job.joined(finished_parts.pop(index))
+                frame = job.joined(finished_parts.pop(index))
+                if recipe is not None and frame.trace:
+                    point = frame.trace[-1]
+                    on_progress(
+                        Progress(
+                            index, done - 1, frame.seconds, frame.seconds, frame.cells, point.covered, point.mpg,
+                            point.mpg_witness, len(frames), target_ratio, budget - (deadline - perf_counter()), budget,
+                        )
+                    )  # fmt: skip
+                yield frame
 
 
 def _goal(job: Job, part: TileTask, target_ratio: float, leaf_bytes: int) -> RefinementGoal:

@@ -15,9 +15,11 @@ from ns_abstract.api.cell_search import (
     CellSearch,
     Request,
     Row,
+    SearchProgress,
     answered,
     cell_place,
     check_arguments,
+    shares_text,
 )
 from ns_abstract.api.certificate_report import CertificateReport
 from ns_abstract.api.certification import MEMORY, Certification, PropertySource, Question
@@ -65,13 +67,13 @@ def check_network_memory(found: Certification, limit: float | None, workers: int
 
 
 @dataclass(frozen=True)
-class CertifyProgress:
+class CertifyProgress(SearchProgress):
     """Where a search stands: mean fractions over the frames, and seconds.
 
     Attributes:
         certified, falsified, unknown: Fractions of the parameter volume that have this verdict.
-        open: The rest, which is still to be examined.
-        seconds: Time spent.
+        open: The rest, which is still to be examined; the result counts it as unknown.
+        seconds: Time spent, earlier searches that this one goes on with included.
     """
 
     certified: float
@@ -79,6 +81,16 @@ class CertifyProgress:
     unknown: float
     open: float
     seconds: float
+
+    @property
+    def done(self) -> float:
+        """Part of the volume that was examined."""
+        return 1.0 - self.open
+
+    @property
+    def sentence(self) -> str:
+        """The four parts of the volume."""
+        return shares_text(self.certified, self.falsified, self.unknown, self.open)
 
 
 class CertificateQuestion(CellQuestion[CertifyProgress]):

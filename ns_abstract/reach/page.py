@@ -88,7 +88,7 @@ def _pictures(
     plot_arguments = (
         ""
         if last is None
-        else f" Cells by the verdict on “{QUESTIONS[last]}”: green certified, red falsified, grey undecided."
+        else f" Cells by the verdict on “{QUESTIONS[last]}”: green certified, red falsified, grey unknown."
     )
     figures = [
         _seen(view, document, loop, outside, plot_arguments)
