@@ -28,6 +28,7 @@ from ns_abstract.io.arguments import at_least, positive, whole
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.refine.engine import RefinementGoal, groups, shared_goal
+from ns_abstract.refine.linear_map import LinearImage, bounds_at, linear_image, point_of, sub_box
 from ns_abstract.refine.result import ExtraOutput, FrameResult, Leaves, PartResult, TracePoint
 from ns_abstract.report.figures import ShownUnits, metrics, number, short_guarantee
 from ns_abstract.report.files import save_frame
@@ -390,6 +391,43 @@ class BoundResult:
             return "missing"
         ratio_is_met = self.mpg == 0.0 or (self.ratio is not None and self.ratio <= self.target_ratio)
         return "done" if ratio_is_met or not self.parameters.dimensions else "partial"
+
+    def linear(self, box: Mapping[str, tuple[float, float]] | ParameterBox | None = None) -> LinearImage:
+        """Linear bounds of the whole picture over the set or a part of it, one map for all cells.
+
+        Args:
+            box: Ranges (low, high) by name, in the units of ``parameters``; what is not named stays whole. None: the
+                whole set.
+
+        Returns:
+            A_lower, A_upper [H, W, 3, d] and b_lower, b_upper [H, W, 3], for parameters scaled to [-1, 1] on the box.
+
+        Raises:
+            InputError: The cells were not kept, or the box is no part of the set.
+        """
+        if self.cells is None:
+            fix = "call bound with keep_cells=True and enough time"
+            raise InputError("found no linear sets of cells", field="cells", fix=fix)
+        return linear_image(self.cells, self.lower, self.upper, sub_box(self.parameters, box))
+
+    def at(self, p: Mapping[str, float] | Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds of the picture at one pose of the set, float32 [H, W, 3] each; those of the set without kept cells.
+
+        Args:
+            p: Values by name, or in the order of ``parameters``, in their units.
+
+        Raises:
+            InputError: It is no pose of the set.
+        """
+        return bounds_at(self.cells, self.lower, self.upper, point_of(self.parameters, p))
+
+    def to_torch(self) -> Any:
+        """The first layer for a verifier of networks; see `ns_abstract.refine.linear_map.LinearImage.to_torch`.
+
+        Raises:
+            InputError: The cells were not kept.
+        """
+        return self.linear().to_torch()
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an npz with the names of the files of ns-abstract-render.
