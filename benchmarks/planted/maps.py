@@ -16,7 +16,7 @@ MAPS = (
     Fault("maps: offsets are rounded to nearest", _MAP, "linear_image", "outward(least, least)[0]",
           "least.astype(np.float32)", "test_linear_map.py::test_planes_hold_exactly[False-wide and narrow]"),
     Fault("maps: leaves that are missing are not noticed", _MAP, "_complete",
-          "bool(part.box_scale[:, varied].prod(axis=1).sum() >= _COVERED)", "True",
+          "bool(part.box_scale[:, varied].prod(axis=1).sum() >= COVER_DOWN)", "True",
           "test_linear_map.py::test_where_leaves_are_missing_the_picture_stays"),
     Fault("maps: at a pose, bounds are rounded to nearest", _MAP, "bounds_at", "outward(value, value)[0]",
           "value.astype(np.float32)", "test_linear_map.py::test_bounds_at_a_pose_are_below_the_planes_of_its_leaf"),

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.arithmetic.outward import outward
-from ns_abstract.arithmetic.rounding import MAP_ROUNDING
+from ns_abstract.arithmetic.rounding import COVER_DOWN, MAP_ROUNDING
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import is_number, show
@@ -17,8 +17,6 @@ from ns_abstract.refine.result import ArrayRecord, Float32Array, Float64Array, L
 
 #: Leaves of a tile that are worked on at once.
 _CHUNK = 128
-#: What the volumes of a tile's leaves may lack of the box's by rounding; where they lack more, a leaf is missing.
-_COVERED = 1.0 - 1e-9
 
 
 @dataclass(frozen=True, repr=False)
@@ -101,7 +99,7 @@ def _parts(leaves: Leaves, rows: np.ndarray, box: ParameterBox) -> tuple[np.ndar
 def _complete(part: _Part, box: ParameterBox) -> bool:
     """Whether leaves cover the box."""
     varied = np.array(box.lower) < np.array(box.upper)
-    return bool(part.box_scale[:, varied].prod(axis=1).sum() >= _COVERED)
+    return bool(part.box_scale[:, varied].prod(axis=1).sum() >= COVER_DOWN)
 
 
 def _chunks(count: int) -> Iterator[slice]:
