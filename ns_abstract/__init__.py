@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from ns_abstract.api.scenes import Scene, load_scene, render
     from ns_abstract.geometry.camera_path import CameraPath, load_camera_path
     from ns_abstract.io.errors import InputError
+    from ns_abstract.report.progress import ProgressBar
 
 __version__ = _version.VERSION
 
@@ -32,6 +33,7 @@ _HOMES = {
     "api.scenes": ("Scene", "load_scene", "render"),
     "geometry.camera_path": ("CameraPath", "load_camera_path"),
     "io.errors": ("InputError",),
+    "report.progress": ("ProgressBar",),
 }
 _HOME = {name: home for home, names in _HOMES.items() for name in names}
 
@@ -46,6 +48,7 @@ __all__ = [
     "InputError",
     "PoseSet",
     "Progress",
+    "ProgressBar",
     "ReachCell",
     "ReachProgress",
     "ReachResult",

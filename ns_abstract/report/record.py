@@ -24,7 +24,7 @@ from ns_abstract.io.jsonio import file_size, is_number, load_json
 from ns_abstract.io.version import ADVISORY, stale
 from ns_abstract.io.version import VERSION as PACKAGE
 from ns_abstract.refine.result import ExtraOutput, FrameResult, TracePoint
-from ns_abstract.report.figures import layer_metrics, metrics, seconds_to, short_guarantee
+from ns_abstract.report.figures import ShownUnits, layer_metrics, metrics, seconds_to, short_guarantee
 from ns_abstract.report.files import (
     StoredFrame,
     check_frame,
@@ -526,7 +526,7 @@ class Report:
         name = str(self.run.scene.get("name", ""))
         path = self.folder / frame_name(result.index, "png")
         guarantee = short_guarantee(self.run.guarantee, self.run.scene.get("bounded"))
-        save_picture(path, result, guarantee=guarantee, about=name)
+        save_picture(path, result, guarantee=guarantee, about=name, units=ShownUnits.of(self.run.scene))
         for layer in result.layers:
             save_layer_picture(self.folder / layer_name(result.index, layer), result, layer)
         self._previews[result.index] = previews(result, _PREVIEW_PIXELS)
