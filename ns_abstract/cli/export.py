@@ -130,6 +130,14 @@ class Occupancy:
     overrides: SceneOverrides = field(default_factory=Overrides)
 
 
+@dataclass
+class Schemas:
+    """JSON Schemas of the perturbation file, the property and the loop, for editors that check files by "$schema"."""
+
+    output_dir: Path
+    """Folder for the schemas; made if missing."""
+
+
 Command = (
     Annotated[Npz, tyro.conf.subcommand("npz")]
     | Annotated[Png, tyro.conf.subcommand("png")]

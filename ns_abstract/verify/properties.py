@@ -38,7 +38,7 @@ ANCHORS = ((1.19, 1.98), (2.79, 4.59), (4.53, 8.92), (8.06, 5.29), (10.32, 10.65
 _HEAD = _ANCHORS * (1 + _CLASSES + 4)
 #: Boxes looked at in a proof of a detection: the best of each cell's sample, and in all.
 _BEST, _CANDIDATES = 2, 6
-_COMPONENTS = ("camera.x", "camera.y", "camera.z", "object.x", "object.y", "object.z", "distance")
+COMPONENTS = ("camera.x", "camera.y", "camera.z", "object.x", "object.y", "object.z", "distance")
 
 
 @dataclass(frozen=True)
@@ -546,6 +546,11 @@ def parse_property(root: Any, folder: Path, input_shape: tuple[int, ...], output
     return _TYPES[kind].parse(root, setting, common)
 
 
+def property_keys() -> dict[str, tuple[str, ...]]:
+    """Return the keys of a property file by its type, those of all types first."""
+    return {name: (*_COMMON, *kind.keys) for name, kind in _TYPES.items()}
+
+
 def _partitions(root: dict[str, Any]) -> tuple[int, ...] | None:
     value = root.get("partitions")
     if value is None:
@@ -571,8 +576,8 @@ def _regression(root: dict[str, Any], setting: _KeySetting, common: dict[str, An
         target = [f"{target}.{axis}" for axis in "xyz"]
     elif target == "distance":
         target = [target]
-    if not isinstance(target, list) or not all(is_moderate(v) or v in _COMPONENTS for v in target):
-        names = f"numbers ({FIX_MODERATE}) or {', '.join(_COMPONENTS)}"
+    if not isinstance(target, list) or not all(is_moderate(v) or v in COMPONENTS for v in target):
+        names = f"numbers ({FIX_MODERATE}) or {', '.join(COMPONENTS)}"
         raise _fail("target", root.get("target"), f"write camera, object, distance, or a list of {names}")
     if len(target) != outputs:
         raise InputError(
