@@ -26,7 +26,7 @@ EXAMPLES: dict[str, list[dict[str, Any]]] = {
     "perturbation": [
         SET,
         {"$schema": "perturbation.schema.json", "translation": {"x": [-0.1, 0.2]}, "orbit": None, "hue": [-0.5, 1]},
-        {"scene": [{"select": {"box": [[0] * 3, [1] * 3], "color": {"min": [0] * 3}, "opacity": [0, 1]}, "color": 0.1}]},
+        {"scene": [{"select": {"box": [[0] * 3, [1] * 3], "color": {"min": [0] * 3}, "opacity": [0, 1]}, "color": 1}]},
     ],
     "property": [
         {"$schema": "s", "type": "classification", "label": 2, "preprocess": PREPROCESS, "partitions": 3},
@@ -74,9 +74,8 @@ READERS: dict[str, Callable[[Any, Path], object]] = {
     "loop": parse_loop,
 }
 CHECKERS = {
-    "perturbation": schemas.perturbation_schema(), "property": schemas.property_schema(), "loop": schemas.loop_schema()
+    name: jsonschema.Draft202012Validator(getattr(schemas, f"{name}_schema")()) for name in EXAMPLES
 }  # fmt: skip
-CHECKERS = {name: jsonschema.Draft202012Validator(schema) for name, schema in CHECKERS.items()}
 #: How often the schema notices what the reader refuses, at least: the reader also knows scene, network and ranges.
 NOTICED = 0.85
 
