@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -11,10 +12,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from certifying import classifier
 from conftest import Inputs
-from test_check import certified  # noqa: F401
 from test_cli import call, one_line  # noqa: F401
 
+from ns_abstract.cli import certify as certify_command
 from ns_abstract.cli import export as export_command
 from ns_abstract.cli import render as render_command
 from ns_abstract.report.files import IMAGES, LEAVES, load_frame
@@ -78,7 +80,7 @@ def test_frames_without_linear_sets_are_refused(call: Call, bounded: Path, tmp_p
         arrays = {name: archive[name] for name in archive.files if name not in LEAVES}
     np.savez(plain / "frame_00000.npz", **arrays)
     code, error = run(call, "safetensors", "--input-dir", plain, "--output-dir", tmp_path)
-    assert code == 2 and "--save-cells" in one_line(error)
+    one_line(code, error, "--save-cells")
 
 
 @pytest.mark.parametrize(
@@ -94,7 +96,7 @@ def test_a_missing_package_is_named_with_the_line_for_pip(
     where = "--output-dir" if command in ("exr", "safetensors") else "--output-filename"
     options = ["--camera-path-filename", blobs.path] if command == "viser" else []
     code, error = run(call, command, "--input-dir", bounded, where, tmp_path / "out", *options)
-    assert code == 2 and f"pip install 'ns-abstract[{extra}]'" in one_line(error)
+    one_line(code, error, f"pip install 'ns-abstract[{extra}]'")
     assert not (tmp_path / "out").is_file()
 
 
@@ -127,4 +129,76 @@ def test_a_path_of_other_frames_is_refused(call: Call, bounded: Path, blobs: Inp
     (tmp_path / "short.json").write_text(json.dumps(content))
     options = ["--camera-path-filename", tmp_path / "short.json", "--output-filename", tmp_path / "path.rrd"]
     code, error = run(call, "rrd", "--input-dir", bounded, *options)
-    assert code == 2 and "1 cameras" in one_line(error)
+    one_line(code, error, "1 cameras")
+
+
+# ---------------------------------------------------------------- statements
+
+
+@pytest.fixture(scope="module")
+def certificate(blobs: Inputs, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A certificate; its network and property lie beside it."""
+    folder = tmp_path_factory.mktemp("certificate")
+    classifier(folder / "net.onnx", 16)
+    (folder / "prop.json").write_text(
+        json.dumps({"type": "classification", "label": 0, "preprocess": {"resize": [16, 16]}})
+    )
+    options = {"model": folder / "net.onnx", "property": folder / "prop.json", "frames": 0, "time_budget": 4}
+    with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as leave:
+        patch.setattr("sys.argv", ["command", *blobs.options(folder / "out", **options)])
+        certify_command.main()
+    assert leave.value.code == 0
+    return folder
+
+
+def stated(call: Call, folder: Path, target: Path) -> tuple[dict[str, Any], str]:  # noqa: F811
+    code, error = run(call, "statement", "--input-dir", folder, "--output-filename", target / "statement.json")
+    assert code == 0, error
+    return json.loads((target / "statement.json").read_text()), error
+
+
+def test_a_statement_names_what_was_certified(
+    call: Call, certificate: Path, blobs: Inputs, tmp_path: Path,  # noqa: F811
+) -> None:  # fmt: skip
+    content, error = stated(call, certificate / "out", tmp_path)
+    report = json.loads((certificate / "out" / "report.json").read_text())
+    assert content["_type"] == "https://in-toto.io/Statement/v1" and ":" in content["predicateType"] and error == ""
+    assert content.keys() == {"_type", "subject", "predicateType", "predicate"}
+    digests = {entry["name"]: entry["digest"]["sha256"] for entry in content["subject"]}
+    files = (certificate / "net.onnx", certificate / "prop.json", blobs.checkpoint)
+    for file in files:
+        assert digests.pop(file.name) == hashlib.sha256(file.read_bytes()).hexdigest()
+    assert digests == {name: report["fingerprint"][name] for name in ("scene", "property")}
+    for name in ("verdict", "coverage", "property", "guarantee", "cells_seal", "frames"):
+        assert content["predicate"][name] == report[name], name
+
+
+def test_a_statement_does_not_name_files_that_have_changed(
+    call: Call, certificate: Path, tmp_path: Path,  # noqa: F811
+) -> None:  # fmt: skip
+    """A scene that cannot be read again, and a property that says something else, are named by their digests alone."""
+    folder = tmp_path / "out"
+    shutil.copytree(certificate / "out", folder)
+    report = json.loads((folder / "report.json").read_text())
+    (tmp_path / "prop.json").write_text(json.dumps({"type": "classification", "label": 1}))
+    report["settings"]["property"] = str(tmp_path / "prop.json")
+    report["settings"]["load_config"] = str(tmp_path / "none.yml")
+    (folder / "report.json").write_text(json.dumps(report))
+    content, error = stated(call, folder, tmp_path)
+    assert {entry["name"] for entry in content["subject"]} == {"scene", "property", "net.onnx"}
+    assert "no such run" in error and error.count("\n") == 1
+
+
+def test_cells_that_are_not_those_of_the_report_are_not_stated(
+    call: Call, certificate: Path, tmp_path: Path, bounded: Path,  # noqa: F811
+) -> None:  # fmt: skip
+    folder = tmp_path / "out"
+    shutil.copytree(certificate / "out", folder)
+    report = json.loads((folder / "report.json").read_text())
+    report["cells_seal"]["rows"] += 1
+    (folder / "report.json").write_text(json.dumps(report))
+    target = tmp_path / "statement.json"
+    for wrong, words in ((folder, "cells_seal"), (bounded, "no certificate"), (tmp_path / "none", "no such folder")):
+        code, error = run(call, "statement", "--input-dir", wrong, "--output-filename", target)
+        one_line(code, error, words)
+        assert not target.exists()
