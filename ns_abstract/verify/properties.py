@@ -498,6 +498,8 @@ class _KeySetting(NamedTuple):
     outputs: int
     height: int
     width: int
+    input_shape: tuple[int, ...]
+    output_shape: tuple[int, ...]
 
 
 class _Type(NamedTuple):
@@ -542,7 +544,8 @@ def parse_property(root: Any, folder: Path, input_shape: tuple[int, ...], output
     preprocess = parse_preprocess(root.get("preprocess", {}))
     height, width = preprocess.size(input_shape)
     common: dict[str, Any] = {"preprocess": preprocess, "partitions": _partitions(root)}
-    setting = _KeySetting(folder, math.prod(input_shape), math.prod(output_shape), height, width)
+    sizes = math.prod(input_shape), math.prod(output_shape), height, width
+    setting = _KeySetting(folder, *sizes, input_shape, output_shape)
     return _TYPES[kind].parse(root, setting, common)
 
 
@@ -653,7 +656,7 @@ def _vnnlib(root: dict[str, Any], setting: _KeySetting, common: dict[str, Any]) 
         file = file_beside(setting.folder, name)
     except InputError as error:
         raise InputError(error.problem, field="file", fix=error.fix) from None
-    return VnnLibProperty(file=file, unsafe=load_vnnlib(file, setting.outputs, setting.inputs), **common)
+    return VnnLibProperty(file=file, unsafe=load_vnnlib(file, setting.output_shape, setting.input_shape), **common)
 
 
 _TYPES = {
