@@ -179,8 +179,8 @@ def bound_frames(
             job.check_time(frames[0], budget)
 
     def known(index: int) -> FrameResult | None:
-        # other scenes are covered anew as a whole; kept leaves are to be as tight as the result
-        before = found_before(index) if job.rays and not keep_leaves else None
+        # kept leaves are to be as tight as the result
+        before = found_before(index) if job.continues and not keep_leaves else None
         return before if before is not None and before.bounded else None
 
     def here(part: TileTask, goal: RefinementGoal) -> PartResult | None:
