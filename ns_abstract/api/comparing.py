@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -133,9 +134,9 @@ class ComparisonJob(Job):
         others = (replace(entry, name=f"other {entry.name}") for entry in self.other._scene_choices)
         return (*self._scene_choices, *others, self.frame_choice, *self.set_choices)
 
-    @cached_property
-    def _fingerprint(self) -> dict[str, Any]:
-        return {**Job._fingerprint.func(self), "other": self.other.method.fingerprint}
+    @property
+    def fingerprint(self) -> dict[str, Any]:
+        return {**super().fingerprint, "other": self.other.method.fingerprint}
 
     def describe(self) -> dict[str, Any]:
         first, second = super().describe(), self.other.method.describe()
@@ -149,18 +150,13 @@ def _open(
     return ComparisonJob(source.open(), other.open(), pose_sets, tolerance=tolerance, **options)
 
 
-class _named:
-    """Names options and keys of an error as B's."""
-
-    def __init__(self, other: Scene) -> None:
-        self.file = other.source.file
-
-    def __enter__(self) -> None:
-        return None
-
-    def __exit__(self, kind: Any, error: BaseException | None, trace: Any) -> None:
-        if isinstance(error, InputError):
-            raise error.within(self.file) from None
+@contextmanager
+def _named(other: Scene) -> Iterator[None]:
+    """Names the file of an error as B's."""
+    try:
+        yield
+    except InputError as error:
+        raise error.within(other.source.file) from None
 
 
 def _check_comparable(scene: Scene, other: Scene, pose_sets: Sequence[PoseBox]) -> None:
