@@ -182,6 +182,8 @@ class LargestDifference:
                 )
                 self.rendered = np.maximum(self.rendered, found)
         self._record()
+        # every pixel once, as a whole
+        self._bound(0.0, 1.0, lambda refinement: refinement.covered)
         for floor, share in self._passes():
             if self._late():
                 break
@@ -190,43 +192,51 @@ class LargestDifference:
 
     def _passes(self) -> Iterator[tuple[float, float]]:
         """Floors and parts of the time left, until the goal is reached."""
-        tolerance, share = self.tolerance, self.tuning.pass_share
-        if tolerance is not None and self._largest_rendered <= tolerance < self._most(self.upper):
-            yield tolerance, 1.0
-        for ratio in (*(r for r in self.tuning.floors if r > self.goal.ratio), self.goal.ratio):
+        if self.tolerance is not None:
+            if not self._decided:
+                yield self.tolerance, 1.0
+            return
+        ratios = (*(ratio for ratio in self.tuning.floors if ratio > self.goal.ratio), self.goal.ratio)
+        for ratio in ratios:
             floor = max(ratio * self._largest_rendered, self._largest_rendered + self.tuning.room)
-            if not self._decided and self._most(self.upper) > floor:
-                yield floor, share
-        if not self._decided:
-            yield 0.0, 1.0
+            if self._most(self.upper) > floor:
+                yield floor, self.tuning.pass_share
+        yield 0.0, 1.0
 
     @property
     def _decided(self) -> bool:
-        """Whether it is known that all values stay below the tolerance, or that one does not."""
-        if self.tolerance is None:
-            return False
+        """Whether it is known that all values stay within the tolerance, or that one does not."""
+        assert self.tolerance is not None
         return self._most(self.upper) <= self.tolerance or self._largest_rendered > self.tolerance
 
-    def _bound(self, floor: float, share: float) -> None:
-        """One pass, in a part of the time left."""
+    def _bound(
+        self, floor: float, share: float, enough: Callable[[Refinement], bool] = lambda refinement: False
+    ) -> None:
+        """One pass over the tiles with values above the floor, in a part of the time left, or until ``enough``."""
         camera, least = self.frame.camera, np.float32(floor)
+        loose = self.upper > np.maximum(self.goal.ratio * self.rendered, least)
+        here = self.tiles[(loose & self.inside[..., None])[self.tiles].any(axis=(1, 2, 3))]
+        if not here.size:
+            return
         upper, rendered = (assemble(np.maximum(p, least), camera) for p in (self.upper, self.rendered))
         lowest = np.full_like(upper, least)
         known = FrameResult(self.index, self.frame.box, lowest, upper, lowest, rendered, rendered, 0.0, 0)
         started = time.perf_counter()
 
         def told(point: TracePoint, covered: float) -> None:
-            most = min(self._most(self.upper), float(refinement.leaves.upper[refinement.tiles.inside].max(initial=0.0)))
+            most = float(refinement.leaves.upper[refinement.tiles.inside].max(initial=0.0))
+            most = min(self._most(self.upper), max(most, others))
             seconds = started - self.begin + point.seconds
             now = TracePoint(seconds, self.cells + point.cells, most, self._largest_rendered, covered)
             self.progress(now, 1.0 if self.bounded else covered)
 
+        others = self._most(np.where(np.isin(np.arange(len(self.upper)), here)[:, None, None, None], 0.0, self.upper))
         # nothing above the floor is to be left open; without a floor, means are measured
         goal = replace(self.goal, ratio=self.goal.ratio if floor == 0.0 else 1.0, seconds=share * self._left())
         frame = self.frame.above(floor)
         refinement = Refinement(
-            frame, self.index, goal, seed=self.seed, stopped=self._late, progress=told,
-            tiles=self.tiles, known=known,
+            frame, self.index, goal, seed=self.seed, stopped=lambda: self._late() or enough(refinement),
+            progress=told, tiles=here, known=known,
         )  # fmt: skip
         try:
             part = refinement.run_part()
@@ -238,8 +248,7 @@ class LargestDifference:
             self.whole.largest = greater(self.whole.largest, frame.largest)
         if not refinement.covered:
             return
-        self.bounded = True
-        here = self.tiles
+        self.bounded = self.bounded or here.size == self.tiles.size
         self.upper[here] = np.minimum(self.upper[here], part.upper)
         # values at the floor were not rendered
         seen = np.where(part.witness_upper > least, part.witness_upper, 0.0).astype(np.float32)
