@@ -43,6 +43,7 @@ class DifferenceBounds:
     slopes: np.ndarray
     context: PairContext
     linear: LinearSets | None = None
+    forms: None = None
 
 
 class DifferenceFrame:
@@ -134,7 +135,9 @@ class DifferenceFrame:
 
     def _difference(self, a: Bounds, b: Bounds, pixels: np.ndarray | None) -> DifferenceBounds:
         """Bounds of one cell from those of both scenes."""
-        upper = np.minimum(linear_upper(a, b), np.maximum(interval_upper(a, b), interval_upper(b, a)))
+        upper = np.maximum(interval_upper(a, b), interval_upper(b, a))
+        for more in (linear_upper(a, b), form_upper(a, b, a.slopes.size)):
+            upper = np.minimum(upper, more)
         _, high = outward(upper, upper)
         # what is not a number stays so, and is no bound
         high = np.maximum(high, self.floor)
@@ -198,3 +201,37 @@ def _signed_upper(a: LinearSets, b: LinearSets) -> np.ndarray:
     most = high - low + np.abs(slope_high - slope_low).sum(axis=-1)
     size = np.abs(high) + np.abs(low) + (np.abs(slope_high) + np.abs(slope_low)).sum(axis=-1)
     return most + DIFFERENCE_ROUNDING * size
+
+
+def form_upper(a: Bounds, b: Bounds, dimensions: int) -> np.ndarray:
+    """Upper bound [...] of |a - b| over a cell from polynomials in the same parameters (design.md, DF3).
+
+    Equal terms of the two cancel, and the clamp to [0, 1] takes no values apart.
+    """
+    if a.forms is None or b.forms is None:
+        return np.full(a.upper.shape, np.inf)
+    difference, d = a.forms - b.forms, dimensions
+    radius = a.forms[..., -1] + b.forms[..., -1]
+    size = (np.abs(a.forms) + np.abs(b.forms)).sum(axis=-1)
+    # what only one sign of the difference reaches: squares of parameters
+    rise, fall = (_polynomial_upper(sign * difference, d) for sign in (1.0, -1.0))
+    return np.maximum(rise, fall) + radius + DIFFERENCE_ROUNDING * size
+
+
+def _polynomial_upper(coefficients: np.ndarray, d: int) -> np.ndarray:
+    """At most the largest value over [-1, 1]^d of polynomials [..., m + 1], whose last column is left out."""
+    most, row = coefficients[..., 0].copy(), 1 + d
+    squares = np.zeros((*most.shape, d))
+    if coefficients.shape[-1] > d + 2:
+        for k in range(d):
+            for l in range(k, d):
+                if k == l:
+                    squares[..., k] = coefficients[..., row]
+                else:
+                    most += np.abs(coefficients[..., row])
+                row += 1
+    slope, steep = np.abs(coefficients[..., 1 : 1 + d]), np.abs(squares)
+    # s p + q p^2 is largest at an end, or where q < 0 at its vertex
+    vertex = (squares < 0.0) & (slope < 2.0 * steep)
+    inner = slope * slope / np.where(vertex, 4.0 * steep, 1.0)
+    return most + np.where(vertex, inner, slope + squares).sum(axis=-1)
