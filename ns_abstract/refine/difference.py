@@ -1,4 +1,4 @@
-"""The absolute difference of two scenes' pictures as a frame of its own (design.md, DF1-DF3)."""
+"""The absolute difference of two scenes' pictures as a frame of its own (design.md, Y1-Y3)."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class DifferenceBounds:
 
 
 class DifferenceFrame:
-    """Renders and bounds of |A - B| by pixel and channel, for two frames with the same parameters.
+    """Renders and bounds of |A - B| by pixel and channel, for two frames with the same parameters (design.md, Y4).
 
     Args:
         first, second: The frames of A and B, of the same set of poses, camera and tiles.
@@ -182,12 +182,12 @@ def _bounds(
 
 
 def interval_upper(a: Bounds, b: Bounds) -> np.ndarray:
-    """Upper bound [...] of the signed difference a - b from intervals; NaN: nothing is known (design.md, DF1)."""
+    """Upper bound [...] of the signed difference a - b from intervals; NaN: nothing is known (design.md, Y1)."""
     return (a.upper.astype(np.float64) - b.lower) * (1.0 + DIFFERENCE_ROUNDING)
 
 
 def linear_upper(a: Bounds, b: Bounds) -> np.ndarray:
-    """Upper bound [...] of |a - b| over a cell from linear bounds in the same parameters (design.md, DF2)."""
+    """Upper bound [...] of |a - b| over a cell from linear bounds in the same parameters (design.md, Y2)."""
     if a.linear is None or b.linear is None:
         return np.full(a.upper.shape, np.inf)
     return np.maximum(_signed_upper(a.linear, b.linear), _signed_upper(b.linear, a.linear))
@@ -204,7 +204,7 @@ def _signed_upper(a: LinearSets, b: LinearSets) -> np.ndarray:
 
 
 def form_upper(a: Bounds, b: Bounds, dimensions: int) -> np.ndarray:
-    """Upper bound [...] of |a - b| over a cell from polynomials in the same parameters (design.md, DF3).
+    """Upper bound [...] of |a - b| over a cell from polynomials in the same parameters (design.md, Y3).
 
     Equal terms of the two cancel, and the clamp to [0, 1] takes no values apart.
     """

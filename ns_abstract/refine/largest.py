@@ -1,4 +1,4 @@
-"""Bounds of the largest value of a `DifferenceFrame`, then of all its pixels (design.md, DF3)."""
+"""Bounds of the largest value of a `DifferenceFrame`, then of all its pixels (design.md, Y4)."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def _neighbours(values: np.ndarray, step: np.ndarray, low: np.ndarray, high: np.
 
 
 class LargestDifference:
-    """Bounds a difference's largest value and every pixel of it.
+    """Bounds a difference's largest value and every pixel of it (design.md, Y4).
 
     A pass is a `Refinement` that leaves values up to a floor open: cells and pixels below it cost nothing. Passes have
     lower and lower floors; the last one has none. What each of them finds holds, so that the least is taken.
