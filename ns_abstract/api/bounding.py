@@ -290,8 +290,8 @@ class _FrameSchedule:
         )  # fmt: skip
 
     def _known(self, index: int) -> FrameResult | None:
-        # other scenes are covered anew as a whole; kept leaves are to be as tight as the result
-        before = self.found_before(index) if self.job.rays and not self.keep_leaves else None
+        # kept leaves are to be as tight as the result
+        before = self.found_before(index) if self.job.continues and not self.keep_leaves else None
         return before if before is not None and before.bounded else None
 
     def _bound_here(self, part: TileTask, goal: RefinementGoal) -> PartResult | None:
