@@ -21,7 +21,7 @@ from ns_abstract.api.cell_search import (
     check_arguments,
 )
 from ns_abstract.api.certificate_report import CertificateReport
-from ns_abstract.api.certification import MEMORY, Certification, PropertySource, Question
+from ns_abstract.api.certification import MEMORY, Certification, PropertySource, asked
 from ns_abstract.api.job import Job
 from ns_abstract.api.poses import PoseSet
 from ns_abstract.api.scenes import Scene
@@ -34,13 +34,11 @@ from ns_abstract.io.memory import allowed_memory
 from ns_abstract.report.certificate import CertifiedRun, coverage, verdict
 from ns_abstract.report.figures import percent, short_guarantee
 from ns_abstract.report.notebook import verdicts_html
-from ns_abstract.report.record import file_stamp
 from ns_abstract.report.verdict_picture import clear_pictures
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.eight_bit import Picture
 from ns_abstract.verify.network import NetworkArithmetic
-from ns_abstract.verify.network.explain import check_cell
-from ns_abstract.verify.scene_margin import ProveCell, VariationKind, bounded_kinds, check_scenes
+from ns_abstract.verify.scene_margin import ProveCell, VariationKind, check_scenes
 from ns_abstract.verify.store import Store, fractions
 
 #: Seconds that pictures for the last report may take beyond the budget, where they are made ray by ray.
@@ -59,8 +57,7 @@ def check_network_memory(found: Certification, limit: float | None, workers: int
     Raises:
         InputError: It does, about.
     """
-    dimensions = max(1, len(found.parameters))
-    check_cell(found.network, dimensions, allowed_memory(limit) / (1 if found.job.rays else workers))
+    found.question.check_memory(len(found.parameters), allowed_memory(limit) / (1 if found.job.rays else workers))
 
 
 @dataclass(frozen=True)
@@ -97,14 +94,10 @@ class CertificateQuestion(CellQuestion[CertifyProgress]):
         self.job, self.waits = job, not job.job.rays
         self.about = CertifiedRun(
             guarantee=job.job.method.guarantee,
-            network_guarantee=job.network.guarantee(job.model.arithmetic),
+            network_guarantee=job.question.guarantee(job.arithmetic),
             renderer={name: job.job.method.program[name] for name in ("name", "version")},
             scene=job.job.describe(),
-            model={
-                **file_stamp(job.question.model),
-                "input": job.network.input_shape,
-                "output": job.network.output_shape,
-            },
+            model=job.question.describe(),
             property=job.question.source.value,
             sentence=job.property.sentence(),
             settings=settings,
@@ -170,7 +163,7 @@ class CertificateQuestion(CellQuestion[CertifyProgress]):
         search.deadline = search.deadline.extended(_LAST)
 
     def varied_scenes(self) -> tuple[Sequence[VariationKind], Callable[[VariationKind], ProveCell]]:
-        return bounded_kinds(self.job.places), self.job.settle
+        return self.job.kinds, self.job.settle
 
     def progress(self, store: Store) -> CertifyProgress:
         shares = [fractions(tally) for tally in store.tallies()]
@@ -256,7 +249,7 @@ class Certificate:
 def certify(
     scene: Scene,
     poses: PoseSet | Sequence[PoseSet],
-    model: str | os.PathLike[str],
+    model: str | os.PathLike[str] | None,
     property: Mapping[str, Any] | str | os.PathLike[str],
     *,
     time_budget: float = 600.0,
@@ -272,14 +265,14 @@ def certify(
     memory_limit: float | None = None,
     scene_margin: bool = False,
 ) -> Certificate:
-    """Prove, or break, a property of a network on every picture that a scene shows over sets of poses.
+    """Prove, or break, a property of a network, or of the picture itself, on every picture over sets of poses.
 
     Ctrl-C and ``on_progress`` returning False end the work between two cells, with what is known.
 
     Args:
         scene: The scene.
         poses: One set, or several.
-        model: Network, .onnx.
+        model: Network, .onnx; None: the property is one of the picture (visible, clear, picture, all, any).
         property: What is to hold, as the object of a property file, or that file.
         time_budget: Seconds for all sets together.
         output_dir: Folder for cells.sqlite, the report and counterexamples, as ns-abstract-certify writes them; None:
@@ -308,7 +301,7 @@ def certify(
     if not sets:
         raise InputError("found no set", field="poses", fix="give at least one PoseSet")
     source = property if isinstance(property, Mapping) else Path(property)
-    question = Question(Path(model), PropertySource.of(source))
+    question = asked(None if model is None else Path(model), PropertySource.of(source))
     drawn = [question.drawn(entry.of(scene)) for entry in sets]
     memory = network_memory(memory_limit, workers)
     job = Job(scene, drawn, arithmetic=arithmetic, workers=workers)

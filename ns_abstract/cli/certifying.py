@@ -47,7 +47,7 @@ class _Display:
 
 def _introduce(console: Console, job: Certification, about: CertifiedRun) -> None:
     method = job.job.method
-    console.print(f"{method.name}: {method.content}; {job.network.source.name}; {about.sentence}", markup=False)
+    console.print(f"{method.name}: {method.content}; {job.question.name}; {about.sentence}", markup=False)
     for note in about.plan:
         console.print(f"  {note}", markup=False, soft_wrap=True)
 

@@ -541,12 +541,17 @@ def parse_property(root: Any, folder: Path, input_shape: tuple[int, ...], output
     known(root, (*_COMMON, *_TYPES[kind].keys), "", lambda name, problem, fix: InputError(problem, field=name, fix=fix))
     preprocess = parse_preprocess(root.get("preprocess", {}))
     height, width = preprocess.size(input_shape)
-    common: dict[str, Any] = {"preprocess": preprocess, "partitions": _partitions(root)}
+    common: dict[str, Any] = {"preprocess": preprocess, "partitions": parse_partitions(root)}
     setting = _KeySetting(folder, math.prod(input_shape), math.prod(output_shape), height, width)
     return _TYPES[kind].parse(root, setting, common)
 
 
-def _partitions(root: dict[str, Any]) -> tuple[int, ...] | None:
+def parse_partitions(root: dict[str, Any]) -> tuple[int, ...] | None:
+    """Return the fixed partition that a parsed PROP.json asks for, or None.
+
+    Raises:
+        InputError: It is no number and no list of numbers.
+    """
     value = root.get("partitions")
     if value is None:
         return None
