@@ -24,7 +24,10 @@ from ns_abstract.methods.splat.load import load_scene
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.methods.splat.write import write_splatfacto_run
 
-HEADER = "| pair | set | largest, bound | largest, rendered | ratio | mean, bound | mean, rendered | seconds | cells | reached |"
+HEADER = (
+    "| pair | set | largest, bound | largest, rendered | ratio | mean, bound | mean, rendered | seconds | cells "
+    "| reached |"
+)
 #: Ratio, or difference, of the largest bound to the largest rendered difference that is asked for.
 RATIO, ROOM = 1.3, 0.01
 
