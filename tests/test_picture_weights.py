@@ -1,4 +1,4 @@
-"""Bounds of blending weights of chosen Gaussians, attacked by the renderer and the reference."""
+"""Bounds of blending weights of chosen Gaussians and samples, attacked by renderers and references."""
 
 from __future__ import annotations
 
@@ -10,11 +10,16 @@ import numpy as np
 import pytest
 import torch
 from conftest import blob_scene
+from nerfs import pixels_of, poses, raw_outputs, tiny_scene
 
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.io.errors import InputError
+from ns_abstract.methods.nerf.method import NerfMethod
+from ns_abstract.methods.nerf.render import Sampling, camera_rays
+from ns_abstract.methods.nerf.scene import NerfScene
+from ns_abstract.methods.nerf.weights import NerfWeightFrame
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.frame import SplatSample
 from ns_abstract.methods.splat.method import SplatMethod
@@ -167,3 +172,81 @@ def test_empty_selections_are_refused() -> None:
         frame_of(blob_scene(5), "pose", planes=[WeightPlane(Selection(box=((50.0,) * 3, (60.0,) * 3)))])
     with pytest.raises(InputError, match="the scene has Gaussians 0 to 4"):
         frame_of(blob_scene(5), "pose", planes=[WeightPlane(Selection(indices=(7,)))])
+
+
+# ---------------------------------------------------------------- fields
+
+
+BOX = Selection(box=((-9.0, -9.0, -9.0), (1.3, 9.0, 0.45)))
+
+
+def weights_by_hand(
+    frame: NerfWeightFrame, scene: NerfScene, values: np.ndarray, sampling: Sampling, planes: Sequence[WeightPlane]
+) -> np.ndarray:
+    """[H, W, planes] sums of the samples' weights, from the densities of `raw_outputs`."""
+    pose = torch.from_numpy(frame.pose_set.pose(values))
+    rays = torch.from_numpy(camera_rays(frame.camera, pixels_of(frame.camera))) @ pose[:, :3].T
+    rays = rays / rays.norm(dim=1, keepdim=True)
+    distances, lengths = (torch.from_numpy(v) for v in sampling.bins)
+    points = pose[:, 3] + rays[:, None] * distances[:, None]
+    density, _ = raw_outputs(scene.fine, points, rays[:, None].expand_as(points))
+    depth = torch.nn.functional.softplus(density).reshape(points.shape[:2]) * lengths
+    weights = (1.0 - torch.exp(-depth)) * torch.exp(-(torch.cumsum(depth, dim=1) - depth))
+    found = []
+    for plane in planes:
+        chosen = torch.ones_like(weights, dtype=torch.bool)
+        if plane.select is not None and plane.select.box is not None:
+            low, high = (torch.tensor(corner, dtype=points.dtype) for corner in plane.select.box)
+            chosen &= ((points >= low) & (points <= high)).all(dim=2)
+        if plane.nearer is not None:
+            chosen &= distances < plane.nearer
+        found.append((weights * chosen).sum(dim=1))
+    return torch.stack(found, dim=1).reshape(frame.camera.height, frame.camera.width, -1).numpy()
+
+
+@pytest.mark.parametrize("spec", [{"translation": {"x": 0.1}}, {"translation": {"y": 0.03}, "rotation": {"yaw": 0.03}}])
+def test_weights_of_samples_stay_inside(spec: dict[str, Any]) -> None:
+    scene, around = tiny_scene(), poses(spec)
+    method = NerfMethod(scene, num_samples=12)
+    planes = (WeightPlane(BOX), WeightPlane(nearer=0.7), WeightPlane(BOX, 1.1))
+    every = np.ones((around.camera.height, around.camera.width), bool)
+    frame = method.weight_frame(around, planes, every)
+    whole = frame.box
+    for box in (whole, whole.split(0, 8)[2]):
+        found = frame.sets(box)
+        assert found.linear is not None
+        lower, upper, a_low, b_low, a_high, b_high = (
+            assemble(part, frame.camera).astype(np.float64) for part in (
+                found.lower, found.upper, found.linear[0], found.linear[1], found.linear[2], found.linear[3],
+            )
+        )  # fmt: skip
+        for point in (box.middle, *box.corners(), *box.sample(6, np.random.default_rng(0))):
+            image = assemble(frame.of_sample(point, None), frame.camera)
+            by_hand = weights_by_hand(frame, scene, point, method.sampling, planes)
+            np.testing.assert_allclose(image, by_hand, atol=2e-7)
+            scaled = _scaled(box, point)
+            assert ((lower <= by_hand) & (by_hand <= upper)).all()
+            assert (a_low @ scaled + b_low <= by_hand).all() and (by_hand <= a_high @ scaled + b_high).all()
+    assert (upper - lower).mean() < 0.4 and (image.mean(axis=(0, 1)) > 1e-3).all()
+
+
+def test_rays_that_are_not_read_are_not_bounded() -> None:
+    around = poses({"translation": {"x": 0.02}})
+    method, some = NerfMethod(tiny_scene(), num_samples=12), np.zeros((3, 4), bool)
+    some[1, 1:3] = True
+    frame = method.weight_frame(around, [WeightPlane(nearer=2.0)], some)
+    every = method.weight_frame(around, [WeightPlane(nearer=2.0)], np.ones((3, 4), bool))
+    found = frame.sets(frame.box)
+    lower, upper = (assemble(part, frame.camera)[..., 0] for part in (found.lower, found.upper))
+    assert not upper[~some].any() and (upper[some] > lower[some]).all()
+    for point in frame.box.sample(5, np.random.default_rng(0)):
+        image = assemble(every.of_sample(point, None), frame.camera)[..., 0]
+        assert ((lower <= image) & (image <= upper))[some].all()
+
+
+def test_fields_have_no_gaussians_and_no_places_of_their_own() -> None:
+    around, every = poses({}), np.ones((3, 4), bool)
+    with pytest.raises(InputError, match="a NeRF has no Gaussians"):
+        NerfMethod(tiny_scene()).weight_frame(around, [WeightPlane(BRIGHT)], every)
+    with pytest.raises(InputError, match="uniform samples"):
+        NerfMethod(tiny_scene(), sampling="hierarchical").weight_frame(around, [WeightPlane(nearer=1.0)], every)
