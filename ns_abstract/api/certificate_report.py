@@ -194,7 +194,7 @@ class CertificateReport:
         if image is None:
             with self.search.deadline.enforced():
                 image = pictures.image(pose)
-        return preview(pictures.shown(image), side)
+        return preview(pictures.shown(image, pose), side)
 
     def _cell_pictures(self, rows: Mapping[int, list[dict[str, Any]]]) -> dict[tuple[int, int], dict[str, Any]]:
         """By frame and position, a picture of some cells: the same number of each verdict, evenly spread."""

@@ -55,8 +55,6 @@ if TYPE_CHECKING:
 
 #: Of the search's rules: results of different ones are not mixed.
 _RULES = 5
-#: Pixels that the picture moves by over a first cell: with one parameter, and with more.
-_MOTION_LINE, _MOTION = 0.08, 0.5
 #: Numbers that a network's layers may have together in a block's cells.
 _BLOCK_NUMBERS = 1 << 18
 #: Slanted parts of a cell at most, about: narrower cells need more of them in all.
@@ -83,6 +81,9 @@ class Question:
     Raises:
         InputError: A file or a field cannot be used.
     """
+
+    #: Pixels that the picture moves by over a first cell: with one parameter, and with more.
+    motion = (0.08, 0.5)
 
     def __init__(self, model: Path, source: PropertySource) -> None:
         self.model, self.source = model, source
@@ -341,7 +342,7 @@ class Certification:
         """
         pictures = self.pictures(index)
         box = pictures.box
-        pixels = _MOTION_LINE if box.dimensions == 1 else _MOTION
+        pixels = self.question.motion[0 if box.dimensions == 1 else 1]
         coarse = initial_divisions(pictures.frame.motion(box), pixels)
         if self.property.partitions is None:
             return CellGrid.adaptive(box, coarse)
@@ -485,7 +486,8 @@ class Certification:
         """
         if not self.job.rays:
             return
-        frame = cast("RayFrame", self.search_frame(index))
+        pictures = cast("FramePictures", self.search(index, self.grid(index)).scene)
+        frame, rays = cast("tuple[RayFrame, int]", pictures.effort)
         # compiling says nothing about rays
         warm_up(frame)
         begin = time.perf_counter()
@@ -495,7 +497,7 @@ class Certification:
         if by_ray is None:
             # not even one was done
             by_ray, more = _FORESEEN * seconds, "more than "
-        rays, workers = frame.camera.width * frame.camera.height, self.job.workers
+        workers = self.job.workers
         least = by_ray * rays / workers
         if more or least > seconds:
             cut = f"over one of {parts:,} parts of the set " if parts > 1 else ""

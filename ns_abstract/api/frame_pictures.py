@@ -163,6 +163,11 @@ class FramePictures:
         """The floats before any rounding, which has no slope."""
         return self._differentiable(values)
 
-    def shown(self, image: np.ndarray) -> np.ndarray:
-        """An `image` as bytes [h, w, 3], for people."""
+    @property
+    def effort(self) -> tuple[Frame, int]:
+        """A frame whose bounds a cell takes, and how many of its tiles, where pictures are made ray by ray."""
+        return self.frame, self.frame.tile_count
+
+    def shown(self, image: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """An `image` at parameter values [d] as bytes [h, w, 3], for people."""
         return to_bytes(image)

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -30,6 +30,8 @@ from ns_abstract.refine.protocol import (
     Bounds,
     Frame,
     Method,
+    PartsFrame,
+    RayFrame,
     SceneSample,
     Score,
     WeightFrame,
@@ -41,9 +43,6 @@ from ns_abstract.verify.camera_response import CameraResponse
 from ns_abstract.verify.eight_bit import Picture
 from ns_abstract.verify.network import NetworkArithmetic
 from ns_abstract.verify.picture_properties import FARTHEST, MeasureModel, PictureProperty, parse_picture_property
-
-#: What a measure costs beside a network; see `Question.numbers`.
-_NUMBERS = 1
 
 
 @dataclass(frozen=True)
@@ -119,6 +118,17 @@ class PlanePictures(FramePictures):
     def _planes(self) -> list[Any]:
         return [plane for plane in self._read if plane != "colors"]
 
+    @property
+    def _dark(self) -> bool:
+        """Whether colours are left out of images: they cost as much as weights, and are not read."""
+        return self.frame.tilewise and "colors" not in self._read
+
+    @property
+    def effort(self) -> tuple[Frame, int]:
+        if not self._dark:
+            return super().effort
+        return self._weights[0][0], int(self.wanted.sum())
+
     def _frame(self, method: Method, poses: PoseBox, sheared: bool) -> Frame:
         try:
             return method.frame(poses, sheared, "depth" in self._read)
@@ -134,13 +144,15 @@ class PlanePictures(FramePictures):
         """Concrete picture [H, W, C] float32; see `ns_abstract.verify.protocol.FrameImages`."""
         values = np.asarray(values, np.float64)
         base = member.base if isinstance(member, PlaneSample) else member
-        whole = super().image(values, base)
-        image = np.zeros((*whole.shape[:2], self.channels), np.float32)
-        image[..., :COLORS] = whole[..., :COLORS]
+        image = np.zeros((*self.wanted.shape, self.channels), np.float32)
+        whole = None if self._dark else super().image(values, base)
+        if whole is not None:
+            image[..., :COLORS] = whole[..., :COLORS]
         for frame, channels in self._weights:
             tiles = frame.of_sample(values, base)
             image[..., channels] = assemble(tiles, frame.camera)[..., : len(channels)]
         if self._depth is not None:
+            assert whole is not None
             depth = whole[..., DEPTH]
             image[..., self._depth] = np.where(np.isnan(depth), FARTHEST, np.minimum(depth, FARTHEST))
         return image
@@ -164,7 +176,7 @@ class PlanePictures(FramePictures):
                 whole[:, :, target] = assemble(every, frame.camera)[:, :, source]
 
         if "colors" in self._read or self._depth is not None:
-            bounds, tiles = self._bounded(self.frame, box)
+            bounds, tiles = self._bounded(self.frame, box, [0, 1, 2])
             slopes = slopes + bounds.slopes
             if "colors" in self._read:
                 put(self.frame, bounds, tiles, [0, 1, 2], [0, 1, 2])
@@ -179,15 +191,27 @@ class PlanePictures(FramePictures):
                 for side, value in ((lower, low), (linear[1], low), (upper, high), (linear[3], high)):
                     side[..., self._depth] = value
         for frame, channels in self._weights:
-            bounds, tiles = self._bounded(frame, box)
+            bounds, tiles = self._bounded(frame, box, channels)
             slopes = slopes + bounds.slopes
             put(frame, bounds, tiles, list(range(len(channels))), channels)
         return linear, lower, upper, slopes
 
-    def _bounded(self, frame: Frame, box: ParameterBox) -> tuple[Bounds, np.ndarray]:
+    def _bounded(self, frame: Frame, box: ParameterBox, channels: list[int]) -> tuple[Bounds, np.ndarray]:
         """Bounds of the tiles that hold pixels which are read, and their numbers."""
+        if frame.tilewise:
+
+            def weigh() -> np.ndarray | None:
+                found = self.weigh(box)
+                costs = np.zeros((*self.wanted.shape, COLORS))
+                if found is not None:
+                    costs[..., : len(channels)] = found[..., channels]
+                return None if found is None else costs
+
+            return cast("RayFrame", frame).sets(box, weigh), np.arange(frame.tile_count)
         pixels = in_tiles(self.wanted, frame.side)
         tiles = np.flatnonzero(pixels.any(axis=(1, 2)))
+        if isinstance(frame, PartsFrame):
+            return frame.bound_parts([box], tiles, None, True, pixels[tiles])[0], tiles
         return frame.bound(box, tiles, keep_linear=True), tiles
 
     def differentiable(self, values: torch.Tensor) -> torch.Tensor:
@@ -204,7 +228,9 @@ class PlanePictures(FramePictures):
             planes[self._depth] = torch.from_numpy(image.astype(np.float64))
         return torch.cat([plane.to(torch.float64) for plane in planes], dim=-1)
 
-    def shown(self, image: np.ndarray) -> np.ndarray:
+    def shown(self, image: np.ndarray, values: np.ndarray) -> np.ndarray:
+        if self._dark:
+            image = np.concatenate([super().image(values)[..., :COLORS], image[..., COLORS:]], axis=-1)
         return planes_picture(image, self.wanted, self._depth)
 
 
@@ -290,9 +316,10 @@ class PictureQuestion:
         """The pictures of a set with what is read."""
         return PlanePictures(method, poses, self.property)
 
-    #: What the property is about.
-    name = "the picture itself"
-    numbers = _NUMBERS
+    #: What the property is about, and what a measure costs beside a network; see `Question`.
+    name, numbers = "the picture itself", 1
+    #: Measures bear wider cells than networks do.
+    motion = (0.6, 0.6)
 
     def guarantee(self, arithmetic: NetworkArithmetic) -> tuple[str, ...]:
         """What holds of the measures."""

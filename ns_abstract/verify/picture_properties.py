@@ -23,7 +23,7 @@ from ns_abstract.io.fields import known
 from ns_abstract.io.jsonio import file_beside, is_number, show
 from ns_abstract.perturbation.variations import parse_selection
 from ns_abstract.refine.protocol import COLORS, WeightPlane
-from ns_abstract.verify.network import OutputBounds
+from ns_abstract.verify.network import ImageSets, OutputBounds
 from ns_abstract.verify.picture_measures import (
     CHANNELS,
     CellParts,
@@ -191,7 +191,8 @@ class PictureProperty(Property):
         """
         others = [plane for plane in self.planes if plane != "colors"]
         measures = self.measures(height, width)
-        return MeasureModel(measures, [0 if m.plane == "colors" else COLORS + others.index(m.plane) for m in measures])
+        places = [0 if m.plane == "colors" else COLORS + others.index(m.plane) for m in measures]
+        return MeasureModel(measures, places, COLORS + len(others))
 
     def measures(self, height: int, width: int) -> tuple[Measure, ...]:
         """The measures of pictures of this size, by leaf.
@@ -206,26 +207,17 @@ def _nearer(plane: Plane) -> bool:
     return isinstance(plane, WeightPlane) and plane.nearer is not None
 
 
-class CellSets(NamedTuple):
-    """Linear sets of m cells' planes: as `ns_abstract.verify.protocol.FrameImages.sets` has them, stacked."""
-
-    linear: tuple[np.ndarray, ...]
-    lower: np.ndarray
-    upper: np.ndarray
-
-
 class MeasureModel:
     """Measures of pictures, in the place of a network (`ns_abstract.verify.protocol.Model`).
 
     Args:
         measures: By leaf.
         places: By leaf, the first channel of its plane.
+        channels: Of the pictures.
     """
 
-    arithmetic = "float32"
-
-    def __init__(self, measures: Sequence[Measure], places: Sequence[int]) -> None:
-        self.measures, self.places = tuple(measures), tuple(places)
+    def __init__(self, measures: Sequence[Measure], places: Sequence[int], channels: int) -> None:
+        self.measures, self.places, self.channels = tuple(measures), tuple(places), channels
 
     def outputs(self, images: np.ndarray) -> np.ndarray:
         """[B, leaves] values of pictures [B, H, W, C]."""
@@ -237,19 +229,23 @@ class MeasureModel:
         pairs = zip(self.measures, self.places, strict=True)
         return torch.stack([measure.value(images, first) for measure, first in pairs], dim=1)
 
-    def input_sets(self, linear: tuple[np.ndarray, ...], lower: np.ndarray, upper: np.ndarray) -> CellSets:
-        """The sets as they are."""
-        return CellSets(linear, lower, upper)
+    def input_sets(self, linear: tuple[np.ndarray, ...], lower: np.ndarray, upper: np.ndarray) -> ImageSets:
+        """The sets as they are, the numbers of a picture in a row."""
+        m, d = len(lower), linear[0].shape[-1]
+        slopes, rest = (linear[0], linear[2]), (linear[1], linear[3], lower, upper)
+        a_lower, a_upper = (np.asarray(part).reshape(m, lower[0].size, d) for part in slopes)
+        b_lower, b_upper, low, high = (np.asarray(part).reshape(m, -1) for part in rest)
+        return ImageSets(a_lower, b_lower, a_upper, b_upper, low, high)
 
-    def bound(self, images: CellSets, query: Query) -> OutputBounds:
+    def bound(self, images: ImageSets, query: Query) -> OutputBounds:
         """Lower bounds of values and of their negatives over parts of cells, a row for each [parts, 2, leaves]."""
-        rows = []
-        for k in range(len(images.lower)):
-            flat = [np.asarray(part[k]).reshape(-1, *part.shape[3:]) for part in images.linear]
-            planes = PlaneSets(
-                tuple(flat), *(side[k].reshape(-1, side.shape[-1]) for side in (images.lower, images.upper))
-            )
-            rows.append(self._cell(planes))
+        rows, c = [], self.channels
+        arrays = (images.a_lower, images.b_lower, images.a_upper, images.b_upper, images.lower, images.upper)
+        for a_lower, b_lower, a_upper, b_upper, lower, upper in zip(*arrays, strict=True):
+            shape = len(lower) // c, c, a_lower.shape[-1]
+            flat = [part.reshape(-1, c) for part in (b_lower, b_upper, lower, upper)]
+            linear = a_lower.reshape(shape), flat[0], a_upper.reshape(shape), flat[1]
+            rows.append(self._cell(PlaneSets(linear, flat[2], flat[3])))
         # as many rows for every cell: cells of fewer parts repeat them
         most = max(len(row) for row in rows)
         lower = np.stack([np.resize(row, (most, *row.shape[1:])).ravel() for row in rows])
@@ -264,7 +260,7 @@ class MeasureModel:
         low, high = (np.stack(side, axis=1) for side in zip(*ends, strict=True))
         return np.stack([low, -high], axis=1)
 
-    def branch(self, images: CellSets, query: Query, groups: Sequence[Sequence[int]], most: int) -> float:
+    def branch(self, images: ImageSets, query: Query, groups: Sequence[Sequence[int]], most: int) -> float:
         """Nothing: there are no activations."""
         return -math.inf
 
