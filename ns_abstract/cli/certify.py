@@ -12,6 +12,7 @@ import tyro
 from ns_abstract.cli.commands import Certify
 from ns_abstract.cli.common import DONE, INTERRUPTED, SignalStop, run
 from ns_abstract.cli.sets import given_set
+from ns_abstract.io.arguments import positive
 from ns_abstract.io.errors import InputError
 
 
@@ -21,8 +22,8 @@ def certify(options: Certify) -> int:
     Raises:
         InputError: A file, a field or an option cannot be used.
     """
-    if options.time_budget is not None and not 0.0 < options.time_budget < float("inf"):
-        raise InputError(f"found {options.time_budget}", field="--time-budget", fix="give a positive number")
+    if options.time_budget is not None:
+        positive(options.time_budget, "--time-budget")
     options.where.check()
     given_set(options)
     stop = SignalStop()

@@ -6,7 +6,7 @@ import json
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
@@ -14,6 +14,9 @@ from ns_abstract.cli.common import DONE, run
 from ns_abstract.cli.options import Overrides, ProgramOptions, SceneOverrides
 from ns_abstract.cli.sets import GivenSet, given_set
 from ns_abstract.io.errors import InputError, visible
+
+if TYPE_CHECKING:
+    from ns_abstract.report.export import Results
 
 #: Along each axis of an occupancy grid.
 _MOST_VOXELS = 512
@@ -63,7 +66,7 @@ class Ply:
     """The Gaussians of a run as a standard 3DGS .ply, in the run's normalised frame."""
 
     load_config: Path
-    """config.yml of a Splatfacto run, or a .ply."""
+    """config.yml of a Splatfacto run, or a scene file (docs/formats.md)."""
     output_filename: Path
     """The .ply file; replaced if it exists."""
     overrides: SceneOverrides = field(default_factory=Overrides)
@@ -79,7 +82,7 @@ class ExportVnnLib(GivenSet):
     """
 
     load_config: Path
-    """config.yml of a Splatfacto run, or a standard 3DGS .ply."""
+    """config.yml of a Splatfacto run, or a scene file (docs/formats.md)."""
     camera_path_filename: Path
     """Camera path as Nerfstudio's viewer writes it."""
     model: Path
@@ -130,38 +133,115 @@ class Occupancy:
     overrides: SceneOverrides = field(default_factory=Overrides)
 
 
+@dataclass
+class Exr:
+    """OpenEXR pictures of every frame: parts lower, upper, witness_lower, witness_upper and image, float32."""
+
+    input_dir: Path
+    """Folder that ns-abstract-render wrote."""
+    output_dir: Path
+    """Folder for the pictures; made if missing."""
+
+
+@dataclass
+class Safetensors:
+    """Bounds and linear sets of every frame as safetensors, of ns-abstract-render --save-cells."""
+
+    input_dir: Path
+    """Folder that ns-abstract-render --save-cells wrote."""
+    output_dir: Path
+    """Folder for the files; made if missing."""
+
+
+@dataclass
+class Statement:
+    """A certificate as an in-toto statement (JSON), which other tools sign."""
+
+    input_dir: Path
+    """Folder that ns-abstract-certify or ns-abstract-reach wrote."""
+    output_filename: Path
+    """The JSON file; replaced if it exists."""
+
+
+@dataclass
+class Rrd:
+    """A Rerun recording (.rrd): bounds and figures frame by frame, and with a path its cameras in the scene."""
+
+    input_dir: Path
+    """Folder that ns-abstract-render wrote."""
+    output_filename: Path
+    """The .rrd file; replaced if it exists."""
+    camera_path_filename: Path | None = None
+    """The path that was rendered, for the cameras."""
+    load_config: Path | None = None
+    """config.yml of a Splatfacto run or a scene file (docs/formats.md), for its Gaussians."""
+    overrides: SceneOverrides = field(default_factory=Overrides)
+
+
+@dataclass
+class Viser:
+    """A recording of viser (.viser): the gap of every frame at its camera, in the scene."""
+
+    input_dir: Path
+    """Folder that ns-abstract-render wrote."""
+    output_filename: Path
+    """The .viser file; replaced if it exists."""
+    camera_path_filename: Path
+    """The path that was rendered."""
+    load_config: Path | None = None
+    """config.yml of a Splatfacto run or a scene file (docs/formats.md), for its Gaussians."""
+    seconds: float = 0.5
+    """Of each frame."""
+    overrides: SceneOverrides = field(default_factory=Overrides)
+
+
+@dataclass
+class Schemas:
+    """JSON Schemas of the perturbation file, the property and the loop, for editors that check files by "$schema"."""
+
+    output_dir: Path
+    """Folder for the schemas; made if missing."""
+
+
 Command = (
     Annotated[Npz, tyro.conf.subcommand("npz")]
     | Annotated[Png, tyro.conf.subcommand("png")]
     | Annotated[Mp4, tyro.conf.subcommand("mp4")]
+    | Annotated[Exr, tyro.conf.subcommand("exr")]
+    | Annotated[Safetensors, tyro.conf.subcommand("safetensors")]
+    | Annotated[Rrd, tyro.conf.subcommand("rrd")]
+    | Annotated[Viser, tyro.conf.subcommand("viser")]
+    | Annotated[Statement, tyro.conf.subcommand("statement")]
     | Annotated[Ply, tyro.conf.subcommand("ply")]
     | Annotated[ExportVnnLib, tyro.conf.subcommand("vnnlib")]
     | Annotated[Occupancy, tyro.conf.subcommand("occupancy")]
+    | Annotated[Schemas, tyro.conf.subcommand("schemas")]
 )
+Options = (
+    Npz | Png | Mp4 | Exr | Safetensors | Rrd | Viser | Statement | Ply | ExportVnnLib | Occupancy | Schemas
+)  # fmt: skip
 
 
-def export(options: Npz | Png | Mp4 | Ply | ExportVnnLib | Occupancy) -> int:
+def export(options: Options) -> int:
     """Run the command; returns the exit code.
 
     Raises:
         InputError: A file or an option cannot be used.
     """
-    into = isinstance(options, (Png, ExportVnnLib))
-    target = options.output_dir if into else options.output_filename
+    target = getattr(options, "output_dir", None) or options.output_filename  # pyright: ignore[reportAttributeAccessIssue]
     try:
-        if not into:
+        if hasattr(options, "output_filename"):
             target.parent.mkdir(parents=True, exist_ok=True)
         if isinstance(options, ExportVnnLib):
             notes = _vnnlib(options)
         elif isinstance(options, Occupancy):
             notes = _occupancy(options)
         elif isinstance(options, Ply):
-            from ns_abstract.methods.splat.load import load_scene
-            from ns_abstract.methods.splat.ply import write_ply
-
-            scene = load_scene(options.load_config, options.overrides)
-            notes = [f"left out: {count:,} Gaussians with {reason}" for reason, count in scene.dropped.items()]
-            notes += [f"not in the file: {sentence}" for sentence in write_ply(scene, target)]
+            notes = _ply(options)
+        elif isinstance(options, Statement):
+            notes = _statement(options)
+        elif isinstance(options, Schemas):
+            notes = _schemas(options)
         else:
             notes = _path(options)
     except OSError as error:
@@ -170,6 +250,34 @@ def export(options: Npz | Png | Mp4 | Ply | ExportVnnLib | Occupancy) -> int:
         print(visible(note), file=sys.stderr)
     print(visible(str(target)))
     return DONE
+
+
+def _ply(options: Ply) -> list[str]:
+    from ns_abstract.methods.splat.load import load_scene
+    from ns_abstract.methods.splat.ply import write_ply
+
+    scene = load_scene(options.load_config, options.overrides)
+    notes = [f"left out: {count:,} Gaussians with {reason}" for reason, count in scene.dropped.items()]
+    return notes + [f"not in the file: {sentence}" for sentence in write_ply(scene, options.output_filename)]
+
+
+def _statement(options: Statement) -> list[str]:
+    from ns_abstract.api.statement import statement
+    from ns_abstract.io.atomic import write_json
+
+    content, notes = statement(options.input_dir)
+    write_json(options.output_filename, content)
+    return notes
+
+
+def _schemas(options: Schemas) -> list[str]:
+    from ns_abstract.api.schemas import schema_files
+    from ns_abstract.io.atomic import write_atomic
+
+    options.output_dir.mkdir(parents=True, exist_ok=True)
+    for name, content in schema_files().items():
+        write_atomic(options.output_dir / name, lambda stream, content=content: stream.write(content))
+    return []
 
 
 def _occupancy(options: Occupancy) -> list[str]:
@@ -249,12 +357,19 @@ def _vnnlib(options: ExportVnnLib) -> list[str]:
     return list(job.property.notes)
 
 
-def _path(options: Npz | Png | Mp4) -> list[str]:
+def _path(options: Npz | Png | Mp4 | Exr | Safetensors | Rrd | Viser) -> list[str]:
     from ns_abstract.report.export import Results, write_archive, write_pictures, write_video
+    from ns_abstract.report.interchange import write_exr, write_safetensors
 
     results = Results(options.input_dir)
     if isinstance(options, Npz):
         write_archive(results, options.output_filename)
+    elif isinstance(options, Exr):
+        write_exr(results, options.output_dir)
+    elif isinstance(options, Safetensors):
+        write_safetensors(results, options.output_dir)
+    elif isinstance(options, (Rrd, Viser)):
+        _recording(options, results)
     elif not options.pictures:
         raise InputError("none given", field="--pictures", fix="name at least one")
     elif isinstance(options, Png):
@@ -265,6 +380,31 @@ def _path(options: Npz | Png | Mp4) -> list[str]:
     if results.unbounded:
         notes.append(f"no bounds but [0, 1] in frames {', '.join(map(str, results.unbounded))}")
     return notes
+
+
+def _recording(options: Rrd | Viser, results: Results) -> None:
+    from ns_abstract.geometry.camera_path import load_camera_path
+    from ns_abstract.methods.splat.activate import SH_C0, activate
+    from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
+    from ns_abstract.methods.splat.load import load_scene
+    from ns_abstract.report.recordings import RecordedScene, write_rerun, write_viser
+
+    scene, cameras = None, ()
+    if options.load_config is not None:
+        splats = activate(load_scene(options.load_config, options.overrides), GSPLAT_1_4_0)
+        colors = splats.sh[:, 0] if splats.degree == 0 else SH_C0 * splats.sh[:, 0] + 0.5
+        scene = RecordedScene(splats.means, splats.axes, colors.clip(0.0, 1.0), splats.opacity)
+    if options.camera_path_filename is not None:
+        cameras = load_camera_path(options.camera_path_filename).cameras
+        if max(results.files) >= len(cameras):
+            problem = f"has {len(cameras)} cameras, the results have a frame {max(results.files)}"
+            raise InputError(problem, file=options.camera_path_filename, fix="give the path that was rendered")
+    if isinstance(options, Rrd):
+        write_rerun(results, cameras, scene, options.output_filename)
+        return
+    if not 0.01 <= options.seconds <= 3600.0:
+        raise InputError(f"found {options.seconds}", field="--seconds", fix="give a number from 0.01 to 3600")
+    write_viser(results, cameras, scene, options.output_filename, options.seconds)
 
 
 def main() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from ns_abstract.report.figures import MARKS, number
+from ns_abstract.report.figures import MARKS, ShownUnits, number
 from ns_abstract.report.html import counted, set_of, whole_page
 from ns_abstract.report.svg import PlotAxis, draw_legend, draw_line, draw_plot, stairs, through
 
@@ -60,6 +60,11 @@ def render_page(
     if others := document["other_files"]:
         names = ", ".join(others[:8]) + (", …" if len(others) > 8 else "")
         notes.append(f"Files of earlier commands in this folder, which this report does not describe: {names}")
+    units = ShownUnits.of(document["scene"])
+
+    def sides(entry: Mapping[str, Any]) -> str:
+        return set_of(entry, units) or "one camera pose"
+
     return whole_page(
         "render.html",
         scripts=("sliders.js", "play.js") if plays else (),
@@ -69,8 +74,8 @@ def render_page(
         program=" ".join(str(v) for key in ("name", "version") if (v := document["renderer"].get(key))),
         sampled=sampled,
         verdict=_verdict(document),
-        sets=list({_set(entry): None for entry in frames}),
-        set_of=_set,
+        sets=list({sides(entry): None for entry in frames}),
+        set_of=sides,
         plays=plays,
         colors=_colors,
         gradient=_gradient,
@@ -99,10 +104,6 @@ def _gradient() -> str:
     from ns_abstract.report.picture import color_stops
 
     return ", ".join(color_stops())
-
-
-def _set(entry: Mapping[str, Any]) -> str:
-    return set_of(entry) or "one camera pose"
 
 
 def _verdict(document: Mapping[str, Any]) -> dict[str, Any]:

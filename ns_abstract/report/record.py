@@ -23,8 +23,8 @@ from ns_abstract.io.folder import remove_parts, unwritable
 from ns_abstract.io.jsonio import file_size, is_number, load_json
 from ns_abstract.io.version import ADVISORY, stale
 from ns_abstract.io.version import VERSION as PACKAGE
-from ns_abstract.refine.result import ExtraOutput, FrameResult, TracePoint
-from ns_abstract.report.figures import layer_metrics, metrics, seconds_to, short_guarantee
+from ns_abstract.refine.result import ExtraOutput, FrameResult, TracePoint, greater
+from ns_abstract.report.figures import ShownUnits, layer_metrics, metrics, seconds_to, short_guarantee
 from ns_abstract.report.files import (
     StoredFrame,
     check_frame,
@@ -261,6 +261,7 @@ def merged(older: FrameResult, newer: FrameResult) -> FrameResult:
         trace=older.trace + later,
         bounded=older.bounded or newer.bounded,
         layers={name: _merged_layer(older.layers[name], layer) for name, layer in newer.layers.items()},
+        largest=greater(older.largest, newer.largest),
     )
 
 
@@ -526,7 +527,7 @@ class Report:
         name = str(self.run.scene.get("name", ""))
         path = self.folder / frame_name(result.index, "png")
         guarantee = short_guarantee(self.run.guarantee, self.run.scene.get("bounded"))
-        save_picture(path, result, guarantee=guarantee, about=name)
+        save_picture(path, result, guarantee=guarantee, about=name, units=ShownUnits.of(self.run.scene))
         for layer in result.layers:
             save_layer_picture(self.folder / layer_name(result.index, layer), result, layer)
         self._previews[result.index] = previews(result, _PREVIEW_PIXELS)
