@@ -38,8 +38,8 @@ class LocationTuning:
     #: Part of a cell's volume that a contraction must take for it to be bounded again, and how often.
     worth: float = 0.4
     rounds: int = 4
-    #: A cell of a smaller part of the set is not cut any more.
-    finest: float = 1e-9
+    #: A cell is not cut any more where its volume is that of a box of this part of every range.
+    finest: float = 2.0**-10
     #: Most cells that one is cut into.
     parts: int = 16
     #: Pixels that a picture may miss beyond those allowed, as a part of all, where a better pose is looked for nearby.
@@ -233,9 +233,7 @@ class _Examination:
         bar = max(0.0, float(np.partition(gaps, gaps.size - count, axis=None)[gaps.size - count]))
         return gaps > bar
 
-    def _bound(
-        self, box: ParameterBox, tiles: np.ndarray, linear: bool, pixels: np.ndarray | None = None
-    ) -> Bounds:
+    def _bound(self, box: ParameterBox, tiles: np.ndarray, linear: bool, pixels: np.ndarray | None = None) -> Bounds:
         """Bounds of ``tiles``, or of some of their ``pixels`` alone where the frame can leave out the others."""
         check_cancelled()
         self.bounded += 1
@@ -299,7 +297,7 @@ class _Examination:
     def _cut(self) -> None:
         """Cut what is left of the cell where the picture moves most."""
         search, tuning = self.search, self.search.tuning
-        if self.cell.volume <= max(1.0, tuning.finest * search.grid.volume):
+        if self.cell.volume <= max(1.0, tuning.finest ** len(self.cell.first) * search.grid.volume):
             return self._finish()
         moved = search.moved(search.grid.box_of(self.cell))
         total = float(np.linalg.norm(moved))
