@@ -245,8 +245,8 @@ FOLLOWED_UP = 1.0 + 2.0**-40
 MEAN_DOWN = 1.0 - 2.0**-20
 #: R7: where a part lies in a box, 6, its product, 1, and a sum of at most 4 d + 1 <= 41 of these; 16 to spare.
 MAP_ROUNDING = 64.0 * UNIT64
-#: R7: no charge: a guard, as leaves are those of all cells (R1): volumes of parts that are whole together, by sums of up
-#: to 2^20 products of d <= 10 factors of 3 roundings each, lack at most 2^-32.
+#: R7: no charge: a guard, as leaves are those of all cells (R1): volumes of parts that are whole together, sums of
+#: up to 2^20 products of d <= 10 factors of 3 roundings each, lack at most 2^-32.
 COVER_DOWN = 1.0 - 2.0**-30
 #: V1: roundings of one float32 evaluation of the preprocessing, in units of the largest numbers met: 7; 3 to spare.
 PREPROCESS_ROUNDING = 10.0 * UNIT32

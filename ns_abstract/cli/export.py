@@ -6,11 +6,11 @@ import json
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Union
 
 import tyro
 
-from ns_abstract.cli.common import DONE, run
+from ns_abstract.cli.common import DONE, command, run
 from ns_abstract.cli.options import Overrides, ProgramOptions, SceneOverrides
 from ns_abstract.cli.sets import GivenSet, given_set
 from ns_abstract.io.errors import InputError, visible
@@ -130,14 +130,9 @@ class Occupancy:
     overrides: SceneOverrides = field(default_factory=Overrides)
 
 
-Command = (
-    Annotated[Npz, tyro.conf.subcommand("npz")]
-    | Annotated[Png, tyro.conf.subcommand("png")]
-    | Annotated[Mp4, tyro.conf.subcommand("mp4")]
-    | Annotated[Ply, tyro.conf.subcommand("ply")]
-    | Annotated[ExportVnnLib, tyro.conf.subcommand("vnnlib")]
-    | Annotated[Occupancy, tyro.conf.subcommand("occupancy")]
-)
+_ABOUT = "Write results of ns-abstract-render, scenes and properties in other programs' formats."
+_PARTS = {"npz": Npz, "png": Png, "mp4": Mp4, "ply": Ply, "vnnlib": ExportVnnLib, "occupancy": Occupancy}
+Command = Union[tuple(Annotated[kind, tyro.conf.subcommand(name)] for name, kind in _PARTS.items())]  # noqa: UP007
 
 
 def export(options: Npz | Png | Mp4 | Ply | ExportVnnLib | Occupancy) -> int:
@@ -269,7 +264,7 @@ def _path(options: Npz | Png | Mp4) -> list[str]:
 
 def main() -> None:
     """Entry point of the console script."""
-    run(export, lambda: tyro.cli(Command, prog="ns-abstract-export"))  # pyright: ignore[reportCallIssue, reportArgumentType]
+    run(export, command("ns-abstract-export", Command, _PARTS, _ABOUT))
 
 
 if __name__ == "__main__":
