@@ -179,7 +179,7 @@
   // the pixel under the pointer
   function tell() {
     const body = get("play-values"), f = frame;
-    get("play-table").hidden = false;
+    get("play-table").hidden = !pixel;
     body.replaceChildren();
     get("play-where").textContent = pixel ? "row " + pixel[0] + ", column " + pixel[1] + (pinned ? " (held)" : "") : "point at the picture; click to hold a pixel";
     if (!pixel) { curve(); return; }
