@@ -29,6 +29,7 @@ from ns_abstract.execution.worker_cache import Recipe, load
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.arguments import positive, whole
 from ns_abstract.io.errors import InputError
+from ns_abstract.io.folder import first_command
 from ns_abstract.report.certificate import LastReport
 from ns_abstract.report.figures import percent
 from ns_abstract.verify.cells import Cell, CellGrid
@@ -301,6 +302,7 @@ class CellSearch(Generic[P]):
         self.deadline = Deadline(request=stop) if question.waits else whole
         with ExitStack() as stack:
             # a signal waits until there is a store to report on
+            self.last.first_command = first_command(self.folder) if request.resume else None
             store = self.open(resume=request.resume)
             stack.callback(store.close)
             stack.enter_context(store.errors_as_input())
