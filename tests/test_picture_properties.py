@@ -207,7 +207,7 @@ def test_certificates_hold(kind: str, blobs: Inputs, tmp_path: Path, in_process:
     # in the middle of what is seen: the property holds in a part of the set
     case = Case(tmp_path / "case", blobs, PROPERTIES[kind](float(0.5 * (seen.min() + seen.max()))))
     output = tmp_path / "out"
-    assert in_process(certify_command, case.options(output)).returncode == 0
+    assert in_process(certify_command.main, case.options(output))[0] == 0
     found = report(output)
     shares = found["coverage"]
     assert shares["certified"] > 0.1 and shares["falsified"] > 0.1 and shares["unknown"] < 0.02
@@ -223,10 +223,10 @@ def test_certificates_hold(kind: str, blobs: Inputs, tmp_path: Path, in_process:
         if verdict == "falsified":
             assert margins[0] == margin <= 0.0
     # it goes on with what there is, and only with that
-    again = in_process(certify_command, case.options(output, "--resume"))
-    assert again.returncode == 0 and report(output)["coverage"] == shares
+    assert in_process(certify_command.main, case.options(output, "--resume"))[0] == 0
+    assert report(output)["coverage"] == shares
     other = Case(tmp_path / "case", blobs, PROPERTIES[kind](0.123))
-    assert in_process(certify_command, other.options(output, "--resume")).returncode == 2
+    assert in_process(certify_command.main, other.options(output, "--resume"))[0] == 2
 
 
 def test_several_parameters_and_scenes(blobs: Inputs) -> None:
@@ -276,16 +276,16 @@ def test_bad_input_is_one_line(blobs: Inputs, tmp_path: Path, in_process: InProc
     Image.fromarray(np.full((8, 8), 255, np.uint8)).save(tmp_path / "mask.png")
     for name, (prop, mentions) in BAD.items():
         case = Case(tmp_path, blobs, prop)
-        done = in_process(certify_command, case.options(tmp_path / "out"))
-        assert done.returncode == 2 and done.stderr.count("\n") == 1, (name, done.stderr)
-        assert all(text in done.stderr for text in mentions), (name, done.stderr)
+        code, _, error = in_process(certify_command.main, case.options(tmp_path / "out"))
+        assert code == 2 and error.count("\n") == 1, (name, error)
+        assert all(text in error for text in mentions), (name, error)
     case = Case(tmp_path, blobs, VISIBLE)
     for more, text in (
         (["--model", "x.onnx"], "--model: given with a property of the picture"), (["--picture", "8-bit"], "--picture"),
         (["--network-arithmetic", "real"], "--network-arithmetic"),
     ):  # fmt: skip
-        done = in_process(certify_command, case.options(tmp_path / "out", *more))
-        assert done.returncode == 2 and text in done.stderr
+        code, _, error = in_process(certify_command.main, case.options(tmp_path / "out", *more))
+        assert code == 2 and text in error
 
 
 def test_masks_and_planes_are_read_where_they_should(blobs: Inputs, tmp_path: Path) -> None:
