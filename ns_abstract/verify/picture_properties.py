@@ -40,6 +40,8 @@ _TUNING = MeasureTuning()
 _STATISTICS = ("mean", "least", "greatest")
 #: The depth of a pixel on which nothing is drawn, and the greatest that is told apart, normalised units.
 FARTHEST = 2.0**20
+#: What reports say of distances.
+_DISTANCES = "distances: depth of the centres of Gaussians along the optical axis; of a NeRF's samples along their rays"
 #: Most leaves of a property, and how deep it may be.
 _MOST_LEAVES, _DEEPEST = 64, 8
 
@@ -173,7 +175,7 @@ class PictureProperty(Property):
     @property
     def notes(self) -> tuple[str, ...]:
         near = any(leaf.plane == "depth" or _nearer(leaf.plane) for leaf in leaves(self.statement))
-        return ("distances: depth along the optical axis of the centres of Gaussians, normalised units",) * near
+        return (_DISTANCES,) * near
 
     @property
     def planes(self) -> tuple[Plane, ...]:
