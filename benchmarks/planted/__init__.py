@@ -10,6 +10,7 @@ from planted.inputs import INPUTS
 from planted.loops import LOOPS
 from planted.network_rows import NETWORK_ROWS
 from planted.networks import NETWORKS
+from planted.pictures import PICTURES
 from planted.polynomials import POLYNOMIALS
 from planted.processes import PROCESSES
 from planted.results import RESULTS
@@ -19,7 +20,7 @@ from planted.verdicts import VERDICTS
 
 FAULTS = (
     *FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS, *DEPTHS, *LOOPS, *CHECKS,
-    *INPUTS, *NETWORKS, *NETWORK_ROWS, *PROCESSES, *RESULTS, *SCENES,
+    *INPUTS, *NETWORKS, *NETWORK_ROWS, *PROCESSES, *RESULTS, *SCENES, *PICTURES,
 )  # fmt: skip
 
 __all__ = ["FAULTS", "Fault", "apply"]

@@ -7,14 +7,13 @@ import itertools
 import json
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-import torch
 
 from ns_abstract.api.assumptions import choice
 from ns_abstract.api.files import Settings, path_sets, resized
@@ -27,18 +26,17 @@ from ns_abstract.execution.worker_cache import Recipe
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import load_camera_path
 from ns_abstract.geometry.poses import PoseBox
-from ns_abstract.geometry.tiles import assemble
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import show
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.perturbation.specification import Perturbation
-from ns_abstract.refine.protocol import Frame, Method, RayFrame, SceneSample
+from ns_abstract.refine.protocol import Frame, Method, RayFrame
 from ns_abstract.report.record import file_stamp
-from ns_abstract.verify.camera_response import CameraResponse, response_sets
+from ns_abstract.verify.camera_response import CameraResponse
 from ns_abstract.verify.cells import Cell, CellGrid, initial_divisions
-from ns_abstract.verify.eight_bit import Picture, rounded, rounded_sets
+from ns_abstract.verify.eight_bit import Picture
 from ns_abstract.verify.model import NetworkModel, parametric
 from ns_abstract.verify.network import NetworkArithmetic, load_network
 from ns_abstract.verify.network.explain import check_cell
@@ -412,7 +410,9 @@ class Certification:
 
     def places(self, kind: VariationKind) -> bool:
         """Whether a kind's parameters can be bounded beside those of every set."""
-        return isinstance(self.model, NetworkModel) and all(poses.box.dimensions + len(kind.place) <= MAX_DIMENSIONS for poses in self.job.pose_sets)
+        return isinstance(self.model, NetworkModel) and all(
+            poses.box.dimensions + len(kind.place) <= MAX_DIMENSIONS for poses in self.job.pose_sets
+        )
 
     @property
     def kinds(self) -> tuple[VariationKind, ...]:

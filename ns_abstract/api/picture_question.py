@@ -107,7 +107,9 @@ class PlanePictures(FramePictures):
         for first in range(0, len(weights), MOST_PLANES):
             some = weights[first : first + MOST_PLANES]
             if not isinstance(method, WeightMethod):
-                raise InputError(f"blending weights of {method.content} are not bounded", field="type", fix="use picture")
+                raise InputError(
+                    f"blending weights of {method.content} are not bounded", field="type", fix="use picture"
+                )
             frame = method.weight_frame(poses, [plane for _, plane in some], self.wanted)
             self._weights.append((frame, [COLORS + k for k, _ in some]))
         self._depth = COLORS + self._planes.index("depth") if "depth" in self._planes else None
@@ -233,7 +235,7 @@ class PlanePictures(FramePictures):
 
 
 def depth_range(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds [H, W] of depths, where nothing drawn is `FARTHEST`, from those of accumulation and depth (V17).
+    """Bounds [H, W] of depths, where nothing drawn is `FARTHEST`, from those of accumulation and depth (Q4).
 
     Args:
         lower, upper: [H, W, 5] bounds of a frame with layers.

@@ -1,4 +1,4 @@
-"""Numbers that are read off a picture, its depths or its blending weights, and their bounds (docs/design.md, V17).
+"""Numbers that are read off a picture, its depths or its blending weights, and their bounds (docs/design.md, Q4).
 
 A measure is a mean or an order statistic of the pixels of a region: it grows with every pixel, so that bounds of the
 pixels bound it. Over a cell it is bounded part by part, where the pixels' linear bounds hold: pixels that rise and fall
@@ -145,9 +145,7 @@ class Measure:
         self, planes: PlaneSets, first: int, parts: CellParts, pixels: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """[s] bounds of the statistic of some pixels over each part."""
-        low, high = (
-            np.minimum(side, self.cap) for side in planes.over(parts, pixels, first, np.array(self.channels))
-        )
+        low, high = (np.minimum(side, self.cap) for side in planes.over(parts, pixels, first, np.array(self.channels)))
         if self.rank is None:
             rounding = len(pixels) * OWN_MARGIN * np.maximum(np.abs(low).max(axis=1), np.abs(high).max(axis=1))
             low, high = low.mean(axis=1) - rounding, high.mean(axis=1) + rounding

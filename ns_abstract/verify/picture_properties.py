@@ -1,7 +1,7 @@
 """Properties of the picture itself, without a network: ``visible``, ``clear``, ``picture``, ``all`` and ``any``.
 
 A property is a tree whose leaves say that a measure of the picture lies within limits; its margin is the least or the
-greatest of theirs (docs/design.md, V17).
+greatest of theirs (docs/design.md, Q4).
 """
 
 from __future__ import annotations
@@ -323,7 +323,7 @@ class _Source(NamedTuple):
         if box is None or box == "all":
             return Region(name=name)
         if not (isinstance(box, list) and len(box) == 4 and all(type(v) is int and 0 <= v < 1 << 20 for v in box)):
-            raise _fail(name, box, "write pixels [x0, y0, x1, y1], whole numbers of at least 0, or \"all\"")
+            raise _fail(name, box, 'write pixels [x0, y0, x1, y1], whole numbers of at least 0, or "all"')
         x0, y0, x1, y1 = box
         if not (x0 < x1 and y0 < y1):
             raise _fail(name, box, "write [x0, y0, x1, y1] with x0 < x1 and y0 < y1")
