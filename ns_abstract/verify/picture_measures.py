@@ -36,7 +36,7 @@ class MeasureTuning:
     """Into how many parts a cell's linear bounds are looked at. It does not decide whether a bound holds."""
 
     #: Most parts, and most numbers (parts times pixels) at once.
-    parts: int = 64
+    parts: int = 32
     numbers: int = 1 << 21
 
 
