@@ -412,8 +412,6 @@ class Certification:
         """Whether a kind's parameters can be bounded beside those of every set."""
         room = all(poses.box.dimensions + len(kind.place) <= MAX_DIMENSIONS for poses in self.job.pose_sets)
         return isinstance(self.model, NetworkModel) and room
-            poses.box.dimensions + len(kind.place) <= MAX_DIMENSIONS for poses in self.job.pose_sets
-        )
 
     @property
     def kinds(self) -> tuple[VariationKind, ...]:
