@@ -89,10 +89,8 @@ def test_measures_stay_inside(d: int) -> None:
             assert inside.any()
             for picture in members(sets, p, rng):
                 value = exact(measure, picture[:, first : first + len(measure.channels)])
-                assert all(
-                    Fraction(float(a)) <= value <= Fraction(float(b))
-                    for a, b in zip(low[inside], high[inside], strict=True)
-                )
+                for a, b in zip(low[inside].tolist(), high[inside].tolist(), strict=True):
+                    assert Fraction(a) <= value <= Fraction(b)
                 shown = float(measure.value(torch.from_numpy(picture)[None, None], first)[0])
                 assert shown == pytest.approx(float(value), abs=1e-12)
         widths.append(float((high - low).mean()))
@@ -132,6 +130,16 @@ def test_claims_are_trees() -> None:
         lower[0, :, 0] = np.nan
         margin = claim.proved(claim.query(values[None]), OutputBounds(lower.reshape(1, -1), lower, lower), [box])[0]
         assert margin == -np.inf
+
+
+def test_parts_of_a_cell_must_all_hold() -> None:
+    claim = parse_picture_property(VISIBLE, Path()).bind(None, lambda: np.zeros(0))  # type: ignore[arg-type]
+    # two parts, of which one holds: lower bounds of the value and of its negative
+    lower = np.array([[[0.9], [-1.0]], [[0.4], [-1.0]]])
+    margin = claim.proved(
+        claim.query(np.ones((1, 1))), OutputBounds(lower.reshape(1, -1), lower, lower), [ParameterBox((), (), (), ())]
+    )
+    assert margin[0] == pytest.approx(-0.1) and margin[0] <= -0.1 + 1e-9
 
 
 def test_limits_include_themselves() -> None:
@@ -219,9 +227,8 @@ def test_certificates_hold(kind: str, blobs: Inputs, tmp_path: Path, in_process:
     claim, rng = job.claim(pictures), np.random.default_rng(3)
     for _, low, high, verdict, margin, example in cells(output):
         (a,), (b,) = json.loads(low), json.loads(high)
-        poses = np.array(
-            [[a], [b], *rng.uniform(a, b, (2, 1))] if verdict == "certified" else [json.loads(example or "[0]")]
-        )
+        inside = [[a], [b], *rng.uniform(a, b, (2, 1))]
+        poses = np.array(inside if verdict == "certified" else [json.loads(example or "[0]")])
         outputs = job.model.outputs(np.stack([pictures.image(pose) for pose in poses]))
         margins = claim.margin(torch.from_numpy(outputs), torch.from_numpy(poses)).numpy()
         if verdict == "certified":

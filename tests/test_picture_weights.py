@@ -37,7 +37,7 @@ NEAR = 1.5
 PLANES = (WeightPlane(LEFT), WeightPlane(nearer=NEAR), WeightPlane(BRIGHT, 1.4))
 SETS: dict[str, dict[str, Any]] = {
     "pose": {},
-    "z": {"translation": {"z": 0.02}},
+    "z": {"translation": {"z": [-0.01, 0.03]}},
     "yaw": {"rotation": {"yaw": 0.01}},
     "three": {"translation": {"x": 0.01, "z": [0.0, 0.02]}, "rotation": {"pitch": 0.01}},
     "scenes": {
@@ -124,10 +124,10 @@ def test_what_crosses_the_distance_counts_as_both() -> None:
     found = frame.bound(frame.box, np.arange(frame.tile_count))
     middle = np.s_[0, 12, 12, 0]
     assert found.lower[middle] == 0.0 and found.upper[middle] > 0.9
-    near, far = frame.render(np.array([-0.02])), frame.render(np.array([0.02]))
+    near, far = frame.render(np.array([-0.01])), frame.render(np.array([0.03]))
     assert near[middle] > 0.9 and far[middle] == 0.0
     # where none crosses it, the bounds say which
-    for part, ends in zip(frame.box.split(0, 4), ((0.9, 1.0), (0.9, 1.0), (0.0, 1e-4), (0.0, 1e-4)), strict=True):
+    for part, ends in zip(frame.box.split(0, 4), ((0.9, 1.0), (0.0, 1e-4), (0.0, 1e-4), (0.0, 1e-4)), strict=True):
         inner = frame.bound(part.replace(0, part.lower[0] + 1e-4, part.upper[0] - 1e-4), np.arange(frame.tile_count))
         assert ends[0] <= inner.lower[middle] <= inner.upper[middle] <= ends[1]
 
@@ -177,7 +177,7 @@ def test_empty_selections_are_refused() -> None:
 # ---------------------------------------------------------------- fields
 
 
-BOX = Selection(box=((-9.0, -9.0, -9.0), (1.3, 9.0, 0.45)))
+BOX = Selection(box=((-9.0, -9.0, -9.0), (9.0, 0.25, 9.0)))
 
 
 def weights_by_hand(

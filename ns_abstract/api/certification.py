@@ -410,9 +410,8 @@ class Certification:
 
     def places(self, kind: VariationKind) -> bool:
         """Whether a kind's parameters can be bounded beside those of every set."""
-        return isinstance(self.model, NetworkModel) and all(
-            poses.box.dimensions + len(kind.place) <= MAX_DIMENSIONS for poses in self.job.pose_sets
-        )
+        room = all(poses.box.dimensions + len(kind.place) <= MAX_DIMENSIONS for poses in self.job.pose_sets)
+        return isinstance(self.model, NetworkModel) and room
 
     @property
     def kinds(self) -> tuple[VariationKind, ...]:

@@ -138,12 +138,14 @@ class CertificateQuestion(CellQuestion[CertifyProgress]):
         return self.job.job.pose_sets[number].box
 
     def counterexamples(self, number: int, grid: CellGrid, findings: Any) -> Iterator[tuple[str, dict[str, Any]]]:
+        pictures = None
         for leaf in findings.leaves:
             if leaf.counterexample is None or leaf.image is None or leaf.outputs is None:
                 continue
             values = np.array(leaf.counterexample)
+            pictures = self.job.pictures(number) if pictures is None else pictures
             arrays: dict[str, Any] = {
-                "image": leaf.image,
+                "image": pictures.completed(leaf.image, values),
                 "outputs": leaf.outputs,
                 "values": values,
                 "names": np.array(grid.box.names, str),

@@ -168,6 +168,10 @@ class FramePictures:
         """A frame whose bounds a cell takes, and how many of its tiles, where pictures are made ray by ray."""
         return self.frame, self.frame.tile_count
 
+    def completed(self, image: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """An `image` at parameter values [d] with its colours, where the search leaves them out."""
+        return image
+
     def shown(self, image: np.ndarray, values: np.ndarray) -> np.ndarray:
         """An `image` at parameter values [d] as bytes [h, w, 3], for people."""
         return to_bytes(image)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, cast
 
 import numpy as np
@@ -118,14 +118,18 @@ class PlanePictures(FramePictures):
     def _planes(self) -> list[Any]:
         return [plane for plane in self._read if plane != "colors"]
 
-    @property
+    @cached_property
     def _dark(self) -> bool:
-        """Whether colours are left out of images: they cost as much as weights, and are not read."""
-        return self.frame.tilewise and "colors" not in self._read
+        """Whether the search leaves colours out of images: they cost as much as weights, and are not read.
+
+        Of other scenes of a set colours are kept, which nobody could render later.
+        """
+        weights = all(isinstance(plane, WeightPlane) for plane in self._read)
+        return weights and next(iter(self.frame.scene_samples(0)), None) is None
 
     @property
     def effort(self) -> tuple[Frame, int]:
-        if not self._dark:
+        if "colors" in self._read:
             return super().effort
         return self._weights[0][0], int(self.wanted.sum())
 
@@ -228,14 +232,17 @@ class PlanePictures(FramePictures):
             planes[self._depth] = torch.from_numpy(image.astype(np.float64))
         return torch.cat([plane.to(torch.float64) for plane in planes], dim=-1)
 
+    def completed(self, image: np.ndarray, values: np.ndarray) -> np.ndarray:
+        if not self._dark:
+            return image
+        return np.concatenate([super().image(values)[..., :COLORS], image[..., COLORS:]], axis=-1)
+
     def shown(self, image: np.ndarray, values: np.ndarray) -> np.ndarray:
-        if self._dark:
-            image = np.concatenate([super().image(values)[..., :COLORS], image[..., COLORS:]], axis=-1)
-        return planes_picture(image, self.wanted, self._depth)
+        return planes_picture(self.completed(image, values), self.wanted, self._depth)
 
 
 def depth_range(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds [H, W] of depths, where nothing drawn is `FARTHEST`, from those of accumulation and depth (V17).
+    """Bounds [H, W] of depths, where nothing drawn is `FARTHEST`, from those of accumulation and depth (Q4).
 
     Args:
         lower, upper: [H, W, 5] bounds of a frame with layers.

@@ -1,7 +1,7 @@
 """Properties of the picture itself, without a network: ``visible``, ``clear``, ``picture``, ``all`` and ``any``.
 
 A property is a tree whose leaves say that a measure of the picture lies within limits; its margin is the least or the
-greatest of theirs (docs/design.md, V17).
+greatest of theirs (docs/design.md, Q4).
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.fields import known
-from ns_abstract.io.jsonio import file_beside, is_number, show
+from ns_abstract.io.jsonio import MODERATE, file_beside, is_number, show
 from ns_abstract.perturbation.variations import parse_selection
 from ns_abstract.refine.protocol import COLORS, WeightPlane
 from ns_abstract.verify.network import ImageSets, OutputBounds
@@ -340,7 +340,7 @@ def _visible(source: _Source) -> Leaf:
     if "select" not in root:
         raise _raised(f"{prefix}select", "missing", 'write {"box": [[x0, y0, z0], [x1, y1, z1]]}')
     select = parse_selection(root["select"], f"{prefix}select", _raised, source.folder)
-    weight, region = source.number("weight", 1e-6, 1.0, 0.5), source.region()
+    weight, region = source.number("weight", MODERATE[0], 1.0, 0.5), source.region()
     if "pixels" in root and "fraction" in root:
         raise _raised(f"{prefix}fraction", "given together with pixels", "write one of them")
     pixels: int | float = 1
@@ -360,7 +360,7 @@ def _visible(source: _Source) -> Leaf:
 
 def _clear(source: _Source) -> Leaf:
     root, prefix = source.root, source.prefix
-    given = source.number("distance", 1e-6, 1e6)
+    given = source.number("distance", *MODERATE)
     scale = source.dataset_scale if source.choice("units", ("normalised", "dataset")) == "dataset" else 1.0
     unit = "units of the data set" if scale != 1.0 else "normalised units"
     distance, region = given * scale, source.region()
@@ -370,7 +370,7 @@ def _clear(source: _Source) -> Leaf:
         sentence = f"the expected depth is above {given:g} {unit} everywhere in {region}"
         # twice as far is as good as any
         return Leaf(sentence, "depth", "least", region, low=distance, cap=2.0 * distance)
-    weight = source.number("weight", 1e-6, 1.0, 0.5)
+    weight = source.number("weight", MODERATE[0], 1.0, 0.5)
     sentence = f"no ray of {region} has collected a weight of {weight:g} nearer than {given:g} {unit}"
     return Leaf(sentence, WeightPlane(nearer=distance), "greatest", region, high=weight)
 

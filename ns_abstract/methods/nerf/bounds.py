@@ -698,7 +698,7 @@ class _BundleWork:
         self.vague[where] = np.minimum(self.vague[where], slack[:, None])
 
     def _whiten(self, white: WhiteSamples, level: int, items: _SampleCells) -> None:
-        """Bound the colours of samples ``items`` that are white where they are chosen (W3)."""
+        """Bound the colours of samples ``items`` that are white where they are chosen (Q3)."""
         distance = self.owner.distances[items.sample]
         lines, radius = self.pencil.points(items.ray, distance, 0.5 * self.owner.lengths[items.sample])
         low, high = self.division.boxes(level)

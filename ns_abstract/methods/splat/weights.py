@@ -1,4 +1,4 @@
-"""Blending weights of chosen Gaussians: pictures in which these are white, the others black (docs/design.md, W1, W2).
+"""Blending weights of chosen Gaussians: pictures in which these are white, the others black (docs/design.md, Q1, Q2).
 
 A pixel of gsplat is a sum of colours, each times its Gaussian's weight, so that a channel of such a picture is the sum
 of the weights of the white Gaussians. Nothing else of the program depends on colours.
@@ -89,7 +89,7 @@ class WeightBounds(SplatBounds):
     def _colors(
         self, forms: PoseForms, camera_magnitude: np.ndarray, candidates: np.ndarray, alive: np.ndarray, n: int
     ) -> np.ndarray:
-        """[n, 6] centres and radii by channel (design.md, W2)."""
+        """[n, 6] centres and radii by channel (design.md, Q2)."""
         numbers = candidates[alive]
         low, high = self.white.between(numbers, *self._depth_range(forms, camera_magnitude, candidates, alive))
         colors = np.zeros((n, 6))
