@@ -15,7 +15,7 @@ from ns_abstract.api.cell_search import CellSearch
 from ns_abstract.api.certification import Certification
 from ns_abstract.api.showing import look_closer
 from ns_abstract.execution.cancellation import WorkCancelledError
-from ns_abstract.report.cameras import CameraDrawings, cameras_entry, cell_cameras, standing
+from ns_abstract.report.cameras import CameraDrawings, cameras_entry, cell_cameras, standing, upward
 from ns_abstract.report.certificate import CertifiedRun, certificate_document
 from ns_abstract.report.certificate_page import certificate_page
 from ns_abstract.report.outside import SceneDrawing
@@ -52,7 +52,7 @@ class CertificateReport:
         entries = [self._entry(tally, rows[tally.frame]) for tally in store.tallies()]
         sets = {frame: self.job.job.pose_sets[frame] for frame in rows}
         cells, left_out = cell_cameras(sets, rows, [name for name, _ in self.job.parameters])
-        self.cameras = CameraDrawings(cells, left_out, self._standing, self._outside)
+        self.cameras = CameraDrawings(cells, left_out, self._standing, self._outside, upward(sets))
         document = certificate_document(
             self.about,
             entries,

@@ -51,7 +51,7 @@ from ns_abstract.verify.search import BLOCK, BlockResult, ContradictionError, Se
 from ns_abstract.verify.subboxes import SubBoxProof
 
 if TYPE_CHECKING:
-    from ns_abstract.verify.interop import Form
+    from ns_abstract.verify.interop import Form, LibraryVersion
 
 #: Of the search's rules: results of different ones are not mixed.
 _RULES = 5
@@ -410,8 +410,9 @@ class Certification:
 
     def places(self, kind: VariationKind) -> bool:
         """Whether a kind's parameters can be bounded beside those of every set."""
-        room = all(poses.box.dimensions + len(kind.place) <= MAX_DIMENSIONS for poses in self.job.pose_sets)
-        return isinstance(self.model, NetworkModel) and room
+        return isinstance(self.model, NetworkModel) and all(
+            poses.box.dimensions + len(kind.place) <= MAX_DIMENSIONS for poses in self.job.pose_sets
+        )
 
     @property
     def kinds(self) -> tuple[VariationKind, ...]:
@@ -512,14 +513,16 @@ class Certification:
         """The frame whose bounds the search of ``index`` will use."""
         return self.search(index, self.grid(index)).scene.frame  # pyright: ignore[reportAttributeAccessIssue]
 
-    def write_vnnlib(self, index: int, box: ParameterBox, target: Path, form: Form) -> tuple[Path, Path]:
+    def write_vnnlib(
+        self, index: int, box: ParameterBox, target: Path, form: Form, version: LibraryVersion = "1.0"
+    ) -> tuple[Path, Path]:
         """Write the abstract image of a cell, the network and the property for other verifiers.
 
         Args:
             index: Entry of the camera path.
             box: The cell.
             target: Path without ending.
-            form: As in `ns_abstract.verify.interop.write_vnnlib`.
+            form, version: As in `ns_abstract.verify.interop.write_vnnlib`.
 
         Returns:
             The .onnx and the .vnnlib file.
@@ -542,7 +545,7 @@ class Certification:
         model = self.question.searched(self.memory, self.arithmetic, self.picture)
         images = parametric(model.input_sets(tuple(part[None] for part in linear), lower[None], upper[None]))
         network = self.question.network
-        return write_vnnlib(network, images, claim.rows, claim.offset, target, form, claim.groups)
+        return write_vnnlib(network, images, claim.rows, claim.offset, target, form, claim.groups, version)
 
     def partitions(self, grid: CellGrid) -> int | None:
         """Number of parts of the fixed partition, if there is one."""

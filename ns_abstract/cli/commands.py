@@ -90,7 +90,7 @@ class Render(GivenSet):
 
 @dataclass
 class Certify(GivenSet):
-    """Prove, or break, a property of a network, or of the picture, on every image of a scene over a set of poses.
+    """Prove or break a property of a network, or of the picture, on every image of a set of poses.
 
     Splits the set into cells until each is certified, falsified or too small. Writes cells.sqlite,
     report.json, report.html and the images of counterexamples. Exit codes: 0 done, whatever the verdict;

@@ -102,6 +102,8 @@ class Bounds(Protocol):
         slopes: [d] how much the picture varies by parameter: what a cut along it may gain.
         context: For the cells inside this one; None: nothing is known that would help.
         linear: Linear bounds in the cell's parameters, if they were asked for.
+        forms: [t, side, side, 3, m + 1] with linear bounds: coefficients of polynomials in the cell's parameters and a
+            radius, before the clamp to [0, 1]; None: there are none.
     """
 
     @property
@@ -118,6 +120,9 @@ class Bounds(Protocol):
 
     @property
     def linear(self) -> LinearSets | None: ...
+
+    @property
+    def forms(self) -> np.ndarray | None: ...
 
 
 class Frame(Protocol):

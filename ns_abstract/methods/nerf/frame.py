@@ -100,6 +100,7 @@ class RayCellBounds:
     slopes: np.ndarray
     context: RayContext | None
     linear: LinearSets | None
+    forms: None = None
 
 
 @lru_cache(maxsize=1)
