@@ -169,7 +169,7 @@ def test_gradients_are_those_of_weights() -> None:
 
 def test_empty_selections_are_refused() -> None:
     with pytest.raises(InputError, match="picks none of 5 Gaussians"):
-        frame_of(blob_scene(5), "pose", planes=[WeightPlane(Selection(box=((50.0,) * 3, (60.0,) * 3)))])
+        frame_of(blob_scene(5), "pose", planes=[WeightPlane(Selection(box=((50.0, 50.0, 50.0), (60.0, 60.0, 60.0))))])
     with pytest.raises(InputError, match="the scene has Gaussians 0 to 4"):
         frame_of(blob_scene(5), "pose", planes=[WeightPlane(Selection(indices=(7,)))])
 
