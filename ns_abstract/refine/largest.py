@@ -15,6 +15,7 @@ from ns_abstract.refine.difference import DifferenceFrame
 from ns_abstract.refine.engine import Refinement
 from ns_abstract.refine.frame_tiles import pixels_inside
 from ns_abstract.refine.goal import RefinementGoal
+from ns_abstract.refine.leaves import BoundedCell
 from ns_abstract.refine.result import FrameResult, PartResult, TracePoint, greater
 
 
@@ -29,6 +30,7 @@ class LargestTuning:
         first_step: Its first step, as a part of each parameter's range.
         halvings: Times that the step is halved.
         search_share: Part of the time that the search may take.
+        cover_share: Part of the time left that the first pass may take.
         floors: Ratios to the largest rendered value up to which values are left open, one pass each, before the one
             that the goal asks for.
         room: What a pass leaves open at least beyond the largest rendered value.
@@ -41,6 +43,7 @@ class LargestTuning:
     first_step: float = 0.125
     halvings: int = 7
     search_share: float = 0.15
+    cover_share: float = 0.7
     floors: tuple[float, ...] = (1.3,)
     room: float = 1e-3
     pass_share: float = 0.7
@@ -144,6 +147,8 @@ class LargestDifference:
             self.upper, self.rendered = (in_tiles(p, frame.side) for p in (known.upper, known.witness_upper))
             self.bounded = known.bounded
         self.cells, self.trace = 0, []
+        #: the cells of the first pass, with bounds of all tiles in ``self.tiles``
+        self._cover: list[BoundedCell] = []
         self.begin = time.perf_counter()
 
     def _late(self) -> bool:
@@ -183,7 +188,7 @@ class LargestDifference:
                 self.rendered = np.maximum(self.rendered, found)
         self._record()
         # every pixel once, as a whole
-        self._bound(0.0, 1.0, lambda refinement: refinement.covered)
+        self._bound(0.0, self.tuning.cover_share, lambda refinement: refinement.covered)
         for floor, share in self._passes():
             if self._late():
                 break
@@ -215,9 +220,12 @@ class LargestDifference:
         """One pass over the tiles with values above the floor, in a part of the time left, or until ``enough``."""
         camera, least = self.frame.camera, np.float32(floor)
         loose = self.upper > np.maximum(self.goal.ratio * self.rendered, least)
-        here = self.tiles[(loose & self.inside[..., None])[self.tiles].any(axis=(1, 2, 3))]
+        some = (loose & self.inside[..., None])[self.tiles].any(axis=(1, 2, 3))
+        first = not self._cover
+        here = self.tiles if first else self.tiles[some]
         if not here.size:
             return
+        cover = [(cell, np.maximum(l[some], least), np.maximum(u[some], least)) for cell, l, u in self._cover]
         upper, rendered = (assemble(np.maximum(p, least), camera) for p in (self.upper, self.rendered))
         lowest = np.full_like(upper, least)
         known = FrameResult(self.index, self.frame.box, lowest, upper, lowest, rendered, rendered, 0.0, 0)
@@ -236,7 +244,7 @@ class LargestDifference:
         frame = self.frame.above(floor)
         refinement = Refinement(
             frame, self.index, goal, seed=self.seed, stopped=lambda: self._late() or enough(refinement),
-            progress=told, tiles=here, known=known,
+            progress=told, tiles=here, known=known, initial=self._cover if first else cover,
         )  # fmt: skip
         try:
             part = refinement.run_part()
