@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -12,8 +13,31 @@ from ns_abstract.arithmetic.outward import outward
 from ns_abstract.arithmetic.rounding import DIFFERENCE_ROUNDING
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.refine.frame_tiles import pixels_inside
-from ns_abstract.refine.protocol import COLORS, Bounds, CellContext, Frame, LinearSets, PartsFrame, SceneSample
+from ns_abstract.refine.protocol import (
+    COLORS,
+    Bounds,
+    CellContext,
+    Frame,
+    LinearSets,
+    OrderedFrame,
+    PartsFrame,
+    SceneSample,
+)
 from ns_abstract.refine.result import RenderedMaximum, greater
+
+
+@dataclass(frozen=True)
+class DifferenceTuning:
+    """What is looked at closer. None of the numbers decides whether a bound holds.
+
+    Attributes:
+        most_pixels: Pixels above the floor up to which a cell's orders are looked at.
+    """
+
+    most_pixels: int = 64
+
+
+TUNING = DifferenceTuning()
 
 
 @dataclass(frozen=True)
@@ -67,6 +91,7 @@ class DifferenceFrame:
         self.tilewise, self.tiles_at_once, self.witnesses = first.tilewise, first.tiles_at_once, first.witnesses
         self.largest: RenderedMaximum | None = None
         self._inside = pixels_inside(first)
+        self._shared = first.shared_order(second) if isinstance(first, OrderedFrame) else None
 
     @property
     def both(self) -> tuple[Frame, Frame]:
@@ -75,7 +100,9 @@ class DifferenceFrame:
 
     def above(self, floor: float) -> DifferenceFrame:
         """The same with another floor."""
-        return DifferenceFrame(self.first, self.second, floor)
+        frame = copy.copy(self)
+        frame.floor, frame.largest = np.float32(floor), None
+        return frame
 
     @property
     def tile_count(self) -> int:
@@ -131,13 +158,37 @@ class DifferenceFrame:
         first, second = (
             _bounds(frame, boxes, tiles, context, pixels) for frame, context in zip(self.both, contexts, strict=True)
         )
-        return [self._difference(a, b, pixels) for a, b in zip(first, second, strict=True)]
+        found = []
+        for box, a, b in zip(boxes, first, second, strict=True):
+            difference = self._difference(a, b, pixels)
+            if self._shared is not None and self.floor > 0.0:
+                self._share_order(box, tiles, difference, pixels)
+            found.append(difference)
+        return found
+
+    def _share_order(
+        self, box: ParameterBox, tiles: np.ndarray, difference: DifferenceBounds, pixels: np.ndarray | None
+    ) -> None:
+        """Lower bounds above the floor where both scenes are drawn in one order, whichever it is (design.md, Y5)."""
+        assert self._shared is not None
+        wanted = self._inside[tiles] & (difference.upper > self.floor).any(axis=-1)
+        wanted &= True if pixels is None else pixels
+        if not 0 < wanted.sum() <= TUNING.most_pixels:
+            return
+        contexts = difference.context.first, difference.context.second
+        for k in np.flatnonzero(wanted.any(axis=(1, 2))):
+            pairs = self._shared.bounds(box, int(tiles[k]), wanted[k], contexts)
+            if pairs is None:
+                continue
+            # what is not a number stays so, and lowers nothing
+            upper = np.maximum.reduce([upper_of(a, b)[0] for a, b in pairs])
+            _, high = outward(upper, upper)
+            lower = wanted[k][..., None] & (high < difference.upper[k])
+            difference.upper[k][lower] = np.maximum(high, self.floor)[lower]
 
     def _difference(self, a: Bounds, b: Bounds, pixels: np.ndarray | None) -> DifferenceBounds:
         """Bounds of one cell from those of both scenes."""
-        upper = np.maximum(interval_upper(a, b), interval_upper(b, a))
-        for more in (linear_upper(a, b), form_upper(a, b, a.slopes.size)):
-            upper = np.minimum(upper, more)
+        upper = upper_of(a, b)
         _, high = outward(upper, upper)
         # what is not a number stays so, and is no bound
         high = np.maximum(high, self.floor)
@@ -179,6 +230,14 @@ def _bounds(
     if isinstance(frame, PartsFrame):
         return frame.bound_parts(boxes, tiles, within, True, pixels)
     return [frame.bound(box, tiles, within, True) for box in boxes]
+
+
+def upper_of(a: Bounds, b: Bounds) -> np.ndarray:
+    """The least upper bound [...] of |a - b| over a cell that is known; NaN: none is."""
+    upper = np.maximum(interval_upper(a, b), interval_upper(b, a))
+    for more in (linear_upper(a, b), form_upper(a, b, a.slopes.size)):
+        upper = np.minimum(upper, more)
+    return upper
 
 
 def interval_upper(a: Bounds, b: Bounds) -> np.ndarray:

@@ -252,7 +252,7 @@ class SplatBounds:
         alive = np.flatnonzero(state)
         colors = self._colors(forms, camera_magnitude, candidates, alive, n)
         mask = tile_mask(wanted, across * down)
-        offsets, entries = tile_lists(depth_order(alive, gaussians.depth), gaussians.tiles, mask, across)
+        offsets, entries = tile_lists(self._listed(alive, candidates, gaussians), gaussians.tiles, mask, across)
         shaped = (wanted.size, self.side, self.side, 3)
         pixel_bounds = PixelBounds(
             lower=np.zeros(shaped),
@@ -299,6 +299,10 @@ class SplatBounds:
             delta=self._buffer("delta", (n, 3)),
             depth_error=self._buffer("depth_error", (n,)),
         )
+
+    def _listed(self, alive: np.ndarray, candidates: np.ndarray, gaussians: ProjectedGaussians) -> np.ndarray:
+        """The rows ``alive`` of ``gaussians``, nearest first; they are the scene's ``candidates[alive]``."""
+        return depth_order(alive, gaussians.depth)
 
     def _viewing_axes(
         self, forms: PoseForms, rotation_magnitude: np.ndarray, gaussians: ProjectedGaussians
