@@ -33,8 +33,20 @@ from ns_abstract.refine.result import FrameResult, PartResult, TracePoint
 from ns_abstract.report.comparison import difference_figures, verdict
 from ns_abstract.report.figures import short_guarantee
 
-#: Entries by which transforms of two runs to one frame may differ, relative to the largest: rounding of their files.
-_SAME_FRAME = 1e-6
+
+@dataclass(frozen=True)
+class ComparisonTuning:
+    """What counts as the same.
+
+    Attributes:
+        same_frame: Entries by which transforms of two runs to one frame may differ, relative to the largest: rounding
+            of their files.
+    """
+
+    same_frame: float = 1e-6
+
+
+_TUNING = ComparisonTuning()
 
 
 class ComparisonJob(Job):
@@ -180,7 +192,7 @@ def _check_comparable(scene: Scene, other: Scene, pose_sets: Sequence[PoseBox]) 
     if first is None or second is None:
         return
     matrices = [np.append(frame.matrix.ravel() * frame.scale, frame.scale) for frame in (first, second)]
-    if not np.abs(matrices[0] - matrices[1]).max() <= _SAME_FRAME * np.abs(matrices[0]).max():
+    if not np.abs(matrices[0] - matrices[1]).max() <= _TUNING.same_frame * np.abs(matrices[0]).max():
         raise InputError(
             f"its dataparser_transforms.json is not that of {scene.source.file}, so one camera would not look at the "
             "same place",

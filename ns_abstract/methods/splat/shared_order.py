@@ -159,7 +159,7 @@ class SplatOrder:
 
 
 def uncertain(delta: np.ndarray, error: np.ndarray, slope: np.ndarray) -> np.ndarray:
-    """[k, k] whether the depth order of two Gaussians may be either in the cell (design.md, O1).
+    """[k, k] whether the depth order of two Gaussians may be either in the cell (design.md, O1, Y5).
 
     Args:
         delta: [k, 3] means minus the cell's origin.
