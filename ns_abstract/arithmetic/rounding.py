@@ -143,7 +143,7 @@ GRAM_UP, GRAM_ROOM = 1.0 + 2.0**-30, 2.0**-46
 SHIFTED_ROUNDING = 8.0 * UNIT64
 #: B9: radii and constant ends of linear sets: at most 44 sums; up to 2^13 of the radius, 2^9 of the others.
 LINEAR_UP, LINEAR_ROUNDING = 1.0 + 2.0**-40, 2.0**-44
-#: Y1-Y3: a difference of two bounds in at most 12 parameters, relative to the sum of all their sizes: at most 92
+#: Y1, Y2, Y3: a difference of bounds in at most 12 parameters, relative to the sum of all their sizes: at most 92
 #: differences and terms of a sum, each rounded at most 2^3 times, and the sum's 2^7 u: 2^8 u; twice as much is charged.
 DIFFERENCE_ROUNDING = 2.0**-44
 #: B8: alphas below are left out by the paper's rasteriser, which draws all; so much is added for each that is.
