@@ -6,6 +6,7 @@ import copy
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -13,8 +14,8 @@ from ns_abstract.arithmetic.rounding import ORDER_ROUNDING, UP
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseForms
 from ns_abstract.methods.splat.bounds import SplatBounds
-from ns_abstract.methods.splat.frame import SplatFrame, TileBounds, VisibleContext
 from ns_abstract.methods.splat.stage_data import ProjectedGaussians, ViewingAxes
+from ns_abstract.refine.protocol import Bounds
 
 
 @dataclass(frozen=True)
@@ -27,6 +28,20 @@ class SharedOrderTuning:
 
 
 _TUNING = SharedOrderTuning()
+
+
+class BoundedFrame(Protocol):
+    """What a splat frame has, see `ns_abstract.methods.splat.frame.SplatFrame`."""
+
+    bounds: SplatBounds
+    order: int
+
+    def bound(
+        self, box: ParameterBox, tiles: np.ndarray, within: Any = None, keep_linear: bool = False,
+        pixels: np.ndarray | None = None,
+    ) -> Bounds:  # fmt: skip
+        """Bounds of some pixels over a cell."""
+        ...
 
 
 class _OrderedBounds(SplatBounds):
@@ -66,7 +81,7 @@ class _OrderedBounds(SplatBounds):
         return axes
 
 
-def shared_order(first: SplatFrame, second: SplatFrame) -> SplatOrder | None:
+def shared_order(first: BoundedFrame, second: BoundedFrame) -> SplatOrder | None:
     """What two frames of the same poses share; None where no two Gaussians have one mean, or the programs differ."""
     a, b = first.bounds, second.bounds
     same = a.rasteriser == b.rasteriser and a.arithmetic == b.arithmetic and a.rasteriser.name == "gsplat"
@@ -103,7 +118,7 @@ class SplatOrder:
         names: [M] names of the second scene's Gaussians; those of the first one's are their numbers, see `matched`.
     """
 
-    def __init__(self, first: SplatFrame, second: SplatFrame, names: np.ndarray) -> None:
+    def __init__(self, first: BoundedFrame, second: BoundedFrame, names: np.ndarray) -> None:
         self.frames = copy.copy(first), copy.copy(second)
         self._bounds = _OrderedBounds(first.bounds), _OrderedBounds(second.bounds)
         for frame, bounds in zip(self.frames, self._bounds, strict=True):
@@ -112,8 +127,8 @@ class SplatOrder:
         self.count = first.bounds.splats.count + second.bounds.splats.count
 
     def bounds(
-        self, box: ParameterBox, tile: int, pixels: np.ndarray, contexts: tuple[VisibleContext, VisibleContext]
-    ) -> list[tuple[TileBounds, TileBounds]] | None:
+        self, box: ParameterBox, tile: int, pixels: np.ndarray, contexts: tuple[Any, Any]
+    ) -> list[tuple[Bounds, Bounds]] | None:
         """See `ns_abstract.refine.protocol.SharedOrder.bounds`."""
         visible = []
         for frame, bounds, context in zip(self.frames, self._bounds, contexts, strict=True):
@@ -131,7 +146,7 @@ class SplatOrder:
             found.append((pair[0], pair[1]))
         return found
 
-    def _orders(self, visible: list[VisibleContext]) -> list[np.ndarray] | None:
+    def _orders(self, visible: list[Any]) -> list[np.ndarray] | None:
         """[names] ranks of the Gaussians that either scene may show, for every order that they may have."""
         names, parts = [], []
         for bounds, scene_names, context in zip(self._bounds, self.names, visible, strict=True):
