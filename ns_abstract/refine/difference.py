@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.arithmetic.outward import outward
-from ns_abstract.arithmetic.rounding import DIFFERENCE_ROUNDING
+from ns_abstract.arithmetic.rounding import DIFFERENCE_ROUNDING, UNIT32
+from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.refine.frame_tiles import pixels_inside
 from ns_abstract.refine.protocol import (
@@ -21,6 +22,7 @@ from ns_abstract.refine.protocol import (
     LinearSets,
     OrderedFrame,
     PartsFrame,
+    PreciseFrame,
     SceneSample,
 )
 from ns_abstract.refine.result import RenderedMaximum, greater
@@ -125,10 +127,10 @@ class DifferenceFrame:
 
     def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
         """Tiles [t, side, side, 3] float32 of |A - B| at parameter values [d], rounded down, at least the floor."""
-        first, second = (frame.render(values, tiles)[..., :COLORS].astype(np.float64) for frame in self.both)
-        difference = np.abs(first - second)
-        # values are float32 numbers in [0, 1], whose difference float64 rounds by one unit at most
-        lower, _ = outward(difference * (1.0 - DIFFERENCE_ROUNDING), difference)
+        check_cancelled()
+        (first, some), (second, more) = (_picture(frame, values, tiles) for frame in self.both)
+        difference = np.abs(first - second) * (1.0 - DIFFERENCE_ROUNDING) - (some + more)
+        lower, _ = outward(np.maximum(difference, 0.0), difference)
         # tiles may extend past the image
         lower[~(self._inside if tiles is None else self._inside[tiles])] = 0.0
         found = RenderedMaximum(float(lower.max(initial=0.0)), tuple(map(float, values)))
@@ -221,6 +223,13 @@ class DifferenceFrame:
     def plan(self, visible: int | None, lower: np.ndarray, upper: np.ndarray) -> list[str]:
         """Nothing was left out."""
         return []
+
+
+def _picture(frame: Frame, values: np.ndarray, tiles: np.ndarray | None) -> tuple[np.ndarray, float]:
+    """Colours of a render in float64, and by how much each may be rounded."""
+    if isinstance(frame, PreciseFrame):
+        return frame.precise(values, tiles)[..., :COLORS], 0.0
+    return frame.render(values, tiles)[..., :COLORS].astype(np.float64), UNIT32
 
 
 def _bounds(
