@@ -2,7 +2,7 @@
 
 from planted.fault import Fault
 
-_FRAME, _LARGEST, _REPORT = "refine/difference.py", "refine/largest.py", "report/comparison.py"
+_FRAME, _REPORT = "refine/difference.py", "report/comparison.py"
 _CELLS = "test_differences.py::test_differences_of_parabolas_hold_every_render[-0.2]"
 _POLYNOMIALS = "test_differences.py::test_polynomials_hold_exact_values[1-2]"
 _JOB, _ORDER = "api/comparing.py", "methods/splat/shared_order.py"
@@ -115,10 +115,10 @@ DIFFERENCES = (
     ),
     Fault(
         "differences: a floor counts as rendered",
-        _LARGEST,
-        "LargestDifference._bound",
-        "part.witness_upper > least",
-        "part.witness_upper >= least",
+        _FRAME,
+        "DifferenceFrame.render",
+        "np.maximum(self.greatest[some], lower)",
+        "np.maximum(self.greatest[some], np.maximum(lower, self.floor))",
         "test_differences.py::test_floors_leave_nothing_out[0.02]",
     ),
     Fault(

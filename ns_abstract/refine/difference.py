@@ -81,6 +81,7 @@ class DifferenceFrame:
 
     Attributes:
         largest: The largest value of the image that was rendered; None before the first render.
+        greatest: [T, side, side, 3] float32, the greatest values rendered by this frame and those `above` a floor.
     """
 
     channels = COLORS
@@ -93,6 +94,7 @@ class DifferenceFrame:
         self.tilewise, self.tiles_at_once, self.witnesses = first.tilewise, first.tiles_at_once, first.witnesses
         self.largest: RenderedMaximum | None = None
         self._inside = pixels_inside(first)
+        self.greatest = np.zeros((first.tile_count, first.side, first.side, COLORS), np.float32)
         self._shared = first.shared_order(second) if isinstance(first, OrderedFrame) else None
 
     @property
@@ -128,11 +130,13 @@ class DifferenceFrame:
     def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
         """Tiles [t, side, side, 3] float32 of |A - B| at parameter values [d], rounded down, at least the floor."""
         check_cancelled()
-        (first, some), (second, more) = (_picture(frame, values, tiles) for frame in self.both)
-        difference = np.abs(first - second) * (1.0 - DIFFERENCE_ROUNDING) - (some + more)
+        (first, one), (second, other) = (_picture(frame, values, tiles) for frame in self.both)
+        difference = np.abs(first - second) * (1.0 - DIFFERENCE_ROUNDING) - (one + other)
         lower, _ = outward(np.maximum(difference, 0.0), difference)
         # tiles may extend past the image
-        lower[~(self._inside if tiles is None else self._inside[tiles])] = 0.0
+        some = slice(None) if tiles is None else tiles
+        lower[~self._inside[some]] = 0.0
+        self.greatest[some] = np.maximum(self.greatest[some], lower)
         found = RenderedMaximum(float(lower.max(initial=0.0)), tuple(map(float, values)))
         self.largest = greater(self.largest, found)
         return np.maximum(lower, self.floor)

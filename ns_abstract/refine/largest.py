@@ -52,25 +52,16 @@ class LargestTuning:
 TUNING = LargestTuning()
 
 
-def search_largest(
-    frame: DifferenceFrame, seed: int, over: Callable[[], bool], tuning: LargestTuning = TUNING
-) -> np.ndarray:
-    """Render poses where the difference may be largest; returns the greatest values rendered [T, side, side, 3].
-
-    ``frame.largest`` is then the best pose. At least the middle of the set is rendered.
-    """
+def search_largest(frame: DifferenceFrame, seed: int, over: Callable[[], bool], tuning: LargestTuning = TUNING) -> None:
+    """Render poses where the difference may be largest; ``frame.largest`` is then the best one."""
     box, random = frame.box, np.random.default_rng(seed)
-    greatest = frame.render(box.middle)
 
     def look(values: np.ndarray) -> float:
-        nonlocal greatest
-        picture = frame.render(values)
-        greatest = np.maximum(greatest, picture)
-        return float(picture[inside].max(initial=0.0))
+        return float(frame.render(values)[inside].max(initial=0.0))
 
     inside = pixels_inside(frame)
     if not box.dimensions:
-        return greatest
+        return
     corners = box.corners() if box.dimensions <= 4 else box.corners()[random.permutation(2**box.dimensions)]
     scored: list[tuple[float, np.ndarray]] = []
     for values in (box.middle, *corners[: tuning.corners], *box.sample(tuning.poses, random)):
@@ -84,11 +75,10 @@ def search_largest(
         for _ in range(tuning.halvings):
             for values_near in _neighbours(values, step, low, high):
                 if over():
-                    return greatest
+                    return
                 if (found := look(values_near)) > value:
                     value, values = found, values_near
             step = 0.5 * step
-    return greatest
 
 
 def _neighbours(values: np.ndarray, step: np.ndarray, low: np.ndarray, high: np.ndarray) -> Iterator[np.ndarray]:
@@ -176,16 +166,15 @@ class LargestDifference:
             # the first call compiles kernels, and the clock starts after it
             middle = self.whole.render(self.whole.box.middle)
             self.begin = time.perf_counter()
-            self.rendered = np.maximum(self.rendered, middle)
             search = self.tuning.search_share * self.goal.seconds
             with suppress(WorkCancelledError):
-                found = search_largest(
+                search_largest(
                     self.whole,
                     self.seed,
                     lambda: self._late() or self._left() < self.goal.seconds - search,
                     self.tuning,
                 )
-                self.rendered = np.maximum(self.rendered, found)
+            self.rendered = np.maximum(self.rendered, self.whole.greatest)
         self._record()
         # every pixel once, as a whole
         self._bound(0.0, self.tuning.cover_share, lambda refinement: refinement.covered)
@@ -251,6 +240,7 @@ class LargestDifference:
         except WorkCancelledError:
             return
         self.cells += part.cells
+        self.rendered = np.maximum(self.rendered, frame.greatest)
         if self.frame is self.whole:
             # poses of the same parameters
             self.whole.largest = greater(self.whole.largest, frame.largest)
@@ -258,9 +248,6 @@ class LargestDifference:
             return
         self.bounded = self.bounded or here.size == self.tiles.size
         self.upper[here] = np.minimum(self.upper[here], part.upper)
-        # values at the floor were not rendered
-        seen = np.where(part.witness_upper > least, part.witness_upper, 0.0).astype(np.float32)
-        self.rendered[here] = np.maximum(self.rendered[here], seen)
         self._record()
 
     def _record(self) -> None:
