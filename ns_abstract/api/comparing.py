@@ -47,6 +47,10 @@ class ComparisonTuning:
 
 
 _TUNING = ComparisonTuning()
+#: What bounds of two splats with equal means rest on (design.md, Y5).
+_ORDER = Assumption(
+    "order of Gaussians with equal means", "the same in both pictures", "one program renders both scenes"
+)
 
 
 class ComparisonJob(Job):
@@ -80,9 +84,12 @@ class ComparisonJob(Job):
         with _named(other):
             self.other = Job(other, pose_sets, **shared)
         super().__init__(scene, pose_sets, **options)
-        self.frame_choice = _frame_choice(scene, other)
+        self.frame_choice, self.order_choice = _frame_choice(scene, other), ()
         if pose_sets:
-            first, second = self.frame(0).both
+            frame = self.frame(0)
+            first, second = frame.both
+            if frame.shares_order:
+                self.order_choice = (_ORDER,)
             if (first.side, first.tilewise) != (second.side, second.tilewise):
                 raise InputError(
                     "pictures are made in tiles of another size than A's",
@@ -144,7 +151,7 @@ class ComparisonJob(Job):
     @property
     def assumptions(self) -> tuple[Assumption, ...]:
         others = (replace(entry, name=f"other {entry.name}") for entry in self.other._scene_choices)
-        return (*self._scene_choices, *others, self.frame_choice, *self.set_choices)
+        return (*self._scene_choices, *others, self.frame_choice, *self.order_choice, *self.set_choices)
 
     @property
     def fingerprint(self) -> dict[str, Any]:

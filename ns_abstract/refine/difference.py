@@ -109,6 +109,11 @@ class DifferenceFrame:
         return frame
 
     @property
+    def shares_order(self) -> bool:
+        """Whether elements of both scenes are taken to be drawn in one order (design.md, Y5)."""
+        return self._shared is not None
+
+    @property
     def tile_count(self) -> int:
         """Number of tiles."""
         return self.first.tile_count
