@@ -5,7 +5,7 @@ from __future__ import annotations
 import bisect
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,6 +16,19 @@ from ns_abstract.geometry.tiles import assemble, tile_grid
 
 Float32Array = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
+
+
+class ArrayRecord:
+    """A record of arrays; its text has their shapes and types in place of their numbers."""
+
+    def __repr__(self) -> str:
+        texts = []
+        for entry in fields(self):  # pyright: ignore[reportArgumentType]
+            value = getattr(self, entry.name)
+            if entry.repr:
+                text = f"{value.dtype}{list(value.shape)}" if isinstance(value, np.ndarray) else repr(value)
+                texts.append(f"{entry.name}={text}")
+        return f"{type(self).__name__}({', '.join(texts)})"
 
 
 @dataclass(frozen=True)
@@ -33,8 +46,8 @@ class TracePoint:
     covered: float = 1.0
 
 
-@dataclass(frozen=True)
-class Leaves:
+@dataclass(frozen=True, repr=False)
+class Leaves(ArrayRecord):
     """Linear sets of the leaf cells of one frame, one row per (cell, tile).
 
     On a leaf's box, with its parameters scaled to ``p`` in [-1, 1]^d, every pixel and channel of
@@ -56,8 +69,8 @@ class Leaves:
     b_upper: Float32Array
 
 
-@dataclass(frozen=True)
-class ExtraOutput:
+@dataclass(frozen=True, repr=False)
+class ExtraOutput(ArrayRecord):
     """A further output (depth, accumulation): bounds, sampled bounds and one render, [H, W] float32 each.
 
     The accumulation is the part of the light that the scene takes, in [0, 1]. The expected depth is the mean of the
@@ -103,8 +116,8 @@ def greater(*maxima: RenderedMaximum | None) -> RenderedMaximum | None:
     return max((m for m in maxima if m is not None), key=lambda m: m.value, default=None)
 
 
-@dataclass(frozen=True)
-class SampleImages:
+@dataclass(frozen=True, repr=False)
+class SampleImages(ArrayRecord):
     """Concrete renders of some poses of a frame's set.
 
     Attributes:
@@ -116,8 +129,8 @@ class SampleImages:
     images: Float32Array
 
 
-@dataclass(frozen=True)
-class FrameResult:
+@dataclass(frozen=True, repr=False)
+class FrameResult(ArrayRecord):
     """One frame's abstract image.
 
     Attributes:
@@ -147,7 +160,7 @@ class FrameResult:
     image: Float32Array
     seconds: float
     cells: int
-    trace: tuple[TracePoint, ...] = ()
+    trace: tuple[TracePoint, ...] = field(default=(), repr=False)
     plan: tuple[str, ...] = ()
     bounded: bool = True
     leaves: Leaves | None = field(default=None, repr=False)
@@ -157,8 +170,8 @@ class FrameResult:
     largest: RenderedMaximum | None = None
 
 
-@dataclass(frozen=True)
-class PartResult:
+@dataclass(frozen=True, repr=False)
+class PartResult(ArrayRecord):
     """Some tiles of a frame's abstract image; fields as in `FrameResult` where nothing is said.
 
     Attributes:
