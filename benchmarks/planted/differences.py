@@ -77,8 +77,8 @@ DIFFERENCES = (
         "differences: depths are taken to be exact",
         _ORDER,
         "uncertain",
-        "rounding + error[:, None] + error[None]",
-        "rounding",
+        "(along[..., 1:].sum(axis=-1) + radius) * UP + rounding + error[:, None] + error[None]",
+        "(along[..., 1:].sum(axis=-1) + radius) * UP + rounding",
         _ORDERS,
     ),
     Fault(
