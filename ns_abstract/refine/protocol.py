@@ -258,6 +258,35 @@ class PartsFrame(Protocol):
         ...
 
 
+class SharedOrder(Protocol):
+    """Two scenes some of whose elements lie at the same places, and so are drawn in the same order in both."""
+
+    def bounds(
+        self, box: ParameterBox, tile: int, pixels: np.ndarray, contexts: tuple[Any, Any]
+    ) -> Sequence[tuple[Bounds, Bounds]] | None:
+        """Bounds of both scenes with linear bounds, once for every order of elements that a pose of ``box`` may have.
+
+        Args:
+            box: A cell.
+            tile: Number.
+            pixels: [side, side] which pixels are wanted.
+            contexts: Those of both scenes for this tile and cell, or one around it.
+
+        Returns:
+            None: there are too many orders, or one alone.
+        """
+        ...
+
+
+@runtime_checkable
+class OrderedFrame(Protocol):
+    """An optional interface of a `Frame`: the order of elements may be shared with another scene's."""
+
+    def shared_order(self, other: Frame) -> SharedOrder | None:
+        """What both scenes' elements have in common; None: nothing. ``other`` has the same poses."""
+        ...
+
+
 @runtime_checkable
 class PreciseFrame(Protocol):
     """What a `Frame` may have beside: pictures that are not rounded."""

@@ -249,7 +249,7 @@ class SplatBounds:
         gaussians, alive = self._projected(candidates, poses, camera, shape)
         colors = self._colors(forms, poses.camera_magnitude, candidates, alive, candidates.size)
         offsets, entries = tile_lists(
-            depth_order(alive, gaussians.depth), gaussians.tiles, tile_mask(wanted, across * down), across
+            self._listed(alive, candidates, gaussians), gaussians.tiles, tile_mask(wanted, across * down), across
         )
         m = shape.monomials
         common = np.zeros(m + 1)
@@ -314,6 +314,10 @@ class SplatBounds:
             delta=self._buffer("delta", (n, 3)),
             depth_error=self._buffer("depth_error", (n,)),
         )
+
+    def _listed(self, alive: np.ndarray, candidates: np.ndarray, gaussians: ProjectedGaussians) -> np.ndarray:
+        """The rows ``alive`` of ``gaussians``, nearest first; they are the scene's ``candidates[alive]``."""
+        return depth_order(alive, gaussians.depth)
 
     def _viewing_axes(
         self, forms: PoseForms, rotation_magnitude: np.ndarray, gaussians: ProjectedGaussians
