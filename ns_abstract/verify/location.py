@@ -31,10 +31,14 @@ class LocationTuning:
     """Preferences of the search. None of them decides whether an excluded cell holds no pose of the photo."""
 
     #: Image motion over a cell, pixels: beyond it, cells are cut without bounds; up to it, they are contracted.
-    coarse: float = 2.4
+    coarse: float = 4.5
     contracted: float = 1.2
     #: Pixels that are bounded to exclude a cell: so many times those that may show anything.
-    surplus: float = 3.0
+    surplus: float = 4.0
+    #: How many pixels bounds exclude, about, as a power of the motion; ends of the part of it that cuts aim at.
+    power: float = 2.5
+    least_aim: float = 0.35
+    most_aim: float = 0.85
     #: Part of a cell's volume that a contraction must take for it to be bounded again, and how often.
     worth: float = 0.4
     rounds: int = 4
@@ -143,6 +147,8 @@ class _Examination:
     children: list[Cell] = field(default_factory=list)
     best: FoundPose | None = None
     bounded: int = 0
+    #: Pixels that were excluded, as a part of those that would have excluded the cell.
+    share: float = 1.0
 
     def run(self) -> None:
         """Exclude the cell, contract it and cut it."""
@@ -216,9 +222,11 @@ class _Examination:
 
     def _excluded(self, bounds: Bounds, tiles: np.ndarray) -> bool:
         """Whether more pixels than are allowed lie beyond the bounds of some tiles: the cell is excluded then."""
+        allowed = self.search.tiled.allowed
         number = int(self.search.tiled.beyond(bounds.lower, bounds.upper, tiles).sum())
-        if number > self.search.tiled.allowed:
-            self._exclude(float(number - self.search.tiled.allowed))
+        self.share = number / (allowed + 1)
+        if number > allowed:
+            self._exclude(float(number - allowed))
         return self.done
 
     def _promising(self, picture: np.ndarray, moved: float) -> np.ndarray:
@@ -301,9 +309,12 @@ class _Examination:
             return self._finish()
         moved = search.moved(search.grid.box_of(self.cell))
         total = float(np.linalg.norm(moved))
+        aim = tuning.coarse
+        if total <= tuning.coarse:
+            aim = total * min(max(self.share ** (1.0 / tuning.power), tuning.least_aim), tuning.most_aim)
         parts = [1] * len(moved)
         sizes = [past - first for first, past in zip(self.cell.first, self.cell.past, strict=True)]
-        while np.prod(parts) < 2 or (2 * np.prod(parts) <= tuning.parts and total > tuning.coarse):
+        while np.prod(parts) < 2 or (2 * np.prod(parts) <= tuning.parts and total > aim):
             free = [k for k in range(len(moved)) if sizes[k] >= 2 * parts[k]]
             if not free:
                 break
