@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Inputs, InProcess
+from conftest import InProcess, Inputs
 from PIL import Image
 
 import ns_abstract as nsa
@@ -33,7 +33,7 @@ def box_of(lower: Any, upper: Any) -> ParameterBox:
 
 
 def taken(picture: np.ndarray, noise: float, outliers: int, generator: np.random.Generator) -> np.ndarray:
-    """A photo of 8 bits of a picture [H, W, 3], with noise at its ends and everywhere, and pixels that show anything."""
+    """A photo of 8 bits of a picture [H, W, 3], with noise up to its ends and pixels that show anything."""
     error = noise * np.where(generator.random(picture.shape) < 0.3, generator.choice([-1.0, 1.0], picture.shape),
                              generator.uniform(-1.0, 1.0, picture.shape))  # fmt: skip
     levels = np.rint(255.0 * np.clip(picture.astype(np.float64) + error, 0.0, 1.0)).astype(np.uint8)
