@@ -7,9 +7,11 @@ it is cut.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -24,6 +26,8 @@ from ns_abstract.verify.search import BlockResult, FinishedCell
 
 #: Grid units along each parameter, as a power of two.
 UNITS = 20
+#: Pixels that the looseness of bounds is averaged over, to every side.
+_SMOOTH = 4
 
 
 @dataclass(frozen=True)
@@ -32,9 +36,13 @@ class LocationTuning:
 
     #: Image motion over a cell, pixels: beyond it, cells are cut without bounds; up to it, they are contracted.
     coarse: float = 4.5
-    contracted: float = 1.2
+    contracted: float = 0.3
     #: Pixels that are bounded to exclude a cell: so many times those that may show anything.
     surplus: float = 4.0
+    #: Image motion over the cell whose bounds tell how loose they are; pixels that must be likely to be excluded, as a
+    #: part of those that exclude a cell, for it to be bounded.
+    reference: float = 2.4
+    promise: float = 0.6
     #: How many pixels bounds exclude, about, as a power of the motion; ends of the part of it that cuts aim at.
     power: float = 2.5
     least_aim: float = 0.35
@@ -104,6 +112,22 @@ class LocationSearch:
     def moved(self, box: ParameterBox) -> Float64Array:
         """[d] pixels that typical scene elements move by over a cell (an estimate)."""
         return self._pace * (np.array(box.upper) - np.array(box.lower))
+
+    @cached_property
+    def looseness(self) -> tuple[np.ndarray, np.ndarray]:
+        """By how much bounds of a typical cell go below and above what is rendered nearby: [T, side, side, 3] each.
+
+        From one cell in the middle of the set; a guess that only decides which pixels are bounded.
+        """
+        box, frame, reference = self.frame.box, self.frame, self.tuning.reference
+        side = np.minimum(1.0, reference / math.sqrt(max(1, box.dimensions)) / np.maximum(self.moved(box), 1e-12))
+        cell = between(box, -side, side)
+        bounds = frame.bound(cell, np.arange(frame.tile_count), None)
+        picture = assemble(self.plain.render(self.original(cell.middle)), frame.camera)
+        least, most = nearby(picture, max(1, round(0.5 * reference)))
+        gaps = least - assemble(bounds.lower, frame.camera), assemble(bounds.upper, frame.camera) - most
+        below, above = (in_tiles(smoothed(np.maximum(gap, 0.0), _SMOOTH), frame.side) for gap in gaps)
+        return below, above
 
     def examine(self, cells: Sequence[Cell]) -> LocationResult:
         """Exclude the cells, or cut them.
@@ -230,16 +254,23 @@ class _Examination:
         return self.done
 
     def _promising(self, picture: np.ndarray, moved: float) -> np.ndarray:
-        """[T, side, side] counted pixels whose photo differs most from all of ``picture`` nearby: a guess of work."""
-        search, tiled = self.search, self.search.tiled
-        image = assemble(picture, search.frame.camera)
-        least, most = nearby(image, max(1, round(0.5 * moved)))
-        side = search.frame.side
-        gaps = np.maximum(in_tiles(least, side) - tiled.high, tiled.low - in_tiles(most, side)).max(axis=-1)
-        gaps = np.where(tiled.counted, gaps, -1.0)
-        count = min(gaps.size, round(search.tuning.surplus * (tiled.allowed + 1)))
-        bar = max(0.0, float(np.partition(gaps, gaps.size - count, axis=None)[gaps.size - count]))
-        return gaps > bar
+        """[T, side, side] counted pixels that bounds are most likely to exclude: a guess of work.
+
+        None are chosen where too few are likely to be.
+        """
+        search, tiled, side = self.search, self.search.tiled, self.search.frame.side
+        least, most = nearby(assemble(picture, search.frame.camera), max(1, round(0.5 * moved)))
+        low, high = in_tiles(least, side), in_tiles(most, side)
+        below, above = (part * (moved / search.tuning.reference) for part in search.looseness)
+        gaps = np.maximum(low - tiled.high, tiled.low - high).max(axis=-1)
+        likely = np.maximum(low - below - tiled.high, tiled.low - high - above).max(axis=-1)
+        chosen = tiled.counted & (gaps > 0.0)
+        self.share = int((chosen & (likely > 0.0)).sum()) / (tiled.allowed + 1)
+        if self.share < search.tuning.promise:
+            return np.zeros_like(chosen)
+        likely = np.where(chosen, likely, -np.inf)
+        count = min(likely.size, round(search.tuning.surplus * (tiled.allowed + 1)))
+        return chosen & (likely >= np.partition(likely, likely.size - count, axis=None)[likely.size - count])
 
     def _bound(self, box: ParameterBox, tiles: np.ndarray, linear: bool, pixels: np.ndarray | None = None) -> Bounds:
         """Bounds of ``tiles``, or of some of their ``pixels`` alone where the frame can leave out the others."""
@@ -384,3 +415,15 @@ def nearby(image: np.ndarray, radius: int) -> tuple[np.ndarray, np.ndarray]:
                 high[here] = np.maximum(high[here], most[there])
         least, most = low, high
     return least, most
+
+
+def smoothed(image: np.ndarray, radius: int) -> np.ndarray:
+    """Means of an image [H, W, ...] over squares of so many pixels to every side, repeated beyond its edges."""
+    for axis in (0, 1):
+        padding = [(radius + 1, radius) if k == axis else (0, 0) for k in range(image.ndim)]
+        sums = np.cumsum(np.pad(image.astype(np.float64), padding, mode="edge"), axis=axis)
+        count = 2 * radius + 1
+        ahead = tuple(slice(count, None) if k == axis else slice(None) for k in range(image.ndim))
+        behind = tuple(slice(None, -count) if k == axis else slice(None) for k in range(image.ndim))
+        image = (sums[ahead] - sums[behind]) / count
+    return image
