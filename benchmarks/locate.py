@@ -15,6 +15,7 @@ import argparse
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -55,7 +56,9 @@ def hidden(scene: nsa.Scene, poses: nsa.PoseSet, seed: int, beyond: bool) -> tup
         )
         names = dict(zip(frame.box.names, values.tolist(), strict=True))
         turned = ("yaw", "pitch", "roll")
-        ranges = [{n: (v - 1e-9, v + 1e-9) for n, v in names.items() if (n in turned) == t} for t in (False, True)]
+        ranges: list[Any] = [
+            {n: (v - 1e-9, v + 1e-9) for n, v in names.items() if (n in turned) == t} for t in (False, True)
+        ]
         frame = scene.method().frame(nsa.PoseSet(poses.camera, *ranges).of(scene))
         return values, photo(assemble(frame.render(frame.box.middle), frame.camera), generator)
     return values, photo(assemble(frame.render(values), frame.camera), generator)

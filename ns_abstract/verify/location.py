@@ -321,7 +321,7 @@ class _Examination:
             p = np.linalg.lstsq(a * np.sqrt(weight)[:, None], target * np.sqrt(weight), rcond=None)[0]
             if not np.isfinite(p).all():
                 return
-        self._look(box.at(np.clip(p, -1.0, 1.0)))
+        self._look(box.at(np.clip(p, -1.0, 1.0).astype(np.float64)))
 
     def _finish(self) -> None:
         """End with the cell as it is: possible if a rendered pose explains the photo."""

@@ -10,6 +10,8 @@ import json
 from collections.abc import Callable, Mapping
 from typing import Any
 
+import numpy as np
+
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.location import FoundPose
 from ns_abstract.verify.location_cover import PoseCover
@@ -81,7 +83,7 @@ class LocationStore(Store):
                 for cells, excluded in ((found.left, False), (found.excluded, True)):
                     for cell in cells:
                         part = found.grid.box_of(cell)
-                        pose = None if excluded else next((p for p in poses if part.contains(p.values)), None)
+                        pose = None if excluded else next((p for p in poses if part.contains(np.array(p.values))), None)
                         verdict = "excluded" if excluded else "unknown" if pose is None else "possible"
                         row = (
                             frame,
