@@ -8,6 +8,7 @@ from planted.fault import Fault, apply
 from planted.fields import FIELDS
 from planted.forms import FORMS
 from planted.inputs import INPUTS
+from planted.location import LOCATION
 from planted.loops import LOOPS
 from planted.maps import MAPS
 from planted.network_rows import NETWORK_ROWS
@@ -23,7 +24,7 @@ from planted.verdicts import VERDICTS
 FAULTS = (
     *FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS, *DEPTHS, *LOOPS, *CHECKS,
     *INPUTS, *NETWORKS, *NETWORK_ROWS, *PROCESSES, *RESULTS, *SCENES, *MAPS, *DIFFERENCES,
-    *PICTURES,
+    *PICTURES, *LOCATION,
 )  # fmt: skip
 
 __all__ = ["FAULTS", "Fault", "apply"]

@@ -259,14 +259,14 @@ PREPROCESSED_ROUNDING = 8.0 * UNIT64
 RESPONSE_ROUNDING = 8.0 * UNIT32
 #: V14: the same of offsets of planes, absolute: of the camera's value, up to 1, and of the planes' own evaluation.
 RESPONSE_ROUNDINGS = 2.0 * RESPONSE_ROUNDING
-#: Q1: a photo's value, the noise and the sums with them, absolute: 6 roundings of numbers below 4; up to 2^11.
+#: U1: a photo's value, the noise and the sums with them, absolute: 6 roundings of numbers below 4; up to 2^11.
 PHOTO_ROOM = 2.0**-40
-#: Q3: a constraint's room and its slopes' sum, of sums of at most d + 3 <= 11 terms: 16; up to 2^9 of their size.
+#: U3: a constraint's room and its slopes' sum, of sums of at most d + 3 <= 11 terms: 16; up to 2^9 of their size.
 REACH_ROUNDING = 2.0**-44
-#: Q3: a reach in [-1, 1], the cell's middle and half its width, and their sum, in half-widths: 2^4; up to 2^13. Whether
+#: U3: a reach in [-1, 1], the cell's middle and half its width, and their sum, in half-widths: 2^4; up to 2^13. Whether
 #: a line of the grid lies outside of a cut is compared with the line itself.
 CUT_ROOM = 2.0**-40
-#: Q3: the same of the ends' own sizes: middle, product and sum, 3; 5 to spare.
+#: U3: the same of the ends' own sizes: middle, product and sum, 3; 5 to spare.
 CUT_VALUE_ROUNDING = 8.0 * UNIT64
 #: L1: roundings on the longest way through a law: sums of up to 9 products, five more products, and four units of
 #: a library's sine or cosine; twice that, to spare. Slack: the forms charge each of their operations for more than

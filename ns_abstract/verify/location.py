@@ -7,9 +7,11 @@ it is cut.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -24,6 +26,8 @@ from ns_abstract.verify.search import BlockResult, FinishedCell
 
 #: Grid units along each parameter, as a power of two.
 UNITS = 20
+#: Pixels that the looseness of bounds is averaged over, to every side.
+_SMOOTH = 4
 
 
 @dataclass(frozen=True)
@@ -31,10 +35,18 @@ class LocationTuning:
     """Preferences of the search. None of them decides whether an excluded cell holds no pose of the photo."""
 
     #: Image motion over a cell, pixels: beyond it, cells are cut without bounds; up to it, they are contracted.
-    coarse: float = 2.4
-    contracted: float = 1.2
+    coarse: float = 4.5
+    contracted: float = 0.3
     #: Pixels that are bounded to exclude a cell: so many times those that may show anything.
-    surplus: float = 3.0
+    surplus: float = 4.0
+    #: Image motion over the cell whose bounds tell how loose they are; pixels that must be likely to be excluded, as a
+    #: part of those that exclude a cell, for it to be bounded.
+    reference: float = 2.4
+    promise: float = 0.6
+    #: How many pixels bounds exclude, about, as a power of the motion; ends of the part of it that cuts aim at.
+    power: float = 2.5
+    least_aim: float = 0.35
+    most_aim: float = 0.85
     #: Part of a cell's volume that a contraction must take for it to be bounded again, and how often.
     worth: float = 0.4
     rounds: int = 4
@@ -101,6 +113,22 @@ class LocationSearch:
         """[d] pixels that typical scene elements move by over a cell (an estimate)."""
         return self._pace * (np.array(box.upper) - np.array(box.lower))
 
+    @cached_property
+    def looseness(self) -> tuple[np.ndarray, np.ndarray]:
+        """By how much bounds of a typical cell go below and above what is rendered nearby: [T, side, side, 3] each.
+
+        From one cell in the middle of the set; a guess that only decides which pixels are bounded.
+        """
+        box, frame, reference = self.frame.box, self.frame, self.tuning.reference
+        side = np.minimum(1.0, reference / math.sqrt(max(1, box.dimensions)) / np.maximum(self.moved(box), 1e-12))
+        cell = between(box, -side, side)
+        bounds = frame.bound(cell, np.arange(frame.tile_count), None)
+        picture = assemble(self.plain.render(self.original(cell.middle)), frame.camera)
+        least, most = nearby(picture, max(1, round(0.5 * reference)))
+        gaps = least - assemble(bounds.lower, frame.camera), assemble(bounds.upper, frame.camera) - most
+        below, above = (in_tiles(smoothed(np.maximum(gap, 0.0), _SMOOTH), frame.side) for gap in gaps)
+        return below, above
+
     def examine(self, cells: Sequence[Cell]) -> LocationResult:
         """Exclude the cells, or cut them.
 
@@ -143,6 +171,8 @@ class _Examination:
     children: list[Cell] = field(default_factory=list)
     best: FoundPose | None = None
     bounded: int = 0
+    #: Pixels that were excluded, as a part of those that would have excluded the cell.
+    share: float = 1.0
 
     def run(self) -> None:
         """Exclude the cell, contract it and cut it."""
@@ -216,22 +246,31 @@ class _Examination:
 
     def _excluded(self, bounds: Bounds, tiles: np.ndarray) -> bool:
         """Whether more pixels than are allowed lie beyond the bounds of some tiles: the cell is excluded then."""
+        allowed = self.search.tiled.allowed
         number = int(self.search.tiled.beyond(bounds.lower, bounds.upper, tiles).sum())
-        if number > self.search.tiled.allowed:
-            self._exclude(float(number - self.search.tiled.allowed))
+        self.share = number / (allowed + 1)
+        if number > allowed:
+            self._exclude(float(number - allowed))
         return self.done
 
     def _promising(self, picture: np.ndarray, moved: float) -> np.ndarray:
-        """[T, side, side] counted pixels whose photo differs most from all of ``picture`` nearby: a guess of work."""
-        search, tiled = self.search, self.search.tiled
-        image = assemble(picture, search.frame.camera)
-        least, most = nearby(image, max(1, round(0.5 * moved)))
-        side = search.frame.side
-        gaps = np.maximum(in_tiles(least, side) - tiled.high, tiled.low - in_tiles(most, side)).max(axis=-1)
-        gaps = np.where(tiled.counted, gaps, -1.0)
-        count = min(gaps.size, round(search.tuning.surplus * (tiled.allowed + 1)))
-        bar = max(0.0, float(np.partition(gaps, gaps.size - count, axis=None)[gaps.size - count]))
-        return gaps > bar
+        """[T, side, side] counted pixels that bounds are most likely to exclude: a guess of work.
+
+        None are chosen where too few are likely to be.
+        """
+        search, tiled, side = self.search, self.search.tiled, self.search.frame.side
+        least, most = nearby(assemble(picture, search.frame.camera), max(1, round(0.5 * moved)))
+        low, high = in_tiles(least, side), in_tiles(most, side)
+        below, above = (part * (moved / search.tuning.reference) for part in search.looseness)
+        gaps = np.maximum(low - tiled.high, tiled.low - high).max(axis=-1)
+        likely = np.maximum(low - below - tiled.high, tiled.low - high - above).max(axis=-1)
+        chosen = tiled.counted & (gaps > 0.0)
+        self.share = int((chosen & (likely > 0.0)).sum()) / (tiled.allowed + 1)
+        if self.share < search.tuning.promise:
+            return np.zeros_like(chosen)
+        likely = np.where(chosen, likely, -np.inf)
+        count = min(likely.size, round(search.tuning.surplus * (tiled.allowed + 1)))
+        return chosen & (likely >= np.partition(likely, likely.size - count, axis=None)[likely.size - count])
 
     def _bound(self, box: ParameterBox, tiles: np.ndarray, linear: bool, pixels: np.ndarray | None = None) -> Bounds:
         """Bounds of ``tiles``, or of some of their ``pixels`` alone where the frame can leave out the others."""
@@ -282,7 +321,7 @@ class _Examination:
             p = np.linalg.lstsq(a * np.sqrt(weight)[:, None], target * np.sqrt(weight), rcond=None)[0]
             if not np.isfinite(p).all():
                 return
-        self._look(box.at(np.clip(p, -1.0, 1.0)))
+        self._look(box.at(np.clip(p, -1.0, 1.0).astype(np.float64)))
 
     def _finish(self) -> None:
         """End with the cell as it is: possible if a rendered pose explains the photo."""
@@ -301,9 +340,12 @@ class _Examination:
             return self._finish()
         moved = search.moved(search.grid.box_of(self.cell))
         total = float(np.linalg.norm(moved))
+        aim = tuning.coarse
+        if total <= tuning.coarse:
+            aim = total * min(max(self.share ** (1.0 / tuning.power), tuning.least_aim), tuning.most_aim)
         parts = [1] * len(moved)
         sizes = [past - first for first, past in zip(self.cell.first, self.cell.past, strict=True)]
-        while np.prod(parts) < 2 or (2 * np.prod(parts) <= tuning.parts and total > tuning.coarse):
+        while np.prod(parts) < 2 or (2 * np.prod(parts) <= tuning.parts and total > aim):
             free = [k for k in range(len(moved)) if sizes[k] >= 2 * parts[k]]
             if not free:
                 break
@@ -318,7 +360,7 @@ class _Examination:
 
 
 def between(box: ParameterBox, least: Float64Array, most: Float64Array) -> ParameterBox:
-    """The part of a box whose scaled parameters may lie in [least, most], rounded outward (Q3)."""
+    """The part of a box whose scaled parameters may lie in [least, most], rounded outward (U3)."""
     for k in range(box.dimensions):
         low, high = box.lower[k], box.upper[k]
         middle = 0.5 * (low + high)
@@ -373,3 +415,15 @@ def nearby(image: np.ndarray, radius: int) -> tuple[np.ndarray, np.ndarray]:
                 high[here] = np.maximum(high[here], most[there])
         least, most = low, high
     return least, most
+
+
+def smoothed(image: np.ndarray, radius: int) -> np.ndarray:
+    """Means of an image [H, W, ...] over squares of so many pixels to every side, repeated beyond its edges."""
+    for axis in (0, 1):
+        padding = [(radius + 1, radius) if k == axis else (0, 0) for k in range(image.ndim)]
+        sums = np.cumsum(np.pad(image.astype(np.float64), padding, mode="edge"), axis=axis)
+        count = 2 * radius + 1
+        ahead = tuple(slice(count, None) if k == axis else slice(None) for k in range(image.ndim))
+        behind = tuple(slice(None, -count) if k == axis else slice(None) for k in range(image.ndim))
+        image = (sums[ahead] - sums[behind]) / count
+    return image

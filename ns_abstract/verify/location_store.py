@@ -1,4 +1,4 @@
-"""The store ``cells.sqlite`` of a search for poses (docs/design.md, Q4).
+"""The store ``cells.sqlite`` of a search for poses (docs/design.md, U4).
 
 While the search runs, its cells count parameters as the frame that is searched does; the table ``cells`` is written at
 its end, in the set's own parameters.
@@ -9,6 +9,8 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Mapping
 from typing import Any
+
+import numpy as np
 
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.location import FoundPose
@@ -81,7 +83,7 @@ class LocationStore(Store):
                 for cells, excluded in ((found.left, False), (found.excluded, True)):
                     for cell in cells:
                         part = found.grid.box_of(cell)
-                        pose = None if excluded else next((p for p in poses if part.contains(p.values)), None)
+                        pose = None if excluded else next((p for p in poses if part.contains(np.array(p.values))), None)
                         verdict = "excluded" if excluded else "unknown" if pose is None else "possible"
                         row = (
                             frame,

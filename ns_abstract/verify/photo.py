@@ -43,7 +43,7 @@ class Photo:
 
     @cached_property
     def ends(self) -> tuple[Float64Array, Float64Array]:
-        """Least and greatest values [H, W, 3] of a picture that explains a pixel (Q1)."""
+        """Least and greatest values [H, W, 3] of a picture that explains a pixel (U1)."""
         value = self.levels.astype(np.float64) / _STEPS
         room = self.noise + (0.5 + STEP) / _STEPS + QUOTIENT + PHOTO_ROOM
         return value - room, value + room
@@ -79,7 +79,7 @@ class TiledPhoto:
         return self.counted & ~((picture >= self.low) & (picture <= self.high)).all(axis=-1)
 
     def beyond(self, lower: np.ndarray, upper: np.ndarray, tiles: np.ndarray) -> np.ndarray:
-        """[t, side, side] which counted pixels of ``tiles`` no picture between the bounds explains (Q2).
+        """[t, side, side] which counted pixels of ``tiles`` no picture between the bounds explains (U2).
 
         Args:
             lower, upper: [t, side, side, 3] bounds of all pictures of a cell; NaN excludes nothing.
@@ -95,7 +95,7 @@ class TiledPhoto:
         return int((self.counted[tiles] & inside.all(axis=-1)).sum())
 
     def reach(self, linear: LinearSets, beyond: np.ndarray, tiles: np.ndarray) -> tuple[Float64Array, Float64Array]:
-        """Ends [d], [d] in [-1, 1] of the scaled parameters outside of which no pose explains the photo (Q3).
+        """Ends [d], [d] in [-1, 1] of the scaled parameters outside of which no pose explains the photo (U3).
 
         Along each parameter, a pixel rules out all that lies beyond its reach, wherever the others are. What more
         pixels rule out than may show anything is ruled out. The ends cross where the cell is.

@@ -1,0 +1,60 @@
+"""Faults in what a photo excludes, and in the boxes of poses that are left."""
+
+from planted.fault import Fault
+
+_PHOTO, _SEARCH, _COVER = "verify/photo.py", "verify/location.py", "verify/location_cover.py"
+_ENDS = "test_locate.py::test_a_photo_allows_its_noise_and_every_rounding"
+_REACH = "test_locate.py::test_contraction_keeps_every_pose_that_explains_the_photo"
+_NUMBERS = "test_locate.py::test_what_is_no_number_explains_and_excludes_nothing"
+_SLABS = "test_locate.py::test_slabs_and_the_inner_cell_tile_a_cell"
+_BOXES = "test_locate.py::test_a_cover_holds_every_pose_of_sheared_boxes"
+
+LOCATION = (
+    Fault(
+        "location: rounding to 8 bits is left out of the noise",
+        _PHOTO, "Photo.ends", "(0.5 + STEP) / _STEPS", "STEP / _STEPS", _ENDS,
+    ),
+    Fault(
+        "location: the photo's own rounding is not charged",
+        _PHOTO, "Photo.ends", "self.noise + (0.5 + STEP) / _STEPS + QUOTIENT + PHOTO_ROOM",
+        "self.noise + 0.5 / _STEPS", _ENDS,
+    ),
+    Fault(
+        "location: as many pixels as are allowed cut a cell",
+        _PHOTO, "TiledPhoto.reach", "np.partition(up, self.allowed)[self.allowed]",
+        "np.partition(up, self.allowed)[max(0, self.allowed - 1)]", _REACH,
+    ),
+    Fault(
+        "location: a pixel's reach forgets the other parameters",
+        _PHOTO, "TiledPhoto.reach", "(room + (steep - np.abs(slope))) / slope", "room / slope", _REACH,
+    ),
+    Fault(
+        "location: reaches are not charged for rounding",
+        _PHOTO, "TiledPhoto.reach", "room + REACH_ROUNDING * (size + steep)", "room - 1e-9 * (size + steep)", _REACH,
+    ),
+    Fault(
+        "location: upper bounds are taken for lower ones",
+        _PHOTO, "TiledPhoto.reach", "b_upper - low", "b_lower - low", _REACH,
+    ),
+    Fault(
+        "location: bounds that cross exclude pixels",
+        _PHOTO, "TiledPhoto.beyond", "(lower <= upper).all(axis=-1)", "np.isfinite(lower).all(axis=-1)", _NUMBERS,
+    ),
+    Fault(
+        "location: what is no number explains a pixel",
+        _PHOTO, "TiledPhoto.outside", "~((picture >= self.low) & (picture <= self.high)).all(axis=-1)",
+        "((picture < self.low) | (picture > self.high)).any(axis=-1)", _NUMBERS,
+    ),
+    Fault(
+        "location: cells are rounded inward",
+        _SEARCH, "inner_cell", "grid.end(k, b) < box.upper[k]", "grid.end(k, b + 1) < box.upper[k]", _SLABS,
+    ),
+    Fault(
+        "location: the last slab is left out",
+        _SEARCH, "slabs", "inner.past[k] < cell.past[k]", "inner.past[k] < cell.past[k] and k > 0", _SLABS,
+    ),
+    Fault(
+        "location: a shear moves the ends of boxes one way",
+        _COVER, "SlantedBoxes.within", "least + np.minimum(a, b)", "least + np.maximum(a, b)", _BOXES,
+    ),
+)  # fmt: skip

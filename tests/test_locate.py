@@ -1,0 +1,318 @@
+"""Where a photo was taken: what is excluded never holds the pose that made it."""
+
+import json
+import sqlite3
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import InProcess, Inputs
+from PIL import Image
+
+import ns_abstract as nsa
+from ns_abstract.api.job import Job
+from ns_abstract.api.location import Location, PhotoOptions
+from ns_abstract.cli.locate import main
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.tiles import assemble
+from ns_abstract.verify.cells import Cell, CellGrid
+from ns_abstract.verify.location import between, inner_cell, nearby, slabs
+from ns_abstract.verify.location_cover import SlantedBoxes, cover
+from ns_abstract.verify.photo import Photo, TiledPhoto
+
+#: Half a step of 8 bits.
+HALF = Fraction(1, 510)
+SET: dict[str, Any] = {"translation": {"x": 0.03, "y": 0.02}, "rotation": {"yaw": 0.03, "roll": 0.05}}
+
+
+def box_of(lower: Any, upper: Any) -> ParameterBox:
+    names = ("x", "y", "z", "yaw", "pitch", "roll")[: len(lower)]
+    return ParameterBox(names, ("",) * len(names), tuple(map(float, lower)), tuple(map(float, upper)))
+
+
+def taken(picture: np.ndarray, noise: float, outliers: int, generator: np.random.Generator) -> np.ndarray:
+    """A photo of 8 bits of a picture [H, W, 3], with noise up to its ends and pixels that show anything."""
+    error = noise * np.where(generator.random(picture.shape) < 0.3, generator.choice([-1.0, 1.0], picture.shape),
+                             generator.uniform(-1.0, 1.0, picture.shape))  # fmt: skip
+    levels = np.rint(255.0 * np.clip(picture.astype(np.float64) + error, 0.0, 1.0)).astype(np.uint8)
+    places = generator.permutation(levels[..., 0].size)[:outliers]
+    levels.reshape(-1, 3)[places] = generator.integers(0, 256, (outliers, 3), np.uint8)
+    return levels
+
+
+def test_a_photo_allows_its_noise_and_every_rounding() -> None:
+    """Any value that rounds, up or down at ties, to the photo's after noise lies within what is allowed, exactly."""
+    levels = np.arange(256, dtype=np.uint8).repeat(3).reshape(16, 16, 3)
+    for noise in (0.0, 2.0 / 255.0, 0.02, 0.3):
+        low, high = Photo(levels, noise, 0.0, np.ones((16, 16), bool)).ends
+        for level, a, b in zip(levels.ravel().tolist(), low.ravel().tolist(), high.ravel().tolist(), strict=True):
+            assert Fraction(a) <= Fraction(level, 255) - Fraction(noise) - HALF
+            assert Fraction(b) >= Fraction(level, 255) + Fraction(noise) + HALF
+            assert b - a <= 2.0 * noise + 1.01 / 255.0
+
+
+def test_what_is_no_number_explains_and_excludes_nothing() -> None:
+    photo = Photo(np.zeros((4, 4, 3), np.uint8), 0.0, 0.5, np.ones((4, 4), bool)).tiled(4)
+    nothing = np.full((1, 4, 4, 3), np.nan, np.float32)
+    tiles = np.arange(1)
+    assert photo.outside(nothing).all()
+    assert not photo.beyond(nothing, nothing, tiles).any()
+    # bounds that cross bound nothing
+    assert not photo.beyond(nothing * 0 + 1, np.zeros_like(nothing) + 0.5, tiles).any()
+    assert photo.beyond(np.full_like(nothing, 0.5), np.ones_like(nothing), tiles).all()
+    assert photo.explained(nothing, nothing, tiles) == 0
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_contraction_keeps_every_pose_that_explains_the_photo(seed: int) -> None:
+    """Poses at which all pixels but the allowed ones lie between exact linear bounds, some of them only just."""
+    generator = np.random.default_rng(seed)
+    d, side, allowed = int(generator.integers(1, 7)), 4, int(generator.integers(0, 6))
+    a = (
+        generator.normal(size=(1, side, side, 3, d)) * generator.choice([0.0, 1e-6, 0.1], (1, side, side, 3, 1))
+    ).astype(np.float32)
+    b = generator.uniform(0.0, 1.0, (1, side, side, 3)).astype(np.float32)
+    width = np.float32(generator.choice([0.0, 0.01]))
+    linear = a, b - width, a.copy(), b + width
+    pose = generator.uniform(-1.0, 1.0, d) if seed % 3 else generator.choice([-1.0, 1.0], d)
+    low, high = np.empty((1, side, side, 3)), np.empty((1, side, side, 3))
+    for place in np.ndindex(low.shape):
+        move = sum((Fraction(float(s)) * Fraction(float(p)) for s, p in zip(a[place], pose, strict=True)), Fraction())
+        # least and greatest value allowed are the bounds' own at the pose, rounded so that it is explained
+        high[place] = np.nextafter(float(move + Fraction(float(linear[1][place]))), np.inf)
+        low[place] = np.nextafter(float(move + Fraction(float(linear[3][place]))), -np.inf)
+    low, high = np.minimum(low, high), np.maximum(low, high)
+    places = generator.permutation(side * side)[:allowed]
+    for part in (low, high):
+        part.reshape(-1, 3)[places] += 5.0
+    photo = TiledPhoto(low, high, np.ones((1, side, side), bool), allowed)
+    steep = np.abs(a).sum(axis=-1)
+    lower, upper = linear[1] - steep - 1e-5, linear[3] + steep + 1e-5
+    tiles = np.arange(1)
+    beyond = photo.beyond(lower, upper, tiles)
+    assert beyond.sum() <= allowed
+    least, most = photo.reach(linear, beyond, tiles)
+    assert (least <= pose).all() and (pose <= most).all()
+    box = box_of(generator.uniform(-1.0, 0.0, d), generator.uniform(0.5, 1.0, d))
+    part = between(box, least, most)
+    assert part.contains(box.at(pose))
+    if allowed == 0 and width == 0.0 and d == 1:
+        # and it is sharp
+        assert (most - least < 1e-3).all()
+
+
+def test_a_box_that_too_many_pixels_rule_out_is_empty() -> None:
+    """Half of the pixels ask for one end of a parameter, half for the other: two more than may show anything."""
+    a, b = np.full((1, 2, 4, 3, 1), 0.1, np.float32), np.full((1, 2, 4, 3), 0.5, np.float32)
+    value = np.full((1, 2, 4, 3), 0.55)
+    value[:, 1] = 0.45
+    counted = np.ones((1, 2, 4), bool)
+    for allowed, empty in ((3, True), (4, False)):
+        photo = TiledPhoto(value - 0.01, value + 0.01, counted, allowed)
+        least, most = photo.reach((a, b, a, b), np.zeros_like(counted), np.arange(1))
+        assert (least > most).any() == empty
+
+
+def test_slabs_and_the_inner_cell_tile_a_cell() -> None:
+    generator = np.random.default_rng(0)
+    for _ in range(200):
+        d = int(generator.integers(1, 7))
+        lower = generator.uniform(-1.0, 1.0, d)
+        grid = CellGrid(box_of(lower, lower + generator.uniform(1e-9, 1.0, d)), (1 << 12,) * d, (1,) * d)
+        first = generator.integers(0, 2000, d)
+        cell = Cell(tuple(first.tolist()), tuple((first + generator.integers(1, 2000, d)).tolist()))
+        ends = np.sort(grid.box_of(cell).sample(2, generator), axis=0)
+        wanted = box_of(*ends)
+        inner = inner_cell(grid, cell, wanted)
+        held = grid.box_of(inner)
+        assert all(a <= b for a, b in zip(held.lower, wanted.lower, strict=True))
+        assert all(a >= b for a, b in zip(held.upper, wanted.upper, strict=True))
+        parts = [inner, *slabs(cell, inner)]
+        assert sum(part.volume for part in parts) == cell.volume
+        for p, q in ((p, q) for k, p in enumerate(parts) for q in parts[:k]):
+            both = zip(p.first, p.past, q.first, q.past, strict=True)
+            assert any(b <= c or e <= a for a, b, c, e in both)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_cover_holds_every_pose_of_sheared_boxes(seed: int) -> None:
+    generator = np.random.default_rng(seed)
+    box = box_of([-0.1, -0.2, -0.1, -0.05], [0.1, 0.1, 0.2, 0.1])
+    shear = {"yaw": {"x": 0.7, "z": -0.2}} if seed else {}
+    count = 12
+    lower = np.stack([generator.uniform(a, b, count) for a, b in zip(box.lower, box.upper, strict=True)], axis=1)
+    upper = lower + generator.uniform(0.0, 0.05, lower.shape)
+    found = cover(box, SlantedBoxes(lower, upper, box.names, shear), 200)
+    cells = [*found.left, *found.excluded]
+    assert sum(cell.volume for cell in cells) == found.grid.volume
+    left = [found.grid.box_of(cell) for cell in found.left]
+    inside = 0
+    for k in range(count):
+        for _ in range(40):
+            values = generator.choice([0.0, 1.0, generator.random()], 4) * (upper[k] - lower[k]) + lower[k]
+            for other, factor in shear.get("yaw", {}).items():
+                values[3] += factor * values[box.names.index(other)]
+            if box.contains(values):
+                inside += 1
+                assert any(part.contains(values) for part in left)
+    assert inside > 20
+    assert found.volume < 0.5
+
+
+def test_nearby_values() -> None:
+    image = np.random.default_rng(0).random((5, 6, 3))
+    least, most = nearby(image, 2)
+    for y, x in np.ndindex(5, 6):
+        part = image[max(0, y - 2) : y + 3, max(0, x - 2) : x + 3].reshape(-1, 3)
+        np.testing.assert_array_equal(least[y, x], part.min(axis=0))
+        np.testing.assert_array_equal(most[y, x], part.max(axis=0))
+
+
+def followed(location: Location, pose: np.ndarray, most: int) -> tuple[int, float]:
+    """Examine the cells that hold a pose alone; how many there were, and the part of the set that is left."""
+    search = location.search(0)
+    sheared = pose.copy()
+    for name, factors in search.frame.pose_set.shear.items():
+        names = search.frame.box.names
+        sheared[names.index(name)] -= sum(f * pose[names.index(other)] for other, f in factors.items())
+    cells = search.grid.roots()
+    for count in range(most):
+        if not cells:
+            return count, 0.0
+        findings = search.examine(cells[:1])
+        for leaf in findings.leaves:
+            assert leaf.verdict != "certified" or not holds(search.grid.box_of(leaf.cell), sheared)
+        parts = [cell for block in findings.blocks for cell in block]
+        kept = [leaf.cell for leaf in findings.leaves if leaf.verdict != "certified"]
+        cells = [*cells[1:], *(cell for cell in parts if search.grid.box_of(cell).contains(sheared))]
+        assert cells or any(search.grid.box_of(cell).contains(sheared) for cell in kept)
+    return most, sum(cell.volume for cell in cells) / search.grid.volume
+
+
+def holds(box: ParameterBox, values: np.ndarray) -> bool:
+    """Whether values lie inside a box, farther from its ends than they are rounded."""
+    room = 1e-13
+    return bool(np.all((values > np.array(box.lower) + room) & (values < np.array(box.upper) - room)))
+
+
+@pytest.mark.slow_cases(every=4)
+@pytest.mark.parametrize("seed", range(4))
+def test_the_true_pose_is_never_excluded(seed: int, blobs: Inputs) -> None:
+    generator = np.random.default_rng(seed)
+    scene = nsa.load_scene(blobs.config)
+    camera = nsa.load_camera_path(blobs.path).cameras[seed % 3]
+    job = Job(scene, [nsa.PoseSet(camera, **SET).of(scene)])
+    frame = job.frame(0)
+    pose = frame.box.sample(1, generator)[0] if seed else np.array(frame.box.upper)
+    noise, outliers = float(generator.choice([0.0, 2.0 / 255.0])), int(generator.choice([0, 20]))
+    levels = taken(assemble(frame.render(pose), frame.camera), noise, outliers, generator)
+    location = Location(job, levels, None, PhotoOptions(noise, outliers / levels[..., 0].size))
+    assert location.photo.outside(location.picture(0, pose)).sum() <= location.photo.allowed
+    _, left = followed(location, pose, 24)
+    assert left < 0.01
+
+
+@pytest.mark.slow
+def test_locate_finds_the_pose(blobs: Inputs, tmp_path: Path) -> None:
+    generator = np.random.default_rng(5)
+    scene = nsa.load_scene(blobs.config)
+    poses = nsa.PoseSet(nsa.load_camera_path(blobs.path).cameras[0], translation={"x": 0.03}, rotation={"yaw": 0.02})
+    frame = scene.method().frame(poses.of(scene))
+    pose = frame.box.sample(1, generator)[0]
+    levels = taken(assemble(frame.render(pose), frame.camera), 2.0 / 255.0, 20, generator)
+    place = nsa.locate(
+        scene, poses, levels, noise=2.0 / 255.0, outliers=20 / 1024, time_budget=20.0, output_dir=tmp_path
+    )
+    assert place.possible_volume < 0.01
+    assert place.hull is not None and place.best is not None
+    assert (place.hull[0] <= pose).all() and (pose <= place.hull[1]).all()
+    assert np.abs(np.array(place.best["pose"]) - pose).max() < 2e-3
+    sizes = np.array(frame.box.upper) - np.array(frame.box.lower)
+    volumes = {
+        kind: sum(np.prod((c.upper - c.lower) / sizes) for c in place.cells if (c.verdict == "excluded") == kind)
+        for kind in (True, False)
+    }
+    assert volumes[False] == pytest.approx(place.possible_volume)
+    assert sum(volumes.values()) == pytest.approx(1.0)
+    for cell in place.cells:
+        if cell.verdict == "possible":
+            assert cell.pose is not None and (cell.lower <= cell.pose).all() and (cell.pose <= cell.upper).all()
+            shown = assemble(frame.render(cell.pose), frame.camera)
+            photo = Photo(levels, 2.0 / 255.0, 20 / 1024, np.ones((32, 32), bool))
+            assert photo.outside(shown).sum() <= 20
+    page = (tmp_path / "report.html").read_text()
+    assert "best render" in page and "What is left" in page
+
+
+def options(blobs: Inputs, output: Path, image: Path, **more: Any) -> list[str]:
+    return blobs.options(output, image=image, frames=0, workers=1, **more)
+
+
+@pytest.mark.slow
+def test_command_says_none_and_resumes(blobs: Inputs, tmp_path: Path, in_process: InProcess) -> None:
+    """A photo of something else; the answer is none, and the table's cells tile the set."""
+    image = tmp_path / "photo.png"
+    Image.fromarray(np.random.default_rng(0).integers(0, 256, (32, 32, 3), np.uint8)).save(image)
+    for more in ({}, {"resume": True}):
+        code, _, err = in_process(main, options(blobs, tmp_path / "out", image, time_budget=60, **more))
+        assert code == 0 and "none: no pose of the set made the photo" in err
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["answer"] == "none" and report["possible_volume"] == 0.0 and report["hull"] is None
+    with sqlite3.connect(tmp_path / "out" / "cells.sqlite") as base:
+        rows = base.execute("SELECT lower, upper, verdict, counterexample FROM cells").fetchall()
+    assert {row[2] for row in rows} == {"excluded"}
+    total = sum(json.loads(row[1])[0] - json.loads(row[0])[0] for row in rows)
+    assert total == pytest.approx(0.06)
+    code, _, err = in_process(main, options(blobs, tmp_path / "out", image, noise=0.1, resume=True))
+    assert code == 2 and "another noise" in err
+
+
+@pytest.mark.parametrize(
+    "size, mode, more, words",
+    [
+        ((40, 30), "RGB", {}, "resize it to 32 x 32"),
+        ((32, 32), "L", {}, "save it as RGB"),
+        ((32, 32), "RGBA", {}, "without an alpha channel"),
+        ((32, 32), "RGB", {"noise": -0.1}, "--noise: found -0.1"),
+        ((32, 32), "RGB", {"noise": "nan"}, "--noise: found nan"),
+        ((32, 32), "RGB", {"outliers": 1.0}, "--outliers: found 1.0"),
+        ((32, 32), "RGB", {"mask": "black.png"}, "counts no pixel"),
+        ((32, 32), "RGB", {"mask": "grey.png"}, "neither black nor white"),
+        ((32, 32), "RGB", {"mask": "small.png"}, "resize it to 32 x 32 with nearest"),
+        ((32, 32), "RGB", {"mask": "missing.png"}, "no such file"),
+        ((32, 32), "RGB", {"mask": "text.png"}, "cannot be read"),
+        ((32, 32), "RGB", {"time_budget": 0}, "--time-budget: found 0.0"),
+    ],
+)
+def test_bad_input_is_one_line(
+    size: tuple[int, int], mode: str, more: dict[str, Any], words: str, blobs: Inputs, tmp_path: Path,
+    in_process: InProcess,
+) -> None:  # fmt: skip
+    image = tmp_path / "photo.png"
+    Image.new(mode, size, 0).save(image)
+    Image.new("RGB", (32, 32), "black").save(tmp_path / "black.png")
+    Image.new("RGB", (32, 32), "grey").save(tmp_path / "grey.png")
+    Image.new("RGB", (16, 16), "white").save(tmp_path / "small.png")
+    (tmp_path / "text.png").write_text("no picture")
+    if "mask" in more:
+        more = {"mask": tmp_path / more["mask"]}
+    code, _, err = in_process(main, options(blobs, tmp_path / "out", image, **more))
+    assert code == 2 and words in err and err.count("\n") == 1
+    assert not (tmp_path / "out").exists()
+
+
+def test_photos_of_the_python_interface(blobs: Inputs) -> None:
+    scene = nsa.load_scene(blobs.config)
+    poses = nsa.PoseSet(nsa.load_camera_path(blobs.path).cameras[0], translation={"x": 0.01})
+    for photo, words in (
+        (np.zeros((32, 32), np.uint8), "found uint8 of shape"),
+        (np.full((32, 32, 3), 0.5), "round it to 8 bits"),
+        (np.full((32, 32, 3), np.nan), "round it to 8 bits"),
+        (np.full((32, 32, 3), 2.0), "round it to 8 bits"),
+    ):
+        with pytest.raises(nsa.InputError, match=words):
+            nsa.locate(scene, poses, photo)
+    with pytest.raises(nsa.InputError, match="bool"):
+        nsa.locate(scene, poses, np.zeros((32, 32, 3), np.uint8), mask=np.ones((32, 32)))
