@@ -60,7 +60,7 @@ def test_what_is_no_number_explains_and_excludes_nothing() -> None:
     assert photo.outside(nothing).all()
     assert not photo.beyond(nothing, nothing, tiles).any()
     # bounds that cross bound nothing
-    assert not photo.beyond(nothing * 0 + 1, np.zeros_like(nothing) + 0.5, tiles).any()
+    assert not photo.beyond(np.ones_like(nothing), np.full_like(nothing, 0.5), tiles).any()
     assert photo.beyond(np.full_like(nothing, 0.5), np.ones_like(nothing), tiles).all()
     assert photo.explained(nothing, nothing, tiles) == 0
 
@@ -77,13 +77,14 @@ def test_contraction_keeps_every_pose_that_explains_the_photo(seed: int) -> None
     width = np.float32(generator.choice([0.0, 0.01]))
     linear = a, b - width, a.copy(), b + width
     pose = generator.uniform(-1.0, 1.0, d) if seed % 3 else generator.choice([-1.0, 1.0], d)
-    low, high = np.empty((1, side, side, 3)), np.empty((1, side, side, 3))
+    low, high = np.full((1, side, side, 3), -5.0), np.full((1, side, side, 3), 5.0)
     for place in np.ndindex(low.shape):
         move = sum((Fraction(float(s)) * Fraction(float(p)) for s, p in zip(a[place], pose, strict=True)), Fraction())
-        # least and greatest value allowed are the bounds' own at the pose, rounded so that it is explained
-        high[place] = np.nextafter(float(move + Fraction(float(linear[1][place]))), np.inf)
-        low[place] = np.nextafter(float(move + Fraction(float(linear[3][place]))), -np.inf)
-    low, high = np.minimum(low, high), np.maximum(low, high)
+        # a picture at one of its bounds is explained, and only just; the other end is far off, or as near
+        if place[-1] != 0 or width == 0.0:
+            high[place] = np.nextafter(float(move + Fraction(float(linear[1][place]))), np.inf)
+        if place[-1] == 0 or width == 0.0:
+            low[place] = np.nextafter(float(move + Fraction(float(linear[3][place]))), -np.inf)
     places = generator.permutation(side * side)[:allowed]
     for part in (low, high):
         part.reshape(-1, 3)[places] += 5.0

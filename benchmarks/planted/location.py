@@ -46,8 +46,8 @@ LOCATION = (
         "((picture < self.low) | (picture > self.high)).any(axis=-1)", _NUMBERS,
     ),
     Fault(
-        "location: cells are rounded inward",
-        _SEARCH, "inner_cell", "grid.end(k, b) < box.upper[k]", "grid.end(k, b + 1) < box.upper[k]", _SLABS,
+        "location: cuts are rounded inward",
+        _SEARCH, "between", "middle + half * float(most[k]) + room", "middle + half * float(most[k]) - 1e-9", _REACH,
     ),
     Fault(
         "location: the last slab is left out",
