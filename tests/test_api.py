@@ -320,7 +320,24 @@ MISTAKES = {
     "fov": (lambda: nsa.Camera(np.eye(4), fov=200.0), "fov"),
     "width": (lambda: nsa.Camera(np.eye(4), width=0), "width"),
     "pose": (lambda: nsa.Camera(2.0 * np.eye(4)), "camera_to_world"),
+    "3x3": (lambda: nsa.Camera(np.eye(3)), "camera_to_world"),
+    "matrix of words": (lambda: nsa.Camera("front"), "camera_to_world"),
+    "one number for three axes": (lambda: nsa.PoseSet(straight(), translation=0.02), "translation"),  # type: ignore[arg-type]
+    "a list for three axes": (lambda: nsa.PoseSet(straight(), rotation=[0.02, 0, 0]), "rotation"),  # type: ignore[arg-type]
+    "a word for a number": (lambda: nsa.PoseSet(straight(), rotation={"yaw": "much"}), "rotation.yaw"),  # type: ignore[dict-item]
+    "orbit": (lambda: nsa.PoseSet(straight(), orbit=1.0), "orbit"),  # type: ignore[arg-type]
+    "axis": (lambda: nsa.PoseSet(straight(), orbit={"target": "a", "axis": 1, "azimuth": 2}), "orbit.axis"),
+    "angle units": (lambda: nsa.PoseSet(straight(), angle_units="turns"), "angle_units"),
+    "scene": (lambda: nsa.bound("scene.yml", straight()), "scene"),  # type: ignore[arg-type]
+    "render a set": (lambda: nsa.render("scene.yml", nsa.PoseSet(straight())), "camera"),  # type: ignore[arg-type]
+    "no path": (lambda: nsa.load_scene(None), "path"),  # type: ignore[arg-type]
+    "no camera path": (lambda: nsa.load_camera_path(3), "path"),  # type: ignore[arg-type]
+    "no folder": (lambda: nsa.check(3), "output_dir"),  # type: ignore[arg-type]
 }
+#: What `ns_abstract.bound` gets, by the name of the argument that its error names.
+BAD_ARGUMENTS: dict[str, Any] = {
+    "poses": None, "time_budget": "long", "target_ratio": None, "workers": 0.5, "seed": -1, "--memory-limit": "x",
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", MISTAKES)
@@ -329,6 +346,36 @@ def test_mistakes_name_the_field(name: str) -> None:
     with pytest.raises(nsa.InputError) as caught:
         make()
     assert caught.value.field == field and caught.value.fix and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", BAD_ARGUMENTS)
+def test_bad_arguments_are_named(name: str, wall: nsa.Scene) -> None:
+    arguments = {"poses": straight(), name.strip("-").replace("-", "_"): BAD_ARGUMENTS[name]}
+    with pytest.raises(nsa.InputError) as caught:
+        nsa.bound(wall, **arguments)
+    assert caught.value.field == name and caught.value.fix
+
+
+def test_a_camera_is_the_set_of_its_pose(wall: nsa.Scene, tmp_path: Path) -> None:
+    result = nsa.bound(wall, straight(8))
+    image = nsa.render(wall, straight(8))
+    assert result.parameters.names == () and ((result.lower <= image) & (image <= result.upper)).all()
+    net = classifier(tmp_path / "net.onnx", 8)
+    for poses in (straight(8), [straight(8), nsa.PoseSet(straight(8))]):
+        found = nsa.certify(wall, poses, net, {"type": "classification", "label": 0}, time_budget=5.0)
+        assert found.certified + found.falsified + found.unknown == pytest.approx(1.0)
+    for poses, field in ((3, "poses"), ([3], "poses[0]"), ([], "poses")):
+        with pytest.raises(nsa.InputError) as caught:
+            nsa.certify(wall, poses, net, {"type": "classification", "label": 0})  # type: ignore[arg-type]
+        assert caught.value.field == field
+
+
+def test_degrees_are_radians() -> None:
+    orbit = {"target": np.zeros(3), "axis": (0, 0, 1), "azimuth": (0.0, 90.0)}
+    turned = nsa.PoseSet(straight(), rotation={"yaw": np.float32(2.0)}, orbit=orbit, angle_units="degrees")
+    found = turned.perturbation()
+    assert found.rotation["yaw"] == pytest.approx((-np.deg2rad(2.0), np.deg2rad(2.0)))
+    assert found.orbit is not None and found.orbit.azimuth == pytest.approx((0.0, np.pi / 2.0))
 
 
 def test_files_that_are_not_there(tmp_path: Path, wall: nsa.Scene) -> None:
@@ -351,6 +398,11 @@ def test_results_show_themselves(wall: nsa.Scene, tmp_path: Path) -> None:
     poses = nsa.PoseSet(straight(8), translation={"x": 0.1}, frame="world")
     shown = nsa.bound(wall, poses)._repr_html_()
     assert shown.count("data:image/png;base64,") == 4
+    result = nsa.bound(wall, poses, keep_cells=True, outputs="rgb")
+    for thing in (result, result.frame, result.cells, result.layers):
+        for printed in (str(thing), repr(thing)):
+            assert len(printed) < 1500 and len(printed.splitlines()) < 24, printed
+    assert "mean gap" in str(result) and "ratio to real renders" in repr(result)
     for text in ("lower bound", "upper bound", "gap", "one render", "real-sound", "ratio"):
         assert text in shown
     net = classifier(tmp_path / "net.onnx", 8)

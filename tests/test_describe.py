@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import json
 import math
 import re
+import shutil
 import sys
 from collections.abc import Callable
 from functools import partial
@@ -15,6 +17,7 @@ import pytest
 from conftest import TIMESTAMP, InProcess, Inputs, blob_scene
 from nerfs import tiny_scene
 
+import ns_abstract as nsa
 from ns_abstract.api.files import Settings, open_job
 from ns_abstract.cli import render as render_command
 from ns_abstract.geometry.camera_path import load_camera_path
@@ -37,6 +40,7 @@ def numbers(text: str, pattern: str) -> list[float]:
     return [float(part) for part in found.groups()]
 
 
+@pytest.mark.slow
 def test_describe_tells_units_distances_and_pixels(blobs: Inputs, call: Call, tmp_path: Path) -> None:
     options = [
         "--load-config", str(blobs.config), "--camera-path-filename", str(blobs.path), "--describe",
@@ -49,9 +53,10 @@ def test_describe_tells_units_distances_and_pixels(blobs: Inputs, call: Call, tm
     (told,) = numbers(text, r"1 unit of the data set \(transforms.json\) = ([\d.e-]+) normalised")
     assert told == pytest.approx(scale, rel=1e-3)
     assert numbers(text, r"1 cm = ([\d.e-]+)")[0] == pytest.approx(0.01 * scale, rel=1e-3)
-    (radius, original) = numbers(text, r"x ± ([\d.e-]+) normalised units \(± ([\d.e-]+) of the data set\)")
+    original, radius = numbers(text, r"x ± ([\d.e-]+) units of the data set \(± ([\d.e-]+) normalised units\)")
     assert (radius, original) == (pytest.approx(0.03 * scale, rel=1e-3), pytest.approx(0.03, rel=1e-3))
-    angle, degrees = numbers(text, r"pitch ± ([\d.e-]+) rad \(± ([\d.e-]+) degrees\)")
+    degrees, angle = numbers(text, r"pitch ± ([\d.e-]+) degrees \(± ([\d.e-]+) rad\)")
+    assert "is this what you mean" not in text
     assert (angle, degrees) == (pytest.approx(math.radians(1.0), rel=1e-3), 1.0)
 
     # by hand: the first camera's picture of all means
@@ -68,6 +73,46 @@ def test_describe_tells_units_distances_and_pixels(blobs: Inputs, call: Call, tm
     (moved,) = numbers(text, r"  x moves what frame 0 shows by ([\d.]+) pixels over its range")
     assert camera.fx * 2 * radius / wanted[2] < moved < camera.fx * 2 * radius / wanted[0]
     assert numbers(text, r"pitch moves what frame 0 shows by ([\d.]+)")[0] == pytest.approx(2 * yaw, rel=0.2)
+
+
+@pytest.mark.parametrize(("rotation", "asks"), [((0.49,), False), ((0.0, 0.51, 0.0), True), ((60.0, 0.0, 0.0), False)])
+def test_wide_rotations_in_radians_ask_back(
+    blobs: Inputs, call: Call, tmp_path: Path, rotation: tuple[float, ...], asks: bool
+) -> None:
+    """Above 0.5 rad, --describe asks back and the commands warn; in degrees, the user has said what was meant."""
+    degrees = ["--angle-units", "degrees"] if rotation[0] > 1.0 else []
+    options = ["--load-config", str(blobs.config), "--camera-path-filename", str(blobs.path), "--frames", "0"]
+    options += ["--rotation", *map(str, rotation), *degrees]
+    code, text, _ = call([*options, "--describe"])
+    assert code == 0 and ("is this what you mean" in text) == asks
+    code, _, text = call([*options, "--time-budget", "0.1", "--output-dir", str(tmp_path / "out")])
+    assert code in (0, 3) and ("warning: the set turns by up to 29.22 degrees (0.51 rad) in pitch" in text) == asks
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert ("if degrees were meant" in page) == asks
+    first = "yaw ± 60 degrees (± 1.047 rad)" if degrees else "± 28.07 degrees" if not asks else "pitch ± 0.51 rad"
+    assert first in page
+
+
+def test_results_have_the_units_that_were_asked(blobs: Inputs, tmp_path: Path) -> None:
+    """In files and in Python: what was asked comes first, the other unit beside it; the file's parameters stay."""
+    scale = 0.5
+    run = shutil.copytree(blobs.config.parent, tmp_path / "run")
+    transform = json.loads((run / "dataparser_transforms.json").read_text())
+    write_json(run / "dataparser_transforms.json", {**transform, "scale": scale})
+    scene, camera = nsa.load_scene(run / "config.yml"), load_camera_path(blobs.path).cameras[0]
+    texts = {}
+    for asked in ({}, {"units": "dataset", "angle_units": "degrees"}):
+        poses = nsa.PoseSet(camera, {"x": 0.01}, {"yaw": (0.0, 0.01)}, **asked)
+        result = nsa.bound(scene, poses, time_budget=0.1)
+        texts["dataset" if asked else "normalised"] = str(result)
+        result.save(tmp_path / "frame.npz")
+        low, high = (0.01 * scale, np.radians(0.01)) if asked else (0.01, 0.01)
+        stored = np.load(tmp_path / "frame.npz")["parameters"]
+        assert list(stored["unit"]) == ["normalised units", "rad"] and stored["upper"].tolist() == [low, high]
+    assert "x ± 0.01 units of the data set (± " in texts["dataset"]
+    assert "yaw ∈ [0, 0.01] degrees ([0, 0.000174533] rad)" in texts["dataset"]
+    assert "x ± 0.01 normalised units (± " in texts["normalised"]
+    assert "yaw ∈ [0, 0.01] rad ([0, 0.572958] degrees)" in texts["normalised"]
 
 
 def test_describe_needs_no_set_and_writes_nothing(
@@ -130,5 +175,5 @@ def test_given_set_that_cannot_be_used(
     assert code == 2 and problem.count("\n") == 1 and all(word in problem for word in words), problem
     code, _, problem = call([*blobs.options(tmp_path / "out"), *more])
     assert code == 2 and "beside --perturbation-filename" in problem
-    with pytest.raises(InputError, match="perturbation for entry 0"):
+    with pytest.raises(InputError, match="perturbation for entry 0; give --translation or --rotation"):
         open_job(Settings(blobs.config, blobs.path))

@@ -22,7 +22,7 @@ from ns_abstract.perturbation.specification import parse_perturbation
 from ns_abstract.reach.loop import Loop, parse_loop
 from ns_abstract.reach.planes import plane_marks, region, views
 from ns_abstract.refine.protocol import SceneElements
-from ns_abstract.report.cameras import MOST, CameraDrawings, cameras_entry, cell_cameras, standing
+from ns_abstract.report.cameras import MOST, CameraDrawings, cameras_entry, cell_cameras, standing, upward
 from ns_abstract.report.export import encode_gif, encode_mp4
 from ns_abstract.report.outside import PlotWindow, SceneDrawing
 from ns_abstract.verify.store import Store
@@ -77,6 +77,7 @@ def test_elements_are_drawn_where_they_are_and_the_nearest_on_top() -> None:
     assert color_at(read(SceneDrawing(turned).picture(beside)), beside, (0.0, 0.0)) == "b"
 
 
+@pytest.mark.slow
 def test_a_picture_of_many_elements_is_small_and_always_the_same() -> None:
     rng = np.random.default_rng(2)
     count = 30_000
@@ -291,6 +292,21 @@ def test_cameras_are_drawn_where_the_middles_of_their_cells_are() -> None:
                     assert any((a.min(axis=1) < 0.01).all() and (a.max(axis=1) > -0.01).all() for a in away)
 
 
+@pytest.mark.parametrize("up", [0, 1, 2])
+def test_an_orbit_is_drawn_in_its_plane(up: int) -> None:
+    """Whatever is up: the plan shows both coordinates that an orbit changes, and is a circle."""
+    axis, eye = np.eye(3)[up] + 0.1, 2.0 * np.eye(3)[(up + 1) % 3]
+    turned = np.concatenate([np.eye(3), eye[:, None]], axis=1)
+    sets = {0: poses({"orbit": {"target": [0, 0, 0], "axis": axis.tolist(), "azimuth": [0.0, 6.0]}}, turned)}
+    assert upward(sets) == up
+    low, high = standing(sets)
+    plan, side = CameraDrawings([], 0, (low, high), None, upward(sets)).views(300)
+    assert set(plan.window.axes) == {0, 1, 2} - {up} and side.window.axes[1] == up
+    assert SceneDrawing.sight(plan.window.axes) == (up, 1.0)
+    assert min(high[list(plan.window.axes)] - low[list(plan.window.axes)]) > 2.0
+    assert upward({0: shifts()}) == 2
+
+
 def test_the_widest_cells_have_cameras_and_the_others_are_counted() -> None:
     narrow = np.linspace(0.0, 3.0, 1001)
     rows = azimuths(np.append(narrow, [4.0, 5.0, 6.0]))
@@ -313,6 +329,7 @@ def test_cameras_that_stand_still_are_drawn() -> None:
     assert CameraDrawings([], 0, standing({0: poses()}), None).html({}) == ""
 
 
+@pytest.mark.slow
 def test_the_scene_behind_cameras_is_the_same_in_every_report() -> None:
     rng = np.random.default_rng(5)
     scene = elements(*[(rng.normal(size=3) * 0.3, rng.uniform(size=3), 0.03, 0.9) for _ in range(3000)])

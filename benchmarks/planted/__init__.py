@@ -3,11 +3,13 @@
 from planted.certificates import CERTIFICATES
 from planted.checks import CHECKS
 from planted.depths import DEPTHS
+from planted.differences import DIFFERENCES
 from planted.fault import Fault, apply
 from planted.fields import FIELDS
 from planted.forms import FORMS
 from planted.inputs import INPUTS
 from planted.loops import LOOPS
+from planted.maps import MAPS
 from planted.network_rows import NETWORK_ROWS
 from planted.networks import NETWORKS
 from planted.polynomials import POLYNOMIALS
@@ -19,7 +21,7 @@ from planted.verdicts import VERDICTS
 
 FAULTS = (
     *FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS, *DEPTHS, *LOOPS, *CHECKS,
-    *INPUTS, *NETWORKS, *NETWORK_ROWS, *PROCESSES, *RESULTS, *SCENES,
+    *INPUTS, *NETWORKS, *NETWORK_ROWS, *PROCESSES, *RESULTS, *SCENES, *MAPS, *DIFFERENCES,
 )  # fmt: skip
 
 __all__ = ["FAULTS", "Fault", "apply"]

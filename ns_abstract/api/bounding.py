@@ -2,31 +2,35 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from time import perf_counter
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ns_abstract.api.job import Job
-from ns_abstract.api.poses import PoseSet
-from ns_abstract.api.scenes import Scene
+from ns_abstract.api.parameters import point_of, sub_box
+from ns_abstract.api.poses import PoseSet, pose_set
+from ns_abstract.api.scenes import Scene, checked_scene
 from ns_abstract.arithmetic.kernel_cache import store as kernels
-from ns_abstract.execution.cancellation import WorkCancelledError
+from ns_abstract.execution.cancellation import Deadline, WorkCancelledError
 from ns_abstract.execution.engines import Engine, SerialEngine
 from ns_abstract.execution.scheduler import Task, work
 from ns_abstract.execution.stopping import StopRequest, interruptible
 from ns_abstract.execution.threads import use_threads
 from ns_abstract.execution.worker_cache import Recipe, load
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.io.arguments import at_least, positive, whole
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.refine.engine import RefinementGoal, groups, shared_goal
+from ns_abstract.refine.linear_map import LinearImage, bounds_at, linear_image
 from ns_abstract.refine.result import ExtraOutput, FrameResult, Leaves, PartResult, TracePoint
-from ns_abstract.report.figures import interval, metrics, number, short_guarantee
+from ns_abstract.report.figures import ShownUnits, metrics, number, short_guarantee
 from ns_abstract.report.files import save_frame
 from ns_abstract.report.notebook import frame_html
 
@@ -48,6 +52,9 @@ class Progress:
         cells: Cells bounded.
         covered: Part of the first cover that is done; nothing but [0, 1] is known below 1.
         mpg, mpg_witness: Mean pixel gap of the bounds and of what was really rendered.
+        frames: Frames of the whole work.
+        target_ratio: Where a frame is done.
+        elapsed, total_budget: Seconds spent on all frames, and seconds that they may take together.
     """
 
     frame: int
@@ -58,11 +65,33 @@ class Progress:
     covered: float
     mpg: float
     mpg_witness: float
+    frames: int = 1
+    target_ratio: float = 1.05
+    elapsed: float = 0.0
+    total_budget: float = math.inf
 
     @property
     def ratio(self) -> float:
         """How loose the bounds can be at most."""
         return self.mpg / self.mpg_witness if self.mpg_witness > 0.0 else float("inf")
+
+    @property
+    def done(self) -> float:
+        """Part of the work that is done: frames, and of the current one the part of its time to target or budget."""
+        left = max(0.0, self.budget - self.seconds)
+        goal = self.target_ratio - 1.0
+        if self.covered >= 1.0 and goal > 0.0:
+            # ratio - 1 falls about in proportion to 1 / time
+            left = min(left, self.seconds * max(0.0, (self.ratio - 1.0) / goal - 1.0))
+        part = self.seconds / (self.seconds + left) if self.seconds > 0.0 else 0.0
+        return min(1.0, (self.frames_done + part) / max(1, self.frames))
+
+    @property
+    def sentence(self) -> str:
+        """What is known of the current frame."""
+        if self.covered < 1.0:
+            return f"frame {self.frame}: covering the set, {self.covered:.0%}"
+        return f"frame {self.frame}: ratio to real renders {self.ratio:.3f}, target {self.target_ratio:g}"
 
 
 #: Told where the work stands; returning False ends it with what is known.
@@ -154,81 +183,130 @@ def bound_frames(
     if not frames:
         engine.close()
         return
-    machine = engine.machine()
-    leaf_bytes = _leaf_bytes(job, machine.processes) // machine.threads
-    count = -(-_GROUPS_BY_THREAD * engine.threads // len(frames)) if engine.threads > len(frames) else 1
-    queue = [
-        TileTask(index, tiles)
-        for index in frames
-        for tiles in ([None] if count == 1 else groups(job.frame(index), count))
-    ]
-    expected = Counter(part.index for part in queue)
-    goals: dict[int, RefinementGoal] = {}
-    finished_parts: dict[int, list[PartResult]] = {}
-    flying = done = number = 0
-    recipe = None if engine.shares else job.recipe
     request = StopRequest() if stop is None else stop
-    deadline = perf_counter() + budget
-    if recipe is None:
-        with request.at_once():
-            compiled = kernels().compiled
-            job.warm_up(frames[0])
-            if kernels().compiled > compiled:
-                deadline = perf_counter() + budget
-            # a look at costly rays is part of the work
-            job.check_time(frames[0], budget)
+    schedule = _FrameSchedule(job, frames, engine, target_ratio, keep_leaves, request, on_progress, found_before)
+    schedule.begin(budget)
+    for results in work(engine, schedule.offer, request):
+        for (_, index), result in results:
+            if result is None:
+                return
+            frame = schedule.take(index, result)
+            if frame is not None:
+                yield frame
 
-    def known(index: int) -> FrameResult | None:
-        # other scenes are covered anew as a whole; kept leaves are to be as tight as the result
-        before = found_before(index) if job.rays and not keep_leaves else None
+
+@dataclass
+class _FrameSchedule:
+    """The parts of frames that are still to be bounded, and the results of frames of which parts are missing.
+
+    Attributes:
+        job, engine, target_ratio, keep_leaves, on_progress, found_before: As `bound_frames` has them.
+        frames: Their numbers.
+        request: Asked whether to stop.
+        budget: Seconds for all of them.
+        deadline: When they end.
+        goals: Of the frames that are begun.
+    """
+
+    job: Job
+    frames: Sequence[int]
+    engine: Engine
+    target_ratio: float
+    keep_leaves: bool
+    request: StopRequest
+    on_progress: Callable[[Progress], object]
+    found_before: Callable[[int], FrameResult | None]
+    budget: float = math.inf
+    deadline: Deadline = field(default_factory=Deadline)
+    goals: dict[int, RefinementGoal] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        threads, machine = self.engine.threads, self.engine.machine()
+        self._neighbours = machine.threads
+        self._leaf_bytes = _leaf_bytes(self.job, machine.processes) // machine.threads
+        count = -(-_GROUPS_BY_THREAD * threads // len(self.frames)) if threads > len(self.frames) else 1
+        self._queue = [
+            TileTask(index, tiles)
+            for index in self.frames
+            for tiles in ([None] if count == 1 else groups(self.job.frame(index), count))
+        ]
+        self._expected = Counter(part.index for part in self._queue)
+        self._parts: dict[int, list[PartResult]] = {}
+        self._flying = self._done = self._number = 0
+
+    def begin(self, budget: float) -> None:
+        """Start the clock: ``budget`` seconds, in which this process has no kernel to compile."""
+        self.budget, self.deadline = budget, Deadline(budget)
+        if self.engine.shares:
+            with self.request.at_once():
+                compiled = kernels().compiled
+                self.job.warm_up(self.frames[0])
+                if kernels().compiled > compiled:
+                    self.deadline = Deadline(budget)
+                # a look at costly rays is part of the work
+                self.job.check_time(self.frames[0], budget)
+
+    def offer(self, room: int) -> Iterator[Task]:
+        """Yield tasks: no more than can be worked on, so that later ones know how much time is left."""
+        threads = self.engine.threads
+        while self._queue and self._flying < threads:
+            left = self.deadline.left
+            if left <= 0.0 and self.goals and self._queue[0].index not in self.goals:
+                self._queue.clear()
+                return
+            part = self._queue.pop(0)
+            if part.index not in self.goals:
+                self.goals[part.index] = _goal(self.job, part, self.target_ratio, self._leaf_bytes)
+            share = max(LEAST_SECONDS, left / -(-(len(self._queue) + 1) // threads))
+            goal = replace(self.goals[part.index], seconds=share)
+            self._flying, self._number = self._flying + 1, self._number + 1
+            key = (self._number, part.index)
+            if self.engine.shares:
+                yield Task(key, self._bound_here, (part, goal))
+            else:
+                before = self._known(part.index)
+                arguments = (self.job.recipe, part, goal, self.keep_leaves, self._neighbours, before)
+                yield Task(key, bound_part, arguments)
+
+    def take(self, index: int, result: PartResult) -> FrameResult | None:
+        """Return the result of a frame if this was the last of its parts."""
+        self._flying -= 1
+        parts = self._parts.setdefault(index, [])
+        parts.append(result)
+        if len(parts) < self._expected[index]:
+            return None
+        frame = self.job.joined(self._parts.pop(index))
+        if not self.engine.shares and frame.trace:
+            self._report(index, frame.seconds, frame.seconds, frame.trace[-1], frame.trace[-1].covered)
+        self._done += 1
+        return frame
+
+    def _report(self, index: int, seconds: float, budget: float, point: TracePoint, covered: float) -> None:
+        elapsed = self.budget - self.deadline.left
+        self.on_progress(
+            Progress(
+                index, self._done, seconds, budget, point.cells, covered, point.mpg, point.mpg_witness,
+                len(self.frames), self.target_ratio, elapsed, self.budget,
+            )
+        )  # fmt: skip
+
+    def _known(self, index: int) -> FrameResult | None:
+        # kept leaves are to be as tight as the result
+        before = self.found_before(index) if self.job.continues and not self.keep_leaves else None
         return before if before is not None and before.bounded else None
 
-    def here(part: TileTask, goal: RefinementGoal) -> PartResult | None:
-        def told(point: TracePoint, covered: float) -> None:
-            on_progress(
-                Progress(
-                    part.index, done, point.seconds, goal.seconds, point.cells, covered, point.mpg, point.mpg_witness
-                )
-            )
+    def _bound_here(self, part: TileTask, goal: RefinementGoal) -> PartResult | None:
+        def report(point: TracePoint, covered: float) -> None:
+            self._report(part.index, point.seconds, goal.seconds, point, covered)
 
         try:
-            return job.bound_part(
-                part.index, goal, part.tiles, keep_leaves=keep_leaves, stopped=request, progress=told,
-                known=known(part.index),
+            return self.job.bound_part(
+                part.index, goal, part.tiles, keep_leaves=self.keep_leaves, stopped=self.request, progress=report,
+                known=self._known(part.index),
             )  # fmt: skip
         except WorkCancelledError:
             # over before there was anything to keep
             return None
-
-    def offer(room: int) -> Iterator[Task]:
-        nonlocal flying, number
-        # no more than can be worked on, so that later ones know how much time is left
-        while queue and flying < engine.threads:
-            left = deadline - perf_counter()
-            if left <= 0.0 and goals and queue[0].index not in goals:
-                queue.clear()
-                return
-            part = queue.pop(0)
-            if part.index not in goals:
-                goals[part.index] = _goal(job, part, target_ratio, leaf_bytes)
-            share = max(LEAST_SECONDS, left / -(-(len(queue) + 1) // engine.threads))
-            goal = replace(goals[part.index], seconds=share)
-            flying, number = flying + 1, number + 1
-            if recipe is None:
-                yield Task((number, part.index), here, (part, goal))
-            else:
-                before = known(part.index)
-                yield Task((number, part.index), bound_part, (recipe, part, goal, keep_leaves, machine.threads, before))
-
-    for results in work(engine, offer, request):
-        for (_, index), result in results:
-            flying -= 1
-            if result is None:
-                return
-            finished_parts.setdefault(index, []).append(result)
-            if len(finished_parts[index]) == expected[index]:
-                done += 1
-                yield job.joined(finished_parts.pop(index))
 
 
 def _goal(job: Job, part: TileTask, target_ratio: float, leaf_bytes: int) -> RefinementGoal:
@@ -353,6 +431,43 @@ class BoundResult:
         ratio_is_met = self.mpg == 0.0 or (self.ratio is not None and self.ratio <= self.target_ratio)
         return "done" if ratio_is_met or not self.parameters.dimensions else "partial"
 
+    def linear(self, box: Mapping[str, tuple[float, float]] | ParameterBox | None = None) -> LinearImage:
+        """Linear bounds of the whole picture over the set or a part of it, one map for all cells.
+
+        Args:
+            box: Ranges (low, high) by name, in the units of ``parameters``; what is not named stays whole. None: the
+                whole set.
+
+        Returns:
+            A_lower, A_upper [H, W, 3, d] and b_lower, b_upper [H, W, 3], for parameters scaled to [-1, 1] on the box.
+
+        Raises:
+            InputError: The cells were not kept, or the box is no part of the set.
+        """
+        if self.cells is None:
+            fix = "call bound with keep_cells=True and enough time"
+            raise InputError("found no linear sets of cells", field="cells", fix=fix)
+        return linear_image(self.cells, self.lower, self.upper, sub_box(self.parameters, box))
+
+    def at(self, p: Mapping[str, float] | Sequence[float]) -> tuple[np.ndarray, np.ndarray]:
+        """Bounds of the picture at one pose of the set, float32 [H, W, 3] each; those of the set without kept cells.
+
+        Args:
+            p: Values by name, or in the order of ``parameters``, in their units.
+
+        Raises:
+            InputError: It is no pose of the set.
+        """
+        return bounds_at(self.cells, self.lower, self.upper, point_of(self.parameters, p))
+
+    def to_torch(self) -> Any:
+        """The first layer for a verifier of networks; see `ns_abstract.refine.linear_map.LinearImage.to_torch`.
+
+        Raises:
+            InputError: The cells were not kept.
+        """
+        return self.linear().to_torch()
+
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write an npz with the names of the files of ns-abstract-render.
 
@@ -361,21 +476,32 @@ class BoundResult:
         """
         save_frame(path, self.frame, status=self.status, about=self.about)
 
-    def _repr_html_(self) -> str:
+    def _lines(self) -> list[str]:
+        """The result in words."""
         box = self.parameters
-        sides = [interval(*side) for side in zip(box.names, box.units, box.lower, box.upper, strict=True)]
+        units = ShownUnits.of(self.about.get("scene", {}))
+        sides = [units.interval(*side) for side in zip(box.names, box.units, box.lower, box.upper, strict=True)]
         summary = f"mean gap {number(self.mpg)}, largest {number(self.xpg)}, ratio to real renders {number(self.ratio)}"
-        lines = [
+        return [
             summary if self.bounded else "no bounds but [0, 1] yet",
             f"{self.guarantee}; {self.cell_count} cells, {self.seconds:.1f} s; {self.status}",
             "; ".join(sides) or "one camera pose",
         ]
-        return frame_html(self.frame, lines)
+
+    def __str__(self) -> str:
+        height, width, _ = self.lower.shape
+        return "\n".join([f"abstract image, {width} x {height} pixels", *(f"  {line}" for line in self._lines())])
+
+    def __repr__(self) -> str:
+        return f"<BoundResult: {'; '.join(self._lines())}>"
+
+    def _repr_html_(self) -> str:
+        return frame_html(self.frame, self._lines())
 
 
 def bound(
     scene: Scene,
-    poses: PoseSet,
+    poses: PoseSet | PinholeCamera,
     *,
     target_ratio: float = 1.05,
     time_budget: float = 60.0,
@@ -393,7 +519,7 @@ def bound(
 
     Args:
         scene: The scene.
-        poses: The set.
+        poses: The set; a camera is the set of its one pose.
         target_ratio: The work is done when the mean gap is at most this many times the one of real renders.
         time_budget: Seconds, compiling at first use not counted.
         arithmetic: "float32": enclose every float32 evaluation of the renderer; "real": the real-number renderer and
@@ -409,14 +535,15 @@ def bound(
         InputError: An argument cannot be used.
         KeyboardInterrupt: Ctrl-C came before the first render, or twice.
     """
-    for name, value in (("target_ratio", target_ratio), ("time_budget", time_budget)):
-        if not 0.0 < value < float("inf"):
-            raise InputError(f"found {value}", field=name, fix="give a positive number")
-    if target_ratio < 1.0:
-        raise InputError(f"found {target_ratio}", field="target_ratio", fix="give a number of at least 1")
+    positive(time_budget, "time_budget")
+    at_least(target_ratio, 1.0, "target_ratio")
+    whole(workers, 1, "workers")
+    whole(seed, 0, "seed")
+    names = [outputs] if isinstance(outputs, str) else list(outputs)
+    pose_box = pose_set(poses).of(checked_scene(scene))
     job = Job(
-        scene, [poses.of(scene)], arithmetic=arithmetic, seed=seed, memory_limit=memory_limit, workers=workers,
-        layers=[name for name in outputs if name != "rgb"],
+        scene, [pose_box], arithmetic=arithmetic, seed=seed, memory_limit=memory_limit, workers=workers,
+        layers=[name for name in names if name != "rgb"],
     )  # fmt: skip
     with interruptible() as stop:
         results = bound_frames(

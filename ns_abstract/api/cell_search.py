@@ -6,6 +6,7 @@ A `CellQuestion` says what is claimed, with a margin that is positive where it h
 from __future__ import annotations
 
 import io
+import math
 import os
 import tempfile
 from abc import ABC, abstractmethod
@@ -26,8 +27,11 @@ from ns_abstract.execution.stopping import StopRequest, interruptible
 from ns_abstract.execution.threads import use_threads
 from ns_abstract.execution.worker_cache import Recipe, load
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.io.arguments import positive, whole
 from ns_abstract.io.errors import InputError
+from ns_abstract.io.folder import first_command
 from ns_abstract.report.certificate import LastReport
+from ns_abstract.report.figures import percent
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.scene_margin import ProveCell, SceneMargin, VariationKind
 from ns_abstract.verify.search import BlockResult
@@ -36,6 +40,25 @@ from ns_abstract.verify.store import CellBlock, Store
 P = TypeVar("P")
 #: A row of ``cells``, JSON read: see `Store.leaves`.
 Row = dict[str, Any]
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchProgress:
+    """The time of a search, to which a question adds what it has found.
+
+    Attributes:
+        elapsed: Seconds of this search; earlier ones that it goes on with are not counted.
+        total_budget: Seconds that it may take.
+    """
+
+    elapsed: float = 0.0
+    total_budget: float = math.inf
+
+
+def shares_text(certified: float, falsified: float, unknown: float, not_examined: float) -> str:
+    """The four parts of a set's volume, which sum to 1, in words."""
+    parts = {"certified": certified, "falsified": falsified, "unknown": unknown, "not examined": not_examined}
+    return ", ".join(f"{name} {percent(part)}" for name, part in parts.items())
 
 
 class Examiner(Protocol):
@@ -93,6 +116,8 @@ class CellQuestion(ABC, Generic[P]):
 
     #: Whether one block is waited for however late it is, so that resuming with any budget gets on.
     waits = True
+    #: Where cells are kept.
+    store: type[Store] = Store
 
     def __init__(
         self,
@@ -202,6 +227,7 @@ class CellSearch(Generic[P]):
         last: Writes the report, also when the process is ended.
         scene_margin: What report.json says of margins of the scene.
         deadline: When no more pictures are made for the report.
+        whole: When the time for the search is over.
     """
 
     question: CellQuestion[P]
@@ -210,6 +236,7 @@ class CellSearch(Generic[P]):
     rows: dict[int, list[Row]] = field(default_factory=dict)
     scene_margin: dict[str, Any] = field(default_factory=lambda: {"skipped": NOT_ASKED, "kinds": []})
     deadline: Deadline = field(default_factory=Deadline)
+    whole: Deadline = field(default_factory=Deadline)
     request: Request = field(default_factory=lambda: Request(0.0))
     stop: StopRequest = field(default_factory=StopRequest)
 
@@ -225,7 +252,9 @@ class CellSearch(Generic[P]):
         """
         question = self.question
         fingerprint = question.examiner.fingerprint
-        self.store = store = Store(self.folder, fingerprint, question.parameters, question.fixed, resume=resume)
+        self.store = store = question.store(
+            self.folder, fingerprint, question.parameters, question.fixed, resume=resume
+        )
         with store.errors_as_input():
             for number, box in question.sets.items():
                 grid = store.grid(number, box)
@@ -268,11 +297,12 @@ class CellSearch(Generic[P]):
         question.check(request)
         budget = request.budget
         searching = (1.0 - SHARE) * budget if request.scene_margin else budget
-        whole = Deadline(budget, stop)
+        self.whole = whole = Deadline(budget, stop)
         # where one block may take longer than there is time, all that is done counts
         self.deadline = Deadline(request=stop) if question.waits else whole
         with ExitStack() as stack:
             # a signal waits until there is a store to report on
+            self.last.first_command = first_command(self.folder) if request.resume else None
             store = self.open(resume=request.resume)
             stack.callback(store.close)
             stack.enter_context(store.errors_as_input())
@@ -281,7 +311,7 @@ class CellSearch(Generic[P]):
                 with stop.at_once():
                     question.prepare(self, request)
                 if question.waits:
-                    whole = Deadline(budget, stop)
+                    self.whole = whole = Deadline(budget, stop)
                 searched = whole.before(budget - searching)
                 end = searched.before(question.reserved(searching))
                 question.before(self, end)
@@ -298,6 +328,14 @@ class CellSearch(Generic[P]):
             self.rows = {tally.frame: store.leaves(tally.frame) for tally in store.tallies()}
         return document
 
+    def tell_progress(self) -> None:
+        """Tell who asked where the search stands."""
+        point: Any = self.question.progress(self.store)
+        if isinstance(point, SearchProgress):
+            budget = self.request.budget
+            point = replace(point, elapsed=max(0.0, budget - self.whole.left), total_budget=budget)
+        self.request.on_progress(point)
+
     def search(self, engine: Engine, deadline: Deadline, stop: StopRequest) -> None:
         """Examine open blocks until none is left, the time is over or ``stop`` says so; closes the engine."""
         question, store, request = self.question, self.store, self.request
@@ -312,7 +350,7 @@ class CellSearch(Generic[P]):
             keep=self._keep_counterexamples,
             between=periodic_report(
                 store,
-                lambda: request.on_progress(question.progress(store)),
+                self.tell_progress,
                 (lambda: self.report("running")) if request.report else lambda: None,
             ),
             waits=question.waits,
@@ -349,10 +387,8 @@ def check_arguments(request: Request, workers: int, output_dir: str | os.PathLik
     Raises:
         InputError: One of them.
     """
-    if not 0.0 < request.budget < float("inf"):
-        raise InputError(f"found {request.budget}", field="time_budget", fix="give a positive number")
-    if workers < 1:
-        raise InputError(f"found {workers}", field="workers", fix="give a number of at least 1")
+    positive(request.budget, "time_budget")
+    whole(workers, 1, "workers")
     if request.resume and output_dir is None:
         raise InputError("given without output_dir", field="resume", fix="give the folder to go on with")
 

@@ -6,7 +6,6 @@ import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -16,31 +15,33 @@ from ns_abstract.api.cell_search import (
     CellSearch,
     Request,
     Row,
+    SearchProgress,
     answered,
     cell_place,
     check_arguments,
+    shares_text,
 )
 from ns_abstract.api.certificate_report import CertificateReport
-from ns_abstract.api.certification import MEMORY, Certification, PropertySource, Question
+from ns_abstract.api.certification import MEMORY, Certification, PropertySource, asked
 from ns_abstract.api.job import Job
-from ns_abstract.api.poses import PoseSet
-from ns_abstract.api.scenes import Scene
+from ns_abstract.api.poses import PoseSet, pose_sets
+from ns_abstract.api.scenes import Scene, checked_scene
 from ns_abstract.execution.cancellation import Deadline
 from ns_abstract.execution.engines import EngineName, started
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.io.arguments import file_path
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.memory import allowed_memory
 from ns_abstract.report.certificate import CertifiedRun, coverage, verdict
 from ns_abstract.report.figures import percent, short_guarantee
 from ns_abstract.report.notebook import verdicts_html
-from ns_abstract.report.record import file_stamp
 from ns_abstract.report.verdict_picture import clear_pictures
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.eight_bit import Picture
 from ns_abstract.verify.network import NetworkArithmetic
-from ns_abstract.verify.network.explain import check_cell
-from ns_abstract.verify.scene_margin import ProveCell, VariationKind, bounded_kinds, check_scenes
+from ns_abstract.verify.scene_margin import ProveCell, VariationKind, check_scenes
 from ns_abstract.verify.store import Store, fractions
 
 #: Seconds that pictures for the last report may take beyond the budget, where they are made ray by ray.
@@ -59,18 +60,17 @@ def check_network_memory(found: Certification, limit: float | None, workers: int
     Raises:
         InputError: It does, about.
     """
-    dimensions = max(1, len(found.parameters))
-    check_cell(found.network, dimensions, allowed_memory(limit) / (1 if found.job.rays else workers))
+    found.question.check_memory(len(found.parameters), allowed_memory(limit) / (1 if found.job.rays else workers))
 
 
 @dataclass(frozen=True)
-class CertifyProgress:
+class CertifyProgress(SearchProgress):
     """Where a search stands: mean fractions over the frames, and seconds.
 
     Attributes:
         certified, falsified, unknown: Fractions of the parameter volume that have this verdict.
-        open: The rest, which is still to be examined.
-        seconds: Time spent.
+        open: The rest, which is still to be examined; the result counts it as unknown.
+        seconds: Time spent, earlier searches that this one goes on with included.
     """
 
     certified: float
@@ -78,6 +78,16 @@ class CertifyProgress:
     unknown: float
     open: float
     seconds: float
+
+    @property
+    def done(self) -> float:
+        """Part of the volume that was examined."""
+        return 1.0 - self.open
+
+    @property
+    def sentence(self) -> str:
+        """The four parts of the volume."""
+        return shares_text(self.certified, self.falsified, self.unknown, self.open)
 
 
 class CertificateQuestion(CellQuestion[CertifyProgress]):
@@ -97,14 +107,10 @@ class CertificateQuestion(CellQuestion[CertifyProgress]):
         self.job, self.waits = job, not job.job.rays
         self.about = CertifiedRun(
             guarantee=job.job.method.guarantee,
-            network_guarantee=job.network.guarantee(job.model.arithmetic),
+            network_guarantee=job.question.guarantee(job.arithmetic),
             renderer={name: job.job.method.program[name] for name in ("name", "version")},
             scene=job.job.describe(),
-            model={
-                **file_stamp(job.question.model),
-                "input": job.network.input_shape,
-                "output": job.network.output_shape,
-            },
+            model=job.question.describe(),
             property=job.question.source.value,
             sentence=job.property.sentence(),
             settings=settings,
@@ -170,7 +176,7 @@ class CertificateQuestion(CellQuestion[CertifyProgress]):
         search.deadline = search.deadline.extended(_LAST)
 
     def varied_scenes(self) -> tuple[Sequence[VariationKind], Callable[[VariationKind], ProveCell]]:
-        return bounded_kinds(self.job.places), self.job.settle
+        return self.job.kinds, self.job.settle
 
     def progress(self, store: Store) -> CertifyProgress:
         shares = [fractions(tally) for tally in store.tallies()]
@@ -243,20 +249,28 @@ class Certificate:
         """Whether the work was ended by Ctrl-C or by ``on_progress``."""
         return self.state == "interrupted"
 
-    def _repr_html_(self) -> str:
-        shares = {"certified": self.certified, "falsified": self.falsified, "unknown": self.unknown}
-        lines = [
+    def _shares(self) -> dict[str, float]:
+        return {"certified": self.certified, "falsified": self.falsified, "unknown": self.unknown}
+
+    def _lines(self) -> list[str]:
+        """The certificate in words."""
+        return [
             f"{self.verdict}: on every image {self.sentence}",
-            ", ".join(f"{kind} {percent(share)}" for kind, share in shares.items()),
+            ", ".join(f"{kind} {percent(share)}" for kind, share in self._shares().items()),
             f"{self.guarantee}; {len(self.cells)} cells, {self.seconds:.1f} s; {self.state}",
         ]
-        return verdicts_html(shares, lines)
+
+    def __str__(self) -> str:
+        return "\n".join(["certificate", *(f"  {line}" for line in self._lines())])
+
+    def _repr_html_(self) -> str:
+        return verdicts_html(self._shares(), self._lines())
 
 
 def certify(
     scene: Scene,
-    poses: PoseSet | Sequence[PoseSet],
-    model: str | os.PathLike[str],
+    poses: PoseSet | PinholeCamera | Sequence[PoseSet | PinholeCamera],
+    model: str | os.PathLike[str] | None,
     property: Mapping[str, Any] | str | os.PathLike[str],
     *,
     time_budget: float = 600.0,
@@ -272,14 +286,14 @@ def certify(
     memory_limit: float | None = None,
     scene_margin: bool = False,
 ) -> Certificate:
-    """Prove, or break, a property of a network on every picture that a scene shows over sets of poses.
+    """Prove, or break, a property of a network, or of the picture itself, on every picture over sets of poses.
 
     Ctrl-C and ``on_progress`` returning False end the work between two cells, with what is known.
 
     Args:
         scene: The scene.
-        poses: One set, or several.
-        model: Network, .onnx.
+        poses: One set, or several; a camera is the set of its one pose.
+        model: Network, .onnx; None: the property is one of the picture (visible, clear, picture, all, any).
         property: What is to hold, as the object of a property file, or that file.
         time_budget: Seconds for all sets together.
         output_dir: Folder for cells.sqlite, the report and counterexamples, as ns-abstract-certify writes them; None:
@@ -304,12 +318,9 @@ def certify(
     check_arguments(request, workers, output_dir)
     if picture not in ("float", "8-bit"):
         raise InputError(f"found {picture}", field="picture", fix="use float or 8-bit")
-    sets = [poses] if isinstance(poses, PoseSet) else list(poses)
-    if not sets:
-        raise InputError("found no set", field="poses", fix="give at least one PoseSet")
-    source = property if isinstance(property, Mapping) else Path(property)
-    question = Question(Path(model), PropertySource.of(source))
-    drawn = [question.drawn(entry.of(scene)) for entry in sets]
+    source = property if isinstance(property, Mapping) else file_path(property, "property")
+    question = asked(None if model is None else file_path(model, "model"), PropertySource.of(source))
+    drawn = [question.drawn(entry.of(checked_scene(scene))) for entry in pose_sets(poses)]
     memory = network_memory(memory_limit, workers)
     job = Job(scene, drawn, arithmetic=arithmetic, workers=workers)
     certification = Certification(job, question, memory, network_arithmetic=network_arithmetic, picture=picture)

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
-from pathlib import Path
 
 from ns_abstract.check.audit import Audit, run
 from ns_abstract.check.inputs import BadInput
+from ns_abstract.io.arguments import file_path, positive, whole
 from ns_abstract.io.errors import InputError
 
 
@@ -39,12 +39,10 @@ def check(
     Raises:
         InputError: A file or a field in it cannot be used.
     """
-    if claims < 1:
-        raise InputError(f"found {claims}", field="claims", fix="give a number of at least 1")
-    if not 0.0 < seconds < float("inf"):
-        raise InputError(f"found {seconds}", field="seconds", fix="give a positive number")
-    if not 0 <= seed < 2**63:
-        raise InputError(f"found {seed}", field="seed", fix="give a number from 0 on")
+    whole(claims, 1, "claims")
+    positive(seconds, "seconds")
+    if whole(seed, 0, "seed") >= 2**63:
+        raise InputError(f"found {seed}", field="seed", fix="give a number below 2**63")
     moved = {
         "load_config": load_config,
         "camera_path_filename": camera_path,
@@ -52,8 +50,15 @@ def check(
         "model": model,
         "loop": loop,
     }
-    files = {name: None if file is None else Path(file) for name, file in moved.items()}
+    files = {name: None if file is None else file_path(file, name) for name, file in moved.items()}
     try:
-        return run(Path(output_dir), claims=claims, seconds=seconds, seed=seed, moved=files, on_claim=on_progress)
+        return run(
+            file_path(output_dir, "output_dir"),
+            claims=claims,
+            seconds=seconds,
+            seed=seed,
+            moved=files,
+            on_claim=on_progress,
+        )
     except BadInput as error:
         raise InputError(error.problem, fix=error.fix, file=error.file, field=error.field) from None

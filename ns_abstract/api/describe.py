@@ -9,7 +9,7 @@ import numpy as np
 
 from ns_abstract.api.files import PathJob
 from ns_abstract.geometry.poses import PoseBox
-from ns_abstract.report.figures import interval, listed, number
+from ns_abstract.report.figures import ShownUnits, listed, number
 
 #: Parts of the visible scene elements that are nearer than the depths that are told.
 _QUANTILES = {"near": 0.05, "middle": 0.5, "far": 0.95}
@@ -66,9 +66,10 @@ def _cameras(job: PathJob, frames: Sequence[int]) -> Iterator[str]:
 
 
 def _sets(job: PathJob, frames: Sequence[int]) -> Iterator[str]:
+    units = ShownUnits.of(job.describe())
     frames_by_text: dict[tuple[str, ...], list[int]] = {}
     for index in frames:
-        frames_by_text.setdefault(tuple(_ranges(job.pose_sets[index], job.method.dataset_scale)), []).append(index)
+        frames_by_text.setdefault(tuple(_ranges(job.pose_sets[index], units)), []).append(index)
     for lines, indices in frames_by_text.items():
         some = f"frame{'s' if indices[1:] else ''} {listed(indices)}"
         yield f"set        of {'every frame' if len(indices) == len(frames) else some}:"
@@ -79,26 +80,18 @@ def _sets(job: PathJob, frames: Sequence[int]) -> Iterator[str]:
         box, moved = job.pose_sets[index].box, job.frame(index).motion(job.pose_sets[index].box)
         for name, pixels in zip(box.names, moved, strict=True):
             yield f"  {name} moves what frame {index} shows by {number(float(pixels), 3)} pixels over its range"
+    yield from (f"  is this what you mean? {note}" for note in job.wide_turns)
 
 
-def _ranges(poses: PoseBox, scale: float) -> Iterator[str]:
+def _ranges(poses: PoseBox, units: ShownUnits) -> Iterator[str]:
     box = poses.box
-    for name, unit, low, high in zip(box.names, box.units, box.lower, box.upper, strict=True):
-        text = interval(name, unit, low, high)
-        if unit == "rad":
-            text += f" ({_span(math.degrees(low), math.degrees(high))} degrees)"
-        elif unit == "normalised units":
-            text += f" ({_span(low / scale, high / scale)} of the data set)"
-        yield text
+    for side in zip(box.names, box.units, box.lower, box.upper, strict=True):
+        yield units.interval(*side)
     for name, value in poses.fixed.items():
         if value:
             yield f"{name} = {number(value)}, fixed"
     if count := len(poses.perturbation.scene):
         yield f"{count} variation{'s' if count > 1 else ''} of the scene"
-
-
-def _span(low: float, high: float) -> str:
-    return f"± {number(high)}" if low == -high else f"{number(low)} to {number(high)}"
 
 
 def _vector(values: np.ndarray) -> str:

@@ -165,7 +165,7 @@ def _perturbations(
                 f"no perturbation for entry {k}",
                 file=path.source,
                 field="perturbation",
-                fix='add the key "perturbation" or give --perturbation-filename',
+                fix='give --translation or --rotation, --perturbation-filename, or the key "perturbation" in the path',
             )
         prefix = "perturbation." if path.overrides[k] is None else f"camera_path[{k}].perturbation."
         try:

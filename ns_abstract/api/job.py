@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import socket
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -26,11 +27,15 @@ from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.memory import allowed_memory
 from ns_abstract.io.version import computed_by
+from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.perturbation.variations import SceneVariation
 from ns_abstract.refine.engine import Refinement, RefinementGoal
 from ns_abstract.refine.protocol import Frame, Method
 from ns_abstract.refine.result import EXTRA_OUTPUTS, FrameResult, PartResult, TracePoint, joined
+from ns_abstract.report.figures import ShownUnits, number
 
+#: Radians of a rotation beyond which a set asks whether degrees were meant.
+_WIDE_TURN = 0.5
 #: Bytes for leaves below which nothing can be done.
 _LEAST_LEAF_BYTES = 64 << 20
 #: Seconds that the ray with which kernels are compiled may take.
@@ -70,7 +75,6 @@ class Job:
         notes: Sequence[str] = (),
         set_choices: Sequence[Assumption] | None = None,
     ) -> None:
-        self.notes = tuple(notes)
         self.layers = tuple(name for name in EXTRA_OUTPUTS if name in layers)
         if unknown := [name for name in layers if name not in EXTRA_OUTPUTS]:
             raise InputError(f"found {unknown[0]}", field="--outputs", fix=f"use rgb, {', '.join(EXTRA_OUTPUTS)}")
@@ -78,6 +82,9 @@ class Job:
         self.method: Method = scene.method(arithmetic, workers)
         self.pose_sets, self.seed, self.memory_limit = tuple(pose_sets), seed, memory_limit
         self.workers = workers if scene.rays else 1
+        #: on rotations that are wide enough to have been meant in degrees
+        self.wide_turns = tuple(_wide_turns([poses.perturbation for poses in self.pose_sets]))
+        self.notes = (*notes, *self.wide_turns)
         self._scene_choices = scene_choices(scene, self.method, arithmetic)
         if set_choices is None:
             set_choices = object_choices(self.pose_sets, "the camera", "the set of poses")
@@ -97,11 +104,14 @@ class Job:
     @property
     def recipe(self) -> Recipe[Job]:
         """How another process opens this job; files are looked for under the same paths."""
-        options = self.source.options
-        grid = None if options.occupancy_grid is None else options.occupancy_grid.absolute()
-        source = replace(self.source, file=self.source.file.absolute(), options=replace(options, occupancy_grid=grid))
+        source = self.source.absolute
         again = partial(_open, source, self.pose_sets, self._arithmetic, self.seed, self.memory_limit, self.layers)
         return Recipe(again, self.fingerprint, Path(self.source.file))
+
+    @property
+    def continues(self) -> bool:
+        """Whether what is known of a frame saves work on it; others are covered anew as a whole."""
+        return self.rays
 
     # ---------------------------------------------------------------- memory
 
@@ -277,9 +287,26 @@ class Job:
         return {**computed_by(), **self.method.fingerprint, **more, "poses": sets.hexdigest()}
 
     def describe(self) -> dict[str, Any]:
-        """The scene for reports."""
-        about = self.method.describe()
-        return {**about, "notes": [*about.get("notes", ()), *self.notes]} if self.notes else about
+        """The scene for reports, and the units that its sets were stated in."""
+        about, first = self.method.describe(), self.pose_sets[0].perturbation
+        units = ShownUnits(first.units, first.angle_units, self.method.dataset_scale)
+        notes = [*about.get("notes", ()), *self.notes]
+        return {**about, "units": asdict(units), **({"notes": notes} if self.notes else {})}
+
+
+def _wide_turns(sets: Sequence[Perturbation]) -> Iterator[str]:
+    """A sentence on rotations stated in radians that are wide enough to have been meant in degrees, or none."""
+    widest: dict[str, float] = {}
+    for entry in sets:
+        for name, ends in entry.rotation.items() if entry.angle_units == "radians" else ():
+            widest[name] = max(widest.get(name, 0.0), *map(abs, ends))
+    wide = {name: most for name, most in widest.items() if most > _WIDE_TURN}
+    if wide:
+        most = max(wide.values())
+        yield (
+            f"the set turns by up to {number(math.degrees(most))} degrees ({number(most)} rad) in {', '.join(wide)}; "
+            'if degrees were meant: --angle-units degrees, in a file "angle_units": "degrees"'
+        )
 
 
 def require_sound_platform() -> None:

@@ -11,10 +11,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ns_abstract.api.scenes import Scene
+from ns_abstract.api.scenes import Scene, not_a_camera
 from ns_abstract.geometry import poses
 from ns_abstract.geometry.camera_path import PinholeCamera, checked_pose, checked_side, focal_length
 from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import show
 from ns_abstract.perturbation.specification import Perturbation, parse_perturbation
 
 Limit = float | Sequence[float]
@@ -36,21 +37,31 @@ class Camera(PinholeCamera):
     """
 
     def __init__(self, camera_to_world: ArrayLike, fov: float = 45.0, width: int = 100, height: int = 100) -> None:
-        matrix = np.asarray(camera_to_world, np.float64)
+        try:
+            matrix = np.asarray(camera_to_world, np.float64)
+        except (TypeError, ValueError):
+            problem = f"found {show(camera_to_world)}"
+            raise InputError(problem, field="camera_to_world", fix="give a 4x4 or 3x4 matrix of numbers") from None
         if matrix.shape == (3, 4):
             matrix = np.concatenate([matrix, [[0.0, 0.0, 0.0, 1.0]]])
+        if matrix.shape != (4, 4):
+            problem = f"found an array of shape {matrix.shape}"
+            raise InputError(problem, field="camera_to_world", fix="give a 4x4 or 3x4 matrix of numbers")
         pose = checked_pose(matrix.tolist(), "camera_to_world")
         across, down = checked_side(width, "width"), checked_side(height, "height")
         focal = focal_length(fov, down, "fov")
         super().__init__(pose, focal, focal, 0.5 * across, 0.5 * down, across, down)
 
 
-def _ranges(given: Mapping[str, Limit] | None) -> dict[str, Any]:
-    """Ranges as a perturbation file says them: numpy's numbers and tuples become JSON's."""
-    return {
-        name: [float(end) for end in limit] if isinstance(limit, (Sequence, np.ndarray)) else float(limit)
-        for name, limit in (given or {}).items()
-    }
+def _plain(value: Any) -> Any:
+    """``value`` as a perturbation file has it: numpy's numbers, arrays and tuples become JSON's."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {name: _plain(entry) for name, entry in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        return [_plain(entry) for entry in value]
+    return value
 
 
 @dataclass(frozen=True, init=False, eq=False)
@@ -60,9 +71,10 @@ class PoseSet:
     Args:
         camera: The camera; the first keyframe of a segment.
         translation: Ranges of x, y and z by name: a number r for [-r, r], or (low, high).
-        rotation: Ranges of yaw, pitch and roll in radians, likewise.
+        rotation: Ranges of yaw, pitch and roll, likewise.
         frame: Axes of the translation: "camera" (x right, y up, z back) or "world".
         units: Of the translation: "normalised" (the run's frame) or "dataset" (those of transforms.json).
+        angle_units: Of the rotation and the orbit's azimuth: "radians" or "degrees".
         orbit: ``{"target": [x, y, z], "axis": [x, y, z], "azimuth": (low, high)}``.
         following: The next keyframe: the pose also moves continuously from ``camera`` to it.
 
@@ -89,6 +101,7 @@ class PoseSet:
         frame: str = "camera",
         *,
         units: str = "normalised",
+        angle_units: str = "radians",
         orbit: Mapping[str, Any] | None = None,
         following: PinholeCamera | None = None,
     ) -> None:
@@ -96,11 +109,12 @@ class PoseSet:
             "version": 1,
             "frame": frame,
             "units": units,
-            "translation": _ranges(translation),
-            "rotation": _ranges(rotation),
+            "angle_units": angle_units,
+            "translation": {} if translation is None else _plain(translation),
+            "rotation": {} if rotation is None else _plain(rotation),
         }
         if orbit is not None:
-            value["orbit"] = {key: np.asarray(entry, np.float64).tolist() for key, entry in orbit.items()}
+            value["orbit"] = _plain(orbit)
         if following is not None:
             value["sweep"] = "segments"
         self._fill(camera, value, following, None)
@@ -145,7 +159,7 @@ class PoseSet:
         folder: str | os.PathLike[str] | None,
     ) -> None:
         if not isinstance(camera, PinholeCamera):
-            raise InputError(f"found {type(camera).__name__}", field="camera", fix="give an ns_abstract.Camera")
+            raise not_a_camera(camera)
         specification = {
             "camera": camera,
             "specification": dict(value) if isinstance(value, Mapping) else value,
@@ -177,3 +191,30 @@ class PoseSet:
     def parameters(self) -> tuple[str, ...]:
         """Names of what varies, in the order of cells; scene variations are not among them."""
         return poses.PoseBox.around(self.camera, self.perturbation(), self.following).box.names
+
+
+def pose_set(value: PoseSet | PinholeCamera, field: str = "poses") -> PoseSet:
+    """``value`` as a set of poses: a camera is the set of its one pose.
+
+    Raises:
+        InputError: It is neither.
+    """
+    if isinstance(value, PinholeCamera):
+        return PoseSet(value)
+    if not isinstance(value, PoseSet):
+        fix = "give an ns_abstract.PoseSet, or a camera for its one pose"
+        raise InputError(f"found {type(value).__name__}", field=field, fix=fix)
+    return value
+
+
+def pose_sets(value: PoseSet | PinholeCamera | Sequence[PoseSet | PinholeCamera]) -> list[PoseSet]:
+    """``value`` as at least one set of poses, each as `pose_set` takes it.
+
+    Raises:
+        InputError: It is no set and no list of sets.
+    """
+    if isinstance(value, PoseSet | PinholeCamera) or not isinstance(value, Sequence):
+        return [pose_set(value)]
+    if not value:
+        raise InputError("found no set", field="poses", fix="give at least one PoseSet")
+    return [pose_set(entry, f"poses[{k}]") for k, entry in enumerate(value)]

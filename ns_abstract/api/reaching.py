@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,17 +14,21 @@ from ns_abstract.api.cell_search import (
     CellSearch,
     Request,
     Row,
+    SearchProgress,
     answered,
     cell_place,
     check_arguments,
+    shares_text,
 )
 from ns_abstract.api.loop_job import LoopJob, open_loop
 from ns_abstract.api.loop_report import LoopReport
-from ns_abstract.api.scenes import Scene
+from ns_abstract.api.scenes import Scene, checked_scene
 from ns_abstract.execution.cancellation import Deadline
 from ns_abstract.execution.engines import EngineName, started
+from ns_abstract.io.arguments import file_path
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.reach.search import QUESTIONS
+from ns_abstract.report.figures import percent
 from ns_abstract.verify.cells import CellGrid
 from ns_abstract.verify.network import NetworkArithmetic
 from ns_abstract.verify.scene_margin import ProveCell, VariationKind, bounded_kinds
@@ -36,13 +39,13 @@ _RUNS_SHARE, _SHOWN_SHARE, _FILM_SHARE = 0.1, 0.1, 0.1
 
 
 @dataclass(frozen=True)
-class ReachProgress:
+class ReachProgress(SearchProgress):
     """Where a search stands: fractions of the initial box for the strongest question asked, and seconds.
 
     Attributes:
         safe, reaches: Fractions that are certified; None where it was not asked.
-        falsified, open: Fractions for the strongest question.
-        seconds: Time spent.
+        falsified, open, unknown: Fractions for the strongest question; what is open is still to be examined.
+        seconds: Time spent, earlier searches that this one goes on with included.
     """
 
     safe: float | None
@@ -50,6 +53,20 @@ class ReachProgress:
     falsified: float
     open: float
     seconds: float
+    unknown: float = 0.0
+
+    @property
+    def done(self) -> float:
+        """Part of the initial box that was examined for the strongest question."""
+        return 1.0 - self.open
+
+    @property
+    def sentence(self) -> str:
+        """The four parts of the initial box for the strongest question, after what is certified of a weaker one."""
+        strongest = self.safe if self.reaches is None else self.reaches
+        parts = shares_text(strongest or 0.0, self.falsified, self.unknown, self.open)
+        weaker = "" if self.safe is None or self.reaches is None else f"safe {percent(self.safe)}; "
+        return f"{weaker}{QUESTIONS[0] if self.reaches is None else QUESTIONS[-1]}: {parts}"
 
 
 class LoopQuestion(CellQuestion[ReachProgress]):
@@ -90,7 +107,7 @@ class LoopQuestion(CellQuestion[ReachProgress]):
         self.reports.simulate_runs(deadline.within(_RUNS_SHARE * deadline.left))
 
     def after(self, search: CellSearch[ReachProgress], deadline: Deadline) -> None:
-        search.request.on_progress(self.progress(search.store))
+        search.tell_progress()
         filming = _FILM_SHARE / self.reserved(1.0) * deadline.left if self.film else 0.0
         self.reports.show_tubes(search.store, deadline.before(filming))
         if self.film:
@@ -108,7 +125,9 @@ class LoopQuestion(CellQuestion[ReachProgress]):
         shares = {QUESTIONS[tally.frame]: fractions(tally) for tally in store.tallies()}
         last = shares[list(shares)[-1]]
         certified = {name: shares[name]["certified"] if name in shares else None for name in QUESTIONS}
-        return ReachProgress(certified["safe"], certified["reaches"], last["falsified"], last["open"], store.seconds)
+        return ReachProgress(
+            certified["safe"], certified["reaches"], last["falsified"], last["open"], store.seconds, last["unknown"]
+        )
 
     def report(self, search: CellSearch[ReachProgress], state: str) -> dict[str, Any]:
         return self.reports.write(search, state)
@@ -207,7 +226,7 @@ def reach(
     """
     request = Request(time_budget, resume, scene_margin=scene_margin)
     check_arguments(request, workers, output_dir)
-    job = open_loop(scene, Path(loop), arithmetic, network_arithmetic, workers)
+    job = open_loop(checked_scene(scene), file_path(loop, "loop"), arithmetic, network_arithmetic, workers)
     settings = {"time_budget": time_budget, "arithmetic": arithmetic, "workers": workers, "engine": engine}
     rows, document = answered(
         LoopQuestion(job, settings, ("ns_abstract.reach",), film=film),

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.geometry.transform import DataparserTransform
+from ns_abstract.io.arguments import file_path
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.load import open_scene
@@ -35,6 +37,12 @@ class SceneSource:
     file: Path
     options: ProgramOptions = field(default_factory=ProgramOptions)
     overrides: Overrides = field(default_factory=Overrides)
+
+    @property
+    def absolute(self) -> SceneSource:
+        """The same with absolute paths."""
+        grid = None if self.options.occupancy_grid is None else self.options.occupancy_grid.absolute()
+        return replace(self, file=self.file.absolute(), options=replace(self.options, occupancy_grid=grid))
 
     def open(self) -> Scene:
         """Read it.
@@ -109,6 +117,24 @@ class Scene:
         return f"<Scene {self.name}: {method.content}, {method.program['name']} {method.program['version']}>"
 
 
+def checked_scene(value: Any) -> Scene:
+    """``value``, which is a scene.
+
+    Raises:
+        InputError: It is none.
+    """
+    if not isinstance(value, Scene):
+        fix = "give what ns_abstract.load_scene returns"
+        raise InputError(f"found {type(value).__name__}", field="scene", fix=fix)
+    return value
+
+
+def not_a_camera(value: Any) -> InputError:
+    """The error of an argument ``camera`` that is no camera."""
+    fix = "give an ns_abstract.Camera, or one of a path's .cameras"
+    return InputError(f"found {type(value).__name__}", field="camera", fix=fix)
+
+
 def load_scene(
     path: str | os.PathLike[str],
     *,
@@ -146,11 +172,12 @@ def load_scene(
     Raises:
         InputError: A file or an option cannot be used.
     """
-    grid = None if occupancy_grid is None else Path(occupancy_grid)
+    grid = None if occupancy_grid is None else file_path(occupancy_grid, "occupancy_grid")
+    file = file_path(path, "path")
     options = ProgramOptions(renderer, gsplat_version, sampling, num_samples, near_plane, grid, device)  # pyright: ignore[reportArgumentType]
     color = None if background is None else tuple(background)
     overrides = Overrides(rasterize_mode, color, load_step, assume_splatfacto, drop_nan_gaussians)  # pyright: ignore[reportArgumentType]
-    scene = SceneSource(Path(path), options, overrides).open()
+    scene = SceneSource(file, options, overrides).open()
     # options that do not go with the scene are told at once
     scene.method()
     return scene
@@ -162,6 +189,8 @@ def render(scene: Scene, camera: PinholeCamera) -> np.ndarray:
     Raises:
         InputError: The camera cannot be used.
     """
-    frame = scene.method().frame(PoseBox.around(camera, Perturbation()))
+    if not isinstance(camera, PinholeCamera):
+        raise not_a_camera(camera)
+    frame = checked_scene(scene).method().frame(PoseBox.around(camera, Perturbation()))
     draw = frame.precise if isinstance(frame, PreciseFrame) else frame.render
     return assemble(draw(frame.box.middle), frame.camera).astype(np.float64)

@@ -101,7 +101,7 @@ class InstanceFolder:
             "frame": frame,
             "scene": job.job.describe()["source"],
             "fingerprint": dict(job.fingerprint),
-            "network": job.question.model.name,
+            "network": job.question.name,
             "property": job.question.source.value,
             "middle": middle.tolist(),
             "camera_to_world": np.asarray(poses.pose(middle)).tolist(),

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from ns_abstract.cli.common import BAD_INPUT, DONE, run
+from ns_abstract.cli.common import BAD_INPUT, DONE, command, run
 from ns_abstract.cli.options import Overrides, ProgramOptions, SceneOverrides
 from ns_abstract.io.errors import InputError
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 #: Seconds after which a case that does not end ends the process, with a trace of where it stands.
 _STUCK = 900.0
+_ABOUT = "Measure cost, tightness and soundness; without options on the demo scene. Tables go to the folder bench."
 #: Headings of the tables by benchmark.
 _TITLES = {
     "cell": "Cost of a cell",
@@ -594,7 +595,7 @@ def bench(
 def main() -> None:
     """Entry point of the console script."""
     kinds = tyro.extras.subcommand_type_from_defaults(_DEFAULTS)
-    run(bench, lambda: tyro.cli(kinds, prog="ns-abstract-bench"))
+    run(bench, command("ns-abstract-bench", kinds, _DEFAULTS, _ABOUT))
 
 
 if __name__ == "__main__":

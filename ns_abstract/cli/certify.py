@@ -10,8 +10,9 @@ from typing import Annotated
 import tyro
 
 from ns_abstract.cli.commands import Certify
-from ns_abstract.cli.common import DONE, INTERRUPTED, SignalStop, run
+from ns_abstract.cli.common import DONE, INTERRUPTED, SignalStop, command, run
 from ns_abstract.cli.sets import given_set
+from ns_abstract.io.arguments import positive
 from ns_abstract.io.errors import InputError
 
 
@@ -21,8 +22,8 @@ def certify(options: Certify) -> int:
     Raises:
         InputError: A file, a field or an option cannot be used.
     """
-    if options.time_budget is not None and not 0.0 < options.time_budget < float("inf"):
-        raise InputError(f"found {options.time_budget}", field="--time-budget", fix="give a positive number")
+    if options.time_budget is not None:
+        positive(options.time_budget, "--time-budget")
     options.where.check()
     given_set(options)
     stop = SignalStop()
@@ -65,8 +66,8 @@ def explain(options: ExplainNetwork) -> int:
 def main() -> None:
     """Entry point of the console script."""
     if "--explain" in sys.argv[1:]:
-        run(explain, lambda: tyro.cli(ExplainNetwork, prog="ns-abstract-certify"))
-    run(certify, lambda: tyro.cli(Certify, prog="ns-abstract-certify"), "give fewer --workers or free memory")
+        run(explain, command("ns-abstract-certify", ExplainNetwork))
+    run(certify, command("ns-abstract-certify", Certify), "give fewer --workers or free memory")
 
 
 if __name__ == "__main__":

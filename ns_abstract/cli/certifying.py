@@ -7,17 +7,17 @@ import sys
 from typing import TYPE_CHECKING
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from ns_abstract.api.cell_search import CellSearch, Request
 from ns_abstract.api.certification import Certification, open_certification
-from ns_abstract.api.certifying import CertificateQuestion, CertifyProgress, check_network_memory, network_memory
+from ns_abstract.api.certifying import CertificateQuestion, check_network_memory, network_memory
 from ns_abstract.api.compiling import compile_beside
 from ns_abstract.api.job import check_frames
 from ns_abstract.cli.common import SignalStop, plain_console
 from ns_abstract.cli.options import stated
 from ns_abstract.report.certificate import CertifiedRun, coverage
 from ns_abstract.report.figures import percent
+from ns_abstract.report.progress import ProgressBar
 from ns_abstract.verify.store import Store
 
 if TYPE_CHECKING:
@@ -27,27 +27,11 @@ if TYPE_CHECKING:
 _SECONDS = 1800.0
 
 
-class _Display:
-    """What the terminal shows."""
-
-    def __init__(self, console: Console, progress: Progress) -> None:
-        self.console, self.progress = console, progress
-        self.task = progress.add_task("cells", total=1.0, state="")
-
-    def on_open(self, store: Store) -> None:
-        if store.resumed:
-            text = f"  {store.count} cells kept from before, {store.open_blocks} blocks open"
-            self.console.print(text, markup=False)
-
-    def on_progress(self, point: CertifyProgress) -> None:
-        shares = {"certified": point.certified, "falsified": point.falsified, "unknown": point.unknown}
-        state = ", ".join(f"{kind} {percent(share)}" for kind, share in shares.items())
-        self.progress.update(self.task, completed=1.0 - point.open, state=state)
-
-
 def _introduce(console: Console, job: Certification, about: CertifiedRun) -> None:
     method = job.job.method
-    console.print(f"{method.name}: {method.content}; {job.network.source.name}; {about.sentence}", markup=False)
+    console.print(f"{method.name}: {method.content}; {job.question.name}; {about.sentence}", markup=False)
+    for warning in job.job.wide_turns:
+        console.print(f"warning: {warning}", markup=False, soft_wrap=True)
     for note in about.plan:
         console.print(f"  {note}", markup=False, soft_wrap=True)
 
@@ -69,18 +53,15 @@ def certify_path(options: Certify, stop: SignalStop) -> bool:
     _introduce(console, job, question.about)
 
     def opened(store: Store) -> None:
-        display.on_open(store)
+        if store.resumed:
+            text = f"  {store.count} cells kept from before, {store.open_blocks} blocks still to be examined"
+            console.print(text, markup=False)
         if options.where.engine == "local":
             # once, and not in every worker
             with stop.at_once():
                 compile_beside(job.job, frames[0])
 
-    progress = Progress(
-        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}"), TimeElapsedColumn(),
-        TimeRemainingColumn(), console=console, disable=not console.is_terminal, transient=True,
-    )  # fmt: skip
-    with progress:
-        display = _Display(console, progress)
+    with ProgressBar(console) as progress:
         document = CellSearch(question, options.output_dir).run(
             # the processes of a NeRF bound its rays, which all cells share
             lambda stack: stack.enter_context(options.where.started(1 if job.job.rays else workers)),
@@ -90,16 +71,17 @@ def certify_path(options: Certify, stop: SignalStop) -> bool:
                 options.resume,
                 scene_margin=options.scene_margin,
                 on_open=opened,
-                on_progress=display.on_progress,
+                on_progress=progress,
                 on_margin=lambda found: console.print(f"scene margin: {found.sentence}", markup=False, soft_wrap=True),
             ),
         )
     covered = coverage(document["frames"])
     parts = ", ".join(f"{kind} {percent(covered[kind])}" for kind in ("certified", "falsified", "unknown"))
-    console.print(f"{document['verdict']}: {parts}", markup=False)
+    left = f" (of it not examined {percent(covered['not_examined'])})" if covered["not_examined"] else ""
+    console.print(f"{document['verdict']}: {parts}{left}", markup=False)
     if document["partitions"]:
         both = document["partitions"]
-        more = f", undecided {percent(both['undecided'])} (no finite margin)" if both["undecided"] else ""
+        more = f", unknown {percent(both['undecided'])} (no finite margin)" if both["undecided"] else ""
         console.print(f"PCP-V {percent(both['PCP-V'])}, PCP-S {percent(both['PCP-S'])}{more}", markup=False)
     console.print(f"report: {options.output_dir / 'report.html'}", markup=False, soft_wrap=True)
     return all(entry["sampled"]["poses"] for entry in document["frames"])

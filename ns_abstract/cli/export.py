@@ -6,11 +6,11 @@ import re
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, Union
 
 import tyro
 
-from ns_abstract.cli.common import DONE, run
+from ns_abstract.cli.common import DONE, command, run
 from ns_abstract.cli.options import Overrides, ProgramOptions, SceneOverrides
 from ns_abstract.cli.sets import GivenSet, given_set
 from ns_abstract.io.errors import InputError, visible
@@ -212,20 +212,12 @@ class Schemas:
     """Folder for the schemas; made if missing."""
 
 
-Command = (
-    Annotated[Npz, tyro.conf.subcommand("npz")]
-    | Annotated[Png, tyro.conf.subcommand("png")]
-    | Annotated[Mp4, tyro.conf.subcommand("mp4")]
-    | Annotated[Exr, tyro.conf.subcommand("exr")]
-    | Annotated[Safetensors, tyro.conf.subcommand("safetensors")]
-    | Annotated[Rrd, tyro.conf.subcommand("rrd")]
-    | Annotated[Viser, tyro.conf.subcommand("viser")]
-    | Annotated[Statement, tyro.conf.subcommand("statement")]
-    | Annotated[Ply, tyro.conf.subcommand("ply")]
-    | Annotated[ExportVnnLib, tyro.conf.subcommand("vnnlib")]
-    | Annotated[Occupancy, tyro.conf.subcommand("occupancy")]
-    | Annotated[Schemas, tyro.conf.subcommand("schemas")]
-)
+_ABOUT = "Write results of ns-abstract-render, scenes and properties in other programs' formats."
+_PARTS = {
+    "npz": Npz, "png": Png, "mp4": Mp4, "exr": Exr, "safetensors": Safetensors, "rrd": Rrd, "viser": Viser,
+    "statement": Statement, "ply": Ply, "vnnlib": ExportVnnLib, "occupancy": Occupancy, "schemas": Schemas,
+}  # fmt: skip
+Command = Union[tuple(Annotated[kind, tyro.conf.subcommand(name)] for name, kind in _PARTS.items())]  # noqa: UP007
 Options = (
     Npz | Png | Mp4 | Exr | Safetensors | Rrd | Viser | Statement | Ply | ExportVnnLib | Occupancy | Schemas
 )  # fmt: skip
@@ -418,7 +410,7 @@ def _recording(options: Rrd | Viser, results: Results) -> None:
 
 def main() -> None:
     """Entry point of the console script."""
-    run(export, lambda: tyro.cli(Command, prog="ns-abstract-export"))  # pyright: ignore[reportCallIssue, reportArgumentType]
+    run(export, command("ns-abstract-export", Command, _PARTS, _ABOUT))
 
 
 if __name__ == "__main__":

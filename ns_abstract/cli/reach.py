@@ -9,12 +9,9 @@ from typing import Annotated, Literal
 
 import tyro
 
-from ns_abstract.cli.common import DONE, INTERRUPTED, SignalStop, plain_console, run
+from ns_abstract.cli.common import DONE, INTERRUPTED, SignalStop, command, plain_console, run
 from ns_abstract.cli.options import EngineOptions, Overrides, Program, ProgramOptions, SceneOverrides, Where, stated
-from ns_abstract.io.errors import InputError
-
-#: Seconds between lines of progress.
-_EVERY = 10.0
+from ns_abstract.io.arguments import positive
 
 
 @dataclass
@@ -59,17 +56,17 @@ def reach(options: Reach) -> int:
     Raises:
         InputError: A file, a field or an option cannot be used.
     """
-    if not 0.0 < options.time_budget < float("inf"):
-        raise InputError(f"found {options.time_budget}", field="--time-budget", fix="give a positive number")
+    positive(options.time_budget, "--time-budget")
     options.where.check()
     stop = SignalStop()
     with stop.installed():
         with stop.at_once():
             from ns_abstract.api.cell_search import CellSearch, Request
             from ns_abstract.api.compiling import compile_beside
-            from ns_abstract.api.reaching import LoopQuestion, ReachProgress, open_loop
+            from ns_abstract.api.reaching import LoopQuestion, open_loop
             from ns_abstract.api.scenes import SceneSource
             from ns_abstract.report.figures import percent
+            from ns_abstract.report.progress import ProgressBar
 
             scene = SceneSource(options.load_config, options.program, options.overrides).open()
             workers = options.where.processes
@@ -77,17 +74,7 @@ def reach(options: Reach) -> int:
             command = ("ns-abstract-reach", *sys.argv[1:])
             question = LoopQuestion(job, stated(options), command, film=options.film)
         console = plain_console()
-        said = 0.0
-
-        def on_progress(point: ReachProgress) -> None:
-            nonlocal said
-            if point.seconds - said < _EVERY and point.open > 0.0:
-                return
-            said = point.seconds
-            shares = {"safe": point.safe, "reaches": point.reaches, "falsified": point.falsified, "open": point.open}
-            text = ", ".join(f"{name} {percent(share)}" for name, share in shares.items() if share is not None)
-            console.print(f"{point.seconds:7.0f} s: {text}", markup=False)
-
+        progress = ProgressBar(console)
         document = CellSearch(question, options.output_dir).run(
             lambda stack: stack.enter_context(options.where.started(workers)),
             stop,
@@ -96,12 +83,13 @@ def reach(options: Reach) -> int:
                 options.resume,
                 scene_margin=options.scene_margin,
                 on_open=lambda store: compile_beside(job.job, 0) if options.where.engine == "local" else None,
-                on_progress=on_progress,
+                on_progress=progress,
                 on_margin=lambda margin: console.print(
                     f"scene margin: {margin.sentence}", markup=False, soft_wrap=True
                 ),
             ),
         )
+        progress.close()
         for name, entry in document["questions"].items():
             console.print(
                 f"{name}: certified {percent(entry['certified'])}, falsified {percent(entry['falsified'])}, "
@@ -117,7 +105,7 @@ def reach(options: Reach) -> int:
 
 def main() -> None:
     """Entry point of the console script."""
-    run(reach, lambda: tyro.cli(Reach, prog="ns-abstract-reach"), "give fewer --workers or free memory")
+    run(reach, command("ns-abstract-reach", Reach), "give fewer --workers or free memory")
 
 
 if __name__ == "__main__":

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import tyro
-
 from ns_abstract.cli.commands import Render
-from ns_abstract.cli.common import DONE, INTERRUPTED, SignalStop, run
+from ns_abstract.cli.common import DONE, INTERRUPTED, SignalStop, command, run
 from ns_abstract.cli.sets import given_set
+from ns_abstract.io.arguments import at_least, positive, whole
 from ns_abstract.io.errors import InputError
 
 #: Seconds by frame where --explain is given none.
@@ -74,13 +73,10 @@ def render(options: Render) -> int:
         if options.explain:
             return explain(options)
         raise InputError("missing --output-dir", fix="--help lists the options")
-    for name, value in (("--target-ratio", options.target_ratio), ("--time-budget", options.time_budget)):
-        if value is not None and not 0.0 < value < float("inf"):
-            raise InputError(f"found {value}", field=name, fix="give a positive number")
-    if options.target_ratio < 1.0:
-        raise InputError(f"found {options.target_ratio}", field="--target-ratio", fix="give a number of at least 1")
-    if options.seed < 0:
-        raise InputError(f"found {options.seed}", field="--seed", fix="give a number of at least 0")
+    if options.time_budget is not None:
+        positive(options.time_budget, "--time-budget")
+    at_least(options.target_ratio, 1, "--target-ratio")
+    whole(options.seed, 0, "--seed")
     options.where.check()
     given_set(options)
     stop = SignalStop()
@@ -93,7 +89,7 @@ def render(options: Render) -> int:
 
 def main() -> None:
     """Entry point of the console script."""
-    run(render, lambda: tyro.cli(Render, prog="ns-abstract-render"))
+    run(render, command("ns-abstract-render", Render))
 
 
 if __name__ == "__main__":

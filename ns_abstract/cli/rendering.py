@@ -8,7 +8,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from ns_abstract.api import bounding
 from ns_abstract.api.compiling import compile_beside
@@ -19,7 +18,9 @@ from ns_abstract.cli.common import SignalStop, plain_console
 from ns_abstract.cli.options import stated
 from ns_abstract.execution.engines import Engine
 from ns_abstract.io.folder import claim
+from ns_abstract.refine.result import Leaves
 from ns_abstract.report.figures import listed
+from ns_abstract.report.progress import ProgressBar
 from ns_abstract.report.record import Report, RunRecord, failed_self_check
 
 if TYPE_CHECKING:
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 
 #: Seconds by frame where no time budget is given.
 _SECONDS_BY_FRAME = 60.0
+#: Bytes of linear sets by frame up to which they are stored without --save-cells, and cells that a small frame takes.
+_SMALL_LEAVES, _USUAL_CELLS = 8 << 20, 16
 
 
 def make_run(job: PathJob, options: Render, frames: tuple[int, ...], problems: tuple[str, ...]) -> RunRecord:
@@ -89,24 +92,21 @@ def _fill(report: Report, job: Job, options: Render, engine: Engine, stop: Signa
     missing = set(report.missing)
     pending = sorted(report.pending, key=lambda index: index not in missing)
     budget = options.time_budget if options.time_budget is not None else _SECONDS_BY_FRAME * max(1, len(pending))
-    progress = Progress(
-        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}"), TimeElapsedColumn(),
-        console=console, disable=not console.is_terminal, transient=True,
-    )  # fmt: skip
+    small = bool(pending) and _leaf_bytes(job, pending[0]) * _USUAL_CELLS <= _SMALL_LEAVES
     try:
         if pending and options.where.engine == "local":
             with stop.at_once():
                 compile_beside(job, report.pending[0])
-        with progress:
-            meter = _Meter(progress, len(pending), options.target_ratio)
+        with ProgressBar(console) as progress:
             results = bounding.bound_frames(
                 job, pending, engine=engine, budget=budget, target_ratio=options.target_ratio,
-                keep_leaves=options.save_cells or options.explain, stop=stop, on_progress=meter.on_progress,
+                keep_leaves=options.save_cells or options.explain or small, stop=stop, on_progress=progress,
                 found_before=report.stored,
             )  # fmt: skip
-            for done, result in enumerate(results, 1):
+            for result in results:
                 # first what was asked for: drawing loads matplotlib
-                stored_result = result if options.save_cells else replace(result, leaves=None)
+                leaves = result.leaves if options.save_cells or (small and _fits(result.leaves)) else None
+                stored_result = replace(result, leaves=leaves)
                 _tell(console, report.add(stored_result, picture=False))
                 report.draw(result.index)
                 if options.explain and result.bounded and not stop():
@@ -115,17 +115,29 @@ def _fill(report: Report, job: Job, options: Render, engine: Engine, stop: Signa
                     report.explain(result.index, lines)
                     for line in lines[1:]:
                         console.print(line, markup=False, soft_wrap=True)
-                meter.finished(done)
     finally:
         # also after a failure: what is finished is written
         report.finish("interrupted" if stop() else "budget" if report.missing else "done")
+
+
+def _leaf_bytes(job: Job, index: int) -> int:
+    """Bytes of the linear sets of one cell of a frame."""
+    camera, box = job.pose_sets[index].camera, job.pose_sets[index].box
+    return 0 if job.rays else camera.width * camera.height * 3 * 2 * (box.dimensions + 1) * 4
+
+
+def _fits(leaves: Leaves | None) -> bool:
+    """Whether linear sets are few enough to be stored without being asked for."""
+    return leaves is not None and sum(getattr(leaves, name).nbytes for name in vars(leaves)) <= _SMALL_LEAVES
 
 
 def _introduce(console: Console, job: Job, report: Report) -> None:
     method = job.method
     program = method.program
     console.print(f"{method.name}: {method.content}, {program['name']} {program['version']}", markup=False)
-    for note in (*method.notes, *job.notes, *job.plan):
+    for warning in job.wide_turns:
+        console.print(f"warning: {warning}", markup=False, soft_wrap=True)
+    for note in (*method.notes, *(note for note in job.notes if note not in job.wide_turns), *job.plan):
         console.print(f"  {note}", markup=False, soft_wrap=True)
     if report.kept:
         console.print(f"  kept from before: frames {listed(report.kept)}", markup=False, soft_wrap=True)
@@ -143,32 +155,3 @@ def _tell(console: Console, entry: dict[str, Any]) -> None:
     )
     for sentence in entry["plan"]:
         console.print(f"  {sentence}", markup=False, soft_wrap=True)
-
-
-class _Meter:
-    """A progress bar with the current ratio and an estimate of the rest."""
-
-    def __init__(self, progress: Progress, frames: int, target: float) -> None:
-        self.progress, self.target = progress, target
-        self.task = progress.add_task("frames", total=max(1, frames), state="compiling kernels on first use")
-
-    def finished(self, frames: int) -> None:
-        self.progress.update(self.task, completed=frames)
-
-    def on_progress(self, point: bounding.Progress) -> None:
-        part = min(0.99, point.seconds / point.budget)
-        if point.covered < 1.0:
-            state = f"frame {point.frame}: covering the set, {point.covered:.0%}"
-        else:
-            left = self._left(point)
-            state = f"frame {point.frame}: ratio {point.ratio:.3f} (target {self.target:g}), {left:.0f} s left"
-            part = max(part, min(0.99, point.seconds / (point.seconds + left))) if left > 0.0 else part
-        self.progress.update(self.task, completed=point.frames_done + part, state=state)
-
-    def _left(self, point: bounding.Progress) -> float:
-        """Seconds to the target if ``ratio - 1`` goes on falling in proportion to 1 / time; at most the budget."""
-        rest = max(0.0, point.budget - point.seconds)
-        goal = self.target - 1.0
-        if goal <= 0.0 or point.ratio <= self.target:
-            return rest if goal <= 0.0 else 0.0
-        return min(rest, point.seconds * ((point.ratio - 1.0) / goal - 1.0))

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from ns_abstract.geometry.camera_files import FileCamera, inria_cameras, is_inria, transforms_cameras
 from ns_abstract.geometry.path_keys import ENTRY, KEYFRAME, PATH
 from ns_abstract.geometry.transform import DataparserTransform
+from ns_abstract.io.arguments import file_path
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import InputTuning, is_moderate, is_number, load_json, parse_json, show
 from ns_abstract.io.keys import sentence
@@ -171,7 +172,7 @@ def load_camera_path(
     Raises:
         InputError: The file or a field in it cannot be used.
     """
-    path = Path(path)
+    path = file_path(path, "path")
     root = load_json(path, "camera path")
     try:
         if is_inria(root):

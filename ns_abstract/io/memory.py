@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from ns_abstract.io.arguments import positive
 from ns_abstract.io.errors import InputError
 
 #: GiB: larger limits are taken for this one, which no machine has.
@@ -35,9 +36,7 @@ def allowed_memory(limit: float | None) -> int:
         InputError: It is no positive number.
     """
     if limit is not None:
-        if not 0.0 < limit < float("inf"):
-            raise InputError(f"found {limit}", field="--memory-limit", fix="give a positive number of GiB")
-        return int(min(limit, MOST_MEMORY) * 2**30)
+        return int(min(positive(limit, "--memory-limit"), MOST_MEMORY) * 2**30)
     free = available_memory()
     return _USUAL if free is None else int(_SHARE * free)
 

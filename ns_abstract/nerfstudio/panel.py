@@ -38,6 +38,10 @@ _MOST = 100.0
 _MOST_VARIATION = 500.0
 #: Side of the box around what is in the middle of the picture, as a part of its distance.
 _BOX = 0.25
+#: Units of the sliders: thousandths of what sets are stated in.
+_UNITS = dict.fromkeys(TRANSLATIONS, "0.001 units") | dict.fromkeys(ROTATIONS, "mrad") | dict.fromkeys(
+    VARIATIONS, "0.001"
+)  # fmt: skip
 _HINTS = {
     "x": "sideways, thousandths of a scene unit",
     "y": "up and down, thousandths of a scene unit",
@@ -179,9 +183,8 @@ class AbstractPanel(torch.nn.Module):
         varied = () if select is None else VARIATIONS
         for name in (*TRANSLATIONS, *ROTATIONS, *varied):
             start, most = 1000.0 * radii.get(name, 0.0), _MOST_VARIATION if name in ("opacity", "color") else _MOST
-            self._sliders[name] = ViewerSlider(
-                f"± {name}", start, 0.0, max(most, start), 0.1, hint=f"Radius of the set: {_HINTS[name]}"
-            )
+            label, hint = f"± {name} ({_UNITS[name]})", f"Radius of the set: {_HINTS[name]}"
+            self._sliders[name] = ViewerSlider(label, start, 0.0, max(most, start), 0.1, hint=hint)
         self._select = ViewerText(
             "select",
             select or "",
@@ -191,7 +194,8 @@ class AbstractPanel(torch.nn.Module):
         selection: list[ViewerElement] = [] if select is None else [
             self._select, ViewerButton("select what is in the middle", lambda _: self.select_middle())
         ]  # fmt: skip
-        self._seconds = ViewerNumber("seconds", seconds, hint="Time for every view, and for every press of refine")
+        hint = "Time for every view, and for every press of refine"
+        self._seconds = ViewerNumber("time by view (s)", seconds, hint=hint)
         self._file = ViewerText("file", "", hint="Where to write the camera with its set; empty: in the run's folder")
         self.control = Attached(attached)
         self.elements: list[ViewerElement] = [

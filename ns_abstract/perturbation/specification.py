@@ -24,8 +24,8 @@ FILE_KEYS = {
     "frame": '"camera" or "world"',
     "units": '"normalised" or "dataset"',
     "angle_units": '"radians" or "degrees"',
-    "translation": "an object with x, y, z",
-    "rotation": "an object with yaw, pitch, roll",
+    "translation": 'an object with x, y, z, such as {"x": 0.01}',
+    "rotation": 'an object with yaw, pitch, roll, such as {"yaw": 0.01}',
     "sweep": '"keyframes" or "segments"',
     "orbit": "an object with target, axis, azimuth",
     "scene": "a list of variations of the scene",
@@ -56,6 +56,8 @@ class Perturbation:
         scene: What varies of a Splatfacto scene; entry by entry, Gaussian by Gaussian.
         hue, saturation: Ranges (turns, and of 1) of what is added to the colours of all points of a NeRF together;
             None: nothing.
+        units, angle_units: Units in which the set was stated, for people alone; the ranges above are normalised units
+            and radians whatever they are.
     """
 
     frame: Literal["camera", "world"] = "camera"
@@ -66,6 +68,8 @@ class Perturbation:
     scene: tuple[SceneVariation, ...] = field(default=(), repr=False)
     hue: Range | None = None
     saturation: Range | None = None
+    units: str = field(default="normalised", repr=False, compare=False)
+    angle_units: str = field(default="radians", repr=False, compare=False)
 
 
 def load_perturbation(path: str | Path, *, dataset_scale: float = 1.0) -> Perturbation:
@@ -130,7 +134,8 @@ def parse_perturbation(
         raise fail("version", f"found {show(value['version'])}", "this program reads version 1")
     frame = _choice(value, "frame", ("camera", "world"), fail)
     units = _choice(value, "units", ("normalised", "dataset"), fail)
-    turn = math.pi / 180.0 if _choice(value, "angle_units", ("radians", "degrees"), fail) == "degrees" else 1.0
+    angle_units = _choice(value, "angle_units", ("radians", "degrees"), fail)
+    turn = math.pi / 180.0 if angle_units == "degrees" else 1.0
     sweep = _choice(value, "sweep", ("keyframes", "segments"), fail)
     shifts = {name: interval(value[name], name, fail) for name in ("hue", "saturation") if name in value}
     for name, (low, high) in shifts.items():
@@ -148,6 +153,8 @@ def parse_perturbation(
         scene=_scene(value, fail, field_prefix, folder),
         hue=shifts.get("hue"),
         saturation=shifts.get("saturation"),
+        units=units,
+        angle_units=angle_units,
     )
 
 

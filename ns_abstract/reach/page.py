@@ -12,7 +12,7 @@ from ns_abstract.reach.film import SHOWN
 from ns_abstract.reach.loop import Loop
 from ns_abstract.reach.planes import LoopPlot, Marks, plane_marks, region, views
 from ns_abstract.reach.search import QUESTIONS
-from ns_abstract.report.figures import interval
+from ns_abstract.report.figures import ShownUnits
 from ns_abstract.report.html import set_of, whole_page
 from ns_abstract.report.outside import PICTURE_WIDTH, SceneDrawing, behind, draw_plane, plane_axes
 from ns_abstract.report.svg import PlotAxis, draw_legend, draw_line, draw_plot
@@ -23,7 +23,7 @@ _TITLES = {
     "reaches": ("good", "Every run stays safe and reaches the goal"),
     "safe": ("good", "Every run stays safe"),
     "falsified": ("bad", "Some run goes wrong"),
-    "unknown": ("fair", "Undecided"),
+    "unknown": ("fair", "Unknown"),
 }
 
 
@@ -49,9 +49,11 @@ def loop_page(
     name = str(document["scene"].get("name", "scene"))
     kind, heading = _TITLES[document["verdict"]]
 
+    units = ShownUnits()
+
     def cell(entry: Mapping[str, Any]) -> str:
         pairs = zip(document["parameters"], entry["lower"], entry["upper"], strict=True)
-        return " · ".join(interval(p["name"], p["unit"], a, b) for p, a, b in pairs) or "one state"
+        return " · ".join(units.interval(p["name"], p["unit"], a, b) for p, a, b in pairs) or "one state"
 
     return whole_page(
         "loop.html",
@@ -61,7 +63,7 @@ def loop_page(
         name=name,
         kind=kind,
         heading=heading,
-        initial=set_of(document) or "one state",
+        initial=set_of(document, units) or "one state",
         course=loop,
         pictures=_pictures(document, rows, loop, outside),
         film_rows=[_FILM_NAMES[name] for name in SHOWN],
@@ -86,7 +88,7 @@ def _pictures(
     plot_arguments = (
         ""
         if last is None
-        else f" Cells by the verdict on “{QUESTIONS[last]}”: green certified, red falsified, grey undecided."
+        else f" Cells by the verdict on “{QUESTIONS[last]}”: green certified, red falsified, grey unknown."
     )
     figures = [
         _seen(view, document, loop, outside, plot_arguments)

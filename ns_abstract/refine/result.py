@@ -5,8 +5,8 @@ from __future__ import annotations
 import bisect
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, fields
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +16,19 @@ from ns_abstract.geometry.tiles import assemble, tile_grid
 
 Float32Array = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
+
+
+class ArrayRecord:
+    """A record of arrays; its text has their shapes and types in place of their numbers."""
+
+    def __repr__(self) -> str:
+        texts = []
+        for entry in fields(self):  # pyright: ignore[reportArgumentType]
+            value = getattr(self, entry.name)
+            if entry.repr:
+                text = f"{value.dtype}{list(value.shape)}" if isinstance(value, np.ndarray) else repr(value)
+                texts.append(f"{entry.name}={text}")
+        return f"{type(self).__name__}({', '.join(texts)})"
 
 
 @dataclass(frozen=True)
@@ -33,8 +46,8 @@ class TracePoint:
     covered: float = 1.0
 
 
-@dataclass(frozen=True)
-class Leaves:
+@dataclass(frozen=True, repr=False)
+class Leaves(ArrayRecord):
     """Linear sets of the leaf cells of one frame, one row per (cell, tile).
 
     On a leaf's box, with its parameters scaled to ``p`` in [-1, 1]^d, every pixel and channel of
@@ -56,8 +69,8 @@ class Leaves:
     b_upper: Float32Array
 
 
-@dataclass(frozen=True)
-class ExtraOutput:
+@dataclass(frozen=True, repr=False)
+class ExtraOutput(ArrayRecord):
     """A further output (depth, accumulation): bounds, sampled bounds and one render, [H, W] float32 each.
 
     The accumulation is the part of the light that the scene takes, in [0, 1]. The expected depth is the mean of the
@@ -86,8 +99,25 @@ EXTRA_OUTPUT_ARRAYS = tuple(ExtraOutput.__dataclass_fields__)
 EXTRA_OUTPUTS = ("depth", "accumulation")
 
 
-@dataclass(frozen=True)
-class SampleImages:
+class RenderedMaximum(NamedTuple):
+    """The largest value of a rendered picture, and the pose that shows it.
+
+    Attributes:
+        value: Over all pixels and channels.
+        pose: [d] parameter values, in the parameters' units.
+    """
+
+    value: float
+    pose: tuple[float, ...]
+
+
+def greater(*maxima: RenderedMaximum | None) -> RenderedMaximum | None:
+    """The first of the greatest ``maxima``; None where there is none."""
+    return max((m for m in maxima if m is not None), key=lambda m: m.value, default=None)
+
+
+@dataclass(frozen=True, repr=False)
+class SampleImages(ArrayRecord):
     """Concrete renders of some poses of a frame's set.
 
     Attributes:
@@ -99,8 +129,8 @@ class SampleImages:
     images: Float32Array
 
 
-@dataclass(frozen=True)
-class FrameResult:
+@dataclass(frozen=True, repr=False)
+class FrameResult(ArrayRecord):
     """One frame's abstract image.
 
     Attributes:
@@ -118,6 +148,7 @@ class FrameResult:
         layers: What else was bounded, by name, of `EXTRA_OUTPUTS`.
         views: Concrete renders across the set, where leaves are kept.
         problems: What is wrong with the arithmetic of a process that bounded some of it; nothing is guaranteed then.
+        largest: Where a largest value was searched for: the largest one rendered, and its parameter values [d].
     """
 
     index: int
@@ -129,17 +160,18 @@ class FrameResult:
     image: Float32Array
     seconds: float
     cells: int
-    trace: tuple[TracePoint, ...] = ()
+    trace: tuple[TracePoint, ...] = field(default=(), repr=False)
     plan: tuple[str, ...] = ()
     bounded: bool = True
     leaves: Leaves | None = field(default=None, repr=False)
     layers: Mapping[str, ExtraOutput] = field(default_factory=dict, repr=False)
     views: SampleImages | None = field(default=None, repr=False)
     problems: tuple[str, ...] = ()
+    largest: RenderedMaximum | None = None
 
 
-@dataclass(frozen=True)
-class PartResult:
+@dataclass(frozen=True, repr=False)
+class PartResult(ArrayRecord):
     """Some tiles of a frame's abstract image; fields as in `FrameResult` where nothing is said.
 
     Attributes:
@@ -171,6 +203,7 @@ class PartResult:
     layers: Mapping[str, ExtraOutput] | None = field(default=None, repr=False)
     views: SampleImages | None = field(default=None, repr=False)
     problems: tuple[str, ...] = ()
+    largest: RenderedMaximum | None = None
 
 
 #: Of a part that has no point yet: [0, 1] everywhere.
@@ -224,6 +257,7 @@ def joined(parts: Sequence[PartResult], camera: Any) -> FrameResult:
         layers=layers,
         views=_joined_views([part.views for part in parts], order, camera) if bounded else None,
         problems=tuple(dict.fromkeys(problem for part in parts for problem in part.problems)),
+        largest=greater(*(part.largest for part in parts)),
     )
 
 

@@ -11,7 +11,7 @@ from typing import Any
 from markupsafe import Markup, escape
 
 from ns_abstract.report.cameras import CameraDrawings
-from ns_abstract.report.figures import number, percent, unit_of_axis
+from ns_abstract.report.figures import ShownUnits, number, percent, unit_of_axis
 from ns_abstract.report.html import set_of, uri, whole_page
 from ns_abstract.report.record import plain
 from ns_abstract.report.regions import FailureRegion, PoseImage, regions_html
@@ -74,14 +74,14 @@ def certificate_page(
     Returns:
         HTML, self-contained; every text of the document is escaped.
     """
-    name = str(document["scene"].get("name", "scene"))
+    name, units = str(document["scene"].get("name", "scene")), ShownUnits.of(document["scene"])
     numbers, closer = _numbered(document, cells), closer or CertificateDetails()
     sides = {entry["index"]: entry["parameters"] for entry in document["frames"]}
     covered = percent(document["coverage"]["certified"])
     kind, heading = {
         "certified": ("good", "Certified: the property holds on every image"),
         "falsified": ("bad", f"Falsified; certified on {covered} of the poses"),
-        "unknown": ("fair", f"Undecided; certified on {covered} of the poses"),
+        "unknown": ("fair", f"Unknown; certified on {covered} of the poses"),
     }[document["verdict"]]
     maps, drawn = verdict_drawings(document["frames"][:_MOST_ROWS], cells, numbers)
     matrices, more_matrices = _matrices(document, cells)
@@ -113,7 +113,7 @@ def certificate_page(
         pictures=pictures,
         falsified=sum(entry["cells"]["falsified"] for entry in document["frames"]),
         time=_time(document["trace"]),
-        set_of=lambda entry: set_of({"parameters": [p for p in entry["parameters"] if p["lower"] < p["upper"]]}),
+        set_of=lambda entry: set_of({"parameters": [p for p in entry["parameters"] if p["lower"] < p["upper"]]}, units),
     )
 
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 from ns_abstract.refine.result import FrameResult, TracePoint, max_pixel_gap, mean_pixel_gap
 
@@ -84,6 +86,40 @@ def percent(part: float | None) -> str:
 def unit_of_axis(unit: str) -> str:
     """A unit, short enough for an axis."""
     return "units" if unit == "normalised units" else unit
+
+
+@dataclass(frozen=True)
+class ShownUnits:
+    """Units that a set of poses was stated in: people read ranges in these, with the other unit beside them.
+
+    Attributes:
+        translation: "normalised" or "dataset".
+        angle: "radians" or "degrees".
+        dataset_scale: Normalised units per unit of the data set.
+    """
+
+    translation: str = "normalised"
+    angle: str = "radians"
+    dataset_scale: float = 1.0
+
+    @classmethod
+    def of(cls, scene: Mapping[str, Any]) -> ShownUnits:
+        """Those that a report's ``scene`` names, or the normalised frame's."""
+        return cls(**scene.get("units", {}))
+
+    def interval(self, name: str, unit: str, low: float, high: float) -> str:
+        """One side of a box for people, in the unit that was asked and in the other one."""
+        text, ends = interval(name, unit, low, high), (low, high)
+        if unit == "rad":
+            other, asked, ends = "degrees", self.angle == "degrees", [math.degrees(end) for end in ends]
+        elif unit == "normalised units" and (self.translation == "dataset" or self.dataset_scale != 1.0):
+            other, asked = "units of the data set", self.translation == "dataset"
+            ends = [end / self.dataset_scale for end in ends]
+        else:
+            return text
+        beside = interval(name, other, *ends)
+        first, second = (beside, text) if asked else (text, beside)
+        return f"{first} ({second.removeprefix(name).strip().removeprefix('∈ ')})"
 
 
 def interval(name: str, unit: str, low: float, high: float) -> str:

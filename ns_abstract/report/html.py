@@ -13,7 +13,7 @@ from typing import Any
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
-from ns_abstract.report.figures import interval, number, percent, short_guarantee
+from ns_abstract.report.figures import ShownUnits, number, percent, short_guarantee
 
 _FOLDER = Path(__file__).parent
 
@@ -28,9 +28,9 @@ def counted(number_of: int, noun: str) -> str:
     return f"{number_of:,} {noun}{'' if number_of == 1 else 's'}"
 
 
-def set_of(entry: Mapping[str, Any]) -> str:
+def set_of(entry: Mapping[str, Any], units: ShownUnits) -> str:
     """The sides of a frame's set that vary, in words."""
-    sides = [interval(p["name"], p["unit"], p["lower"], p["upper"]) for p in entry["parameters"]]
+    sides = [units.interval(p["name"], p["unit"], p["lower"], p["upper"]) for p in entry["parameters"]]
     return " · ".join(sides)
 
 

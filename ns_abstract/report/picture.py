@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.refine.result import FrameResult, gap, max_pixel_gap
-from ns_abstract.report.figures import interval, metrics, number
+from ns_abstract.report.figures import ShownUnits, metrics, number
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -57,12 +57,14 @@ def _wrapped(items: list[str], width: int) -> list[str]:
     return lines
 
 
-def _box_items(box: ParameterBox) -> list[str]:
+def _box_items(box: ParameterBox, units: ShownUnits) -> list[str]:
     sides = zip(box.names, box.units, box.lower, box.upper, strict=True)
-    return [interval(*side) for side in sides] or ["one camera pose"]
+    return [units.interval(*side) for side in sides] or ["one camera pose"]
 
 
-def frame_figure(result: FrameResult, *, guarantee: str = "", about: str = "") -> Figure:
+def frame_figure(
+    result: FrameResult, *, guarantee: str = "", about: str = "", units: ShownUnits | None = None
+) -> Figure:
     """The picture of one frame: lower | upper | gap heat map with colour bar | one render.
 
     Panels show whole pixels, several screen pixels each for small images.
@@ -71,6 +73,7 @@ def frame_figure(result: FrameResult, *, guarantee: str = "", about: str = "") -
         result: The frame.
         guarantee: Shown in the title; see `ns_abstract.report.figures.short_guarantee`.
         about: More for the title, such as the scene's name.
+        units: Those that the set's ranges are written in.
     """
     from matplotlib.figure import Figure
 
@@ -92,7 +95,7 @@ def frame_figure(result: FrameResult, *, guarantee: str = "", about: str = "") -
     bar = px(_GUTTER / 2 + _BAR + _BAR_TEXT)
     total_w = 2 * px(_MARGIN) + 4 * panel_w + 3 * px(_GUTTER) + bar
     characters = max(40, int(total_w / dpi / (_TEXT_POINTS * 0.0087)))
-    lines = _wrapped(_box_items(result.box), characters)
+    lines = _wrapped(_box_items(result.box, units or ShownUnits()), characters)
     figures = metrics(result)
     text = [
         f"MPG {number(figures['mpg'])}",
@@ -141,7 +144,7 @@ def frame_figure(result: FrameResult, *, guarantee: str = "", about: str = "") -
             image, cmap=GAP_COLORS if k == 2 else None, vmin=0.0, vmax=top if top > 0.0 else 1.0,
             interpolation="antialiased",
         )  # fmt: skip
-        _bare(axes)
+        bare_axes(axes)
         write(x, total_h - base - panel_h - px(0.075), label, _LABEL_POINTS, color=_INK)
         x += panel_w + px(_GUTTER)
         if k == 2:
@@ -180,7 +183,7 @@ def layer_figure(result: FrameResult, name: str) -> Figure:
             image, cmap=GAP_COLORS if image is length else _LAYER_COLORS, vmin=0.0, vmax=whole,
             interpolation="antialiased",
         )  # fmt: skip
-        _bare(place)
+        bare_axes(place)
         place.set_title(label, fontsize=_LABEL_POINTS, color=_INK)
         figure.colorbar(heat_map, ax=place, fraction=0.05, pad=0.02).ax.tick_params(labelsize=_TICK_POINTS)
     unit = " (units of the normalised frame)" if name == "depth" else ""
@@ -200,7 +203,8 @@ def save_layer_picture(path: str | os.PathLike[str], result: FrameResult, name: 
     )
 
 
-def _bare(axes: Axes) -> None:
+def bare_axes(axes: Axes) -> None:
+    """Take the ticks from a picture's axes and make their frame thin."""
     axes.set_xticks([])
     axes.set_yticks([])
     for spine in axes.spines.values():
@@ -223,13 +227,13 @@ def _color_bar(figure: Figure, shown: Any, side: Axes, inches: float) -> None:
     side.tick_params(labelsize=_TICK_POINTS, width=0.4, length=2.0, pad=2.0, colors=_INK)
 
 
-def save_picture(path: str | os.PathLike[str], result: FrameResult, *, guarantee: str = "", about: str = "") -> None:
-    """Write `frame_figure` as PNG, whole or not at all.
+def save_picture(path: str | os.PathLike[str], result: FrameResult, **labels: Any) -> None:
+    """Write `frame_figure` with ``labels`` as PNG, whole or not at all.
 
     Raises:
         OSError: The file cannot be written.
     """
-    figure = frame_figure(result, guarantee=guarantee, about=about)
+    figure = frame_figure(result, **labels)
     write_atomic(path, lambda stream: figure.savefig(stream, format="png", metadata={"Software": "ns_abstract"}))
 
 

@@ -19,12 +19,12 @@ import numpy as np
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.folder import remove_parts, unwritable
+from ns_abstract.io.folder import first_command, remove_parts, unwritable
 from ns_abstract.io.jsonio import file_size, is_number, load_json
 from ns_abstract.io.version import ADVISORY, stale
 from ns_abstract.io.version import VERSION as PACKAGE
-from ns_abstract.refine.result import ExtraOutput, FrameResult, TracePoint
-from ns_abstract.report.figures import layer_metrics, metrics, seconds_to, short_guarantee
+from ns_abstract.refine.result import ExtraOutput, FrameResult, TracePoint, greater
+from ns_abstract.report.figures import ShownUnits, layer_metrics, metrics, seconds_to, short_guarantee
 from ns_abstract.report.files import (
     StoredFrame,
     check_frame,
@@ -261,6 +261,7 @@ def merged(older: FrameResult, newer: FrameResult) -> FrameResult:
         trace=older.trace + later,
         bounded=older.bounded or newer.bounded,
         layers={name: _merged_layer(older.layers[name], layer) for name, layer in newer.layers.items()},
+        largest=greater(older.largest, newer.largest),
     )
 
 
@@ -294,6 +295,7 @@ class Report:
 
     def __init__(self, output_dir: str | os.PathLike[str], run: RunRecord, *, keep_stored: bool = False) -> None:
         self._start(Path(output_dir), run)
+        self._first_command = first_command(self.folder) if keep_stored else None
         if keep_stored:
             self._keep()
         self._publish(page=True)
@@ -526,7 +528,7 @@ class Report:
         name = str(self.run.scene.get("name", ""))
         path = self.folder / frame_name(result.index, "png")
         guarantee = short_guarantee(self.run.guarantee, self.run.scene.get("bounded"))
-        save_picture(path, result, guarantee=guarantee, about=name)
+        save_picture(path, result, guarantee=guarantee, about=name, units=ShownUnits.of(self.run.scene))
         for layer in result.layers:
             save_layer_picture(self.folder / layer_name(result.index, layer), result, layer)
         self._previews[result.index] = previews(result, _PREVIEW_PIXELS)
@@ -616,6 +618,7 @@ class Report:
                 "settings": run.settings,
                 "fingerprint": run.fingerprint,
                 "command": run.command,
+                **({"first_command": first} if (first := self._first_command) else {}),
                 "sha256": self._digests,
                 "packages": self._packages,
                 "started": self._started,

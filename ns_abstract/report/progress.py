@@ -1,0 +1,114 @@
+"""One display of progress for all commands and for notebooks."""
+
+from __future__ import annotations
+
+import math
+import sys
+import time
+from importlib import import_module
+from typing import Any, Protocol
+
+from ns_abstract.report.figures import number
+
+#: Seconds between lines where nothing can be redrawn.
+_EVERY = 15.0
+
+
+class WorkProgress(Protocol):
+    """What a display shows of the progress of bounding, certifying or reaching."""
+
+    @property
+    def done(self) -> float:
+        """Part of the work that is done, from 0 to 1."""
+        ...
+
+    @property
+    def sentence(self) -> str:
+        """What is known so far."""
+        ...
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds that this command has worked."""
+        ...
+
+    @property
+    def total_budget(self) -> float:
+        """Seconds that it may take."""
+        ...
+
+
+def time_text(point: WorkProgress, first: WorkProgress) -> str:
+    """Seconds used of the budget, and what is left if the work goes on as since ``first``; never above the budget."""
+    rest = max(0.0, point.total_budget - point.elapsed)
+    gained = point.done - first.done
+    rate = (1.0 - point.done) * (point.elapsed - first.elapsed) / gained if gained > 0.0 else math.inf
+    budget = f" of {number(point.total_budget)}" if math.isfinite(point.total_budget) else ""
+    used = f"{point.elapsed:.0f}{budget} s used"
+    if point.done >= 1.0:
+        return used
+    if rate < rest:
+        return f"{used}, about {rate:.0f} s left"
+    return f"{used}, at most {rest:.0f} s left" if math.isfinite(rest) else used
+
+
+class ProgressBar:
+    """A live line on progress, as ``on_progress`` of `ns_abstract.bound`, `certify` and `reach`.
+
+    A line that is redrawn on a terminal and in a notebook; elsewhere a line every 15 seconds. Use it in a ``with``
+    block, which ends the line.
+
+    Args:
+        console: A console of rich; None: one on stderr.
+    """
+
+    def __init__(self, console: Any = None) -> None:
+        self._console = console
+        self._first: WorkProgress | None = None
+        self._bar: Any = None
+        self._task: Any = None
+        self._cell: Any = None
+        self._said = -math.inf
+
+    def __enter__(self) -> ProgressBar:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the line; what comes next begins a new one."""
+        if self._bar is not None:
+            self._bar.stop()
+        self._first = self._bar = self._cell = None
+
+    def __call__(self, point: WorkProgress) -> None:
+        """Show where the work stands."""
+        if self._first is None:
+            self._begin(point)
+        assert self._first is not None
+        used = time_text(point, self._first)
+        if self._bar is not None:
+            self._bar.update(self._task, completed=point.done, sentence=point.sentence, used=used)
+        elif self._cell is not None:
+            self._cell.update({"text/plain": f"{point.done:.0%} · {point.sentence} · {used}"}, raw=True)
+        elif time.monotonic() - self._said >= _EVERY:
+            self._said = time.monotonic()
+            self._console.print(f"{point.done:4.0%} · {point.sentence} · {used}", markup=False, soft_wrap=True)
+
+    def _begin(self, point: WorkProgress) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn
+
+        self._first, self._said = point, time.monotonic()
+        if self._console is None and "ipykernel" in sys.modules:
+            # which a notebook has, and nothing else needs
+            display = import_module("IPython.display").display
+            self._cell = display({"text/plain": ""}, raw=True, display_id=True)
+            return
+        self._console = self._console or Console(stderr=True, highlight=False)
+        if self._console.is_terminal:
+            columns = BarColumn(bar_width=20), TextColumn("{task.fields[sentence]} · {task.fields[used]}", markup=False)
+            self._bar = Progress(*columns, console=self._console, transient=True)
+            self._task = self._bar.add_task("", total=1.0, sentence="", used="")
+            self._bar.start()
