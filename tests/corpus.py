@@ -96,7 +96,8 @@ _OPTIONS: dict[str, dict[str, str]] = {
     "ply": {"load-config": "config"}, "occupancy": {"load-config": "config"},
     "bench": {"load-config": "config", "camera-path-filename": "path"}, "demo": {}, "viewer": {"load-config": "config"},
 }  # fmt: skip
-_OUTPUT: dict[str, str] = dict.fromkeys(("npz", "mp4", "ply", "occupancy", "rrd", "viser", "statement"), "output-filename")
+_FILES_WRITTEN = ("npz", "mp4", "ply", "occupancy", "rrd", "viser", "statement")
+_OUTPUT: dict[str, str] = dict.fromkeys(_FILES_WRITTEN, "output-filename")
 
 #: Files of a folder of results that a command may replace.
 _RESULTS = ("report.json", "report.html", *(f"frame_{k:05d}.{kind}" for k in range(2) for kind in ("npz", "png")))
