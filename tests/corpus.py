@@ -52,6 +52,11 @@ MODULES = {
     "mp4": "ns_abstract.cli.export",
     "ply": "ns_abstract.cli.export",
     "vnnlib": "ns_abstract.cli.export",
+    "exr": "ns_abstract.cli.export",
+    "safetensors": "ns_abstract.cli.export",
+    "rrd": "ns_abstract.cli.export",
+    "viser": "ns_abstract.cli.export",
+    "statement": "ns_abstract.cli.export",
     "occupancy": "ns_abstract.cli.export",
     "bench": "ns_abstract.cli.bench",
     "demo": "ns_abstract.cli.demo",
@@ -62,7 +67,7 @@ _IMPORTS = (
     *sorted(set(MODULES.values())), "torch", "onnx", "onnxruntime", "plyfile", "ns_abstract.cli.rendering",
     "ns_abstract.cli.certifying", "ns_abstract.bench.sets", "ns_abstract.bench.stiff", "ns_abstract.report.export",
     "ns_abstract.api.reaching", "ns_abstract.methods.splat.ply", "ns_abstract.verify.interop",
-    "ns_abstract.report.picture",
+    "ns_abstract.report.picture", "ns_abstract.report.interchange", "ns_abstract.api.statement",
 )  # fmt: skip
 #: Names of files by what they are; a change may give another.
 _FILES = {
@@ -86,10 +91,13 @@ _OPTIONS: dict[str, dict[str, str]] = {
     },
     "reach": {"load-config": "config", "loop": "loop"},
     "npz": {"input-dir": "results"}, "png": {"input-dir": "results"}, "mp4": {"input-dir": "results"},
+    "exr": {"input-dir": "results"}, "safetensors": {"input-dir": "results"}, "rrd": {"input-dir": "results"},
+    "viser": {"input-dir": "results", "camera-path-filename": "path"}, "statement": {"input-dir": "search"},
     "ply": {"load-config": "config"}, "occupancy": {"load-config": "config"},
     "bench": {"load-config": "config", "camera-path-filename": "path"}, "demo": {}, "viewer": {"load-config": "config"},
 }  # fmt: skip
-_OUTPUT = {"npz": "output-filename", "mp4": "output-filename", "ply": "output-filename", "occupancy": "output-filename"}
+_FILES_WRITTEN = ("npz", "mp4", "ply", "occupancy", "rrd", "viser", "statement")
+_OUTPUT: dict[str, str] = dict.fromkeys(_FILES_WRITTEN, "output-filename")
 
 #: Files of a folder of results that a command may replace.
 _RESULTS = ("report.json", "report.html", *(f"frame_{k:05d}.{kind}" for k in range(2) for kind in ("npz", "png")))
@@ -269,7 +277,7 @@ class Bench:
                 arguments += [f"--{option}", str(files[kind])]
         target = _OUTPUT.get(case.command, "output-dir")
         if case.command != "viewer" and f"--{target}" not in given:
-            name = {"npz": "out.npz", "mp4": "out.mp4", "ply": "out.ply", "occupancy": "out.npz"}.get(case.command)
+            name = f"out.{'npz' if case.command == 'occupancy' else case.command}" if case.command in _OUTPUT else None
             arguments += [f"--{target}", str(out if name is None else here / name)]
         more = case.options[1:] if case.command == "bench" else case.options
         arguments += [

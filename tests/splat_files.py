@@ -97,6 +97,85 @@ def read_splat(file: Path) -> SplatScene:
     return scene(rows)
 
 
+# .glb
+
+
+def glb_parts(source: SplatScene, bytes_: bool = False) -> tuple[dict[str, Any], bytes]:
+    """JSON and binary part of a .glb of KHR_gaussian_splatting; with ``bytes_``, integers where there may be some."""
+    prefix, n = "KHR_gaussian_splatting:", source.count
+    quats = np.array([unit(q) for q in source.quats])[:, [1, 2, 3, 0]]
+    opacities = np.array([[sigmoid(float(o))] for o in source.opacity_logits])
+    columns: dict[str, tuple[str, int, bool, np.ndarray]] = {
+        "POSITION": ("VEC3", 5126, False, source.means),
+        prefix + "SCALE": ("VEC3", 5126, False, np.exp(source.log_scales.astype(float))),
+        prefix + "ROTATION": ("VEC4", 5126, False, quats),
+        prefix + "OPACITY": ("SCALAR", 5126, False, opacities),
+    }
+    if bytes_:
+        columns[prefix + "ROTATION"] = ("VEC4", 5122, True, np.round(quats * 32767))
+        columns[prefix + "OPACITY"] = ("SCALAR", 5121, True, np.round(opacities * 255))
+    k = 0
+    for degree in range(source.sh_degree + 1):
+        for m in range(2 * degree + 1):
+            columns[f"{prefix}SH_DEGREE_{degree}_COEF_{m}"] = ("VEC3", 5126, False, source.sh[:, k])
+            k += 1
+    data, views, accessors = b"", [], []
+    for kind, component, normalized, values in columns.values():
+        dtype = {5126: "<f4", 5122: "<i2", 5121: "<u1"}[component]
+        rows = np.asarray(values, dtype).reshape(n, -1)
+        # bytes stand apart by four
+        stride = -(-rows.shape[1] * rows.itemsize // 4) * 4
+        padded = b"".join(row.tobytes().ljust(stride, b"\0") for row in rows)
+        views.append({"buffer": 0, "byteOffset": len(data), "byteLength": len(padded), "byteStride": stride})
+        accessors.append({"bufferView": len(accessors), "componentType": component, "count": n, "type": kind,
+                          "normalized": normalized})  # fmt: skip
+        data += padded
+    extension = {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}
+    primitive = {"mode": 0, "attributes": {name: i for i, name in enumerate(columns)},
+                 "extensions": {"KHR_gaussian_splatting": extension}}  # fmt: skip
+    root = {
+        "asset": {"version": "2.0"}, "extensionsUsed": ["KHR_gaussian_splatting"], "scene": 0,
+        "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}], "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors, "bufferViews": views, "buffers": [{"byteLength": len(data)}],
+    }  # fmt: skip
+    return root, data
+
+
+def write_glb(file: Path, root: Any, data: bytes) -> Path:
+    text = json.dumps(root).encode()
+    text += b" " * (-len(text) % 4)
+    parts = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(data), b"BIN\0") + data
+    file.write_bytes(struct.pack("<4sII", b"glTF", 2, 12 + len(parts)) + parts)
+    return file
+
+
+def read_glb(file: Path) -> SplatScene:
+    content = file.read_bytes()
+    (length,) = struct.unpack_from("<I", content, 12)
+    root, data = json.loads(content[20 : 20 + length]), content[28 + length :]
+    attributes = root["meshes"][0]["primitives"][0]["attributes"]
+
+    def row(name: str, i: int) -> list[float]:
+        accessor = root["accessors"][attributes[name]]
+        view = root["bufferViews"][accessor["bufferView"]]
+        letter, most = {5126: ("f", 1), 5122: ("h", 32767), 5121: ("B", 255)}[accessor["componentType"]]
+        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[accessor["type"]]
+        return [
+            v / most for v in struct.unpack_from(f"<{width}{letter}", data, view["byteOffset"] + i * view["byteStride"])
+        ]
+
+    rows, prefix = [], "KHR_gaussian_splatting:"
+    for i in range(root["accessors"][0]["count"]):
+        (opacity,) = row(prefix + "OPACITY", i)
+        x, y, z, w = row(prefix + "ROTATION", i)
+        rows.append({
+            "mean": row("POSITION", i), "scale": [math.log(s) for s in row(prefix + "SCALE", i)], "quat": [w, x, y, z],
+            "opacity": math.log(opacity / (1 - opacity)),
+            "sh": [row(name, i) for name in attributes if "SH_DEGREE" in name],
+        })  # fmt: skip
+    return scene(rows)
+
+
 # compressed.ply
 
 

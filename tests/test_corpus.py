@@ -31,6 +31,7 @@ from typing import Any
 import numpy as np
 import onnx
 import pytest
+import test_formats
 from certifying import classifier
 from conftest import SHIFT, blob_scene, ring
 from corpus import Bench, Row, check, row, rows_by_name
@@ -857,6 +858,42 @@ VIEWER = [
     row("viewer", "ply cut off", "cut off", scene=ply(lambda data: data[:-50]), memory=WORK),
 ]  # fmt: skip
 
+
+def _format_rows() -> Iterator[Row]:
+    """Every damaged file of other programs' formats, as a scene."""
+    for name, (write, mentions) in test_formats.BAD.items():
+        # a scale below 0 is never drawn, and no error
+        if name != "splat: scales below 0":
+            yield row("render", name, *mentions, scene=lambda file, write=write: write(file.parent))
+
+
+QUERY = (
+    "(vnnlib-version <2.0>)(declare-network f (declare-input X float32 [1,3,16,16])(declare-output Y float32 [1,3]))"
+)
+EXPORTS = [
+    row("vnnlib", "prefix of a folder", "--prefix", options="--prefix ../x_"),
+    row("vnnlib", "prefix of 100 letters", "--prefix", options=("--prefix", "a" * 100)),
+    row("vnnlib", "two properties for a network", "--property", options="--property {spec} {spec}"),
+    row("vnnlib", "a version of VNN-LIB that does not exist", "vnnlib-version", options="--vnnlib-version 3.0"),
+    row("certify", "VNN-LIB 2.0 of strict comparisons", "<=", lib=QUERY + "(assert (< Y[0,0] 1.0))"),
+    row("certify", "VNN-LIB 2.0 of another shape", "declare-input", lib=QUERY.replace("16,16", "8,8") + "(assert (<= Y[0,0] 1.0))"),
+    row("certify", "VNN-LIB 2.0 nested", "deep", lib=QUERY + "(assert " + "(and " * 100000),
+    row("certify", "VNN-LIB 2.0 with a zero byte", "zero byte", lib=QUERY + "(assert (<= Y[0,0] 1.0))\0"),
+    row("certify", "VNN-LIB 2.0 of 10^12 elements", "shape", lib=QUERY.replace("1,3,16,16", "999999,999999") + "(assert (<= Y[0,0] 1.0))"),
+    row("certify", "VNN-LIB 3.0", "version", lib=QUERY.replace("2.0", "3.0") + "(assert (<= Y[0,0] 1.0))"),
+    row("exr", "results absent", "cannot be listed", options="--input-dir {here}/none"),
+    row("safetensors", "frame cut off", "frame_00000.npz", results=frame_file(cut(500))),
+    row("rrd", "frame empty", "frame_00001.npz", results=frame_file(lambda f: f.write_bytes(b""), 1)),
+    row("viser", "results of no frames", "no frame", results=lambda f: [x.unlink() for x in f.glob("frame_*.npz")]),
+    row("viser", "half a year a frame", "--seconds", options="--seconds 1e7"),
+    row("viser", "path of one camera", "cameras", path=lambda f: f.write_text(json.dumps(path_json(ring(2, 16)[:1])))),
+    row("statement", "result absent", "no such folder", options="--input-dir {here}/none"),
+    row("statement", "result of pictures", "no certificate", options="--input-dir {here}/../base/results"),
+    row("statement", "report empty", "report.json", search=lambda f: (f / "report.json").write_bytes(b"")),
+    row("statement", "report of text", "report.json", search=lambda f: (f / "report.json").write_text("done")),
+    row("statement", "cells cut off", "cells.sqlite", search=lambda f: (f / "cells.sqlite").write_bytes(b"SQLite format 3\0")),
+]  # fmt: skip
+
 ROWS = dict(
     rows_by_name(
         [
@@ -876,6 +913,8 @@ ROWS = dict(
             *CLUSTERS,
             *SIGNALS,
             *LOOPS,
+            *EXPORTS,
+            *_format_rows(),
         ]
     )
 )

@@ -18,14 +18,17 @@ import torch
 from conftest import blob_scene
 from scene_files import origin_of, picture, refused, shows
 from splat_files import (
+    glb_parts,
     picture_bytes,
     read_compressed,
+    read_glb,
     read_sog,
     read_splat,
     read_spz,
     sog_parts,
     write_checkpoints,
     write_compressed,
+    write_glb,
     write_sog,
     write_splat,
     write_spz,
@@ -100,6 +103,14 @@ def _splat(folder: Path, scene: SplatScene) -> tuple[Path, SplatScene]:
     return file, read_splat(file)
 
 
+def _glb(bytes_: bool = False) -> Written:
+    def write(folder: Path, scene: SplatScene) -> tuple[Path, SplatScene]:
+        file = write_glb(folder / "scene.glb", *glb_parts(scene, bytes_))
+        return file, read_glb(file)
+
+    return write
+
+
 def _checkpoint(ranks: int, config: str | None, mode: str) -> Written:
     def write(folder: Path, scene: SplatScene) -> tuple[Path, SplatScene]:
         black = np.zeros(3, np.float32)
@@ -111,6 +122,8 @@ def _checkpoint(ranks: int, config: str | None, mode: str) -> Written:
 
 FORMATS: dict[str, Written] = {
     "splat": _splat,
+    "glb": _glb(),
+    "glb, integers": _glb(True),
     "compressed": _compressed(),
     "compressed, mip": _compressed("SplatRenderMode: mip", "antialiased"),
     "compressed, one range of colours": _compressed(colors=False),
@@ -300,6 +313,28 @@ def _image(name: str, data: Callable[[bytes], bytes], degree: int = 0) -> Callab
     return write
 
 
+def _gltf(
+    change: Callable[[dict[str, Any]], Any], data: Callable[[bytes], bytes] = lambda d: d
+) -> Callable[[Path], Path]:
+    """A changed JSON part of a .glb."""
+
+    def write(folder: Path) -> Path:
+        root, binary = glb_parts(source(1, 8))
+        change(root)
+        return write_glb(folder / "scene.glb", root, binary)
+
+    return write
+
+
+def _splats(root: dict[str, Any]) -> dict[str, Any]:
+    """The extension's object."""
+    return root["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]
+
+
+def _attributes(root: dict[str, Any]) -> dict[str, Any]:
+    return root["meshes"][0]["primitives"][0]["attributes"]
+
+
 def _bomb(folder: Path) -> Path:
     meta, pictures = sog_parts(source(0, 16))
     file = folder / "scene.sog"
@@ -352,6 +387,13 @@ def _many_points(folder: Path) -> Path:
     with pack(file, "wb", mtime=0) as stream:
         stream.write(head)
     return file
+
+
+KHR = "KHR_gaussian_splatting:"
+
+
+def _written_glb(scene: SplatScene, file: Path) -> Path:
+    return write_glb(file, *glb_parts(scene))
 
 
 BAD: dict[str, tuple[Callable[[Path], Path], tuple[str, ...]]] = {
@@ -418,6 +460,58 @@ BAD: dict[str, tuple[Callable[[Path], Path], tuple[str, ...]]] = {
     "splat: odd size": (_raw(write_splat, "s.splat", lambda d: d[:-5]), ("multiple of 32",)),
     "splat: empty": (_raw(write_splat, "s.splat", lambda d: b""), ("no Gaussians",)),
     "splat: scales below 0": (_raw(write_splat, "s.splat", lambda d: d[:12] + struct.pack("<f", -1.0) + d[16:]), ()),
+    # .glb
+    "glb: other kernel": (_gltf(lambda r: _splats(r).update(kernel="disc")), ("kernel", "disc")),
+    "glb: no kernel": (_gltf(lambda r: _splats(r).pop("kernel")), ("kernel",)),
+    "glb: linear colours": (_gltf(lambda r: _splats(r).update(colorSpace="lin_rec709_display")), ("colorSpace",)),
+    "glb: no colour space": (_gltf(lambda r: _splats(r).pop("colorSpace")), ("colorSpace",)),
+    "glb: other order": (_gltf(lambda r: _splats(r).update(sortingMethod="depth")), ("sortingMethod",)),
+    "glb: other projection": (_gltf(lambda r: _splats(r).update(projection=["perspective"])), ("projection",)),
+    "glb: unknown property": (_gltf(lambda r: _splats(r).update(blur=1)), ("blur",)),
+    "glb: compressed": (
+        _gltf(lambda r: _splats(r).update(extensions={"KHR_gaussian_splatting_compression_spz_2": {}})), ("spz_2",),
+    ),
+    "glb: required extension": (_gltf(lambda r: r.update(extensionsRequired=["EXT_meshopt"])), ("EXT_meshopt",)),
+    "glb: required text": (_gltf(lambda r: r.update(extensionsRequired="KHR")), ("extensionsRequired",)),
+    "glb: two primitives": (_gltf(lambda r: r["meshes"].append(r["meshes"][0])), ("2 things",)),
+    "glb: no Gaussians": (_gltf(lambda r: r["meshes"][0]["primitives"][0].pop("extensions")), ("no Gaussians",)),
+    "glb: two nodes": (_gltf(lambda r: r["nodes"].append({"mesh": 0})), ("one node",)),
+    "glb: no node": (_gltf(lambda r: r.update(nodes=[])), ("one node",)),
+    "glb: turned node": (_gltf(lambda r: r["nodes"][0].update(rotation=[0, 1, 0, 0])), ("nodes[0].rotation",)),
+    "glb: parent that scales": (_gltf(lambda r: r["nodes"].append({"scale": [2, 2, 2], "children": [0]})), ("scale",)),
+    "glb: node with an extension": (_gltf(lambda r: r["nodes"][0].update(extensions={"X": {}})), ("extensions",)),
+    "glb: animation": (_gltf(lambda r: r.update(animations=[{}])), ("animations",)),
+    "glb: triangles": (_gltf(lambda r: r["meshes"][0]["primitives"][0].update(mode=4)), ("points",)),
+    "glb: no scales": (_gltf(lambda r: _attributes(r).pop(KHR + "SCALE")), ("SCALE", "missing")),
+    "glb: degree 4": (_gltf(lambda r: _attributes(r).update({KHR + "SH_DEGREE_4_COEF_0": 0})), ("4_COEF_0",)),
+    "glb: half a degree": (_gltf(lambda r: _attributes(r).pop(KHR + "SH_DEGREE_1_COEF_1")), ("1_COEF_1",)),
+    "glb: attribute of text": (_gltf(lambda r: _attributes(r).update(POSITION="0")), ("attributes",)),
+    "glb: accessor 99": (_gltf(lambda r: _attributes(r).update(POSITION=99)), ("POSITION", "99")),
+    "glb: count 10^18": (_gltf(lambda r: r["accessors"][0].update(count=10**18)), ("count",)),
+    "glb: count below 0": (_gltf(lambda r: r["accessors"][0].update(count=-1)), ("count",)),
+    "glb: counts differ": (_gltf(lambda r: r["accessors"][1].update(count=7)), ("SCALE", "7 rows")),
+    "glb: count of rows that are not there": (
+        _gltf(lambda r: [a.update(count=9) for a in r["accessors"]]), ("cut off",),
+    ),
+    "glb: sparse": (_gltf(lambda r: r["accessors"][0].update(sparse={"count": 1})), ("sparse",)),
+    "glb: component type": (_gltf(lambda r: r["accessors"][0].update(componentType=5125)), ("POSITION", "5125")),
+    "glb: opacity not normalised": (
+        _gltf(lambda r: r["accessors"][3].update(componentType=5121)), ("OPACITY", "normalised"),
+    ),
+    "glb: view beyond the file": (_gltf(lambda r: r["bufferViews"][0].update(byteLength=10**15)), ("POSITION",)),
+    "glb: offset below 0": (_gltf(lambda r: r["bufferViews"][0].update(byteOffset=-4)), ("POSITION",)),
+    "glb: offset of an accessor": (_gltf(lambda r: r["accessors"][0].update(byteOffset=8)), ("POSITION", "cut off")),
+    "glb: stride 0": (_gltf(lambda r: r["bufferViews"][0].update(byteStride=0)), ("POSITION",)),
+    "glb: stride 10^9": (_gltf(lambda r: r["bufferViews"][0].update(byteStride=10**9)), ("POSITION",)),
+    "glb: buffer elsewhere": (_gltf(lambda r: r["buffers"][0].update(uri="../../etc/passwd")), ("buffers",)),
+    "glb: buffer longer than the file": (_gltf(lambda r: r["buffers"][0].update(byteLength=10**9)), ("buffers",)),
+    "glb: scales below 0": (_gltf(lambda r: _attributes(r).update({KHR + "SCALE": 0})), ("SCALE", "outside")),
+    "glb: a list": (lambda folder: write_glb(folder / "scene.glb", [], b"abcd"), ("object",)),
+    "glb: no binary part": (lambda folder: _cut(_gltf(lambda r: None)(folder), 200), ("cut off",)),
+    "glb: more behind": (_raw(_written_glb, "scene.glb", lambda d: d + b"more"), ("header says",)),
+    "glb: version 1": (_raw(_written_glb, "scene.glb", lambda d: d[:4] + b"\1" + d[5:]), ("version 1",)),
+    "glb: JSON part of 4 GiB": (_raw(_written_glb, "scene.glb", lambda d: d[:12] + b"\xff" * 4 + d[16:]), ("JSON",)),
+    "glb: NaN": (_raw(_written_glb, "scene.glb", lambda d: d.replace(b'"mode": 0, ', b'"mode":NaN,')), ("NaN",)),
     # compressed.ply
     "compressed: few chunks": (_compressed_text(b"element chunk 1", b"element chunk 0"), ("chunk",)),
     "compressed: other columns": (_compressed_text(b"packed_scale", b"packed_skale"), ("packed_scale",)),

@@ -168,7 +168,7 @@ KINDS: dict[str, tuple[Callable[[Path], Any], tuple[str, ...]]] = {
     "spz.ply": (lambda p: p.write_bytes(gzip.compress(SPZ)), ("SPZ", "splat-transform")),
     "spz4": (lambda p: p.write_bytes(SPZ), ("cut off",)),
     "a.ply.gz": (lambda p: p.write_bytes(gzip.compress(b"ply\n" * 99)), ("gzip", "gunzip a.ply.gz")),
-    "a.glb": (lambda p: p.write_bytes(b"glTF\2\0\0\0" + bytes(99)), (".glb", "export the scene as .ply")),
+    "a.glb": (lambda p: p.write_bytes(b"glTF\2\0\0\0" + bytes(99)), (".glb", "export the scene again")),
     "lfs.ply": (lambda p: p.write_bytes(LFS), ("Git LFS pointer", "git lfs pull")),
     "config.yml": (lambda p: p.write_bytes(LFS), ("Git LFS pointer", "git lfs pull")),
     "page.ply": (lambda p: p.write_bytes(PAGE), ("web page", "download")),

@@ -16,6 +16,7 @@ from ns_abstract.api import schemas
 from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.specification import parse_perturbation
 from ns_abstract.reach.loop import parse_loop
+from ns_abstract.verify.picture_properties import PICTURE_TYPES, is_of_picture, parse_picture_property
 from ns_abstract.verify.properties import loading, parse_property, property_keys
 
 jsonschema = pytest.importorskip("jsonschema")
@@ -37,6 +38,17 @@ EXAMPLES: dict[str, list[dict[str, Any]]] = {
         {"type": "vnnlib", "file": "unsafe.vnnlib",
          "preprocess": {"resize": None, "std": [1, 2, 3], "mean": [0, 0, 0], "layout": "NCHW", "channels": "BGR",
                         "range": [0, 255]}},
+    ],
+    "picture": [
+        {"$schema": "s", "type": "visible", "select": {"box": [[0, 0, 0], [1, 1, 1]]}, "weight": 0.5, "pixels": 40,
+         "preprocess": {"resize": [8, 8]}, "partitions": 2},
+        {"type": "visible", "select": {}, "fraction": 0.5, "mask": "mask.png"},
+        {"type": "clear", "distance": 0.5, "units": "dataset", "measure": "expected", "region": "all"},
+        {"$schema": "s", "preprocess": {}, "all": [
+            {"type": "picture", "statistic": "mean", "channel": "luminance", "min": 0.1, "max": 0.5,
+             "region": [0, 0, 4, 4], "minus": [4, 4, 8, 8]},
+            {"any": [{"type": "clear", "distance": 1.0, "weight": 0.4}]},
+        ]},
     ],
     "loop": [
         LOOP,
@@ -68,13 +80,21 @@ def _property(value: Any, folder: Path) -> None:
     parse_property(value, folder, (3, 16, 16), sizes.get(kind, (3,)))
 
 
+def _no(value: Any) -> None:
+    raise InputError("not of a picture", field="type", fix="")
+
+
 READERS: dict[str, Callable[[Any, Path], object]] = {
     "perturbation": lambda value, folder: parse_perturbation(value, folder=folder),
     "property": _property,
+    "picture": lambda value, folder: parse_picture_property(value, folder) if is_of_picture(value) else _no(value),
     "loop": parse_loop,
 }
+#: Properties of the picture are of the same file.
+SCHEMAS = {"picture": "property"}
 CHECKERS = {
-    name: jsonschema.Draft202012Validator(getattr(schemas, f"{name}_schema")()) for name in EXAMPLES
+    name: jsonschema.Draft202012Validator(getattr(schemas, f"{SCHEMAS.get(name, name)}_schema")())
+    for name in EXAMPLES
 }  # fmt: skip
 #: How often the schema notices what the reader refuses, at least: the reader also knows scene, network and ranges.
 NOTICED = 0.85
@@ -160,7 +180,8 @@ def test_every_key_of_the_readers_has_a_schema_of_its_own() -> None:
         text = json.dumps(checker.schema)
         assert text.count(": {}") == 0, kind
     cases = CHECKERS["property"].schema["allOf"]
-    for (name, keys), case in zip(property_keys().items(), cases, strict=True):
+    pictures = {name: (*kind.keys, "preprocess", "partitions") for name, kind in PICTURE_TYPES.items()}
+    for (name, keys), case in zip((property_keys() | pictures).items(), cases[:-1], strict=True):
         assert {*keys, "type", "$schema"} == case["then"]["properties"].keys(), name
 
 

@@ -6,6 +6,7 @@ from planted.depths import DEPTHS
 from planted.differences import DIFFERENCES
 from planted.fault import Fault, apply
 from planted.fields import FIELDS
+from planted.files import FILES
 from planted.forms import FORMS
 from planted.inputs import INPUTS
 from planted.location import LOCATION
@@ -24,7 +25,7 @@ from planted.verdicts import VERDICTS
 FAULTS = (
     *FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS, *DEPTHS, *LOOPS, *CHECKS,
     *INPUTS, *NETWORKS, *NETWORK_ROWS, *PROCESSES, *RESULTS, *SCENES, *MAPS, *DIFFERENCES,
-    *PICTURES, *LOCATION,
+    *PICTURES, *LOCATION, *FILES,
 )  # fmt: skip
 
 __all__ = ["FAULTS", "Fault", "apply"]

@@ -566,7 +566,7 @@ class CertifySettings:
     """What to certify, as the command line says it.
 
     Attributes:
-        load_config: config.yml of a run, or a standard 3DGS .ply.
+        load_config: config.yml of a run, or a scene file.
         camera_path_filename: Camera path JSON.
         model: Network, .onnx; None: the property is one of the picture.
         property: PROP.json.

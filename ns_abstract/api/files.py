@@ -24,7 +24,7 @@ class Settings:
     """The options of a command line that say what to bound.
 
     Attributes:
-        load_config: config.yml of a run, or a standard 3DGS .ply.
+        load_config: config.yml of a run, or a scene file.
         camera_path_filename: Camera path JSON.
         perturbation_filename: Perturbation JSON; None: the camera path holds it.
         given_set: The content of a perturbation file, in place of one; errors name its keys as options.

@@ -29,7 +29,7 @@ class SceneSource:
     """Where a scene is read from.
 
     Attributes:
-        file: config.yml of a run, or a .ply.
+        file: config.yml of a run, or a scene file.
         options: Which program draws it.
         overrides: What the user says of the scene in place of its files.
     """
@@ -154,7 +154,7 @@ def load_scene(
     """Read a scene; nothing in the files is executed.
 
     Args:
-        path: ``config.yml`` of a Splatfacto or vanilla-nerf run, or a standard 3DGS ``.ply``.
+        path: ``config.yml`` of a Splatfacto or vanilla-nerf run, or a scene file (docs/formats.md).
         renderer: "gsplat" (what Nerfstudio shows of splats; their default) or "paper" (Algorithm 1 or 2 of "Abstract
             Rendering").
         sampling: NeRF: "uniform" (default) or "hierarchical".

@@ -15,6 +15,7 @@ from ns_abstract.perturbation.specification import FILE_KEYS, ROTATIONS, TRANSLA
 from ns_abstract.perturbation.variations import KEYS, SELECT_KEYS, VARIATIONS
 from ns_abstract.reach import dynamics, loop
 from ns_abstract.verify import preprocess
+from ns_abstract.verify.picture_properties import CHANNELS, COMMON, PICTURE_TYPES, STATISTICS
 from ns_abstract.verify.properties import COMPONENTS, property_keys
 
 Schema = dict[str, Any]
@@ -55,16 +56,21 @@ _NAMED: Schema = {"description": "the schema that an editor checks this file by"
 _MATRIX = _list(_list(_NUMBER, 1), 1)
 
 
-def perturbation_schema() -> Schema:
-    """The JSON Schema of a perturbation file."""
+def _select() -> Schema:
+    """A selection of Gaussians."""
     select = {
         "box": _list(_numbers(3), 2, 2, description="[[x0, y0, z0], [x1, y1, z1]]"),
         "indices": {"anyOf": [_list({"type": "integer", "minimum": 0}, 1), _TEXT]},
         "opacity": _INTERVAL,
         "color": _object({"min": _numbers(3), "max": _numbers(3)}, minProperties=1),
     }
+    return _object(_fields(SELECT_KEYS, select))
+
+
+def perturbation_schema() -> Schema:
+    """The JSON Schema of a perturbation file."""
     varied = _object(
-        _fields(KEYS, {"select": _object(_fields(SELECT_KEYS, select)), **dict.fromkeys(VARIATIONS, _RANGE)}),
+        _fields(KEYS, {"select": _select(), **dict.fromkeys(VARIATIONS, _RANGE)}),
         ["select"],
         anyOf=[{"required": [name]} for name in VARIATIONS],
     )
@@ -129,20 +135,61 @@ def property_schema() -> Schema:
         "classification": ["label"], "regression": ["target", "tolerance"], "vnnlib": ["file"],
         "detection": ["class", "iou", "confidence"],
     }  # fmt: skip
-    types = property_keys()
-    cases = [
+    kinds = {
+        name: (_fields(keys, schemas), needed.get(name, [])) for name, keys in property_keys().items()
+    }  # fmt: skip
+    top = {
+        "preprocess": _object({"resize": _preprocess()["properties"]["resize"]}),
+        "partitions": schemas["partitions"],
+    }
+    beside = {"$schema": _NAMED, **_fields(COMMON, top)}
+    statements = _statements()
+    kinds |= {name: ({**keys, **beside}, required) for name, (keys, required) in statements.items()}
+    cases: list[Schema] = [
         {
-            "if": {"properties": {"type": {"const": name}}},
-            "then": _object(
-                {"$schema": _NAMED, **_fields(keys, schemas), "type": {"const": name}}, needed.get(name, [])
-            ),
+            "if": {"properties": {"type": {"const": name}}, "required": ["type"]},
+            "then": _object({"$schema": _NAMED, **keys, "type": {"const": name}}, required),
         }
-        for name, keys in types.items()
+        for name, (keys, required) in kinds.items()
+    ]
+    parts = _list({"$ref": "#/$defs/statement"}, 1)
+    joined = [{name: parts} for name in ("all", "any")]
+    several = {"anyOf": [_object({**one, **beside}, list(one)) for one in joined]}
+    cases.append({"if": {"not": {"required": ["type"]}}, "then": several})
+    single = [
+        _object({**keys, "type": {"const": n}}, ["type", *required]) for n, (keys, required) in statements.items()
     ]
     root: Schema = {
-        "type": "object", "properties": {"type": {"enum": list(types)}}, "required": ["type"], "allOf": cases
-    }  # fmt: skip
+        "type": "object",
+        "properties": {"type": {"enum": list(kinds)}},
+        "allOf": cases,
+        "$defs": {"statement": {"anyOf": [*single, *(_object(one, list(one)) for one in joined)]}},
+    }
     return _whole("property", "What is to hold on every picture", root)
+
+
+def _statements() -> dict[str, tuple[dict[str, Schema], list[str]]]:
+    """Keys of the properties of the picture by type, and those that are needed."""
+    size: Schema = {"type": "integer", "minimum": 0}
+    box = {"anyOf": [_NULL, {"const": "all"}, _list(size, 4, 4)]}
+    schemas: dict[str, Schema] = {
+        "select": _select(),
+        "weight": {"type": "number", "minimum": 1e-6, "maximum": 1},
+        "pixels": {"type": "integer", "minimum": 1},
+        "fraction": {"type": "number", "exclusiveMinimum": 0, "maximum": 1},
+        "distance": {"type": "number", "minimum": 1e-6, "maximum": 1e6},
+        "units": {"enum": ["normalised", "dataset"]},
+        "measure": {"enum": ["weight", "expected"]},
+        "statistic": {"enum": list(STATISTICS)},
+        "channel": {"enum": list(CHANNELS)},
+        "min": {"type": "number", "minimum": -1, "maximum": 1},
+        "max": {"type": "number", "minimum": -1, "maximum": 1},
+        "region": box,
+        "minus": box,
+        "mask": {"anyOf": [_NULL, _TEXT]},
+    }
+    needed = {"visible": ["select"], "clear": ["distance"]}
+    return {name: (_fields(kind.keys, schemas), needed.get(name, [])) for name, kind in PICTURE_TYPES.items()}
 
 
 def _motion() -> Schema:

@@ -39,7 +39,7 @@ class SceneBenchmark:
     """What is measured."""
 
     load_config: tuple[Path, ...] = ()
-    """Runs (config.yml or .ply). Default: the demo scene."""
+    """Runs (config.yml) or scene files. Default: the demo scene."""
     camera_path_filename: Path | None = None
     """Default: camera_path.json in the folder that holds the method's folder."""
     output_dir: Path = Path("bench")
@@ -200,7 +200,7 @@ class Loops:
     """A network in the loop: certified fraction against time, tubes against runs, attacks on tubes."""
 
     load_config: Path
-    """Run (config.yml or .ply)."""
+    """Run (config.yml) or scene file."""
     loop: Path
     """LOOP.json."""
     output_dir: Path = Path("bench")

@@ -29,7 +29,7 @@ class Check:
     seed: int = 0
     """Of the draws."""
     load_config: Path | None = None
-    """config.yml or .ply, if it has been moved since."""
+    """config.yml or scene file, if it has been moved since."""
     camera_path_filename: Path | None = None
     """The camera path, if it has been moved since."""
     perturbation_filename: Path | None = None

@@ -28,7 +28,7 @@ class Render(GivenSet):
     """
 
     load_config: Path
-    """config.yml of a Splatfacto or vanilla-nerf run, or a standard 3DGS .ply."""
+    """config.yml of a Splatfacto or vanilla-nerf run, or a scene file (.ply, .sog, .spz, .splat, .glb, .pt)."""
     camera_path_filename: Path
     """Camera path as Nerfstudio's viewer writes it."""
     output_dir: Path | None = None
@@ -102,7 +102,7 @@ class Certify(GivenSet):
     """
 
     load_config: Path
-    """config.yml of a Splatfacto or vanilla-nerf run, or a standard 3DGS .ply."""
+    """config.yml of a Splatfacto or vanilla-nerf run, or a scene file (.ply, .sog, .spz, .splat, .glb, .pt)."""
     camera_path_filename: Path
     """Camera path as Nerfstudio's viewer writes it."""
     property: Path

@@ -66,7 +66,7 @@ class Ply:
     """The Gaussians of a run as a standard 3DGS .ply, in the run's normalised frame."""
 
     load_config: Path
-    """config.yml of a Splatfacto run, or a scene file (docs/formats.md)."""
+    """config.yml of a Splatfacto run, or a scene file (.ply, .sog, .spz, .splat, .glb, .pt)."""
     output_filename: Path
     """The .ply file; replaced if it exists."""
     overrides: SceneOverrides = field(default_factory=Overrides)
@@ -83,7 +83,7 @@ class ExportVnnLib(GivenSet):
     """
 
     load_config: Path
-    """config.yml of a Splatfacto run, or a scene file (docs/formats.md)."""
+    """config.yml of a Splatfacto run, or a scene file (.ply, .sog, .spz, .splat, .glb, .pt)."""
     camera_path_filename: Path
     """Camera path as Nerfstudio's viewer writes it."""
     model: tuple[Path, ...]
@@ -183,7 +183,7 @@ class Rrd:
     camera_path_filename: Path | None = None
     """The path that was rendered, for the cameras."""
     load_config: Path | None = None
-    """config.yml of a Splatfacto run or a scene file (docs/formats.md), for its Gaussians."""
+    """config.yml of a Splatfacto run or a scene file (.ply, .sog, .spz, .splat, .glb, .pt), for its Gaussians."""
     overrides: SceneOverrides = field(default_factory=Overrides)
 
 
@@ -198,7 +198,7 @@ class Viser:
     camera_path_filename: Path
     """The path that was rendered."""
     load_config: Path | None = None
-    """config.yml of a Splatfacto run or a scene file (docs/formats.md), for its Gaussians."""
+    """config.yml of a Splatfacto run or a scene file (.ply, .sog, .spz, .splat, .glb, .pt), for its Gaussians."""
     seconds: float = 0.5
     """Of each frame."""
     overrides: SceneOverrides = field(default_factory=Overrides)

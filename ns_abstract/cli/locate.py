@@ -26,7 +26,7 @@ class Locate(GivenSet):
     """
 
     load_config: Path
-    """config.yml of a Splatfacto or vanilla-nerf run, or a standard 3DGS .ply."""
+    """config.yml of a Splatfacto or vanilla-nerf run, or a scene file (.ply, .sog, .spz, .splat, .glb, .pt)."""
     image: Path
     """The photo: RGB of 8 bits, of the size of the camera path's pictures."""
     camera_path_filename: Path

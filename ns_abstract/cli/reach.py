@@ -25,7 +25,7 @@ class Reach:
     """
 
     load_config: Path
-    """config.yml of a Splatfacto run, or a standard 3DGS .ply."""
+    """config.yml of a Splatfacto run, or a scene file (.ply, .sog, .spz, .splat, .glb, .pt)."""
     loop: Path
     """Initial box, dynamics, camera, network, control, unsafe sets and goal (JSON)."""
     output_dir: Path

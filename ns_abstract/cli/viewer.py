@@ -52,7 +52,7 @@ class ViewRun:
     """
 
     load_config: Path
-    """config.yml of a Splatfacto or vanilla-nerf run, or a standard 3DGS .ply."""
+    """config.yml of a Splatfacto or vanilla-nerf run, or a scene file (.ply, .sog, .spz, .splat, .glb, .pt)."""
     viewer: Viewer = field(default_factory=Viewer)
     """Viewer configuration"""
     vis: Literal["viewer", "viewer_legacy"] = "viewer"

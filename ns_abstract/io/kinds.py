@@ -10,7 +10,7 @@ from ns_abstract.io.errors import InputError
 
 #: Bytes that are looked at.
 _HEAD = 512
-_GIVE = "give the config.yml of a run, its folder, or a .ply"
+_GIVE = "give the config.yml of a run, its folder, or a scene file such as a .ply"
 _EXPORT = "export the scene as .ply"
 _DOWNLOAD = "download the file itself (its raw version), not the page that shows it"
 _CONVERT = "convert with: splat-transform {name} out.ply"

@@ -22,7 +22,7 @@ def open_scene(path: str | os.PathLike[str], overrides: Overrides | None = None)
     """Read the scene of a run (by the method that its config.yml names) or of a 3DGS ``.ply``.
 
     Args:
-        path: config.yml, its folder, or a .ply.
+        path: config.yml, its folder, or a scene file.
         overrides: What the user says in place of the files.
 
     Returns:
@@ -38,7 +38,9 @@ def open_scene(path: str | os.PathLike[str], overrides: Overrides | None = None)
     for representation in REPRESENTATIONS:
         if representation.reads(source):
             return representation, representation.load(source, overrides or Overrides())
-    raise InputError("holds no scene known here", file=str(path), fix="give config.yml of a run, or a .ply")
+    raise InputError(
+        "holds no scene known here", file=str(path), fix="give config.yml of a run, or a scene file such as a .ply"
+    )
 
 
 def load_any(path: str | os.PathLike[str], overrides: Overrides | None = None) -> Any:

@@ -24,9 +24,9 @@ class Overrides:
     """
 
     rasterize_mode: Literal["classic", "antialiased"] | None = None
-    """Splats: how they are rasterised, in place of what config.yml or a comment of the .ply says."""
+    """Splats: how they are rasterised, in place of what config.yml or the scene's file says."""
     background: tuple[float, float, float] | None = None
-    """Red, green and blue from 0 to 1 behind the scene, in place of what config.yml says; for a .ply, of black."""
+    """Red, green and blue from 0 to 1 behind the scene, in place of what the files say, or of black."""
     load_step: int | None = None
     """Training step of the checkpoint. Default: what config.yml says, or else the highest."""
     assume_splatfacto: bool = False

@@ -23,6 +23,7 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.methods.load import load_any
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.runs import read_config
+from ns_abstract.methods.splat.formats.readers import scene_file
 from ns_abstract.methods.splat.load import load_scene
 from ns_abstract.methods.splat.write import write_splatfacto_run
 from ns_abstract.nerfstudio.loading import allow_numpy_scalars, check_tags
@@ -47,7 +48,7 @@ def view(
     """Open the run and serve the viewer until the process is interrupted.
 
     Args:
-        load_config: config.yml, or a .ply.
+        load_config: config.yml, its folder, or a scene file.
         vis: Which of nerfstudio's viewers.
         options: Of its ``ViewerConfig``.
         abstract: Of splats' `AbstractConfig`.
@@ -59,7 +60,8 @@ def view(
     overrides = overrides or Overrides()
     with tempfile.TemporaryDirectory(prefix="ns-abstract-viewer-") as scratch:
         config_file = load_config
-        if config_file.suffix.lower() == ".ply":
+        named = config_file.suffix.lower() in (".yml", ".yaml")
+        if not named and not (config_file.is_dir() and scene_file(config_file, None) is None):
             config_file = run_of_ply(config_file, Path(scratch), overrides)
             overrides = Overrides(background=overrides.background)
         config, pipeline, step = open_run(config_file, abstract, overrides)
@@ -76,7 +78,7 @@ def view(
 
 
 def run_of_ply(file: Path, folder: Path, overrides: Overrides | None = None) -> Path:
-    """Write the scene of a ``.ply`` as a run into ``folder``; returns its config.yml."""
+    """Write the scene of a file as a run into ``folder``; returns its config.yml."""
     scene = load_scene(file, overrides)
     middle = np.median(scene.means.astype(np.float64), axis=0)
     distance = 3.0 * float(np.quantile(np.linalg.norm(scene.means - middle, axis=1), 0.8)) + 1e-3

@@ -37,7 +37,7 @@ from ns_abstract.verify.preprocess import Preprocess, parse_preprocess
 from ns_abstract.verify.properties import Claim, Property, Query, parse_partitions
 
 _TUNING = MeasureTuning()
-_STATISTICS = ("mean", "least", "greatest")
+STATISTICS = ("mean", "least", "greatest")
 #: The depth of a pixel on which nothing is drawn, and the greatest that is told apart, normalised units.
 FARTHEST = 2.0**20
 #: What reports say of distances.
@@ -270,7 +270,7 @@ class MeasureModel:
 # ---------------------------------------------------------------- the file
 
 #: Keys beside those of a statement, at the top of the file.
-_COMMON = ("preprocess", "partitions")
+COMMON = ("preprocess", "partitions")
 #: Keys of every leaf.
 _PLACE = ("region", "mask")
 
@@ -377,7 +377,7 @@ def _clear(source: _Source) -> Leaf:
 
 def _picture(source: _Source) -> Leaf:
     root, prefix = source.root, source.prefix
-    statistic, channel = source.choice("statistic", _STATISTICS), source.choice("channel", tuple(CHANNELS))
+    statistic, channel = source.choice("statistic", STATISTICS), source.choice("channel", tuple(CHANNELS))
     region, minus = source.region(), source.region("minus") if "minus" in root else None
     if "min" not in root and "max" not in root:
         raise _raised(f"{prefix}min", "missing", "write min, max or both")
@@ -429,7 +429,7 @@ def parse_picture_property(root: dict[str, Any], folder: Path, dataset_scale: fl
     if isinstance(value, dict):
         known(value, ("resize",), "preprocess.", _raised)
     common: dict[str, Any] = {"preprocess": parse_preprocess(value), "partitions": parse_partitions(root)}
-    statement = parse_statement(root, folder, dataset_scale, _COMMON)
+    statement = parse_statement(root, folder, dataset_scale, COMMON)
     if sum(1 for _ in leaves(statement)) > _MOST_LEAVES:
         raise _raised("type", f"more than {_MOST_LEAVES} statements", "split the file")
     return PictureProperty(statement, **common)

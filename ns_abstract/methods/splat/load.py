@@ -57,7 +57,7 @@ _IDLE = {
 _CLASSES = ("nerfstudio.models.splatfacto.SplatfactoModel", "ns_abstract.nerfstudio.splat.AbstractSplatfactoModel")
 #: Unknown modules that are named.
 _SHOWN = 8
-_FIX = "give the config.yml of a run, its folder, or a .ply"
+_FIX = "give the config.yml of a run, its folder, or a scene file such as a .ply"
 
 
 def load_scene(path: str | os.PathLike[str], overrides: Overrides | None = None) -> SplatScene:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-from ns_abstract.methods.splat.formats import antimatter15, gsplat_checkpoint, inria, sog, spz
+from ns_abstract.methods.splat.formats import antimatter15, gltf, gsplat_checkpoint, inria, sog, spz
 from ns_abstract.methods.splat.formats.decoded import Decoder
 
 _HEAD = 512
@@ -37,6 +37,7 @@ def _is_sog(path: Path, head: bytes) -> bool:
 _FORMATS = (
     _Format(_is_spz, spz.decode_spz),
     _Format(_is_sog, sog.decode_sog),
+    _Format(lambda path, head: head.startswith(gltf.MAGIC), gltf.decode_glb),
     _Format(
         lambda path, head: gsplat_checkpoint.is_gsplat_checkpoint(path), gsplat_checkpoint.decode_gsplat_checkpoint
     ),
