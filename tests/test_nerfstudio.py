@@ -8,6 +8,7 @@ import json
 import shutil
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Iterator
@@ -430,6 +431,7 @@ def test_viewer_finds_the_panel_and_works_in_the_background(
     model.abstract.send()
     assert "The run's folder stays as it is" in model.abstract._figures.text
     model.abstract._file.value = ""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     for where in (tmp_path, run_folder):
         monkeypatch.chdir(where)
         model.abstract.send()
