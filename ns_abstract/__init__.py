@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from ns_abstract.api.bounding import BoundResult, Progress, bound
     from ns_abstract.api.certifying import Certificate, CertifiedCell, CertifyProgress, certify
     from ns_abstract.api.checking import Audit, check
+    from ns_abstract.api.comparing import Comparison, compare
+    from ns_abstract.api.locating import Located, LocatedCell, LocateProgress, locate
     from ns_abstract.api.poses import Camera, PoseSet
     from ns_abstract.api.reaching import ReachCell, ReachProgress, ReachResult, reach
     from ns_abstract.api.scenes import Scene, load_scene, render
@@ -28,6 +30,8 @@ _HOMES = {
     "api.bounding": ("BoundResult", "Progress", "bound"),
     "api.certifying": ("Certificate", "CertifiedCell", "CertifyProgress", "certify"),
     "api.checking": ("Audit", "check"),
+    "api.comparing": ("Comparison", "compare"),
+    "api.locating": ("Located", "LocatedCell", "LocateProgress", "locate"),
     "api.poses": ("Camera", "PoseSet"),
     "api.reaching": ("ReachCell", "ReachProgress", "ReachResult", "reach"),
     "api.scenes": ("Scene", "load_scene", "render"),
@@ -45,7 +49,11 @@ __all__ = [
     "Certificate",
     "CertifiedCell",
     "CertifyProgress",
+    "Comparison",
     "InputError",
+    "LocateProgress",
+    "Located",
+    "LocatedCell",
     "PoseSet",
     "Progress",
     "ProgressBar",
@@ -57,8 +65,10 @@ __all__ = [
     "bound",
     "certify",
     "check",
+    "compare",
     "load_camera_path",
     "load_scene",
+    "locate",
     "reach",
     "render",
 ]

@@ -115,6 +115,7 @@ def test_loop(tmp_path: Path) -> None:
     assert found["picture size"][1] in ("the network's input", "loop file: preprocess.resize")
 
 
+@pytest.mark.slow
 def test_reports_and_results_have_them(blobs: Inputs, tmp_path: Path, in_process: InProcess) -> None:
     code, *_ = in_process(render_command.main, blobs.options(tmp_path, time_budget=5, target_ratio=3, frames=0))
     document = json.loads((tmp_path / "report.json").read_text())

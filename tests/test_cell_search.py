@@ -138,6 +138,7 @@ def test_verdicts_of_a_claim_about_the_picture(tmp_path: Path) -> None:
     assert len(stored) == sum(row["verdict"] == "falsified" for rows in search.rows.values() for row in rows)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("blocks", [0, 1, 7])
 def test_an_ended_search_loses_nothing(tmp_path: Path, blocks: int) -> None:
     whole = timeless(run(BrightnessQuestion(Brightness()), tmp_path / "whole"))

@@ -543,6 +543,7 @@ def test_budget_ends_with_a_result_and_is_continued(planted: Case, finished: Pat
     assert cells(folder) == cells(finished)
 
 
+@pytest.mark.slow
 def test_resume_refuses_other_inputs(planted: Case, net: Path, finished: Path, tmp_path: Path) -> None:
     folder = tmp_path / "out"
     certify(command_options(Certify, **planted.values(folder, time_budget=1e-6)))

@@ -385,6 +385,7 @@ def test_linear_sets_moved_inward_are_never_proved(copy: Path, side: str) -> Non
     assert all(entry["bound"] in ("lower", "upper") for entry in found.refutations)
 
 
+@pytest.mark.slow
 def test_cells_that_leave_a_gap_are_refuted(copy: Path, in_process: InProcess) -> None:
     rewrite(copy, lambda a: a["box_lower"].__setitem__((0, 0), np.nextafter(a["box_lower"][0, 0], 1.0)))
     code, out, _ = in_process(check_command.main, [str(copy), "--claims", "4"])

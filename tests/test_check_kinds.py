@@ -187,6 +187,7 @@ def rewrite(folder: Path, change: str) -> None:
     file.write_text(json.dumps(json.loads(file.read_text()) | {"cells_seal": seal}))
 
 
+@pytest.mark.slow
 def test_a_certificate_is_proved_again(copy: Path) -> None:
     found = check(copy, claims=3, seconds=120)
     assert (found.claims, found.proved, found.float32, found.exit_code) == (3, 3, 3, 0)
@@ -256,6 +257,7 @@ def test_a_network_that_was_moved_is_asked_for(copy: Path, certificate: Path, in
 # ---------------------------------------------------------------- loops
 
 
+@pytest.mark.slow
 def test_a_loop_is_proved_again_and_other_sets_are_not(tmp_path: Path) -> None:
     config, loop = write_loop_demo(tmp_path / "course")
     about = json.loads(loop.read_text()) | {"steps": 3}

@@ -563,6 +563,7 @@ def test_budget_reached_with_a_result_for_every_frame_is_success(
     check_samples(inputs, tmp_path / "out", 0)
 
 
+@pytest.mark.slow
 def test_resuming_keeps_finished_frames_and_ends_the_same(
     blobs: Inputs, finished: Path, tmp_path: Path, call: Callable[..., tuple[int, str]]
 ) -> None:

@@ -188,6 +188,7 @@ def test_a_killed_client_leaves_nothing_behind(local: bool, tmp_path: Path) -> N
             parts.close()
 
 
+@pytest.mark.slow
 def test_a_cluster_on_this_machine_listens_to_itself_alone() -> None:
     with connected(None, 1) as client:
         info = client.scheduler_info()

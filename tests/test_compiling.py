@@ -198,6 +198,7 @@ def test_worker_compiles_what_it_is_told(blobs: Inputs, tmp_path: Path) -> None:
     assert worker.returncode == 0, said.decode()
 
 
+@pytest.mark.slow
 def test_worker_ends_with_the_one_that_started_it() -> None:
     here, there = Pipe()
     with there:

@@ -54,6 +54,7 @@ def problems(text: str) -> list[str]:
     return sorted(found)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_what_is_cited_exists(page: Path) -> None:
     assert problems(page.read_text(encoding="utf-8")) == []

@@ -83,6 +83,7 @@ def test_exact_functions_are_within_their_charges(program: ModuleType, binary: P
     assert "| sqrtf(x) |" in (tmp_path / "cuda_functions.md").read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 @compiled
 def test_planted_charges_are_exceeded(program: ModuleType, binary: Path, tmp_path: Path) -> None:
     status, rows = run(program, binary, tmp_path, "--planted", "256")

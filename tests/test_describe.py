@@ -40,6 +40,7 @@ def numbers(text: str, pattern: str) -> list[float]:
     return [float(part) for part in found.groups()]
 
 
+@pytest.mark.slow
 def test_describe_tells_units_distances_and_pixels(blobs: Inputs, call: Call, tmp_path: Path) -> None:
     options = [
         "--load-config", str(blobs.config), "--camera-path-filename", str(blobs.path), "--describe",

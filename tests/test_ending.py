@@ -34,6 +34,7 @@ from ns_abstract.api.searching import search_blocks
 from ns_abstract.cli import certify as certify_command
 from ns_abstract.cli import render as render_command
 from ns_abstract.cli.common import SignalStop, run
+from ns_abstract.execution import cancellation
 from ns_abstract.execution.cancellation import Deadline, WorkCancelledError, cancel_when, check_cancelled
 from ns_abstract.execution.engines import Machine, Processes, SerialEngine
 from ns_abstract.execution.stopping import StopRequest
@@ -184,7 +185,7 @@ def test_only_compiling_comes_on_top_of_the_budget(
         seen.append(goal.seconds)
         raise WorkCancelledError
 
-    monkeypatch.setattr(bounding, "perf_counter", lambda: clock.now)
+    monkeypatch.setattr(cancellation, "time", SimpleNamespace(perf_counter=lambda: clock.now))
     monkeypatch.setattr(bounding, "kernels", lambda: clock)
     monkeypatch.setattr(Job, "warm_up", warm_up)
     monkeypatch.setattr(Job, "bound_part", bound_part)

@@ -128,6 +128,7 @@ def call(in_process: InProcess) -> Callable[[list[str]], tuple[int, str, str]]:
     return partial(in_process, render_command.main)
 
 
+@pytest.mark.slow
 def test_command(make_blobs: Make, call: Callable[[list[str]], tuple[int, str, str]], tmp_path: Path) -> None:
     balls = scene([[-0.1, 0.0, 0.0], [0.1, 0.001, 0.0]], [0.2, 0.2], plain([1.0, 0.0, 0.0], [0.0, 0.0, 1.0]))
     inputs = make_blobs(scene=balls, views=FRONT, spec=TURN)
@@ -145,6 +146,7 @@ def test_command(make_blobs: Make, call: Callable[[list[str]], tuple[int, str, s
     assert code == 2 and "--explain" in err and err.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_the_report_tells_why(
     make_blobs: Make, call: Callable[[list[str]], tuple[int, str, str]], tmp_path: Path
 ) -> None:

@@ -60,6 +60,7 @@ def frames(folder: Path) -> list[FrameResult]:
     return [load_frame(file).result for file in sorted(folder.glob("frame_*.npz"))]
 
 
+@pytest.mark.slow
 def test_archive_holds_every_frame(call: Call, bounded: Path, tmp_path: Path) -> None:  # noqa: F811
     file = tmp_path / "new" / "path.npz"
     code, error = run(call, "npz", "--input-dir", bounded, "--output-filename", file)

@@ -13,8 +13,15 @@ TESTS = Path(__file__).resolve().parent
 FILES = sorted(path.name for path in TESTS.glob("test_*.py"))
 #: Of one whole session of a user each, which is slow or nothing.
 WHOLE = {"test_browser.py", "test_tutorial.py"}
-#: Sources whose planted faults show in a certified loop alone, which takes seconds.
-LOOPS = {"api/loop_job.py", "reach/film.py"}
+#: Sources whose planted faults show alone in what takes seconds: a certified loop, kernels that are compiled anew,
+#: skipped fragments in every mode, a whole search of a network.
+LONG = {
+    "api/loop_job.py",
+    "arithmetic/kernel_cache.py",
+    "methods/splat/threshold_crossings.py",
+    "reach/film.py",
+    "verify/network/forward.py",
+}
 
 
 @cache
@@ -44,7 +51,7 @@ def test_every_file_with_planted_faults_has_a_fast_test() -> None:
         file, *_, name = fault.test.partition("[")[0].split("::")
         if "slow" not in functions(file)[name]:
             fast.add(fault.file)
-    assert {fault.file for fault in faults} - fast == LOOPS
+    assert {fault.file for fault in faults} - fast == LONG
 
 
 def test_cases_that_are_left_out(pytestconfig: pytest.Config) -> None:

@@ -50,6 +50,7 @@ def broken(rows: list[tuple[str, list[str], list[str]]], names: frozenset[str]) 
     return missing + [f"{term}: {word} is a name" for term, _, others in rows for word in others if word in names]
 
 
+@pytest.mark.slow
 def test_terms_are_names_and_synonyms_are_not() -> None:
     assert len(ROWS) > 30
     assert broken(ROWS, names()) == []

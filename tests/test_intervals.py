@@ -131,6 +131,7 @@ def test_blends_over_parts_hold_every_exact_blend(counts, size):
                     assert low[channel] - room <= value <= high[channel] + room
 
 
+@pytest.mark.slow
 def test_one_fragment_over_parts():
     """A fragment that moves along one axis: its least and most alpha are those at the ends, parts or not."""
     pixel = _Pixel((4, 2), 1, 0)

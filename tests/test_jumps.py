@@ -139,7 +139,7 @@ def _bounded(d, order, alphas, radii, colors, background):
     return low, high, out[8:11], out[12:15], int(out[24])
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize("radius", [0.0, 0.05])
 @pytest.mark.parametrize("d, order", [(1, 2), (1, 1), (2, 1), (3, 1), (6, 1)])
 def test_skipped_fragments(d, order, radius):

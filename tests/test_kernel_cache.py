@@ -105,6 +105,7 @@ print(sum(int(compiled) for compiled, _ in found))
 """
 
 
+@pytest.mark.slow
 def test_processes_of_one_session_compile_no_kernel_twice(tmp_path: Path) -> None:
     """Two that begin at once compile together what one compiles alone, and their kernels are kept."""
     alone, two = (run(SHARED.replace("COUNT", count), NS_ABSTRACT_CACHE_DIR=str(tmp_path / count))[0] for count in "13")

@@ -1043,6 +1043,7 @@ def _loads_or_refuses(path: Path) -> None:
         assert len(str(error).splitlines()) == 1
 
 
+@pytest.mark.slow
 @FUZZ
 @given(seed=st.integers(0, 2**32), flips=st.integers(1, 12))
 def test_fuzzed_config(run: Run, seed: int, flips: int) -> None:
@@ -1050,6 +1051,7 @@ def test_fuzzed_config(run: Run, seed: int, flips: int) -> None:
     _loads_or_refuses(run.config)
 
 
+@pytest.mark.slow
 @FUZZ
 @given(seed=st.integers(0, 2**32), flips=st.integers(1, 12))
 def test_fuzzed_transforms(run: Run, seed: int, flips: int) -> None:
@@ -1057,6 +1059,7 @@ def test_fuzzed_transforms(run: Run, seed: int, flips: int) -> None:
     _loads_or_refuses(run.config)
 
 
+@pytest.mark.slow
 @FUZZ
 @given(seed=st.integers(0, 2**32), flips=st.integers(1, 6))
 def test_fuzzed_checkpoint(run: Run, seed: int, flips: int) -> None:
@@ -1068,6 +1071,7 @@ def test_fuzzed_checkpoint(run: Run, seed: int, flips: int) -> None:
         run.checkpoint.write_bytes(original)
 
 
+@pytest.mark.slow
 @FUZZ
 @given(seed=st.integers(0, 2**32), flips=st.integers(1, 6))
 def test_fuzzed_index_with_right_checksums(run: Run, seed: int, flips: int) -> None:

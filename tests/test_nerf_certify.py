@@ -101,6 +101,7 @@ def test_any_choice_of_samples_lies_between_the_planes() -> None:
         assert outside(frame, box, found, 10) == 0
 
 
+@pytest.mark.slow
 def test_planes_follow_the_pixels() -> None:
     """Most of how far pixels move over a cell goes into the slopes."""
     frame = NerfFrame(tiny_scene(3), UNIFORM, poses(SETS["orbit"]))
@@ -151,6 +152,7 @@ def test_what_a_cell_gets_does_not_depend_on_what_was_asked_before() -> None:
         assert (one == other).all()
 
 
+@pytest.mark.slow
 def test_rays_that_cost_more_get_tighter_and_nothing_is_bounded_twice(monkeypatch: pytest.MonkeyPatch) -> None:
     frame = NerfFrame(tiny_scene(3), UNIFORM, poses(SETS["orbit"]))
     box = frame.box.split(0, 64)[20]
@@ -190,7 +192,6 @@ def a_quarter_strip_on(self: Any, axis: int, count: int, first: int, past: int, 
 original_ends = strips_module.PoseStrips._part_ends
 
 
-@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     ("target", "name", "fault"),
     [

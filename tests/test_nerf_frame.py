@@ -76,6 +76,7 @@ def test_sets_of_poses_are_enclosed(name: str) -> None:
     assert compared > 0 and violations == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FIELDS)
 def test_stiff_fields_are_enclosed(name: str) -> None:
     for seed, spec in enumerate(({"rotation": {"yaw": 0.002}}, {"translation": {"x": 2e-4}})):
@@ -111,6 +112,7 @@ def test_refinement_approaches_the_truth(spec: dict) -> None:
         assert (result.lower.reshape(-1, 3) <= picture).all() and (picture <= result.upper.reshape(-1, 3)).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sampling", [UNIFORM, BINS], ids=["uniform", "hierarchical"])
 @pytest.mark.parametrize("yaw", [1e-5, 1e-6])
 def test_bounds_of_narrow_sets_are_as_tight_as_their_renders_vary(yaw: float, sampling: Sampling) -> None:
@@ -196,6 +198,7 @@ def test_what_is_known_holds_of_a_frame_that_is_stopped_at_once() -> None:
     assert now.bounded and np.array_equal(now.lower, before.lower) and np.array_equal(now.upper, before.upper)
 
 
+@pytest.mark.slow
 def test_children_skip_what_is_empty_and_stay_sound() -> None:
     scene, pose_set = tiny_scene(5, density=20.0), poses(SETS["yaw"])
     rays = NerfBounds(scene, UNIFORM, 1)
@@ -311,6 +314,7 @@ def test_what_is_known_is_only_replaced_by_bounds() -> None:
     assert lower.tolist() == [0.3] + 6 * [0.2] and upper.tolist() == [0.7] + 6 * [0.8]
 
 
+@pytest.mark.slow
 def test_pieces_that_are_given_up_say_nothing() -> None:
     scene, pose_set = tiny_scene(3), poses(SETS["yaw"])
     bounds = NerfBounds(scene, UNIFORM, 1)

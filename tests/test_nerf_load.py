@@ -237,6 +237,7 @@ NERFSTUDIO = textwrap.dedent(
 )
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(importlib.util.find_spec("nerfstudio") is None, reason="nerfstudio is not installed")
 def test_nerfstudio_shows_the_same_picture(tmp_path: Path) -> None:
     """Full-size fields with different weights, opaque enough for the importance samples to matter."""

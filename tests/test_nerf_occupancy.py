@@ -126,6 +126,7 @@ def violations(scene: NerfScene, pose_set: PoseBox, found: RayBounds) -> int:
     return result.violations
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SETS)
 def test_sets_of_poses_are_enclosed(name: str) -> None:
     pose_set = poses(SETS[name])
@@ -136,6 +137,7 @@ def test_sets_of_poses_are_enclosed(name: str) -> None:
     assert violations(scene, pose_set, found) == 0
 
 
+@pytest.mark.slow
 def test_planted_faults_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
     pose_set = poses(SETS["shift"])
     # on an edge-on border of voxels that the rays cross while the camera moves

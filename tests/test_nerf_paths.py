@@ -82,6 +82,7 @@ def checkered(side: int = 12) -> OccupancyGrid:
     return OccupancyGrid.of_box(np.full(3, -1.2), np.full(3, 1.2), occupied)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["soft", "opaque"])
 def test_declared_voxels_are_heeded(kind: str) -> None:
     seed, changes = FIELDS[kind]
@@ -228,6 +229,7 @@ def test_what_is_negligible_is_charged() -> None:
         assert (lower <= shown).all() and (shown <= upper).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["yaw", "shift and yaw"])
 def test_parts_hold_their_renders(name: str) -> None:
     scene, pose_set = tiny_scene(3), poses(SETS[name])
@@ -256,6 +258,7 @@ def fixed(self: SamplePaths, *arguments: Any) -> tuple[np.ndarray, np.ndarray]:
 EDGES = SamplePaths.edges
 
 
+@pytest.mark.slow
 def test_planted_faults_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SamplePaths, "edges", fixed)
     scene, pose_set = tiny_scene(2, rough=20.0), poses({"rotation": {"yaw": 1e-3}})

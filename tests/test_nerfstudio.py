@@ -129,6 +129,7 @@ def abstract_run(nerfstudio: SimpleNamespace, folder: Path, config_file: Path) -
 # ---------------------------------------------------------------- opening
 
 
+@pytest.mark.slow
 def test_the_real_eval_setup_opens_the_run(opened: tuple[Any, Any], nerfstudio: SimpleNamespace) -> None:
     _, pipeline = opened
     assert isinstance(pipeline, nerfstudio.pipeline.AbstractPipeline)
@@ -240,6 +241,7 @@ def test_abstract_outputs_hold(model: Any, nerfstudio: SimpleNamespace, attack: 
     assert (violations == 0) == (attack == "poses")
 
 
+@pytest.mark.slow
 def test_crop_and_background_reach_the_bounds(model: Any, nerfstudio: SimpleNamespace) -> None:
     import torch
     from nerfstudio.data.scene_box import OrientedBox

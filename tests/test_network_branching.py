@@ -30,6 +30,7 @@ def line(rng: np.random.Generator, n: int) -> ImageSets:
     return ImageSets(a, b, a, b, np.nextafter(b - reach, -np.inf), np.nextafter(b + reach, np.inf))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arithmetic", ["float32", "real"])
 def test_claims_next_to_the_exact_minimum(arithmetic: NetworkArithmetic, tmp_path: Path) -> None:
     """What some image breaks exactly is never proved; a little below it is, where slopes alone prove less."""
@@ -62,6 +63,7 @@ def test_claims_next_to_the_exact_minimum(arithmetic: NetworkArithmetic, tmp_pat
     assert gained >= 4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 2, 3])
 def test_behind_residuals(seed: int, tmp_path: Path) -> None:
     """Rows on units that are read twice; what attacks break is not proved, what slopes leave open may be."""

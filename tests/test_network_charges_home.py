@@ -299,6 +299,7 @@ def test_defaults_are_float32_numbers(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- the attack
 
 
+@pytest.mark.slow
 def test_no_network_is_found_outside() -> None:
     """A short part of the search that `benchmarks/network_attack.py` makes for an hour."""
     found = attack.attack(1e9, 47, networks=120)

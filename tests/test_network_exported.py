@@ -138,6 +138,7 @@ def read(file: Path) -> Network:
         raise AssertionError(str(error)) from None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", MODULES)
 def test_operators_are_read_and_bounded(name: str, tmp_path: Path) -> None:
     torch.manual_seed(0)
@@ -175,6 +176,7 @@ def test_what_is_not_read_is_told(name: str, tmp_path: Path) -> None:
     assert caught.value.field is not None and caught.value.fix
 
 
+@pytest.mark.slow
 def test_a_program_of_torch_becomes_a_network_as_the_refusal_says(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -60,6 +60,7 @@ def exported(module: nn.Module, file: Path, dynamo: bool) -> Path:
     return file
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("which", [0, 1])
 def test_pieces_are_bounded(which: int, tmp_path: Path) -> None:
     torch.manual_seed(0)

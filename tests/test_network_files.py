@@ -209,6 +209,7 @@ def test_a_network_is_explained_before_any_work(
     assert "Convolution" in text and "LeakyRelu" in text and "GiB" in text and "Conv_v0" in text
 
 
+@pytest.mark.slow
 def test_cells_that_need_too_much_memory_are_refused_by_an_estimate(tmp_path: Path) -> None:
     f = OnnxFile((3, 256, 256))
     f.node("Unsqueeze", f.last, f.constant([2], np.int64))

@@ -273,7 +273,7 @@ def test_read_like_onnxruntime(name: str, tmp_path: Path) -> None:
         np.testing.assert_allclose(network(torch.from_numpy(x).double()).numpy(), expected, rtol=2e-5, atol=2e-6)
 
 
-@pytest.mark.slow_cases(every=12)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize(("d", "radius", "slack"), [(1, 0.1, 0.01), (2, 0.5, 0.3), (3, 0.003, 1e-7)])
 def test_contained_under_attack(name: str, d: int, radius: float, slack: float, tmp_path: Path) -> None:
@@ -465,7 +465,7 @@ def _caught(name: str, tmp_path: Path, mutate: Callable[[pytest.MonkeyPatch], No
     return False
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize("mutant", MUTANTS)
 def test_attack_catches(mutant: str, tmp_path: Path) -> None:
     mutate, name = MUTANTS[mutant]

@@ -41,6 +41,7 @@ def curve(shape: tuple[int, ...], d: int, radius: float, slack: float, seed: int
     return ImageSets(a, c - slack, a, c + slack, c - reach, c + reach)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES[:4])
 @pytest.mark.parametrize("d", [1, 3])
 def test_bounds_hold_for_onnxruntime(name: str, d: int) -> None:
@@ -77,6 +78,7 @@ def test_network_agrees_with_onnxruntime(name: str) -> None:
         assert x.grad is not None and float(x.grad.abs().max()) > 0.0
 
 
+@pytest.mark.slow
 def test_detector_rows_stay_in_their_windows() -> None:
     """Single outputs of the detector depend on windows only; a narrow cell is bounded within a fixed memory."""
     file = model("tinyyolo_voc")
@@ -101,6 +103,7 @@ def channels_first(tiles: np.ndarray) -> np.ndarray:
     return np.moveaxis(image, 2, 0).reshape(1, 3072, *tiles.shape[4:])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("width", [1e-3, 8e-3])
 def test_rendered_images_of_an_orbit(width: float) -> None:
     """Float32 runs on really rendered images obey bounds and planes; margins are certified with room."""

@@ -77,6 +77,7 @@ def test_elements_are_drawn_where_they_are_and_the_nearest_on_top() -> None:
     assert color_at(read(SceneDrawing(turned).picture(beside)), beside, (0.0, 0.0)) == "b"
 
 
+@pytest.mark.slow
 def test_a_picture_of_many_elements_is_small_and_always_the_same() -> None:
     rng = np.random.default_rng(2)
     count = 30_000
@@ -328,6 +329,7 @@ def test_cameras_that_stand_still_are_drawn() -> None:
     assert CameraDrawings([], 0, standing({0: poses()}), None).html({}) == ""
 
 
+@pytest.mark.slow
 def test_the_scene_behind_cameras_is_the_same_in_every_report() -> None:
     rng = np.random.default_rng(5)
     scene = elements(*[(rng.normal(size=3) * 0.3, rng.uniform(size=3), 0.03, 0.9) for _ in range(3000)])

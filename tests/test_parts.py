@@ -10,6 +10,7 @@ import signal
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from ns_abstract.api import bounding
 from ns_abstract.api.bounding import TileTask, bound_frames, bound_part
 from ns_abstract.api.files import PathJob, Settings, open_job
 from ns_abstract.cli.render import Render, render
+from ns_abstract.execution import cancellation
 from ns_abstract.execution.engines import Cluster, Machine, connected
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.io.errors import InputError
@@ -277,7 +279,8 @@ def test_frames_are_divided_where_threads_are_many(blobs: Inputs, monkeypatch: p
     job = job_of(blobs)
     for frames, threads, tasks in (([0, 1, 2], 2, 3), ([0], 1, 1), ([0], 2, 4), ([0, 2], 3, 6)):
         engine = Machines([threads])
-        monkeypatch.setattr(bounding, "perf_counter", lambda done=engine.done: float(len(done)))
+        clock = SimpleNamespace(perf_counter=lambda done=engine.done: float(len(done)))
+        monkeypatch.setattr(cancellation, "time", clock)
         results = list(bound_frames(job, frames, engine=engine, budget=60.0, target_ratio=3.0))
         assert sorted(r.index for r in results) == frames and all(r.bounded for r in results)
         assert len(engine.goals) == tasks
@@ -317,6 +320,7 @@ def test_memory_is_shared_by_the_tasks_of_a_machine(blobs: Inputs) -> None:
     assert refused.value.field == "--memory-limit"
 
 
+@pytest.mark.slow
 @needs_dask
 def test_one_frame_on_two_workers_from_the_command_line(
     blobs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -179,6 +179,7 @@ def test_signed_members_are_members_and_worse(scripts: Any) -> None:
         assert loss(model(found), which) > loss(model(middle), which)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("training", ["signs", "certified"])
 def test_classifiers_learn_scenes_that_vary(scripts: Any, training: str, tmp_path: Path) -> None:
     """Of a run that shows one kind, and of things before its background; all trainings write what they trained."""
@@ -315,6 +316,7 @@ def test_a_part_is_certified(scripts: Any, name: str, tmp_path: Path) -> None:
     assert "| 100.0% | 100.0% | 1.000 |" in line and "10 / 0" in line
 
 
+@pytest.mark.slow
 def test_parts_are_proved_for_all_colours(scripts: Any, tmp_path: Path) -> None:
     """What certified training is for: the plainly trained network is right, but not proved, on the same parts."""
     row = scripts.certify.ROWS["car, orbit, certified, color 0.05"]
@@ -334,6 +336,7 @@ def test_parts_are_proved_for_all_colours(scripts: Any, tmp_path: Path) -> None:
     assert found["classifier_things"][0] < 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "shift", "turn"), [("airfield, x", 0.01, 0.01), ("lawn, car", 0.03, 0.02)])
 def test_slanted_parts_of_an_estimator_and_a_detector(
     scripts: Any, name: str, shift: float, turn: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

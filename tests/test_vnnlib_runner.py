@@ -60,6 +60,7 @@ def decided(folder: Path, conditions: dict[str, str], packed: bool = False, seco
     return {row["property"].split(".")[0]: row["verdict"] for row in run_folder(folder, folder / "out")}
 
 
+@pytest.mark.slow
 def test_verdicts_against_a_grid(tmp_path: Path) -> None:
     for seed in range(3):
         file = net(tmp_path, seed)

@@ -3,6 +3,7 @@
 from planted.certificates import CERTIFICATES
 from planted.checks import CHECKS
 from planted.depths import DEPTHS
+from planted.differences import DIFFERENCES
 from planted.fault import Fault, apply
 from planted.fields import FIELDS
 from planted.forms import FORMS
@@ -20,7 +21,7 @@ from planted.verdicts import VERDICTS
 
 FAULTS = (
     *FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS, *DEPTHS, *LOOPS, *CHECKS,
-    *INPUTS, *NETWORKS, *NETWORK_ROWS, *PROCESSES, *RESULTS, *SCENES, *MAPS,
+    *INPUTS, *NETWORKS, *NETWORK_ROWS, *PROCESSES, *RESULTS, *SCENES, *MAPS, *DIFFERENCES,
 )  # fmt: skip
 
 __all__ = ["FAULTS", "Fault", "apply"]

@@ -7,7 +7,6 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
-from time import perf_counter
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +16,7 @@ from ns_abstract.api.parameters import point_of, sub_box
 from ns_abstract.api.poses import PoseSet, pose_set
 from ns_abstract.api.scenes import Scene, checked_scene
 from ns_abstract.arithmetic.kernel_cache import store as kernels
-from ns_abstract.execution.cancellation import WorkCancelledError
+from ns_abstract.execution.cancellation import Deadline, WorkCancelledError
 from ns_abstract.execution.engines import Engine, SerialEngine
 from ns_abstract.execution.scheduler import Task, work
 from ns_abstract.execution.stopping import StopRequest, interruptible
@@ -184,91 +183,130 @@ def bound_frames(
     if not frames:
         engine.close()
         return
-    machine = engine.machine()
-    leaf_bytes = _leaf_bytes(job, machine.processes) // machine.threads
-    count = -(-_GROUPS_BY_THREAD * engine.threads // len(frames)) if engine.threads > len(frames) else 1
-    queue = [
-        TileTask(index, tiles)
-        for index in frames
-        for tiles in ([None] if count == 1 else groups(job.frame(index), count))
-    ]
-    expected = Counter(part.index for part in queue)
-    goals: dict[int, RefinementGoal] = {}
-    finished_parts: dict[int, list[PartResult]] = {}
-    flying = done = number = 0
-    recipe = None if engine.shares else job.recipe
     request = StopRequest() if stop is None else stop
-    deadline = perf_counter() + budget
-    if recipe is None:
-        with request.at_once():
-            compiled = kernels().compiled
-            job.warm_up(frames[0])
-            if kernels().compiled > compiled:
-                deadline = perf_counter() + budget
-            # a look at costly rays is part of the work
-            job.check_time(frames[0], budget)
+    schedule = _FrameSchedule(job, frames, engine, target_ratio, keep_leaves, request, on_progress, found_before)
+    schedule.begin(budget)
+    for results in work(engine, schedule.offer, request):
+        for (_, index), result in results:
+            if result is None:
+                return
+            frame = schedule.take(index, result)
+            if frame is not None:
+                yield frame
 
-    def known(index: int) -> FrameResult | None:
-        # other scenes are covered anew as a whole; kept leaves are to be as tight as the result
-        before = found_before(index) if job.rays and not keep_leaves else None
+
+@dataclass
+class _FrameSchedule:
+    """The parts of frames that are still to be bounded, and the results of frames of which parts are missing.
+
+    Attributes:
+        job, engine, target_ratio, keep_leaves, on_progress, found_before: As `bound_frames` has them.
+        frames: Their numbers.
+        request: Asked whether to stop.
+        budget: Seconds for all of them.
+        deadline: When they end.
+        goals: Of the frames that are begun.
+    """
+
+    job: Job
+    frames: Sequence[int]
+    engine: Engine
+    target_ratio: float
+    keep_leaves: bool
+    request: StopRequest
+    on_progress: Callable[[Progress], object]
+    found_before: Callable[[int], FrameResult | None]
+    budget: float = math.inf
+    deadline: Deadline = field(default_factory=Deadline)
+    goals: dict[int, RefinementGoal] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        threads, machine = self.engine.threads, self.engine.machine()
+        self._neighbours = machine.threads
+        self._leaf_bytes = _leaf_bytes(self.job, machine.processes) // machine.threads
+        count = -(-_GROUPS_BY_THREAD * threads // len(self.frames)) if threads > len(self.frames) else 1
+        self._queue = [
+            TileTask(index, tiles)
+            for index in self.frames
+            for tiles in ([None] if count == 1 else groups(self.job.frame(index), count))
+        ]
+        self._expected = Counter(part.index for part in self._queue)
+        self._parts: dict[int, list[PartResult]] = {}
+        self._flying = self._done = self._number = 0
+
+    def begin(self, budget: float) -> None:
+        """Start the clock: ``budget`` seconds, in which this process has no kernel to compile."""
+        self.budget, self.deadline = budget, Deadline(budget)
+        if self.engine.shares:
+            with self.request.at_once():
+                compiled = kernels().compiled
+                self.job.warm_up(self.frames[0])
+                if kernels().compiled > compiled:
+                    self.deadline = Deadline(budget)
+                # a look at costly rays is part of the work
+                self.job.check_time(self.frames[0], budget)
+
+    def offer(self, room: int) -> Iterator[Task]:
+        """Yield tasks: no more than can be worked on, so that later ones know how much time is left."""
+        threads = self.engine.threads
+        while self._queue and self._flying < threads:
+            left = self.deadline.left
+            if left <= 0.0 and self.goals and self._queue[0].index not in self.goals:
+                self._queue.clear()
+                return
+            part = self._queue.pop(0)
+            if part.index not in self.goals:
+                self.goals[part.index] = _goal(self.job, part, self.target_ratio, self._leaf_bytes)
+            share = max(LEAST_SECONDS, left / -(-(len(self._queue) + 1) // threads))
+            goal = replace(self.goals[part.index], seconds=share)
+            self._flying, self._number = self._flying + 1, self._number + 1
+            key = (self._number, part.index)
+            if self.engine.shares:
+                yield Task(key, self._bound_here, (part, goal))
+            else:
+                before = self._known(part.index)
+                arguments = (self.job.recipe, part, goal, self.keep_leaves, self._neighbours, before)
+                yield Task(key, bound_part, arguments)
+
+    def take(self, index: int, result: PartResult) -> FrameResult | None:
+        """Return the result of a frame if this was the last of its parts."""
+        self._flying -= 1
+        parts = self._parts.setdefault(index, [])
+        parts.append(result)
+        if len(parts) < self._expected[index]:
+            return None
+        frame = self.job.joined(self._parts.pop(index))
+        if not self.engine.shares and frame.trace:
+            self._report(index, frame.seconds, frame.seconds, frame.trace[-1], frame.trace[-1].covered)
+        self._done += 1
+        return frame
+
+    def _report(self, index: int, seconds: float, budget: float, point: TracePoint, covered: float) -> None:
+        elapsed = self.budget - self.deadline.left
+        self.on_progress(
+            Progress(
+                index, self._done, seconds, budget, point.cells, covered, point.mpg, point.mpg_witness,
+                len(self.frames), self.target_ratio, elapsed, self.budget,
+            )
+        )  # fmt: skip
+
+    def _known(self, index: int) -> FrameResult | None:
+        # kept leaves are to be as tight as the result
+        before = self.found_before(index) if self.job.continues and not self.keep_leaves else None
         return before if before is not None and before.bounded else None
 
-    def here(part: TileTask, goal: RefinementGoal) -> PartResult | None:
-        def told(point: TracePoint, covered: float) -> None:
-            on_progress(
-                Progress(
-                    part.index, done, point.seconds, goal.seconds, point.cells, covered, point.mpg, point.mpg_witness,
-                    len(frames), target_ratio, budget - (deadline - perf_counter()), budget,
-                )
-            )  # fmt: skip
+    def _bound_here(self, part: TileTask, goal: RefinementGoal) -> PartResult | None:
+        def report(point: TracePoint, covered: float) -> None:
+            self._report(part.index, point.seconds, goal.seconds, point, covered)
 
         try:
-            return job.bound_part(
-                part.index, goal, part.tiles, keep_leaves=keep_leaves, stopped=request, progress=told,
-                known=known(part.index),
+            return self.job.bound_part(
+                part.index, goal, part.tiles, keep_leaves=self.keep_leaves, stopped=self.request, progress=report,
+                known=self._known(part.index),
             )  # fmt: skip
         except WorkCancelledError:
             # over before there was anything to keep
             return None
-
-    def offer(room: int) -> Iterator[Task]:
-        nonlocal flying, number
-        # no more than can be worked on, so that later ones know how much time is left
-        while queue and flying < engine.threads:
-            left = deadline - perf_counter()
-            if left <= 0.0 and goals and queue[0].index not in goals:
-                queue.clear()
-                return
-            part = queue.pop(0)
-            if part.index not in goals:
-                goals[part.index] = _goal(job, part, target_ratio, leaf_bytes)
-            share = max(LEAST_SECONDS, left / -(-(len(queue) + 1) // engine.threads))
-            goal = replace(goals[part.index], seconds=share)
-            flying, number = flying + 1, number + 1
-            if recipe is None:
-                yield Task((number, part.index), here, (part, goal))
-            else:
-                before = known(part.index)
-                yield Task((number, part.index), bound_part, (recipe, part, goal, keep_leaves, machine.threads, before))
-
-    for results in work(engine, offer, request):
-        for (_, index), result in results:
-            flying -= 1
-            if result is None:
-                return
-            finished_parts.setdefault(index, []).append(result)
-            if len(finished_parts[index]) == expected[index]:
-                done += 1
-                frame = job.joined(finished_parts.pop(index))
-                if recipe is not None and frame.trace:
-                    point = frame.trace[-1]
-                    on_progress(
-                        Progress(
-                            index, done - 1, frame.seconds, frame.seconds, frame.cells, point.covered, point.mpg,
-                            point.mpg_witness, len(frames), target_ratio, budget - (deadline - perf_counter()), budget,
-                        )
-                    )  # fmt: skip
-                yield frame
 
 
 def _goal(job: Job, part: TileTask, target_ratio: float, leaf_bytes: int) -> RefinementGoal:

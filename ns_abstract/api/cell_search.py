@@ -116,6 +116,8 @@ class CellQuestion(ABC, Generic[P]):
 
     #: Whether one block is waited for however late it is, so that resuming with any budget gets on.
     waits = True
+    #: Where cells are kept.
+    store: type[Store] = Store
 
     def __init__(
         self,
@@ -250,7 +252,9 @@ class CellSearch(Generic[P]):
         """
         question = self.question
         fingerprint = question.examiner.fingerprint
-        self.store = store = Store(self.folder, fingerprint, question.parameters, question.fixed, resume=resume)
+        self.store = store = question.store(
+            self.folder, fingerprint, question.parameters, question.fixed, resume=resume
+        )
         with store.errors_as_input():
             for number, box in question.sets.items():
                 grid = store.grid(number, box)

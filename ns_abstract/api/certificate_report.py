@@ -19,7 +19,7 @@ from ns_abstract.report.cameras import CameraDrawings, cameras_entry, cell_camer
 from ns_abstract.report.certificate import CertifiedRun, certificate_document
 from ns_abstract.report.certificate_page import certificate_page
 from ns_abstract.report.outside import SceneDrawing
-from ns_abstract.report.picture import preview, to_bytes
+from ns_abstract.report.picture import preview
 from ns_abstract.report.verdict_picture import write_pictures
 from ns_abstract.verify.store import Store, Tally, fractions
 from ns_abstract.verify.store_file import IMAGES
@@ -194,7 +194,7 @@ class CertificateReport:
         if image is None:
             with self.search.deadline.enforced():
                 image = pictures.image(pose)
-        return preview(to_bytes(image), side)
+        return preview(pictures.shown(image, pose), side)
 
     def _cell_pictures(self, rows: Mapping[int, list[dict[str, Any]]]) -> dict[tuple[int, int], dict[str, Any]]:
         """By frame and position, a picture of some cells: the same number of each verdict, evenly spread."""

@@ -108,11 +108,14 @@ class Job:
     @property
     def recipe(self) -> Recipe[Job]:
         """How another process opens this job; files are looked for under the same paths."""
-        options = self.source.options
-        grid = None if options.occupancy_grid is None else options.occupancy_grid.absolute()
-        source = replace(self.source, file=self.source.file.absolute(), options=replace(options, occupancy_grid=grid))
+        source = self.source.absolute
         again = partial(_open, source, self.pose_sets, self._arithmetic, self.seed, self.memory_limit, self.layers)
         return Recipe(again, self.fingerprint, Path(self.source.file))
+
+    @property
+    def continues(self) -> bool:
+        """Whether what is known of a frame saves work on it; others are covered anew as a whole."""
+        return self.rays
 
     # ---------------------------------------------------------------- memory
 

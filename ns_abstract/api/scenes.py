@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +37,12 @@ class SceneSource:
     file: Path
     options: ProgramOptions = field(default_factory=ProgramOptions)
     overrides: Overrides = field(default_factory=Overrides)
+
+    @property
+    def absolute(self) -> SceneSource:
+        """The same with absolute paths."""
+        grid = None if self.options.occupancy_grid is None else self.options.occupancy_grid.absolute()
+        return replace(self, file=self.file.absolute(), options=replace(self.options, occupancy_grid=grid))
 
     def open(self) -> Scene:
         """Read it.

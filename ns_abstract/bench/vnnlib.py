@@ -1,12 +1,17 @@
-"""Run folders of instances in the format of the verification competitions: networks, properties, time limits."""
+"""Run folders of instances in the format of the verification competitions: networks, properties, time limits.
+
+Folders of 2026 have the versions 1.0 and 2.0 of VNN-LIB below them; a network of 2.0 may be a list of names and files.
+"""
 
 from __future__ import annotations
 
+import ast
 import csv
 import io
+import re
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,13 +26,17 @@ from ns_abstract.verify.network import Network, NetworkArithmetic, load_network
 from ns_abstract.verify.network.comparison import compare
 from ns_abstract.verify.network.explain import check_cell
 from ns_abstract.verify.network.load import onnx_runner
-from ns_abstract.verify.vnnlib import load_regions
+from ns_abstract.verify.vnnlib import InputRegion, load_query
+from ns_abstract.verify.vnnlib2 import Query
 
 _LIST_LIMIT = 16 << 20
 _INSTANCES = 100_000
 #: Bytes that a packed network may grow to.
 _NETWORK_LIMIT = 1 << 30
 _LONGEST = 1e6
+#: Characters of a list of networks.
+_LIST_LENGTH = 10_000
+_ONE_NETWORK = "queries about one network are decided: give it as --network NAME=FILE.onnx"
 #: Boxes at whose corners the reading of a network is compared.
 _COMPARED = 4
 
@@ -74,6 +83,33 @@ def instances(folder: Path) -> list[Instance]:
     except csv.Error as error:
         raise InputError(f"cannot be read: {error}", file=path, fix="write network,property,seconds") from None
     return lines
+
+
+def version_folder(folder: Path) -> Path:
+    """The folder of instances.csv: ``folder`` itself, or of its parts 2.0 and 1.0 the first that has one."""
+    for part in (folder, folder / "2.0", folder / "1.0"):
+        if (part / "instances.csv").exists():
+            return part
+    return folder
+
+
+def networks_of(text: str) -> dict[str, str]:
+    """Files by the names of networks, of ``[('f', 'net.onnx')]``; a file alone has the name "".
+
+    Raises:
+        InputError: The list is not understood.
+    """
+    if not text.startswith("["):
+        return {"": text}
+    try:
+        pairs = ast.literal_eval(text) if len(text) <= _LIST_LENGTH else None
+        good = isinstance(pairs, list) and all(isinstance(p, tuple) and len(p) == 2 for p in pairs)
+        files = dict(pairs) if good and pairs else {}
+    except (ValueError, SyntaxError, MemoryError, RecursionError, TypeError):
+        files = {}
+    if not files or not all(isinstance(v, str) for pair in files.items() for v in pair):
+        raise InputError(f"found {text[:60]}", field="network", fix="write a file, or [('f', 'net.onnx')]")
+    return files
 
 
 def _stored(folder: Path, name: str) -> Path:
@@ -124,7 +160,7 @@ def run_folder(
     seconds), and ``output_dir/NETWORK_PROPERTY.txt`` the verdict and, with "sat", the counterexample.
 
     Args:
-        folder: Holds instances.csv and what it names, also packed (.gz).
+        folder: Holds instances.csv and what it names, also packed (.gz); or the folders 2.0 or 1.0 that do.
         output_dir: Folder of the results.
         only: Parts of names of networks or properties; all if there are none.
         seconds: Limit beside those of the list.
@@ -135,6 +171,7 @@ def run_folder(
     Raises:
         InputError: The list cannot be read. A network or a property that cannot is a row with "error" and a reason.
     """
+    benchmark, folder = folder, version_folder(folder)
     chosen = [
         one
         for one in instances(folder)
@@ -150,15 +187,14 @@ def run_folder(
             limit = one.seconds if seconds is None else min(one.seconds, seconds)
             start = time.perf_counter()
             ready, answer, why = start, None, ""
+            query: Query | None = None
             try:
-                network, run = networks.load(_stored(folder, one.network))
-                check_cell(network, 1, memory)
-                regions = load_regions(_stored(folder, one.property), network.input_size, network.output_size)
-                ends = [
-                    image[None] for r in regions[:_COMPARED] for image in (r.lower, r.upper, 0.5 * (r.lower + r.upper))
-                ]
-                shape = (1, *network.input_shape)
-                compare(network, run, [image.reshape(shape) for image in ends], usual=False)
+                files = networks_of(one.network)
+                if len(files) > 1:
+                    raise InputError("is about several networks", field=one.property, fix=_ONE_NETWORK)
+                ((name, file),) = files.items()
+                network, run = networks.load(_stored(folder, file))
+                regions, query = _question(network, run, _stored(folder, one.property), name, memory, arithmetic)
                 ready = time.perf_counter()
                 end = ready + limit
 
@@ -170,10 +206,10 @@ def run_folder(
                 why = str(error)
             word = "error" if answer is None else answer.word
             prepared, spent = ready - start, time.perf_counter() - ready
-            writer.writerow([folder.name, one.network, one.property, f"{prepared:.3f}", word, f"{spent:.3f}"])
+            writer.writerow([benchmark.name, one.network, one.property, f"{prepared:.3f}", word, f"{spent:.3f}"])
             stream.flush()
             name = f"{_stem(one.network)}_{_stem(one.property)}.txt"
-            (output_dir / name).write_text(word + "\n" + ("" if answer is None else assignment(answer)))
+            (output_dir / name).write_text(word + "\n" + ("" if answer is None else assignment(answer, query)))
             yield {
                 "network": one.network,
                 "property": one.property,
@@ -186,16 +222,74 @@ def run_folder(
 
 def _stem(name: str) -> str:
     """A file's name without its endings."""
-    last = Path(name).name
+    # the last of a list's files
+    last = re.sub(r"[\[\]()' ]", "", Path(name).name)
     for ending in (".gz", ".onnx", ".vnnlib"):
         last = last[: -len(ending)] if last.lower().endswith(ending) else last
     return last
 
 
-def assignment(answer: Decision) -> str:
-    """A counterexample as the competitions want it; nothing without one."""
+def assignment(answer: Decision, query: Query | None = None) -> str:
+    """A counterexample as the competitions want it, of a query of version 2 in its form; nothing without one."""
     if answer.x is None or answer.y is None:
         return ""
+    if query is not None:
+        return query.input.assignment(answer.x) + query.output.assignment(answer.y)
     lines = [f"(X_{k} {value!r})" for k, value in enumerate(answer.x.tolist())]
     lines += [f"(Y_{k} {value!r})" for k, value in enumerate(answer.y.tolist())]
     return "(" + "\n".join(lines) + ")\n"
+
+
+def _question(
+    network: Network, run: Any, file: Path, name: str, memory: int, arithmetic: NetworkArithmetic
+) -> tuple[tuple[InputRegion, ...], Query | None]:
+    """What a property file asks of the network, which is compared with the program that runs it.
+
+    Raises:
+        InputError: The file is about another network, or asks more than ``arithmetic`` covers.
+    """
+    check_cell(network, 1, memory)
+    regions, query = load_query(file, network.input_shape, network.output_shape)
+    if query is not None and name not in ("", query.network):
+        raise InputError(f"names the network {query.network}, given is {name}", file=file, fix=f"give {query.network}=")
+    if query is not None and query.input.kind == "float32" and arithmetic != "float32":
+        fix = "leave --network-arithmetic out, or declare the tensors as real"
+        raise InputError("asks about float32", file=file, field="--network-arithmetic", fix=fix)
+    ends = [image[None] for r in regions[:_COMPARED] for image in (r.lower, r.upper, 0.5 * (r.lower + r.upper))]
+    shape = (1, *network.input_shape)
+    compare(network, run, [image.reshape(shape) for image in ends], usual=False)
+    return regions, query
+
+
+def verify_query(
+    file: Path,
+    networks: Mapping[str, Path],
+    *,
+    seconds: float | None = None,
+    memory: int = 2 << 30,
+    arithmetic: NetworkArithmetic = "float32",
+    output: str | None = None,
+) -> str:
+    """Return the standard's answer to a query: ``sat`` and an assignment, ``unsat``, ``unknown`` or ``timed-out``.
+
+    Args:
+        file: The query, of version 1 or 2.
+        networks: Files by the names of the query's networks; of version 1 by any name.
+        seconds: Limit; None: none.
+        memory: Bytes that bounds may take.
+        arithmetic: What "unsat" covers.
+        output: Name of the network's output; None: the only one.
+
+    Raises:
+        InputError: A file cannot be used, or other networks are given than the query is about.
+    """
+    if len(networks) != 1:
+        raise InputError(f"{len(networks)} networks", field="--network", fix=_ONE_NETWORK)
+    ((name, path),) = networks.items()
+    end = time.perf_counter() + (_LONGEST if seconds is None else seconds)
+    with tempfile.TemporaryDirectory() as scratch:
+        network, run = _Networks(Path(scratch), output).load(path)
+        regions, query = _question(network, run, file, name, memory, arithmetic)
+        answer = decide(network, run, regions, lambda: time.perf_counter() > end, memory=memory, arithmetic=arithmetic)
+    word = "timed-out" if answer.word == "timeout" else answer.word
+    return f"{word}\n{assignment(answer, query)}"

@@ -90,7 +90,7 @@ class Render(GivenSet):
 
 @dataclass
 class Certify(GivenSet):
-    """Prove, or break, a property of a network on every image that a scene shows over a set of poses.
+    """Prove or break a property of a network, or of the picture, on every image of a set of poses.
 
     Splits the set into cells until each is certified, falsified or too small. Writes cells.sqlite,
     report.json, report.html and the images of counterexamples. Exit codes: 0 done, whatever the verdict;
@@ -103,12 +103,13 @@ class Certify(GivenSet):
     """config.yml of a Splatfacto or vanilla-nerf run, or a standard 3DGS .ply."""
     camera_path_filename: Path
     """Camera path as Nerfstudio's viewer writes it."""
-    model: Path
-    """Network: .onnx."""
     property: Path
-    """What is to hold (JSON): classification, regression, detection or vnnlib, with the preprocessing."""
+    """What is to hold (JSON): of a network classification, regression, detection or vnnlib, with the preprocessing; of
+    the picture itself visible, clear, picture, or several as all or any."""
     output_dir: Path
     """Folder for the results; made if missing."""
+    model: Path | None = field(default=None, kw_only=True)
+    """Network: .onnx. Left out for a property of the picture."""
     perturbation_filename: Path | None = field(default=None, kw_only=True)
     """Set of poses (JSON). Default: the key "perturbation" of the camera path, or its poses alone."""
     time_budget: float | None = None

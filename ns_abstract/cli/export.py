@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import json
+import re
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal, Union
+from typing import TYPE_CHECKING, Annotated, Literal, Union
 
 import tyro
 
@@ -14,6 +14,9 @@ from ns_abstract.cli.common import DONE, command, run
 from ns_abstract.cli.options import Overrides, ProgramOptions, SceneOverrides
 from ns_abstract.cli.sets import GivenSet, given_set
 from ns_abstract.io.errors import InputError, visible
+
+if TYPE_CHECKING:
+    from ns_abstract.report.export import Results
 
 #: Along each axis of an occupancy grid.
 _MOST_VOXELS = 512
@@ -63,7 +66,7 @@ class Ply:
     """The Gaussians of a run as a standard 3DGS .ply, in the run's normalised frame."""
 
     load_config: Path
-    """config.yml of a Splatfacto run, or a .ply."""
+    """config.yml of a Splatfacto run, or a scene file (docs/formats.md)."""
     output_filename: Path
     """The .ply file; replaced if it exists."""
     overrides: SceneOverrides = field(default_factory=Overrides)
@@ -75,17 +78,18 @@ class ExportVnnLib(GivenSet):
 
     Cuts the set of poses of a frame into boxes and writes for each NAME.onnx, whose input is the box's parameters in
     [-1, 1] and the slack of every number of the image, and NAME.vnnlib ("unsat": the property holds on every image
-    of the box). Beside them instances.csv, as verifiers of VNN-COMP read it, and boxes.json, the boxes.
+    of the box). Beside them instances.csv, as verifiers of VNN-COMP read it, boxes.json, the boxes, and origins.json:
+    scene, pose, property and picture of each. With several networks and --append a folder becomes a benchmark.
     """
 
     load_config: Path
-    """config.yml of a Splatfacto run, or a standard 3DGS .ply."""
+    """config.yml of a Splatfacto run, or a scene file (docs/formats.md)."""
     camera_path_filename: Path
     """Camera path as Nerfstudio's viewer writes it."""
-    model: Path
-    """Network: .onnx."""
-    property: Path
-    """What is to hold (JSON): classification or vnnlib, with the preprocessing."""
+    model: tuple[Path, ...]
+    """Networks: .onnx."""
+    property: tuple[Path, ...]
+    """What is to hold (JSON): classification or vnnlib, with the preprocessing. One for all networks, or one each."""
     output_dir: Path
     """Folder for the files; made if missing."""
     perturbation_filename: Path | None = field(default=None, kw_only=True)
@@ -106,6 +110,14 @@ class ExportVnnLib(GivenSet):
     """slice: small files. gemm: no operators in front but Gemm and Reshape, for verifiers that know little."""
     timeout: int = 300
     """Seconds by box in instances.csv."""
+    vnnlib_version: Literal["1.0", "2.0"] = "1.0"
+    """Version of VNN-LIB. 2.0 asks about float32."""
+    prefix: str = ""
+    """What names of instances begin with, such as the scene's name."""
+    append: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Keep the instances that the folder holds."""
+    pictures: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Write the picture at the middle of every box to pictures/."""
     overrides: SceneOverrides = field(default_factory=Overrides)
 
 
@@ -130,33 +142,107 @@ class Occupancy:
     overrides: SceneOverrides = field(default_factory=Overrides)
 
 
+@dataclass
+class Exr:
+    """OpenEXR pictures of every frame: parts lower, upper, witness_lower, witness_upper and image, float32."""
+
+    input_dir: Path
+    """Folder that ns-abstract-render wrote."""
+    output_dir: Path
+    """Folder for the pictures; made if missing."""
+
+
+@dataclass
+class Safetensors:
+    """Bounds and linear sets of every frame as safetensors, of ns-abstract-render --save-cells."""
+
+    input_dir: Path
+    """Folder that ns-abstract-render --save-cells wrote."""
+    output_dir: Path
+    """Folder for the files; made if missing."""
+
+
+@dataclass
+class Statement:
+    """A certificate as an in-toto statement (JSON), which other tools sign."""
+
+    input_dir: Path
+    """Folder that ns-abstract-certify or ns-abstract-reach wrote."""
+    output_filename: Path
+    """The JSON file; replaced if it exists."""
+
+
+@dataclass
+class Rrd:
+    """A Rerun recording (.rrd): bounds and figures frame by frame, and with a path its cameras in the scene."""
+
+    input_dir: Path
+    """Folder that ns-abstract-render wrote."""
+    output_filename: Path
+    """The .rrd file; replaced if it exists."""
+    camera_path_filename: Path | None = None
+    """The path that was rendered, for the cameras."""
+    load_config: Path | None = None
+    """config.yml of a Splatfacto run or a scene file (docs/formats.md), for its Gaussians."""
+    overrides: SceneOverrides = field(default_factory=Overrides)
+
+
+@dataclass
+class Viser:
+    """A recording of viser (.viser): the gap of every frame at its camera, in the scene."""
+
+    input_dir: Path
+    """Folder that ns-abstract-render wrote."""
+    output_filename: Path
+    """The .viser file; replaced if it exists."""
+    camera_path_filename: Path
+    """The path that was rendered."""
+    load_config: Path | None = None
+    """config.yml of a Splatfacto run or a scene file (docs/formats.md), for its Gaussians."""
+    seconds: float = 0.5
+    """Of each frame."""
+    overrides: SceneOverrides = field(default_factory=Overrides)
+
+
+@dataclass
+class Schemas:
+    """JSON Schemas of the perturbation file, the property and the loop, for editors that check files by "$schema"."""
+
+    output_dir: Path
+    """Folder for the schemas; made if missing."""
+
+
 _ABOUT = "Write results of ns-abstract-render, scenes and properties in other programs' formats."
-_PARTS = {"npz": Npz, "png": Png, "mp4": Mp4, "ply": Ply, "vnnlib": ExportVnnLib, "occupancy": Occupancy}
+_PARTS = {
+    "npz": Npz, "png": Png, "mp4": Mp4, "exr": Exr, "safetensors": Safetensors, "rrd": Rrd, "viser": Viser,
+    "statement": Statement, "ply": Ply, "vnnlib": ExportVnnLib, "occupancy": Occupancy, "schemas": Schemas,
+}  # fmt: skip
 Command = Union[tuple(Annotated[kind, tyro.conf.subcommand(name)] for name, kind in _PARTS.items())]  # noqa: UP007
+Options = (
+    Npz | Png | Mp4 | Exr | Safetensors | Rrd | Viser | Statement | Ply | ExportVnnLib | Occupancy | Schemas
+)  # fmt: skip
 
 
-def export(options: Npz | Png | Mp4 | Ply | ExportVnnLib | Occupancy) -> int:
+def export(options: Options) -> int:
     """Run the command; returns the exit code.
 
     Raises:
         InputError: A file or an option cannot be used.
     """
-    into = isinstance(options, (Png, ExportVnnLib))
-    target = options.output_dir if into else options.output_filename
+    target = getattr(options, "output_dir", None) or options.output_filename  # pyright: ignore[reportAttributeAccessIssue]
     try:
-        if not into:
+        if hasattr(options, "output_filename"):
             target.parent.mkdir(parents=True, exist_ok=True)
         if isinstance(options, ExportVnnLib):
             notes = _vnnlib(options)
         elif isinstance(options, Occupancy):
             notes = _occupancy(options)
         elif isinstance(options, Ply):
-            from ns_abstract.methods.splat.load import load_scene
-            from ns_abstract.methods.splat.ply import write_ply
-
-            scene = load_scene(options.load_config, options.overrides)
-            notes = [f"left out: {count:,} Gaussians with {reason}" for reason, count in scene.dropped.items()]
-            notes += [f"not in the file: {sentence}" for sentence in write_ply(scene, target)]
+            notes = _ply(options)
+        elif isinstance(options, Statement):
+            notes = _statement(options)
+        elif isinstance(options, Schemas):
+            notes = _schemas(options)
         else:
             notes = _path(options)
     except OSError as error:
@@ -165,6 +251,34 @@ def export(options: Npz | Png | Mp4 | Ply | ExportVnnLib | Occupancy) -> int:
         print(visible(note), file=sys.stderr)
     print(visible(str(target)))
     return DONE
+
+
+def _ply(options: Ply) -> list[str]:
+    from ns_abstract.methods.splat.load import load_scene
+    from ns_abstract.methods.splat.ply import write_ply
+
+    scene = load_scene(options.load_config, options.overrides)
+    notes = [f"left out: {count:,} Gaussians with {reason}" for reason, count in scene.dropped.items()]
+    return notes + [f"not in the file: {sentence}" for sentence in write_ply(scene, options.output_filename)]
+
+
+def _statement(options: Statement) -> list[str]:
+    from ns_abstract.api.statement import statement
+    from ns_abstract.io.atomic import write_json
+
+    content, notes = statement(options.input_dir)
+    write_json(options.output_filename, content)
+    return notes
+
+
+def _schemas(options: Schemas) -> list[str]:
+    from ns_abstract.api.schemas import schema_files
+    from ns_abstract.io.atomic import write_atomic
+
+    options.output_dir.mkdir(parents=True, exist_ok=True)
+    for name, content in schema_files().items():
+        write_atomic(options.output_dir / name, lambda stream, content=content: stream.write(content))
+    return []
 
 
 def _occupancy(options: Occupancy) -> list[str]:
@@ -202,54 +316,61 @@ def _occupancy(options: Occupancy) -> list[str]:
 def _vnnlib(options: ExportVnnLib) -> list[str]:
     from ns_abstract.api.certification import CertifySettings, open_certification
     from ns_abstract.api.job import check_frames
-    from ns_abstract.io.atomic import write_atomic
-    from ns_abstract.verify.cells import CellGrid
+    from ns_abstract.api.verifier_instances import InstanceFolder
 
     if options.timeout < 1:
         raise InputError(f"found {options.timeout}", field="--timeout", fix="give a number of at least 1")
     if any(n < 1 for n in options.parts):
         raise InputError(f"found {min(options.parts)}", field="--parts", fix="give numbers of at least 1")
-    settings = CertifySettings(
-        options.load_config,
-        options.camera_path_filename,
-        options.model,
-        options.property,
-        options.perturbation_filename,
-        arithmetic=options.arithmetic,
-        picture=options.picture,
-        given_set=given_set(options),
-        program=ProgramOptions(options.renderer, options.gsplat_version),
-        overrides=options.overrides,
+    if not re.fullmatch(r"[A-Za-z0-9_.-]{0,60}", options.prefix) or options.prefix.startswith("."):
+        raise InputError(f"found {options.prefix[:80]}", field="--prefix", fix="give letters, digits and _ . -")
+    if not options.model or len(options.property) not in (1, len(options.model)):
+        problem = f"{len(options.property)} properties for {len(options.model)} networks"
+        raise InputError(problem, field="--property", fix="give one for all networks, or one for each")
+    names = [f"{model.stem}_" if len(options.model) > 1 else "" for model in options.model]
+    if len(set(names)) < len(names):
+        raise InputError("two networks of one name", field="--model", fix="rename one")
+    folder = InstanceFolder(
+        options.output_dir, options.timeout, options.form, options.vnnlib_version, options.prefix, options.pictures
     )
-    job = open_certification(settings)
-    options.output_dir.mkdir(parents=True, exist_ok=True)
-    lines, boxes = [], {}
-    for frame in check_frames(options.frames, job.job.frame_count):
-        box = job.job.pose_sets[frame].box
-        parts = options.parts or (1,) * box.dimensions
-        try:
-            grid = CellGrid.fixed(box, parts, parts)
-        except InputError as error:
-            raise InputError(error.problem, field="--parts", fix=error.fix) from None
-        for k, cell in enumerate(grid.roots()):
-            one = grid.box_of(cell)
-            name = f"frame_{frame:05d}_box_{k:05d}"
-            written = job.write_vnnlib(frame, one, options.output_dir / name, options.form)
-            lines.append(",".join([*(file.name for file in written), str(options.timeout)]))
-            sides = zip(one.names, one.units, one.lower, one.upper, strict=True)
-            boxes[name] = [dict(zip(("name", "unit", "lower", "upper"), side, strict=True)) for side in sides]
-    for file, text in (("instances.csv", "\n".join(lines)), ("boxes.json", json.dumps(boxes, indent=1))):
-        content = f"{text}\n".encode()
-        write_atomic(options.output_dir / file, lambda stream, content=content: stream.write(content))
-    return list(job.property.notes)
+    if options.append:
+        folder.keep_earlier()
+    notes: list[str] = []
+    properties = options.property * (1 if len(options.property) > 1 else len(options.model))
+    for name, model, prop in zip(names, options.model, properties, strict=True):
+        settings = CertifySettings(
+            options.load_config,
+            options.camera_path_filename,
+            model,
+            prop,
+            options.perturbation_filename,
+            arithmetic=options.arithmetic,
+            picture=options.picture,
+            given_set=given_set(options),
+            program=ProgramOptions(options.renderer, options.gsplat_version),
+            overrides=options.overrides,
+        )
+        job = open_certification(settings)
+        for frame in check_frames(options.frames, job.job.frame_count):
+            folder.add(job, frame, options.parts, name)
+        notes += job.property.notes
+    folder.write_lists()
+    return list(dict.fromkeys(notes))
 
 
-def _path(options: Npz | Png | Mp4) -> list[str]:
+def _path(options: Npz | Png | Mp4 | Exr | Safetensors | Rrd | Viser) -> list[str]:
     from ns_abstract.report.export import Results, write_archive, write_pictures, write_video
+    from ns_abstract.report.interchange import write_exr, write_safetensors
 
     results = Results(options.input_dir)
     if isinstance(options, Npz):
         write_archive(results, options.output_filename)
+    elif isinstance(options, Exr):
+        write_exr(results, options.output_dir)
+    elif isinstance(options, Safetensors):
+        write_safetensors(results, options.output_dir)
+    elif isinstance(options, (Rrd, Viser)):
+        _recording(options, results)
     elif not options.pictures:
         raise InputError("none given", field="--pictures", fix="name at least one")
     elif isinstance(options, Png):
@@ -260,6 +381,31 @@ def _path(options: Npz | Png | Mp4) -> list[str]:
     if results.unbounded:
         notes.append(f"no bounds but [0, 1] in frames {', '.join(map(str, results.unbounded))}")
     return notes
+
+
+def _recording(options: Rrd | Viser, results: Results) -> None:
+    from ns_abstract.geometry.camera_path import load_camera_path
+    from ns_abstract.methods.splat.activate import SH_C0, activate
+    from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
+    from ns_abstract.methods.splat.load import load_scene
+    from ns_abstract.report.recordings import RecordedScene, write_rerun, write_viser
+
+    scene, cameras = None, ()
+    if options.load_config is not None:
+        splats = activate(load_scene(options.load_config, options.overrides), GSPLAT_1_4_0)
+        colors = splats.sh[:, 0] if splats.degree == 0 else SH_C0 * splats.sh[:, 0] + 0.5
+        scene = RecordedScene(splats.means, splats.axes, colors.clip(0.0, 1.0), splats.opacity)
+    if options.camera_path_filename is not None:
+        cameras = load_camera_path(options.camera_path_filename).cameras
+        if max(results.files) >= len(cameras):
+            problem = f"has {len(cameras)} cameras, the results have a frame {max(results.files)}"
+            raise InputError(problem, file=options.camera_path_filename, fix="give the path that was rendered")
+    if isinstance(options, Rrd):
+        write_rerun(results, cameras, scene, options.output_filename)
+        return
+    if not 0.01 <= options.seconds <= 3600.0:
+        raise InputError(f"found {options.seconds}", field="--seconds", fix="give a number from 0.01 to 3600")
+    write_viser(results, cameras, scene, options.output_filename, options.seconds)
 
 
 def main() -> None:

@@ -256,7 +256,7 @@ def quadrotor(dt: float, lag: float, gravity: float) -> Dynamics:
 #: m / s^2.
 _GRAVITY = 9.81
 
-_KEYS = {
+KEYS = {
     "affine": ("type", "A", "B", "c"),
     "unicycle": ("type", "speed"),
     "double integrator": ("type", "axes", "drag", "quadratic_drag"),
@@ -333,13 +333,13 @@ def parse_dynamics(value: Any, states: int, dt: float, folder: Path, fail: Fail)
     Raises:
         InputError: A key is unknown, or a value cannot be used.
     """
-    kinds = ", ".join(_KEYS)
+    kinds = ", ".join(KEYS)
     if not isinstance(value, Mapping):
         raise fail("dynamics", f"found {show(value)}", f"write an object with a type: {kinds}")
     kind = value.get("type")
-    if not isinstance(kind, str) or kind not in _KEYS:
+    if not isinstance(kind, str) or kind not in KEYS:
         raise fail("dynamics.type", f"found {show(kind)}", f"write one of {kinds}")
-    known(value, _KEYS[kind], "dynamics.", fail)
+    known(value, KEYS[kind], "dynamics.", fail)
     dynamics: Dynamics | LearnedDynamics
     if kind == "onnx":
         dynamics = LearnedDynamics(named_file(value.get("file"), "dynamics.file", folder, "an .onnx", fail), states)

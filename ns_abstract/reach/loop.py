@@ -37,7 +37,7 @@ Float64 = NDArray[np.float64]
 MOST_STEPS, _MOST_SETS, _MOST_OUTPUTS = 1000, 64, 64
 #: Poses that may be looked at: positions in normalised units, angles in radians.
 FARTHEST, _TURN = 1e4, 10.0
-_KEYS = (
+KEYS = (
     "version", "state", "units", "initial", "steps", "sampling_time", "dynamics", "disturbance", "camera", "network",
     "preprocess", "control", "unsafe", "goal", "output",
 )  # fmt: skip
@@ -240,7 +240,7 @@ def parse_loop(value: Any, folder: Path) -> Loop:
 
     if not isinstance(value, dict):
         raise fail("", f"found {show(value)}", "write an object")
-    known(value, _KEYS, "", fail)
+    known(value, KEYS, "", fail)
     if value.get("version") != 1 or isinstance(value.get("version"), bool):
         raise fail("version", f"found {show(value.get('version'))}", "write 1")
     names = _names(value.get("state"), fail)

@@ -6,7 +6,7 @@ import bisect
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -99,6 +99,23 @@ EXTRA_OUTPUT_ARRAYS = tuple(ExtraOutput.__dataclass_fields__)
 EXTRA_OUTPUTS = ("depth", "accumulation")
 
 
+class RenderedMaximum(NamedTuple):
+    """The largest value of a rendered picture, and the pose that shows it.
+
+    Attributes:
+        value: Over all pixels and channels.
+        pose: [d] parameter values, in the parameters' units.
+    """
+
+    value: float
+    pose: tuple[float, ...]
+
+
+def greater(*maxima: RenderedMaximum | None) -> RenderedMaximum | None:
+    """The first of the greatest ``maxima``; None where there is none."""
+    return max((m for m in maxima if m is not None), key=lambda m: m.value, default=None)
+
+
 @dataclass(frozen=True, repr=False)
 class SampleImages(ArrayRecord):
     """Concrete renders of some poses of a frame's set.
@@ -131,6 +148,7 @@ class FrameResult(ArrayRecord):
         layers: What else was bounded, by name, of `EXTRA_OUTPUTS`.
         views: Concrete renders across the set, where leaves are kept.
         problems: What is wrong with the arithmetic of a process that bounded some of it; nothing is guaranteed then.
+        largest: Where a largest value was searched for: the largest one rendered, and its parameter values [d].
     """
 
     index: int
@@ -149,6 +167,7 @@ class FrameResult(ArrayRecord):
     layers: Mapping[str, ExtraOutput] = field(default_factory=dict, repr=False)
     views: SampleImages | None = field(default=None, repr=False)
     problems: tuple[str, ...] = ()
+    largest: RenderedMaximum | None = None
 
 
 @dataclass(frozen=True, repr=False)
@@ -184,6 +203,7 @@ class PartResult(ArrayRecord):
     layers: Mapping[str, ExtraOutput] | None = field(default=None, repr=False)
     views: SampleImages | None = field(default=None, repr=False)
     problems: tuple[str, ...] = ()
+    largest: RenderedMaximum | None = None
 
 
 #: Of a part that has no point yet: [0, 1] everywhere.
@@ -237,6 +257,7 @@ def joined(parts: Sequence[PartResult], camera: Any) -> FrameResult:
         layers=layers,
         views=_joined_views([part.views for part in parts], order, camera) if bounded else None,
         problems=tuple(dict.fromkeys(problem for part in parts for problem in part.problems)),
+        largest=greater(*(part.largest for part in parts)),
     )
 
 

@@ -19,7 +19,7 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.arrays import Archive, open_archive
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.jsonio import parse_json
+from ns_abstract.io.jsonio import is_number, parse_json
 from ns_abstract.io.memory import check_memory
 from ns_abstract.refine.result import (
     EXTRA_OUTPUT_ARRAYS,
@@ -27,6 +27,7 @@ from ns_abstract.refine.result import (
     ExtraOutput,
     FrameResult,
     Leaves,
+    RenderedMaximum,
     SampleImages,
     TracePoint,
 )
@@ -41,6 +42,8 @@ LAYER_NAMES = {f"{name}_{array}": (name, array) for name in EXTRA_OUTPUTS for ar
 LEAVES = tuple(field.name for field in fields(Leaves))
 #: Arrays of a frame file with leaf cells: poses of the set, and what was rendered there.
 VIEWS = ("view_values", "view_images")
+#: Arrays of the frame file of a difference of two scenes.
+DIFFERENCES = ("difference_upper", "difference_lower")
 
 _NAME = re.compile(r"frame_(\d{5,})\.npz")
 _IGNORED = "the frame is computed again"
@@ -95,6 +98,10 @@ def check_frame(result: FrameResult) -> None:
     for name, layer in result.layers.items():
         _check_layer(name, layer, shape[:2], fail)
     box = result.box
+    if result.largest is not None:
+        value, pose = result.largest
+        if not (0.0 <= value <= float(result.witness_upper.max()) and box.contains(np.array(pose).reshape(-1))):
+            raise fail("the largest value is not one that was rendered of the set")
     if not len(box.names) == len(box.units) == len(box.lower) == len(box.upper):
         raise fail("the box has sides of different number")
     for name, low, high in zip(box.names, box.lower, box.upper, strict=True):
@@ -177,7 +184,8 @@ def save_frame(
     float32, ``parameters`` [d] (fields name, unit, lower, upper), ``record`` (a JSON text), the arrays
     [H, W] of further outputs as ``depth_lower``, ``accumulation_witness_upper`` and so on, and, where
     the result has leaves, the arrays of `ns_abstract.refine.result.Leaves` under their own names, and
-    ``view_values`` [n, d] and ``view_images`` [n, H, W, 3], renders across the set.
+    ``view_values`` [n, d] and ``view_images`` [n, H, W, 3], renders across the set. Of a difference of two scenes,
+    ``difference_upper`` and ``difference_lower`` are ``upper`` and ``witness_upper`` by their meaning.
 
     Args:
         path: The file; replaced if it exists.
@@ -204,9 +212,13 @@ def save_frame(
         ],
         "about": dict(about or {}),
     }
+    if result.largest is not None:
+        record["largest"] = [float(result.largest.value), [float(v) for v in result.largest.pose]]
     arrays: dict[str, np.ndarray] = {name: getattr(result, name) for name in IMAGES}
     arrays["parameters"] = _parameters(result.box)
     arrays["record"] = np.array(json.dumps(record, allow_nan=False))
+    if result.largest is not None:
+        arrays |= dict(zip(DIFFERENCES, (result.upper, result.witness_upper), strict=True))
     arrays |= {full: getattr(result.layers[n], a) for full, (n, a) in LAYER_NAMES.items() if n in result.layers}
     if result.leaves is not None:
         arrays |= {name: getattr(result.leaves, name) for name in LEAVES}
@@ -347,10 +359,21 @@ def _parse(archive: Archive, has_leaves: bool, read_leaves: bool) -> StoredFrame
         views=SampleImages(*(archive.read(name) for name in VIEWS))
         if read_leaves and set(VIEWS) <= set(archive.declared)
         else None,
+        largest=_maximum(record.get("largest")),
     )
     if record["status"] not in ("done", "partial", "missing"):
         raise InputError("the status is not one of done, partial, missing")
     return StoredFrame(result, record["status"], dict(record["about"]), has_leaves)
+
+
+def _maximum(stored: Any) -> RenderedMaximum | None:
+    if stored is None:
+        return None
+    if not (isinstance(stored, list) and len(stored) == 2 and isinstance(stored[1], list)):
+        raise InputError("the largest value is not a value and a pose")
+    if not all(is_number(v) for v in (stored[0], *stored[1])):
+        raise InputError("the largest value and its pose are not numbers")
+    return RenderedMaximum(float(stored[0]), tuple(map(float, stored[1])))
 
 
 def _integer(value: object) -> int:

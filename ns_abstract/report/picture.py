@@ -144,7 +144,7 @@ def frame_figure(
             image, cmap=GAP_COLORS if k == 2 else None, vmin=0.0, vmax=top if top > 0.0 else 1.0,
             interpolation="antialiased",
         )  # fmt: skip
-        _bare(axes)
+        bare_axes(axes)
         write(x, total_h - base - panel_h - px(0.075), label, _LABEL_POINTS, color=_INK)
         x += panel_w + px(_GUTTER)
         if k == 2:
@@ -183,7 +183,7 @@ def layer_figure(result: FrameResult, name: str) -> Figure:
             image, cmap=GAP_COLORS if image is length else _LAYER_COLORS, vmin=0.0, vmax=whole,
             interpolation="antialiased",
         )  # fmt: skip
-        _bare(place)
+        bare_axes(place)
         place.set_title(label, fontsize=_LABEL_POINTS, color=_INK)
         figure.colorbar(heat_map, ax=place, fraction=0.05, pad=0.02).ax.tick_params(labelsize=_TICK_POINTS)
     unit = " (units of the normalised frame)" if name == "depth" else ""
@@ -203,7 +203,8 @@ def save_layer_picture(path: str | os.PathLike[str], result: FrameResult, name: 
     )
 
 
-def _bare(axes: Axes) -> None:
+def bare_axes(axes: Axes) -> None:
+    """Take the ticks from a picture's axes and make their frame thin."""
     axes.set_xticks([])
     axes.set_yticks([])
     for spine in axes.spines.values():

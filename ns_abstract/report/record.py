@@ -23,7 +23,7 @@ from ns_abstract.io.folder import first_command, remove_parts, unwritable
 from ns_abstract.io.jsonio import file_size, is_number, load_json
 from ns_abstract.io.version import ADVISORY, stale
 from ns_abstract.io.version import VERSION as PACKAGE
-from ns_abstract.refine.result import ExtraOutput, FrameResult, TracePoint
+from ns_abstract.refine.result import ExtraOutput, FrameResult, TracePoint, greater
 from ns_abstract.report.figures import ShownUnits, layer_metrics, metrics, seconds_to, short_guarantee
 from ns_abstract.report.files import (
     StoredFrame,
@@ -261,6 +261,7 @@ def merged(older: FrameResult, newer: FrameResult) -> FrameResult:
         trace=older.trace + later,
         bounded=older.bounded or newer.bounded,
         layers={name: _merged_layer(older.layers[name], layer) for name, layer in newer.layers.items()},
+        largest=greater(older.largest, newer.largest),
     )
 
 

@@ -21,7 +21,7 @@ from ns_abstract.io.jsonio import FIX_MODERATE, is_moderate, show
 if TYPE_CHECKING:
     from ns_abstract.verify.network import ImageSets
 
-_KEYS = ("resize", "mean", "std", "layout", "channels", "range")
+KEYS = ("resize", "mean", "std", "layout", "channels", "range")
 
 
 @dataclass(frozen=True)
@@ -158,7 +158,7 @@ def parse_preprocess(value: Any) -> Preprocess:
 
     if not isinstance(value, dict):
         raise fail("", value, "write an object")
-    known(value, _KEYS, "preprocess.", lambda name, problem, fix: InputError(problem, field=name, fix=fix))
+    known(value, KEYS, "preprocess.", lambda name, problem, fix: InputError(problem, field=name, fix=fix))
 
     def numbers(name: str, count: int, default: tuple[float, ...]) -> tuple[float, ...]:
         numbers = value.get(name, list(default))

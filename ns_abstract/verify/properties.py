@@ -38,7 +38,7 @@ ANCHORS = ((1.19, 1.98), (2.79, 4.59), (4.53, 8.92), (8.06, 5.29), (10.32, 10.65
 _HEAD = _ANCHORS * (1 + _CLASSES + 4)
 #: Boxes looked at in a proof of a detection: the best of each cell's sample, and in all.
 _BEST, _CANDIDATES = 2, 6
-_COMPONENTS = ("camera.x", "camera.y", "camera.z", "object.x", "object.y", "object.z", "distance")
+COMPONENTS = ("camera.x", "camera.y", "camera.z", "object.x", "object.y", "object.z", "distance")
 
 
 @dataclass(frozen=True)
@@ -498,6 +498,8 @@ class _KeySetting(NamedTuple):
     outputs: int
     height: int
     width: int
+    input_shape: tuple[int, ...]
+    output_shape: tuple[int, ...]
 
 
 class _Type(NamedTuple):
@@ -541,12 +543,23 @@ def parse_property(root: Any, folder: Path, input_shape: tuple[int, ...], output
     known(root, (*_COMMON, *_TYPES[kind].keys), "", lambda name, problem, fix: InputError(problem, field=name, fix=fix))
     preprocess = parse_preprocess(root.get("preprocess", {}))
     height, width = preprocess.size(input_shape)
-    common: dict[str, Any] = {"preprocess": preprocess, "partitions": _partitions(root)}
-    setting = _KeySetting(folder, math.prod(input_shape), math.prod(output_shape), height, width)
+    common: dict[str, Any] = {"preprocess": preprocess, "partitions": parse_partitions(root)}
+    sizes = math.prod(input_shape), math.prod(output_shape), height, width
+    setting = _KeySetting(folder, *sizes, input_shape, output_shape)
     return _TYPES[kind].parse(root, setting, common)
 
 
-def _partitions(root: dict[str, Any]) -> tuple[int, ...] | None:
+def property_keys() -> dict[str, tuple[str, ...]]:
+    """Return the keys of a property file by its type, those of all types first."""
+    return {name: (*_COMMON, *kind.keys) for name, kind in _TYPES.items()}
+
+
+def parse_partitions(root: dict[str, Any]) -> tuple[int, ...] | None:
+    """Return the fixed partition that a parsed PROP.json asks for, or None.
+
+    Raises:
+        InputError: It is no number and no list of numbers.
+    """
     value = root.get("partitions")
     if value is None:
         return None
@@ -571,8 +584,8 @@ def _regression(root: dict[str, Any], setting: _KeySetting, common: dict[str, An
         target = [f"{target}.{axis}" for axis in "xyz"]
     elif target == "distance":
         target = [target]
-    if not isinstance(target, list) or not all(is_moderate(v) or v in _COMPONENTS for v in target):
-        names = f"numbers ({FIX_MODERATE}) or {', '.join(_COMPONENTS)}"
+    if not isinstance(target, list) or not all(is_moderate(v) or v in COMPONENTS for v in target):
+        names = f"numbers ({FIX_MODERATE}) or {', '.join(COMPONENTS)}"
         raise _fail("target", root.get("target"), f"write camera, object, distance, or a list of {names}")
     if len(target) != outputs:
         raise InputError(
@@ -648,7 +661,7 @@ def _vnnlib(root: dict[str, Any], setting: _KeySetting, common: dict[str, Any]) 
         file = file_beside(setting.folder, name)
     except InputError as error:
         raise InputError(error.problem, field="file", fix=error.fix) from None
-    return VnnLibProperty(file=file, unsafe=load_vnnlib(file, setting.outputs, setting.inputs), **common)
+    return VnnLibProperty(file=file, unsafe=load_vnnlib(file, setting.output_shape, setting.input_shape), **common)
 
 
 _TYPES = {

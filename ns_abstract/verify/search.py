@@ -185,6 +185,7 @@ class Search:
         block: Most cells examined together.
         cuts: Whether cells without a verdict are cut; else they are done with.
         cover: Proves cells that are too wide part by part; None: they are cut.
+        costly: Whether bounds of the model cost so much that cells whose sets are wide are cut without them.
     """
 
     def __init__(
@@ -198,7 +199,9 @@ class Search:
         block: int = BLOCK,
         cuts: bool = True,
         cover: SubBoxProof | None = None,
+        costly: bool = True,
     ) -> None:
+        self.costly = costly
         self.scene, self.model, self.claim, self.grid = scene, model, claim, grid
         self.every_unit, self.cuts, self.cover = every_unit, cuts, cover
         self.block = block if cover is None else min(block, cover.block)
@@ -414,8 +417,10 @@ class Search:
             sets = PictureSets(cell.box, linear, lower, upper)
             if not sets.sane:
                 reasons[number] = "the image's bounds are not finite or cross"
-            elif (self._splittable(cell.cell) or self._coverable(cell.cell)) and self._too_wide(
-                cell, number, sets, costs
+            elif (
+                self.costly
+                and (self._splittable(cell.cell) or self._coverable(cell.cell))
+                and self._too_wide(cell, number, sets, costs)
             ):
                 reasons[number] = "the image's bounds are too wide"
                 if self._coverable(cell.cell):

@@ -1,6 +1,7 @@
-"""Read VNN-LIB files (version 1): sets of unsafe outputs, and boxes of inputs.
+"""Read VNN-LIB files (versions 1 and 2): sets of unsafe outputs, and boxes of inputs.
 
-Only what the format's users write is read: ``declare-const``, and ``assert`` of ``<=``, ``>=``, ``and``,
+Only what the format's users write is read: ``declare-const`` (of version 2: `ns_abstract.verify.vnnlib2`), and
+``assert`` of ``<=``, ``>=``, ``and``,
 ``or`` over bounds of single inputs and linear expressions of the outputs. In certificates of scenes bounds of the
 inputs are set aside: the images take their place.
 
@@ -10,7 +11,9 @@ factors are multiplied by powers of two, which changes no sign: no overflow may 
 
 from __future__ import annotations
 
+import math
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -20,6 +23,7 @@ import numpy as np
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import read_text
 from ns_abstract.io.packed import unpacked
+from ns_abstract.verify.vnnlib2 import Query, is_version_2, joined, parse_query
 
 _LIMIT = 64 << 20
 _TOKEN = re.compile(r'\s+|;[^\n]*|(?P<text>[()]|"[^"]*"|[^\s();"]+)|(?P<bad>.)', re.DOTALL)
@@ -87,22 +91,41 @@ class _VariableCounts(NamedTuple):
     outputs: int
 
 
-def load_vnnlib(path: Path, output_size: int, input_size: int | None = None) -> UnsafeSet:
+#: A network's shape without the batch, or its number of elements.
+Shape = Sequence[int] | int
+
+
+def _size(shape: Shape) -> int:
+    return shape if isinstance(shape, int) else math.prod(shape)
+
+
+def load_vnnlib(path: Path, output_shape: Shape, input_shape: Shape | None = None) -> UnsafeSet:
     """Read a VNN-LIB file, packed (.gz) or not.
 
     Args:
         path: The file.
-        output_size: Number of the network's outputs; as many must be declared.
-        input_size: Number of its inputs; as many must be declared, or none. None: not compared.
+        output_shape: Of the network; as many outputs must be declared.
+        input_shape: Of the network; as many inputs must be declared, or none. None: not compared.
 
     Raises:
         InputError: The file cannot be read or says something that is not understood.
     """
     text = _text(path)
     try:
-        return _parse(_expressions(text), output_size, input_size)
+        expressions, _ = _read(text, input_shape, output_shape)
+        inputs = None if input_shape is None else _size(input_shape)
+        return _parse(expressions, _size(output_shape), inputs)
     except InputError as error:
         raise error.within(path) from None
+
+
+def _read(text: str, input_shape: Shape | None, output_shape: Shape) -> tuple[list[Any], Query | None]:
+    """The expressions of version 1 that a file means, and the query that a file of version 2 is."""
+    if not is_version_2(text):
+        return _expressions(text), None
+    expressions = _expressions(joined(text))
+    query = parse_query(expressions, input_shape, output_shape)
+    return query.expressions, query
 
 
 def _text(path: Path) -> str:
@@ -127,20 +150,30 @@ def _check_declared(declared: set[str], kind: str, count: int) -> None:
         )
 
 
-def load_regions(path: Path, input_size: int, output_size: int, text: str | None = None) -> tuple[InputRegion, ...]:
+def load_regions(
+    path: Path, input_shape: Shape, output_shape: Shape, text: str | None = None
+) -> tuple[InputRegion, ...]:
     """Read a VNN-LIB file with its inputs: the property is violated if some region has an input with an unsafe output.
 
     Args:
         path: The file; only named in errors if ``text`` is given.
-        input_size, output_size: Numbers of the network's inputs and outputs.
+        input_shape, output_shape: Of the network.
         text: Its contents.
 
     Raises:
         InputError: As `load_vnnlib`, or an input has no bounds.
     """
+    return load_query(path, input_shape, output_shape, text)[0]
+
+
+def load_query(
+    path: Path, input_shape: Shape, output_shape: Shape, text: str | None = None
+) -> tuple[tuple[InputRegion, ...], Query | None]:
+    """`load_regions` with the query that a file of version 2 is; None for version 1."""
     text = _text(path) if text is None else text
     try:
-        return _regions(_expressions(text), _VariableCounts(input_size, output_size))
+        expressions, query = _read(text, input_shape, output_shape)
+        return _regions(expressions, _VariableCounts(_size(input_shape), _size(output_shape))), query
     except InputError as error:
         raise error.within(path) from None
 

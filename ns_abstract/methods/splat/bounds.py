@@ -37,7 +37,9 @@ from ns_abstract.methods.splat.stage_data import (
     CellPoses,
     Colors,
     Cutoffs,
+    FormShape,
     PixelBounds,
+    PixelInputs,
     ProjectedGaussians,
     SceneColors,
     SceneGaussians,
@@ -150,6 +152,14 @@ class SceneSums:
         return min(float(step.min(initial=np.inf)) for step in steps)
 
 
+def _cell_poses(forms: PoseForms) -> CellPoses:
+    """The cell's poses as the Gaussians' stage takes them."""
+    rotation, position = (
+        np.maximum(np.abs(low), np.abs(high)) for low, high in (forms.rotation.bounds(), forms.position.bounds())
+    )
+    return CellPoses(forms.rotation.data, forms.offset.data, forms.origin, position, rotation.ravel())
+
+
 class SplatBounds:
     """Bounds the pictures of one scene.
 
@@ -226,68 +236,73 @@ class SplatBounds:
         Raises:
             ValueError: Linear sets or layers are asked for together with ``parts``, or these are not as above.
         """
-        splats = self.splats
         if parts is not None:
             check_parts(parts, forms.rotation.basis.dimensions)
             if keep_linear or layers:
                 raise ValueError("intervals over parts of a cell have no linear sets and no layers")
         shape = form_shape(forms.rotation.basis, 0 if parts is None else int(parts.prod()))
-        d, m = shape.dimensions, shape.monomials
         across, down = tile_grid(camera, self.side)
-        if wanted is None:
-            wanted = np.arange(across * down)
-        wanted = np.asarray(wanted, np.int64)
+        wanted = np.asarray(np.arange(across * down) if wanted is None else wanted, np.int64)
         if candidates is None:
-            candidates = np.arange(splats.count, dtype=np.int32)
-        n = candidates.size
-        view = camera.intrinsics
-        rotation, offset = forms.rotation.data, forms.offset.data
-        low, high = forms.rotation.bounds()
-        rotation_magnitude = np.maximum(np.abs(low), np.abs(high)).ravel()
-        low, high = forms.position.bounds()
-        camera_magnitude = np.maximum(np.abs(low), np.abs(high))
-        gaussians, state = self._room(n, m), self._buffer("state", (n,), np.uint8)
-        poses = CellPoses(rotation, offset, forms.origin, camera_magnitude, rotation_magnitude)
-        gaussian_stage(candidates, self._sums.gaussians, poses, view, self.rules, self.charges, shape, gaussians, state)
-        alive = np.flatnonzero(state)
-        colors = self._colors(forms, camera_magnitude, candidates, alive, n)
-        mask = tile_mask(wanted, across * down)
-        offsets, entries = tile_lists(depth_order(alive, gaussians.depth), gaussians.tiles, mask, across)
-        shaped = (wanted.size, self.side, self.side, 3)
-        pixel_bounds = PixelBounds(
-            lower=np.zeros(shaped),
-            upper=np.zeros(shaped),
-            linear=np.zeros((wanted.size if keep_linear else 0, *shaped[1:], m + 1)),
-            layers=np.zeros((wanted.size if layers else 0, self.side, self.side, 4)),
-            slopes=np.zeros((wanted.size, d)),
-            statistics=np.zeros((threads(), 5), np.int64),
-            marks=np.zeros(n, np.uint8),
+            candidates = np.arange(self.splats.count, dtype=np.int32)
+        poses = _cell_poses(forms)
+        gaussians, alive = self._projected(candidates, poses, camera, shape)
+        colors = self._colors(forms, poses.camera_magnitude, candidates, alive, candidates.size)
+        offsets, entries = tile_lists(
+            depth_order(alive, gaussians.depth), gaussians.tiles, tile_mask(wanted, across * down), across
         )
+        m = shape.monomials
         common = np.zeros(m + 1)
         if layers:
             colors = _four_channels(colors, self._depths(poses, candidates, alive, gaussians.delta, m), alive, m)
-            common = np.ascontiguousarray(offset[: m + 1, 2])
-        pixel_stage(
-            TileLists(wanted, offsets, entries),
-            pixel_sets(np.broadcast_to(True, pixel_bounds.lower.shape[:3]) if pixels is None else pixels),
+            common = np.ascontiguousarray(poses.offset[: m + 1, 2])
+        bounds = self._unset_bounds(wanted.size, candidates.size, shape, keep_linear, layers)
+        inputs = PixelInputs(
             gaussians,
-            self._viewing_axes(forms, rotation_magnitude, gaussians),
-            view,
-            Colors(colors, splats.background, self._sums.color_radius, 4 if layers else 3, common),
+            self._viewing_axes(forms, poses.rotation_magnitude, gaussians),
+            camera.intrinsics,
+            Colors(colors, self.splats.background, self._sums.color_radius, 4 if layers else 3, common),
             self.rules,
             self.charges,
             self._cutoffs(floor),
             shape,
-            cell_parts(np.ones(d, np.int64) if parts is None else parts),
-            pixel_bounds,
+            cell_parts(np.ones(shape.dimensions, np.int64) if parts is None else parts),
         )
+        sets = pixel_sets(np.broadcast_to(True, bounds.lower.shape[:3]) if pixels is None else pixels)
+        pixel_stage(TileLists(wanted, offsets, entries), sets, inputs, bounds)
         return CellBounds(
-            wanted, pixel_bounds.lower, pixel_bounds.upper,
-            *visible_again(pixel_bounds.marks, candidates, gaussians.box, gaussians.tiles, self.side),
-            pixel_bounds.linear if keep_linear else None, pixel_bounds.layers if layers else None,
-            pixel_bounds.slopes.sum(axis=0) / (max(wanted.size, 1) * self.side**2 * 3),
-            pixel_bounds.statistics.sum(axis=0),
+            wanted, bounds.lower, bounds.upper,
+            *visible_again(bounds.marks, candidates, gaussians.box, gaussians.tiles, self.side),
+            bounds.linear if keep_linear else None, bounds.layers if layers else None,
+            bounds.slopes.sum(axis=0) / (max(wanted.size, 1) * self.side**2 * 3), bounds.statistics.sum(axis=0),
         )  # fmt: skip
+
+    def _projected(
+        self, candidates: np.ndarray, poses: CellPoses, camera: PinholeCamera, shape: FormShape
+    ) -> tuple[ProjectedGaussians, np.ndarray]:
+        """The candidates' forms, and the places [k] of those that some pose shows."""
+        n = candidates.size
+        gaussians, state = self._room(n, shape.monomials), self._buffer("state", (n,), np.uint8)
+        gaussian_stage(
+            candidates, self._sums.gaussians, poses, camera.intrinsics, self.rules, self.charges, shape, gaussians,
+            state,
+        )  # fmt: skip
+        return gaussians, np.flatnonzero(state)
+
+    def _unset_bounds(
+        self, tiles: int, gaussians: int, shape: FormShape, keep_linear: bool, layers: bool
+    ) -> PixelBounds:
+        """The output of the pixel stage for so many tiles and candidates, not filled in."""
+        shaped = (tiles, self.side, self.side, 3)
+        return PixelBounds(
+            lower=np.zeros(shaped),
+            upper=np.zeros(shaped),
+            linear=np.zeros((tiles if keep_linear else 0, *shaped[1:], shape.monomials + 1)),
+            layers=np.zeros((tiles if layers else 0, self.side, self.side, 4)),
+            slopes=np.zeros((tiles, shape.dimensions)),
+            statistics=np.zeros((threads(), 5), np.int64),
+            marks=np.zeros(gaussians, np.uint8),
+        )
 
     def _room(self, n: int, m: int) -> ProjectedGaussians:
         """Memory for ``n`` Gaussians' forms of ``m`` coefficients."""

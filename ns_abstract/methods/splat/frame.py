@@ -91,6 +91,7 @@ class TileBounds:
         context: For the cells inside this one.
         linear: (A_lower, b_lower, A_upper, b_upper) as in `ns_abstract.refine.result.Leaves`, or None.
         trivial: Blocks of pixels where too many depth orders were open, so that nothing is known.
+        forms: Polynomials before the clamp, with linear bounds.
     """
 
     lower: np.ndarray
@@ -99,6 +100,7 @@ class TileBounds:
     context: VisibleContext
     linear: LinearSets | None
     trivial: int
+    forms: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -309,7 +311,7 @@ class SplatFrame:
             assert cell.linear is not None
             linear = linear_sets(cell.linear, cell.lower, cell.upper, box.dimensions)
         slopes = cell.slopes if parts is None else self._all_slopes(box, cell.slopes, parts)
-        return TileBounds(lower, upper, slopes, context, linear, int(cell.statistics[3]))
+        return TileBounds(lower, upper, slopes, context, linear, int(cell.statistics[3]), cell.linear)
 
     @cached_property
     def _pace(self) -> np.ndarray:

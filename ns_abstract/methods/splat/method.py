@@ -24,9 +24,10 @@ from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.load import load_scene
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.methods.splat.variations import VariedSplats, vary
+from ns_abstract.methods.splat.weights import SplatWeightFrame, WhiteGaussians, plane_mask
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.perturbation.variations import SceneVariation
-from ns_abstract.refine.protocol import MOST_PARTS, Frame, SceneElements
+from ns_abstract.refine.protocol import MOST_PARTS, Frame, SceneElements, WeightPlane
 
 if TYPE_CHECKING:
     import torch
@@ -108,6 +109,18 @@ class SplatMethod:
             self.splats, self.rasteriser, self.arithmetic, poses, varied=varied, sheared=sheared, layers=layers,
             reference=self._slow, sums=sums,
         )  # fmt: skip
+
+    def weight_frame(self, poses: PoseBox, planes: Sequence[WeightPlane], pixels: np.ndarray) -> SplatWeightFrame:
+        """See `ns_abstract.refine.protocol.WeightMethod`; tiles of which no pixel is read cost nothing anyway.
+
+        Raises:
+            InputError: A selection picks no Gaussian.
+        """
+        masks = [plane_mask(self.scene, self.splats.opacity, plane) for plane in planes]
+        varied = self.varied(poses.perturbation.scene)
+        sums = self._sums[poses.perturbation.scene]
+        white = WhiteGaussians.of(masks, [plane.nearer for plane in planes])
+        return SplatWeightFrame(white, self.splats, self.rasteriser, self.arithmetic, poses, varied, sums, self._slow)
 
     def ablations(self, poses: PoseBox) -> Iterator[tuple[str, SplatFrame]]:
         """See `Method.ablations`."""

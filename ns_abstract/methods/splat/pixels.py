@@ -11,11 +11,8 @@ import math
 import numpy as np
 from numba import njit
 
-from ns_abstract.arithmetic.rounding import Charges
 from ns_abstract.arithmetic.simd.intrinsics import borrowed, lowest_bit, pointer, signed, taken
-from ns_abstract.geometry.camera_path import Intrinsics
 from ns_abstract.methods.splat.blend import shade
-from ns_abstract.methods.splat.constants import RasterRules
 from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW, DEPTH_HIGH, DEPTH_LOW, shade_layers
 from ns_abstract.methods.splat.fragments import GIVE_UP, GROW, apply_stops, collect_fragments, number_groups
 from ns_abstract.methods.splat.lists import BLOCK, TileLists, block_lists, longest_first
@@ -23,8 +20,6 @@ from ns_abstract.methods.splat.pixel_block import BlockPlace, block_of, longest_
 from ns_abstract.methods.splat.reordering import swap_bounds
 from ns_abstract.methods.splat.stage_data import (
     Colors,
-    Cutoffs,
-    FormShape,
     Parts,
     PixelBounds,
     PixelInputs,
@@ -94,8 +89,9 @@ def _bound_block(numbers, place, inputs, block, bounds):
 
 
 @njit(cache=True, error_model="numpy")
-def _borrowed_inputs(gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape, parts):
+def _borrowed_inputs(inputs):
     """The `PixelInputs` without references to the arrays' owners."""
+    gaussians, axes, colors, parts = inputs.gaussians, inputs.axes, inputs.colors, inputs.parts
     gaussians = ProjectedGaussians(
         borrowed(gaussians.record), borrowed(gaussians.box), borrowed(gaussians.tiles), borrowed(gaussians.depth),
         borrowed(gaussians.delta), borrowed(gaussians.depth_error),
@@ -105,7 +101,9 @@ def _borrowed_inputs(gaussians, axes, intrinsics, colors, rules, charges, cutoff
         borrowed(colors.values), borrowed(colors.background), colors.error, colors.channels, borrowed(colors.common)
     )
     parts = Parts(pointer(parts.middles), pointer(parts.half), pointer(parts.slope))
-    return PixelInputs(gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape, parts)
+    return PixelInputs(
+        gaussians, axes, inputs.intrinsics, colors, inputs.rules, inputs.charges, inputs.cutoffs, inputs.shape, parts
+    )
 
 
 @njit(cache=True, error_model="numpy")
@@ -120,12 +118,10 @@ def _tile_bounds(bounds, number, thread):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _pixel_worker(
-    share, lists, pixels, gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape, parts, bounds
-):
+def _pixel_worker(share, lists, pixels, inputs, bounds):
     """One thread's tiles; see `ThreadShare` and `pixel_stage`."""
     sequence, counter = borrowed(share.sequence), pointer(share.counter)
-    inputs = _borrowed_inputs(gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape, parts)
+    inputs = _borrowed_inputs(inputs)
     camera = inputs.intrinsics
     side = bounds.lower.shape[1]
     tiles_x = int(math.ceil(camera.width / side))
@@ -164,29 +160,17 @@ def _pixel_worker(
     return len(buffers)
 
 
-def pixel_stage(
-    lists: TileLists, pixels: np.ndarray, gaussians: ProjectedGaussians, axes: ViewingAxes, intrinsics: Intrinsics,
-    colors: Colors, rules: RasterRules, charges: Charges, cutoffs: Cutoffs, shape: FormShape, parts: Parts,
-    bounds: PixelBounds,
-) -> None:  # fmt: skip
+def pixel_stage(lists: TileLists, pixels: np.ndarray, inputs: PixelInputs, bounds: PixelBounds) -> None:
     """Bounds of the pixels of the tiles ``lists.wanted`` (design.md, B).
 
     Args:
         lists: Of all tiles of the image.
         pixels: [t, blocks] the set of the pixels of each block that are wanted, blocks row by row; nothing is known of
             the others.
-        gaussians: Projected.
-        axes: What decides their order.
-        intrinsics: The camera's.
-        colors: Of the Gaussians.
-        rules: The rasteriser's.
-        charges: For the program's rounding.
-        cutoffs: What is left out.
-        shape: Of the Gaussians' forms.
-        parts: Of the cell, where ``shape`` has some; then no linear sets and no layers are found.
+        inputs: Of the cell; where it has parts, no linear sets and no layers are found.
         bounds: The output; one row of its statistics for each thread.
     """
     run_by_tiles(
-        _pixel_worker, longest_first(lists.wanted, lists.offsets), bounds.statistics.shape[0],
-        lists, pixels, gaussians, axes, intrinsics, colors, rules, charges, cutoffs, shape, parts, bounds,
+        _pixel_worker, longest_first(lists.wanted, lists.offsets), bounds.statistics.shape[0], lists, pixels, inputs,
+        bounds,
     )  # fmt: skip

@@ -254,7 +254,19 @@ class PixelBounds(NamedTuple):
 
 
 class PixelInputs(NamedTuple):
-    """All that the pixel stage reads of a cell."""
+    """All that the pixel stage reads of a cell.
+
+    Attributes:
+        gaussians: Projected.
+        axes: What decides their order.
+        intrinsics: The camera's.
+        colors: Of the Gaussians.
+        rules: The rasteriser's.
+        charges: For the program's rounding.
+        cutoffs: What is left out.
+        shape: Of the Gaussians' forms.
+        parts: Of the cell, where ``shape`` has some.
+    """
 
     gaussians: ProjectedGaussians
     axes: ViewingAxes

@@ -1,0 +1,285 @@
+"""Bounds of the largest value of a `DifferenceFrame`, then of all its pixels (design.md, Y4)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ns_abstract.execution.cancellation import WorkCancelledError, cancel_when
+from ns_abstract.geometry.tiles import assemble, in_tiles
+from ns_abstract.refine.difference import DifferenceFrame
+from ns_abstract.refine.engine import Refinement
+from ns_abstract.refine.frame_tiles import pixels_inside
+from ns_abstract.refine.goal import RefinementGoal
+from ns_abstract.refine.result import FrameResult, PartResult, TracePoint, greater
+
+
+@dataclass(frozen=True)
+class LargestTuning:
+    """How the time of a frame is divided. None of the numbers decides whether a bound holds.
+
+    Attributes:
+        poses: Random poses rendered in the search for the largest value.
+        corners: Most corners of the set rendered there.
+        starts: Best poses from which the search climbs.
+        first_step: Its first step, as a part of each parameter's range.
+        halvings: Times that the step is halved.
+        search_share: Part of the time that the search may take.
+        floors: Ratios to the largest rendered value up to which values are left open, one pass each, before the one
+            that the goal asks for.
+        room: What a pass leaves open at least beyond the largest rendered value.
+        pass_share: Part of the time left that a pass may take, where others follow.
+    """
+
+    poses: int = 48
+    corners: int = 16
+    starts: int = 3
+    first_step: float = 0.125
+    halvings: int = 7
+    search_share: float = 0.15
+    floors: tuple[float, ...] = (1.3,)
+    room: float = 1e-3
+    pass_share: float = 0.7
+
+
+TUNING = LargestTuning()
+
+
+def search_largest(
+    frame: DifferenceFrame, seed: int, over: Callable[[], bool], tuning: LargestTuning = TUNING
+) -> np.ndarray:
+    """Render poses where the difference may be largest; returns the greatest values rendered [T, side, side, 3].
+
+    ``frame.largest`` is then the best pose. At least the middle of the set is rendered.
+    """
+    box, random = frame.box, np.random.default_rng(seed)
+    greatest = frame.render(box.middle)
+
+    def look(values: np.ndarray) -> float:
+        nonlocal greatest
+        picture = frame.render(values)
+        greatest = np.maximum(greatest, picture)
+        return float(picture[inside].max(initial=0.0))
+
+    inside = pixels_inside(frame)
+    if not box.dimensions:
+        return greatest
+    corners = box.corners() if box.dimensions <= 4 else box.corners()[random.permutation(2**box.dimensions)]
+    scored: list[tuple[float, np.ndarray]] = []
+    for values in (box.middle, *corners[: tuning.corners], *box.sample(tuning.poses, random)):
+        if over():
+            break
+        scored.append((look(values), values))
+    scored.sort(key=lambda entry: -entry[0])
+    low, high = np.array(box.lower), np.array(box.upper)
+    for value, values in scored[: tuning.starts]:
+        step = tuning.first_step * (high - low)
+        for _ in range(tuning.halvings):
+            for values_near in _neighbours(values, step, low, high):
+                if over():
+                    return greatest
+                if (found := look(values_near)) > value:
+                    value, values = found, values_near
+            step = 0.5 * step
+    return greatest
+
+
+def _neighbours(values: np.ndarray, step: np.ndarray, low: np.ndarray, high: np.ndarray) -> Iterator[np.ndarray]:
+    for axis in range(values.size):
+        for sign in (1.0, -1.0):
+            moved = values.copy()
+            moved[axis] = np.clip(values[axis] + sign * step[axis], low[axis], high[axis])
+            yield moved
+
+
+class LargestDifference:
+    """Bounds a difference's largest value and every pixel of it (design.md, Y4).
+
+    A pass is a `Refinement` that leaves values up to a floor open: cells and pixels below it cost nothing. Passes have
+    lower and lower floors; the last one has none. What each of them finds holds, so that the least is taken.
+
+    Args:
+        whole: The difference over the set, in the set's own parameters; its renders are searched for the worst pose.
+        frame: The difference that is bounded: ``whole``, or one whose box counts parameters otherwise.
+        index: The frame's number.
+        goal: When to stop: ``ratio`` is meant of the largest bound to the largest value rendered, then of the means.
+        seed: Of the random poses.
+        tolerance: Value of which is asked whether all stay below it; the work ends once that is decided.
+        stopped: Asked between cells.
+        progress: Called with (trace point, covered part of the set); ``mpg`` and ``mpg_witness`` of its points are
+            the largest bound and the largest value rendered.
+        tiles: Numbers of the tiles; None: all.
+        known: What was found before of the same set.
+        tuning: How the time is divided.
+    """
+
+    def __init__(
+        self,
+        whole: DifferenceFrame,
+        frame: DifferenceFrame,
+        index: int,
+        goal: RefinementGoal,
+        *,
+        seed: int = 0,
+        tolerance: float | None = None,
+        stopped: Callable[[], bool] = lambda: False,
+        progress: Callable[[TracePoint, float], None] = lambda point, share: None,
+        tiles: np.ndarray | None = None,
+        known: FrameResult | None = None,
+        tuning: LargestTuning = TUNING,
+    ) -> None:
+        self.whole, self.frame, self.index, self.goal, self.seed = whole, frame, index, goal, seed
+        self.tolerance, self.stopped, self.progress, self.tuning = tolerance, stopped, progress, tuning
+        self.tiles = np.arange(frame.tile_count) if tiles is None else np.asarray(tiles, np.int64)
+        shape = frame.tile_count, frame.side, frame.side, frame.channels
+        self.upper, self.rendered = np.ones(shape, np.float32), np.zeros(shape, np.float32)
+        self.inside = pixels_inside(frame)
+        self.bounded = False
+        self.before = None if known is None else known.largest
+        if known is not None:
+            self.upper, self.rendered = (in_tiles(p, frame.side) for p in (known.upper, known.witness_upper))
+            self.bounded = known.bounded
+        self.cells, self.trace = 0, []
+        self.begin = time.perf_counter()
+
+    def _late(self) -> bool:
+        return self.stopped() or self._left() <= 0.0
+
+    def _left(self) -> float:
+        return self.goal.seconds - (time.perf_counter() - self.begin)
+
+    def _most(self, pictures: np.ndarray) -> float:
+        """Largest value of the tiles that are bounded."""
+        return float(pictures[self.tiles][self.inside[self.tiles]].max(initial=0.0))
+
+    @property
+    def _largest_rendered(self) -> float:
+        """Of the whole picture, so that parts of a frame have one goal."""
+        return float(self.rendered[self.inside].max(initial=0.0))
+
+    def run(self) -> PartResult:
+        """Search, then bound until the goal is reached; sound whenever it ends.
+
+        Raises:
+            WorkCancelledError: ``stopped`` was true before a first picture was there.
+        """
+        with cancel_when(self.stopped):
+            # the first call compiles kernels, and the clock starts after it
+            middle = self.whole.render(self.whole.box.middle)
+            self.begin = time.perf_counter()
+            self.rendered = np.maximum(self.rendered, middle)
+            search = self.tuning.search_share * self.goal.seconds
+            with suppress(WorkCancelledError):
+                found = search_largest(
+                    self.whole,
+                    self.seed,
+                    lambda: self._late() or self._left() < self.goal.seconds - search,
+                    self.tuning,
+                )
+                self.rendered = np.maximum(self.rendered, found)
+        self._record()
+        # every pixel once, as a whole
+        self._bound(0.0, 1.0, lambda refinement: refinement.covered)
+        for floor, share in self._passes():
+            if self._late():
+                break
+            self._bound(floor, share)
+        return self._result(middle)
+
+    def _passes(self) -> Iterator[tuple[float, float]]:
+        """Floors and parts of the time left, until the goal is reached."""
+        if self.tolerance is not None:
+            if not self._decided:
+                yield self.tolerance, 1.0
+            return
+        ratios = (*(ratio for ratio in self.tuning.floors if ratio > self.goal.ratio), self.goal.ratio)
+        for ratio in ratios:
+            floor = max(ratio * self._largest_rendered, self._largest_rendered + self.tuning.room)
+            if self._most(self.upper) > floor:
+                yield floor, self.tuning.pass_share
+        yield 0.0, 1.0
+
+    @property
+    def _decided(self) -> bool:
+        """Whether it is known that all values stay within the tolerance, or that one does not."""
+        assert self.tolerance is not None
+        return self._most(self.upper) <= self.tolerance or self._largest_rendered > self.tolerance
+
+    def _bound(
+        self, floor: float, share: float, enough: Callable[[Refinement], bool] = lambda refinement: False
+    ) -> None:
+        """One pass over the tiles with values above the floor, in a part of the time left, or until ``enough``."""
+        camera, least = self.frame.camera, np.float32(floor)
+        loose = self.upper > np.maximum(self.goal.ratio * self.rendered, least)
+        here = self.tiles[(loose & self.inside[..., None])[self.tiles].any(axis=(1, 2, 3))]
+        if not here.size:
+            return
+        upper, rendered = (assemble(np.maximum(p, least), camera) for p in (self.upper, self.rendered))
+        lowest = np.full_like(upper, least)
+        known = FrameResult(self.index, self.frame.box, lowest, upper, lowest, rendered, rendered, 0.0, 0)
+        started = time.perf_counter()
+
+        def told(point: TracePoint, covered: float) -> None:
+            most = float(refinement.leaves.upper[refinement.tiles.inside].max(initial=0.0))
+            most = min(self._most(self.upper), max(most, others))
+            seconds = started - self.begin + point.seconds
+            now = TracePoint(seconds, self.cells + point.cells, most, self._largest_rendered, covered)
+            self.progress(now, 1.0 if self.bounded else covered)
+
+        others = self._most(np.where(np.isin(np.arange(len(self.upper)), here)[:, None, None, None], 0.0, self.upper))
+        # nothing above the floor is to be left open; without a floor, means are measured
+        goal = replace(self.goal, ratio=self.goal.ratio if floor == 0.0 else 1.0, seconds=share * self._left())
+        frame = self.frame.above(floor)
+        refinement = Refinement(
+            frame, self.index, goal, seed=self.seed, stopped=lambda: self._late() or enough(refinement),
+            progress=told, tiles=here, known=known,
+        )  # fmt: skip
+        try:
+            part = refinement.run_part()
+        except WorkCancelledError:
+            return
+        self.cells += part.cells
+        if self.frame is self.whole:
+            # poses of the same parameters
+            self.whole.largest = greater(self.whole.largest, frame.largest)
+        if not refinement.covered:
+            return
+        self.bounded = self.bounded or here.size == self.tiles.size
+        self.upper[here] = np.minimum(self.upper[here], part.upper)
+        # values at the floor were not rendered
+        seen = np.where(part.witness_upper > least, part.witness_upper, 0.0).astype(np.float32)
+        self.rendered[here] = np.maximum(self.rendered[here], seen)
+        self._record()
+
+    def _record(self) -> None:
+        seconds = time.perf_counter() - self.begin
+        self.trace.append(
+            TracePoint(seconds, self.cells, self._most(self.upper), self._largest_rendered, float(self.bounded))
+        )
+
+    def _result(self, middle: np.ndarray) -> PartResult:
+        here = self.tiles
+        lower = np.zeros_like(self.upper[here])
+        # what lies beyond the image is 0 in every picture
+        upper, rendered = (np.where(self.inside[here][..., None], p[here], 0.0) for p in (self.upper, self.rendered))
+        return PartResult(
+            index=self.index,
+            box=self.frame.box,
+            tiles=here,
+            lower=lower,
+            upper=upper.astype(np.float32),
+            witness_lower=lower,
+            witness_upper=rendered.astype(np.float32),
+            image=middle[here],
+            pixels=int(self.inside[here].sum()),
+            seconds=time.perf_counter() - self.begin,
+            cells=self.cells,
+            trace=tuple(self.trace),
+            bounded=self.bounded,
+            shown=None,
+            largest=greater(self.before, self.whole.largest),
+        )

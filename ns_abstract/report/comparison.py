@@ -1,0 +1,267 @@
+"""The report on differences of two scenes: files of frames, report.json, report.html."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ns_abstract.io.atomic import write_atomic
+from ns_abstract.refine.result import FrameResult
+from ns_abstract.report.figures import ShownUnits, number
+from ns_abstract.report.files import frame_name, load_frame
+from ns_abstract.report.html import counted, set_of, whole_page
+from ns_abstract.report.picture import (
+    GAP_COLORS,
+    bare_axes,
+    color_stops,
+    heat,
+    preview,
+    to_bytes,
+)
+from ns_abstract.report.record import PAGE_FRAMES, Report, RunRecord
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+#: A frame is done where its largest bound is at most so much above what was rendered, whatever the ratio.
+LEAST_ROOM = 1e-3
+_PREVIEW_PIXELS = 256
+_FRAME_FIGURES = ("mpg", "xpg", "mpg_witness", "xpg_witness", "ratio", "seconds_to_ratio")
+#: [H, W, 3] pictures of A and B of a frame at parameter values [d].
+Pictures = Callable[[int, Sequence[float]], tuple[np.ndarray, np.ndarray]]
+
+METRICS = {
+    "largest_upper": "no picture of A differs from that of B at the same pose by more, at any pixel and channel",
+    "largest_lower": "rendered pictures differ by as much",
+    "mean_upper": "mean over pixels and channels of the bounds; pixels may reach them at different poses",
+    "mean_lower": "the same of the largest differences rendered",
+    "worst": "the pose of the largest difference that was rendered, and that difference",
+    "verdict": "with --tolerance: certified (no picture differs by more), falsified (the worst pose does), unknown",
+    "seconds": "wall time spent on the frame",
+    "covered": "part of the set that was bounded at least once at a point of the trace; no bound but 1 holds below 1",
+    "cells": "cells (boxes of parameters) bounded",
+    "sha256": "of the npz files; a file that is another one is not continued with --resume",
+    "images": "RGB in [0, 1], so differences lie in [0, 1]; 1/255 is 0.0039",
+}
+
+
+def difference_figures(result: FrameResult) -> dict[str, float]:
+    """Largest and mean values over pixels and channels of the bound and of what was rendered."""
+    return {
+        "largest_upper": float(result.upper.max()),
+        "largest_lower": float(result.witness_upper.max()),
+        "mean_upper": float(result.upper.mean(dtype=np.float64)),
+        "mean_lower": float(result.witness_upper.mean(dtype=np.float64)),
+    }
+
+
+def verdict(result: FrameResult, tolerance: float, guarantee: str) -> str:
+    """Whether no picture differs by more than the tolerance: "certified", "falsified" or "unknown".
+
+    "falsified" needs a stored pose whose rendered pictures differ by more, "certified" a guarantee.
+    """
+    if result.largest is not None and result.largest.value > tolerance:
+        return "falsified"
+    if guarantee != "sampled" and result.bounded and float(result.upper.max()) <= tolerance:
+        return "certified"
+    return "unknown"
+
+
+def overall(verdicts: Sequence[str], complete: bool) -> str:
+    """The verdict on all frames: one that is falsified decides; certified are all together."""
+    if "falsified" in verdicts:
+        return "falsified"
+    return "certified" if complete and verdicts and set(verdicts) == {"certified"} else "unknown"
+
+
+class ComparisonReport(Report):
+    """Writes a comparison's results as they come; see `Report`.
+
+    Args:
+        output_dir: Made if it is absent.
+        run: What is computed.
+        pictures: Renders both scenes.
+        tolerance: Difference of which is asked whether any picture exceeds it, or None.
+        keep_stored: Whether to go on with what the folder holds.
+
+    Raises:
+        InputError: The folder cannot be written, or holds other results that were to be kept.
+    """
+
+    def __init__(
+        self,
+        output_dir: str | os.PathLike[str],
+        run: RunRecord,
+        pictures: Pictures,
+        tolerance: float | None,
+        *,
+        keep_stored: bool = False,
+    ) -> None:
+        self.pictures, self.tolerance = pictures, tolerance
+        super().__init__(output_dir, run, keep_stored=keep_stored)
+
+    def _reached(self, result: FrameResult) -> bool:
+        if self.tolerance is not None:
+            return verdict(result, self.tolerance, self.run.guarantee) != "unknown"
+        figures, target = difference_figures(result), self.run.settings["target_ratio"]
+        largest = figures["largest_lower"]
+        return result.bounded and figures["largest_upper"] <= max(target * largest, largest + LEAST_ROOM)
+
+    def _entry(self, result: FrameResult, status: str) -> dict[str, Any]:
+        entry = super()._entry(result, status)
+        for name in _FRAME_FIGURES:
+            del entry[name]
+        entry |= difference_figures(result)
+        entry["trace"] = [
+            {
+                "seconds": p.seconds, "cells": p.cells, "largest_upper": p.mpg, "largest_lower": p.mpg_witness,
+                "covered": p.covered,
+            }
+            for p in result.trace
+        ]  # fmt: skip
+        largest = result.largest
+        entry["worst"] = None if largest is None else {"pose": list(largest.pose), "difference": largest.value}
+        if self.tolerance is not None:
+            entry["verdict"] = verdict(result, self.tolerance, self.run.guarantee)
+        return entry
+
+    def document(self) -> dict[str, Any]:
+        """The content of report.json."""
+        document = super().document() | {"kind": "comparison", "metrics": METRICS, "tolerance": self.tolerance}
+        frames = document["frames"]
+        for name in ("largest_upper", "largest_lower"):
+            document[name] = max((entry[name] for entry in frames), default=None)
+        if self.tolerance is not None:
+            known = {entry["index"] for entry in frames}
+            verdicts = [entry["verdict"] for entry in frames if entry["index"] in self.run.frames]
+            document["verdict"] = overall(verdicts, known >= set(self.run.frames))
+        return document
+
+    def _draw(self, result: FrameResult) -> None:
+        figure = difference_figure(result, self._panels(result), str(self.run.scene.get("name", "")), self.tolerance)
+        path = self.folder / frame_name(result.index, "png")
+        write_atomic(
+            path, lambda stream: figure.savefig(stream, format="png", dpi=120, metadata={"Software": "ns_abstract"})
+        )
+        self._previews[result.index] = self._small(result)
+        self._undrawn.discard(result.index)
+
+    def _panels(self, result: FrameResult) -> list[tuple[str, np.ndarray, bool]]:
+        """Titles, pictures [H, W, 3] or greatest differences over the channels [H, W], and whether it is the latter."""
+        assert result.largest is not None
+        first, second = self.pictures(result.index, result.largest.pose)
+        difference = np.abs(first.astype(np.float64) - second)
+        return [
+            ("A at the worst pose", first, False),
+            ("B at the worst pose", second, False),
+            ("difference there", difference.max(axis=-1), True),
+            ("rendered, over all poses", result.witness_upper.max(axis=-1), True),
+            ("upper bound, over all poses", result.upper.max(axis=-1), True),
+        ]
+
+    def _small(self, result: FrameResult) -> Mapping[str, bytes]:
+        top = float(result.upper.max())
+        return {
+            title: preview(heat(image, top) if hot else to_bytes(image), _PREVIEW_PIXELS)
+            for title, image, hot in self._panels(result)
+        }
+
+    def _preview(self, index: int) -> Mapping[str, bytes]:
+        if index not in self._previews:
+            path = self.folder / frame_name(index, "npz")
+            self._previews[index] = self._small(load_frame(path, leaves=False).result)
+        return self._previews[index]
+
+    def _played(self, result: FrameResult) -> str | None:
+        return None
+
+    def _write_page(self, document: dict[str, Any]) -> None:
+        begin = time.monotonic()
+        frames = sorted(document["frames"], key=lambda entry: -entry["largest_upper"])[:PAGE_FRAMES]
+        shown = sorted(frames, key=lambda entry: entry["index"])
+        text = comparison_page(document, {entry["index"]: self._preview(entry["index"]) for entry in shown})
+        write_atomic(self.folder / "report.html", lambda stream: stream.write(text.encode()))
+        self._page_due = time.monotonic() + max(10.0, 20.0 * (time.monotonic() - begin))
+
+
+def difference_figure(
+    result: FrameResult, panels: Sequence[tuple[str, np.ndarray, bool]], about: str, tolerance: float | None
+) -> Figure:
+    """The picture of one frame: both scenes at the worst pose, their difference, and the maps, of one colour scale."""
+    from matplotlib.figure import Figure
+
+    height, width = result.upper.shape[:2]
+    side = 2.6
+    figure = Figure(
+        figsize=(len(panels) * side + 1.0, side * min(1.5, max(0.25, height / width)) + 0.9), facecolor="white",
+        layout="constrained",
+    )  # fmt: skip
+    axes: Any = figure.subplots(1, len(panels))
+    top = float(result.upper.max()) or 1.0
+    for place, (title, image, hot) in zip(axes, panels, strict=True):
+        place.imshow(
+            image if hot else to_bytes(image), cmap=GAP_COLORS if hot else None, vmin=0.0, vmax=top,
+            interpolation="antialiased",
+        )  # fmt: skip
+        bare_axes(place)
+        place.set_title(title, fontsize=8.5)
+    figure.colorbar(axes[-1].images[0], ax=axes[-1], fraction=0.05, pad=0.02).ax.tick_params(labelsize=7.5)
+    figures = difference_figures(result)
+    text = (
+        f"Frame {result.index}  ·  {about}  ·  largest difference between {number(figures['largest_lower'])} and "
+        f"{number(figures['largest_upper'])}"
+    )
+    figure.suptitle(text if tolerance is None else f"{text}  ·  tolerance {number(tolerance)}", fontsize=10.5)
+    return figure
+
+
+_TITLES = {
+    "certified": ("good", "No picture differs by more than the tolerance"),
+    "falsified": ("bad", "Some picture differs by more than the tolerance"),
+    "unknown": ("fair", "Undecided"),
+}
+
+
+def comparison_page(document: Mapping[str, Any], pictures: Mapping[int, Mapping[str, bytes]]) -> str:
+    """The page: HTML, self-contained; every text of the document is escaped.
+
+    Args:
+        document: Content of report.json.
+        pictures: For the frames shown, by number: PNGs by title.
+    """
+    frames, scene = document["frames"], document["scene"]
+    other = Path(str(scene["other"].get("source", ""))).name
+    units = ShownUnits.of(scene)
+    kind, title = "good", "How far apart the pictures are"
+    if document["tolerance"] is not None:
+        kind, title = _TITLES[document["verdict"]]
+    elif document["missing"]:
+        kind = "fair"
+    if document["guarantee"] == "sampled":
+        kind, title = "bad", "No guarantee: rendered samples only"
+    return whole_page(
+        "comparison.html",
+        title=f"Differences of {scene.get('name', 'scene')}",
+        d=document,
+        kind=kind,
+        heading=title,
+        counted=counted,
+        other=other,
+        sets=list({set_of(entry, units) or "one camera pose": None for entry in frames}),
+        set_of=lambda entry: set_of(entry, units),
+        shown=[entry for entry in frames if entry["index"] in pictures],
+        pictures=pictures,
+        gradient=", ".join(color_stops()),
+        pose=_pose,
+    )
+
+
+def _pose(entry: Mapping[str, Any]) -> str:
+    """The worst pose of a frame in words."""
+    pairs = zip(entry["parameters"], entry["worst"]["pose"], strict=True)
+    return ", ".join(f"{p['name']} {number(value, 6)} {p['unit']}".strip() for p, value in pairs) or "the only one"

@@ -1,0 +1,145 @@
+"""Recordings for 3-D viewers: bounds along a path, its cameras and the scene, for Rerun and viser."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.io.atomic import write_atomic
+from ns_abstract.report.export import Results
+from ns_abstract.report.figures import metrics
+from ns_abstract.report.interchange import optional_package
+
+#: Gaussians in a recording at most: those that are largest and most opaque.
+_GAUSSIANS = 200_000
+#: From OpenGL camera axes (x right, y up, z back) to those of Rerun and viser (y down, z forward).
+_FLIP = np.diag([1.0, -1.0, -1.0])
+
+
+@dataclass(frozen=True)
+class RecordedScene:
+    """The Gaussians of a scene, for drawing.
+
+    Attributes:
+        means: [N, 3], normalised frame.
+        axes: [N, 3, 3], columns are principal axes in standard deviations.
+        colors: [N, 3] of band 0, in [0, 1].
+        opacities: [N].
+    """
+
+    means: NDArray[np.float64]
+    axes: NDArray[np.float64]
+    colors: NDArray[np.float64]
+    opacities: NDArray[np.float64]
+
+    def drawn(self) -> RecordedScene:
+        """At most `_GAUSSIANS` of them."""
+        size = self.opacities * np.square(self.axes).sum(axis=(1, 2))
+        best = np.sort(np.argsort(-size, kind="stable")[:_GAUSSIANS])
+        return RecordedScene(self.means[best], self.axes[best], self.colors[best], self.opacities[best])
+
+
+def write_rerun(results: Results, cameras: Sequence[PinholeCamera], scene: RecordedScene | None, file: Path) -> None:
+    """Write a Rerun recording (.rrd).
+
+    Its timeline "frame" shows the bounds, their gap and a render of every frame, and the figures of the report. With
+    ``cameras``, those of the path by frame, pictures stand in the scene at their cameras.
+
+    Raises:
+        InputError: The package rerun-sdk is missing.
+    """
+    rerun: Any = optional_package("rerun", "rerun", "rrd")
+    recording = rerun.RecordingStream("ns-abstract")
+    scratch = file.with_name(f".{file.name}.part")
+    try:
+        recording.save(str(scratch))
+        recording.log("scene", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        if scene is not None:
+            scene = scene.drawn()
+            radii = np.sqrt(np.square(scene.axes).sum(axis=1)).max(axis=1)
+            colors = np.concatenate([scene.colors, scene.opacities[:, None]], axis=1)
+            points = rerun.Points3D(scene.means, radii=radii, colors=np.round(255.0 * colors).astype(np.uint8))
+            recording.log("scene/gaussians", points, static=True)
+        for result in results:  # pyright: ignore[reportGeneralTypeIssues]
+            recording.set_time("frame", sequence=result.index)
+            if cameras:
+                camera = cameras[result.index]
+                pose, scale = camera.camera_to_world, results.size[0] / camera.height
+                recording.log(
+                    "scene/camera",
+                    rerun.Transform3D(translation=pose[:3, 3], mat3x3=pose[:3, :3] @ _FLIP),
+                    rerun.Pinhole(
+                        focal_length=(scale * camera.fx, scale * camera.fy),
+                        principal_point=(scale * camera.cx, scale * camera.cy),
+                        width=results.size[1], height=results.size[0],
+                    ),
+                )  # fmt: skip
+                recording.log("scene/camera/image", rerun.Image(results.picture(result, "image")))
+            for name in ("lower", "upper", "image"):
+                recording.log(f"bounds/{name}", rerun.Image(getattr(result, name)))
+            recording.log("bounds/gap", rerun.Image(results.picture(result, "gap")))
+            for name, value in metrics(result).items():
+                if isinstance(value, (int, float)):
+                    recording.log(f"figures/{name}", rerun.Scalars(float(value)))
+        recording.flush()
+        recording.disconnect()
+        scratch.replace(file)
+    finally:
+        scratch.unlink(missing_ok=True)
+
+
+def write_viser(
+    results: Results, cameras: Sequence[PinholeCamera], scene: RecordedScene | None, file: Path, seconds: float
+) -> None:
+    """Write a recording of viser's (.viser) that shows every frame's gap at its camera, ``seconds`` long each.
+
+    Raises:
+        InputError: The package viser is missing.
+    """
+    viser: Any = optional_package("viser", "viser", "viser")
+    with _server(viser) as server:
+        record = _recorder(server)
+        if scene is not None:
+            scene = scene.drawn()
+            covariances = scene.axes @ scene.axes.transpose(0, 2, 1)
+            add = getattr(server.scene, "add_gaussian_splats", None) or server.scene._add_gaussian_splats
+            add(
+                "/scene", centers=scene.means.astype(np.float32), covariances=covariances.astype(np.float32),
+                rgbs=scene.colors.astype(np.float32), opacities=scene.opacities[:, None].astype(np.float32),
+            )  # fmt: skip
+        shown: Any = None
+        for result in results:  # pyright: ignore[reportGeneralTypeIssues]
+            camera = cameras[result.index]
+            former, rotation = shown, camera.camera_to_world[:3, :3] @ _FLIP
+            shown = server.scene.add_camera_frustum(
+                f"/frames/{result.index:05d}", fov=2.0 * float(np.arctan2(0.5 * camera.height, camera.fy)),
+                aspect=camera.width / camera.height, scale=0.15, image=results.picture(result, "gap"),
+                wxyz=viser.transforms.SO3.from_matrix(rotation).wxyz, position=camera.camera_to_world[:3, 3],
+            )  # fmt: skip
+            if former is not None:
+                former.visible = False
+            record.insert_sleep(seconds)
+        content = record.serialize() if hasattr(record, "serialize") else record.end_and_serialize()
+    write_atomic(file, lambda stream: stream.write(content))
+
+
+def _recorder(server: Any) -> Any:
+    """The recorder of either version of viser: 1.x has a public one, 0.2.7 one with an underscore."""
+    return server.get_scene_serializer() if hasattr(server, "get_scene_serializer") else server._start_scene_recording()
+
+
+@contextmanager
+def _server(viser: Any) -> Iterator[Any]:
+    """A server of this machine alone, which viser needs for a recording."""
+    server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
+    try:
+        yield server
+    finally:
+        server.stop()
