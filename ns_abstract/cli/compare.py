@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from ns_abstract.cli.common import DONE, INTERRUPTED, SignalStop, run
+from ns_abstract.cli.common import DONE, INTERRUPTED, SignalStop, command, run
 from ns_abstract.cli.options import EngineOptions, Overrides, Program, ProgramOptions, SceneOverrides, Where
 from ns_abstract.cli.sets import GivenSet, given_set
 from ns_abstract.io.errors import InputError
@@ -133,7 +133,7 @@ def compare(options: Compare) -> int:
 
 def main() -> None:
     """Entry point of the console script."""
-    run(compare, lambda: tyro.cli(Compare, prog="ns-abstract-compare"))
+    run(compare, command("ns-abstract-compare", Compare))
 
 
 if __name__ == "__main__":
