@@ -29,7 +29,9 @@ _SECONDS = 1800.0
 
 def _introduce(console: Console, job: Certification, about: CertifiedRun) -> None:
     method = job.job.method
-    console.print(f"{method.name}: {method.content}; {job.question.name}; {about.sentence}", markup=False)
+    console.print(
+        f"{method.name}: {method.content}; {job.question.name}; {about.sentence}", markup=False, soft_wrap=True
+    )
     for warning in job.job.warnings:
         console.print(f"warning: {warning}", markup=False, soft_wrap=True)
     for note in about.plan:

@@ -134,7 +134,8 @@ def _fits(leaves: Leaves | None) -> bool:
 def _introduce(console: Console, job: Job, report: Report) -> None:
     method = job.method
     program = method.program
-    console.print(f"{method.name}: {method.content}, {program['name']} {program['version']}", markup=False)
+    about = f"{method.name}: {method.content}, {program['name']} {program['version']}"
+    console.print(about, markup=False, soft_wrap=True)
     for warning in job.warnings:
         console.print(f"warning: {warning}", markup=False, soft_wrap=True)
     for note in (*method.notes, *(note for note in job.notes if note not in job.warnings), *job.plan):

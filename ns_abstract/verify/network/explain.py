@@ -99,5 +99,5 @@ def explain(network: Network, dimensions: int = 2) -> Sequence[str]:
         lines.append(
             "deep: rows end on the way; of sets for which that leaves nothing known they are given up after seconds"
         )
-    lines += [f"covered: {line}" for line in network.guarantee()]
+    lines += [line if line.startswith("not covered") else f"covered: {line}" for line in network.guarantee()]
     return lines
