@@ -89,7 +89,10 @@ def test_measures_stay_inside(d: int) -> None:
             assert inside.any()
             for picture in members(sets, p, rng):
                 value = exact(measure, picture[:, first : first + len(measure.channels)])
-                assert all(Fraction(float(a)) <= value <= Fraction(float(b)) for a, b in zip(low[inside], high[inside], strict=True))
+                assert all(
+                    Fraction(float(a)) <= value <= Fraction(float(b))
+                    for a, b in zip(low[inside], high[inside], strict=True)
+                )
                 shown = float(measure.value(torch.from_numpy(picture)[None, None], first)[0])
                 assert shown == pytest.approx(float(value), abs=1e-12)
         widths.append(float((high - low).mean()))
@@ -193,8 +196,9 @@ def value_at(case: Case, kind: str, values: np.ndarray) -> float:
 PROPERTIES: dict[str, Callable[[float], dict[str, Any]]] = {
     "visible": lambda limit: {**VISIBLE, "weight": limit},
     "clear": lambda limit: {**CLEAR, "weight": limit},
-    "expected": lambda limit: {k: v for k, v in CLEAR.items() if k != "weight"}
-    | {"measure": "expected", "distance": limit},
+    "expected": lambda limit: (
+        {k: v for k, v in CLEAR.items() if k != "weight"} | {"measure": "expected", "distance": limit}
+    ),
 }
 
 
@@ -215,7 +219,9 @@ def test_certificates_hold(kind: str, blobs: Inputs, tmp_path: Path, in_process:
     claim, rng = job.claim(pictures), np.random.default_rng(3)
     for _, low, high, verdict, margin, example in cells(output):
         (a,), (b,) = json.loads(low), json.loads(high)
-        poses = np.array([[a], [b], *rng.uniform(a, b, (2, 1))] if verdict == "certified" else [json.loads(example or "[0]")])
+        poses = np.array(
+            [[a], [b], *rng.uniform(a, b, (2, 1))] if verdict == "certified" else [json.loads(example or "[0]")]
+        )
         outputs = job.model.outputs(np.stack([pictures.image(pose) for pose in poses]))
         margins = claim.margin(torch.from_numpy(outputs), torch.from_numpy(poses)).numpy()
         if verdict == "certified":

@@ -243,7 +243,7 @@ class Search:
         self._sample([samples[k] for k in sorted(proved)], self._attack)
         failing = [samples[k] for k in open_cells if k not in proved]
         self._sample(failing, self._late)
-        self._ascend(failing)
+        self._descend_worst_cell(failing)
         if self.varies:
             self._vary(failing)
         leaves, children = self._verdicts(samples, bounded, reasons, slopes, costs, cuts)
@@ -343,7 +343,7 @@ class Search:
         """The margin's negative."""
         return -self.claim.margin(self.model.differentiable(picture[None]), values[None])[0]
 
-    def _ascend(self, cells: Sequence[_CellSamples]) -> None:
+    def _descend_worst_cell(self, cells: Sequence[_CellSamples]) -> None:
         """Projected gradient descent of the margin in the cell that came closest to a counterexample.
 
         With one parameter, samples do better than gradients.

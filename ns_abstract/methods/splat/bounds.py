@@ -256,7 +256,7 @@ class SplatBounds:
         if layers:
             colors = _four_channels(colors, self._depths(poses, candidates, alive, gaussians.delta, m), alive, m)
             common = np.ascontiguousarray(poses.offset[: m + 1, 2])
-        bounds = self._unset_bounds(wanted.size, candidates.size, shape, keep_linear, layers)
+        bounds = self._allocate_bounds(wanted.size, candidates.size, shape, keep_linear, layers)
         inputs = PixelInputs(
             gaussians,
             self._viewing_axes(forms, poses.rotation_magnitude, gaussians),
@@ -289,7 +289,7 @@ class SplatBounds:
         )  # fmt: skip
         return gaussians, np.flatnonzero(state)
 
-    def _unset_bounds(
+    def _allocate_bounds(
         self, tiles: int, gaussians: int, shape: FormShape, keep_linear: bool, layers: bool
     ) -> PixelBounds:
         """The output of the pixel stage for so many tiles and candidates, not filled in."""

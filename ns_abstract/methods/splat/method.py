@@ -93,7 +93,8 @@ class SplatMethod:
     @property
     def content(self) -> str:
         """The scene in a few words."""
-        return f"{self.scene.count:,} Gaussians{' alone, of a model that may draw more' if self.scene.alone else ''}"
+        alone = " alone, of a model that may draw more" if self.scene.gaussians_alone else ""
+        return f"{self.scene.count:,} Gaussians{alone}"
 
     def frame(self, poses: PoseBox, sheared: bool = False, layers: bool = False) -> SplatFrame:
         """One frame, ready for refinement; ``sheared``, ``layers``: see `SplatFrame`.
@@ -197,7 +198,7 @@ class SplatMethod:
             "renderer": self.rasteriser.name,
             "version": self.rasteriser.version,
             "arithmetic": self.arithmetic.name,
-            **({"bounded": "Gaussians alone"} if scene.alone else {}),
+            **({"bounded": "Gaussians alone"} if scene.gaussians_alone else {}),
         }
 
     def describe(self) -> dict[str, Any]:
@@ -212,7 +213,7 @@ class SplatMethod:
             "rasterize_mode": scene.rasterize_mode,
             "background": [float(v) for v in scene.background],
             "notes": list(scene.notes),
-            **({"bounded": GAUSSIANS_ALONE} if scene.alone else {}),
+            **({"bounded": GAUSSIANS_ALONE} if scene.gaussians_alone else {}),
         }
 
     def elements(self) -> SceneElements:
