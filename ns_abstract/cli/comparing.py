@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 from contextlib import ExitStack
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
@@ -18,7 +17,7 @@ from ns_abstract.cli.options import stated
 from ns_abstract.io.folder import claim
 from ns_abstract.report.comparison import ComparisonReport
 from ns_abstract.report.figures import listed, number
-from ns_abstract.report.progress import ProgressBar
+from ns_abstract.report.progress import ProgressBar, ShownProgress
 from ns_abstract.report.record import RunRecord, failed_self_check
 
 if TYPE_CHECKING:
@@ -63,8 +62,7 @@ def compare_path(options: Compare, stop: SignalStop) -> bool:
                 def on_progress(point: bounding.Progress) -> None:
                     text = f"frame {point.frame}: at most {number(point.mpg)}, rendered {number(point.mpg_witness)}"
                     # mpg is a difference here, which the sentence of bounds would misname
-                    times = {name: getattr(point, name) for name in ("done", "elapsed", "total_budget")}
-                    progress(SimpleNamespace(sentence=text, **times))
+                    progress(ShownProgress(point.done, text, point.elapsed, point.total_budget))
 
                 results = bounding.bound_frames(
                     job, pending, engine=engine, budget=budget, target_ratio=options.target_ratio, stop=stop,
