@@ -112,10 +112,10 @@ def test_slider_to_picture(server: Server, tmp_path: Path) -> None:
         # the slider by its keys: the set shrinks from 10 to 5 thousandths
         x, y = browser.place(slider("± x"))
         browser.click(x, y)
-        browser.ask(f"{slider('± x')}.focus()")
-        before = float(browser.ask(f"{number_field('± x')}.value"))
+        browser.ask(f"{slider('± x (0.001 units)')}.focus()")
+        before = float(browser.ask(f"{number_field('± x (0.001 units)')}.value"))
         browser.key("ArrowLeft", 37, 50)
-        until(lambda: float(browser.ask(f"{number_field('± x')}.value")) < before - 3.0, "the slider")
+        until(lambda: float(browser.ask(f"{number_field('± x (0.001 units)')}.value")) < before - 3.0, "the slider")
         second = settled(browser, server, first)
         assert second[0] < first[0]
 

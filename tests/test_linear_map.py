@@ -208,6 +208,38 @@ def test_slack_reaches_both_planes() -> None:
             assert middle - reach <= low and high <= middle + reach
 
 
+def test_auto_lirpa_takes_the_layer(result: tuple[nsa.Scene, nsa.PoseSet, nsa.BoundResult]) -> None:
+    """The manual's example: CROWN's bounds of a network behind the layer hold for outputs at renders."""
+    lirpa = pytest.importorskip("auto_LiRPA", reason="auto_LiRPA is not installed")
+    unit = pytest.importorskip("auto_LiRPA.perturbations").PerturbationLpNorm(norm=np.inf, eps=1.0)
+    scene, poses, bounds = result
+    layer = bounds.to_torch()
+    torch.manual_seed(0)
+    size = int(np.prod(layer.shape))
+    network = torch.nn.Sequential(torch.nn.Flatten(), torch.nn.Linear(size, 8), torch.nn.ReLU(), torch.nn.Linear(8, 3))
+
+    class Seen(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.layer, self.network = layer, network
+
+        def forward(self, p: torch.Tensor, e: torch.Tensor) -> torch.Tensor:
+            return self.network(self.layer(p, e))
+
+    p, e = torch.zeros(1, len(bounds.parameters.names)), torch.zeros(1, *layer.shape)
+    model = lirpa.BoundedModule(Seen(), (p, e), bound_opts={"conv_mode": "matrix"})
+    low, high = model.compute_bounds(
+        x=(lirpa.BoundedTensor(p, unit), lirpa.BoundedTensor(e, unit)), method="CROWN"
+    )  # fmt: skip
+    frame = scene.method().frame(poses.of(scene))
+    for values in frame.box.sample(20, np.random.default_rng(2)):
+        image = torch.from_numpy(_render(frame, values).transpose(2, 0, 1)[None]).float()
+        out = network(image)
+        # auto_LiRPA and this evaluation round to float32, which neither charges
+        assert ((low - 1e-5 <= out) & (out <= high + 1e-5)).all()
+    assert torch.isfinite(low).all() and torch.isfinite(high).all()
+
+
 @pytest.mark.parametrize(
     ("call", "field"),
     [

@@ -8,6 +8,7 @@ import json
 import shutil
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from collections.abc import Iterator
@@ -369,7 +370,7 @@ class Machine:
 
 @pytest.mark.slow
 def test_viewer_finds_the_panel_and_works_in_the_background(
-    viewer: Any, model: Any, nerfstudio: SimpleNamespace, tmp_path: Path
+    viewer: Any, model: Any, nerfstudio: SimpleNamespace, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     paths = [path for path, _ in viewer.viewer_elements]
     assert all(path.startswith("Custom Elements/model/abstract/") for path in paths)
@@ -421,7 +422,22 @@ def test_viewer_finds_the_panel_and_works_in_the_background(
     np.testing.assert_array_equal(sent.camera_to_world, shown.camera_to_world)
     np.testing.assert_allclose([sent.fx, sent.fy], [shown.fx, shown.fy], rtol=1e-12)
     assert (sent.width, sent.height) == (100, 80)
-    assert "ns-abstract-certify" in model.abstract._figures.text
+    said = model.abstract._figures.text
+    assert "ns-abstract-certify" in said and "\n  --property PROP.json" in said
+    # the panel is narrow: an option a line
+    assert all(line.count(" --") <= 1 for line in said.splitlines())
+    # the run's folder is never written to: not by name, and not from a shell that stands in it
+    run_folder = model.abstract.control.folder
+    before = sorted(run_folder.rglob("*"))
+    model.abstract._file.value = str(run_folder / "view.json")
+    model.abstract.send()
+    assert "The run's folder stays as it is" in model.abstract._figures.text
+    model.abstract._file.value = ""
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    for where in (tmp_path, run_folder):
+        monkeypatch.chdir(where)
+        model.abstract.send()
+    assert (tmp_path / "view_000.json").is_file() and sorted(run_folder.rglob("*")) == before
     # a variation of the scene: around what is in the middle of the picture, and sent as it is
     whole = float(found["abstract_gap"].mean())
     model.abstract.select_middle()

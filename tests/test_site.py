@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
@@ -9,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from browser import Browser, chromium
+from test_architecture import project
 from waiting import until
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -34,6 +36,25 @@ def test_no_formula_stays_raw(site):
         assert "arithmatex" not in html, page.parent.name
         formulas += html.count("<math")
     assert formulas > 700
+
+
+def test_start_page_notebooks_and_commands(site):
+    """The start page says how to install and what can be asked; notebooks and commands have pages."""
+    start = (site / "index.html").read_text(encoding="utf-8")
+    for word in ("pip install", "ns-abstract-reach", "ns-abstract-certify", "notebooks/bound_a_scene/", "to_torch"):
+        assert word in start, word
+    for notebook in (ROOT / "docs" / "notebooks").glob("*.ipynb"):
+        cells = json.loads(notebook.read_text(encoding="utf-8"))["cells"]
+        page = (site / "notebooks" / notebook.stem / "index.html").read_text(encoding="utf-8")
+        kinds = [kind for cell in cells for output in cell.get("outputs", ()) for kind in output.get("data", {})]
+        assert page.count("data:image/png;base64,") >= kinds.count("image/png") > 0
+        code = next(cell for cell in cells if cell["cell_type"] == "code")
+        assert page.count('class="language-python"') == sum(cell["cell_type"] == "code" for cell in cells)
+        assert "".join(code["source"]).split("(")[0].split()[-1] in page
+    commands = (site / "commands" / "index.html").read_text(encoding="utf-8")
+    for name in project()["scripts"]:
+        assert f"usage: {name}" in commands, name
+    assert "--tyro-write-completion" in commands
 
 
 @pytest.mark.skipif(chromium() is None, reason="Chromium is not installed")

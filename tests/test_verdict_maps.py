@@ -399,7 +399,8 @@ def test_regions_on_the_page() -> None:
     text = regions_html(regions, pictures, {0: frame["parameters"]}, ": <why>")
     assert text.count("<img") == 3 and text.count('class="region"') == 2 and "<y>" not in text and "<right>" not in text
     assert f"make {MOST + 3} regions" in text and "7 further regions, none of them larger: &lt;why&gt;." in text
-    assert "50.00 % of its set in 2 cells: x 1 to 4 rad" in text and "margin not a number" in text
+    assert "50.00 % of its set in 2 cells: x ∈ [1, 4] rad ([57.2958, 229.183] degrees)" in text
+    assert "margin not a number" in text
     assert "&lt;y&gt; = 2 (same)" in text and "x = 1<br>" not in text and "No pose of its own set" in text
     assert "<td>0.5</td><td>1.5</td>" in text and "not finite" in text
     assert regions_html([], [], {}, "") == ""

@@ -18,8 +18,9 @@ def _result(output: dict[str, Any]) -> str:
         return "<div>" + re.sub(r"\n\s*\n", "\n", data["text/html"]) + "</div>"
     if "image/png" in data:
         return f'<img alt="result of the cell above" src="data:image/png;base64,{data["image/png"].strip()}">'
-    text = data.get("text/plain") or "".join(output.get("text", ()))
-    return f"```text\n{text.rstrip()}\n```" if text else ""
+    # what moves a terminal's cursor says nothing on a page
+    text = re.sub(r"\x1b\[[0-9;?]*[A-Za-z]", "", data.get("text/plain") or "".join(output.get("text", ()))).strip()
+    return f"```text\n{text}\n```" if text else ""
 
 
 def page(notebook: Path) -> str:

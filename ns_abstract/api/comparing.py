@@ -14,14 +14,14 @@ from ns_abstract.api.assumptions import DEFAULT
 from ns_abstract.api.bounding import OnProgress, bound_frames, listener
 from ns_abstract.api.files import Settings, path_sets
 from ns_abstract.api.job import Job
-from ns_abstract.api.poses import PoseSet
-from ns_abstract.api.scenes import Scene, SceneSource
+from ns_abstract.api.poses import PoseSet, pose_set
+from ns_abstract.api.scenes import Scene, SceneSource, checked_scene
 from ns_abstract.arithmetic.selfcheck import platform_problems
 from ns_abstract.execution.engines import SerialEngine
 from ns_abstract.execution.stopping import interruptible
 from ns_abstract.execution.worker_cache import Recipe
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.camera_path import CameraPath, load_camera_path
+from ns_abstract.geometry.camera_path import CameraPath, PinholeCamera, load_camera_path
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.io.assumptions import Assumption
@@ -29,7 +29,7 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.refine.difference import DifferenceFrame
 from ns_abstract.refine.goal import RefinementGoal
 from ns_abstract.refine.largest import LargestDifference
-from ns_abstract.refine.result import FrameResult, PartResult, TracePoint
+from ns_abstract.refine.result import ArrayRecord, FrameResult, PartResult, TracePoint
 from ns_abstract.report.comparison import difference_figures, verdict
 from ns_abstract.report.figures import short_guarantee
 
@@ -239,8 +239,8 @@ def open_comparison(settings: Settings, other: SceneSource, tolerance: float | N
     )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class Comparison:
+@dataclass(frozen=True, eq=False, repr=False)
+class Comparison(ArrayRecord):
     """Bounds of the absolute difference of two scenes' pictures over a set of poses.
 
     Attributes:
@@ -280,7 +280,7 @@ class Comparison:
 def compare(
     scene: Scene,
     other_scene: Scene,
-    poses: PoseSet,
+    poses: PoseSet | PinholeCamera,
     *,
     tolerance: float | None = None,
     target_ratio: float = 1.05,
@@ -296,7 +296,7 @@ def compare(
     Args:
         scene: A, in whose frame the camera is given.
         other_scene: B, in the same frame.
-        poses: The set.
+        poses: The set; a camera is the set of its one pose.
         tolerance: Difference of which is asked whether any picture exceeds it; the work ends once that is decided.
         target_ratio: The work is done when largest and mean bounds are at most this many times those of renders.
         time_budget: Seconds, compiling at first use not counted.
@@ -313,7 +313,8 @@ def compare(
     """
     check_comparison(tolerance, target_ratio, time_budget, prefix="")
     job = ComparisonJob(
-        scene, other_scene, [poses.of(scene)], tolerance=tolerance, arithmetic=arithmetic, seed=seed,
+        checked_scene(scene), checked_scene(other_scene), [pose_set(poses).of(scene)], tolerance=tolerance,
+        arithmetic=arithmetic, seed=seed,
         memory_limit=memory_limit, workers=workers,
     )  # fmt: skip
     with interruptible() as stop:

@@ -80,7 +80,7 @@ def _sets(job: PathJob, frames: Sequence[int]) -> Iterator[str]:
         box, moved = job.pose_sets[index].box, job.frame(index).motion(job.pose_sets[index].box)
         for name, pixels in zip(box.names, moved, strict=True):
             yield f"  {name} moves what frame {index} shows by {number(float(pixels), 3)} pixels over its range"
-    yield from (f"  is this what you mean? {note}" for note in job.wide_turns)
+    yield from (f"  is this what you mean? {note}" for note in job.warnings)
 
 
 def _ranges(poses: PoseBox, units: ShownUnits) -> Iterator[str]:

@@ -58,11 +58,11 @@ class Explanation:
     def lines(self) -> Iterator[str]:
         """It in words."""
         gap = f"mean gap of a channel {self.gap:.4f}"
-        yield f"frame {self.index}: {gap}, of which renders did not reach {self.excess:.4f}"
+        yield f"frame {self.index}: {gap}; {self.excess:.4f} of it was reached by no render"
         if not self.leaves:
             yield "  nothing to explain"
             return
-        yield f"  of that in {self.leaves} leaf cells looked at, taken one at a time:"
+        yield f"  what it goes back to, one cause at a time, in {self.leaves} cells that were bounded again:"
         for name, share in sorted(self.causes.items(), key=lambda item: -item[1]):
             advice = f" ({_ADVICE[name]})" if share >= 0.1 and name in _ADVICE else ""
             yield f"  {share:6.1%}  {name}{advice}"
@@ -70,7 +70,7 @@ class Explanation:
         for share, top, bottom, left, right in self.regions:
             yield f"  {share:6.1%}  lies in rows {top} to {bottom - 1}, columns {left} to {right - 1}"
         for number, share in self.elements:
-            yield f"  {share:6.1%}  of the gap of the widest leaf goes away without Gaussian {number}"
+            yield f"  Gaussian {number} alone causes {share:.1%} of the widest cell's gap"
 
 
 def check_explained(job: Job) -> None:

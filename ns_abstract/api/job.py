@@ -22,6 +22,7 @@ from ns_abstract.arithmetic.selfcheck import platform_problems
 from ns_abstract.execution.cancellation import WorkCancelledError, cancel_when
 from ns_abstract.execution.threads import most_threads
 from ns_abstract.execution.worker_cache import Recipe
+from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
@@ -82,9 +83,12 @@ class Job:
         self.method: Method = scene.method(arithmetic, workers)
         self.pose_sets, self.seed, self.memory_limit = tuple(pose_sets), seed, memory_limit
         self.workers = workers if scene.rays else 1
-        #: on rotations that are wide enough to have been meant in degrees
-        self.wide_turns = tuple(_wide_turns([poses.perturbation for poses in self.pose_sets]))
-        self.notes = (*notes, *self.wide_turns)
+        #: what is legal and hardly meant, one sentence each
+        self.warnings = (
+            *_wide_turns([poses.perturbation for poses in self.pose_sets]),
+            *_tiny_pictures([poses.camera for poses in self.pose_sets]),
+        )
+        self.notes = (*notes, *self.warnings)
         self._scene_choices = scene_choices(scene, self.method, arithmetic)
         if set_choices is None:
             set_choices = object_choices(self.pose_sets, "the camera", "the set of poses")
@@ -243,7 +247,7 @@ class Job:
         floor = max(part.floor for part in parts)
         if floor > 0.0:
             plan.append(
-                f"dim light: layers that at most {floor:.2%} of the light comes to are left out of the first cells, "
+                f"dim light: layers that contribute at most {floor:.2%} of a pixel are left out of the first cells, "
                 "and bounded by the range of their colours"
             )
         if len(parts) > 1:
@@ -307,6 +311,14 @@ def _wide_turns(sets: Sequence[Perturbation]) -> Iterator[str]:
             f"the set turns by up to {number(math.degrees(most))} degrees ({number(most)} rad) in {', '.join(wide)}; "
             'if degrees were meant: --angle-units degrees, in a file "angle_units": "degrees"'
         )
+
+
+def _tiny_pictures(cameras: Sequence[PinholeCamera]) -> Iterator[str]:
+    """A sentence on pictures of one pixel, or none."""
+    count = sum(camera.width * camera.height == 1 for camera in cameras)
+    if count:
+        frames = f"the picture of {count} of {len(cameras)} frames"
+        yield f"{frames} is 1 x 1 pixel; check the path's size and --downscale-factor"
 
 
 def require_sound_platform() -> None:

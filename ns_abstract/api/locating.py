@@ -11,12 +11,21 @@ from typing import Any, Literal, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ns_abstract.api.cell_search import CellQuestion, CellSearch, Request, Row, answered, check_arguments
+from ns_abstract.api.cell_search import (
+    CellQuestion,
+    CellSearch,
+    Request,
+    Row,
+    SearchProgress,
+    answered,
+    check_arguments,
+)
 from ns_abstract.api.job import Job
 from ns_abstract.api.location import Location, PhotoOptions
-from ns_abstract.api.poses import PoseSet
-from ns_abstract.api.scenes import Scene
+from ns_abstract.api.poses import PoseSet, pose_sets
+from ns_abstract.api.scenes import Scene, checked_scene
 from ns_abstract.execution.engines import EngineName, started
+from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.io.errors import InputError
 from ns_abstract.report.figures import percent, short_guarantee
 from ns_abstract.report.location import LocatedRun, location_document, location_page, location_pictures
@@ -27,7 +36,7 @@ from ns_abstract.verify.store import Store
 
 
 @dataclass(frozen=True)
-class LocateProgress:
+class LocateProgress(SearchProgress):
     """Where a search stands.
 
     Attributes:
@@ -39,6 +48,17 @@ class LocateProgress:
     left: float
     outliers: int | None
     seconds: float
+
+    @property
+    def done(self) -> float:
+        """Part of the searched volume that is excluded."""
+        return 1.0 - self.left
+
+    @property
+    def sentence(self) -> str:
+        """What is left, and how well the best pose explains the photo."""
+        best = "" if self.outliers is None else f", best pose misses {self.outliers:,} pixels"
+        return f"excluded {percent(self.done)}, left {percent(self.left)}{best}"
 
 
 class LocationQuestion(CellQuestion[LocateProgress]):
@@ -175,7 +195,7 @@ class Located:
 
 def locate(
     scene: Scene,
-    poses: PoseSet | Sequence[PoseSet],
+    poses: PoseSet | PinholeCamera | Sequence[PoseSet | PinholeCamera],
     photo: ArrayLike,
     *,
     noise: float = 0.02,
@@ -198,7 +218,7 @@ def locate(
 
     Args:
         scene: The scene.
-        poses: One set, or several.
+        poses: One set, or several; a camera is the set of its one pose.
         photo: [H, W, 3] of the cameras' size: uint8, or numbers in [0, 1] that are multiples of 1/255.
         noise: By how much a value of the photo may differ from the picture's before it is rounded to 8 bits.
         outliers: Part of the pixels that may show anything.
@@ -220,12 +240,14 @@ def locate(
     """
     request = Request(time_budget, resume, output_dir is not None)
     check_arguments(request, workers, output_dir)
-    sets = [poses] if isinstance(poses, PoseSet) else list(poses)
-    if not sets:
-        raise InputError("found no set", field="poses", fix="give at least one PoseSet")
+    sets = pose_sets(poses)
     options = PhotoOptions(noise, outliers, contract)
     job = Job(
-        scene, [entry.of(scene) for entry in sets], arithmetic=arithmetic, workers=workers, memory_limit=memory_limit
+        checked_scene(scene),
+        [entry.of(scene) for entry in sets],
+        arithmetic=arithmetic,
+        workers=workers,
+        memory_limit=memory_limit,
     )
     location = Location(job, photo_levels(photo), None if mask is None else _checked_mask(mask, job), options)
     settings = {"time_budget": time_budget, "arithmetic": arithmetic, "workers": workers, "engine": engine}

@@ -46,6 +46,7 @@ class ReachProgress(SearchProgress):
         safe, reaches: Fractions that are certified; None where it was not asked.
         falsified, open, unknown: Fractions for the strongest question; what is open is still to be examined.
         seconds: Time spent, earlier searches that this one goes on with included.
+        examined: Part of the initial box that was examined, mean over the questions.
     """
 
     safe: float | None
@@ -54,11 +55,12 @@ class ReachProgress(SearchProgress):
     open: float
     seconds: float
     unknown: float = 0.0
+    examined: float | None = None
 
     @property
     def done(self) -> float:
-        """Part of the initial box that was examined for the strongest question."""
-        return 1.0 - self.open
+        """Part of the initial box that was examined, mean over the questions."""
+        return 1.0 - self.open if self.examined is None else self.examined
 
     @property
     def sentence(self) -> str:
@@ -125,9 +127,11 @@ class LoopQuestion(CellQuestion[ReachProgress]):
         shares = {QUESTIONS[tally.frame]: fractions(tally) for tally in store.tallies()}
         last = shares[list(shares)[-1]]
         certified = {name: shares[name]["certified"] if name in shares else None for name in QUESTIONS}
+        examined = 1.0 - sum(share["open"] for share in shares.values()) / len(shares)
         return ReachProgress(
-            certified["safe"], certified["reaches"], last["falsified"], last["open"], store.seconds, last["unknown"]
-        )
+            certified["safe"], certified["reaches"], last["falsified"], last["open"], store.seconds, last["unknown"],
+            examined,
+        )  # fmt: skip
 
     def report(self, search: CellSearch[ReachProgress], state: str) -> dict[str, Any]:
         return self.reports.write(search, state)

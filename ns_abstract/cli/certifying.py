@@ -29,8 +29,10 @@ _SECONDS = 1800.0
 
 def _introduce(console: Console, job: Certification, about: CertifiedRun) -> None:
     method = job.job.method
-    console.print(f"{method.name}: {method.content}; {job.question.name}; {about.sentence}", markup=False)
-    for warning in job.job.wide_turns:
+    console.print(
+        f"{method.name}: {method.content}; {job.question.name}; {about.sentence}", markup=False, soft_wrap=True
+    )
+    for warning in job.job.warnings:
         console.print(f"warning: {warning}", markup=False, soft_wrap=True)
     for note in about.plan:
         console.print(f"  {note}", markup=False, soft_wrap=True)
@@ -78,10 +80,15 @@ def certify_path(options: Certify, stop: SignalStop) -> bool:
     covered = coverage(document["frames"])
     parts = ", ".join(f"{kind} {percent(covered[kind])}" for kind in ("certified", "falsified", "unknown"))
     left = f" (of it not examined {percent(covered['not_examined'])})" if covered["not_examined"] else ""
-    console.print(f"{document['verdict']}: {parts}{left}", markup=False)
+    console.print(f"{document['verdict']}: {parts}{left}", markup=False, soft_wrap=True)
+    if (proved := document["certified_of_sampled_right"]) is not None:
+        console.print(
+            f"of the sampled poses where the property holds, {percent(min(1.0, proved))} are proved", markup=False
+        )
     if document["partitions"]:
         both = document["partitions"]
-        more = f", unknown {percent(both['undecided'])} (no finite margin)" if both["undecided"] else ""
-        console.print(f"PCP-V {percent(both['PCP-V'])}, PCP-S {percent(both['PCP-S'])}{more}", markup=False)
+        more = f", {percent(both['undecided'])} unknown (no finite margin)" if both["undecided"] else ""
+        text = f"{percent(both['PCP-V'])} are proved (PCP-V), {percent(both['PCP-S'])} right at every sample (PCP-S)"
+        console.print(f"of {both['partitions']:,} fixed parts, {text}{more}", markup=False, soft_wrap=True)
     console.print(f"report: {options.output_dir / 'report.html'}", markup=False, soft_wrap=True)
     return all(entry["sampled"]["poses"] for entry in document["frames"])

@@ -171,7 +171,7 @@ class Compare(GivenSet):
     """
 
     load_config: Path
-    """Scene A: config.yml of a Splatfacto or vanilla-nerf run, or a standard 3DGS .ply."""
+    """Scene A: config.yml of a run, or a scene file (.ply, .sog, .spz, .splat, .glb, .pt)."""
     other: Path
     """Scene B, in the same frame: a compressed, pruned or retrained version of A, or its export."""
     camera_path_filename: Path

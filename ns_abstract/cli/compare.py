@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import tyro
-
 from ns_abstract.cli.commands import Compare
-from ns_abstract.cli.common import DONE, INTERRUPTED, SignalStop, run
+from ns_abstract.cli.common import DONE, INTERRUPTED, SignalStop, command, run
 from ns_abstract.cli.sets import given_set
 from ns_abstract.io.errors import InputError
 
@@ -30,7 +28,7 @@ def compare(options: Compare) -> int:
 
 def main() -> None:
     """Entry point of the console script."""
-    run(compare, lambda: tyro.cli(Compare, prog="ns-abstract-compare"))
+    run(compare, command("ns-abstract-compare", Compare))
 
 
 if __name__ == "__main__":

@@ -7,7 +7,6 @@ from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 from ns_abstract.api import bounding
 from ns_abstract.api.comparing import ComparisonJob, check_comparison, open_comparison
@@ -18,6 +17,7 @@ from ns_abstract.cli.options import stated
 from ns_abstract.io.folder import claim
 from ns_abstract.report.comparison import ComparisonReport
 from ns_abstract.report.figures import listed, number
+from ns_abstract.report.progress import ProgressBar, ShownProgress
 from ns_abstract.report.record import RunRecord, failed_self_check
 
 if TYPE_CHECKING:
@@ -53,30 +53,24 @@ def compare_path(options: Compare, stop: SignalStop) -> bool:
         stack.enter_context(stop.last_words(report.interrupted))
         pending = report.pending
         budget = options.time_budget if options.time_budget is not None else _SECONDS_BY_FRAME * max(1, len(pending))
-        progress = Progress(
-            TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}"), TimeElapsedColumn(),
-            console=console, disable=not console.is_terminal, transient=True,
-        )  # fmt: skip
         try:
             if pending and options.where.engine == "local":
                 with stop.at_once():
                     compile_beside(job, pending[0])
-            with progress:
-                task = progress.add_task("frames", total=max(1, len(pending)), state="compiling kernels on first use")
+            with ProgressBar(console) as progress:
 
                 def on_progress(point: bounding.Progress) -> None:
-                    state = f"frame {point.frame}: at most {number(point.mpg)}, rendered {number(point.mpg_witness)}"
-                    done = point.frames_done + min(0.99, point.seconds / point.budget)
-                    progress.update(task, completed=done, state=state)
+                    text = f"frame {point.frame}: at most {number(point.mpg)}, rendered {number(point.mpg_witness)}"
+                    # mpg is a difference here, which the sentence of bounds would misname
+                    progress(ShownProgress(point.done, text, point.elapsed, point.total_budget))
 
                 results = bounding.bound_frames(
                     job, pending, engine=engine, budget=budget, target_ratio=options.target_ratio, stop=stop,
                     on_progress=on_progress, found_before=report.stored,
                 )  # fmt: skip
-                for done, result in enumerate(results, 1):
+                for result in results:
                     _tell(console, report.add(result, picture=False))
                     report.draw(result.index)
-                    progress.update(task, completed=done)
         finally:
             # also after a failure: what is finished is written
             document = report.finish("interrupted" if stop() else "budget" if report.missing else "done")
@@ -116,7 +110,9 @@ def _introduce(console: Console, job: ComparisonJob, report: ComparisonReport) -
         )
         for note in method.notes:
             console.print(f"  {note}", markup=False, soft_wrap=True)
-    for note in (*job.notes, *job.plan):
+    for warning in job.warnings:
+        console.print(f"warning: {warning}", markup=False, soft_wrap=True)
+    for note in (*(note for note in job.notes if note not in job.warnings), *job.plan):
         console.print(f"  {note}", markup=False, soft_wrap=True)
     console.print(f"  frame: {job.frame_choice.origin}", markup=False, soft_wrap=True)
     if report.kept:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 
 import tyro
 
-from ns_abstract.cli.common import DONE, INTERRUPTED, SignalStop, run
+from ns_abstract.cli.common import DONE, INTERRUPTED, SignalStop, command, run
 from ns_abstract.cli.options import EngineOptions, Overrides, Program, ProgramOptions, SceneOverrides, Where
 from ns_abstract.cli.sets import GivenSet, given_set
 from ns_abstract.io.errors import InputError
@@ -104,7 +104,7 @@ def locate(options: Locate) -> int:
 
 def main() -> None:
     """Entry point of the console script."""
-    run(locate, lambda: tyro.cli(Locate, prog="ns-abstract-locate"), "give fewer --workers or free memory")
+    run(locate, command("ns-abstract-locate", Locate), "give fewer --workers or free memory")
 
 
 if __name__ == "__main__":

@@ -5,16 +5,15 @@ from __future__ import annotations
 import sys
 from typing import TYPE_CHECKING
 
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-
 from ns_abstract.api.cell_search import CellSearch, Request
 from ns_abstract.api.compiling import compile_beside
 from ns_abstract.api.job import check_frames
-from ns_abstract.api.locating import LocateProgress, LocationQuestion
+from ns_abstract.api.locating import LocationQuestion
 from ns_abstract.api.location import open_location
 from ns_abstract.cli.common import SignalStop, plain_console
 from ns_abstract.cli.options import stated
 from ns_abstract.report.figures import percent
+from ns_abstract.report.progress import ProgressBar
 from ns_abstract.verify.store import Store
 
 if TYPE_CHECKING:
@@ -45,34 +44,26 @@ def locate_photo(options: Locate, stop: SignalStop) -> None:
         f"{method.name}: {method.content}; {photo.allowed} of {int(photo.counted.sum())} pixels may show anything",
         markup=False,
     )
+    for warning in location.job.warnings:
+        console.print(f"warning: {warning}", markup=False, soft_wrap=True)
     for note in question.about.plan:
         console.print(f"  {note}", markup=False, soft_wrap=True)
 
     def opened(store: Store) -> None:
         if store.resumed:
-            console.print(f"  {store.open_blocks} cells open from before", markup=False)
+            console.print(f"  {store.open_blocks} cells still to be examined from before", markup=False)
         if options.where.engine == "local":
             # once, and not in every worker
             with stop.at_once():
                 compile_beside(location.job, frames[0])
 
-    progress = Progress(
-        TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[state]}"), TimeElapsedColumn(),
-        console=console, disable=not console.is_terminal, transient=True,
-    )  # fmt: skip
-    with progress:
-        task = progress.add_task("poses", total=1.0, state="")
-
-        def on_progress(point: LocateProgress) -> None:
-            best = "" if point.outliers is None else f", best pose misses {point.outliers} pixels"
-            progress.update(task, completed=1.0 - point.left, state=f"{percent(point.left)} left{best}")
-
+    with ProgressBar(console) as progress:
         document = CellSearch(question, options.output_dir).run(
             lambda stack: stack.enter_context(
                 options.where.started(1 if location.job.rays else options.where.processes)
             ),
             stop,
-            Request(options.time_budget or _SECONDS, options.resume, on_open=opened, on_progress=on_progress),
+            Request(options.time_budget or _SECONDS, options.resume, on_open=opened, on_progress=progress),
         )
     left = percent(document["possible_volume"])
     console.print(f"{_ANSWERS[document['answer']]}; {left} of the set left", markup=False)

@@ -65,6 +65,7 @@ def reach(options: Reach) -> int:
             from ns_abstract.api.compiling import compile_beside
             from ns_abstract.api.reaching import LoopQuestion, open_loop
             from ns_abstract.api.scenes import SceneSource
+            from ns_abstract.reach.page import runs_text
             from ns_abstract.report.figures import percent
             from ns_abstract.report.progress import ProgressBar
 
@@ -93,9 +94,9 @@ def reach(options: Reach) -> int:
         for name, entry in document["questions"].items():
             console.print(
                 f"{name}: certified {percent(entry['certified'])}, falsified {percent(entry['falsified'])}, "
-                f"unknown {percent(entry['unknown'])}; {percent(entry['simulated']['went_well'])} of "
-                f"{entry['simulated']['runs']} random runs went well",
+                f"unknown {percent(entry['unknown'])}; {runs_text(name, entry['simulated'])}",
                 markup=False,
+                soft_wrap=True,
             )
         console.print(
             f"{document['verdict']}; report: {options.output_dir / 'report.html'}", markup=False, soft_wrap=True

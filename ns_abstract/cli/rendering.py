@@ -134,10 +134,11 @@ def _fits(leaves: Leaves | None) -> bool:
 def _introduce(console: Console, job: Job, report: Report) -> None:
     method = job.method
     program = method.program
-    console.print(f"{method.name}: {method.content}, {program['name']} {program['version']}", markup=False)
-    for warning in job.wide_turns:
+    about = f"{method.name}: {method.content}, {program['name']} {program['version']}"
+    console.print(about, markup=False, soft_wrap=True)
+    for warning in job.warnings:
         console.print(f"warning: {warning}", markup=False, soft_wrap=True)
-    for note in (*method.notes, *(note for note in job.notes if note not in job.wide_turns), *job.plan):
+    for note in (*method.notes, *(note for note in job.notes if note not in job.warnings), *job.plan):
         console.print(f"  {note}", markup=False, soft_wrap=True)
     if report.kept:
         console.print(f"  kept from before: frames {listed(report.kept)}", markup=False, soft_wrap=True)
@@ -147,7 +148,7 @@ def _tell(console: Console, entry: dict[str, Any]) -> None:
     if entry["status"] == "missing":
         console.print(f"frame {entry['index']}: no bounds before the time was over", markup=False)
         return
-    ratio = "" if entry["ratio"] is None else f", {entry['ratio']:.3f} times the renders'"
+    ratio = "" if entry["ratio"] is None else f", at most {entry['ratio']:.3f} times the true one"
     console.print(
         f"frame {entry['index']}: mean gap {entry['mpg']:.4f}{ratio}, {entry['cells']} cells, "
         f"{entry['seconds']:.1f} s, {entry['status']}",

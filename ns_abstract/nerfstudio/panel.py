@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import tempfile
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -196,7 +198,9 @@ class AbstractPanel(torch.nn.Module):
         ]  # fmt: skip
         hint = "Time for every view, and for every press of refine"
         self._seconds = ViewerNumber("time by view (s)", seconds, hint=hint)
-        self._file = ViewerText("file", "", hint="Where to write the camera with its set; empty: in the run's folder")
+        self._file = ViewerText(
+            "file", "", hint="Where to write the camera with its set; empty: in the working directory"
+        )
         self.control = Attached(attached)
         self.elements: list[ViewerElement] = [
             self._figures,
@@ -261,9 +265,12 @@ class AbstractPanel(torch.nn.Module):
         view = self._last
         if view is None:
             return
-        folder = self.control.folder if self.control.present else Path()
+        folder = self.control.folder if self.control.present else None
         name = str(self._file.value).strip()
-        file = Path(name) if name else _free_name(folder / "abstract")
+        file = Path(name) if name else _free_name(_outside(folder))
+        if folder is not None and _within(file, folder):
+            self._figures.show(f"{self._figures.text}\n\nThe run's folder stays as it is: give another **file**.")
+            return
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
             text = json.dumps(certify_path(view), indent=1) + "\n"
@@ -271,12 +278,35 @@ class AbstractPanel(torch.nn.Module):
         except OSError as error:
             self._figures.show(f"{self._figures.text}\n\n**{file}** cannot be written ({error.strerror})")
             return
-        files = f"--load-config {folder / 'config.yml'} --camera-path-filename {file}"
         # certificates are for poses of splats
-        command = f"ns-abstract-certify {files} --model NET.onnx --property PROP.json"
-        if view.perturbation.scene or not self._certified:
-            command = f"ns-abstract-render {files}"
-        self._figures.show(f"{self._figures.text}\n\nWritten: `{file}`\n\n`{command} --output-dir OUT`")
+        certified = not view.perturbation.scene and self._certified
+        config = "RUN/config.yml" if folder is None else _short(folder / "config.yml")
+        lines = [
+            f"ns-abstract-{'certify' if certified else 'render'}",
+            f"--load-config {config}",
+            f"--camera-path-filename {_short(file)}",
+            *(("--model NET.onnx", "--property PROP.json") if certified else ()),
+            "--output-dir OUT",
+        ]
+        # an option a line: the panel is narrow
+        command = " \\\n  ".join(lines)
+        text = f"The camera and its set are in **{_short(file)}**. To {'certify' if certified else 'bound'} it, run"
+        self._figures.show(f"{self._figures.text}\n\n{text}\n\n```\n{command}\n```")
+
+
+def _within(file: Path, folder: Path) -> bool:
+    return file.resolve().is_relative_to(folder.resolve())
+
+
+def _outside(run: Path | None) -> Path:
+    """A folder for views that is not the run's: the working directory, or that of temporary files."""
+    here = Path()
+    return Path(tempfile.gettempdir()) if run is not None and _within(here, run) else here
+
+
+def _short(file: Path) -> str:
+    """A path as seen from the working directory, where that is shorter."""
+    return min(str(file), os.path.relpath(file), key=len)
 
 
 def _free_name(folder: Path) -> Path:

@@ -70,7 +70,17 @@ def loop_page(
         strips=strips,
         widths=_widths(document),
         cell=cell,
+        runs_text=runs_text,
     )
+
+
+def runs_text(question: str, simulated: Mapping[str, Any]) -> str:
+    """How many simulated runs did what a question asks, in words."""
+    runs = simulated["runs"]
+    if not runs:
+        return "no run was simulated"
+    well = "stayed safe" if question == "safe" else "stayed safe and reached the goal"
+    return f"{round(simulated['went_well'] * runs):,} of {runs:,} simulated runs {well}"
 
 
 def _pictures(

@@ -107,7 +107,7 @@ def certificate_page(
         cell_data=_cell_data(document, cells, numbers, seen or {}) if numbers else None,
         matrices=matrices,
         more_matrices=more_matrices,
-        regions=regions_html(closer.regions, closer.pictures, sides, closer.why),
+        regions=regions_html(closer.regions, closer.pictures, sides, closer.why, units),
         walk=walk_html(closer.stops),
         cameras="" if cameras is None else cameras.html(numbers),
         pictures=pictures,

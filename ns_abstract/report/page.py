@@ -129,8 +129,8 @@ def _verdict(document: Mapping[str, Any]) -> dict[str, Any]:
     if ratios and not sampled:
         worst = max((entry for entry in frames if entry["ratio"] in ratios), key=lambda entry: entry["ratio"])
         lines.append(
-            f"Tightness: the bounds are {number(median(ratios))} times as wide as what was really rendered"
-            + (f" (median; at most {number(worst['ratio'])}, frame {worst['index']})." if len(ratios) > 1 else ".")
+            f"Tightness: the mean gap is at most {number(median(ratios))} times the true one"
+            + (f" (median; widest {number(worst['ratio'])}, frame {worst['index']})." if len(ratios) > 1 else ".")
         )
     partial = [entry for entry in frames if entry["status"] == "partial"]
     if partial:
@@ -162,7 +162,7 @@ def _captions(entry: Mapping[str, Any], sampled: bool) -> Sequence[tuple[str, st
         ("image", "one render", "at the middle of the set"),
     )  # fmt: skip
     for name, figures in entry.get("layers", {}).items():
-        mean = f"mean {number(figures['mean_gap'])}, {number(figures['ratio'])} times the renders'"
+        mean = f"mean {number(figures['mean_gap'])}, at most {number(figures['ratio'])} times the true one"
         captions += (
             (f"{name}_lower", f"{name}, lower", ""), (f"{name}_upper", f"{name}, upper", ""),
             (f"{name}_gap", f"{name}, upper − lower", mean), (f"{name}_image", f"{name}, one render", ""),

@@ -52,7 +52,9 @@ def play_data(result: FrameResult, most: int) -> str | None:
         result: The frame.
         most: Characters that it may take.
     """
-    leaves = result.leaves if result.leaves is not None and result.leaves.tile.shape[0] else None
+    # one pose has nothing to move
+    moves = result.leaves is not None and result.leaves.tile.shape[0] and result.box.dimensions
+    leaves = result.leaves if moves else None
     for steps, finest in LEVELS:
         if finest is not None and leaves is None:
             continue

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import sys
 import time
+from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, Protocol
 
@@ -36,6 +37,16 @@ class WorkProgress(Protocol):
     def total_budget(self) -> float:
         """Seconds that it may take."""
         ...
+
+
+@dataclass(frozen=True)
+class ShownProgress:
+    """What a display shows, as `WorkProgress` has it."""
+
+    done: float
+    sentence: str
+    elapsed: float
+    total_budget: float
 
 
 def time_text(point: WorkProgress, first: WorkProgress) -> str:

@@ -10,7 +10,7 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from ns_abstract.report.figures import number, unit_of_axis
+from ns_abstract.report.figures import ShownUnits, number
 from ns_abstract.report.html import fill
 
 Float64 = NDArray[np.float64]
@@ -164,6 +164,7 @@ def regions_html(
     pictures: Sequence[tuple[PoseImage, PoseImage | None]],
     parameters: Mapping[int, Sequence[Mapping[str, Any]]],
     why: str,
+    units: ShownUnits | None = None,
 ) -> Markup:
     """The page's part about regions; ``pictures`` are of the first ones, ``why`` there are no more of them."""
     if not regions:
@@ -172,7 +173,7 @@ def regions_html(
     for region, (broken, right) in zip(regions, pictures, strict=False):
         sides = parameters[region.frame]
         box = ", ".join(
-            f"{p['name']} {number(a, 4)} to {number(b, 4)} {unit_of_axis(p['unit'])}"
+            (units or ShownUnits()).interval(p["name"], p["unit"], a, b)
             for p, a, b in zip(sides, region.lower, region.upper, strict=True)
             if p["lower"] < p["upper"]
         )

@@ -18,7 +18,9 @@ _NUMBERS = 8
 _FEW_ROWS, _MANY_ROWS = 128 << 20, 420 << 20
 #: Products a second of one core: of forms in float64, and of rows in float32, few at a time, many, and many that end
 #: by plan; measured.
-_FORMS_SPEED, _FEW_SPEED, _MANY_SPEED, _PLANNED_SPEED = 1.5e9, 2.5e9, 3e10, 7e10
+_FORMS_SPEED, _FEW_SPEED, _MANY_SPEED, _PLANNED_SPEED = 1.5e9, 1.2e9, 3e10, 7e10
+#: Seconds that a layer takes however small it is, the network's bounds of one cell by themselves; measured.
+_LAYER_EACH = 2.5e-3
 #: Seconds that the two rows of a number take besides where they end by plan: most are short; measured.
 _PLANNED_EACH = 3.2e-5
 #: Part of all units that rows are passed back for, in sets that are worth a proof; of a deep network most.
@@ -50,7 +52,7 @@ def estimate(network: Network, dimensions: int) -> tuple[float, float, bool]:
     many = costs.deep and not rows.given_up
     memory = sum(sizes) * 8 * (3 * dimensions + _NUMBERS) + (_MANY_ROWS if many else _FEW_ROWS)
     speed = _PLANNED_SPEED if costs.planned else _MANY_SPEED if costs.deep else _FEW_SPEED
-    seconds = forwards / _FORMS_SPEED + rows.products / speed + _PLANNED_EACH * rows.numbers
+    seconds = forwards / _FORMS_SPEED + rows.products / speed + _PLANNED_EACH * rows.numbers + _LAYER_EACH * count
     return memory, seconds, rows.given_up
 
 
@@ -88,8 +90,8 @@ def explain(network: Network, dimensions: int = 2) -> Sequence[str]:
     memory, seconds, given_up = estimate(network, dimensions)
     lines.append(f"{len(network.nodes)} layers, {total:,.0f} numbers, {work:,.0f} products an evaluation")
     lines.append(
-        f"one cell in {dimensions} parameters: about {memory / 2**30:.2f} GiB, and {seconds:,.1f} s of one core "
-        f"if one unit of {1 / _OPEN:.0f} is open"
+        f"one cell in {dimensions} parameters: about {memory / 2**30:.2f} GiB, and {seconds:.2g} s of one core "
+        f"for the network, if one unit of {1 / _OPEN:.0f} is unstable"
     )
     if given_up:
         lines.append("deep: rows for its units cost more than they may, so they are given up and bounds are wide")
@@ -97,5 +99,5 @@ def explain(network: Network, dimensions: int = 2) -> Sequence[str]:
         lines.append(
             "deep: rows end on the way; of sets for which that leaves nothing known they are given up after seconds"
         )
-    lines += [f"covered: {line}" for line in network.guarantee()]
+    lines += [line if line.startswith("not covered") else f"covered: {line}" for line in network.guarantee()]
     return lines
