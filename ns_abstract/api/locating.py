@@ -275,8 +275,9 @@ def photo_levels(photo: ArrayLike) -> np.ndarray:
     if values.dtype == np.uint8:
         return np.ascontiguousarray(values)
     with np.errstate(invalid="ignore"):
-        levels = np.rint(values.astype(np.float64) * 255.0)
-        fits = (levels >= 0.0) & (levels <= 255.0) & (np.abs(levels / 255.0 - values) <= 1e-6)
+        exact = values.astype(np.float64) * 255.0
+        levels = np.rint(exact)
+        fits = (levels >= 0.0) & (levels <= 255.0) & (np.abs(levels - exact) <= 1e-3)
     if values.dtype.kind == "u" or not fits.all():
         raise InputError(
             "has values that are no multiples of 1/255 in [0, 1]", field="photo",

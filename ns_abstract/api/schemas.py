@@ -174,10 +174,10 @@ def _statements() -> dict[str, tuple[dict[str, Schema], list[str]]]:
     box = {"anyOf": [_NULL, {"const": "all"}, _list(size, 4, 4)]}
     schemas: dict[str, Schema] = {
         "select": _select(),
-        "weight": {"type": "number", "minimum": 1e-6, "maximum": 1},
+        "weight": {"type": "number", "minimum": MODERATE[0], "maximum": 1},
         "pixels": {"type": "integer", "minimum": 1},
         "fraction": {"type": "number", "exclusiveMinimum": 0, "maximum": 1},
-        "distance": {"type": "number", "minimum": 1e-6, "maximum": 1e6},
+        "distance": {"type": "number", "minimum": MODERATE[0], "maximum": MODERATE[1]},
         "units": {"enum": ["normalised", "dataset"]},
         "measure": {"enum": ["weight", "expected"]},
         "statistic": {"enum": list(STATISTICS)},

@@ -17,7 +17,7 @@ from ns_abstract.report.progress import ProgressBar
 from ns_abstract.verify.store import Store
 
 if TYPE_CHECKING:
-    from ns_abstract.cli.locate import Locate
+    from ns_abstract.cli.commands import Locate
 
 #: Seconds where no time budget is given.
 _SECONDS = 600.0

@@ -43,6 +43,8 @@ class LocationTuning:
     #: part of those that exclude a cell, for it to be bounded.
     reference: float = 2.4
     promise: float = 0.6
+    #: Image motion below which a parameter counts as one that moves nothing.
+    still: float = 1e-12
     #: How many pixels bounds exclude, about, as a power of the motion; ends of the part of it that cuts aim at.
     power: float = 2.5
     least_aim: float = 0.35
@@ -120,7 +122,9 @@ class LocationSearch:
         From one cell in the middle of the set; a guess that only decides which pixels are bounded.
         """
         box, frame, reference = self.frame.box, self.frame, self.tuning.reference
-        side = np.minimum(1.0, reference / math.sqrt(max(1, box.dimensions)) / np.maximum(self.moved(box), 1e-12))
+        side = np.minimum(
+            1.0, reference / math.sqrt(max(1, box.dimensions)) / np.maximum(self.moved(box), self.tuning.still)
+        )
         cell = between(box, -side, side)
         bounds = frame.bound(cell, np.arange(frame.tile_count), None)
         picture = assemble(self.plain.render(self.original(cell.middle)), frame.camera)
@@ -375,7 +379,7 @@ def between(box: ParameterBox, least: Float64Array, most: Float64Array) -> Param
 
 
 def inner_cell(grid: CellGrid, cell: Cell, box: ParameterBox) -> Cell:
-    """The smallest part of a cell, in whole units, that holds all of ``box`` within it."""
+    """The smallest part of a cell, in whole units, that holds all of ``box`` within it (U3)."""
     first, past = list(cell.first), list(cell.past)
     for k in range(grid.box.dimensions):
         low, high = grid.box.lower[k], grid.box.upper[k]
