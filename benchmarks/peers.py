@@ -102,7 +102,13 @@ def ours(
     rows = np.concatenate([eye, -eye])
     start = time.perf_counter()
     lower = bound_outputs(
-        network, box(x, radius), rows, np.zeros(len(rows)), arithmetic=arithmetic, slope_steps=steps
+        network,
+        box(x, radius),
+        rows,
+        np.zeros(len(rows)),
+        arithmetic=arithmetic,
+        slope_steps=steps,
+        intermediate_steps=steps,
     ).lower
     return -float(lower.sum()), time.perf_counter() - start
 
@@ -129,7 +135,9 @@ def main() -> None:
     options = parser.parse_args()
     warnings.filterwarnings("ignore")
     torch.set_num_threads(1)
-    print("| network | box | CROWN | s | s | float32 | alpha-CROWN | s | s | float32 |\n|---|---|---|---|---|---|---|---|---|---|")
+    print(
+        "| network | box | CROWN | s | s | float32 | alpha-CROWN | s | s | float32 |\n|---|---|---|---|---|---|---|---|---|---|"
+    )
     for name in options.names:
         make, shape, radius = NETWORKS[name]
         torch.manual_seed(0)
