@@ -40,6 +40,8 @@ class NeuronBounds:
         self.intermediate, self.network, self.backward = intermediate, intermediate.network, backward
         self.schedule, self.sharing = schedule, sharing
         self.ascent = ascent
+        # rows in float64 pay where the network's own rounding is none
+        self._number = intermediate.relaxations[0 if schedule.deep else -1].number
         self.spared = 0.0
 
     def bounded(
@@ -103,7 +105,7 @@ class NeuronBounds:
             if not len(at):
                 continue
             cell, channel, y, x = (np.ascontiguousarray(v) for v in where[at].T)
-            value = np.zeros((len(at), shape[0], 1, 1), np.float32)
+            value = np.zeros((len(at), shape[0], 1, 1), self.intermediate.relaxations[-1].number)
             value[np.arange(len(at)), channel, 0, 0] = side
             best = BackwardBounds.unknown(len(at), self.intermediate.d)
             best.lower[:] = side * ends[at]
@@ -125,9 +127,9 @@ class NeuronBounds:
         def bound(first: int) -> tuple[Int64, BackwardBounds, BackwardTrace | None]:
             number = np.arange(first, min(len(where), first + step))
             cell, channel, y, x = (np.ascontiguousarray(v) for v in where[number].T)
-            value = np.zeros((len(cell), channels, 1, 1), np.float32)
-            value[np.arange(len(cell)), channel, 0, 0] = sign[number]
             trace = self.sharing.trace(len(cell))
+            value = np.zeros((len(cell), channels, 1, 1), np.float32 if trace is not None else self._number)
+            value[np.arange(len(cell)), channel, 0, 0] = sign[number]
             criterion = None if enough is None else enough[number]
             part = self.backward.bound(index, Coefficients(value, y, x), cell, criterion, trace, cut)
             return number, part, trace

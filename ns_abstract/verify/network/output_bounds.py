@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ns_abstract.arithmetic.network_charges import DOUBLE_UNIT, OWN_LINE, UP
+from ns_abstract.arithmetic.network_charges import DOUBLE_UNIT, OWN_LINE
 from ns_abstract.verify.network.backward import ROWS_AT_ONCE, BackwardPass
 from ns_abstract.verify.network.coefficients import Coefficients, Float64, Int64, grid
 from ns_abstract.verify.network.forms import NodeForm
@@ -45,8 +45,6 @@ class OutputRows:
         missing = size @ np.abs(dense - stored).T
         missing += 2.0 * DOUBLE_UNIT * (dense.shape[1] + 2) * (np.abs(reference) @ np.abs(dense).T)
         offset = reference @ dense.T + offset
-        # lines are chosen for rows in float32
-        rounded = size @ np.abs(stored - stored.astype(np.float32)).T * UP
         need = -offset + _SURE * (1.0 + np.abs(offset))
         for top, left, height, width, number in _windows(stored.reshape(k, *shape)):
             part = stored.reshape(k, *shape)[:, :, top : top + height, left : left + width]
@@ -60,7 +58,7 @@ class OutputRows:
                 bounds = self.backward.bound(index, Coefficients(rows.value.copy(), rows.y, rows.x), cell)
                 if self.ascent.steps:
                     wanted = None if self.intermediate.assumed is None else need[cell, row]
-                    loosest[cell, row] = self.ascent.climb(index, rows, cell, bounds, wanted, rounded[cell, row])
+                    loosest[cell, row] = self.ascent.climb(index, rows, cell, bounds, wanted)
                 plane[cell, row], lower[cell, row] = bounds.plane[:, 0], bounds.lower
         room = OWN_LINE * (np.abs(plane).sum(-1) + np.abs(offset) + missing) + missing
         lower, b = lower + offset - room, plane[..., -1] + offset - room

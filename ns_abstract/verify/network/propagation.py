@@ -179,11 +179,11 @@ class ForwardPropagation:
         if fold:
             self.intermediate.folded.add(source)
         if self.chooses and isinstance(layer, (LeakyRelu, ScalarFunction)):
-            first = self.intermediate.relaxations[0]
+            first = self.intermediate.relaxations[-1]
             loose = (SPARE + self.network.readers[source]) * first.unit * z.width
             loose = loose + (first.noise[source] if fold else 0.0)
             arguments = (lower, upper, z.reference, reference, loose, room + torch.zeros_like(lower))
-            self.intermediate.unstable[k] = _unstable_neurons(layer, arguments)
+            self.intermediate.unstable[k] = _unstable_neurons(layer, first, arguments)
         lost = int(np.prod(layer.shape)) * 2 * FLUSH
         self.intermediate.flush += lost * z.width.reshape(self.intermediate.count, -1).amax(1).numpy()
         ends = layer.range(lower, upper)
@@ -253,7 +253,9 @@ def _around_slope(slope: Tensor, z: NodeForm, line: tuple[Tensor, Tensor, Tensor
 
 
 def _unstable_neurons(
-    layer: LeakyRelu | ScalarFunction, given: tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+    layer: LeakyRelu | ScalarFunction,
+    relaxations: Relaxations,
+    given: tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor],
 ) -> UnstableNeurons:
     """Return the neurons [m, *shape] whose lines may be chosen as `UnstableNeurons`."""
     lower, upper = given[:2]
@@ -261,4 +263,4 @@ def _unstable_neurons(
     at = where[:, 0], where[:, 1]
     lower, upper, reference, image, loose, room = (v.flatten(1)[at].numpy() for v in given)
     cell, flat = (v.numpy() for v in at)
-    return UnstableNeurons(cell, flat, lower, upper, reference, image, loose, room, layer)
+    return UnstableNeurons(cell, flat, lower, upper, reference, image, loose, room, layer, relaxations)

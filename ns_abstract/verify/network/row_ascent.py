@@ -28,40 +28,29 @@ class RowAscent:
     Args:
         intermediate: What is known of the nodes.
         backward: Passes rows back over it.
-        steps: Steps towards the best lines; 0: none.
+        steps: Steps towards the best lines; 0: none. Rows are of the type that the outputs' are.
     """
 
     def __init__(self, intermediate: IntermediateBounds, backward: BackwardPass, steps: int) -> None:
         self.intermediate, self.network, self.backward = intermediate, intermediate.network, backward
         self.steps = steps
 
-    def climb(
-        self,
-        index: int,
-        rows: Coefficients,
-        cell: Int64,
-        best: BackwardBounds,
-        need: Float64 | None,
-        rounded: Float64 | None = None,
-    ) -> Int64:
+    def climb(self, index: int, rows: Coefficients, cell: Int64, best: BackwardBounds, need: Float64 | None) -> Int64:
         """Raise ``best.lower`` of rows on node ``index``, and planes with it, where lines of their own give more.
 
-        A cell whose rows are all above ``need`` [R] is done. ``rounded`` [R] is what bounds lose where rows are rounded
-        to float32. Returns `OutputBounds.loosest` of the rows.
+        A cell whose rows are all above ``need`` [R] is done. Returns `OutputBounds.loosest` of the rows.
         """
         loosest = np.full((len(cell), 2), -1, np.int64)
-        rounded = np.zeros(len(cell)) if rounded is None else rounded
-        start = Coefficients(rows.value.astype(np.float32), rows.y, rows.x)
         for k in np.unique(cell):
             choices, own = ascending(self.intermediate.unstable, k), np.flatnonzero(cell == k)
             if not (choices or self.intermediate.split[k]) or not self.intermediate.good[k]:
                 continue
-            size = sum(24 * int(np.prod(self.network.shape(at))) for at in choices)
+            size = sum(6 * rows.value.itemsize * int(np.prod(self.network.shape(at))) for at in choices)
             step = max(1, _LINES_AT_ONCE // max(1, size))
             for first in range(0, len(own), step):
                 part = own[first : first + step]
                 target = None if need is None else need[part]
-                loosest[part] = self._climb(index, start[part], k, part, best, target, rounded[part], choices)
+                loosest[part] = self._climb(index, rows[part], k, part, best, target, choices)
         return loosest
 
     def _climb(
@@ -72,11 +61,10 @@ class RowAscent:
         own: Int64,
         best: BackwardBounds,
         need: Float64 | None,
-        rounded: Float64,
         choices: Mapping[int, Sequence[LineChoice]],
     ) -> Int64:
         """`climb` for rows ``own`` of cell k."""
-        relaxations, cell = self.intermediate.relaxations[0], np.full(len(own), k)
+        relaxations, cell = self.intermediate.relaxations[-1], np.full(len(own), k)
         lines = {at: relaxations.lines[at][:, k] for at in choices}
         ascent = DualAscent(choices, lines, len(own), self.intermediate.split[k])
         for number in range(self.steps + 1):
@@ -88,8 +76,6 @@ class RowAscent:
             total, numbers = np.zeros((len(own), 2)), np.arange(len(own))
             batch = CoefficientBatch({index: part}, cell, total, numbers, relaxations, chosen)
             self.backward.descend(index, index, batch, bounds, None)
-            bounds.lower -= rounded
-            bounds.plane[:, 0, -1] -= rounded
             better = bounds.lower > best.lower[own]
             best.lower[own[better]], best.plane[own[better]] = bounds.lower[better], bounds.plane[better]
             if number < self.steps:
@@ -125,7 +111,7 @@ class RowAscent:
         self, index: int, cell: int, chosen: OptimisedSlopes, found: BackwardBounds, ascent: DualAscent
     ) -> tuple[dict[int, list[Float64]], dict[int, Float64]]:
         """How the bounds of a cell's rows change with parameters and with multipliers."""
-        planes, relaxations = self.intermediate.image, self.intermediate.relaxations[0]
+        planes, relaxations = self.intermediate.image, self.intermediate.relaxations[-1]
         rows = chosen.trace.get(0)
         if rows is None:
             rows = np.zeros((len(found.lower), *grid(self.network.input_shape)), np.float32)

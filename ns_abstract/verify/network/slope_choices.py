@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 
 from ns_abstract.arithmetic.network_charges import OWN_SUMS
 from ns_abstract.verify.network.activations import ScalarFunction
+from ns_abstract.verify.network.coefficients import Floats
 from ns_abstract.verify.network.layers import Activation, LeakyRelu
+from ns_abstract.verify.network.relaxations import Relaxations
 from ns_abstract.verify.network.tangents import Tangents
 
 Float64 = NDArray[np.float64]
-Float32 = NDArray[np.float32]
 Int64 = NDArray[np.int64]
 
 
@@ -31,6 +32,7 @@ class UnstableNeurons:
         loose: [U] charged for every part of a slope: rounding of rows and of the layer before.
         room: [U] charged besides.
         layer: The activation behind them.
+        relaxations: Of rows that choose.
     """
 
     cell: Int64
@@ -42,9 +44,10 @@ class UnstableNeurons:
     loose: Float64
     room: Float64
     layer: Activation
+    relaxations: Relaxations
 
     def __getitem__(self, at: np.ndarray) -> UnstableNeurons:
-        names = (entry.name for entry in fields(self) if entry.name != "layer")
+        names = (entry.name for entry in fields(self) if entry.name not in ("layer", "relaxations"))
         return replace(self, **{name: getattr(self, name)[at] for name in names})
 
     def choices(self, cell: int) -> list[LineChoice]:
@@ -61,14 +64,15 @@ class UnstableNeurons:
                 found.append(TangentPoints(units[at.numpy()], tangents[at]))
         return found
 
-    def shifted(self, slope: Float64, low: Float64, high: Float64) -> tuple[Float32, Float32]:
-        """Offsets below and above, relative to the references, of lines with float32 ``slope`` [R, U] (N4)."""
+    def shifted(self, slope: Float64, low: Float64, high: Float64) -> tuple[Floats, Floats]:
+        """Offsets below and above, relative to the references, of lines with stored ``slope`` [R, U] (N4)."""
         base = slope * self.reference - self.image
         size = np.abs(self.reference) + np.abs(self.image) + np.abs(self.lower) + np.abs(self.upper)
         give = np.abs(slope) * self.loose + self.room + OWN_SUMS * (size + np.abs(low) + np.abs(high))
         give = give + OWN_SUMS * np.abs(slope) * size
-        below, above = (low + base - give).astype(np.float32), (high + base + give).astype(np.float32)
-        return np.nextafter(below, np.float32(-np.inf)), np.nextafter(above, np.float32(np.inf))
+        ends = ((low + base - give, -1.0), (high + base + give, 1.0))
+        below, above = (self.relaxations.outward(torch.from_numpy(v), side).numpy() for v, side in ends)
+        return below, above
 
 
 class LineChoice(Protocol):
@@ -79,7 +83,7 @@ class LineChoice(Protocol):
         """The neurons."""
         ...
 
-    def start(self, lines: Float32) -> Float64:
+    def start(self, lines: Floats) -> Float64:
         """[U] parameters of the cell's ``lines`` [6, N], or about."""
         ...
 
@@ -87,7 +91,7 @@ class LineChoice(Protocol):
         """The closest parameters that are allowed."""
         ...
 
-    def put(self, parameter: Float64, lines: Float32) -> None:
+    def put(self, parameter: Float64, lines: Floats) -> None:
         """Write the lines of parameters [R, U] into ``lines`` [6, R, N]."""
         ...
 
@@ -103,21 +107,21 @@ class ReluSlopes:
     units: UnstableNeurons
     alpha: float
 
-    def losses(self, coefficient: Float32) -> Float64:
+    def losses(self, coefficient: Floats) -> Float64:
         """[R, U] about what rows with ``coefficient`` on the units lose because these are open."""
         lower, upper = self.units.lower, self.units.upper
         gap = (1.0 - self.alpha) * upper * -lower / (upper - lower)
         # a slope below was chosen for the row, the line above could not be
         return np.where(coefficient < 0.0, 1.0, 0.5) * np.abs(coefficient) * gap
 
-    def start(self, lines: Float32) -> Float64:
+    def start(self, lines: Floats) -> Float64:
         return lines[0][self.units.flat].astype(np.float64)
 
     def within(self, parameter: Float64) -> Float64:
         return np.clip(parameter, self.alpha, 1.0)
 
-    def put(self, parameter: Float64, lines: Float32) -> None:
-        slope = parameter.astype(np.float32).astype(np.float64)
+    def put(self, parameter: Float64, lines: Floats) -> None:
+        slope = parameter.astype(self.units.relaxations.number).astype(np.float64)
         lower, upper, flat = self.units.lower, self.units.upper, self.units.flat
         # the function is convex: above a line by most at an end, below it at the kink or, past the limits, at an end
         ends = self.alpha * lower - slope * lower, upper - slope * upper
@@ -139,7 +143,7 @@ class TangentPoints:
         first, last = self.tangents.first, self.tangents.last
         return torch.minimum(torch.maximum(first + parameter * (last - first), first), last)
 
-    def start(self, lines: Float32) -> Float64:
+    def start(self, lines: Floats) -> Float64:
         first, last = self.tangents.first, self.tangents.last
         middle = 0.5 * (self.tangents.lower + self.tangents.upper)
         return ((middle - first) / (last - first)).clamp(0.0, 1.0).numpy()
@@ -147,10 +151,9 @@ class TangentPoints:
     def within(self, parameter: Float64) -> Float64:
         return np.clip(parameter, 0.0, 1.0)
 
-    def put(self, parameter: Float64, lines: Float32) -> None:
-        slope, offset = (
-            v.numpy() for v in self.tangents.line(self._points(torch.from_numpy(parameter)), torch.float32)
-        )
+    def put(self, parameter: Float64, lines: Floats) -> None:
+        touch = self._points(torch.from_numpy(parameter))
+        slope, offset = (v.numpy() for v in self.tangents.line(touch, self.units.relaxations.dtype))
         lower, upper, flat = self.units.lower, self.units.upper, self.units.flat
         least, most = (v.numpy() for v in self.units.layer.range(self.tangents.lower, self.tangents.upper))
         # the other side of the row is asked for by nobody: any bound will do

@@ -188,10 +188,10 @@ def slope_derivatives(
         elif rows is None:
             values.append(torch.zeros((count, *node.layer.shape), dtype=image.dtype))
         elif isinstance(node.layer, (Product, MaxPool)):
-            values.append(others[k](torch.from_numpy(rows), inputs).reshape(count, *node.layer.shape))
+            values.append(others[k](torch.from_numpy(rows), inputs).to(image.dtype).reshape(count, *node.layer.shape))
         else:
             assert isinstance(node.layer, Activation)
-            own = torch.from_numpy(lines(k)).reshape(6, -1, *node.layer.shape)
+            own = torch.from_numpy(lines(k)).to(image.dtype).reshape(6, -1, *node.layer.shape)
             a, u = torch.from_numpy(rows).reshape(inputs[0].shape), inputs[0]
             slope, offset = torch.where(a >= 0.0, own[0], own[3]), torch.where(a >= 0.0, own[1], own[4])
             source = node.inputs[0]
