@@ -10,6 +10,7 @@ are in real arithmetic, and in float32 beside it, which nobody else charges.
 from __future__ import annotations
 
 import argparse
+import itertools
 import sys
 import tempfile
 import time
@@ -32,7 +33,7 @@ from ns_abstract.verify.network.onnx_file import read_onnx  # noqa: E402
 def dense(sizes: Sequence[int], function: Callable[[], nn.Module], gain: float = 1.4) -> nn.Module:
     """Fully connected layers with a function between."""
     layers: list[nn.Module] = [nn.Flatten()]
-    for before, after in zip(sizes[:-1], sizes[1:], strict=True):
+    for before, after in itertools.pairwise(sizes):
         layer = nn.Linear(before, after)
         nn.init.normal_(layer.weight, std=gain / before**0.5)
         nn.init.normal_(layer.bias, std=0.1)
@@ -135,9 +136,7 @@ def main() -> None:
     options = parser.parse_args()
     warnings.filterwarnings("ignore")
     torch.set_num_threads(1)
-    print(
-        "| network | box | CROWN | s | s | float32 | alpha-CROWN | s | s | float32 |\n|---|---|---|---|---|---|---|---|---|---|"
-    )
+    print("| network | box | CROWN | s | s | float32 | alpha-CROWN | s | s | float32 |\n" + "|---" * 10 + "|")
     for name in options.names:
         make, shape, radius = NETWORKS[name]
         torch.manual_seed(0)
