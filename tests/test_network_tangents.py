@@ -15,6 +15,7 @@ from test_network_curves import CURVES, Exact, above, below, intervals, points
 
 from ns_abstract.arithmetic.network_charges import UNIT
 from ns_abstract.verify.network import ImageSets, bound_outputs
+from ns_abstract.verify.network.activations import ScalarFunction
 from ns_abstract.verify.network.graph import NetworkArithmetic
 from ns_abstract.verify.network.layers import Activation, LeakyRelu
 from ns_abstract.verify.network.load import load_network
@@ -25,6 +26,17 @@ from ns_abstract.verify.network.tangents import Tangents
 
 BENT = [name for name, (curve, _, _) in CURVES.items() if any(curve.bends)]
 DOUBLE = torch.float64
+
+
+def ends_of_part(curve: ScalarFunction, tangents: Tangents) -> tuple[torch.Tensor, torch.Tensor]:
+    """Of the one part that bends towards the side, also where tangents cross the function elsewhere."""
+    edges = [tangents.lower, *(torch.full_like(tangents.lower, b) for b in curve.breaks), tangents.upper]
+    edges = [torch.minimum(torch.maximum(edge, tangents.lower), tangents.upper) for edge in edges]
+    first, last = tangents.first.clone(), tangents.last.clone()
+    for before, after, bend in zip(edges[:-1], edges[1:], curve.bends, strict=True):
+        here = (after > before) & (bend == -tangents.side)
+        first, last = torch.where(here, before, first), torch.where(here, after, last)
+    return first, last
 
 
 @pytest.mark.parametrize("name", BENT)
@@ -40,8 +52,9 @@ def test_tangents_are_on_one_side(name: str) -> None:
             tangents = tangents[at]
             for dtype in (torch.float32, DOUBLE):
                 part = torch.from_numpy(rng.choice([0.0, 1.0, *rng.uniform(size=3)], len(at)))
-                t = tangents.first + part * (tangents.last - tangents.first)
-                slope, offset = tangents.line(torch.minimum(t, tangents.last), dtype)
+                first, last = ends_of_part(curve, tangents)
+                t = torch.minimum(first + part * (last - first), last)
+                slope, offset = tangents.line(t, dtype)
                 for k in range(len(at)):
                     ends = float(tangents.lower[k]), float(tangents.upper[k])
                     for z in [float(t[k]), *points(*ends, curve.breaks)]:

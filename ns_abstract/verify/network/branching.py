@@ -75,8 +75,7 @@ def branch(
         images: One cell.
         groups: Numbers of rows.
         most: Branches after which it is given up.
-        intermediate_steps: Steps towards the best lines of intermediate bounds, before branching on what is open without
-            them; 0: none.
+        intermediate_steps: Steps towards the best lines of intermediate bounds before anything is branched on.
         enough: Asked between batches of branches: whether to give up.
     """
     dense = np.asarray(rows.toarray() if hasattr(rows, "toarray") else rows, np.float64)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import torch
@@ -96,7 +96,7 @@ class Tangents:
                     bad, good = torch.where(fine, bad, middle), torch.where(fine, middle, good)
                 point[at] = torch.where(none, math.nan, good)
             points.append(point)
-        return Tangents(self.curve, self.side, *points, self.lower, self.upper, self.corners, self.values)
+        return replace(self, first=points[0], last=points[1])
 
     def _clear(self, t: Tensor, end: Tensor, value: Tensor) -> Tensor:
         """Whether the tangent at ``t`` is on its side of the function at an end."""
