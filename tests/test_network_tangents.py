@@ -63,6 +63,18 @@ def test_tangents_are_on_one_side(name: str) -> None:
     assert tried > 100
 
 
+def test_rounded_slopes_are_charged() -> None:
+    """A slope near 1 is rounded by more than a flat curve bends away from its tangent."""
+    curve, exact, _ = CURVES["softplus"]
+    lower, upper = torch.full((40,), 10.0, dtype=DOUBLE), torch.full((40,), 25.0, dtype=DOUBLE)
+    t = torch.linspace(15.0, 18.0, 40, dtype=DOUBLE)
+    slope, offset = Tangents.of(curve, lower, upper, -1.0).line(t, torch.float32)
+    with flint.ctx.workprec(200):
+        for k in range(40):
+            for z in np.linspace(float(t[k]) - 0.5, float(t[k]) + 0.5, 11):
+                assert below(float(slope[k]), float(offset[k]), z, exact)
+
+
 def neurons(layer: Activation, lower: torch.Tensor, upper: torch.Tensor, dtype: torch.dtype) -> UnstableNeurons:
     """Neurons of one cell about references of their own, whose rows are not charged."""
     count = len(lower)
