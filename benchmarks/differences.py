@@ -24,7 +24,11 @@ from ns_abstract.methods.splat.load import load_scene
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.methods.splat.write import write_splatfacto_run
 
-HEADER = "| pair | set | largest, bound | largest, rendered | ratio | mean, bound | mean, rendered | seconds | cells | reached |"
+#: Columns of the table.
+COLUMNS = (
+    "pair", "set", "largest, bound", "largest, rendered", "ratio", "mean, bound", "mean, rendered", "seconds", "cells",
+    "reached",
+)  # fmt: skip
 #: Ratio, or difference, of the largest bound to the largest rendered difference that is asked for.
 RATIO, ROOM = 1.3, 0.01
 
@@ -99,8 +103,8 @@ def main() -> int:
     options = parser.parse_args()
     with tempfile.TemporaryDirectory() as scratch:
         folder = options.variants or Path(scratch)
-        print(HEADER)
-        print("|---" * 10 + "|", flush=True)
+        print(f"| {' | '.join(COLUMNS)} |")
+        print("|---" * len(COLUMNS) + "|", flush=True)
         for name, (run, change) in PAIRS.items():
             file = config(options.runs, run)
             stored = load_scene(file)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from ns_abstract.api.certifying import Certificate, CertifiedCell, CertifyProgress, certify
     from ns_abstract.api.checking import Audit, check
     from ns_abstract.api.comparing import Comparison, compare
+    from ns_abstract.api.locating import Located, LocatedCell, LocateProgress, locate
     from ns_abstract.api.poses import Camera, PoseSet
     from ns_abstract.api.reaching import ReachCell, ReachProgress, ReachResult, reach
     from ns_abstract.api.scenes import Scene, load_scene, render
@@ -30,6 +31,7 @@ _HOMES = {
     "api.certifying": ("Certificate", "CertifiedCell", "CertifyProgress", "certify"),
     "api.checking": ("Audit", "check"),
     "api.comparing": ("Comparison", "compare"),
+    "api.locating": ("Located", "LocatedCell", "LocateProgress", "locate"),
     "api.poses": ("Camera", "PoseSet"),
     "api.reaching": ("ReachCell", "ReachProgress", "ReachResult", "reach"),
     "api.scenes": ("Scene", "load_scene", "render"),
@@ -49,6 +51,9 @@ __all__ = [
     "CertifyProgress",
     "Comparison",
     "InputError",
+    "LocateProgress",
+    "Located",
+    "LocatedCell",
     "PoseSet",
     "Progress",
     "ProgressBar",
@@ -63,6 +68,7 @@ __all__ = [
     "compare",
     "load_camera_path",
     "load_scene",
+    "locate",
     "reach",
     "render",
 ]

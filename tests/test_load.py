@@ -443,7 +443,7 @@ def test_other_methods_with_gaussians(run: Run) -> None:
     run.replace("rasterize_mode: classic", "rasterize_mode: antialiased")
     refused(run.config, "pipeline.model._target", "mine.MyModel", "--assume-splatfacto")
     scene = load_scene(run.config, Overrides(assume_splatfacto=True))
-    assert (scene.rasterize_mode, scene.alone, scene.notes) == ("antialiased", True, ())
+    assert (scene.rasterize_mode, scene.gaussians_alone, scene.notes) == ("antialiased", True, ())
 
 
 def test_zero_quaternions_are_dropped(run: Run) -> None:

@@ -36,6 +36,8 @@ FIELDS = {
     "stiff": (0, {"density": 1e4}),
     "rough": (2, {"rough": 20.0}),
 }
+#: Rays of a picture that are bounded; each takes seconds.
+RAYS = 3
 #: How far a set's bounds may be from what renders reach: mean gap over theirs, and what may be added.
 TIGHT = {
     ("soft", "point"): (0.0, 1e-4), ("soft", "narrow"): (2.5, 0.0), ("soft", "yaw"): (1.2, 0.0),
@@ -46,7 +48,7 @@ TIGHT = {
 
 
 def bounded(scene: NerfScene, pose_set: PoseBox, tolerance: float) -> RayBounds:
-    pixels = pixels_of(pose_set.camera)[:6]
+    pixels = pixels_of(pose_set.camera)[:RAYS]
     return NerfBounds(scene, BINS, pose_set.box.dimensions).rays(pose_set, pose_set.box, pixels, tolerance)
 
 
@@ -56,7 +58,7 @@ def reached(scene: NerfScene, pose_set: PoseBox) -> float:
     values = [box.middle]
     if box.dimensions:
         values += [*box.corners(), *box.sample(40, np.random.default_rng(0))]
-    pixels = pixels_of(pose_set.camera)[:6]
+    pixels = pixels_of(pose_set.camera)[:RAYS]
     shown = np.stack([renderer.pixels(pose_set.camera, pose_set.pose(np.asarray(v)), pixels) for v in values])
     return float((shown.max(axis=0) - shown.min(axis=0)).mean())
 
@@ -178,7 +180,7 @@ def test_samples_are_where_and_what_they_are_said_to_be(kind: str, grid: bool) -
     seed, changes = FIELDS[kind]
     scene, pose_set = tiny_scene(seed, **changes), poses({"rotation": {"yaw": 2e-4}})
     scene = dataclasses.replace(scene, occupancy=checkered() if grid else None)
-    paths, pixels = NerfBounds(scene, BINS, 1).paths, pixels_of(pose_set.camera)[:6]
+    paths, pixels = NerfBounds(scene, BINS, 1).paths, pixels_of(pose_set.camera)[:RAYS]
     assert paths is not None
     work = BundleBounds(
         paths, RayBundle(pose_set, pose_set.box, pixels, paths.degree), Division((), 1, 2), np.zeros(6, np.int64), 1.0,

@@ -470,4 +470,9 @@ def _caught(name: str, tmp_path: Path, mutate: Callable[[pytest.MonkeyPatch], No
 def test_attack_catches(mutant: str, tmp_path: Path) -> None:
     mutate, name = MUTANTS[mutant]
     assert _caught(name, tmp_path, mutate)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", sorted({name for _, name in MUTANTS.values()}))
+def test_attack_catches_nothing_else(name: str, tmp_path: Path) -> None:
     assert not _caught(name, tmp_path, lambda patch: None)

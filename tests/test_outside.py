@@ -22,7 +22,7 @@ from ns_abstract.perturbation.specification import parse_perturbation
 from ns_abstract.reach.loop import Loop, parse_loop
 from ns_abstract.reach.planes import plane_marks, region, views
 from ns_abstract.refine.protocol import SceneElements
-from ns_abstract.report.cameras import MOST, CameraDrawings, cameras_entry, cell_cameras, standing
+from ns_abstract.report.cameras import MOST, CameraDrawings, cameras_entry, cell_cameras, standing, upward
 from ns_abstract.report.export import encode_gif, encode_mp4
 from ns_abstract.report.outside import PlotWindow, SceneDrawing
 from ns_abstract.verify.store import Store
@@ -290,6 +290,21 @@ def test_cameras_are_drawn_where_the_middles_of_their_cells_are() -> None:
                 else:
                     # who looks at one who looks has its tip in the middle
                     assert any((a.min(axis=1) < 0.01).all() and (a.max(axis=1) > -0.01).all() for a in away)
+
+
+@pytest.mark.parametrize("up", [0, 1, 2])
+def test_an_orbit_is_drawn_in_its_plane(up: int) -> None:
+    """Whatever is up: the plan shows both coordinates that an orbit changes, and is a circle."""
+    axis, eye = np.eye(3)[up] + 0.1, 2.0 * np.eye(3)[(up + 1) % 3]
+    turned = np.concatenate([np.eye(3), eye[:, None]], axis=1)
+    sets = {0: poses({"orbit": {"target": [0, 0, 0], "axis": axis.tolist(), "azimuth": [0.0, 6.0]}}, turned)}
+    assert upward(sets) == up
+    low, high = standing(sets)
+    plan, side = CameraDrawings([], 0, (low, high), None, upward(sets)).views(300)
+    assert set(plan.window.axes) == {0, 1, 2} - {up} and side.window.axes[1] == up
+    assert SceneDrawing.sight(plan.window.axes) == (up, 1.0)
+    assert min(high[list(plan.window.axes)] - low[list(plan.window.axes)]) > 2.0
+    assert upward({0: shifts()}) == 2
 
 
 def test_the_widest_cells_have_cameras_and_the_others_are_counted() -> None:

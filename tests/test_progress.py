@@ -83,12 +83,14 @@ def test_display_on_a_terminal_in_a_pipe_and_in_a_notebook(monkeypatch: pytest.M
         bar(CERTIFY)
         bar._bar.refresh()
     assert "certified 20.00 %" in stream.getvalue() and "30 of 60 s used" in stream.getvalue()
-    pipe = io.StringIO()
+    pipe, clock = io.StringIO(), iter([0.0, 1.0, 16.0, 16.0, 17.0, *range(18, 40)])
+    monkeypatch.setattr(progress, "time", SimpleNamespace(monotonic=lambda: next(clock)))
     with nsa.ProgressBar(Console(file=pipe, width=60)) as bar:
         for _ in range(3):
             bar(CERTIFY)
-    # a line now and then, not wrapped
+    # a line every fifteen seconds, not wrapped
     assert pipe.getvalue().count("\n") == 1 and "not examined 67.47 %" in pipe.getvalue()
+    monkeypatch.undo()
     shown: list[Any] = []
     handle = SimpleNamespace(update=lambda value, raw: shown.append(value["text/plain"]))
     monkeypatch.setitem(sys.modules, "ipykernel", SimpleNamespace())

@@ -8,6 +8,7 @@ import itertools
 import json
 import math
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -22,7 +23,7 @@ from hypothesis import strategies as st
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.folder import remove_parts
+from ns_abstract.io.folder import first_command, remove_parts
 from ns_abstract.refine.result import FrameResult, Leaves, TracePoint
 from ns_abstract.report import files, page, picture, record
 from ns_abstract.report.figures import interval, metrics, number
@@ -419,6 +420,53 @@ def test_resume(tmp_path):
     assert needs_leaves.kept == [] and "has no leaf cells" in needs_leaves.ignored[0]
     part = Report.resume(tmp_path, run(frames=(5,)))
     assert part.pending == [5] and [e["index"] for e in read(tmp_path)["frames"]] == [0, 1]
+
+
+def test_first_command_stays(tmp_path):
+    """The command that began is kept beside those that go on, however many."""
+    for k, keep in enumerate((False, True, True)):
+        report = (Report.resume if keep else Report)(tmp_path, run(command=("render", str(k))))
+        document = report.finish("done")
+    assert document["first_command"] == ["render", "0"] and document["command"] == ["render", "2"]
+    assert "Begun by" in (tmp_path / "report.html").read_text()
+    assert "first_command" not in Report(tmp_path, run(command=("render", "3"))).finish("done")
+    (tmp_path / "report.json").write_text('{"command": 3}')
+    assert first_command(tmp_path) is None and first_command(tmp_path / "none") is None
+
+
+def entry_of(trace: list[tuple[float, float, float, float]], status: str = "done") -> dict[str, Any]:
+    keys = ("seconds", "mpg", "mpg_witness", "covered")
+    return {"trace": [dict(zip(keys, point, strict=True)) for point in trace], "status": status}
+
+
+def test_curves_begin_where_something_is_known():
+    """No second before the first whole cover is drawn, and no band where one of its sides is missing."""
+    late = [(1e-6, 1.73, 0.0, 0.0), (2.0, 1.73, 0.1, 0.5), (4.0, 0.5, 0.1, 1.0), (8.0, 0.2, 0.15, 1.0)]
+    points = page._seen(entry_of(late)["trace"])
+    assert [p["seconds"] for p in points] == [4.0, 8.0]
+    plot = str(page._curve(entry_of(late)))
+    band = re.search(r'class="band" d="M([\d.,L]+)Z"', plot)
+    assert band
+    corners = [tuple(map(float, pair.split(","))) for pair in band[1].split("L")]
+    # along the bounds and back along the renders: the same times, no triangle
+    times = [x for x, _ in corners]
+    assert times == times[: len(times) // 2] + times[: len(times) // 2][::-1]
+    assert not re.search()
+    nothing = [(1e-6, 1.73, 0.0, 0.0), (2.0, 1.73, 0.0, 0.5)]
+    assert page._seen(entry_of(nothing)["trace"]) == entry_of(nothing)["trace"]
+    never_seen = [(1.0, 0.3, 0.0, 1.0), (2.0, 0.2, 0.0, 1.0), (3.0, 0.1, 0.05, 1.0)]
+    assert [p["seconds"] for p in page._seen(entry_of(never_seen)["trace"])] == [3.0]
+
+
+@pytest.mark.parametrize(("witness", "kind"), [(0.97, "good"), (0.3, "fair")])
+def test_only_tight_bounds_are_green(tmp_path, witness, kind):
+    report = Report(tmp_path, run(frames=(0,)))
+    report.add(frame(0, witness=witness), picture=False)
+    report.finish("done")
+    text = (tmp_path / "report.html").read_text()
+    assert f'<div class="verdict {kind}">' in text
+    # nothing to move where cells were not kept
+    assert "Look at a pixel" in text and "Move the camera" not in text and '<table id="play-table" hidden>' in text
 
 
 def test_done_by_the_caller_stays_done(tmp_path):

@@ -327,7 +327,7 @@ def test_unknown_modules_are_refused_unless_they_are_declared(plain: Path, modul
     shown = module if module.startswith("gauss_params") else module.partition(".")[0]
     refused(plain, shown, "--assume-splatfacto")
     scene = load_scene(plain, Overrides(assume_splatfacto=True))
-    assert scene.alone and shown in origin_of(scene, "bounded").value
+    assert scene.gaussians_alone and shown in origin_of(scene, "bounded").value
 
 
 IDLE = (
@@ -347,12 +347,12 @@ def test_what_draws_nothing_is_accepted_and_listed(plain: Path) -> None:
     scene = load_scene(plain)
     listed = {record.name for record in scene.assumptions if record.value.startswith("left out")}
     assert listed == {f"module {name.partition('.')[0]}" for name in IDLE}
-    assert not scene.alone
+    assert not scene.gaussians_alone
     shows(plain, LATE)
 
 
 def test_an_assumption_that_nothing_needs_takes_nothing_away(plain: Path) -> None:
-    assert not load_scene(plain, Overrides(assume_splatfacto=True)).alone
+    assert not load_scene(plain, Overrides(assume_splatfacto=True)).gaussians_alone
 
 
 def test_the_guarantee_says_of_the_gaussians_alone(plain: Path) -> None:

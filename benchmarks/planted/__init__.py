@@ -12,6 +12,7 @@ from planted.loops import LOOPS
 from planted.maps import MAPS
 from planted.network_rows import NETWORK_ROWS
 from planted.networks import NETWORKS
+from planted.pictures import PICTURES
 from planted.polynomials import POLYNOMIALS
 from planted.processes import PROCESSES
 from planted.results import RESULTS
@@ -22,6 +23,7 @@ from planted.verdicts import VERDICTS
 FAULTS = (
     *FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS, *DEPTHS, *LOOPS, *CHECKS,
     *INPUTS, *NETWORKS, *NETWORK_ROWS, *PROCESSES, *RESULTS, *SCENES, *MAPS, *DIFFERENCES,
+    *PICTURES,
 )  # fmt: skip
 
 __all__ = ["FAULTS", "Fault", "apply"]

@@ -340,7 +340,7 @@ CERTIFICATES = (
     ),
     Fault(
         "search: only the stored scene is shown",
-        "api/certification.py", "FramePictures.image", "member(values)",
+        "api/frame_pictures.py", "FramePictures.image", "member(values)",
         "self.frame.render(values)", "test_certify_cli.py::test_a_variation_of_the_scene_breaks_what_poses_do_not",
         compiled=True,
     ),

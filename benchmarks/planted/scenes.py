@@ -62,9 +62,9 @@ SCENES = (
     ),
     Fault(
         "scenes: workers read the scene without what was given",
-        "api/job.py", "Job.recipe",
-        "replace(self.source, file=self.source.file.absolute(), options=replace(options, occupancy_grid=grid))",
-        "SceneSource(self.source.file.absolute(), replace(options, occupancy_grid=grid))",
+        "api/scenes.py", "SceneSource.absolute",
+        "replace(self, file=self.file.absolute(), options=replace(self.options, occupancy_grid=grid))",
+        "SceneSource(self.file.absolute(), replace(self.options, occupancy_grid=grid))",
         _FILES + "test_workers_and_continued_results_see_what_was_given",
     ),
 )  # fmt: skip

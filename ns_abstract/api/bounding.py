@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ns_abstract.api.job import Job
+from ns_abstract.api.parameters import point_of, sub_box
 from ns_abstract.api.poses import PoseSet, pose_set
 from ns_abstract.api.scenes import Scene, checked_scene
 from ns_abstract.arithmetic.kernel_cache import store as kernels
@@ -27,7 +28,7 @@ from ns_abstract.io.arguments import at_least, positive, whole
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.refine.engine import RefinementGoal, groups, shared_goal
-from ns_abstract.refine.linear_map import LinearImage, bounds_at, linear_image, point_of, sub_box
+from ns_abstract.refine.linear_map import LinearImage, bounds_at, linear_image
 from ns_abstract.refine.result import ExtraOutput, FrameResult, Leaves, PartResult, TracePoint
 from ns_abstract.report.figures import ShownUnits, metrics, number, short_guarantee
 from ns_abstract.report.files import save_frame

@@ -29,6 +29,7 @@ from ns_abstract.execution.worker_cache import Recipe, load
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.arguments import positive, whole
 from ns_abstract.io.errors import InputError
+from ns_abstract.io.folder import first_command
 from ns_abstract.report.certificate import LastReport
 from ns_abstract.report.figures import percent
 from ns_abstract.verify.cells import Cell, CellGrid
@@ -115,6 +116,8 @@ class CellQuestion(ABC, Generic[P]):
 
     #: Whether one block is waited for however late it is, so that resuming with any budget gets on.
     waits = True
+    #: Where cells are kept.
+    store: type[Store] = Store
 
     def __init__(
         self,
@@ -249,7 +252,9 @@ class CellSearch(Generic[P]):
         """
         question = self.question
         fingerprint = question.examiner.fingerprint
-        self.store = store = Store(self.folder, fingerprint, question.parameters, question.fixed, resume=resume)
+        self.store = store = question.store(
+            self.folder, fingerprint, question.parameters, question.fixed, resume=resume
+        )
         with store.errors_as_input():
             for number, box in question.sets.items():
                 grid = store.grid(number, box)
@@ -297,6 +302,7 @@ class CellSearch(Generic[P]):
         self.deadline = Deadline(request=stop) if question.waits else whole
         with ExitStack() as stack:
             # a signal waits until there is a store to report on
+            self.last.first_command = first_command(self.folder) if request.resume else None
             store = self.open(resume=request.resume)
             stack.callback(store.close)
             stack.enter_context(store.errors_as_input())

@@ -15,11 +15,11 @@ from ns_abstract.api.cell_search import CellSearch
 from ns_abstract.api.certification import Certification
 from ns_abstract.api.showing import look_closer
 from ns_abstract.execution.cancellation import WorkCancelledError
-from ns_abstract.report.cameras import CameraDrawings, cameras_entry, cell_cameras, standing
+from ns_abstract.report.cameras import CameraDrawings, cameras_entry, cell_cameras, standing, upward
 from ns_abstract.report.certificate import CertifiedRun, certificate_document
 from ns_abstract.report.certificate_page import certificate_page
 from ns_abstract.report.outside import SceneDrawing
-from ns_abstract.report.picture import preview, to_bytes
+from ns_abstract.report.picture import preview
 from ns_abstract.report.verdict_picture import write_pictures
 from ns_abstract.verify.store import Store, Tally, fractions
 from ns_abstract.verify.store_file import IMAGES
@@ -52,7 +52,7 @@ class CertificateReport:
         entries = [self._entry(tally, rows[tally.frame]) for tally in store.tallies()]
         sets = {frame: self.job.job.pose_sets[frame] for frame in rows}
         cells, left_out = cell_cameras(sets, rows, [name for name, _ in self.job.parameters])
-        self.cameras = CameraDrawings(cells, left_out, self._standing, self._outside)
+        self.cameras = CameraDrawings(cells, left_out, self._standing, self._outside, upward(sets))
         document = certificate_document(
             self.about,
             entries,
@@ -194,7 +194,7 @@ class CertificateReport:
         if image is None:
             with self.search.deadline.enforced():
                 image = pictures.image(pose)
-        return preview(to_bytes(image), side)
+        return preview(pictures.shown(image, pose), side)
 
     def _cell_pictures(self, rows: Mapping[int, list[dict[str, Any]]]) -> dict[tuple[int, int], dict[str, Any]]:
         """By frame and position, a picture of some cells: the same number of each verdict, evenly spread."""

@@ -7,54 +7,54 @@ import itertools
 import json
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
-import torch
 
 from ns_abstract.api.assumptions import choice
 from ns_abstract.api.files import Settings, path_sets, resized
+from ns_abstract.api.frame_pictures import FramePictures, PropertySource
 from ns_abstract.api.job import Job, require_sound_platform, warm_up
+from ns_abstract.api.picture_question import PictureQuestion
 from ns_abstract.arithmetic.forms import MAX_DIMENSIONS
 from ns_abstract.execution.cancellation import cancel_when
 from ns_abstract.execution.worker_cache import Recipe
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import load_camera_path
 from ns_abstract.geometry.poses import PoseBox
-from ns_abstract.geometry.tiles import assemble
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.jsonio import load_json
+from ns_abstract.io.jsonio import show
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.perturbation.specification import Perturbation
-from ns_abstract.refine.protocol import Frame, Method, RayFrame, SceneSample
+from ns_abstract.refine.protocol import Frame, Method, RayFrame
 from ns_abstract.report.record import file_stamp
-from ns_abstract.verify.camera_response import CameraResponse, response_sets
+from ns_abstract.verify.camera_response import CameraResponse
 from ns_abstract.verify.cells import Cell, CellGrid, initial_divisions
-from ns_abstract.verify.eight_bit import Picture, rounded, rounded_sets
+from ns_abstract.verify.eight_bit import Picture
 from ns_abstract.verify.model import NetworkModel, parametric
 from ns_abstract.verify.network import NetworkArithmetic, load_network
+from ns_abstract.verify.network.explain import check_cell
+from ns_abstract.verify.picture_properties import PICTURE_TYPES, MeasureModel, is_of_picture
 from ns_abstract.verify.pixel_costs import pixel_weights
 from ns_abstract.verify.properties import Claim, LinearClaim, Property, loading, parse_property
 from ns_abstract.verify.protocol import FrameImages as SearchedScene
 from ns_abstract.verify.protocol import Model as SearchedModel
 from ns_abstract.verify.registration import RegisteredImages, RegisteredModel
-from ns_abstract.verify.scene_margin import CellOutcome, ProveCell, VariationKind
+from ns_abstract.verify.scene_margin import KINDS, CellOutcome, ProveCell, VariationKind, bounded_kinds
 from ns_abstract.verify.search import BLOCK, BlockResult, ContradictionError, Search
 from ns_abstract.verify.subboxes import SubBoxProof
 
 if TYPE_CHECKING:
-    from ns_abstract.verify.interop import Form
+    from ns_abstract.verify.interop import Form, LibraryVersion
 
 #: Of the search's rules: results of different ones are not mixed.
 _RULES = 5
-#: Pixels that the picture moves by over a first cell: with one parameter, and with more.
-_MOTION_LINE, _MOTION = 0.08, 0.5
 #: Numbers that a network's layers may have together in a block's cells.
 _BLOCK_NUMBERS = 1 << 18
 #: Slanted parts of a cell at most, about: narrower cells need more of them in all.
@@ -65,124 +65,10 @@ _AIM_SHEARED = 0.32
 _FIRST_BLOCKS = (1, 1, 1, 1, 2, 2, 4, 4)
 #: Frames whose bounds a process keeps at hand.
 _KEPT = 4
-#: Pictures of a frame that are kept where they are made ray by ray.
-_IMAGES = 64
 #: Part of the time in which it must show how long a ray takes.
 _FORESEEN = 0.25
 #: Bytes for the bounds of one process, where nothing is said.
 MEMORY = 1 << 30
-
-
-@dataclass(frozen=True)
-class PropertySource:
-    """A property and the file that states it.
-
-    Attributes:
-        value: Content of PROP.json.
-        file: The file, or None.
-    """
-
-    value: Any
-    file: Path | None = None
-
-    @classmethod
-    def of(cls, given: Mapping[str, Any] | str | Path) -> PropertySource:
-        """Of a mapping, or read from a file.
-
-        Raises:
-            InputError: The file cannot be read.
-        """
-        if isinstance(given, Mapping):
-            return cls(dict(given))
-        return cls(load_json(Path(given), "property file"), Path(given))
-
-    @property
-    def folder(self) -> Path:
-        """Where files that it names lie."""
-        return Path() if self.file is None else self.file.parent
-
-    def absolute(self) -> PropertySource:
-        """The same for a process with another working directory."""
-        return PropertySource(self.value, (self.file or Path("property")).absolute())
-
-    def within(self, error: InputError) -> InputError:
-        """The error with the file named."""
-        return error if self.file is None else error.within(self.file)
-
-
-class FramePictures:
-    """One frame's pictures, for `ns_abstract.verify.search.Search`.
-
-    Args:
-        method: The scene and its program.
-        poses: The frame's set.
-        picture: Whether the network is shown floats or rounded pictures.
-        response: The cameras that may show them; None: one that shows what is rendered.
-        sheared: Whether parameters may be counted otherwise than the set does, where that is tighter (P2).
-    """
-
-    def __init__(
-        self,
-        method: Method,
-        poses: PoseBox,
-        picture: Picture = "float",
-        response: CameraResponse | None = None,
-        sheared: bool = False,
-    ) -> None:
-        self._rounded, self._response = picture == "8-bit", response
-        self.frame: Frame = method.frame(poses, sheared)
-        #: What pixels of a cell cost, where pictures are made ray by ray: see `pixel_weights`.
-        self.weigh: Callable[[ParameterBox], np.ndarray | None] = lambda box: None
-        self._images: dict[bytes, np.ndarray] = {}
-        self.box = self.frame.box
-        self._method = method
-        self._tiles = np.arange(self.frame.tile_count)
-
-    @property
-    def pose_set(self) -> PoseBox:
-        """The frame's poses."""
-        return self.frame.pose_set
-
-    def image(self, values: np.ndarray, member: SceneSample | None = None) -> np.ndarray:
-        values = np.asarray(values, np.float64)
-        if member is not None:
-            image = assemble(member(values), self.frame.camera)
-            return rounded(image) if self._rounded else image
-        key = values.tobytes()
-        image = self._images.get(key)
-        if image is None:
-            image = assemble(self.frame.render(values), self.frame.camera)
-            if self.frame.tilewise:
-                # costly, and neighbouring cells share their ends
-                while len(self._images) >= _IMAGES:
-                    self._images.pop(next(iter(self._images)))
-                self._images[key] = image
-        return rounded(image) if self._rounded else image
-
-    def scene_samples(self, seed: int) -> Iterator[SceneSample]:
-        return (
-            self.frame.scene_samples(seed) if self._response is None else self._response.scene_samples(self.frame, seed)
-        )
-
-    def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
-        if self.frame.tilewise:
-            linear_sets = cast("RayFrame", self.frame).sets(box, partial(self.weigh, box))
-        else:
-            linear_sets = self.frame.bound(box, self._tiles, keep_linear=True)
-        linear, lower, upper = response_sets(linear_sets, self.frame.camera, self._response)
-        if self._rounded:
-            linear, lower, upper = rounded_sets(linear, lower, upper)
-        return linear, lower, upper, linear_sets.slopes
-
-    @cached_property
-    def _differentiable(self) -> Callable[[torch.Tensor], torch.Tensor]:
-        renderer = self._method.differentiable(self.pose_set)
-        assert renderer is not None
-        return renderer
-
-    def differentiable(self, values: torch.Tensor) -> torch.Tensor:
-        """The floats before any rounding, which has no slope."""
-        return self._differentiable(values)
 
 
 class Question:
@@ -195,6 +81,9 @@ class Question:
     Raises:
         InputError: A file or a field cannot be used.
     """
+
+    #: Pixels that the picture moves by over a first cell: with one parameter, and with more.
+    motion = (0.08, 0.5)
 
     def __init__(self, model: Path, source: PropertySource) -> None:
         self.model, self.source = model, source
@@ -215,13 +104,119 @@ class Question:
         """A set whose pictures have the size that the property asks for."""
         return poses if self.property.preprocess.resize is None else resized(poses, *self.size)
 
+    def opened(self, job: Job) -> None:
+        """Check that the pictures of a scene with its sets are those of the network.
+
+        Raises:
+            InputError: They have another size.
+        """
+        camera, size = job.pose_sets[0].camera, self.size
+        if (camera.height, camera.width) != size:
+            raise InputError(
+                f"the camera path has {camera.width} x {camera.height} pixels, the network's input "
+                f"{size[1]} x {size[0]}",
+                file=self.source.file,
+                field="preprocess.resize",
+                fix=f"write [{size[0]}, {size[1]}]",
+            )
+
+    def searched(self, memory: int, arithmetic: NetworkArithmetic, picture: Picture) -> NetworkModel:
+        """The network, as the search bounds it with so many bytes; ``picture`` is any."""
+        return NetworkModel(self.network, self.property.preprocess, memory, arithmetic)
+
+    def pictures(
+        self,
+        method: Method,
+        poses: PoseBox,
+        picture: Picture,
+        response: CameraResponse | None = None,
+        sheared: bool = False,
+    ) -> FramePictures:
+        """The pictures of a set that are shown to the network."""
+        return FramePictures(method, poses, picture, response, sheared)
+
+    @property
+    def name(self) -> str:
+        """What the property is about."""
+        return self.network.source.name
+
+    @property
+    def numbers(self) -> int:
+        """How many numbers the network computes for one picture."""
+        return sum(math.prod(self.network.shape(k)) for k in range(len(self.network.nodes) + 1))
+
+    def guarantee(self, arithmetic: NetworkArithmetic) -> tuple[str, ...]:
+        """What holds of the network, one sentence each."""
+        return self.network.guarantee(arithmetic)
+
+    def check_memory(self, dimensions: int, memory: float) -> None:
+        """Refuse a network one cell of which, of so many parameters, takes more bytes than there are.
+
+        Raises:
+            InputError: It does, about.
+        """
+        check_cell(self.network, max(1, dimensions), memory)
+
+    def describe(self) -> dict[str, Any]:
+        """The network for reports."""
+        shapes = {"input": self.network.input_shape, "output": self.network.output_shape}
+        return {**file_stamp(self.model), **shapes}
+
+    def fingerprint(self, arithmetic: NetworkArithmetic) -> dict[str, Any]:
+        """What a stored search must agree with beside the property."""
+        return {"model": file_stamp(self.model)["sha256"], "network_arithmetic": arithmetic}
+
+    def choices(self, arithmetic: NetworkArithmetic, picture: Picture) -> tuple[Assumption, ...]:
+        """What verdicts about the network rest on, and where each choice came from."""
+        name, output = self.source.name, self.source.value.get("output")
+        return (
+            choice("network output", self.network.output or "the only one", output, f"{name}: output"),
+            choice(
+                "network_arithmetic", arithmetic, None if arithmetic == "float32" else arithmetic,
+                "--network-arithmetic",
+            ),
+            choice("picture", picture, None if picture == "float" else picture, "--picture"),
+        )  # fmt: skip
+
+    def absolute(self) -> partial[Question]:
+        """How a process with another working directory asks it."""
+        return partial(Question, self.model.absolute(), self.source.absolute())
+
+
+#: What a certification is about.
+AnyQuestion = Question | PictureQuestion
+
+
+def asked(model: Path | None, source: PropertySource) -> AnyQuestion:
+    """Return the question that a property and its network, if there is one, make.
+
+    Raises:
+        InputError: A file or a field cannot be used, or the property needs a network, or has none.
+    """
+    if model is not None and is_of_picture(source.value):
+        raise InputError(
+            "given with a property of the picture, which asks no network", field="--model", fix="leave it out"
+        )
+    if model is not None:
+        return Question(model, source)
+    if not is_of_picture(source.value):
+        kind = source.value.get("type") if isinstance(source.value, dict) else None
+        raise source.within(
+            InputError(
+                f"{'missing' if kind is None else show(kind)}, and no --model is given",
+                field="type",
+                fix=f"write one of {', '.join(PICTURE_TYPES)}, or give the network with --model",
+            )
+        )
+    return PictureQuestion(source)
+
 
 class Certification:
-    """An opened scene with sets of poses, a network and a property.
+    """An opened scene with sets of poses, and a property of a network or of the picture.
 
     Args:
         job: The scene and the sets, one by frame, as `Question.drawn` makes them.
-        question: The network and the property.
+        question: The property, with its network if it has one.
         memory: Bytes for the network's bounds of one process.
         origin: File that the sets come from, for errors.
         network_arithmetic: Whether every float32 evaluation of the network is meant, or the exact one alone.
@@ -234,7 +229,7 @@ class Certification:
     def __init__(
         self,
         job: Job,
-        question: Question,
+        question: AnyQuestion,
         memory: int = MEMORY,
         origin: Path | None = None,
         network_arithmetic: NetworkArithmetic = "float32",
@@ -242,24 +237,18 @@ class Certification:
     ) -> None:
         self.job, self.question = job, question
         self.picture: Picture = picture
-        self.network, self.property = question.network, question.property
         if job.method.differentiable(job.pose_sets[0]) is None:
             raise InputError(
                 f"pictures of {job.method.content} have no slopes that the search could follow",
                 file=job.source.file,
                 fix="give another scene; ns-abstract-render bounds the pictures of this one",
             )
-        camera, size = job.pose_sets[0].camera, question.size
-        if (camera.height, camera.width) != size:
-            raise InputError(
-                f"the camera path has {camera.width} x {camera.height} pixels, the network's input "
-                f"{size[1]} x {size[0]}",
-                file=question.source.file,
-                field="preprocess.resize",
-                fix=f"write [{size[0]}, {size[1]}]",
-            )
+        question.opened(job)
         require_sound_platform()
-        self.model = NetworkModel(self.network, self.property.preprocess, memory, network_arithmetic)
+        self.memory: int = memory
+        self.arithmetic: NetworkArithmetic = network_arithmetic
+        self.model: NetworkModel | MeasureModel = question.searched(memory, network_arithmetic, picture)
+        self.property: Property = question.property
         self._searches: dict[tuple[int, CellGrid], Search] = {}
 
     @property
@@ -269,10 +258,9 @@ class Certification:
         again = partial(
             _open,
             self.job.recipe.open,
-            question.model.absolute(),
-            question.source.absolute(),
-            self.model.memory,
-            self.model.arithmetic,
+            question.absolute(),
+            self.memory,
+            self.arithmetic,
             self.picture,
         )
         return Recipe(again, self.fingerprint, self.job.source.file)
@@ -303,16 +291,11 @@ class Certification:
     @property
     def assumptions(self) -> tuple[Assumption, ...]:
         """What the verdicts rest on, and where each choice came from."""
-        source, resize = self.question.source, self.property.preprocess.resize
-        name, output = "property" if source.file is None else source.file.name, source.value.get("output")
-        arithmetic = None if self.model.arithmetic == "float32" else self.model.arithmetic
-        picture = None if self.picture == "float" else self.picture
-        drawn = {} if resize is None else {"picture size": f"{name}: preprocess.resize"}
+        resize = self.property.preprocess.resize
+        drawn = {} if resize is None else {"picture size": f"{self.question.source.name}: preprocess.resize"}
         return (
             *(replace(entry, origin=drawn.get(entry.name, entry.origin)) for entry in self.job.assumptions),
-            choice("network output", self.network.output or "the only one", output, f"{name}: output"),
-            choice("network_arithmetic", self.model.arithmetic, arithmetic, "--network-arithmetic"),
-            choice("picture", self.picture, picture, "--picture"),
+            *self.question.choices(self.arithmetic, self.picture),
         )
 
     @property
@@ -322,22 +305,18 @@ class Certification:
 
     @cached_property
     def _fingerprint(self) -> dict[str, Any]:
-        prop = dict(self.question.source.value)
-        if "file" in prop:
-            prop["file"] = file_stamp(self.question.source.folder / prop["file"])["sha256"]
-        text = json.dumps(prop, sort_keys=True)
+        text = json.dumps(self.question.source.stamped, sort_keys=True)
         return {
             **self.job.fingerprint,
-            "model": file_stamp(self.question.model)["sha256"],
+            **self.question.fingerprint(self.arithmetic),
             "property": hashlib.sha256(text.encode()).hexdigest(),
-            "network_arithmetic": self.model.arithmetic,
             **({} if self.picture == "float" else {"picture": self.picture}),
             "rules": _RULES,
         }
 
     def pictures(self, index: int) -> FramePictures:
         """Frame ``index``, ready to be rendered and bounded."""
-        return FramePictures(self.job.method, self.job.pose_sets[index], self.picture)
+        return self.question.pictures(self.job.method, self.job.pose_sets[index], self.picture)
 
     def claim(self, pictures: FramePictures, poses: PoseBox | None = None) -> Claim:
         """What is to hold in a frame.
@@ -363,7 +342,7 @@ class Certification:
         """
         pictures = self.pictures(index)
         box = pictures.box
-        pixels = _MOTION_LINE if box.dimensions == 1 else _MOTION
+        pixels = self.question.motion[0 if box.dimensions == 1 else 1]
         coarse = initial_divisions(pictures.frame.motion(box), pixels)
         if self.property.partitions is None:
             return CellGrid.adaptive(box, coarse)
@@ -375,8 +354,7 @@ class Certification:
     @cached_property
     def block(self) -> int:
         """Cells examined together: few where each takes long, so that little is lost and progress is seen."""
-        numbers = sum(math.prod(self.network.shape(k)) for k in range(len(self.network.nodes) + 1))
-        return max(1, min(BLOCK, _BLOCK_NUMBERS // numbers))
+        return max(1, min(BLOCK, _BLOCK_NUMBERS // self.question.numbers))
 
     def first_blocks(self, grid: CellGrid) -> list[list[Cell]]:
         """What a frame's search begins with."""
@@ -396,8 +374,9 @@ class Certification:
             claim = self.claim(pictures)
             pictures.weigh = partial(pixel_weights, pictures, self.model, claim)
             cover = self._cover(pictures)
+            costly = isinstance(self.model, NetworkModel)
             self._searches[key] = Search(
-                pictures, self.model, claim, grid, every_unit=every_unit, block=self.block, cover=cover
+                pictures, self.model, claim, grid, every_unit=every_unit, block=self.block, cover=cover, costly=costly
             )
         return self._searches[key]
 
@@ -412,9 +391,10 @@ class Certification:
             pictures: The frame's pictures.
             response: The cameras that may show them.
         """
-        if pictures.box.dimensions < 2 or pictures.frame.tilewise:
+        model = self.model
+        if not isinstance(model, NetworkModel) or pictures.box.dimensions < 2 or pictures.frame.tilewise:
             return None
-        poses, straight = pictures.pose_set, SubBoxProof(pictures, self.model, self.model, self.claim(pictures))
+        poses, straight = pictures.pose_set, SubBoxProof(pictures, model, model, self.claim(pictures))
         sheared = FramePictures(self.job.method, poses, self.picture, response, sheared=True)
         if not (shear := sheared.pose_set.shear):
             return straight
@@ -425,12 +405,18 @@ class Certification:
 
         claim = self.claim(pictures, sheared.pose_set)
         return SubBoxProof(
-            sheared, self.model, self.model, claim, frame, most=_MOST_SHEARED, block=1, aim=_AIM_SHEARED, other=straight
+            sheared, model, model, claim, frame, most=_MOST_SHEARED, block=1, aim=_AIM_SHEARED, other=straight
         )
 
     def places(self, kind: VariationKind) -> bool:
         """Whether a kind's parameters can be bounded beside those of every set."""
-        return all(poses.box.dimensions + len(kind.place) <= MAX_DIMENSIONS for poses in self.job.pose_sets)
+        room = all(poses.box.dimensions + len(kind.place) <= MAX_DIMENSIONS for poses in self.job.pose_sets)
+        return isinstance(self.model, NetworkModel) and room
+
+    @property
+    def kinds(self) -> tuple[VariationKind, ...]:
+        """What may vary of a scene while the property holds: of a property of the picture, the Gaussians alone."""
+        return bounded_kinds(self.places) if isinstance(self.model, NetworkModel) else KINDS
 
     def _varied(
         self, kind: VariationKind, radius: float, frame: int
@@ -441,6 +427,7 @@ class Certification:
         """
         method, poses, model = self.job.method, self.job.pose_sets[frame], self.model
         if kind.place:
+            assert isinstance(model, NetworkModel)
             pictures = FramePictures(method, poses.registered(kind.place, radius), self.picture)
             return pictures, RegisteredImages(pictures, pictures.frame), RegisteredModel(model), None
         response = None
@@ -448,7 +435,7 @@ class Certification:
             response = CameraResponse(kind.response, radius)
             pictures = FramePictures(method, poses, self.picture, response)
         else:
-            pictures = FramePictures(method, self.job.varied(frame, kind.variation(radius)), self.picture)
+            pictures = self.question.pictures(method, self.job.varied(frame, kind.variation(radius)), self.picture)
         return pictures, pictures, model, self._cover(pictures, response)
 
     def settle(self, kind: VariationKind) -> ProveCell:
@@ -498,7 +485,8 @@ class Certification:
         """
         if not self.job.rays:
             return
-        frame = cast("RayFrame", self.search_frame(index))
+        pictures = cast("FramePictures", self.search(index, self.grid(index)).scene)
+        frame, rays = cast("tuple[RayFrame, int]", pictures.effort)
         # compiling says nothing about rays
         warm_up(frame)
         begin = time.perf_counter()
@@ -508,7 +496,7 @@ class Certification:
         if by_ray is None:
             # not even one was done
             by_ray, more = _FORESEEN * seconds, "more than "
-        rays, workers = frame.camera.width * frame.camera.height, self.job.workers
+        workers = self.job.workers
         least = by_ray * rays / workers
         if more or least > seconds:
             cut = f"over one of {parts:,} parts of the set " if parts > 1 else ""
@@ -524,14 +512,16 @@ class Certification:
         """The frame whose bounds the search of ``index`` will use."""
         return self.search(index, self.grid(index)).scene.frame  # pyright: ignore[reportAttributeAccessIssue]
 
-    def write_vnnlib(self, index: int, box: ParameterBox, target: Path, form: Form) -> tuple[Path, Path]:
+    def write_vnnlib(
+        self, index: int, box: ParameterBox, target: Path, form: Form, version: LibraryVersion = "1.0"
+    ) -> tuple[Path, Path]:
         """Write the abstract image of a cell, the network and the property for other verifiers.
 
         Args:
             index: Entry of the camera path.
             box: The cell.
             target: Path without ending.
-            form: As in `ns_abstract.verify.interop.write_vnnlib`.
+            form, version: As in `ns_abstract.verify.interop.write_vnnlib`.
 
         Returns:
             The .onnx and the .vnnlib file.
@@ -543,17 +533,18 @@ class Certification:
 
         pictures = self.pictures(index)
         claim = self.claim(pictures)
-        if not isinstance(claim, LinearClaim):
+        if not isinstance(self.question, Question) or not isinstance(claim, LinearClaim):
             raise InputError(
-                "is not linear in the network's outputs",
+                "is not linear in a network's outputs",
                 file=self.question.source.file,
                 field="type",
                 fix="give a property of type classification or vnnlib",
             )
         linear, lower, upper, _ = pictures.sets(box)
-        images = parametric(self.model.input_sets(tuple(part[None] for part in linear), lower[None], upper[None]))
+        model = self.question.searched(self.memory, self.arithmetic, self.picture)
+        images = parametric(model.input_sets(tuple(part[None] for part in linear), lower[None], upper[None]))
         network = self.question.network
-        return write_vnnlib(network, images, claim.rows, claim.offset, target, form, claim.groups)
+        return write_vnnlib(network, images, claim.rows, claim.offset, target, form, claim.groups, version)
 
     def partitions(self, grid: CellGrid) -> int | None:
         """Number of parts of the fixed partition, if there is one."""
@@ -562,14 +553,12 @@ class Certification:
 
 def _open(
     open_job: Callable[[], Job],
-    model: Path,
-    source: PropertySource,
+    ask: Callable[[], AnyQuestion],
     memory: int,
     arithmetic: NetworkArithmetic,
     picture: Picture,
 ) -> Certification:
-    question = Question(model, source)
-    return Certification(open_job(), question, memory, network_arithmetic=arithmetic, picture=picture)
+    return Certification(open_job(), ask(), memory, network_arithmetic=arithmetic, picture=picture)
 
 
 @dataclass(frozen=True)
@@ -579,7 +568,7 @@ class CertifySettings:
     Attributes:
         load_config: config.yml of a run, or a standard 3DGS .ply.
         camera_path_filename: Camera path JSON.
-        model: Network, .onnx.
+        model: Network, .onnx; None: the property is one of the picture.
         property: PROP.json.
         perturbation_filename: Perturbation JSON; None: the camera path holds it.
         workers: Processes that bound the rays of a NeRF.
@@ -594,7 +583,7 @@ class CertifySettings:
 
     load_config: Path
     camera_path_filename: Path
-    model: Path
+    model: Path | None
     property: Path
     perturbation_filename: Path | None = None
     arithmetic: str | None = None
@@ -613,7 +602,7 @@ def open_certification(settings: CertifySettings) -> Certification:
     Raises:
         InputError: A file or a field cannot be used.
     """
-    question = Question(settings.model, PropertySource.of(settings.property))
+    question = asked(settings.model, PropertySource.of(settings.property))
     files = Settings(
         settings.load_config,
         settings.camera_path_filename,

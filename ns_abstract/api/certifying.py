@@ -22,7 +22,7 @@ from ns_abstract.api.cell_search import (
     shares_text,
 )
 from ns_abstract.api.certificate_report import CertificateReport
-from ns_abstract.api.certification import MEMORY, Certification, PropertySource, Question
+from ns_abstract.api.certification import MEMORY, Certification, PropertySource, asked
 from ns_abstract.api.job import Job
 from ns_abstract.api.poses import PoseSet, pose_sets
 from ns_abstract.api.scenes import Scene, checked_scene
@@ -37,13 +37,11 @@ from ns_abstract.io.memory import allowed_memory
 from ns_abstract.report.certificate import CertifiedRun, coverage, verdict
 from ns_abstract.report.figures import percent, short_guarantee
 from ns_abstract.report.notebook import verdicts_html
-from ns_abstract.report.record import file_stamp
 from ns_abstract.report.verdict_picture import clear_pictures
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.eight_bit import Picture
 from ns_abstract.verify.network import NetworkArithmetic
-from ns_abstract.verify.network.explain import check_cell
-from ns_abstract.verify.scene_margin import ProveCell, VariationKind, bounded_kinds, check_scenes
+from ns_abstract.verify.scene_margin import ProveCell, VariationKind, check_scenes
 from ns_abstract.verify.store import Store, fractions
 
 #: Seconds that pictures for the last report may take beyond the budget, where they are made ray by ray.
@@ -62,8 +60,7 @@ def check_network_memory(found: Certification, limit: float | None, workers: int
     Raises:
         InputError: It does, about.
     """
-    dimensions = max(1, len(found.parameters))
-    check_cell(found.network, dimensions, allowed_memory(limit) / (1 if found.job.rays else workers))
+    found.question.check_memory(len(found.parameters), allowed_memory(limit) / (1 if found.job.rays else workers))
 
 
 @dataclass(frozen=True)
@@ -110,14 +107,10 @@ class CertificateQuestion(CellQuestion[CertifyProgress]):
         self.job, self.waits = job, not job.job.rays
         self.about = CertifiedRun(
             guarantee=job.job.method.guarantee,
-            network_guarantee=job.network.guarantee(job.model.arithmetic),
+            network_guarantee=job.question.guarantee(job.arithmetic),
             renderer={name: job.job.method.program[name] for name in ("name", "version")},
             scene=job.job.describe(),
-            model={
-                **file_stamp(job.question.model),
-                "input": job.network.input_shape,
-                "output": job.network.output_shape,
-            },
+            model=job.question.describe(),
             property=job.question.source.value,
             sentence=job.property.sentence(),
             settings=settings,
@@ -145,12 +138,14 @@ class CertificateQuestion(CellQuestion[CertifyProgress]):
         return self.job.job.pose_sets[number].box
 
     def counterexamples(self, number: int, grid: CellGrid, findings: Any) -> Iterator[tuple[str, dict[str, Any]]]:
+        pictures = None
         for leaf in findings.leaves:
             if leaf.counterexample is None or leaf.image is None or leaf.outputs is None:
                 continue
             values = np.array(leaf.counterexample)
+            pictures = self.job.pictures(number) if pictures is None else pictures
             arrays: dict[str, Any] = {
-                "image": leaf.image,
+                "image": pictures.completed(leaf.image, values),
                 "outputs": leaf.outputs,
                 "values": values,
                 "names": np.array(grid.box.names, str),
@@ -183,7 +178,7 @@ class CertificateQuestion(CellQuestion[CertifyProgress]):
         search.deadline = search.deadline.extended(_LAST)
 
     def varied_scenes(self) -> tuple[Sequence[VariationKind], Callable[[VariationKind], ProveCell]]:
-        return bounded_kinds(self.job.places), self.job.settle
+        return self.job.kinds, self.job.settle
 
     def progress(self, store: Store) -> CertifyProgress:
         shares = [fractions(tally) for tally in store.tallies()]
@@ -277,7 +272,7 @@ class Certificate:
 def certify(
     scene: Scene,
     poses: PoseSet | PinholeCamera | Sequence[PoseSet | PinholeCamera],
-    model: str | os.PathLike[str],
+    model: str | os.PathLike[str] | None,
     property: Mapping[str, Any] | str | os.PathLike[str],
     *,
     time_budget: float = 600.0,
@@ -293,14 +288,14 @@ def certify(
     memory_limit: float | None = None,
     scene_margin: bool = False,
 ) -> Certificate:
-    """Prove, or break, a property of a network on every picture that a scene shows over sets of poses.
+    """Prove, or break, a property of a network, or of the picture itself, on every picture over sets of poses.
 
     Ctrl-C and ``on_progress`` returning False end the work between two cells, with what is known.
 
     Args:
         scene: The scene.
         poses: One set, or several; a camera is the set of its one pose.
-        model: Network, .onnx.
+        model: Network, .onnx; None: the property is one of the picture (visible, clear, picture, all, any).
         property: What is to hold, as the object of a property file, or that file.
         time_budget: Seconds for all sets together.
         output_dir: Folder for cells.sqlite, the report and counterexamples, as ns-abstract-certify writes them; None:
@@ -326,7 +321,7 @@ def certify(
     if picture not in ("float", "8-bit"):
         raise InputError(f"found {picture}", field="picture", fix="use float or 8-bit")
     source = property if isinstance(property, Mapping) else file_path(property, "property")
-    question = Question(file_path(model, "model"), PropertySource.of(source))
+    question = asked(None if model is None else file_path(model, "model"), PropertySource.of(source))
     drawn = [question.drawn(entry.of(checked_scene(scene))) for entry in pose_sets(poses)]
     memory = network_memory(memory_limit, workers)
     job = Job(scene, drawn, arithmetic=arithmetic, workers=workers)

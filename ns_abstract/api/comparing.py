@@ -33,8 +33,24 @@ from ns_abstract.refine.result import FrameResult, PartResult, TracePoint
 from ns_abstract.report.comparison import difference_figures, verdict
 from ns_abstract.report.figures import short_guarantee
 
-#: Entries by which transforms of two runs to one frame may differ, relative to the largest: rounding of their files.
-_SAME_FRAME = 1e-6
+
+@dataclass(frozen=True)
+class ComparisonTuning:
+    """What counts as the same.
+
+    Attributes:
+        same_frame: Entries by which transforms of two runs to one frame may differ, relative to the largest: rounding
+            of their files.
+    """
+
+    same_frame: float = 1e-6
+
+
+_TUNING = ComparisonTuning()
+#: What bounds of two splats with equal means rest on (design.md, Y5).
+_ORDER = Assumption(
+    "order of Gaussians with equal means", "the same in both pictures", "one program renders both scenes"
+)
 
 
 class ComparisonJob(Job):
@@ -68,9 +84,12 @@ class ComparisonJob(Job):
         with _named(other):
             self.other = Job(other, pose_sets, **shared)
         super().__init__(scene, pose_sets, **options)
-        self.frame_choice = _frame_choice(scene, other)
+        self.frame_choice, self.order_choice = _frame_choice(scene, other), ()
         if pose_sets:
-            first, second = self.frame(0).both
+            frame = self.frame(0)
+            first, second = frame.both
+            if frame.shares_order:
+                self.order_choice = (_ORDER,)
             if (first.side, first.tilewise) != (second.side, second.tilewise):
                 raise InputError(
                     "pictures are made in tiles of another size than A's",
@@ -132,7 +151,7 @@ class ComparisonJob(Job):
     @property
     def assumptions(self) -> tuple[Assumption, ...]:
         others = (replace(entry, name=f"other {entry.name}") for entry in self.other._scene_choices)
-        return (*self._scene_choices, *others, self.frame_choice, *self.set_choices)
+        return (*self._scene_choices, *others, self.frame_choice, *self.order_choice, *self.set_choices)
 
     @property
     def fingerprint(self) -> dict[str, Any]:
@@ -180,7 +199,7 @@ def _check_comparable(scene: Scene, other: Scene, pose_sets: Sequence[PoseBox]) 
     if first is None or second is None:
         return
     matrices = [np.append(frame.matrix.ravel() * frame.scale, frame.scale) for frame in (first, second)]
-    if not np.abs(matrices[0] - matrices[1]).max() <= _SAME_FRAME * np.abs(matrices[0]).max():
+    if not np.abs(matrices[0] - matrices[1]).max() <= _TUNING.same_frame * np.abs(matrices[0]).max():
         raise InputError(
             f"its dataparser_transforms.json is not that of {scene.source.file}, so one camera would not look at the "
             "same place",

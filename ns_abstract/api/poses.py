@@ -213,7 +213,7 @@ def pose_sets(value: PoseSet | PinholeCamera | Sequence[PoseSet | PinholeCamera]
     Raises:
         InputError: It is no set and no list of sets.
     """
-    if not isinstance(value, list | tuple):
+    if isinstance(value, PoseSet | PinholeCamera) or not isinstance(value, Sequence):
         return [pose_set(value)]
     if not value:
         raise InputError("found no set", field="poses", fix="give at least one PoseSet")

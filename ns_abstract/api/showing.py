@@ -16,7 +16,7 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.report import regions as broken
 from ns_abstract.report import walk
 from ns_abstract.report.certificate_page import CertificateDetails
-from ns_abstract.report.picture import preview, to_bytes
+from ns_abstract.report.picture import preview
 from ns_abstract.report.regions import FailureRegion, PoseImage
 from ns_abstract.verify.properties import Claim
 
@@ -55,7 +55,7 @@ class _PoseRenderer:
         outputs = np.asarray(self._job.model.outputs(image[None]), np.float64)
         with torch.no_grad():
             margin = float(claim.margin(torch.from_numpy(outputs), torch.from_numpy(pose[None]))[0])
-        png = preview(to_bytes(image), _PIXELS)
+        png = preview(pictures.shown(image, pose), _PIXELS)
         return PoseImage(title, values, png, outputs[0].tolist(), margin if np.isfinite(margin) else None)
 
     def right(self, region: FailureRegion, rows: CellRows, parameters: Sequence[Mapping[str, Any]]) -> PoseImage | None:

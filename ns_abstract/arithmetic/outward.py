@@ -15,12 +15,12 @@ def _beside(values: np.ndarray, sign: float) -> np.ndarray:
     """The nearest float32 numbers that are not above ``values``; not below for ``sign`` -1."""
     values = np.ascontiguousarray(values, np.float64)
     neighbours = np.empty(values.shape, np.float32)
-    _round_down(values.reshape(-1), sign, neighbours.reshape(-1))
+    _round_towards(values.reshape(-1), sign, neighbours.reshape(-1))
     return neighbours
 
 
 @njit(cache=True, error_model="numpy")
-def _round_down(values, sign, out):
+def _round_towards(values, sign, out):
     """``sign * out <= sign * values`` [n], as large as float32 allows; ``sign`` is 1 or -1."""
     for q in range(values.size):
         value = sign * values[q]

@@ -143,7 +143,7 @@ GRAM_UP, GRAM_ROOM = 1.0 + 2.0**-30, 2.0**-46
 SHIFTED_ROUNDING = 8.0 * UNIT64
 #: B9: radii and constant ends of linear sets: at most 44 sums; up to 2^13 of the radius, 2^9 of the others.
 LINEAR_UP, LINEAR_ROUNDING = 1.0 + 2.0**-40, 2.0**-44
-#: Y1-Y3: a difference of two bounds in at most 12 parameters, relative to the sum of all their sizes: at most 92
+#: Y1, Y2, Y3: a difference of two bounds in at most 12 parameters, relative to the sum of all sizes: at most 92
 #: differences and terms of a sum, each rounded at most 2^3 times, and the sum's 2^7 u: 2^8 u; twice as much is charged.
 DIFFERENCE_ROUNDING = 2.0**-44
 #: B8: alphas below are left out by the paper's rasteriser, which draws all; so much is added for each that is.
@@ -248,8 +248,8 @@ FOLLOWED_UP = 1.0 + 2.0**-40
 MEAN_DOWN = 1.0 - 2.0**-20
 #: R7: where a part lies in a box, 6, its product, 1, and a sum of at most 4 d + 1 <= 41 of these; 16 to spare.
 MAP_ROUNDING = 64.0 * UNIT64
-#: R7: no charge: a guard, as leaves are those of all cells (R1): volumes of parts that are whole together, by sums of up
-#: to 2^20 products of d <= 10 factors of 3 roundings each, lack at most 2^-32.
+#: R7: no charge: a guard, as leaves are those of all cells (R1): volumes of parts that are whole together, by sums of
+#: up to 2^20 products of d <= 10 factors of 3 roundings each, lack at most 2^-32.
 COVER_DOWN = 1.0 - 2.0**-30
 #: V1: roundings of one float32 evaluation of the preprocessing, in units of the largest numbers met: 7; 3 to spare.
 PREPROCESS_ROUNDING = 10.0 * UNIT32
@@ -259,6 +259,15 @@ PREPROCESSED_ROUNDING = 8.0 * UNIT64
 RESPONSE_ROUNDING = 8.0 * UNIT32
 #: V14: the same of offsets of planes, absolute: of the camera's value, up to 1, and of the planes' own evaluation.
 RESPONSE_ROUNDINGS = 2.0 * RESPONSE_ROUNDING
+#: Q1: a photo's value, the noise and the sums with them, absolute: 6 roundings of numbers below 4; up to 2^11.
+PHOTO_ROOM = 2.0**-40
+#: Q3: a constraint's room and its slopes' sum, of sums of at most d + 3 <= 11 terms: 16; up to 2^9 of their size.
+REACH_ROUNDING = 2.0**-44
+#: Q3: a reach in [-1, 1], the cell's middle and half its width, and their sum, in half-widths: 2^4; up to 2^13. Whether
+#: a line of the grid lies outside of a cut is compared with the line itself.
+CUT_ROOM = 2.0**-40
+#: Q3: the same of the ends' own sizes: middle, product and sum, 3; 5 to spare.
+CUT_VALUE_ROUNDING = 8.0 * UNIT64
 #: L1: roundings on the longest way through a law: sums of up to 9 products, five more products, and four units of
 #: a library's sine or cosine; twice that, to spare. Slack: the forms charge each of their operations for more than
 #: float64 errs in it (rounding takes at most 0.15 of their radius, 0.45 where a library's sines are 16 units off), and

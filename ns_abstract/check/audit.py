@@ -136,7 +136,8 @@ def opened(folder: Path, report: dict[str, Any], moved: dict[str, Path | None]) 
         return parts, [CheckedLoop(c, scene, report, model) for c in parts if CheckedLoop.claims(c)]
     path, given = file("camera_path_filename"), given_set(settings, moved.get("perturbation_filename"))
     if (folder / "cells.sqlite").exists():
-        parts, model = read_verdicts(folder, report), file("model")
+        without = "sha256" not in report.get("model", {})
+        parts, model = read_verdicts(folder, report), Path() if without else file("model")
     else:
         parts, model = [], None
         for entry in report["frames"]:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import tyro
 
-from ns_abstract.cli.common import BAD_INPUT, DONE, run
+from ns_abstract.cli.common import BAD_INPUT, DONE, command, run
 from ns_abstract.cli.options import Overrides, ProgramOptions, SceneOverrides
 from ns_abstract.io.errors import InputError
 
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 #: Seconds after which a case that does not end ends the process, with a trace of where it stands.
 _STUCK = 900.0
+_ABOUT = "Measure cost, tightness and soundness; without options on the demo scene. Tables go to the folder bench."
 #: Headings of the tables by benchmark.
 _TITLES = {
     "cell": "Cost of a cell",
@@ -246,7 +247,7 @@ class Vnnlib:
     """Decide instances of a verification competition: networks and VNN-LIB properties with boxes of inputs."""
 
     folder: tyro.conf.Positional[Path]
-    """Holds instances.csv (network,property,seconds) and what it names, packed (.gz) or not."""
+    """Holds instances.csv (network,property,seconds) and what it names, packed (.gz) or not, or 2.0 or 1.0 that do."""
     output_dir: Path = Path("bench")
     """Folder for results.csv, and for each instance the verdict and a counterexample."""
     only: tuple[str, ...] = ()
@@ -259,6 +260,24 @@ class Vnnlib:
     """What "unsat" covers: every float32 evaluation and the exact network, or the exact network alone."""
     output: str | None = None
     """Name of the networks' output. Default: the only one."""
+
+
+@dataclass
+class Verify:
+    """Decide one VNN-LIB query, as the standard's command "verify" does: its answer alone is printed."""
+
+    query: tyro.conf.Positional[Path]
+    """The query (.vnnlib), of version 1 or 2, packed (.gz) or not."""
+    network: tuple[str, ...] = ()
+    """NAME=FILE.onnx: the file of the network that the query calls NAME."""
+    timeout: float | None = None
+    """Seconds. Default: no limit."""
+    memory_limit: float = 2.0
+    """GiB that bounds may take."""
+    network_arithmetic: Literal["float32", "real"] = "float32"
+    """What "unsat" covers: every float32 evaluation and the exact network, or the exact network alone."""
+    output: str | None = None
+    """Name of the network's output. Default: the only one."""
 
 
 def _said(text: str) -> None:
@@ -290,6 +309,27 @@ def vnnlib(options: Vnnlib) -> int:
             print(f"error: {row['why']}", file=sys.stderr)
     print(", ".join(f"{count} {word}" for word, count in sorted(words.items())))
     return BAD_INPUT if "error" in words else DONE
+
+
+def verify(options: Verify) -> int:
+    """Decide the query and print the standard's answer."""
+    from ns_abstract.bench.vnnlib import verify_query
+
+    for name, value in (("--timeout", options.timeout), ("--memory-limit", options.memory_limit)):
+        if value is not None and not 0.0 < value <= 1e6:
+            raise InputError(f"{value}", field=name, fix="give a positive number")
+    networks = {}
+    for entry in options.network:
+        name, equals, file = entry.partition("=")
+        if not (name and equals and file) or name in networks:
+            raise InputError(f"found {entry}", field="--network", fix="write NAME=FILE.onnx once for every network")
+        networks[name] = Path(file)
+    answer = verify_query(
+        options.query, networks, seconds=options.timeout, memory=int(options.memory_limit * 2**30),
+        arithmetic=options.network_arithmetic, output=options.output,
+    )  # fmt: skip
+    print(answer, end="")
+    return DONE
 
 
 def stiff(options: Stiff) -> int:
@@ -470,6 +510,7 @@ _DEFAULTS: dict[str, Any] = {
     "loops": Loops(load_config=tyro.MISSING, loop=tyro.MISSING),
     "stiff": Stiff(),
     "vnnlib": Vnnlib(folder=tyro.MISSING),
+    "verify": Verify(query=tyro.MISSING),
 }
 
 
@@ -485,11 +526,14 @@ def bench(
     | Certificates
     | Loops
     | Stiff
-    | Vnnlib,
+    | Vnnlib
+    | Verify,
 ) -> int:
     """Run one benchmark; the exit code is 1 if a bound was violated."""
     if isinstance(options, Vnnlib):
         return vnnlib(options)
+    if isinstance(options, Verify):
+        return verify(options)
     if isinstance(options, Stiff):
         return stiff(options)
     if isinstance(options, ScaleBenchmark):
@@ -551,7 +595,7 @@ def bench(
 def main() -> None:
     """Entry point of the console script."""
     kinds = tyro.extras.subcommand_type_from_defaults(_DEFAULTS)
-    run(bench, lambda: tyro.cli(kinds, prog="ns-abstract-bench"))
+    run(bench, command("ns-abstract-bench", kinds, _DEFAULTS, _ABOUT))
 
 
 if __name__ == "__main__":

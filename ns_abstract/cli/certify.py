@@ -10,7 +10,7 @@ from typing import Annotated
 import tyro
 
 from ns_abstract.cli.commands import Certify
-from ns_abstract.cli.common import DONE, INTERRUPTED, SignalStop, run
+from ns_abstract.cli.common import DONE, INTERRUPTED, SignalStop, command, run
 from ns_abstract.cli.sets import given_set
 from ns_abstract.io.arguments import positive
 from ns_abstract.io.errors import InputError
@@ -66,8 +66,8 @@ def explain(options: ExplainNetwork) -> int:
 def main() -> None:
     """Entry point of the console script."""
     if "--explain" in sys.argv[1:]:
-        run(explain, lambda: tyro.cli(ExplainNetwork, prog="ns-abstract-certify"))
-    run(certify, lambda: tyro.cli(Certify, prog="ns-abstract-certify"), "give fewer --workers or free memory")
+        run(explain, command("ns-abstract-certify", ExplainNetwork))
+    run(certify, command("ns-abstract-certify", Certify), "give fewer --workers or free memory")
 
 
 if __name__ == "__main__":

@@ -29,7 +29,7 @@ _SECONDS = 1800.0
 
 def _introduce(console: Console, job: Certification, about: CertifiedRun) -> None:
     method = job.job.method
-    console.print(f"{method.name}: {method.content}; {job.network.source.name}; {about.sentence}", markup=False)
+    console.print(f"{method.name}: {method.content}; {job.question.name}; {about.sentence}", markup=False)
     for warning in job.job.wide_turns:
         console.print(f"warning: {warning}", markup=False, soft_wrap=True)
     for note in about.plan:

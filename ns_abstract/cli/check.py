@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from ns_abstract.cli.common import run
+from ns_abstract.cli.common import command, run
 
 
 @dataclass
@@ -86,7 +86,7 @@ def check(options: Check) -> int:
 
 def main() -> None:
     """Entry point of the console script."""
-    run(check, lambda: tyro.cli(Check, prog="ns-abstract-check"), "close other programs")
+    run(check, command("ns-abstract-check", Check), "close other programs")
 
 
 if __name__ == "__main__":

@@ -11,11 +11,12 @@ import signal
 import socket
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr, suppress
 from types import FrameType
 from typing import Any, NoReturn
 
+from ns_abstract.cli.mistakes import mistake
 from ns_abstract.execution.stopping import StopRequest, is_interruption
 from ns_abstract.io.errors import InputError, visible
 
@@ -83,6 +84,30 @@ class SignalStop(StopRequest):
             receiver.close()
 
 
+def command(program: str, kind: Any, parts: Mapping[str, Any] | None = None, about: str = "") -> Callable[[], Any]:
+    """What parses a command line, or prints the command's version or help and leaves.
+
+    Args:
+        program: The console script.
+        kind: What tyro reads: a dataclass, or a union of the parts.
+        parts: Sub-commands by name: a dataclass, or an instance with the defaults.
+        about: What the sub-commands are for.
+    """
+
+    def read() -> Any:
+        import tyro
+
+        from ns_abstract.cli.help import shown
+
+        text = shown(program, kind, sys.argv[1:], parts or {}, about)
+        if text is not None:
+            print(text)
+            raise SystemExit(DONE)
+        return tyro.cli(kind, prog=program)
+
+    return read
+
+
 class _ToStderr(logging.Handler):
     """Lines on what is stderr at the time."""
 
@@ -119,7 +144,7 @@ def parse(read: Callable[[], Any]) -> Any:
     except SystemExit as leave:
         if leave.code != BAD_INPUT:
             raise
-        raise InputError(complaint(said.getvalue()), fix="--help lists the options") from None
+        raise mistake(complaint(said.getvalue())) from None
 
 
 def complaint(text: str) -> str:

@@ -21,7 +21,7 @@ from ns_abstract.report.figures import listed, number
 from ns_abstract.report.record import RunRecord, failed_self_check
 
 if TYPE_CHECKING:
-    from ns_abstract.cli.compare import Compare
+    from ns_abstract.cli.commands import Compare
 
 #: Seconds by frame where no time budget is given.
 _SECONDS_BY_FRAME = 60.0

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from ns_abstract.cli.common import DONE, run
+from ns_abstract.cli.common import DONE, command, run
 from ns_abstract.io.errors import InputError, visible
 
 
@@ -77,7 +77,7 @@ def demo(options: Demo) -> int:
 
 def main() -> None:
     """Entry point of the console script."""
-    run(demo, lambda: tyro.cli(Demo, prog="ns-abstract-demo"))
+    run(demo, command("ns-abstract-demo", Demo))
 
 
 if __name__ == "__main__":

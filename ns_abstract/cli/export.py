@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import json
+import re
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, Union
 
 import tyro
 
-from ns_abstract.cli.common import DONE, run
+from ns_abstract.cli.common import DONE, command, run
 from ns_abstract.cli.options import Overrides, ProgramOptions, SceneOverrides
 from ns_abstract.cli.sets import GivenSet, given_set
 from ns_abstract.io.errors import InputError, visible
@@ -78,17 +78,18 @@ class ExportVnnLib(GivenSet):
 
     Cuts the set of poses of a frame into boxes and writes for each NAME.onnx, whose input is the box's parameters in
     [-1, 1] and the slack of every number of the image, and NAME.vnnlib ("unsat": the property holds on every image
-    of the box). Beside them instances.csv, as verifiers of VNN-COMP read it, and boxes.json, the boxes.
+    of the box). Beside them instances.csv, as verifiers of VNN-COMP read it, boxes.json, the boxes, and origins.json:
+    scene, pose, property and picture of each. With several networks and --append a folder becomes a benchmark.
     """
 
     load_config: Path
     """config.yml of a Splatfacto run, or a scene file (docs/formats.md)."""
     camera_path_filename: Path
     """Camera path as Nerfstudio's viewer writes it."""
-    model: Path
-    """Network: .onnx."""
-    property: Path
-    """What is to hold (JSON): classification or vnnlib, with the preprocessing."""
+    model: tuple[Path, ...]
+    """Networks: .onnx."""
+    property: tuple[Path, ...]
+    """What is to hold (JSON): classification or vnnlib, with the preprocessing. One for all networks, or one each."""
     output_dir: Path
     """Folder for the files; made if missing."""
     perturbation_filename: Path | None = field(default=None, kw_only=True)
@@ -109,6 +110,14 @@ class ExportVnnLib(GivenSet):
     """slice: small files. gemm: no operators in front but Gemm and Reshape, for verifiers that know little."""
     timeout: int = 300
     """Seconds by box in instances.csv."""
+    vnnlib_version: Literal["1.0", "2.0"] = "1.0"
+    """Version of VNN-LIB. 2.0 asks about float32."""
+    prefix: str = ""
+    """What names of instances begin with, such as the scene's name."""
+    append: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Keep the instances that the folder holds."""
+    pictures: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Write the picture at the middle of every box to pictures/."""
     overrides: SceneOverrides = field(default_factory=Overrides)
 
 
@@ -203,20 +212,12 @@ class Schemas:
     """Folder for the schemas; made if missing."""
 
 
-Command = (
-    Annotated[Npz, tyro.conf.subcommand("npz")]
-    | Annotated[Png, tyro.conf.subcommand("png")]
-    | Annotated[Mp4, tyro.conf.subcommand("mp4")]
-    | Annotated[Exr, tyro.conf.subcommand("exr")]
-    | Annotated[Safetensors, tyro.conf.subcommand("safetensors")]
-    | Annotated[Rrd, tyro.conf.subcommand("rrd")]
-    | Annotated[Viser, tyro.conf.subcommand("viser")]
-    | Annotated[Statement, tyro.conf.subcommand("statement")]
-    | Annotated[Ply, tyro.conf.subcommand("ply")]
-    | Annotated[ExportVnnLib, tyro.conf.subcommand("vnnlib")]
-    | Annotated[Occupancy, tyro.conf.subcommand("occupancy")]
-    | Annotated[Schemas, tyro.conf.subcommand("schemas")]
-)
+_ABOUT = "Write results of ns-abstract-render, scenes and properties in other programs' formats."
+_PARTS = {
+    "npz": Npz, "png": Png, "mp4": Mp4, "exr": Exr, "safetensors": Safetensors, "rrd": Rrd, "viser": Viser,
+    "statement": Statement, "ply": Ply, "vnnlib": ExportVnnLib, "occupancy": Occupancy, "schemas": Schemas,
+}  # fmt: skip
+Command = Union[tuple(Annotated[kind, tyro.conf.subcommand(name)] for name, kind in _PARTS.items())]  # noqa: UP007
 Options = (
     Npz | Png | Mp4 | Exr | Safetensors | Rrd | Viser | Statement | Ply | ExportVnnLib | Occupancy | Schemas
 )  # fmt: skip
@@ -315,46 +316,46 @@ def _occupancy(options: Occupancy) -> list[str]:
 def _vnnlib(options: ExportVnnLib) -> list[str]:
     from ns_abstract.api.certification import CertifySettings, open_certification
     from ns_abstract.api.job import check_frames
-    from ns_abstract.io.atomic import write_atomic
-    from ns_abstract.verify.cells import CellGrid
+    from ns_abstract.api.verifier_instances import InstanceFolder
 
     if options.timeout < 1:
         raise InputError(f"found {options.timeout}", field="--timeout", fix="give a number of at least 1")
     if any(n < 1 for n in options.parts):
         raise InputError(f"found {min(options.parts)}", field="--parts", fix="give numbers of at least 1")
-    settings = CertifySettings(
-        options.load_config,
-        options.camera_path_filename,
-        options.model,
-        options.property,
-        options.perturbation_filename,
-        arithmetic=options.arithmetic,
-        picture=options.picture,
-        given_set=given_set(options),
-        program=ProgramOptions(options.renderer, options.gsplat_version),
-        overrides=options.overrides,
+    if not re.fullmatch(r"[A-Za-z0-9_.-]{0,60}", options.prefix) or options.prefix.startswith("."):
+        raise InputError(f"found {options.prefix[:80]}", field="--prefix", fix="give letters, digits and _ . -")
+    if not options.model or len(options.property) not in (1, len(options.model)):
+        problem = f"{len(options.property)} properties for {len(options.model)} networks"
+        raise InputError(problem, field="--property", fix="give one for all networks, or one for each")
+    names = [f"{model.stem}_" if len(options.model) > 1 else "" for model in options.model]
+    if len(set(names)) < len(names):
+        raise InputError("two networks of one name", field="--model", fix="rename one")
+    folder = InstanceFolder(
+        options.output_dir, options.timeout, options.form, options.vnnlib_version, options.prefix, options.pictures
     )
-    job = open_certification(settings)
-    options.output_dir.mkdir(parents=True, exist_ok=True)
-    lines, boxes = [], {}
-    for frame in check_frames(options.frames, job.job.frame_count):
-        box = job.job.pose_sets[frame].box
-        parts = options.parts or (1,) * box.dimensions
-        try:
-            grid = CellGrid.fixed(box, parts, parts)
-        except InputError as error:
-            raise InputError(error.problem, field="--parts", fix=error.fix) from None
-        for k, cell in enumerate(grid.roots()):
-            one = grid.box_of(cell)
-            name = f"frame_{frame:05d}_box_{k:05d}"
-            written = job.write_vnnlib(frame, one, options.output_dir / name, options.form)
-            lines.append(",".join([*(file.name for file in written), str(options.timeout)]))
-            sides = zip(one.names, one.units, one.lower, one.upper, strict=True)
-            boxes[name] = [dict(zip(("name", "unit", "lower", "upper"), side, strict=True)) for side in sides]
-    for file, text in (("instances.csv", "\n".join(lines)), ("boxes.json", json.dumps(boxes, indent=1))):
-        content = f"{text}\n".encode()
-        write_atomic(options.output_dir / file, lambda stream, content=content: stream.write(content))
-    return list(job.property.notes)
+    if options.append:
+        folder.keep_earlier()
+    notes: list[str] = []
+    properties = options.property * (1 if len(options.property) > 1 else len(options.model))
+    for name, model, prop in zip(names, options.model, properties, strict=True):
+        settings = CertifySettings(
+            options.load_config,
+            options.camera_path_filename,
+            model,
+            prop,
+            options.perturbation_filename,
+            arithmetic=options.arithmetic,
+            picture=options.picture,
+            given_set=given_set(options),
+            program=ProgramOptions(options.renderer, options.gsplat_version),
+            overrides=options.overrides,
+        )
+        job = open_certification(settings)
+        for frame in check_frames(options.frames, job.job.frame_count):
+            folder.add(job, frame, options.parts, name)
+        notes += job.property.notes
+    folder.write_lists()
+    return list(dict.fromkeys(notes))
 
 
 def _path(options: Npz | Png | Mp4 | Exr | Safetensors | Rrd | Viser) -> list[str]:
@@ -409,7 +410,7 @@ def _recording(options: Rrd | Viser, results: Results) -> None:
 
 def main() -> None:
     """Entry point of the console script."""
-    run(export, lambda: tyro.cli(Command, prog="ns-abstract-export"))  # pyright: ignore[reportCallIssue, reportArgumentType]
+    run(export, command("ns-abstract-export", Command, _PARTS, _ABOUT))
 
 
 if __name__ == "__main__":

@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from ns_abstract.cli.common import DONE, INTERRUPTED, SignalStop, plain_console, run
+from ns_abstract.cli.common import DONE, INTERRUPTED, SignalStop, command, plain_console, run
 from ns_abstract.cli.options import EngineOptions, Overrides, Program, ProgramOptions, SceneOverrides, Where, stated
 from ns_abstract.io.arguments import positive
 
@@ -105,7 +105,7 @@ def reach(options: Reach) -> int:
 
 def main() -> None:
     """Entry point of the console script."""
-    run(reach, lambda: tyro.cli(Reach, prog="ns-abstract-reach"), "give fewer --workers or free memory")
+    run(reach, command("ns-abstract-reach", Reach), "give fewer --workers or free memory")
 
 
 if __name__ == "__main__":

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import tyro
-
 from ns_abstract.cli.commands import Render
-from ns_abstract.cli.common import DONE, INTERRUPTED, SignalStop, run
+from ns_abstract.cli.common import DONE, INTERRUPTED, SignalStop, command, run
 from ns_abstract.cli.sets import given_set
 from ns_abstract.io.arguments import at_least, positive, whole
 from ns_abstract.io.errors import InputError
@@ -91,7 +89,7 @@ def render(options: Render) -> int:
 
 def main() -> None:
     """Entry point of the console script."""
-    run(render, lambda: tyro.cli(Render, prog="ns-abstract-render"))
+    run(render, command("ns-abstract-render", Render))
 
 
 if __name__ == "__main__":

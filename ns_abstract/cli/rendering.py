@@ -18,6 +18,7 @@ from ns_abstract.cli.common import SignalStop, plain_console
 from ns_abstract.cli.options import stated
 from ns_abstract.execution.engines import Engine
 from ns_abstract.io.folder import claim
+from ns_abstract.refine.result import Leaves
 from ns_abstract.report.figures import listed
 from ns_abstract.report.progress import ProgressBar
 from ns_abstract.report.record import Report, RunRecord, failed_self_check
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 
 #: Seconds by frame where no time budget is given.
 _SECONDS_BY_FRAME = 60.0
+#: Bytes of linear sets by frame up to which they are stored without --save-cells, and cells that a small frame takes.
+_SMALL_LEAVES, _USUAL_CELLS = 8 << 20, 16
 
 
 def make_run(job: PathJob, options: Render, frames: tuple[int, ...], problems: tuple[str, ...]) -> RunRecord:
@@ -89,6 +92,7 @@ def _fill(report: Report, job: Job, options: Render, engine: Engine, stop: Signa
     missing = set(report.missing)
     pending = sorted(report.pending, key=lambda index: index not in missing)
     budget = options.time_budget if options.time_budget is not None else _SECONDS_BY_FRAME * max(1, len(pending))
+    small = bool(pending) and _leaf_bytes(job, pending[0]) * _USUAL_CELLS <= _SMALL_LEAVES
     try:
         if pending and options.where.engine == "local":
             with stop.at_once():
@@ -96,12 +100,13 @@ def _fill(report: Report, job: Job, options: Render, engine: Engine, stop: Signa
         with ProgressBar(console) as progress:
             results = bounding.bound_frames(
                 job, pending, engine=engine, budget=budget, target_ratio=options.target_ratio,
-                keep_leaves=options.save_cells or options.explain, stop=stop, on_progress=progress,
+                keep_leaves=options.save_cells or options.explain or small, stop=stop, on_progress=progress,
                 found_before=report.stored,
             )  # fmt: skip
             for result in results:
                 # first what was asked for: drawing loads matplotlib
-                stored_result = result if options.save_cells else replace(result, leaves=None)
+                leaves = result.leaves if options.save_cells or (small and _fits(result.leaves)) else None
+                stored_result = replace(result, leaves=leaves)
                 _tell(console, report.add(stored_result, picture=False))
                 report.draw(result.index)
                 if options.explain and result.bounded and not stop():
@@ -113,6 +118,17 @@ def _fill(report: Report, job: Job, options: Render, engine: Engine, stop: Signa
     finally:
         # also after a failure: what is finished is written
         report.finish("interrupted" if stop() else "budget" if report.missing else "done")
+
+
+def _leaf_bytes(job: Job, index: int) -> int:
+    """Bytes of the linear sets of one cell of a frame."""
+    camera, box = job.pose_sets[index].camera, job.pose_sets[index].box
+    return 0 if job.rays else camera.width * camera.height * 3 * 2 * (box.dimensions + 1) * 4
+
+
+def _fits(leaves: Leaves | None) -> bool:
+    """Whether linear sets are few enough to be stored without being asked for."""
+    return leaves is not None and sum(getattr(leaves, name).nbytes for name in vars(leaves)) <= _SMALL_LEAVES
 
 
 def _introduce(console: Console, job: Job, report: Report) -> None:

@@ -19,13 +19,13 @@ class GivenSet:
     perturbation_filename: Path | None = None
     """Set of poses (JSON). Default: the key "perturbation" of the camera path."""
     translation: tuple[float, ...] | None = None
-    """A set without a file: radius of the shift along x, y and z of the camera, or three radii."""
+    """Largest shift, in place of a file: one number for all three axes of the camera, or three for x, y, z."""
     rotation: tuple[float, ...] | None = None
-    """A set without a file: radius of yaw, pitch and roll, or three radii."""
+    """Largest turn, in place of a file: one number for all three angles, or three for yaw, pitch, roll."""
     units: Literal["normalised", "dataset"] = "normalised"
-    """Of --translation: the run's normalised frame, or transforms.json."""
+    """Units of --translation: those of the run's normalised frame, or of transforms.json."""
     angle_units: Literal["radians", "degrees"] = "radians"
-    """Of --rotation."""
+    """Units of --rotation."""
 
 
 def given_set(options: GivenSet) -> dict[str, Any] | None:
@@ -45,7 +45,7 @@ def given_set(options: GivenSet) -> dict[str, Any] | None:
         if radii is None:
             continue
         if len(radii) not in (1, 3):
-            fix = f"give one radius, or three for {', '.join(axes)}"
+            fix = f"give one number for all, or three for {', '.join(axes)}"
             raise InputError(f"found {len(radii)} numbers", field=f"--{name}", fix=fix)
         perturbation[name] = dict(zip(axes, radii if len(radii) == 3 else radii * 3, strict=True))
     return perturbation

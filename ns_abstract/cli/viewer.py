@@ -9,7 +9,7 @@ from typing import Literal
 
 import tyro
 
-from ns_abstract.cli.common import DONE, run
+from ns_abstract.cli.common import DONE, command, run
 from ns_abstract.cli.options import Overrides, SceneOverrides
 from ns_abstract.io.errors import InputError
 
@@ -91,7 +91,7 @@ def view(options: ViewRun) -> int:
 
 def main() -> None:
     """Entry point of the console script."""
-    run(view, lambda: tyro.cli(tyro.conf.FlagConversionOff[ViewRun], prog="ns-abstract-viewer"))
+    run(view, command("ns-abstract-viewer", tyro.conf.FlagConversionOff[ViewRun]))
 
 
 if __name__ == "__main__":

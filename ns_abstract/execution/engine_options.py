@@ -29,8 +29,8 @@ class EngineOptions:
     tls_key: Path | None = None
     """The certificate's key (PEM)."""
     workers: int | None = None
-    """Processes on this machine; 1 works in this process. They bound cells of splats, rays of a NeRF. None: one by
-    core."""
+    """Processes on this machine; 1 works in this process. They bound cells of splats, rays of a NeRF. Default:
+    one by core."""
 
     @property
     def processes(self) -> int:

@@ -17,7 +17,7 @@ def positive(value: Any, field: str) -> float:
     Raises:
         InputError: It is none.
     """
-    if isinstance(value, bool) or not isinstance(value, Real) or not 0.0 < value < float("inf"):
+    if isinstance(value, bool) or not isinstance(value, Real) or not 0.0 < float(value) < float("inf"):
         raise InputError(f"found {show(value)}", field=field, fix="give a positive number")
     return float(value)
 
@@ -28,7 +28,7 @@ def at_least(value: Any, least: float, field: str) -> float:
     Raises:
         InputError: It is none.
     """
-    if isinstance(value, bool) or not isinstance(value, Real) or not least <= value < float("inf"):
+    if isinstance(value, bool) or not isinstance(value, Real) or not least <= float(value) < float("inf"):
         raise InputError(f"found {show(value)}", field=field, fix=f"give a number of at least {least:g}")
     return float(value)
 

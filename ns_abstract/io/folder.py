@@ -54,6 +54,16 @@ def claim(folder: Path) -> BinaryIO:
         raise unwritable(folder, error) from None
 
 
+def first_command(folder: Path) -> list[str] | None:
+    """The command that began what a folder's report.json describes, or None."""
+    try:
+        document = load_json(folder / "report.json", "report", _REPORT_LIMIT)
+    except InputError:
+        return None
+    command = (document.get("first_command") or document.get("command")) if isinstance(document, dict) else None
+    return command if isinstance(command, list) and all(isinstance(word, str) for word in command) else None
+
+
 def _refuse_strangers(folder: Path) -> None:
     if (folder / MARK).exists():
         return

@@ -23,7 +23,7 @@ _TITLES = {
     "reaches": ("good", "Every run stays safe and reaches the goal"),
     "safe": ("good", "Every run stays safe"),
     "falsified": ("bad", "Some run goes wrong"),
-    "unknown": ("fair", "Undecided"),
+    "unknown": ("fair", "Unknown"),
 }
 
 

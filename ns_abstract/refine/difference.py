@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,11 +10,36 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.arithmetic.outward import outward
-from ns_abstract.arithmetic.rounding import DIFFERENCE_ROUNDING
+from ns_abstract.arithmetic.rounding import DIFFERENCE_ROUNDING, UNIT32
+from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.refine.frame_tiles import pixels_inside
-from ns_abstract.refine.protocol import COLORS, Bounds, CellContext, Frame, LinearSets, PartsFrame, SceneSample
+from ns_abstract.refine.protocol import (
+    COLORS,
+    Bounds,
+    CellContext,
+    Frame,
+    LinearSets,
+    OrderedFrame,
+    PartsFrame,
+    PreciseFrame,
+    SceneSample,
+)
 from ns_abstract.refine.result import RenderedMaximum, greater
+
+
+@dataclass(frozen=True)
+class DifferenceTuning:
+    """What is looked at closer. None of the numbers decides whether a bound holds.
+
+    Attributes:
+        most_pixels: Pixels above the floor up to which a cell's orders are looked at.
+    """
+
+    most_pixels: int = 64
+
+
+TUNING = DifferenceTuning()
 
 
 @dataclass(frozen=True)
@@ -55,6 +81,7 @@ class DifferenceFrame:
 
     Attributes:
         largest: The largest value of the image that was rendered; None before the first render.
+        greatest: [T, side, side, 3] float32, the greatest values rendered by this frame and those `above` a floor.
     """
 
     channels = COLORS
@@ -67,6 +94,8 @@ class DifferenceFrame:
         self.tilewise, self.tiles_at_once, self.witnesses = first.tilewise, first.tiles_at_once, first.witnesses
         self.largest: RenderedMaximum | None = None
         self._inside = pixels_inside(first)
+        self.greatest = np.zeros((first.tile_count, first.side, first.side, COLORS), np.float32)
+        self._shared = first.shared_order(second) if isinstance(first, OrderedFrame) else None
 
     @property
     def both(self) -> tuple[Frame, Frame]:
@@ -75,7 +104,14 @@ class DifferenceFrame:
 
     def above(self, floor: float) -> DifferenceFrame:
         """The same with another floor."""
-        return DifferenceFrame(self.first, self.second, floor)
+        frame = copy.copy(self)
+        frame.floor, frame.largest = np.float32(floor), None
+        return frame
+
+    @property
+    def shares_order(self) -> bool:
+        """Whether elements of both scenes are taken to be drawn in one order (design.md, Y5)."""
+        return self._shared is not None
 
     @property
     def tile_count(self) -> int:
@@ -98,12 +134,14 @@ class DifferenceFrame:
 
     def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
         """Tiles [t, side, side, 3] float32 of |A - B| at parameter values [d], rounded down, at least the floor."""
-        first, second = (frame.render(values, tiles)[..., :COLORS].astype(np.float64) for frame in self.both)
-        difference = np.abs(first - second)
-        # values are float32 numbers in [0, 1], whose difference float64 rounds by one unit at most
-        lower, _ = outward(difference * (1.0 - DIFFERENCE_ROUNDING), difference)
+        check_cancelled()
+        (first, one), (second, other) = (_picture(frame, values, tiles) for frame in self.both)
+        difference = np.abs(first - second) * (1.0 - DIFFERENCE_ROUNDING) - (one + other)
+        lower, _ = outward(np.maximum(difference, 0.0), difference)
         # tiles may extend past the image
-        lower[~(self._inside if tiles is None else self._inside[tiles])] = 0.0
+        some = slice(None) if tiles is None else tiles
+        lower[~self._inside[some]] = 0.0
+        self.greatest[some] = np.maximum(self.greatest[some], lower)
         found = RenderedMaximum(float(lower.max(initial=0.0)), tuple(map(float, values)))
         self.largest = greater(self.largest, found)
         return np.maximum(lower, self.floor)
@@ -131,13 +169,37 @@ class DifferenceFrame:
         first, second = (
             _bounds(frame, boxes, tiles, context, pixels) for frame, context in zip(self.both, contexts, strict=True)
         )
-        return [self._difference(a, b, pixels) for a, b in zip(first, second, strict=True)]
+        found = []
+        for box, a, b in zip(boxes, first, second, strict=True):
+            difference = self._difference(a, b, pixels)
+            if self._shared is not None and self.floor > 0.0:
+                self._share_order(box, tiles, difference, pixels)
+            found.append(difference)
+        return found
+
+    def _share_order(
+        self, box: ParameterBox, tiles: np.ndarray, difference: DifferenceBounds, pixels: np.ndarray | None
+    ) -> None:
+        """Lower bounds above the floor where both scenes are drawn in one order, whichever it is (design.md, Y5)."""
+        assert self._shared is not None
+        wanted = self._inside[tiles] & (difference.upper > self.floor).any(axis=-1)
+        wanted &= True if pixels is None else pixels
+        if not 0 < wanted.sum() <= TUNING.most_pixels:
+            return
+        contexts = difference.context.first, difference.context.second
+        for k in np.flatnonzero(wanted.any(axis=(1, 2))):
+            pairs = self._shared.bounds(box, int(tiles[k]), wanted[k], contexts)
+            if pairs is None:
+                continue
+            # what is not a number stays so, and lowers nothing
+            upper = np.maximum.reduce([upper_of(a, b)[0] for a, b in pairs])
+            _, high = outward(upper, upper)
+            lower = wanted[k][..., None] & (high < difference.upper[k])
+            difference.upper[k][lower] = np.maximum(high, self.floor)[lower]
 
     def _difference(self, a: Bounds, b: Bounds, pixels: np.ndarray | None) -> DifferenceBounds:
         """Bounds of one cell from those of both scenes."""
-        upper = np.maximum(interval_upper(a, b), interval_upper(b, a))
-        for more in (linear_upper(a, b), form_upper(a, b, a.slopes.size)):
-            upper = np.minimum(upper, more)
+        upper = upper_of(a, b)
         _, high = outward(upper, upper)
         # what is not a number stays so, and is no bound
         high = np.maximum(high, self.floor)
@@ -172,6 +234,13 @@ class DifferenceFrame:
         return []
 
 
+def _picture(frame: Frame, values: np.ndarray, tiles: np.ndarray | None) -> tuple[np.ndarray, float]:
+    """Colours of a render in float64, and by how much each may be rounded."""
+    if isinstance(frame, PreciseFrame):
+        return frame.precise(values, tiles)[..., :COLORS], 0.0
+    return frame.render(values, tiles)[..., :COLORS].astype(np.float64), UNIT32
+
+
 def _bounds(
     frame: Frame, boxes: Sequence[ParameterBox], tiles: np.ndarray, within: Any, pixels: np.ndarray | None
 ) -> Sequence[Bounds]:
@@ -179,6 +248,14 @@ def _bounds(
     if isinstance(frame, PartsFrame):
         return frame.bound_parts(boxes, tiles, within, True, pixels)
     return [frame.bound(box, tiles, within, True) for box in boxes]
+
+
+def upper_of(a: Bounds, b: Bounds) -> np.ndarray:
+    """The least upper bound [...] of |a - b| over a cell that is known; NaN: none is."""
+    upper = np.maximum(interval_upper(a, b), interval_upper(b, a))
+    for more in (linear_upper(a, b), form_upper(a, b, a.slopes.size)):
+        upper = np.minimum(upper, more)
+    return upper
 
 
 def interval_upper(a: Bounds, b: Bounds) -> np.ndarray:

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 
@@ -24,7 +24,7 @@ from ns_abstract.refine.frame_tiles import FrameTiles, LeafCell, context_bytes, 
 from ns_abstract.refine.goal import RefinementGoal
 from ns_abstract.refine.initial import InitialPartition, Partition
 from ns_abstract.refine.inner import InnerBound, sampled_gap
-from ns_abstract.refine.leaves import Change, LeafBounds
+from ns_abstract.refine.leaves import BoundedCell, Change, LeafBounds
 from ns_abstract.refine.linear_sets import LeafSets
 from ns_abstract.refine.protocol import ACCUMULATION, COLORS, DEPTH, Bounds, Frame, Render
 from ns_abstract.refine.result import ExtraOutput, FrameResult, PartResult, TracePoint, joined
@@ -53,6 +53,8 @@ class Refinement:
         tiles: Numbers of the tiles that are looked at, ascending; None: all. Measures are those of its pixels (R6).
         known: What was found of the same set before, with bounds: results are no looser, and work goes where it
             leaves most open. Not for ``keep_leaves``: leaves are to be as tight as the result.
+        initial: Takes the cells of the initial partition with their bounds in these tiles; where it holds some, they
+            are the initial partition.
         tuning: How time and memory are divided.
 
     Attributes:
@@ -75,6 +77,7 @@ class Refinement:
         members: Iterator[Render] | None = None,
         tiles: np.ndarray | None = None,
         known: FrameResult | None = None,
+        initial: list[BoundedCell] | None = None,
         tuning: Tuning = TUNING,
     ) -> None:
         self.frame, self.index, self.goal, self.tuning = frame, index, goal, tuning
@@ -100,7 +103,9 @@ class Refinement:
         self.covered = False
         self.shown: np.ndarray | None = None
         self.floor = 0.0
-        self._numbers = itertools.count()
+        self.initial = initial
+        #: cells are told apart by their numbers
+        self._numbers = itertools.count(1 + max((cell.number for cell, _, _ in initial or ()), default=-1))
         #: middles of initial cells that are not rendered unless the goal asks for them
         self._unseen: list[np.ndarray] = []
 
@@ -203,10 +208,12 @@ class Refinement:
 
     def _cover(self) -> bool:
         """Bound an initial partition of the set; False if the work was stopped first."""
+        if self.initial:
+            return self._begin_leaves(self.initial)
         everything = self.tiles.all
         partition = InitialPartition(self.tiles, self.splitter, self.inner, self.goal, self.tuning).choose()
         parts = partition.parts
-        leaves: list[tuple[LeafCell, np.ndarray, np.ndarray]] = []
+        leaves: list[BoundedCell] = []
         for number, part in enumerate(parts):
             if number and self._over():
                 if self.stopped():
@@ -227,6 +234,12 @@ class Refinement:
                 share, points = (number + 1) / len(parts), self.tuning.initial_points
                 due = int(share * points) > int(number / len(parts) * points)
                 self._record(share, keep=number < self.tuning.first_points or due)
+        if self.initial is not None:
+            self.initial.extend(leaves)
+        return self._begin_leaves(leaves)
+
+    def _begin_leaves(self, leaves: Sequence[BoundedCell]) -> bool:
+        """Take cells that cover the set; returns True."""
         self.leaves.begin(leaves)
         self.covered = True
         elements = [None if cell.context is None else cell.context.shown for cell, _, _ in leaves]
@@ -236,7 +249,7 @@ class Refinement:
         self._record(1.0)
         return True
 
-    def _initial_cell(self, part: SubBox, partition: Partition) -> tuple[LeafCell, np.ndarray, np.ndarray]:
+    def _initial_cell(self, part: SubBox, partition: Partition) -> BoundedCell:
         """A cell of the initial partition with its bounds, which are computed unless they were tried before."""
         cell, everything = self._cell(part), self.tiles.all
         tried = part.box == partition.tried.box

@@ -15,6 +15,7 @@ from ns_abstract.refine.difference import DifferenceFrame
 from ns_abstract.refine.engine import Refinement
 from ns_abstract.refine.frame_tiles import pixels_inside
 from ns_abstract.refine.goal import RefinementGoal
+from ns_abstract.refine.leaves import BoundedCell
 from ns_abstract.refine.result import FrameResult, PartResult, TracePoint, greater
 
 
@@ -29,6 +30,7 @@ class LargestTuning:
         first_step: Its first step, as a part of each parameter's range.
         halvings: Times that the step is halved.
         search_share: Part of the time that the search may take.
+        cover_share: Part of the time left that the first pass may take.
         floors: Ratios to the largest rendered value up to which values are left open, one pass each, before the one
             that the goal asks for.
         room: What a pass leaves open at least beyond the largest rendered value.
@@ -41,6 +43,7 @@ class LargestTuning:
     first_step: float = 0.125
     halvings: int = 7
     search_share: float = 0.15
+    cover_share: float = 0.7
     floors: tuple[float, ...] = (1.3,)
     room: float = 1e-3
     pass_share: float = 0.7
@@ -49,25 +52,16 @@ class LargestTuning:
 TUNING = LargestTuning()
 
 
-def search_largest(
-    frame: DifferenceFrame, seed: int, over: Callable[[], bool], tuning: LargestTuning = TUNING
-) -> np.ndarray:
-    """Render poses where the difference may be largest; returns the greatest values rendered [T, side, side, 3].
-
-    ``frame.largest`` is then the best pose. At least the middle of the set is rendered.
-    """
+def search_largest(frame: DifferenceFrame, seed: int, over: Callable[[], bool], tuning: LargestTuning = TUNING) -> None:
+    """Render poses where the difference may be largest; ``frame.largest`` is then the best one."""
     box, random = frame.box, np.random.default_rng(seed)
-    greatest = frame.render(box.middle)
 
     def look(values: np.ndarray) -> float:
-        nonlocal greatest
-        picture = frame.render(values)
-        greatest = np.maximum(greatest, picture)
-        return float(picture[inside].max(initial=0.0))
+        return float(frame.render(values)[inside].max(initial=0.0))
 
     inside = pixels_inside(frame)
     if not box.dimensions:
-        return greatest
+        return
     corners = box.corners() if box.dimensions <= 4 else box.corners()[random.permutation(2**box.dimensions)]
     scored: list[tuple[float, np.ndarray]] = []
     for values in (box.middle, *corners[: tuning.corners], *box.sample(tuning.poses, random)):
@@ -81,11 +75,10 @@ def search_largest(
         for _ in range(tuning.halvings):
             for values_near in _neighbours(values, step, low, high):
                 if over():
-                    return greatest
+                    return
                 if (found := look(values_near)) > value:
                     value, values = found, values_near
             step = 0.5 * step
-    return greatest
 
 
 def _neighbours(values: np.ndarray, step: np.ndarray, low: np.ndarray, high: np.ndarray) -> Iterator[np.ndarray]:
@@ -144,6 +137,8 @@ class LargestDifference:
             self.upper, self.rendered = (in_tiles(p, frame.side) for p in (known.upper, known.witness_upper))
             self.bounded = known.bounded
         self.cells, self.trace = 0, []
+        #: the cells of the first pass, with bounds of all tiles in ``self.tiles``
+        self._cover: list[BoundedCell] = []
         self.begin = time.perf_counter()
 
     def _late(self) -> bool:
@@ -171,19 +166,18 @@ class LargestDifference:
             # the first call compiles kernels, and the clock starts after it
             middle = self.whole.render(self.whole.box.middle)
             self.begin = time.perf_counter()
-            self.rendered = np.maximum(self.rendered, middle)
             search = self.tuning.search_share * self.goal.seconds
             with suppress(WorkCancelledError):
-                found = search_largest(
+                search_largest(
                     self.whole,
                     self.seed,
                     lambda: self._late() or self._left() < self.goal.seconds - search,
                     self.tuning,
                 )
-                self.rendered = np.maximum(self.rendered, found)
+            self.rendered = np.maximum(self.rendered, self.whole.greatest)
         self._record()
         # every pixel once, as a whole
-        self._bound(0.0, 1.0, lambda refinement: refinement.covered)
+        self._bound(0.0, self.tuning.cover_share, lambda refinement: refinement.covered)
         for floor, share in self._passes():
             if self._late():
                 break
@@ -215,9 +209,12 @@ class LargestDifference:
         """One pass over the tiles with values above the floor, in a part of the time left, or until ``enough``."""
         camera, least = self.frame.camera, np.float32(floor)
         loose = self.upper > np.maximum(self.goal.ratio * self.rendered, least)
-        here = self.tiles[(loose & self.inside[..., None])[self.tiles].any(axis=(1, 2, 3))]
+        some = (loose & self.inside[..., None])[self.tiles].any(axis=(1, 2, 3))
+        first = not self._cover
+        here = self.tiles if first else self.tiles[some]
         if not here.size:
             return
+        cover = [(cell, np.maximum(l[some], least), np.maximum(u[some], least)) for cell, l, u in self._cover]
         upper, rendered = (assemble(np.maximum(p, least), camera) for p in (self.upper, self.rendered))
         lowest = np.full_like(upper, least)
         known = FrameResult(self.index, self.frame.box, lowest, upper, lowest, rendered, rendered, 0.0, 0)
@@ -236,13 +233,14 @@ class LargestDifference:
         frame = self.frame.above(floor)
         refinement = Refinement(
             frame, self.index, goal, seed=self.seed, stopped=lambda: self._late() or enough(refinement),
-            progress=told, tiles=here, known=known,
+            progress=told, tiles=here, known=known, initial=self._cover if first else cover,
         )  # fmt: skip
         try:
             part = refinement.run_part()
         except WorkCancelledError:
             return
         self.cells += part.cells
+        self.rendered = np.maximum(self.rendered, frame.greatest)
         if self.frame is self.whole:
             # poses of the same parameters
             self.whole.largest = greater(self.whole.largest, frame.largest)
@@ -250,9 +248,6 @@ class LargestDifference:
             return
         self.bounded = self.bounded or here.size == self.tiles.size
         self.upper[here] = np.minimum(self.upper[here], part.upper)
-        # values at the floor were not rendered
-        seen = np.where(part.witness_upper > least, part.witness_upper, 0.0).astype(np.float32)
-        self.rendered[here] = np.maximum(self.rendered[here], seen)
         self._record()
 
     def _record(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -11,6 +12,9 @@ from ns_abstract.refine.goal import RefinementGoal
 from ns_abstract.refine.inner import InnerBound
 from ns_abstract.refine.protocol import COLORS, MOST_PARTS, CellContext
 from ns_abstract.refine.tuning import TUNING, Tuning
+
+#: A cell with lower and upper bounds [t, side, side, channels] of all tiles.
+BoundedCell = tuple[LeafCell, np.ndarray, np.ndarray]
 
 
 @dataclass
@@ -110,8 +114,8 @@ class LeafBounds:
         """MPG of the outer bound."""
         return self.tiles.mean_gap(self.lower, self.upper)
 
-    def begin(self, leaves: list[tuple[LeafCell, np.ndarray, np.ndarray]]) -> None:
-        """Take cells that cover the set, with lower and upper bounds [t, side, side, channels] of all tiles."""
+    def begin(self, leaves: Sequence[BoundedCell]) -> None:
+        """Take cells that cover the set."""
         for t in self.tiles.all:
             cells, lowers, uppers = zip(*((cell, lower[t], upper[t]) for cell, lower, upper in leaves), strict=True)
             self.by_tile[t].replace(Change([], list(cells), list(lowers), list(uppers)))

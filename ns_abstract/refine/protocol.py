@@ -7,6 +7,7 @@ every set of poses. Nothing above `ns_abstract.methods.load` asks which one it i
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
@@ -15,6 +16,7 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.perturbation.specification import Perturbation
+from ns_abstract.perturbation.variations import Selection
 
 if TYPE_CHECKING:
     import torch
@@ -256,6 +258,35 @@ class PartsFrame(Protocol):
         ...
 
 
+class SharedOrder(Protocol):
+    """Two scenes some of whose elements lie at the same places, and so are drawn in the same order in both."""
+
+    def bounds(
+        self, box: ParameterBox, tile: int, pixels: np.ndarray, contexts: tuple[Any, Any]
+    ) -> Sequence[tuple[Bounds, Bounds]] | None:
+        """Bounds of both scenes with linear bounds, once for every order of elements that a pose of ``box`` may have.
+
+        Args:
+            box: A cell.
+            tile: Number.
+            pixels: [side, side] which pixels are wanted.
+            contexts: Those of both scenes for this tile and cell, or one around it.
+
+        Returns:
+            None: there are too many orders, or one alone.
+        """
+        ...
+
+
+@runtime_checkable
+class OrderedFrame(Protocol):
+    """An optional interface of a `Frame`: the order of elements may be shared with another scene's."""
+
+    def shared_order(self, other: Frame) -> SharedOrder | None:
+        """What both scenes' elements have in common; None: nothing. ``other`` has the same poses."""
+        ...
+
+
 @runtime_checkable
 class PreciseFrame(Protocol):
     """What a `Frame` may have beside: pictures that are not rounded."""
@@ -287,6 +318,54 @@ class RayFrame(Frame, Protocol):
         """Seconds that one ray takes over one part of the set, about, and in how many parts the set is bounded.
 
         None: there was no time to find out.
+        """
+        ...
+
+
+@dataclass(frozen=True)
+class WeightPlane:
+    """Which scene elements a plane adds up the blending weights of: those that meet both rules.
+
+    Attributes:
+        select: What is stored of the element; None: anything.
+        nearer: Distance (normalised units) that the element is nearer than to the camera: along the optical axis for
+            what has a place of its own, along the ray for samples of a field; None: anywhere.
+    """
+
+    select: Selection | None = None
+    nearer: float | None = None
+
+
+#: Most planes of one frame of blending weights: as many as colours have channels.
+MOST_PLANES = COLORS
+
+
+class WeightFrame(Frame, Protocol):
+    """A frame whose three channels are blending weights of chosen scene elements, and nothing behind them."""
+
+    def of_sample(self, values: np.ndarray, sample: SceneSample | None) -> np.ndarray:
+        """What `Frame.render` returns, of a scene sample of the coloured frame of the same set; None: of the scene."""
+        ...
+
+    def differentiable(self, values: torch.Tensor) -> torch.Tensor:
+        """Weights [H, W, 3] at parameter values [d], differentiable where elements are chosen."""
+        ...
+
+
+@runtime_checkable
+class WeightMethod(Protocol):
+    """An optional interface of a `Method`: frames of blending weights."""
+
+    def weight_frame(self, poses: PoseBox, planes: Sequence[WeightPlane], pixels: np.ndarray) -> WeightFrame:
+        """The frame whose first channels are ``planes``, at most `MOST_PLANES`.
+
+        Args:
+            poses: Its set.
+            planes: The elements.
+            pixels: [H, W] the pixels that will be read.
+
+        Raises:
+            InputError: A selection picks nothing, or this program's weights are not bounded.
         """
         ...
 

@@ -15,8 +15,8 @@ from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.report.figures import number
 from ns_abstract.report.html import fill
 from ns_abstract.report.outside import (
-    ABOVE,
     PICTURE_WIDTH,
+    PLANS,
     PlotWindow,
     SceneDrawing,
     about,
@@ -128,6 +128,14 @@ def standing(pose_sets: Mapping[int, PoseBox]) -> tuple[Float64, Float64]:
     return np.min(places, axis=0), np.max(places, axis=0)
 
 
+def upward(pose_sets: Mapping[int, PoseBox]) -> int:
+    """The axis that sets turn about most nearly, so that an orbit is seen in its plane; 2 where none turns."""
+    for poses in pose_sets.values():
+        if (orbit := poses.perturbation.orbit) is not None:
+            return int(np.argmax(np.abs(orbit.axis)))
+    return 2
+
+
 def cameras_entry(cameras: Sequence[CellCamera], left_out: int) -> dict[str, Any]:
     """The key ``cameras`` of report.json."""
 
@@ -172,12 +180,14 @@ class CameraDrawings:
         left_out: Cells without one here.
         ends: [3], [3] ends of a box about where cameras stand, normalised units.
         outside: Draws the scene behind them; None: it has no elements with a place of their own.
+        up: The axis from whose tip the plan is drawn; see `upward`.
     """
 
     cells: Sequence[CellCamera]
     left_out: int
     ends: tuple[Float64, Float64]
     outside: SceneDrawing | None
+    up: int = 2
 
     def views(self, width: int) -> list[CameraPlot]:
         """What there is to see from above and from the side, in pictures so many pixels wide."""
@@ -188,8 +198,8 @@ class CameraDrawings:
         plots = []
         for axes, title, nearest in (
             # a ceiling would hide everything
-            (ABOVE, "from above", float(high[2])),
-            (sideways(low, high), "from the side", np.inf),
+            (PLANS[self.up], "from above" if self.up == 2 else f"along {'xyz'[self.up]}", float(high[self.up])),
+            (sideways(low, high, self.up), "from the side", np.inf),
         ):
             chosen = list(axes)
             window = about(self.outside, axes, low[chosen] - around, high[chosen] + around, nearest, width)

@@ -191,6 +191,8 @@ class LastReport:
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
+        #: the command that a resumed search goes on with
+        self.first_command: list[str] | None = None
         self._document: dict[str, Any] = {}
         self._page: Callable[[], str] = str
 
@@ -198,12 +200,14 @@ class LastReport:
         """Write both.
 
         Args:
-            document: Content of report.json; only its key ``state`` may change later.
+            document: Content of report.json; its keys ``state`` and ``first_command`` are set here.
             page: Makes the content of report.html from it.
 
         Raises:
             InputError: The folder cannot be written.
         """
+        if self.first_command:
+            document["first_command"] = self.first_command
         self._document, self._page = document, page
         write_certificate(self._folder, document, page())
 

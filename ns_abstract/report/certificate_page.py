@@ -81,7 +81,7 @@ def certificate_page(
     kind, heading = {
         "certified": ("good", "Certified: the property holds on every image"),
         "falsified": ("bad", f"Falsified; certified on {covered} of the poses"),
-        "unknown": ("fair", f"Undecided; certified on {covered} of the poses"),
+        "unknown": ("fair", f"Unknown; certified on {covered} of the poses"),
     }[document["verdict"]]
     maps, drawn = verdict_drawings(document["frames"][:_MOST_ROWS], cells, numbers)
     matrices, more_matrices = _matrices(document, cells)

@@ -12,7 +12,7 @@ import numpy as np
 
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.refine.result import FrameResult
-from ns_abstract.report.figures import number
+from ns_abstract.report.figures import ShownUnits, number
 from ns_abstract.report.files import frame_name, load_frame
 from ns_abstract.report.html import counted, set_of, whole_page
 from ns_abstract.report.picture import (
@@ -236,6 +236,7 @@ def comparison_page(document: Mapping[str, Any], pictures: Mapping[int, Mapping[
     """
     frames, scene = document["frames"], document["scene"]
     other = Path(str(scene["other"].get("source", ""))).name
+    units = ShownUnits.of(scene)
     kind, title = "good", "How far apart the pictures are"
     if document["tolerance"] is not None:
         kind, title = _TITLES[document["verdict"]]
@@ -251,8 +252,8 @@ def comparison_page(document: Mapping[str, Any], pictures: Mapping[int, Mapping[
         heading=title,
         counted=counted,
         other=other,
-        sets=list({set_of(entry) or "one camera pose": None for entry in frames}),
-        set_of=set_of,
+        sets=list({set_of(entry, units) or "one camera pose": None for entry in frames}),
+        set_of=lambda entry: set_of(entry, units),
         shown=[entry for entry in frames if entry["index"] in pictures],
         pictures=pictures,
         gradient=", ".join(color_stops()),

@@ -36,8 +36,10 @@ _KEPT = 4
 #: Room beside the window of a plot: left, right, above, below; and the window's width.
 _ROOM = 52, 12, 20, 34
 PICTURE_WIDTH = 820 - _ROOM[0] - _ROOM[1]
-#: The world's axes to the right and up, seen from above.
-ABOVE = (0, 1)
+#: The world's axes to the right and up, seen from the tip of each axis.
+PLANS = ((1, 2), (2, 0), (0, 1))
+#: The same seen from above, where z is up.
+ABOVE = PLANS[2]
 
 
 @dataclass(frozen=True)
@@ -172,9 +174,10 @@ def framed(axes: tuple[int, int], low: Float64, high: Float64, width: int) -> Pl
     return PlotWindow(axes, (low[0], low[1]), (high[0], high[1]), (width, max(1, round(width * shape))))
 
 
-def sideways(low: Float64, high: Float64) -> tuple[int, int]:
-    """The axes to the right and up from the side: along the longer horizontal side of a box, [2] at least."""
-    return (0, 2) if high[0] - low[0] >= high[1] - low[1] else (1, 2)
+def sideways(low: Float64, high: Float64, up: int = 2) -> tuple[int, int]:
+    """The axes to the right and up from the side: along the longer side of a box that is not ``up``."""
+    first, second = sorted(PLANS[up])
+    return (first, up) if high[first] - low[first] >= high[second] - low[second] else (second, up)
 
 
 def about(

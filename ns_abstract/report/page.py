@@ -11,6 +11,7 @@ from markupsafe import Markup
 
 from ns_abstract.report.figures import MARKS, ShownUnits, number
 from ns_abstract.report.html import counted, set_of, whole_page
+from ns_abstract.report.play import play_moves
 from ns_abstract.report.svg import PlotAxis, draw_legend, draw_line, draw_plot, stairs, through
 
 #: Points drawn of one curve.
@@ -77,6 +78,7 @@ def render_page(
         sets=list({sides(entry): None for entry in frames}),
         set_of=sides,
         plays=plays,
+        moves=any(play_moves(text) for text in plays.values()),
         colors=_colors,
         gradient=_gradient,
         overview=_overview(frames),
@@ -119,10 +121,9 @@ def _verdict(document: Mapping[str, Any]) -> dict[str, Any]:
     elif missing:
         kind, title = "fair", f"Bounds for {bounded} of {counted(frame_count, 'frame')}"
     else:
-        kind, title = (
-            "good",
-            f"Bounds for all {counted(frame_count, 'frame')}" if frame_count > 1 else "Bounds for the frame",
-        )
+        # bounds that could be much tighter are no success
+        kind = "fair" if any(entry["status"] == "partial" for entry in frames) else "good"
+        title = f"Bounds for all {counted(frame_count, 'frame')}" if frame_count > 1 else "Bounds for the frame"
     lines = []
     ratios = [entry["ratio"] for entry in frames if entry["ratio"] is not None and entry["status"] != "missing"]
     if ratios and not sampled:
@@ -176,9 +177,15 @@ def _thinned(trace: Sequence[Mapping[str, float]]) -> list[Mapping[str, float]]:
     return [point for point in points if point["seconds"] > 0.0]
 
 
+def _seen(trace: Sequence[Mapping[str, float]]) -> list[Mapping[str, float]]:
+    """Points from the first whole cover on, before which nothing is known; all of them where there is none."""
+    covered = [point for point in trace if point.get("covered", 1.0) >= 1.0 and point["mpg_witness"] > 0.0]
+    return covered or list(trace)
+
+
 def _curve(entry: Mapping[str, Any]) -> Markup | None:
     """Error against run time, both axes logarithmic; zero has no place on them and is left out."""
-    points = _thinned(entry["trace"])
+    points = _thinned(_seen(entry["trace"]))
     outer = [(point["seconds"], point["mpg"]) for point in points if point["mpg"] > 0.0]
     inner = [(point["seconds"], point["mpg_witness"]) for point in points if point["mpg_witness"] > 0.0]
     if not outer:
@@ -190,7 +197,7 @@ def _curve(entry: Mapping[str, Any]) -> Markup | None:
     upper = [(x(t), y(v)) for t, v in stairs(outer, end)]
     lower = [(x(t), y(v)) for t, v in stairs(inner, end)]
     band = ""
-    if len(upper) > 2 and len(lower) > 2:
+    if len(upper) > 2 and len(lower) > 2 and outer[0][0] == inner[0][0]:
         band = f'<path class="band" d="{through(upper + lower[::-1])}Z"/>'
     marks = band + draw_line(upper, "outer", False) + draw_line(lower, "inner", False)
     if len(points) <= 25:
@@ -209,6 +216,8 @@ def _path_curve(frames: Sequence[Mapping[str, Any]]) -> Markup | None:
     times = sorted({point["seconds"] for trace in traces for point in trace})
     every = max(1, math.ceil(len(times) / _CURVE_POINTS))
     times = [*times[::every], times[-1]]
+    begin = min(_seen(entry["trace"])[0]["seconds"] for entry in frames if len(_thinned(entry["trace"])) > 1)
+    times = [time for time in times if time >= begin] or times[-1:]
 
     def at(trace: Sequence[Mapping[str, float]], key: str, before: float) -> list[float]:
         values_at, position, value = [], 0, before

@@ -167,7 +167,7 @@
     const whole = !frame.cells || get("play-whole").checked, where = whole ? "any pose of the set" : "this pose";
     let sum = 0;
     for (let i = 0; i < frame.height * frame.width; i++) sum += length(frame, frame.now.lower, frame.now.upper, 3 * i);
-    const mean = "mean pixel gap " + shortNumber(sum / (frame.height * frame.width));
+    const mean = "mean pixel gap " + shortNumber(whole ? frame.mpg : sum / (frame.height * frame.width));
     if (shown === "lower") return "No picture of " + where + " is darker. " + mean;
     if (shown === "upper") return "No picture of " + where + " is brighter. " + mean;
     if (shown === "gap") return "Length over RGB of upper − lower, over " + where + "; the brightest colour is " + shortNumber(frame.scale) + ". " + mean;
@@ -179,6 +179,7 @@
   // the pixel under the pointer
   function tell() {
     const body = get("play-values"), f = frame;
+    get("play-table").hidden = !pixel;
     body.replaceChildren();
     get("play-where").textContent = pixel ? "row " + pixel[0] + ", column " + pixel[1] + (pinned ? " (held)" : "") : "point at the picture; click to hold a pixel";
     if (!pixel) { curve(); return; }

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ns_abstract.refine.result import FrameResult, Leaves
+from ns_abstract.refine.result import FrameResult, Leaves, mean_pixel_gap
 
 #: Steps of finished bounds, and of leaves' coefficients if there are any, best first; the first that fits is taken.
 LEVELS: tuple[tuple[int, int | None], ...] = (
@@ -68,6 +68,12 @@ def play_data(result: FrameResult, most: int) -> str | None:
     return None
 
 
+def play_moves(text: str) -> bool:
+    """Whether a frame for the page has bounds at single poses."""
+    head = zlib.decompressobj().decompress(base64.b64decode(text), 65536).split(b"\n", 1)[0]
+    return json.loads(head)["cell_steps"] is not None
+
+
 def _guess(leaves: Leaves, steps: int) -> float:
     """Characters that leaves will take at least, from some of their tiles: trying all is slow."""
     numbers = leaves.tile[:, 0].astype(np.int64) * 65536 + leaves.tile[:, 1]
@@ -83,6 +89,7 @@ def _packed(result: FrameResult, head: dict[str, Any], arrays: dict[str, NDArray
         "index": result.index,
         "height": result.lower.shape[0],
         "width": result.lower.shape[1],
+        "mpg": mean_pixel_gap(result.lower, result.upper),
         "names": list(box.names),
         "units": list(box.units),
         "ends": [list(side) for side in zip(box.lower, box.upper, strict=True)],

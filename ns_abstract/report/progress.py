@@ -100,7 +100,7 @@ class ProgressBar:
         from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn
 
-        self._first = point
+        self._first, self._said = point, time.monotonic()
         if self._console is None and "ipykernel" in sys.modules:
             # which a notebook has, and nothing else needs
             display = import_module("IPython.display").display

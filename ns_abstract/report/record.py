@@ -19,7 +19,7 @@ import numpy as np
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.folder import remove_parts, unwritable
+from ns_abstract.io.folder import first_command, remove_parts, unwritable
 from ns_abstract.io.jsonio import file_size, is_number, load_json
 from ns_abstract.io.version import ADVISORY, stale
 from ns_abstract.io.version import VERSION as PACKAGE
@@ -295,6 +295,7 @@ class Report:
 
     def __init__(self, output_dir: str | os.PathLike[str], run: RunRecord, *, keep_stored: bool = False) -> None:
         self._start(Path(output_dir), run)
+        self._first_command = first_command(self.folder) if keep_stored else None
         if keep_stored:
             self._keep()
         self._publish(page=True)
@@ -617,6 +618,7 @@ class Report:
                 "settings": run.settings,
                 "fingerprint": run.fingerprint,
                 "command": run.command,
+                **({"first_command": first} if (first := self._first_command) else {}),
                 "sha256": self._digests,
                 "packages": self._packages,
                 "started": self._started,

@@ -4,7 +4,7 @@ See design.md, N8.
 
 The written network takes ``X = (p, e)``, the cell's parameters p in [-1, 1]^d and one e in [-1, 1] for every
 number of the image, and computes ``A p + c + r e`` (the abstract image), the network, and the rows of the
-property. The VNN-LIB file (version 1) asks for an X in that box with a group of rows none of which is positive:
+property. The VNN-LIB file (version 1 or 2) asks for an X in that box with a group of rows none of which is positive:
 "unsat" means that the property holds for every image of the set.
 """
 
@@ -23,8 +23,11 @@ from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import ImageSets, Network, load_network
 from ns_abstract.verify.network.onnx_tensors import parse_model
+from ns_abstract.verify.vnnlib2 import write_query
 
 Form = Literal["slice", "gemm"]
+#: Version of VNN-LIB that is written.
+LibraryVersion = Literal["1.0", "2.0"]
 
 #: Roundoff of float32; the layer's constants and sums are rounded to it.
 
@@ -37,6 +40,7 @@ def write_vnnlib(
     target: Path,
     form: Form = "slice",
     groups: Sequence[Sequence[int]] | None = None,
+    version: LibraryVersion = "1.0",
 ) -> tuple[Path, Path]:
     """Write one abstract image, a network and a property as ``target.onnx`` and ``target.vnnlib``.
 
@@ -52,6 +56,7 @@ def write_vnnlib(
         form: "slice" needs n (d + 2) numbers for an image of n; "gemm" n (n + d), and no operator but Gemm
             and Reshape, for verifiers that know little.
         groups: Row numbers of each group; None: every row is one.
+        version: Of VNN-LIB; 2.0 asks about float32.
 
     Raises:
         InputError: The network cannot be extended.
@@ -78,7 +83,10 @@ def write_vnnlib(
     _extend(proto, _parallel(images), network, matrix, np.asarray(offset, np.float64), form)
     d, n = images.dimensions, network.input_size
     network_file, property_file = target.with_name(target.name + ".onnx"), target.with_name(target.name + ".vnnlib")
-    text = _vnnlib(d, n, [(k,) for k in range(len(matrix))] if groups is None else groups, len(matrix)).encode("ascii")
+    chosen = [(k,) for k in range(len(matrix))] if groups is None else groups
+    note = f"the first {d} inputs: parameters of the cell; the rest: slack of the image's {n} numbers"
+    write = _vnnlib if version == "1.0" else write_query
+    text = write(d, n, chosen, len(matrix), [note]).encode("ascii")
     write_atomic(network_file, lambda stream: stream.write(proto.SerializeToString()))
     write_atomic(property_file, lambda stream: stream.write(text))
     return network_file, property_file
@@ -163,9 +171,9 @@ def _extend(
     graph.output.append(helper.make_tensor_value_info(result, TensorProto.FLOAT, [1, len(rows)]))
 
 
-def _vnnlib(d: int, n: int, groups: Sequence[Sequence[int]], k: int) -> str:
+def _vnnlib(d: int, n: int, groups: Sequence[Sequence[int]], k: int, notes: Sequence[str]) -> str:
     """The box of (p, e) and the negated property of ``k`` rows, in VNN-LIB 1."""
-    lines = [f"; X_0 to X_{d - 1}: parameters of the cell; the rest: slack of the image's {n} numbers"]
+    lines = [f"; {note}" for note in notes]
     lines += [f"(declare-const X_{i} Real)" for i in range(d + n)]
     lines += [f"(declare-const Y_{i} Real)" for i in range(k)]
     for i in range(d + n):

@@ -543,7 +543,7 @@ def parse_property(root: Any, folder: Path, input_shape: tuple[int, ...], output
     known(root, (*_COMMON, *_TYPES[kind].keys), "", lambda name, problem, fix: InputError(problem, field=name, fix=fix))
     preprocess = parse_preprocess(root.get("preprocess", {}))
     height, width = preprocess.size(input_shape)
-    common: dict[str, Any] = {"preprocess": preprocess, "partitions": _partitions(root)}
+    common: dict[str, Any] = {"preprocess": preprocess, "partitions": parse_partitions(root)}
     sizes = math.prod(input_shape), math.prod(output_shape), height, width
     setting = _KeySetting(folder, *sizes, input_shape, output_shape)
     return _TYPES[kind].parse(root, setting, common)
@@ -554,7 +554,12 @@ def property_keys() -> dict[str, tuple[str, ...]]:
     return {name: (*_COMMON, *kind.keys) for name, kind in _TYPES.items()}
 
 
-def _partitions(root: dict[str, Any]) -> tuple[int, ...] | None:
+def parse_partitions(root: dict[str, Any]) -> tuple[int, ...] | None:
+    """Return the fixed partition that a parsed PROP.json asks for, or None.
+
+    Raises:
+        InputError: It is no number and no list of numbers.
+    """
     value = root.get("partitions")
     if value is None:
         return None

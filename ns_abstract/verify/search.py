@@ -185,6 +185,7 @@ class Search:
         block: Most cells examined together.
         cuts: Whether cells without a verdict are cut; else they are done with.
         cover: Proves cells that are too wide part by part; None: they are cut.
+        costly: Whether bounds of the model cost so much that cells whose sets are wide are cut without them.
     """
 
     def __init__(
@@ -198,7 +199,9 @@ class Search:
         block: int = BLOCK,
         cuts: bool = True,
         cover: SubBoxProof | None = None,
+        costly: bool = True,
     ) -> None:
+        self.costly = costly
         self.scene, self.model, self.claim, self.grid = scene, model, claim, grid
         self.every_unit, self.cuts, self.cover = every_unit, cuts, cover
         self.block = block if cover is None else min(block, cover.block)
@@ -240,7 +243,7 @@ class Search:
         self._sample([samples[k] for k in sorted(proved)], self._attack)
         failing = [samples[k] for k in open_cells if k not in proved]
         self._sample(failing, self._late)
-        self._ascend(failing)
+        self._descend_worst_cell(failing)
         if self.varies:
             self._vary(failing)
         leaves, children = self._verdicts(samples, bounded, reasons, slopes, costs, cuts)
@@ -340,7 +343,7 @@ class Search:
         """The margin's negative."""
         return -self.claim.margin(self.model.differentiable(picture[None]), values[None])[0]
 
-    def _ascend(self, cells: Sequence[_CellSamples]) -> None:
+    def _descend_worst_cell(self, cells: Sequence[_CellSamples]) -> None:
         """Projected gradient descent of the margin in the cell that came closest to a counterexample.
 
         With one parameter, samples do better than gradients.
@@ -414,8 +417,10 @@ class Search:
             sets = PictureSets(cell.box, linear, lower, upper)
             if not sets.sane:
                 reasons[number] = "the image's bounds are not finite or cross"
-            elif (self._splittable(cell.cell) or self._coverable(cell.cell)) and self._too_wide(
-                cell, number, sets, costs
+            elif (
+                self.costly
+                and (self._splittable(cell.cell) or self._coverable(cell.cell))
+                and self._too_wide(cell, number, sets, costs)
             ):
                 reasons[number] = "the image's bounds are too wide"
                 if self._coverable(cell.cell):

@@ -29,6 +29,7 @@ from ns_abstract.methods.nerf.render import Sampling
 from ns_abstract.methods.nerf.sample_paths import BundleBounds, SamplePaths
 from ns_abstract.methods.nerf.samples import composite, field_hulls
 from ns_abstract.methods.nerf.scene import FieldWeights, NerfScene
+from ns_abstract.methods.nerf.white import WhiteSamples
 from ns_abstract.methods.nerf.zonotope import ERROR_TERMS, FieldBounds, PostActivation, PreActivation
 
 #: (degree, grid) of the polynomials by number of parameters.
@@ -186,6 +187,8 @@ class NerfBounds:
         dimensions: Number of parameters.
         device: Where the network is bounded.
         compiled: Whether by kernels compiled for a processor; None: where ``device`` is one.
+        white: Which samples are white, the others black, in place of the field's colours; None: these. Of uniform
+            samples alone.
     """
 
     def __init__(
@@ -195,7 +198,9 @@ class NerfBounds:
         dimensions: int,
         device: torch.device | str = "cpu",
         compiled: bool | None = None,
+        white: WhiteSamples | None = None,
     ) -> None:
+        self.white = white
         self.sampling, self.device = sampling, torch.device(device)
         self.swept = sampling.kind == "hierarchical"
         self.basis = basis_of(dimensions + self.swept, scene.fine)
@@ -676,6 +681,9 @@ class _BundleWork:
 
     def _color(self, level: int, items: _SampleCells, pieces: PostActivation, there: Tensor) -> None:
         """Bound the colours of ``pieces``, those of ``items``; ``there``: monomials at their nodes."""
+        if self.owner.white is not None:
+            self._whiten(self.owner.white, level, items)
+            return
         device, field = self.owner.device, self.field
         bernstein = self._level(level)[1]
         direction = there @ torch.from_numpy(self.pencil.direction[items.ray]).to(device)
@@ -688,6 +696,17 @@ class _BundleWork:
         slack = 2.0 * torch.tanh(0.25 * error.amax(dim=1))
         slack = torch.where(color.failed, 1.0, slack).cpu().numpy()
         self.vague[where] = np.minimum(self.vague[where], slack[:, None])
+
+    def _whiten(self, white: WhiteSamples, level: int, items: _SampleCells) -> None:
+        """Bound the colours of samples ``items`` that are white where they are chosen (Q3)."""
+        distance = self.owner.distances[items.sample]
+        lines, radius = self.pencil.points(items.ray, distance, 0.5 * self.owner.lengths[items.sample])
+        low, high = self.division.boxes(level)
+        ends = self.pencil.ranges(lines, radius, low[items.cell], high[items.cell])
+        least, most = white.between(*ends, distance)
+        where = self._rows(level, items)
+        self._keep(self.color_low, self.color_high, where, least[:, None], most[:, None])
+        self.vague[where] = np.minimum(self.vague[where], (most - least).max(axis=1)[:, None])
 
     @staticmethod
     def _keep(lower: np.ndarray, upper: np.ndarray, rows: tuple, low: np.ndarray, high: np.ndarray) -> None:

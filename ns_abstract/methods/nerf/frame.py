@@ -150,7 +150,7 @@ class NerfFrame:
         self.across, self.down = tile_grid(self.camera, 1)
         self.renderer = NerfRenderer(scene, sampling, device=device)
         self._geometry = pose_set.geometry
-        self._recipe = scene, sampling, self._geometry.box.dimensions, device
+        self._recipe: tuple[Any, ...] = (scene, sampling, self._geometry.box.dimensions, device)
         self._token = secrets.token_bytes(16)
         self.bounds = NerfBounds(*self._recipe)
         weights = sum(array.size for array in scene.fine.arrays())
@@ -161,6 +161,8 @@ class NerfFrame:
         self._inner: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         #: whether boxes need not wait for what others tell of the width of cells
         self._steady = False
+        #: Numbers of the rays that `sets` bounds; of others it says 0.
+        self.rays = np.arange(self.tile_count)
 
     #: Few kernels, which are compiled together.
     stages: tuple[str, ...] = ()
@@ -361,7 +363,7 @@ class NerfFrame:
 
     @cached_property
     def _strips(self) -> PoseStrips:
-        return PoseStrips(self.bounds, self.pose_set, self._pixels(np.arange(self.tile_count)), self._run)
+        return PoseStrips(self.bounds, self.pose_set, self._pixels(self.rays), self._run)
 
     def sets(self, box: ParameterBox, weigh: Callable[[], np.ndarray | None] | None = None) -> RayCellBounds:
         """All rays over a cell ``box`` with linear bounds, from strips of the set that are kept.
@@ -377,15 +379,25 @@ class NerfFrame:
 
         def weights() -> np.ndarray | None:
             pixel_weights = None if weigh is None else weigh()
-            return None if pixel_weights is None else np.asarray(pixel_weights, np.float64).reshape(self.tile_count, 3)
+            if pixel_weights is None:
+                return None
+            return np.asarray(pixel_weights, np.float64).reshape(self.tile_count, 3)[self.rays]
 
         linear, lower, upper = self._strips.sets(box, weights)
         shape = (self.tile_count, 1, 1, 3)
-        a_lower, b_lower, a_upper, b_upper = linear
+        a_lower, b_lower, a_upper, b_upper, lower, upper = (self._every(part) for part in (*linear, lower, upper))
         d = box.dimensions
         slopes = 0.5 * (np.abs(a_lower) + np.abs(a_upper)).astype(np.float64).sum(axis=(0, 1))
         sets = a_lower.reshape(*shape, d), b_lower.reshape(shape), a_upper.reshape(*shape, d), b_upper.reshape(shape)
         return RayCellBounds(lower.reshape(shape), upper.reshape(shape), slopes, None, sets)
+
+    def _every(self, part: np.ndarray) -> np.ndarray:
+        """Bounds of all rays, of those of `rays`."""
+        if self.rays.size == self.tile_count:
+            return part
+        whole = np.zeros((self.tile_count, *part.shape[1:]), part.dtype)
+        whole[self.rays] = part
+        return whole
 
     def effort(self) -> tuple[float | None, int]:
         """Seconds that one ray takes over one strip of the set, about, and how many strips there are.

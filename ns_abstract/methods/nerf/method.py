@@ -18,8 +18,9 @@ from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.occupancy import VOXEL_BYTES, OccupancyGrid
 from ns_abstract.methods.nerf.render import Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
+from ns_abstract.methods.nerf.weights import NerfWeightFrame
 from ns_abstract.perturbation.specification import Perturbation
-from ns_abstract.refine.protocol import Frame
+from ns_abstract.refine.protocol import Frame, WeightPlane
 
 if TYPE_CHECKING:
     import torch
@@ -144,6 +145,15 @@ class NerfMethod:
         if layers:
             raise InputError("depth and accumulation of a NeRF are not bounded", field="--outputs", fix="leave it out")
         return NerfFrame(self.scene, self.sampling, poses, self.device, self._processes(poses.geometry.box.dimensions))
+
+    def weight_frame(self, poses: PoseBox, planes: Sequence[WeightPlane], pixels: np.ndarray) -> NerfWeightFrame:
+        """See `ns_abstract.refine.protocol.WeightMethod`: weights of samples in boxes, distances along the rays.
+
+        Raises:
+            InputError: A selection is one of Gaussians, or the sampling is hierarchical.
+        """
+        workers = self._processes(poses.geometry.box.dimensions)
+        return NerfWeightFrame(self.scene, self.sampling, poses, planes, pixels, self.device, workers)
 
     def _processes(self, dimensions: int) -> int:
         """Processes that bound rays of a set with so many parameters."""

@@ -20,6 +20,7 @@ from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.methods.nerf.field import Field
 from ns_abstract.methods.nerf.hsv import shifted
 from ns_abstract.methods.nerf.scene import NerfScene
+from ns_abstract.methods.nerf.white import WhiteSamples
 
 #: nerfstudio/model_components/ray_samplers.py, ``PDFSampler``.
 HISTOGRAM_PADDING = 0.01
@@ -78,6 +79,7 @@ class NerfRenderer:
         sampling: Where they are evaluated.
         dtype: Of all arithmetic.
         device: Where.
+        white: Which uniform samples are white, the others black, in place of the field's colours; None: these.
     """
 
     def __init__(
@@ -86,7 +88,9 @@ class NerfRenderer:
         sampling: Sampling,
         dtype: torch.dtype = torch.float64,
         device: torch.device | str = "cpu",
+        white: WhiteSamples | None = None,
     ) -> None:
+        self.white = white
         self.sampling, self.dtype, self.device = sampling, dtype, torch.device(device)
         self.fine = Field(scene.fine, dtype, device)
         self.coarse = Field(scene.coarse, dtype, device) if sampling.kind == "hierarchical" else self.fine
@@ -109,6 +113,10 @@ class NerfRenderer:
             bins = self._refined(bins, _weights(density, self._lengths(bins)))
         density, base, inside = self._densities(self.fine, origin, world, bins)
         weights = _weights(density, self._lengths(bins))
+        if self.white is not None:
+            distances = self._middles(bins)
+            color = self.white.at(origin + world[:, None] * distances[..., None], distances)
+            return (weights[..., None] * color).sum(dim=1).clamp(0.0, 1.0)
         if not weights.requires_grad:
             # most samples of empty space add exactly nothing, whatever their colour
             visible = weights > 0.0
@@ -161,6 +169,10 @@ class NerfRenderer:
         s = self.sampling
         return bins * s.far + (1.0 - bins) * s.near
 
+    def _middles(self, bins: Tensor) -> Tensor:
+        distances = self._distances(bins)
+        return (distances[:, :-1] + distances[:, 1:]) / 2.0
+
     def _lengths(self, bins: Tensor) -> Tensor:
         distances = self._distances(bins)
         return distances[:, 1:] - distances[:, :-1]
@@ -170,9 +182,7 @@ class NerfRenderer:
 
         The last value selects these points of [n, k]: where nothing is declared empty, all of them.
         """
-        distances = self._distances(bins)
-        middles = (distances[:, :-1] + distances[:, 1:]) / 2.0
-        points = origin + world[:, None] * middles[..., None]
+        points = origin + world[:, None] * self._middles(bins)[..., None]
         if self.occupancy is None:
             return *field.density(points), ...
         inside = self.occupancy.at(points)

@@ -249,14 +249,14 @@ class SplatBounds:
         gaussians, alive = self._projected(candidates, poses, camera, shape)
         colors = self._colors(forms, poses.camera_magnitude, candidates, alive, candidates.size)
         offsets, entries = tile_lists(
-            depth_order(alive, gaussians.depth), gaussians.tiles, tile_mask(wanted, across * down), across
+            self._listed(alive, candidates, gaussians), gaussians.tiles, tile_mask(wanted, across * down), across
         )
         m = shape.monomials
         common = np.zeros(m + 1)
         if layers:
             colors = _four_channels(colors, self._depths(poses, candidates, alive, gaussians.delta, m), alive, m)
             common = np.ascontiguousarray(poses.offset[: m + 1, 2])
-        bounds = self._unset_bounds(wanted.size, candidates.size, shape, keep_linear, layers)
+        bounds = self._allocate_bounds(wanted.size, candidates.size, shape, keep_linear, layers)
         inputs = PixelInputs(
             gaussians,
             self._viewing_axes(forms, poses.rotation_magnitude, gaussians),
@@ -289,7 +289,7 @@ class SplatBounds:
         )  # fmt: skip
         return gaussians, np.flatnonzero(state)
 
-    def _unset_bounds(
+    def _allocate_bounds(
         self, tiles: int, gaussians: int, shape: FormShape, keep_linear: bool, layers: bool
     ) -> PixelBounds:
         """The output of the pixel stage for so many tiles and candidates, not filled in."""
@@ -314,6 +314,10 @@ class SplatBounds:
             delta=self._buffer("delta", (n, 3)),
             depth_error=self._buffer("depth_error", (n,)),
         )
+
+    def _listed(self, alive: np.ndarray, candidates: np.ndarray, gaussians: ProjectedGaussians) -> np.ndarray:
+        """The rows ``alive`` of ``gaussians``, nearest first; they are the scene's ``candidates[alive]``."""
+        return depth_order(alive, gaussians.depth)
 
     def _viewing_axes(
         self, forms: PoseForms, rotation_magnitude: np.ndarray, gaussians: ProjectedGaussians

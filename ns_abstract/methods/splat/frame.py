@@ -26,7 +26,7 @@ from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.stage_data import shared_out
 from ns_abstract.methods.splat.variations import VariedSplats
 from ns_abstract.perturbation.specification import ROTATIONS
-from ns_abstract.refine.protocol import COLORS, LinearSets, Score
+from ns_abstract.refine.protocol import COLORS, Frame, LinearSets, Score, SharedOrder
 
 if TYPE_CHECKING:
     from ns_abstract.methods.splat.reference import Reference
@@ -266,6 +266,12 @@ class SplatFrame:
         if not varied.counts["mean"] and translation_only(self.pose_set.enclosure(self.box, 1)):
             plan.append("depth-order rules left out but for near-ties: translations never change the order")
         return plan
+
+    def shared_order(self, other: Frame) -> SharedOrder | None:
+        """See `ns_abstract.refine.protocol.OrderedFrame`."""
+        from ns_abstract.methods.splat.shared_order import shared_order
+
+        return shared_order(self, other) if isinstance(other, SplatFrame) else None
 
     def feasible(self, box: ParameterBox) -> ParameterBox | None:
         """See `PoseBox.feasible`."""

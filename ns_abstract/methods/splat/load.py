@@ -160,7 +160,7 @@ def _load_run(run: runs.RunConfig, overrides: Overrides) -> SplatScene:
     checkpoint = runs.find_checkpoint(run, overrides.load_step)
     whole = runs.read_model_state(checkpoint)
     state = _gaussian_state(whole, checkpoint, run.method_name)
-    alone, whose = _check_model(run, whole, checkpoint, overrides.assume_splatfacto)
+    gaussians_alone, model_assumptions = _check_model(run, whole, checkpoint, overrides.assume_splatfacto)
     unused = config_keys.check_keys(run, config_keys.SPLATFACTO, refuse_unknown=not overrides.assume_splatfacto)
     arrays = _run_arrays(state, checkpoint, degree_stored, degree)
     fields = {"scales": "scales", "quats": "quats", "opacities": "opacities", "colours": "features_dc"}
@@ -185,10 +185,10 @@ def _load_run(run: runs.RunConfig, overrides: Overrides) -> SplatScene:
         assumptions=(
             *choices,
             runs.step_assumption(run, checkpoint, overrides.load_step),
-            *whose,
+            *model_assumptions,
             Assumption("units", f"1 of the data set is {transform.scale:.9g}", units),
         ),
-        alone=alone,
+        gaussians_alone=gaussians_alone,
     )
 
 
@@ -235,10 +235,10 @@ def _check_model(
             field="pipeline",
             fix="give --assume-splatfacto to bound its Gaussians alone",
         )
-    alone = bool(unknown) or bool(name and name not in _CLASSES)
+    gaussians_alone = bool(unknown) or bool(name and name not in _CLASSES)
     origin = "config.yml: pipeline.model._target" if name else "default: config.yml names no class"
     records = [Assumption("model", visible(name) or "SplatfactoModel", origin)]
-    if alone:
+    if gaussians_alone:
         left = f", without {visible(', '.join(unknown[:_SHOWN]))}" if unknown else ""
         records.append(Assumption("bounded", f"the Gaussians alone{left}", "--assume-splatfacto"))
     records += [
@@ -246,7 +246,7 @@ def _check_model(
         for prefix, why in _IDLE.items()
         if why != "no values" and any(key.startswith(prefix) for key in state)
     ]
-    return alone, tuple(records)
+    return gaussians_alone, tuple(records)
 
 
 def _known(key: str) -> bool:

@@ -24,9 +24,10 @@ from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.load import load_scene
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.methods.splat.variations import VariedSplats, vary
+from ns_abstract.methods.splat.weights import SplatWeightFrame, WhiteGaussians, plane_mask
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.perturbation.variations import SceneVariation
-from ns_abstract.refine.protocol import MOST_PARTS, Frame, SceneElements
+from ns_abstract.refine.protocol import MOST_PARTS, Frame, SceneElements, WeightPlane
 
 if TYPE_CHECKING:
     import torch
@@ -92,7 +93,8 @@ class SplatMethod:
     @property
     def content(self) -> str:
         """The scene in a few words."""
-        return f"{self.scene.count:,} Gaussians{' alone, of a model that may draw more' if self.scene.alone else ''}"
+        alone = " alone, of a model that may draw more" if self.scene.gaussians_alone else ""
+        return f"{self.scene.count:,} Gaussians{alone}"
 
     def frame(self, poses: PoseBox, sheared: bool = False, layers: bool = False) -> SplatFrame:
         """One frame, ready for refinement; ``sheared``, ``layers``: see `SplatFrame`.
@@ -108,6 +110,18 @@ class SplatMethod:
             self.splats, self.rasteriser, self.arithmetic, poses, varied=varied, sheared=sheared, layers=layers,
             reference=self._slow, sums=sums,
         )  # fmt: skip
+
+    def weight_frame(self, poses: PoseBox, planes: Sequence[WeightPlane], pixels: np.ndarray) -> SplatWeightFrame:
+        """See `ns_abstract.refine.protocol.WeightMethod`; tiles of which no pixel is read cost nothing anyway.
+
+        Raises:
+            InputError: A selection picks no Gaussian.
+        """
+        masks = [plane_mask(self.scene, self.splats.opacity, plane) for plane in planes]
+        varied = self.varied(poses.perturbation.scene)
+        sums = self._sums[poses.perturbation.scene]
+        white = WhiteGaussians.of(masks, [plane.nearer for plane in planes])
+        return SplatWeightFrame(white, self.splats, self.rasteriser, self.arithmetic, poses, varied, sums, self._slow)
 
     def ablations(self, poses: PoseBox) -> Iterator[tuple[str, SplatFrame]]:
         """See `Method.ablations`."""
@@ -184,7 +198,7 @@ class SplatMethod:
             "renderer": self.rasteriser.name,
             "version": self.rasteriser.version,
             "arithmetic": self.arithmetic.name,
-            **({"bounded": "Gaussians alone"} if scene.alone else {}),
+            **({"bounded": "Gaussians alone"} if scene.gaussians_alone else {}),
         }
 
     def describe(self) -> dict[str, Any]:
@@ -199,7 +213,7 @@ class SplatMethod:
             "rasterize_mode": scene.rasterize_mode,
             "background": [float(v) for v in scene.background],
             "notes": list(scene.notes),
-            **({"bounded": GAUSSIANS_ALONE} if scene.alone else {}),
+            **({"bounded": GAUSSIANS_ALONE} if scene.gaussians_alone else {}),
         }
 
     def elements(self) -> SceneElements:

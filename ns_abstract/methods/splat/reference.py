@@ -127,6 +127,7 @@ class Reference:
         self._opacities = torch.sigmoid(torch.from_numpy(scene.opacity_logits.copy()).to(dtype))
         self._sh = torch.from_numpy(scene.sh.copy()).to(dtype)
         self._shift: Tensor | None = None
+        self._plain: Tensor | None = None
         self._background = torch.from_numpy(scene.background.copy()).to(dtype)
         if not rasteriser.background:
             self._background = torch.zeros(3, dtype=dtype)
@@ -139,6 +140,12 @@ class Reference:
         other = copy.copy(self)
         other._means, other._opacities = means.to(self.dtype), opacities.to(self.dtype)
         other._shift = None if color_shift is None else color_shift.to(self.dtype)
+        return other
+
+    def recolored(self, colors: Tensor) -> Reference:
+        """The same Gaussians with ``colors`` [N, 3] seen from everywhere, and black behind them."""
+        other = copy.copy(self)
+        other._plain, other._background = colors.to(self.dtype), torch.zeros(3, dtype=self.dtype)
         return other
 
     def project(self, camera: PinholeCamera, camera_to_world: Tensor, subset: Tensor | None = None) -> Projection:
@@ -251,6 +258,8 @@ class Reference:
 
     def _colors(self, indices: Tensor, position: Tensor) -> Tensor:
         """[n, 3] colours seen from ``position`` [3], world."""
+        if self._plain is not None:
+            return self._plain[indices]
         sh = self._sh[indices]
         if self.scene.color_model == "sigmoid":
             colors = torch.sigmoid(sh[:, 0])

@@ -41,7 +41,7 @@ class SplatScene:
         stored: [N] numbers of the Gaussians in the source, ascending, where some were dropped; else None.
         notes: What was assumed where the source says nothing, one sentence each.
         assumptions: What was decided of the picture, and where each choice came from.
-        alone: Whether the run's model draws more than these Gaussians, so that bounds are of the Gaussians alone.
+        gaussians_alone: Whether the run's model draws more than these Gaussians, so that bounds are of them alone.
     """
 
     means: Float32Array
@@ -60,7 +60,7 @@ class SplatScene:
     stored: NDArray[np.int64] | None = None
     notes: tuple[str, ...] = ()
     assumptions: tuple[Assumption, ...] = ()
-    alone: bool = False
+    gaussians_alone: bool = False
 
     def __post_init__(self) -> None:
         n = self.means.shape[0]

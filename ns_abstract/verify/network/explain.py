@@ -25,7 +25,7 @@ _PLANNED_EACH = 3.2e-5
 _OPEN, _DEEP_OPEN = 0.1, 0.4
 
 
-def products(network: Network, index: int) -> float:
+def multiplications(network: Network, index: int) -> float:
     """Return the number of multiplications in one evaluation of node ``index``."""
     layer = network.nodes[index - 1].layer
     size = float(np.prod(layer.shape))
@@ -44,7 +44,7 @@ def estimate(network: Network, dimensions: int) -> tuple[float, float, bool]:
     """Return a cell's bytes, seconds on one core (roughly), and whether backward passes are skipped."""
     count = len(network.nodes)
     sizes = [float(np.prod(network.shape(k))) for k in range(count + 1)]
-    forwards = 2.0 * sum(products(network, k) for k in range(1, count + 1)) * (1 + dimensions)
+    forwards = 2.0 * sum(multiplications(network, k) for k in range(1, count + 1)) * (1 + dimensions)
     costs = cost_model_of(network)
     rows = costs.foreseen(_OPEN, _DEEP_OPEN)
     many = costs.deep and not rows.given_up
@@ -84,7 +84,7 @@ def explain(network: Network, dimensions: int = 2) -> Sequence[str]:
         inputs = ", ".join(map(str, node.inputs))
         lines.append(f"{k:5d}  {kind:22s} {item(node.layer.shape):>14s}  of {inputs:12s} {node.op} {node.name}")
     total = sum(float(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1))
-    work = sum(products(network, k) for k in range(1, len(network.nodes) + 1))
+    work = sum(multiplications(network, k) for k in range(1, len(network.nodes) + 1))
     memory, seconds, given_up = estimate(network, dimensions)
     lines.append(f"{len(network.nodes)} layers, {total:,.0f} numbers, {work:,.0f} products an evaluation")
     lines.append(

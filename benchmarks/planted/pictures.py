@@ -1,0 +1,78 @@
+"""Faults in properties of the picture: blending weights, depths, measures and claims."""
+
+from planted.fault import Fault
+
+_WEIGHTS, _WHITE, _BOUNDS = "methods/splat/weights.py", "methods/nerf/white.py", "methods/nerf/bounds.py"
+_MEASURES, _PROPERTIES, _QUESTION = (
+    "verify/picture_measures.py", "verify/picture_properties.py", "api/picture_question.py",
+)  # fmt: skip
+_CROSS = "test_picture_weights.py::test_what_crosses_the_distance_counts_as_both"
+_SAMPLES = "test_picture_weights.py::test_weights_of_samples_stay_inside[spec0]"
+_INSIDE = "test_picture_properties.py::test_measures_stay_inside[2]"
+_TREES = "test_picture_properties.py::test_claims_are_trees"
+_DEPTHS = "test_picture_properties.py::test_depths_where_nothing_may_be_drawn"
+
+PICTURES = (
+    Fault(
+        "weights: what may be nearer is not", _WEIGHTS, "WhiteGaussians.between", "~(low[:, None] >= self.nearer)",
+        "high[:, None] < self.nearer", _CROSS,
+    ),
+    Fault(
+        "weights: what may be nearer surely is", _WEIGHTS, "WhiteGaussians.between", "high[:, None] < self.nearer",
+        "low[:, None] < self.nearer", _CROSS,
+    ),
+    Fault(
+        "weights: what depths have in common does not move", _WEIGHTS, "WeightBounds._depth_range",
+        "forms.offset.data[:m + 1, 2]", "forms.offset.data[0, 2] * (np.arange(m + 1) == 0)", _CROSS,
+    ),
+    Fault(
+        "weights: the depth's own rounding is forgotten", _WEIGHTS, "WeightBounds._depth_range",
+        "np.abs(depths[:, 1:]).sum(axis=1)", "np.abs(depths[:, 1:m]).sum(axis=1)",
+        "test_picture_weights.py::test_depths_are_rounded",
+    ),
+    Fault(
+        "weights: the background stays", _WEIGHTS, "SplatWeightFrame.__init__", "np.zeros(3)", "splats.background",
+        "test_picture_weights.py::test_weights_stay_inside[pose-classic]",
+    ),
+    Fault(
+        "weights: samples that may be in the box are not", _WHITE, "WhiteSamples.between",
+        "((high < self.lower) | (low > self.upper)).any(axis=2)", "~surely", _SAMPLES,
+    ),
+    Fault(
+        "weights: samples that may be in the box surely are", _WHITE, "WhiteSamples.between",
+        "((low >= self.lower) & (high <= self.upper)).all(axis=2)",
+        "((high >= self.lower) & (low <= self.upper)).all(axis=2)", _SAMPLES,
+    ),
+    Fault(
+        "measures: parts are looked at in their middles", _MEASURES, "PlaneSets.over",
+        "sign * (parts.halves @ np.abs(a).T)", "0.0", _INSIDE,
+    ),
+    Fault(
+        "measures: a difference takes the lower side of both", _MEASURES, "Measure.bounds", "low - taken[1]",
+        "low - taken[0]", _INSIDE,
+    ),
+    Fault(
+        "measures: one rank too high", _MEASURES, "Measure._one", "len(pixels) - self.rank",
+        "min(len(pixels) - 1, len(pixels) - self.rank + 1)", _INSIDE,
+    ),
+    Fault(
+        "measures: means of the upper planes from below", _MEASURES, "Measure._mean",
+        "0 if sign * weight > 0.0 else 2", "2 if sign * weight > 0.0 else 0", _INSIDE,
+    ),
+    Fault(
+        "claims: any part of a cell will do", _PROPERTIES, "PictureClaim.proved",
+        "_joined(self.statement, iter(margins), np.minimum, np.maximum).min(axis=1)",
+        "_joined(self.statement, iter(margins), np.minimum, np.maximum).max(axis=1)",
+        "test_picture_properties.py::test_parts_of_a_cell_must_all_hold",
+    ),
+    Fault(
+        "claims: all is any", _PROPERTIES, "_joined", "least if statement.all else most", "most", _TREES,
+    ),
+    Fault(
+        "claims: what is no number proves something", _PROPERTIES, "PictureClaim.proved",
+        "np.where(np.isnan(side), -np.inf, side)", "np.nan_to_num(side)", _TREES,
+    ),
+    Fault(
+        "depths: what may be empty is drawn", _QUESTION, "depth_range", "nothing | maybe", "nothing", _DEPTHS,
+    ),
+)  # fmt: skip

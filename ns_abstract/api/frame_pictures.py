@@ -1,0 +1,177 @@
+"""One frame's pictures as the search for certificates sees them, and the file that states a property."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any, cast
+
+import numpy as np
+import torch
+
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.poses import PoseBox
+from ns_abstract.geometry.tiles import assemble
+from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import load_json
+from ns_abstract.refine.protocol import Frame, Method, RayFrame, SceneSample
+from ns_abstract.report.picture import to_bytes
+from ns_abstract.report.record import file_stamp
+from ns_abstract.verify.camera_response import CameraResponse, response_sets
+from ns_abstract.verify.eight_bit import Picture, rounded, rounded_sets
+
+#: Pictures of a frame that are kept where they are made ray by ray.
+_IMAGES = 64
+
+
+@dataclass(frozen=True)
+class PropertySource:
+    """A property and the file that states it.
+
+    Attributes:
+        value: Content of PROP.json.
+        file: The file, or None.
+    """
+
+    value: Any
+    file: Path | None = None
+
+    @classmethod
+    def of(cls, given: Mapping[str, Any] | str | Path) -> PropertySource:
+        """Of a mapping, or read from a file.
+
+        Raises:
+            InputError: The file cannot be read.
+        """
+        if isinstance(given, Mapping):
+            return cls(dict(given))
+        return cls(load_json(Path(given), "property file"), Path(given))
+
+    @property
+    def name(self) -> str:
+        """The file's name."""
+        return "property" if self.file is None else self.file.name
+
+    @property
+    def stamped(self) -> Any:
+        """The content, with the sum of every file in place of its name."""
+        return self._stamped(self.value)
+
+    def _stamped(self, value: Any) -> Any:
+        if isinstance(value, list):
+            return [self._stamped(part) for part in value]
+        if not isinstance(value, dict):
+            return value
+        files = ("file", "mask", "indices")
+        return {
+            key: file_stamp(self.folder / part)["sha256"]
+            if key in files and isinstance(part, str)
+            else self._stamped(part)
+            for key, part in value.items()
+        }
+
+    @property
+    def folder(self) -> Path:
+        """Where files that it names lie."""
+        return Path() if self.file is None else self.file.parent
+
+    def absolute(self) -> PropertySource:
+        """The same for a process with another working directory."""
+        return PropertySource(self.value, (self.file or Path("property")).absolute())
+
+    def within(self, error: InputError) -> InputError:
+        """The error with the file named."""
+        return error if self.file is None else error.within(self.file)
+
+
+class FramePictures:
+    """One frame's pictures, for `ns_abstract.verify.search.Search`.
+
+    Args:
+        method: The scene and its program.
+        poses: The frame's set.
+        picture: Whether the network is shown floats or rounded pictures.
+        response: The cameras that may show them; None: one that shows what is rendered.
+        sheared: Whether parameters may be counted otherwise than the set does, where that is tighter (P2).
+    """
+
+    def __init__(
+        self,
+        method: Method,
+        poses: PoseBox,
+        picture: Picture = "float",
+        response: CameraResponse | None = None,
+        sheared: bool = False,
+    ) -> None:
+        self._rounded, self._response = picture == "8-bit", response
+        self.frame: Frame = self._frame(method, poses, sheared)
+        #: What pixels of a cell cost, where pictures are made ray by ray: see `pixel_weights`.
+        self.weigh: Callable[[ParameterBox], np.ndarray | None] = lambda box: None
+        self._images: dict[bytes, np.ndarray] = {}
+        self.box = self.frame.box
+        self._method = method
+        self._tiles = np.arange(self.frame.tile_count)
+
+    def _frame(self, method: Method, poses: PoseBox, sheared: bool) -> Frame:
+        return method.frame(poses, sheared)
+
+    @property
+    def pose_set(self) -> PoseBox:
+        """The frame's poses."""
+        return self.frame.pose_set
+
+    def image(self, values: np.ndarray, member: SceneSample | None = None) -> np.ndarray:
+        values = np.asarray(values, np.float64)
+        if member is not None:
+            image = assemble(member(values), self.frame.camera)
+            return rounded(image) if self._rounded else image
+        key = values.tobytes()
+        image = self._images.get(key)
+        if image is None:
+            image = assemble(self.frame.render(values), self.frame.camera)
+            if self.frame.tilewise:
+                # costly, and neighbouring cells share their ends
+                while len(self._images) >= _IMAGES:
+                    self._images.pop(next(iter(self._images)))
+                self._images[key] = image
+        return rounded(image) if self._rounded else image
+
+    def scene_samples(self, seed: int) -> Iterator[SceneSample]:
+        return (
+            self.frame.scene_samples(seed) if self._response is None else self._response.scene_samples(self.frame, seed)
+        )
+
+    def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
+        if self.frame.tilewise:
+            linear_sets = cast("RayFrame", self.frame).sets(box, partial(self.weigh, box))
+        else:
+            linear_sets = self.frame.bound(box, self._tiles, keep_linear=True)
+        linear, lower, upper = response_sets(linear_sets, self.frame.camera, self._response)
+        if self._rounded:
+            linear, lower, upper = rounded_sets(linear, lower, upper)
+        return linear, lower, upper, linear_sets.slopes
+
+    @cached_property
+    def _differentiable(self) -> Callable[[torch.Tensor], torch.Tensor]:
+        renderer = self._method.differentiable(self.pose_set)
+        assert renderer is not None
+        return renderer
+
+    def differentiable(self, values: torch.Tensor) -> torch.Tensor:
+        """The floats before any rounding, which has no slope."""
+        return self._differentiable(values)
+
+    @property
+    def effort(self) -> tuple[Frame, int]:
+        """A frame whose bounds a cell takes, and how many of its tiles, where pictures are made ray by ray."""
+        return self.frame, self.frame.tile_count
+
+    def completed(self, image: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """An `image` at parameter values [d] with its colours, where the search leaves them out."""
+        return image
+
+    def shown(self, image: np.ndarray, values: np.ndarray) -> np.ndarray:
+        """An `image` at parameter values [d] as bytes [h, w, 3], for people."""
+        return to_bytes(image)

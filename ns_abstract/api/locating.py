@@ -1,0 +1,301 @@
+"""Where a photo was taken: `locate`, its result, and the question that the command line asks, too."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any, Literal, cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ns_abstract.api.cell_search import CellQuestion, CellSearch, Request, Row, answered, check_arguments
+from ns_abstract.api.job import Job
+from ns_abstract.api.location import Location, PhotoOptions
+from ns_abstract.api.poses import PoseSet
+from ns_abstract.api.scenes import Scene
+from ns_abstract.execution.engines import EngineName, started
+from ns_abstract.io.errors import InputError
+from ns_abstract.report.figures import percent, short_guarantee
+from ns_abstract.report.location import LocatedRun, location_document, location_page, location_pictures
+from ns_abstract.report.notebook import verdicts_html
+from ns_abstract.verify.cells import CellGrid
+from ns_abstract.verify.location_store import LocationStore
+from ns_abstract.verify.store import Store
+
+
+@dataclass(frozen=True)
+class LocateProgress:
+    """Where a search stands.
+
+    Attributes:
+        left: Part of the searched volume that is not excluded.
+        outliers: Pixels that the best pose so far does not explain, or None.
+        seconds: Time spent.
+    """
+
+    left: float
+    outliers: int | None
+    seconds: float
+
+
+class LocationQuestion(CellQuestion[LocateProgress]):
+    """Which poses of some frames' sets can have made a photo, and the report on it.
+
+    Args:
+        job: The photo and the sets.
+        frames: Numbers of the frames.
+        settings: What the report says that was asked for.
+        command: The command line, or the call.
+    """
+
+    store = LocationStore
+
+    def __init__(
+        self, job: Location, frames: Sequence[int], settings: Mapping[str, Any], command: tuple[str, ...]
+    ) -> None:
+        self.job = job
+        super().__init__(job, job.parameters, {k: job.search(k).frame.box for k in frames}, job.fixed)
+        self.about = LocatedRun(
+            guarantee=job.job.method.guarantee,
+            renderer=dict(job.job.method.program),
+            scene=job.job.describe(),
+            assumptions=job.job.assumptions,
+            photo=None if job.file is None else str(job.file),
+            levels=job.photo.levels,
+            noise=job.photo.noise,
+            outliers=job.photo.outliers,
+            counted=int(job.photo.counted.sum()),
+            allowed=job.photo.allowed,
+            settings=settings,
+            fingerprint=job.fingerprint,
+            command=command,
+            plan=job.job.plan,
+        )
+
+    def grid(self, number: int) -> CellGrid:
+        return self.job.search(number).grid
+
+    def stored_set(self, number: int) -> Any:
+        return self.job.search(number).frame.box
+
+    def prepare(self, search: CellSearch[LocateProgress], request: Request) -> None:
+        store = cast(LocationStore, search.store)
+        store.allowed = self.job.photo.allowed
+        store.cover = lambda frame: self.job.cover(frame, store.left(frame))
+        request.on_open(store)
+        self.job.job.warm_up(next(iter(self.sets)))
+
+    def progress(self, store: Store) -> LocateProgress:
+        assert isinstance(store, LocationStore)
+        tallies = store.tallies()
+        left = sum(1.0 - tally.certified / tally.units for tally in tallies) / max(1, len(tallies))
+        best = [pose.outliers for tally in tallies for pose in store.poses(tally.frame)[:1]]
+        return LocateProgress(left, min(best, default=None), store.seconds)
+
+    def report(self, search: CellSearch[LocateProgress], state: str) -> dict[str, Any]:
+        store = cast(LocationStore, search.store)
+        if state == "running":
+            return {}
+        rows = {tally.frame: store.leaves(tally.frame) for tally in store.tallies()}
+        sets = {frame: self.job.job.pose_sets[frame] for frame in rows}
+        poses = {frame: store.poses(frame) for frame in rows}
+        document = location_document(
+            self.about, self.parameters, sets, rows, poses, state=state, seconds=store.seconds, effort=store.effort,
+            trace=store.points,
+        )  # fmt: skip
+        if search.request.report:
+            photo, picture, missed = self.job.photo, None, None
+            if document["best"] is not None and state != "interrupted":
+                values = poses[document["best"]["frame"]][0].values
+                picture = self.job.picture(document["best"]["frame"], np.array(values))
+                missed = photo.outside(picture)
+            pictures = location_pictures(photo.levels, picture, missed)
+            page = partial(location_page, document, rows, sets, pictures, self.job.job.method.elements())
+            search.last.write(document, page)
+        return document
+
+
+@dataclass(frozen=True)
+class LocatedCell:
+    """A cell of a set.
+
+    Attributes:
+        frame: Number of its set of poses.
+        lower, upper: Ends of its box, in the order of `Located.parameters`.
+        verdict: "excluded" (no pose of it made the photo), "possible" (``pose`` explains the photo) or "unknown".
+        pose: Parameters of a rendered pose that explains the photo, or None.
+    """
+
+    frame: int
+    lower: np.ndarray
+    upper: np.ndarray
+    verdict: Literal["excluded", "possible", "unknown"]
+    pose: np.ndarray | None
+
+
+@dataclass(frozen=True)
+class Located:
+    """The poses of some sets that can have made a photo.
+
+    Attributes:
+        possible_volume: Part of the parameter volume that is not excluded, mean over the sets.
+        hull: Ends [d], [d] of the smallest box around all that is not excluded; None: no pose made the photo.
+        best: Parameters ``pose`` of the rendered pose that explains most, and the number of ``outliers``; or None.
+        answer: "none" (no pose of the sets made the photo), "possible" (a rendered pose explains it) or "unknown".
+        cells: What the sets are made of.
+        parameters: Names and units of the cells' axes.
+        guarantee: Of the pictures, as in `ns_abstract.BoundResult`.
+        state: "done", "budget" (the time ended first) or "interrupted".
+        seconds: Time spent.
+        report: Content of report.json.
+    """
+
+    possible_volume: float
+    hull: tuple[np.ndarray, np.ndarray] | None
+    best: Mapping[str, Any] | None
+    answer: str
+    cells: tuple[LocatedCell, ...] = field(repr=False)
+    parameters: tuple[tuple[str, str], ...]
+    guarantee: str
+    state: str
+    seconds: float
+    report: dict[str, Any] = field(repr=False)
+
+    def _repr_html_(self) -> str:
+        shares = {"certified": 1.0 - self.possible_volume, "falsified": 0.0, "unknown": self.possible_volume}
+        lines = [
+            f"{self.answer}: {percent(self.possible_volume)} of the set is left",
+            f"{self.guarantee}; {len(self.cells)} cells, {self.seconds:.1f} s; {self.state}",
+        ]
+        return verdicts_html(shares, lines)
+
+
+def locate(
+    scene: Scene,
+    poses: PoseSet | Sequence[PoseSet],
+    photo: ArrayLike,
+    *,
+    noise: float = 0.02,
+    outliers: float = 0.05,
+    mask: ArrayLike | None = None,
+    contract: bool = True,
+    time_budget: float = 600.0,
+    output_dir: str | os.PathLike[str] | None = None,
+    arithmetic: str | None = None,
+    resume: bool = False,
+    on_progress: Callable[[LocateProgress], object] | None = None,
+    workers: int = 1,
+    engine: EngineName = "local",
+    scheduler_address: str | None = None,
+    memory_limit: float | None = None,
+) -> Located:
+    """Find which poses of sets can have made a photo; what is excluded is proved.
+
+    Ctrl-C and ``on_progress`` returning False end the work between two cells, with what is known.
+
+    Args:
+        scene: The scene.
+        poses: One set, or several.
+        photo: [H, W, 3] of the cameras' size: uint8, or numbers in [0, 1] that are multiples of 1/255.
+        noise: By how much a value of the photo may differ from the picture's before it is rounded to 8 bits.
+        outliers: Part of the pixels that may show anything.
+        mask: [H, W] which pixels count; None: all.
+        contract: Whether cells are contracted by their pixels' linear bounds before they are cut.
+        time_budget: Seconds for all sets together.
+        output_dir: Folder for cells.sqlite and the report, as ns-abstract-locate writes them; None: nothing is kept.
+        arithmetic: "float32" or "real", of the pictures; None: float32.
+        resume: Whether to go on with what ``output_dir`` holds.
+        on_progress: Told about once a second.
+        workers: Processes (for a NeRF: that bound rays); with more than one, a script needs
+            ``if __name__ == "__main__":``.
+        engine: "dask" spreads the cells over a Dask cluster.
+        scheduler_address: HOST:PORT of its scheduler; None: a cluster on this machine.
+        memory_limit: GiB; None: 80 % of what is free.
+
+    Raises:
+        InputError: An argument cannot be used.
+    """
+    request = Request(time_budget, resume, output_dir is not None)
+    check_arguments(request, workers, output_dir)
+    sets = [poses] if isinstance(poses, PoseSet) else list(poses)
+    if not sets:
+        raise InputError("found no set", field="poses", fix="give at least one PoseSet")
+    options = PhotoOptions(noise, outliers, contract)
+    job = Job(
+        scene, [entry.of(scene) for entry in sets], arithmetic=arithmetic, workers=workers, memory_limit=memory_limit
+    )
+    location = Location(job, photo_levels(photo), None if mask is None else _checked_mask(mask, job), options)
+    settings = {"time_budget": time_budget, "arithmetic": arithmetic, "workers": workers, "engine": engine}
+    rows, document = answered(
+        LocationQuestion(location, range(len(sets)), {**settings, **vars(options)}, ("ns_abstract.locate",)),
+        request if on_progress is None else replace(request, on_progress=on_progress),
+        lambda engines: engines.enter_context(started(engine, scheduler_address, 1 if scene.rays else workers)),
+        output_dir,
+    )
+    return located(location, rows, document)
+
+
+def photo_levels(photo: ArrayLike) -> np.ndarray:
+    """[H, W, 3] uint8 levels of a photo.
+
+    Raises:
+        InputError: It is none, or its numbers are no multiples of 1/255.
+    """
+    values = np.asarray(photo)
+    if values.ndim != 3 or values.shape[2] != 3 or values.dtype.kind not in "fu":
+        raise InputError(
+            f"found {values.dtype} of shape {list(values.shape)}", field="photo",
+            fix="give [H, W, 3] uint8, or numbers in [0, 1]",
+        )  # fmt: skip
+    if values.dtype == np.uint8:
+        return np.ascontiguousarray(values)
+    with np.errstate(invalid="ignore"):
+        levels = np.rint(values.astype(np.float64) * 255.0)
+        fits = (levels >= 0.0) & (levels <= 255.0) & (np.abs(levels / 255.0 - values) <= 1e-6)
+    if values.dtype.kind == "u" or not fits.all():
+        raise InputError(
+            "has values that are no multiples of 1/255 in [0, 1]", field="photo",
+            fix="round it to 8 bits: np.rint(255 * photo).astype(np.uint8)",
+        )  # fmt: skip
+    return levels.astype(np.uint8)
+
+
+def _checked_mask(mask: ArrayLike, job: Job) -> np.ndarray:
+    values, camera = np.asarray(mask), job.pose_sets[0].camera
+    if values.dtype != bool or values.shape != (camera.height, camera.width):
+        raise InputError(
+            f"found {values.dtype} of shape {list(values.shape)}", field="mask",
+            fix=f"give [{camera.height}, {camera.width}] bool",
+        )  # fmt: skip
+    return values
+
+
+def located(job: Location, rows: Mapping[int, list[Row]], document: Mapping[str, Any]) -> Located:
+    """The result of a search that has ended with these rows of cells by frame."""
+    cells = [
+        LocatedCell(
+            frame,
+            np.array(row["lower"], np.float64),
+            np.array(row["upper"], np.float64),
+            row["verdict"],
+            None if row["counterexample"] is None else np.array(row["counterexample"], np.float64),
+        )
+        for frame, entries in sorted(rows.items())
+        for row in entries
+    ]
+    hull = document["hull"]
+    return Located(
+        possible_volume=document["possible_volume"],
+        hull=None if hull is None else (np.array(hull["lower"]), np.array(hull["upper"])),
+        best=document["best"],
+        answer=document["answer"],
+        cells=tuple(cells),
+        parameters=tuple(job.parameters),
+        guarantee=short_guarantee(job.job.method.guarantee, document["scene"].get("bounded")),
+        state=document["state"],
+        seconds=document["seconds"],
+        report=dict(document),
+    )

@@ -1,0 +1,182 @@
+"""A location: scene, sets of poses and a photo, and the examination of cells."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ns_abstract.api.files import Settings, open_job
+from ns_abstract.api.job import Job, require_sound_platform
+from ns_abstract.execution.worker_cache import Recipe
+from ns_abstract.geometry.tiles import assemble
+from ns_abstract.io.errors import InputError
+from ns_abstract.io.photos import read_mask, read_photo
+from ns_abstract.perturbation.specification import Perturbation
+from ns_abstract.verify.cells import Cell, CellGrid
+from ns_abstract.verify.location import LocationResult, LocationSearch
+from ns_abstract.verify.location_cover import PoseCover, SlantedBoxes, cover
+from ns_abstract.verify.photo import Photo
+
+#: Of the search's rules: results of different ones are not mixed.
+_RULES = 1
+
+
+@dataclass(frozen=True)
+class PhotoOptions:
+    """What a picture may miss of a photo, and how it is searched for.
+
+    Attributes:
+        noise: By how much values may differ, of 1.
+        outliers: Part of the pixels that may be anything.
+        contract: Whether cells are contracted by their pixels' linear bounds before they are cut.
+
+    Raises:
+        InputError: A value cannot be used.
+    """
+
+    noise: float = 0.02
+    outliers: float = 0.05
+    contract: bool = True
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.noise < 1.0:
+            raise InputError(f"found {self.noise}", field="--noise", fix="give a number from 0 to below 1")
+        if not 0.0 <= self.outliers < 1.0:
+            raise InputError(f"found {self.outliers}", field="--outliers", fix="give a number from 0 to below 1")
+
+
+class Location:
+    """Sets of poses, and the photo that one of them may have made.
+
+    Args:
+        job: The scene and the sets.
+        levels: [H, W, 3] uint8 photo.
+        mask: [H, W] which pixels count; None: all.
+        options: What a picture may miss.
+        file: Of the photo, for errors.
+
+    Raises:
+        InputError: The photo does not fit the cameras, or the platform's arithmetic is not sound.
+    """
+
+    def __init__(
+        self, job: Job, levels: np.ndarray, mask: np.ndarray | None, options: PhotoOptions, file: Path | None = None
+    ) -> None:
+        self.job, self.options, self.file = job, options, file
+        camera = job.pose_sets[0].camera
+        size = camera.height, camera.width
+        if levels.shape[:2] != size:
+            height, width = levels.shape[:2]
+            raise InputError(
+                f"has {width} x {height} pixels, pictures of the camera path {camera.width} x {camera.height}",
+                file=file,
+                field="--image",
+                fix=f"resize it to {camera.width} x {camera.height}, or write render_width {width} and render_height "
+                f"{height} into the path",
+            )
+        counted = np.ones(size, bool) if mask is None else mask
+        if not counted.any():
+            raise InputError("counts no pixel", field="--mask", fix="write white where pixels count")
+        self.photo = Photo(levels, options.noise, options.outliers, counted)
+        require_sound_platform()
+        self._searches: dict[int, LocationSearch] = {}
+
+    def search(self, number: int) -> LocationSearch:
+        """The search of a frame's set; kept at hand."""
+        if number not in self._searches:
+            self._searches.clear()
+            frame, plain = self.job.frame(number, sheared=True), self.job.frame(number)
+            self._searches[number] = LocationSearch(frame, plain, self.photo, contract=self.options.contract)
+        return self._searches[number]
+
+    def examine(self, number: int, grid: CellGrid, cells: tuple[Cell, ...]) -> LocationResult:
+        """What becomes of cells of a frame; see `ns_abstract.api.cell_search.Examiner`."""
+        return self.search(number).examine(cells)
+
+    def picture(self, number: int, values: np.ndarray) -> np.ndarray:
+        """[H, W, 3] picture at parameters of a frame's set."""
+        plain = self.search(number).plain
+        return assemble(plain.render(np.asarray(values, np.float64)), plain.camera)[..., :3]
+
+    def cover(self, number: int, cells: list[Cell]) -> PoseCover:
+        """Cells of a set's own parameters that hold all poses in ``cells`` of its search."""
+        search = self.search(number)
+        boxes = [box for cell in cells if (box := search.frame.feasible(search.grid.box_of(cell))) is not None]
+        d = search.frame.box.dimensions
+        lower, upper = (
+            np.array([getattr(box, end) for box in boxes], np.float64).reshape(len(boxes), d)
+            for end in ("lower", "upper")
+        )
+        slanted = SlantedBoxes(lower, upper, search.frame.box.names, search.frame.pose_set.shear)
+        return cover(search.plain.box, slanted)
+
+    @property
+    def fingerprint(self) -> dict[str, Any]:
+        """What a stored search must agree with to be continued."""
+        return self._fingerprint
+
+    @cached_property
+    def _fingerprint(self) -> dict[str, Any]:
+        photo = self.photo
+        digest = hashlib.sha256(photo.levels.tobytes() + np.packbits(photo.counted).tobytes()).hexdigest()
+        options = vars(self.options)
+        return {**self.job.fingerprint, "photo": digest, **options, "rules": _RULES}
+
+    @property
+    def recipe(self) -> Recipe[Location]:
+        """How another process opens it."""
+        photo = self.photo
+        again = partial(_open, self.job.recipe.open, photo.levels, photo.counted, self.options)
+        return Recipe(again, self.fingerprint, self.job.source.file)
+
+    @property
+    def parameters(self) -> list[tuple[str, str]]:
+        """Names and units of all frames' parameters, in the order of boxes."""
+        units: dict[str, str] = {}
+        for poses in sorted(self.job.pose_sets, key=lambda p: -p.box.dimensions):
+            units |= {n: u for n, u in zip(poses.box.names, poses.box.units, strict=True) if n not in units}
+        return list(units.items())
+
+    @property
+    def fixed(self) -> dict[int, dict[str, float]]:
+        """Values of parameters that do not vary, by frame."""
+        return {k: dict(poses.fixed) for k, poses in enumerate(self.job.pose_sets)}
+
+
+def _open(open_job: Callable[[], Job], levels: np.ndarray, counted: np.ndarray, options: PhotoOptions) -> Location:
+    return Location(open_job(), levels, counted, options)
+
+
+@dataclass(frozen=True)
+class LocateSettings:
+    """What to locate, as the command line says it.
+
+    Attributes:
+        files: The scene and the sets.
+        image: The photo.
+        mask: Which of its pixels count, or None.
+        photo: What a picture may miss.
+    """
+
+    files: Settings
+    image: Path
+    mask: Path | None = None
+    photo: PhotoOptions = field(default_factory=PhotoOptions)
+
+
+def open_location(settings: LocateSettings) -> Location:
+    """Open the files of a command line.
+
+    Raises:
+        InputError: A file or a field cannot be used.
+    """
+    levels = read_photo(settings.image)
+    mask = None if settings.mask is None else read_mask(settings.mask, levels.shape[:2])
+    job = open_job(settings.files, default=Perturbation())
+    return Location(job, levels, mask, settings.photo, settings.image)

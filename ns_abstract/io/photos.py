@@ -1,0 +1,79 @@
+"""Photos and masks, read from files that nobody vouches for."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ns_abstract.io.errors import InputError, first_line
+
+#: Most pixels of a photo.
+_MOST_PIXELS = 1 << 26
+#: Formats that hold values without loss of meaning: a .jpg's compression is noise like others.
+_FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "PPM")
+
+
+def read_photo(file: Path, field: str = "--image") -> np.ndarray:
+    """The values [H, W, 3] uint8 of a photo of 8 bits by channel.
+
+    Raises:
+        InputError: The file is missing, is no such photo, or is partly transparent.
+    """
+    image = _opened(file, field)
+    if image.mode in ("RGBA", "PA", "LA"):
+        image = image.convert("RGBA")
+        if image.getchannel("A").getextrema() != (255, 255):
+            raise InputError("is partly transparent", file=file, field=field, fix="save it without an alpha channel")
+    if image.mode not in ("RGB", "RGBA", "P"):
+        raise InputError(
+            f"holds pixels of kind {image.mode}", file=file, field=field, fix="save it as RGB with 8 bits by channel"
+        )
+    return np.array(image.convert("RGB"), np.uint8)
+
+
+def read_mask(file: Path, size: tuple[int, int], field: str = "--mask") -> np.ndarray:
+    """Which pixels [H, W] of a mask are white; it has to be black and white.
+
+    Args:
+        file: The mask.
+        size: Height and width that it has to have.
+        field: Option that names it.
+
+    Raises:
+        InputError: The file is missing, of another size, or holds other values.
+    """
+    values = np.array(_opened(file, field).convert("RGBA"), np.uint8)
+    if values.shape[:2] != size:
+        fix = f"resize it to {size[1]} x {size[0]} with nearest neighbours"
+        raise InputError(f"has {values.shape[1]} x {values.shape[0]} pixels", file=file, field=field, fix=fix)
+    white, black = (values[..., :3] == 255).all(axis=-1), (values[..., :3] == 0).all(axis=-1)
+    if not (white | black).all() or (values[..., 3] != 255).any():
+        raise InputError(
+            "has pixels that are neither black nor white", file=file, field=field,
+            fix="write white where pixels count and black elsewhere",
+        )  # fmt: skip
+    return white
+
+
+def _opened(file: Path, field: str) -> Any:
+    from PIL import Image
+
+    if not file.is_file():
+        raise InputError("no such file", file=file, field=field, fix="give an existing picture")
+    try:
+        with Image.open(file, formats=_FORMATS) as image:
+            if image.width * image.height > _MOST_PIXELS:
+                raise InputError(
+                    f"has {image.width} x {image.height} pixels", file=file, field=field, fix="give a smaller one"
+                )
+            image.load()
+            return image.copy()
+    except InputError:
+        raise
+    # decoders raise what they like
+    except Exception as error:
+        raise InputError(
+            f"cannot be read: {first_line(error)}", file=file, field=field, fix="give a PNG of 8 bits"
+        ) from None

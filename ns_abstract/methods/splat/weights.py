@@ -1,0 +1,172 @@
+"""Blending weights of chosen Gaussians: pictures in which these are white, the others black (docs/design.md, Q1, Q2).
+
+A pixel of gsplat is a sum of colours, each times its Gaussian's weight, so that a channel of such a picture is the sum
+of the weights of the white Gaussians. Nothing else of the program depends on colours.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, Arithmetic
+from ns_abstract.geometry.differentiable_pose import differentiable_pose
+from ns_abstract.geometry.poses import PoseBox, PoseForms
+from ns_abstract.io.errors import InputError
+from ns_abstract.methods.splat.activate import Splats
+from ns_abstract.methods.splat.bounds import SceneSums, SplatBounds
+from ns_abstract.methods.splat.constants import Rasteriser
+from ns_abstract.methods.splat.frame import SplatFrame, SplatSample
+from ns_abstract.methods.splat.scene import Float64Array, SplatScene
+from ns_abstract.methods.splat.stage_data import CellPoses
+from ns_abstract.methods.splat.variations import VariedSplats, selected
+from ns_abstract.refine.protocol import MOST_PLANES, SceneSample, WeightPlane
+
+if TYPE_CHECKING:
+    from ns_abstract.methods.splat.reference import Reference
+
+
+def plane_mask(scene: SplatScene, opacity: Float64Array, plane: WeightPlane) -> np.ndarray:
+    """[N] bool: the Gaussians that the plane's selection picks.
+
+    Raises:
+        InputError: It picks none.
+    """
+    if plane.select is None:
+        return np.ones(scene.count, bool)
+    try:
+        mask = selected(scene, opacity, plane.select)
+    except InputError as error:
+        raise InputError(error.problem, field=f"select.{error.field}", fix=error.fix) from None
+    if not mask.any():
+        raise InputError(f"picks none of {scene.count} Gaussians", field="select", fix="widen the selection")
+    return mask
+
+
+@dataclass(frozen=True)
+class WhiteGaussians:
+    """Which Gaussians are white in each channel: those that are selected and nearer than a distance.
+
+    Attributes:
+        selected: [N, 3] bool.
+        nearer: [3] depths of centres, normalised units; infinite where any depth will do.
+    """
+
+    selected: np.ndarray
+    nearer: Float64Array
+
+    @classmethod
+    def of(cls, masks: Sequence[np.ndarray], nearer: Sequence[float | None]) -> WhiteGaussians:
+        """One channel for each of at most three masks [N]; the other channels stay black."""
+        black = [np.zeros_like(masks[0])] * (MOST_PLANES - len(masks))
+        distances = [np.inf if distance is None else distance for distance in nearer]
+        return cls(np.stack([*masks, *black], axis=1), np.array(distances + [np.inf] * len(black)))
+
+    def at(self, depth: Float64Array) -> Float64Array:
+        """[N, 3] colours of Gaussians at ``depth`` [N]."""
+        return (self.selected & ((depth[:, None] < self.nearer) | np.isinf(self.nearer))).astype(np.float64)
+
+    def between(self, numbers: np.ndarray, low: Float64Array, high: Float64Array) -> tuple[Float64Array, Float64Array]:
+        """[k, 3] lower and upper bounds of the colours of Gaussians ``numbers`` [k], whose depths lie in a range.
+
+        A depth that is no number may be any.
+        """
+        chosen = self.selected[numbers]
+        anywhere = np.isinf(self.nearer)
+        surely, maybe = high[:, None] < self.nearer, ~(low[:, None] >= self.nearer)
+        return (chosen & (surely | anywhere)).astype(np.float64), (chosen & (maybe | anywhere)).astype(np.float64)
+
+
+class WeightBounds(SplatBounds):
+    """Bounds of blending weights: `SplatBounds` with the colours of `WhiteGaussians`."""
+
+    white: WhiteGaussians
+
+    def _colors(
+        self, forms: PoseForms, camera_magnitude: np.ndarray, candidates: np.ndarray, alive: np.ndarray, n: int
+    ) -> np.ndarray:
+        """[n, 6] centres and radii by channel (design.md, Q2)."""
+        numbers = candidates[alive]
+        low, high = self.white.between(numbers, *self._depth_range(forms, camera_magnitude, candidates, alive))
+        colors = np.zeros((n, 6))
+        colors[alive, 0::2], colors[alive, 1::2] = 0.5 * (low + high), 0.5 * (high - low)
+        return colors
+
+    def _depth_range(
+        self, forms: PoseForms, camera_magnitude: np.ndarray, candidates: np.ndarray, alive: np.ndarray
+    ) -> tuple[Float64Array, Float64Array]:
+        """[k] bounds of the depths of candidates ``alive`` over the cell, in every evaluation of the program."""
+        if np.isinf(self.white.nearer).all():
+            return np.zeros(alive.size), np.zeros(alive.size)
+        m = forms.rotation.basis.monomials
+        low, high = forms.rotation.bounds()
+        most = np.maximum(np.abs(low), np.abs(high)).ravel()
+        poses = CellPoses(forms.rotation.data, forms.offset.data, forms.origin, camera_magnitude, most)
+        away = np.zeros((candidates.size, 3))
+        away[alive] = self.varied.mean_middle[candidates[alive]] - forms.origin
+        depths = self._depths(poses, candidates, alive, away, m) + forms.offset.data[: m + 1, 2]
+        # every monomial lies in [-1, 1]
+        center, reach = depths[:, 0], np.abs(depths[:, 1:]).sum(axis=1)
+        reach = reach + FRAGMENT_ROUNDING * (np.abs(center) + reach)
+        return center - reach, center + reach
+
+
+class SplatWeightFrame(SplatFrame):
+    """A frame of blending weights; see `ns_abstract.refine.protocol.WeightFrame`.
+
+    Args:
+        white: Which Gaussians are white.
+        splats: The scene, in its own colours.
+        rasteriser, arithmetic, pose_set, varied, sums, reference: As `SplatFrame` takes them.
+    """
+
+    def __init__(
+        self,
+        white: WhiteGaussians,
+        splats: Splats,
+        rasteriser: Rasteriser,
+        arithmetic: Arithmetic,
+        pose_set: PoseBox,
+        varied: VariedSplats,
+        sums: SceneSums,
+        reference: Callable[[], Reference],
+    ) -> None:
+        self.white, self._renders = white, reference
+        # no colour of the scene's, none of its shifts and no background is left
+        black = replace(
+            splats,
+            sh=np.zeros((splats.count, 1, 3)),
+            degree=0,
+            background=np.zeros(3),
+            color_shift=np.empty((0, 3)),
+        )
+        super().__init__(black, rasteriser, arithmetic, pose_set, varied=varied, sums=sums)
+        self.bounds = WeightBounds(black, rasteriser, arithmetic, varied, sums)
+        self.bounds.white = white
+        self._black = black
+
+    def precise(self, values: np.ndarray, tiles: np.ndarray | None = None, member: Splats | None = None) -> np.ndarray:
+        """What `drawn` rounds: float64 tiles of the weights at parameter values [d]."""
+        rotation, position = self.pose_set.world_to_camera(values)
+        scene = self.varied.nearest if member is None else member
+        colors = self.white.at((scene.means - position) @ rotation[2])
+        shown = replace(self._black, means=scene.means, opacity=scene.opacity, sh=colors[:, None])
+        return self.renderer.tiles(self.camera, rotation, position, tiles, shown)
+
+    def of_sample(self, values: np.ndarray, sample: SceneSample | None) -> np.ndarray:
+        """See `ns_abstract.refine.protocol.WeightFrame`."""
+        if sample is None:
+            return self.render(values)
+        assert isinstance(sample, SplatSample)
+        return self.drawn(values, None, sample.splats)
+
+    def differentiable(self, values: torch.Tensor) -> torch.Tensor:
+        """See `ns_abstract.refine.protocol.WeightFrame`, by the reference renderer."""
+        rotation, position = self.pose_set.world_to_camera(values.detach().numpy())
+        colors = self.white.at((self.varied.nearest.means - position) @ rotation[2])
+        pose = differentiable_pose(self.pose_set)(values)
+        return self._renders().recolored(torch.from_numpy(colors)).image(self.camera, pose)

@@ -1,0 +1,319 @@
+"""The report on where a photo was taken: report.json, report.html."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from html import escape
+from typing import Any
+
+import numpy as np
+from markupsafe import Markup
+from numpy.typing import NDArray
+
+from ns_abstract.geometry.poses import PoseBox
+from ns_abstract.io.assumptions import Assumption
+from ns_abstract.refine.protocol import SceneElements
+from ns_abstract.report.cameras import CameraDrawings, cell_cameras, standing
+from ns_abstract.report.certificate import VERSION, now
+from ns_abstract.report.figures import number, unit_of_axis
+from ns_abstract.report.html import uri, whole_page
+from ns_abstract.report.outside import SceneDrawing
+from ns_abstract.report.picture import heat, preview, to_bytes
+from ns_abstract.report.record import guarantee_text, plain, versions
+from ns_abstract.report.svg import draw_svg
+from ns_abstract.report.verdict_maps import NONE, OPEN, pixels
+
+Row = Mapping[str, Any]
+#: Longest side of pictures on the page, and the difference that its scale ends at.
+_PIXELS, _LARGEST = 384, 0.25
+#: Places along a parameter of a map; pixels of the whole matrix, between its maps and beside them.
+_BINS, _WIDTH, _GAP, _LEFT, _BELOW, _PANEL = 48, 760, 10, 62, 34, 190
+#: Colours of what may have made the photo, and of where the best pose is.
+_POSSIBLE, _BEST = (29, 116, 64), (179, 38, 30)
+
+METRICS = {
+    "possible_volume": "part of the parameter volume that is not excluded, mean over the frames' sets",
+    "hull": "the smallest box around all that is not excluded; null: no pose of the sets made the photo",
+    "best": "of all rendered poses the one that explains most, and how many counted pixels it does not explain",
+    "answer": "none (proved: no pose of the sets made the photo), possible (a rendered pose explains it), unknown",
+    "excluded": "cells no pose of which made the photo: more pixels than the outliers allow lie beyond the bounds",
+    "possible": "cells with a rendered pose that explains the photo, in the column counterexample",
+    "unknown": "the rest",
+    "explains": "all counted pixels but the allowed ones differ by no more than the noise and half a step of 8 bits",
+}
+_HEADINGS = {
+    "none": ("good", "No pose of the set made this photo"),
+    "possible": ("good", "The photo is explained by poses of the set"),
+    "unknown": ("fair", "No pose found that explains the photo, and not all of them excluded"),
+}
+
+
+@dataclass(frozen=True)
+class LocatedRun:
+    """What a command looked for; all mappings must have a JSON form.
+
+    Attributes:
+        guarantee: "float32-sound" or "real-sound", of the pictures.
+        renderer: The bounded program.
+        scene: ``name``, and whatever describes the scene.
+        assumptions: What the answer rests on.
+        photo: Its file, or None.
+        levels: [H, W, 3] uint8 the photo.
+        noise, outliers: What a picture may miss.
+        counted: Number of pixels that count.
+        allowed: Number of them that may show anything.
+        settings: The command's options.
+        fingerprint: What results of a resumed run must agree in.
+        command: The command line.
+        plan: What was left out and why.
+    """
+
+    guarantee: str
+    renderer: Mapping[str, Any]
+    scene: Mapping[str, Any]
+    assumptions: tuple[Assumption, ...]
+    photo: str | None
+    levels: NDArray[np.uint8]
+    noise: float
+    outliers: float
+    counted: int
+    allowed: int
+    settings: Mapping[str, Any]
+    fingerprint: Mapping[str, Any]
+    command: tuple[str, ...]
+    plan: tuple[str, ...] = ()
+    started: str = field(default_factory=now)
+
+
+def location_document(
+    run: LocatedRun,
+    parameters: Sequence[tuple[str, str]],
+    sets: Mapping[int, PoseBox],
+    rows: Mapping[int, Sequence[Row]],
+    poses: Mapping[int, Sequence[Any]],
+    *,
+    state: str,
+    seconds: float,
+    effort: Mapping[str, float],
+    trace: Sequence[Mapping[str, float]],
+) -> dict[str, Any]:
+    """Content of report.json.
+
+    Args:
+        run: What was looked for.
+        parameters: Names and units of the table ``parameters``.
+        sets: By frame.
+        rows: Cells by frame.
+        poses: Rendered poses by frame, the best first, with ``values`` and ``outliers``.
+        state: "done", "budget" or "interrupted".
+        seconds: Wall time, earlier runs included.
+        effort: Figures of the work done.
+        trace: Points of the search over time.
+    """
+    frames = [_frame(run, parameters, frame, sets[frame], rows[frame], poses[frame]) for frame in sorted(rows)]
+    hulls = [entry["hull"] for entry in frames if entry["hull"] is not None]
+    bests = [dict(entry["best"], frame=entry["index"]) for entry in frames if entry["best"] is not None]
+    best = min(bests, key=lambda entry: entry["outliers"], default=None)
+    hull = None
+    if hulls:
+        hull = {
+            "lower": np.min([entry["lower"] for entry in hulls], axis=0),
+            "upper": np.max([entry["upper"] for entry in hulls], axis=0),
+        }
+    if not hulls:
+        answer = "none"
+    else:
+        answer = "possible" if best is not None and best["outliers"] <= run.allowed else "unknown"
+    return plain(
+        {
+            "version": VERSION,
+            "answer": answer,
+            "possible_volume": sum(entry["possible_volume"] for entry in frames) / max(1, len(frames)),
+            "hull": hull,
+            "best": best,
+            "photo": {
+                "file": run.photo,
+                "noise": run.noise,
+                "outliers": run.outliers,
+                "counted": run.counted,
+                "allowed": run.allowed,
+            },
+            "guarantee": run.guarantee,
+            "guarantee_text": guarantee_text(run.guarantee, run.renderer["name"], run.scene.get("bounded")),
+            "renderer": run.renderer,
+            "scene": run.scene,
+            "assumptions": [vars(entry) for entry in run.assumptions],
+            "frames": frames,
+            "trace": [{"seconds": p["seconds"], "searched_left": 1.0 - p["certified"]} for p in trace],
+            "seconds": seconds,
+            "effort": effort,
+            "plan": run.plan,
+            "state": state,
+            "metrics": METRICS,
+            "settings": run.settings,
+            "fingerprint": run.fingerprint,
+            "command": run.command,
+            "packages": versions(),
+            "started": run.started,
+            "updated": now(),
+        }
+    )
+
+
+def _frame(
+    run: LocatedRun,
+    parameters: Sequence[tuple[str, str]],
+    index: int,
+    poses: PoseBox,
+    rows: Sequence[Row],
+    found: Sequence[Any],
+) -> dict[str, Any]:
+    box = poses.box
+    sides = {n: (low, high) for n, low, high in zip(box.names, box.lower, box.upper, strict=True)}
+    known = {name: sides.get(name, (poses.fixed.get(name, 0.0),) * 2) for name, _ in parameters}
+    left = [row for row in rows if row["verdict"] != "excluded"]
+    columns = [[name for name, _ in parameters].index(name) for name in box.names]
+
+    def volume(row: Row) -> float:
+        sides = np.subtract(row["upper"], row["lower"])[columns] / np.subtract(box.upper, box.lower)
+        return float(np.prod(sides))
+
+    hull = None
+    if left:
+        hull = {
+            "lower": np.min([row["lower"] for row in left], axis=0),
+            "upper": np.max([row["upper"] for row in left], axis=0),
+        }
+    best = None
+    if found:
+        values = dict(zip(box.names, found[0].values, strict=True))
+        pose = [values.get(name, known[name][0]) for name, _ in parameters]
+        matrix = poses.pose(np.array(found[0].values))
+        best = {"pose": pose, "outliers": found[0].outliers, "camera_to_world": matrix}
+    return {
+        "index": index,
+        "parameters": [
+            {"name": name, "unit": unit, "lower": known[name][0], "upper": known[name][1]} for name, unit in parameters
+        ],
+        "possible_volume": min(1.0, sum(map(volume, left))),
+        "hull": hull,
+        "best": best,
+        "cells": {kind: sum(row["verdict"] == kind for row in rows) for kind in ("excluded", "possible", "unknown")},
+    }
+
+
+def location_pictures(
+    levels: NDArray[np.uint8], picture: NDArray[np.floating] | None, missed: NDArray[np.bool_] | None
+) -> dict[str, bytes]:
+    """PNGs of the photo, the render that explains most, their difference and the pixels it does not explain."""
+    images = {"photo": levels}
+    if picture is not None and missed is not None:
+        gap = np.abs(picture.astype(np.float64) - levels / 255.0).max(axis=-1)
+        images["best render"] = to_bytes(picture)
+        images["difference"] = heat(gap, _LARGEST)
+        images["not explained"] = np.where(missed[..., None], np.array(_BEST, np.uint8), levels // 4 + 191)
+    return {title: preview(image, _PIXELS) for title, image in images.items()}
+
+
+def location_page(
+    document: Mapping[str, Any],
+    rows: Mapping[int, Sequence[Row]],
+    sets: Mapping[int, PoseBox],
+    pictures: Mapping[str, bytes],
+    elements: SceneElements | None,
+) -> str:
+    """The page of a report; all texts of the document are escaped."""
+    kind, heading = _HEADINGS[document["answer"]]
+    left = {frame: [_colored(row) for row in cells if row["verdict"] != "excluded"] for frame, cells in rows.items()}
+    names = [p["name"] for p in document["frames"][0]["parameters"]] if document["frames"] else []
+    cells, left_out = cell_cameras(sets, left, names)
+    outside = None if elements is None else SceneDrawing(elements)
+    drawings = CameraDrawings(cells, left_out, standing(sets), outside).plots({}) if cells else []
+    maps = [(entry, svg) for entry in document["frames"] if (svg := pair_svg(entry, rows[entry["index"]])) is not None]
+    return whole_page(
+        "location.html",
+        styles=("certificate.css",),
+        title=f"Where a photo of {document['scene'].get('name', 'the scene')} was taken",
+        d=document,
+        kind=kind,
+        heading=heading,
+        maps=maps,
+        drawings=drawings,
+        pictures=pictures,
+        largest=_LARGEST,
+    )
+
+
+def _colored(row: Row) -> dict[str, Any]:
+    """A row with the verdict that has its colour in drawings of cameras."""
+    return {**row, "verdict": "certified" if row["verdict"] == "possible" else "unknown"}
+
+
+def pair_svg(entry: Mapping[str, Any], rows: Sequence[Row]) -> Markup | None:
+    """Maps of what is left over every pair of parameters: of the set below the diagonal, of the hull above it.
+
+    A place is coloured where some value of the other parameters is left there.
+    """
+    parameters = entry["parameters"]
+    free = [k for k, p in enumerate(parameters) if p["lower"] < p["upper"]]
+    if len(free) < 2 or entry["hull"] is None:
+        return None
+    left = [row for row in rows if row["verdict"] != "excluded"]
+    ends = np.array([[row["lower"], row["upper"]] for row in left], np.float64)[:, :, free]
+    possible = np.array([row["verdict"] == "possible" for row in left])
+    whole = np.array([[parameters[k][end] for k in free] for end in ("lower", "upper")], np.float64)
+    hull = np.array([entry["hull"]["lower"], entry["hull"]["upper"]], np.float64)[:, free]
+    best = None if entry["best"] is None else np.array(entry["best"]["pose"], np.float64)[free]
+    d = len(free)
+    panel = min(_PANEL, (_WIDTH - _LEFT - (d - 1) * _GAP) // d)
+    step = panel + _GAP
+    marks = []
+    for i in range(d):
+        for j in range(d):
+            if i == j:
+                continue
+            window = whole if i > j else hull
+            image = _touched(ends[:, :, (j, i)], possible, window[:, (j, i)], None if best is None else best[[j, i]])
+            names = escape(f"{parameters[free[i]]['name']} over {parameters[free[j]]['name']}")
+            what = "the set" if i > j else "the hull"
+            x, y = _LEFT + j * step, 8 + i * step
+            marks.append(
+                f'<image class="pixels" x="{x}" y="{y}" width="{panel}" height="{panel}" preserveAspectRatio="none" '
+                f'href="{uri(pixels(image))}"><title>{what}: {names}</title></image>'
+                f'<rect class="frame" x="{x}" y="{y}" width="{panel}" height="{panel}"/>'
+            )
+    bottom = 8 + d * step - _GAP
+    for k in range(d):
+        p = parameters[free[k]]
+        x, y = _LEFT + k * step, 8 + k * step
+        label = escape(f"{p['name']} ({unit_of_axis(p['unit'])})")
+        middle = f'x="{x + 0.5 * panel:.0f}" text-anchor="middle"'
+        marks += [
+            f'<text {middle} y="{bottom + 13}">{label}</text>',
+            f'<text {middle} y="{bottom + 28}">{number(whole[0, k], 3)} to {number(whole[1, k], 3)}</text>',
+            f'<text x="{_LEFT - 4}" y="{y + 0.5 * panel + 4:.0f}" text-anchor="end">{escape(str(p["name"]))}</text>',
+            f'<text {middle} y="{y + 0.5 * panel:.0f}">left:</text>',
+            f'<text {middle} y="{y + 0.5 * panel + 14:.0f}">{number(hull[0, k], 3)}</text>',
+            f'<text {middle} y="{y + 0.5 * panel + 28:.0f}">{number(hull[1, k], 3)}</text>',
+        ]
+    title = "What is left over pairs of parameters"
+    return draw_svg(_LEFT + d * step - _GAP + 8, bottom + _BELOW, title, "".join(marks), kind="pairs")
+
+
+def _touched(
+    ends: NDArray[np.float64], possible: NDArray[np.bool_], window: NDArray[np.float64], best: Any
+) -> NDArray[np.uint8]:
+    """[bins, bins, 3] places of two parameters that boxes [n, 2, 2] touch; upward is more of the second one."""
+    low, width = window[0], np.maximum(window[1] - window[0], np.finfo(np.float64).tiny)
+    first = np.clip(np.floor((ends[:, 0] - low) / width * _BINS), 0, _BINS - 1).astype(int)
+    last = np.clip(np.ceil((ends[:, 1] - low) / width * _BINS), 1, _BINS).astype(int)
+    last = np.maximum(last, first + 1)
+    image = np.full((_BINS, _BINS, 3), NONE, np.uint8)
+    for kind, color in ((False, OPEN), (True, _POSSIBLE)):
+        for k in np.flatnonzero(possible == kind):
+            image[first[k, 1] : last[k, 1], first[k, 0] : last[k, 0]] = color
+    if best is not None:
+        at = np.clip(np.floor((best - low) / width * _BINS), 0, _BINS - 1).astype(int)
+        image[at[1], at[0]] = _BEST
+    return image[::-1]

@@ -1,0 +1,375 @@
+"""The search for poses that explain a photo, one block of cells at a time (docs/design.md, Q).
+
+Cells are those of the frame that is searched, whose parameters may be sheared: there, a cell of the same image motion
+is far larger. A cell is excluded ("certified" in the store's terms), or its pose explains the photo ("falsified"), or
+it is cut.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ns_abstract.arithmetic.rounding import CUT_VALUE_ROUNDING, HALF_UP
+from ns_abstract.execution.cancellation import check_cancelled
+from ns_abstract.geometry.box import Float64Array, ParameterBox
+from ns_abstract.geometry.tiles import assemble, in_tiles
+from ns_abstract.refine.protocol import Bounds, Frame, LinearSets, PartsFrame
+from ns_abstract.verify.cells import Cell, CellGrid
+from ns_abstract.verify.photo import Photo
+from ns_abstract.verify.search import BlockResult, FinishedCell
+
+#: Grid units along each parameter, as a power of two.
+UNITS = 20
+
+
+@dataclass(frozen=True)
+class LocationTuning:
+    """Preferences of the search. None of them decides whether an excluded cell holds no pose of the photo."""
+
+    #: Image motion over a cell, pixels: beyond it, cells are cut without bounds; up to it, they are contracted.
+    coarse: float = 2.4
+    contracted: float = 1.2
+    #: Pixels that are bounded to exclude a cell: so many times those that may show anything.
+    surplus: float = 3.0
+    #: Part of a cell's volume that a contraction must take for it to be bounded again, and how often.
+    worth: float = 0.4
+    rounds: int = 4
+    #: A cell is not cut any more where its volume is that of a box of this part of every range.
+    finest: float = 2.0**-10
+    #: Most cells that one is cut into.
+    parts: int = 16
+    #: Pixels that a picture may miss beyond those allowed, as a part of all, where a better pose is looked for nearby.
+    hopeful: float = 0.3
+    steps: int = 12
+
+
+@dataclass(frozen=True)
+class FoundPose:
+    """A rendered pose.
+
+    Attributes:
+        values: Parameters of the set.
+        outliers: Counted pixels that it does not explain.
+    """
+
+    values: tuple[float, ...]
+    outliers: int
+
+
+@dataclass(frozen=True)
+class LocationResult(BlockResult):
+    """The result of a block.
+
+    Attributes:
+        best: The rendered pose with the fewest outliers; None: nothing was rendered.
+    """
+
+    best: FoundPose | None = None
+
+
+class LocationSearch:
+    """Examines cells of one set of poses.
+
+    Args:
+        frame: What is searched and bounded; its parameters may be sheared.
+        plain: The same set in its own parameters, for renders.
+        photo: The photo.
+        contract: Whether cells are contracted before they are cut.
+        tuning: Preferences.
+    """
+
+    def __init__(
+        self, frame: Frame, plain: Frame, photo: Photo, *, contract: bool = True, tuning: LocationTuning | None = None
+    ) -> None:
+        self.frame, self.plain, self.photo, self.contract = frame, plain, photo, contract
+        self.tuning = tuning or LocationTuning()
+        self.tiled = photo.tiled(frame.side)
+        box = frame.box
+        self.grid = CellGrid(box, (1 << UNITS,) * box.dimensions, (1,) * box.dimensions)
+        self.tiles = np.flatnonzero(self.tiled.counted.any(axis=(1, 2)))
+        width = np.array(box.upper) - np.array(box.lower)
+        motion = np.nan_to_num(np.asarray(frame.motion(box), np.float64), nan=0.0, posinf=0.0)
+        # what moves nothing is cut for the bounds' sake now and then
+        motion = np.maximum(motion, 1e-3 * max(1.0, float(motion.max(initial=0.0))))
+        self._pace = motion / width
+
+    def moved(self, box: ParameterBox) -> Float64Array:
+        """[d] pixels that typical scene elements move by over a cell (an estimate)."""
+        return self._pace * (np.array(box.upper) - np.array(box.lower))
+
+    def examine(self, cells: Sequence[Cell]) -> LocationResult:
+        """Exclude the cells, or cut them.
+
+        Raises:
+            WorkCancelledError: There is no time for it.
+        """
+        begin = time.perf_counter()
+        reports = [_Examination(self, cell) for cell in cells]
+        for report in reports:
+            report.run()
+        children = [part for report in reports for part in report.children]
+        poses = [report.best for report in reports if report.best is not None]
+        return LocationResult(
+            leaves=tuple(leaf for report in reports for leaf in report.leaves),
+            blocks=tuple((part,) for part in children),
+            # the largest first
+            ranks=tuple(-part.volume / self.grid.volume for part in children),
+            samples=(),
+            bounded=sum(report.bounded for report in reports),
+            seconds=time.perf_counter() - begin,
+            best=min(poses, key=lambda pose: pose.outliers, default=None),
+        )
+
+    def original(self, values: Float64Array) -> Float64Array:
+        """Parameters [d] of the set at sheared ``values`` [d], the nearest ones of the set."""
+        box = self.plain.box
+        by_name = dict(zip(self.frame.box.names, np.asarray(values, np.float64).tolist(), strict=True))
+        for name, factors in self.frame.pose_set.shear.items():
+            by_name[name] += sum(factor * by_name[other] for other, factor in factors.items())
+        return np.clip([by_name[name] for name in box.names], box.lower, box.upper)
+
+
+@dataclass
+class _Examination:
+    """What becomes of one cell."""
+
+    search: LocationSearch
+    cell: Cell
+    leaves: list[FinishedCell] = field(default_factory=list)
+    children: list[Cell] = field(default_factory=list)
+    best: FoundPose | None = None
+    bounded: int = 0
+
+    def run(self) -> None:
+        """Exclude the cell, contract it and cut it."""
+        search, tuning = self.search, self.search.tuning
+        for _ in range(tuning.rounds):
+            before = self.cell.volume
+            feasible = search.frame.feasible(search.grid.box_of(self.cell))
+            if feasible is None:
+                return self._exclude(1.0)
+            self._shrink(feasible)
+            box = search.grid.box_of(self.cell)
+            moved = float(np.linalg.norm(search.moved(box)))
+            if box.dimensions and moved > tuning.coarse:
+                break
+            picture, number = self._look(box.middle)
+            bounds = self._bounds(box, picture)
+            if bounds is None or self._settled(bounds):
+                break
+            assert bounds.linear is not None
+            if search.tiled.allowed < number < tuning.hopeful * search.photo.counted.sum():
+                self._approach(box, bounds.linear)
+            if not self._contracted(box, bounds) or self.cell.volume > (1.0 - tuning.worth) * before:
+                break
+        if not self.done:
+            self._cut()
+        return None
+
+    @property
+    def done(self) -> bool:
+        """Whether what is left of the cell has a verdict."""
+        return bool(self.leaves) and self.leaves[-1].cell == self.cell
+
+    def _exclude(self, margin: float) -> None:
+        self.leaves.append(FinishedCell(self.cell, "certified", margin, 0.0))
+
+    def _shrink(self, box: ParameterBox) -> None:
+        """Exclude what of the cell lies outside of ``box``, in whole grid units."""
+        inner = inner_cell(self.search.grid, self.cell, box)
+        self.leaves += [FinishedCell(slab, "certified", 1.0, 0.0) for slab in slabs(self.cell, inner)]
+        self.cell = inner
+
+    def _look(self, values: Float64Array) -> tuple[np.ndarray, int]:
+        """Render the pose at sheared values; returns its tiles, and how many pixels it does not explain."""
+        search = self.search
+        pose = search.original(values)
+        picture = search.plain.render(pose)
+        number = int(search.tiled.outside(picture).sum())
+        if self.best is None or number < self.best.outliers:
+            self.best = FoundPose(tuple(pose.tolist()), number)
+        return picture, number
+
+    @property
+    def explained(self) -> bool:
+        """Whether a pose that was rendered explains the photo."""
+        return self.best is not None and self.best.outliers <= self.search.tiled.allowed
+
+    def _bounds(self, box: ParameterBox, picture: np.ndarray) -> Bounds | None:
+        """Linear bounds of all tiles, for a contraction; None: the cell is excluded, or too wide for one."""
+        search, tiled = self.search, self.search.tiled
+        moved = float(np.linalg.norm(search.moved(box)))
+        chosen = self._promising(picture, moved)
+        if chosen.sum() > tiled.allowed:
+            tiles = np.flatnonzero(chosen.any(axis=(1, 2)))
+            bounds = self._bound(box, tiles, False, chosen[tiles])
+            if self._excluded(bounds, tiles):
+                return None
+        if moved > search.tuning.contracted or not search.contract:
+            return None
+        bounds = self._bound(box, search.tiles, True)
+        return None if self._excluded(bounds, search.tiles) else bounds
+
+    def _excluded(self, bounds: Bounds, tiles: np.ndarray) -> bool:
+        """Whether more pixels than are allowed lie beyond the bounds of some tiles: the cell is excluded then."""
+        number = int(self.search.tiled.beyond(bounds.lower, bounds.upper, tiles).sum())
+        if number > self.search.tiled.allowed:
+            self._exclude(float(number - self.search.tiled.allowed))
+        return self.done
+
+    def _promising(self, picture: np.ndarray, moved: float) -> np.ndarray:
+        """[T, side, side] counted pixels whose photo differs most from all of ``picture`` nearby: a guess of work."""
+        search, tiled = self.search, self.search.tiled
+        image = assemble(picture, search.frame.camera)
+        least, most = nearby(image, max(1, round(0.5 * moved)))
+        side = search.frame.side
+        gaps = np.maximum(in_tiles(least, side) - tiled.high, tiled.low - in_tiles(most, side)).max(axis=-1)
+        gaps = np.where(tiled.counted, gaps, -1.0)
+        count = min(gaps.size, round(search.tuning.surplus * (tiled.allowed + 1)))
+        bar = max(0.0, float(np.partition(gaps, gaps.size - count, axis=None)[gaps.size - count]))
+        return gaps > bar
+
+    def _bound(self, box: ParameterBox, tiles: np.ndarray, linear: bool, pixels: np.ndarray | None = None) -> Bounds:
+        """Bounds of ``tiles``, or of some of their ``pixels`` alone where the frame can leave out the others."""
+        check_cancelled()
+        self.bounded += 1
+        frame = self.search.frame
+        if pixels is not None and isinstance(frame, PartsFrame):
+            return frame.bound_parts([box], tiles, None, linear, pixels)[0]
+        return frame.bound(box, tiles, None, linear)
+
+    def _settled(self, bounds: Bounds) -> bool:
+        """Whether every pose of the cell explains the photo: it is finished then."""
+        tiled, tiles = self.search.tiled, self.search.tiles
+        inside = tiled.explained(bounds.lower, bounds.upper, tiles)
+        if int(tiled.counted.sum()) - inside > tiled.allowed or not self.explained:
+            return False
+        self._finish()
+        return True
+
+    def _contracted(self, box: ParameterBox, bounds: Bounds) -> bool:
+        """Exclude what of the cell the pixels' linear bounds rule out; returns whether anything is left of it."""
+        tiled, tiles = self.search.tiled, self.search.tiles
+        assert bounds.linear is not None
+        beyond = tiled.beyond(bounds.lower, bounds.upper, tiles)
+        least, most = tiled.reach(bounds.linear, beyond, tiles)
+        if (least > most).any():
+            self._exclude(1.0)
+            return False
+        self._shrink(between(box, least, most))
+        return True
+
+    def _approach(self, box: ParameterBox, linear: LinearSets) -> None:
+        """Render the pose at which the linear bounds' middle explains most (weighted least squares)."""
+        search, tiles = self.search, self.search.tiles
+        counted = search.tiled.counted[tiles]
+        a = 0.5 * (linear[0].astype(np.float64) + linear[2])[counted].reshape(-1, box.dimensions)
+        b = 0.5 * (linear[1].astype(np.float64) + linear[3])[counted].reshape(-1)
+        low, high = (end[tiles][counted].reshape(-1) for end in (search.tiled.low, search.tiled.high))
+        target, room = 0.5 * (low + high) - b, 0.5 * (high - low)
+        good = np.isfinite(a).all(axis=-1) & np.isfinite(target) & (np.abs(a).sum(axis=-1) > 0.0)
+        if not good.any():
+            return
+        a, target, room = a[good], target[good], room[good]
+        p = np.zeros(box.dimensions)
+        for _ in range(search.tuning.steps):
+            miss = np.abs(a @ p - target)
+            weight = 1.0 / np.maximum(miss, room) ** 2
+            p = np.linalg.lstsq(a * np.sqrt(weight)[:, None], target * np.sqrt(weight), rcond=None)[0]
+            if not np.isfinite(p).all():
+                return
+        self._look(box.at(np.clip(p, -1.0, 1.0)))
+
+    def _finish(self) -> None:
+        """End with the cell as it is: possible if a rendered pose explains the photo."""
+        if self.explained:
+            assert self.best is not None
+            margin = float(self.best.outliers - self.search.tiled.allowed)
+            leaf = FinishedCell(self.cell, "falsified", min(margin, 0.0), 0.0, counterexample=self.best.values)
+        else:
+            leaf = FinishedCell(self.cell, "unknown", None, 0.0, reason="the finest cell")
+        self.leaves.append(leaf)
+
+    def _cut(self) -> None:
+        """Cut what is left of the cell where the picture moves most."""
+        search, tuning = self.search, self.search.tuning
+        if self.cell.volume <= max(1.0, tuning.finest ** len(self.cell.first) * search.grid.volume):
+            return self._finish()
+        moved = search.moved(search.grid.box_of(self.cell))
+        total = float(np.linalg.norm(moved))
+        parts = [1] * len(moved)
+        sizes = [past - first for first, past in zip(self.cell.first, self.cell.past, strict=True)]
+        while np.prod(parts) < 2 or (2 * np.prod(parts) <= tuning.parts and total > tuning.coarse):
+            free = [k for k in range(len(moved)) if sizes[k] >= 2 * parts[k]]
+            if not free:
+                break
+            axis = max(free, key=lambda k: moved[k])
+            parts[axis] *= 2
+            moved[axis] *= 0.5
+            total = float(np.linalg.norm(moved))
+        if np.prod(parts) == 1:
+            return self._finish()
+        self.children = search.grid.cut(self.cell, parts)
+        return None
+
+
+def between(box: ParameterBox, least: Float64Array, most: Float64Array) -> ParameterBox:
+    """The part of a box whose scaled parameters may lie in [least, most], rounded outward (Q3)."""
+    for k in range(box.dimensions):
+        low, high = box.lower[k], box.upper[k]
+        middle = 0.5 * (low + high)
+        half = max(high - middle, middle - low) * HALF_UP
+        room = CUT_VALUE_ROUNDING * (abs(low) + abs(high))
+        first = low if least[k] <= -1.0 else max(low, middle + half * float(least[k]) - room)
+        last = high if most[k] >= 1.0 else min(high, middle + half * float(most[k]) + room)
+        # a cut at an end leaves that end
+        first, last = min(first, high), max(last, low)
+        box = box.replace(k, first, last)
+    return box
+
+
+def inner_cell(grid: CellGrid, cell: Cell, box: ParameterBox) -> Cell:
+    """The smallest part of a cell, in whole units, that holds all of ``box`` within it."""
+    first, past = list(cell.first), list(cell.past)
+    for k in range(grid.box.dimensions):
+        low, high = grid.box.lower[k], grid.box.upper[k]
+        scale = grid.units[k] / (high - low)
+        a = min(max(int((box.lower[k] - low) * scale), first[k]), past[k] - 1)
+        # the ends themselves are compared, whatever the product was rounded to
+        while a > first[k] and grid.end(k, a) > box.lower[k]:
+            a -= 1
+        b = max(min(int((box.upper[k] - low) * scale) + 1, past[k]), a + 1)
+        while b < past[k] and grid.end(k, b) < box.upper[k]:
+            b += 1
+        first[k], past[k] = a, b
+    return Cell(tuple(first), tuple(past))
+
+
+def slabs(cell: Cell, inner: Cell) -> Iterator[Cell]:
+    """Cells that tile what of ``cell`` lies outside of ``inner``."""
+    for k in range(len(cell.first)):
+        if cell.first[k] < inner.first[k]:
+            yield replace(cell, past=(*cell.past[:k], inner.first[k], *cell.past[k + 1 :]))
+        if inner.past[k] < cell.past[k]:
+            yield replace(cell, first=(*cell.first[:k], inner.past[k], *cell.first[k + 1 :]))
+        first = (*cell.first[:k], inner.first[k], *cell.first[k + 1 :])
+        cell = Cell(first, (*cell.past[:k], inner.past[k], *cell.past[k + 1 :]))
+
+
+def nearby(image: np.ndarray, radius: int) -> tuple[np.ndarray, np.ndarray]:
+    """Least and greatest values [H, W, ...] of an image within so many pixels along both axes."""
+    least, most = image.copy(), image.copy()
+    for axis in (0, 1):
+        low, high = least.copy(), most.copy()
+        for step in range(1, min(radius, image.shape[axis] - 1) + 1):
+            ahead = tuple(slice(step, None) if k == axis else slice(None) for k in range(image.ndim))
+            behind = tuple(slice(None, -step) if k == axis else slice(None) for k in range(image.ndim))
+            for here, there in ((ahead, behind), (behind, ahead)):
+                low[here] = np.minimum(low[here], least[there])
+                high[here] = np.maximum(high[here], most[there])
+        least, most = low, high
+    return least, most

@@ -1,0 +1,147 @@
+"""Boxes of a set's own parameters that hold all poses of sheared cells (docs/design.md, Q4)."""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from ns_abstract.arithmetic.rounding import POSE_ROUNDING
+from ns_abstract.geometry.box import Float64Array, ParameterBox
+from ns_abstract.verify.cells import Cell, CellGrid
+from ns_abstract.verify.location import UNITS, inner_cell, slabs
+
+#: Most cells of a cover that are left, and by how much their volume may exceed that of what they hold.
+MOST, SPARE = 1500, 1.3
+
+
+@dataclass(frozen=True)
+class PoseCover:
+    """A set cut into cells that tile it: those that hold what is left, and those that hold none of it.
+
+    Attributes:
+        grid: The set.
+        left: Cells that hold all poses that are left.
+        excluded: The others.
+    """
+
+    grid: CellGrid
+    left: tuple[Cell, ...]
+    excluded: tuple[Cell, ...]
+
+    @property
+    def volume(self) -> float:
+        """Part of the set that is left."""
+        return sum(cell.volume for cell in self.left) / self.grid.volume
+
+    @property
+    def hull(self) -> ParameterBox | None:
+        """The smallest box of the set around all that is left; None: nothing is."""
+        if not self.left:
+            return None
+        first = tuple(min(cell.first[k] for cell in self.left) for k in range(len(self.grid.units)))
+        past = tuple(max(cell.past[k] for cell in self.left) for k in range(len(self.grid.units)))
+        return self.grid.box_of(Cell(first, past))
+
+
+class SlantedBoxes:
+    """Boxes of sheared parameters, and where they are in the set's own.
+
+    Args:
+        lower, upper: [n, d] ends of the boxes.
+        names: [d] of the parameters.
+        shear: As of `PoseBox`: name to other to factor.
+    """
+
+    def __init__(
+        self, lower: Float64Array, upper: Float64Array, names: tuple[str, ...], shear: Mapping[str, Mapping[str, float]]
+    ) -> None:
+        self.lower, self.upper = lower, upper
+        self._terms = [
+            (names.index(name), [(names.index(other), factor) for other, factor in factors.items()])
+            for name, factors in shear.items()
+        ]
+
+    def within(self, box: ParameterBox, chosen: np.ndarray) -> tuple[np.ndarray, Float64Array, Float64Array]:
+        """Which boxes of ``chosen`` [m] may have poses in ``box``, and ends [m, d] around these, rounded outward."""
+        box_lower, box_upper = np.array(box.lower), np.array(box.upper)
+        own_lower, own_upper = self.lower[chosen], self.upper[chosen]
+        lower, upper = np.maximum(own_lower, box_lower), np.minimum(own_upper, box_upper)
+        for axis, terms in self._terms:
+            least, most = own_lower[:, axis].copy(), own_upper[:, axis].copy()
+            size = np.abs(least) + np.abs(most)
+            for other, factor in terms:
+                a, b = factor * lower[:, other], factor * upper[:, other]
+                least, most, size = least + np.minimum(a, b), most + np.maximum(a, b), size + np.abs(a) + np.abs(b)
+            room = POSE_ROUNDING * (size + abs(box_lower[axis]) + abs(box_upper[axis]))
+            lower[:, axis] = np.maximum(least - room, box_lower[axis])
+            upper[:, axis] = np.minimum(most + room, box_upper[axis])
+            for other, factor in terms:
+                # what the other terms leave of the rotation's range
+                a, b = factor * lower[:, other], factor * upper[:, other]
+                rest_least, rest_most = least - np.minimum(a, b), most - np.maximum(a, b)
+                ends = (lower[:, axis] - rest_most - room) / factor, (upper[:, axis] - rest_least + room) / factor
+                extra = room / abs(factor)
+                lower[:, other] = np.maximum(lower[:, other], np.minimum(*ends) - extra)
+                upper[:, other] = np.minimum(upper[:, other], np.maximum(*ends) + extra)
+        some = (lower <= upper).all(axis=1)
+        return chosen[some], lower[some], upper[some]
+
+
+def cover(box: ParameterBox, boxes: SlantedBoxes, most: int = MOST) -> PoseCover:
+    """Tile a set by cells of its own parameters, about ``most`` of which hold what is in ``boxes``."""
+    d = box.dimensions
+    grid = CellGrid(box, (1 << UNITS,) * d, (1,) * d)
+    excluded: list[Cell] = []
+    finished: list[Cell] = []
+    queue: list[tuple[int, int, Cell, np.ndarray]] = []
+    count = 0
+
+    def add(cell: Cell, chosen: np.ndarray) -> None:
+        nonlocal count
+        chosen, lower, upper = boxes.within(grid.box_of(cell), chosen)
+        if not chosen.size:
+            excluded.append(cell)
+            return
+        hull = _replaced(box, lower.min(axis=0), upper.max(axis=0))
+        inner = inner_cell(grid, cell, hull)
+        excluded.extend(slabs(cell, inner))
+        count += 1
+        filled = float(np.prod(upper - lower, axis=1).sum())
+        taken = float(np.prod(np.array(grid.box_of(inner).upper) - np.array(grid.box_of(inner).lower)))
+        if taken <= SPARE * filled or inner.volume == 1:
+            finished.append(inner)
+        else:
+            heapq.heappush(queue, (-inner.volume, count, inner, chosen))
+
+    add(Cell((0,) * d, grid.units), np.arange(len(boxes.lower)))
+    while queue and len(queue) + len(finished) < most:
+        _, _, cell, chosen = heapq.heappop(queue)
+        halves = min(
+            (grid.cut(cell, [2 if k == axis else 1 for k in range(d)]) for axis in range(d)),
+            key=lambda parts: _hull_volume(grid, boxes, parts, chosen),
+        )
+        if len(halves) == 1:
+            finished.append(cell)
+            continue
+        for half in halves:
+            add(half, chosen)
+    return PoseCover(grid, (*finished, *(entry[2] for entry in queue)), tuple(excluded))
+
+
+def _hull_volume(grid: CellGrid, boxes: SlantedBoxes, parts: list[Cell], chosen: np.ndarray) -> float:
+    """Volume of the hulls of what is in each of the parts."""
+    if len(parts) == 1:
+        return np.inf
+    total = 0.0
+    for part in parts:
+        some, lower, upper = boxes.within(grid.box_of(part), chosen)
+        if some.size:
+            total += float(np.prod(upper.max(axis=0) - lower.min(axis=0)))
+    return total
+
+
+def _replaced(box: ParameterBox, lower: Float64Array, upper: Float64Array) -> ParameterBox:
+    return ParameterBox(box.names, box.units, tuple(lower.tolist()), tuple(upper.tolist()))

@@ -1,0 +1,132 @@
+"""A photo as a claim about poses: which pictures may have made it, and which cells of poses cannot (docs/design.md, Q).
+
+A picture explains a photo where all but a few of the pixels lie within the noise of the photo's values.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ns_abstract.arithmetic.network_charges import QUOTIENT, STEP
+from ns_abstract.arithmetic.rounding import CUT_ROOM, PHOTO_ROOM, REACH_ROUNDING
+from ns_abstract.geometry.box import Float64Array
+from ns_abstract.geometry.tiles import in_tiles
+from ns_abstract.refine.protocol import LinearSets
+
+_STEPS = 255.0
+
+
+@dataclass(frozen=True, eq=False)
+class Photo:
+    """A photo of 8 bits, and what of it a picture may miss.
+
+    Attributes:
+        levels: [H, W, 3] uint8.
+        noise: By how much a value of the photo, in [0, 1], may differ from the picture's before it is rounded.
+        outliers: Part of the counted pixels that may show anything.
+        counted: [H, W] which pixels count.
+    """
+
+    levels: np.ndarray
+    noise: float
+    outliers: float
+    counted: np.ndarray
+
+    @property
+    def allowed(self) -> int:
+        """Number of counted pixels that may show anything."""
+        return math.floor(self.outliers * int(self.counted.sum()))
+
+    @cached_property
+    def ends(self) -> tuple[Float64Array, Float64Array]:
+        """Least and greatest values [H, W, 3] of a picture that explains a pixel (Q1)."""
+        value = self.levels.astype(np.float64) / _STEPS
+        room = self.noise + (0.5 + STEP) / _STEPS + QUOTIENT + PHOTO_ROOM
+        return value - room, value + room
+
+    def outside(self, picture: np.ndarray) -> np.ndarray:
+        """[H, W] which counted pixels of a picture [H, W, 3] do not explain the photo; NaN explains nothing."""
+        low, high = self.ends
+        return self.counted & ~((picture >= low) & (picture <= high)).all(axis=-1)
+
+    def tiled(self, side: int) -> TiledPhoto:
+        """The photo in tiles of ``side`` pixels."""
+        low, high = self.ends
+        return TiledPhoto(in_tiles(low, side), in_tiles(high, side), in_tiles(self.counted, side), self.allowed)
+
+
+@dataclass(frozen=True, eq=False)
+class TiledPhoto:
+    """A photo in tiles, as bounds are.
+
+    Attributes:
+        low, high: [T, side, side, 3] values of a picture that explains a pixel.
+        counted: [T, side, side] which pixels count; false beyond the photo's edges.
+        allowed: Pixels of the whole photo that may show anything.
+    """
+
+    low: Float64Array
+    high: Float64Array
+    counted: np.ndarray
+    allowed: int
+
+    def outside(self, picture: np.ndarray) -> np.ndarray:
+        """[T, side, side] which counted pixels of a picture in tiles do not explain the photo."""
+        return self.counted & ~((picture >= self.low) & (picture <= self.high)).all(axis=-1)
+
+    def beyond(self, lower: np.ndarray, upper: np.ndarray, tiles: np.ndarray) -> np.ndarray:
+        """[t, side, side] which counted pixels of ``tiles`` no picture between the bounds explains (Q2).
+
+        Args:
+            lower, upper: [t, side, side, 3] bounds of all pictures of a cell; NaN excludes nothing.
+            tiles: [t] numbers.
+        """
+        # bounds that cross bound nothing
+        sane = (lower <= upper).all(axis=-1)
+        return sane & self.counted[tiles] & ((lower > self.high[tiles]) | (upper < self.low[tiles])).any(axis=-1)
+
+    def explained(self, lower: np.ndarray, upper: np.ndarray, tiles: np.ndarray) -> int:
+        """How many counted pixels of ``tiles`` every picture between the bounds explains."""
+        inside = (lower >= self.low[tiles]) & (upper <= self.high[tiles]) & (lower <= upper)
+        return int((self.counted[tiles] & inside.all(axis=-1)).sum())
+
+    def reach(self, linear: LinearSets, beyond: np.ndarray, tiles: np.ndarray) -> tuple[Float64Array, Float64Array]:
+        """Ends [d], [d] in [-1, 1] of the scaled parameters outside of which no pose explains the photo (Q3).
+
+        Along each parameter, a pixel rules out all that lies beyond its reach, wherever the others are. What more
+        pixels rule out than may show anything is ruled out. The ends cross where the cell is.
+
+        Args:
+            linear: Linear bounds of ``tiles`` over a cell.
+            beyond: [t, side, side] pixels that nothing in the cell explains.
+            tiles: [t] numbers.
+        """
+        counted = self.counted[tiles]
+        a_lower, b_lower, a_upper, b_upper = (np.asarray(part, np.float64)[counted] for part in linear)
+        low, high = self.low[tiles][counted], self.high[tiles][counted]
+        # A p <= room where lower bounds A_lower p + b_lower are at most high, and upper bounds at least low
+        a = np.concatenate([a_lower, -a_upper], axis=1)
+        room = np.concatenate([high - b_lower, b_upper - low], axis=1)
+        size = np.concatenate([np.abs(high) + np.abs(b_lower), np.abs(b_upper) + np.abs(low)], axis=1)
+        steep = np.abs(a).sum(axis=-1)
+        room = room + REACH_ROUNDING * (size + steep)
+        usable = np.isfinite(room) & np.isfinite(steep)
+        d = a.shape[-1]
+        least, most = np.full(d, -1.0), np.full(d, 1.0)
+        if counted.sum() <= self.allowed:
+            return least, most
+        out = beyond[counted]
+        for k in range(d):
+            slope = a[..., k]
+            with np.errstate(all="ignore"):
+                reach = (room + (steep - np.abs(slope))) / slope
+            up = np.where(usable & (slope > 0.0), reach, np.inf).min(axis=1)
+            down = np.where(usable & (slope < 0.0), reach, -np.inf).max(axis=1)
+            up[out], down[out] = -np.inf, np.inf
+            most[k] = min(1.0, float(np.partition(up, self.allowed)[self.allowed]) + CUT_ROOM)
+            least[k] = max(-1.0, -float(np.partition(-down, self.allowed)[self.allowed]) - CUT_ROOM)
+        return least, most

@@ -1,0 +1,238 @@
+"""Numbers that are read off a picture, its depths or its blending weights, and their bounds (docs/design.md, Q4).
+
+A measure is a mean or an order statistic of the pixels of a region: it grows with every pixel, so that bounds of the
+pixels bound it. Over a cell it is bounded part by part, where the pixels' linear bounds hold: pixels that rise and fall
+with the pose at the same time keep doing so.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+import torch
+
+from ns_abstract.arithmetic.network_charges import OWN_MARGIN
+from ns_abstract.io.errors import InputError
+from ns_abstract.io.images import read_mask
+from ns_abstract.refine.protocol import WeightPlane
+
+#: What a measure is read off: the picture's colours, its expected depths, or weights.
+Plane = Literal["colors", "depth"] | WeightPlane
+#: Luminance of linear RGB (ITU-R BT.709), and the channels by themselves.
+CHANNELS = {
+    "luminance": (0.2126, 0.7152, 0.0722),
+    "r": (1.0, 0.0, 0.0),
+    "g": (0.0, 1.0, 0.0),
+    "b": (0.0, 0.0, 1.0),
+}
+
+
+@dataclass(frozen=True)
+class MeasureTuning:
+    """Into how many parts a cell's linear bounds are looked at. It does not decide whether a bound holds."""
+
+    #: Most parts, and most numbers (parts times pixels) at once.
+    parts: int = 32
+    numbers: int = 1 << 21
+
+
+_TUNING = MeasureTuning()
+
+
+@dataclass(frozen=True)
+class Region:
+    """A set of pixels: a box, what is white in a mask, or all of the picture.
+
+    Attributes:
+        box: First columns and rows, past columns and rows: x0, y0, x1, y1; None: no box.
+        mask: A .png; None: none.
+        name: The key of the property file, for errors.
+    """
+
+    box: tuple[int, int, int, int] | None = None
+    mask: Path | None = None
+    name: str = "region"
+
+    def pixels(self, height: int, width: int) -> np.ndarray:
+        """[H, W] bool.
+
+        Raises:
+            InputError: It reaches beyond the picture, the mask has another size or nothing white.
+        """
+        chosen = np.ones((height, width), bool)
+        if self.mask is not None:
+            chosen = read_mask(self.mask)
+            if chosen.shape != (height, width):
+                raise InputError(
+                    f"the mask has {chosen.shape[1]} x {chosen.shape[0]} pixels, the picture {width} x {height}",
+                    file=self.mask,
+                    field="mask",
+                    fix=f"resize it to {width} x {height}, or write preprocess.resize [{chosen.shape[0]}, "
+                    f"{chosen.shape[1]}]",
+                )
+            if not chosen.any():
+                raise InputError("no pixel is white", file=self.mask, field="mask", fix="paint what counts white")
+        if self.box is not None:
+            x0, y0, x1, y1 = self.box
+            if x1 > width or y1 > height:
+                raise InputError(
+                    f"[{x0}, {y0}, {x1}, {y1}] reaches beyond the picture of {width} x {height} pixels",
+                    field=self.name,
+                    fix="write [x0, y0, x1, y1] inside of it",
+                )
+            inside = np.zeros_like(chosen)
+            inside[y0:y1, x0:x1] = True
+            chosen = inside
+        return chosen
+
+    def __str__(self) -> str:
+        if self.mask is not None:
+            return f"the white pixels of {self.mask.name}"
+        return "the picture" if self.box is None else f"the pixels {list(self.box)}"
+
+
+@dataclass(frozen=True, eq=False)
+class Measure:
+    """A number of a picture of known size.
+
+    Attributes:
+        plane: What it is read off.
+        channels: [c] how much each channel of the plane counts, not negative.
+        rank: The so many-th largest of the region's pixels; None: their mean.
+        pixels: [n] places of the region's pixels, row by row.
+        least: Whether ``rank`` counts from the smallest pixel on.
+        minus: [k] places of a second region, the same statistic of which is subtracted; None: nothing is.
+        cap: Pixels above it count as it.
+    """
+
+    plane: Plane
+    channels: tuple[float, ...]
+    rank: int | None
+    pixels: np.ndarray
+    least: bool = False
+    minus: np.ndarray | None = None
+    cap: float = math.inf
+
+    def value(self, planes: torch.Tensor, first: int) -> torch.Tensor:
+        """[B] values of pictures [B, H, W, C] whose channels ``first`` on are the plane's; differentiable."""
+        flat = planes.flatten(1, 2)[..., first : first + len(self.channels)]
+        single = (flat * torch.tensor(self.channels, dtype=flat.dtype)).sum(dim=-1).clamp(max=self.cap)
+        value = self._statistic(single[:, self.pixels])
+        return value if self.minus is None else value - self._statistic(single[:, self.minus])
+
+    def _statistic(self, pixels: torch.Tensor) -> torch.Tensor:
+        if self.rank is None:
+            return pixels.mean(dim=1)
+        return torch.topk(pixels, self.rank, dim=1, largest=not self.least).values[:, -1]
+
+    def bounds(self, planes: PlaneSets, first: int, parts: CellParts) -> tuple[np.ndarray, np.ndarray]:
+        """[s] lower and upper bounds of the value over each part of the cell."""
+        low, high = self._one(planes, first, parts, self.pixels)
+        if self.minus is not None:
+            taken = self._one(planes, first, parts, self.minus)
+            low, high = low - taken[1], high - taken[0]
+            if self.rank is None:
+                # one linear function of the pose: what both regions do together cancels
+                both = self._mean(planes, first, parts, [(self.pixels, 1.0), (self.minus, -1.0)])
+                low, high = np.maximum(low, both[0]), np.minimum(high, both[1])
+        return low - OWN_MARGIN * (1.0 + np.abs(low)), high + OWN_MARGIN * (1.0 + np.abs(high))
+
+    def _one(
+        self, planes: PlaneSets, first: int, parts: CellParts, pixels: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """[s] bounds of the statistic of some pixels over each part."""
+        low, high = (np.minimum(side, self.cap) for side in planes.over(parts, pixels, first, np.array(self.channels)))
+        if self.rank is None:
+            rounding = len(pixels) * OWN_MARGIN * np.maximum(np.abs(low).max(axis=1), np.abs(high).max(axis=1))
+            low, high = low.mean(axis=1) - rounding, high.mean(axis=1) + rounding
+            if math.isinf(self.cap):
+                mean = self._mean(planes, first, parts, [(pixels, 1.0)])
+                low, high = np.maximum(low, mean[0]), np.minimum(high, mean[1])
+            return low, high
+        place = self.rank - 1 if self.least else len(pixels) - self.rank
+        return tuple(np.partition(side, place, axis=1)[:, place] for side in (low, high))  # pyright: ignore[reportReturnType]
+
+    def _mean(
+        self, planes: PlaneSets, first: int, parts: CellParts, regions: list[tuple[np.ndarray, float]]
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """[s] bounds of a signed sum of means by linear bounds alone."""
+        channels, ends = np.array(self.channels), []
+        for sign in (1.0, -1.0):
+            slope, value, size, count = np.zeros(parts.dimensions), 0.0, 0.0, 0
+            for pixels, weight in regions:
+                # the lower side of what is added, the upper side of what is taken away
+                side = 0 if sign * weight > 0.0 else 2
+                a = planes.linear[side][pixels][:, first : first + len(channels)].astype(np.float64)
+                b = planes.linear[side + 1][pixels][:, first : first + len(channels)].astype(np.float64)
+                slope = slope + weight * np.tensordot(channels, a, (0, 1)).mean(axis=0)
+                value += weight * float((b @ channels).mean())
+                size += float((np.abs(b) @ channels).mean() + np.abs(a).sum(axis=-1).dot(channels).mean())
+                count += len(pixels)
+            center, half = parts.middles @ slope + value, parts.halves @ np.abs(slope)
+            ends.append(center - sign * (half + (count + parts.dimensions) * OWN_MARGIN * size))
+        return ends[0], ends[1]
+
+
+@dataclass(frozen=True)
+class CellParts:
+    """Equal parts of a cell in its parameters, each scaled to [-1, 1].
+
+    Attributes:
+        middles, halves: [s, d] middles and half widths.
+    """
+
+    middles: np.ndarray
+    halves: np.ndarray
+
+    @property
+    def dimensions(self) -> int:
+        """Number of parameters d."""
+        return self.middles.shape[1]
+
+    @classmethod
+    def along(cls, effects: np.ndarray, most: int) -> CellParts:
+        """At most so many parts, more of them along parameters with larger ``effects`` [d]."""
+        counts = np.ones(len(effects), np.int64)
+        while effects.size and np.max(effects / counts) > 0.0 and 2 * counts.prod() <= most:
+            counts[int(np.argmax(effects / counts))] *= 2
+        middles, halves = np.zeros((1, 0)), np.zeros((1, 0))
+        for count in counts.tolist():
+            # powers of two: these are exact
+            places = (2.0 * np.arange(count) + 1.0) / count - 1.0
+            middles = np.concatenate([np.repeat(middles, count, 0), np.tile(places, len(middles))[:, None]], axis=1)
+            halves = np.concatenate([np.repeat(halves, count, 0), np.full((len(middles), 1), 1.0 / count)], axis=1)
+        return cls(middles, halves)
+
+
+@dataclass(frozen=True)
+class PlaneSets:
+    """Linear sets of all planes of one cell's pictures, pixels in a row.
+
+    Attributes:
+        linear: A_lower [n, C, d], b_lower [n, C], A_upper, b_upper.
+        lower, upper: [n, C].
+    """
+
+    linear: tuple[np.ndarray, ...]
+    lower: np.ndarray
+    upper: np.ndarray
+
+    def over(
+        self, parts: CellParts, pixels: np.ndarray, first: int, channels: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """[s, k] lower and upper bounds of weighted channels, ``first`` on, of ``pixels`` [k] over each part."""
+        cut = slice(first, first + len(channels))
+        ends = []
+        for sign, side, interval in ((-1.0, 0, self.lower), (1.0, 2, self.upper)):
+            a = np.tensordot(self.linear[side][pixels][:, cut].astype(np.float64), channels, (1, 0))
+            b = self.linear[side + 1][pixels][:, cut].astype(np.float64) @ channels
+            flat = interval[pixels][:, cut].astype(np.float64) @ channels
+            size = np.abs(a).sum(axis=1) + np.abs(self.linear[side + 1][pixels][:, cut]) @ channels + np.abs(flat)
+            line = parts.middles @ a.T + b + sign * (parts.halves @ np.abs(a).T)
+            nearest = np.maximum(line, flat) if sign < 0.0 else np.minimum(line, flat)
+            ends.append(nearest + sign * OWN_MARGIN * size)
+        return ends[0], ends[1]

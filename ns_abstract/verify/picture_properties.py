@@ -1,0 +1,465 @@
+"""Properties of the picture itself, without a network: ``visible``, ``clear``, ``picture``, ``all`` and ``any``.
+
+A property is a tree whose leaves say that a measure of the picture lies within limits; its margin is the least or the
+greatest of theirs (docs/design.md, Q4).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from ns_abstract.arithmetic.network_charges import OWN_MARGIN
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.poses import PoseBox
+from ns_abstract.io.errors import InputError
+from ns_abstract.io.fields import known
+from ns_abstract.io.jsonio import MODERATE, file_beside, is_number, show
+from ns_abstract.perturbation.variations import parse_selection
+from ns_abstract.refine.protocol import COLORS, WeightPlane
+from ns_abstract.verify.network import ImageSets, OutputBounds
+from ns_abstract.verify.picture_measures import (
+    CHANNELS,
+    CellParts,
+    Measure,
+    MeasureTuning,
+    Plane,
+    PlaneSets,
+    Region,
+)
+from ns_abstract.verify.preprocess import Preprocess, parse_preprocess
+from ns_abstract.verify.properties import Claim, Property, Query, parse_partitions
+
+_TUNING = MeasureTuning()
+_STATISTICS = ("mean", "least", "greatest")
+#: The depth of a pixel on which nothing is drawn, and the greatest that is told apart, normalised units.
+FARTHEST = 2.0**20
+#: What reports say of distances.
+_DISTANCES = "distances: depth of the centres of Gaussians along the optical axis; of a NeRF's samples along their rays"
+#: Most leaves of a property, and how deep it may be.
+_MOST_LEAVES, _DEEPEST = 64, 8
+
+
+@dataclass(frozen=True)
+class Leaf:
+    """The statement that a measure lies above ``low`` and below ``high``.
+
+    Attributes:
+        sentence: In words, as the end of "on every image ...".
+        plane, statistic, region, minus: What is measured; see `Measure`.
+        channels: How much each channel of the plane counts.
+        pixels: The so many-th largest pixel, for the statistic "rank": a number, or a part of the region.
+        low, high: Limits; infinite where there is none.
+        cap: See `Measure`.
+    """
+
+    sentence: str
+    plane: Plane
+    statistic: str
+    region: Region
+    minus: Region | None = None
+    channels: tuple[float, ...] = (1.0,)
+    pixels: int | float = 1
+    low: float = -math.inf
+    high: float = math.inf
+    cap: float = math.inf
+
+    def measure(self, height: int, width: int) -> Measure:
+        """The measure of pictures of this size.
+
+        Raises:
+            InputError: A region does not lie in them, or has too few pixels.
+        """
+        places = np.flatnonzero(self.region.pixels(height, width))
+        minus = None if self.minus is None else np.flatnonzero(self.minus.pixels(height, width))
+        rank: int | None = 1
+        if self.statistic == "mean":
+            rank = None
+        elif self.statistic == "rank":
+            rank = self.pixels if isinstance(self.pixels, int) else math.ceil(self.pixels * places.size)
+            if not 1 <= rank <= places.size:
+                raise InputError(
+                    f"found {self.pixels}, {self.region} has {places.size} pixels", field="pixels", fix="ask for fewer"
+                )
+        return Measure(self.plane, self.channels, rank, places, self.statistic == "least", minus, self.cap)
+
+
+@dataclass(frozen=True)
+class Combined:
+    """The statement that ``all`` or any of some statements hold."""
+
+    all: bool
+    parts: tuple[Statement, ...]
+
+
+Statement = Leaf | Combined
+
+
+def leaves(statement: Statement) -> Iterator[Leaf]:
+    """Yield the leaves of a statement, in order."""
+    if isinstance(statement, Leaf):
+        yield statement
+    else:
+        for part in statement.parts:
+            yield from leaves(part)
+
+
+def _sentence(statement: Statement, inner: bool = False) -> str:
+    if isinstance(statement, Leaf):
+        return statement.sentence
+    text = (" and " if statement.all else " or ").join(_sentence(part, True) for part in statement.parts)
+    return f"({text})" if inner else text
+
+
+def _joined(statement: Statement, margins: Iterator[Any], least: Callable[..., Any], most: Callable[..., Any]) -> Any:
+    """The margin of a statement, of those of its leaves in order."""
+    if isinstance(statement, Leaf):
+        return next(margins)
+    parts = [_joined(part, margins, least, most) for part in statement.parts]
+    found = parts[0]
+    for part in parts[1:]:
+        found = (least if statement.all else most)(found, part)
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class PictureClaim(Claim):
+    """A statement about measures; "outputs" are their values, in the order of the leaves."""
+
+    statement: Statement
+    limits: tuple[tuple[float, float], ...]
+
+    def margin(self, outputs: torch.Tensor, values: torch.Tensor) -> torch.Tensor:
+        margins = []
+        for k, (low, high) in enumerate(self.limits):
+            value = outputs[:, k]
+            # a limit that is not there takes no part, also in slopes
+            sides = [value - low] * math.isfinite(low) + [high - value] * math.isfinite(high)
+            margins.append(sides[0] if len(sides) == 1 else torch.minimum(*sides))
+        return _joined(self.statement, iter(margins), torch.minimum, torch.maximum)
+
+    def query(self, outputs: np.ndarray) -> Query:
+        unit = np.eye(len(self.limits))
+        return Query(np.concatenate([unit, -unit]), np.zeros(2 * len(unit)))
+
+    def proved(self, query: Query, bounds: OutputBounds, boxes: Sequence[ParameterBox]) -> np.ndarray:
+        # [m, parts, 2, leaves] lower bounds of values and of their negatives over parts of the cells
+        lower = bounds.lower.reshape(len(boxes), -1, 2, len(self.limits))
+        margins = []
+        for k, (low, high) in enumerate(self.limits):
+            # what is not known is as bad as can be, whatever it is combined with
+            rise, fall = (np.where(np.isnan(side), -np.inf, side) for side in (lower[..., 0, k], lower[..., 1, k]))
+            sides = [rise - low] * math.isfinite(low) + [fall + high] * math.isfinite(high)
+            margin = np.min(sides, axis=0)
+            margins.append(margin - OWN_MARGIN * (1.0 + np.abs(np.where(np.isfinite(margin), margin, 0.0))))
+        return _joined(self.statement, iter(margins), np.minimum, np.maximum).min(axis=1)
+
+
+@dataclass(frozen=True)
+class PictureProperty(Property):
+    """A statement about the picture, its depths or its blending weights."""
+
+    statement: Statement
+    preprocess: Preprocess = field(default_factory=Preprocess)
+    partitions: tuple[int, ...] | None = None
+
+    def sentence(self) -> str:
+        return _sentence(self.statement)
+
+    @property
+    def notes(self) -> tuple[str, ...]:
+        near = any(leaf.plane == "depth" or _nearer(leaf.plane) for leaf in leaves(self.statement))
+        return (_DISTANCES,) * near
+
+    @property
+    def planes(self) -> tuple[Plane, ...]:
+        """What is read, each once."""
+        return tuple(dict.fromkeys(leaf.plane for leaf in leaves(self.statement)))
+
+    def bind(self, pose_set: PoseBox, nominal: Callable[[], np.ndarray]) -> PictureClaim:
+        return PictureClaim(self.statement, tuple((leaf.low, leaf.high) for leaf in leaves(self.statement)))
+
+    def model(self, height: int, width: int) -> MeasureModel:
+        """The measures in the place of a network, of pictures of this size whose colours come first.
+
+        Raises:
+            InputError: A region does not lie in them.
+        """
+        others = [plane for plane in self.planes if plane != "colors"]
+        measures = self.measures(height, width)
+        places = [0 if m.plane == "colors" else COLORS + others.index(m.plane) for m in measures]
+        return MeasureModel(measures, places, COLORS + len(others))
+
+    def measures(self, height: int, width: int) -> tuple[Measure, ...]:
+        """The measures of pictures of this size, by leaf.
+
+        Raises:
+            InputError: A region does not lie in them.
+        """
+        return tuple(leaf.measure(height, width) for leaf in leaves(self.statement))
+
+
+def _nearer(plane: Plane) -> bool:
+    return isinstance(plane, WeightPlane) and plane.nearer is not None
+
+
+class MeasureModel:
+    """Measures of pictures, in the place of a network (`ns_abstract.verify.protocol.Model`).
+
+    Args:
+        measures: By leaf.
+        places: By leaf, the first channel of its plane.
+        channels: Of the pictures.
+    """
+
+    def __init__(self, measures: Sequence[Measure], places: Sequence[int], channels: int) -> None:
+        self.measures, self.places, self.channels = tuple(measures), tuple(places), channels
+
+    def outputs(self, images: np.ndarray) -> np.ndarray:
+        """[B, leaves] values of pictures [B, H, W, C]."""
+        with torch.no_grad():
+            return self.differentiable(torch.from_numpy(np.asarray(images, np.float64))).numpy()
+
+    def differentiable(self, images: torch.Tensor) -> torch.Tensor:
+        """[B, leaves] values of pictures [B, H, W, C]."""
+        pairs = zip(self.measures, self.places, strict=True)
+        return torch.stack([measure.value(images, first) for measure, first in pairs], dim=1)
+
+    def input_sets(self, linear: tuple[np.ndarray, ...], lower: np.ndarray, upper: np.ndarray) -> ImageSets:
+        """The sets as they are, the numbers of a picture in a row."""
+        m, d = len(lower), linear[0].shape[-1]
+        slopes, rest = (linear[0], linear[2]), (linear[1], linear[3], lower, upper)
+        a_lower, a_upper = (np.asarray(part).reshape(m, lower[0].size, d) for part in slopes)
+        b_lower, b_upper, low, high = (np.asarray(part).reshape(m, -1) for part in rest)
+        return ImageSets(a_lower, b_lower, a_upper, b_upper, low, high)
+
+    def bound(self, images: ImageSets, query: Query) -> OutputBounds:
+        """Lower bounds of values and of their negatives over parts of cells, a row for each [parts, 2, leaves]."""
+        rows, c = [], self.channels
+        arrays = (images.a_lower, images.b_lower, images.a_upper, images.b_upper, images.lower, images.upper)
+        for a_lower, b_lower, a_upper, b_upper, lower, upper in zip(*arrays, strict=True):
+            shape = len(lower) // c, c, a_lower.shape[-1]
+            flat = [part.reshape(-1, c) for part in (b_lower, b_upper, lower, upper)]
+            linear = a_lower.reshape(shape), flat[0], a_upper.reshape(shape), flat[1]
+            rows.append(self._cell(PlaneSets(linear, flat[2], flat[3])))
+        # as many rows for every cell: cells of fewer parts repeat them
+        most = max(len(row) for row in rows)
+        lower = np.stack([np.resize(row, (most, *row.shape[1:])).ravel() for row in rows])
+        return OutputBounds(lower, np.zeros((*lower.shape, 1)), lower)
+
+    def _cell(self, planes: PlaneSets) -> np.ndarray:
+        read = np.unique(np.concatenate([m.pixels for m in self.measures]))
+        effects = np.abs(planes.linear[0][read].astype(np.float64)).sum(axis=(0, 1))
+        most = max(1, min(_TUNING.parts, _TUNING.numbers // read.size))
+        parts = CellParts.along(effects, most)
+        ends = [m.bounds(planes, first, parts) for m, first in zip(self.measures, self.places, strict=True)]
+        low, high = (np.stack(side, axis=1) for side in zip(*ends, strict=True))
+        return np.stack([low, -high], axis=1)
+
+    def branch(self, images: ImageSets, query: Query, groups: Sequence[Sequence[int]], most: int) -> float:
+        """Nothing: there are no activations."""
+        return -math.inf
+
+
+# ---------------------------------------------------------------- the file
+
+#: Keys beside those of a statement, at the top of the file.
+_COMMON = ("preprocess", "partitions")
+#: Keys of every leaf.
+_PLACE = ("region", "mask")
+
+
+def _fail(name: str, found: Any, fix: str) -> InputError:
+    return InputError(f"found {show(found)}", field=name, fix=fix)
+
+
+def _raised(name: str, problem: str, fix: str) -> InputError:
+    return InputError(problem, field=name, fix=fix)
+
+
+class _Source(NamedTuple):
+    """An object of the file, the name of its place in it for errors, the folder of files that it names."""
+
+    root: dict[str, Any]
+    prefix: str
+    folder: Path
+    dataset_scale: float
+
+    def number(self, key: str, low: float, high: float, otherwise: float | None = None) -> float:
+        """A number between two others, the ends included."""
+        value = self.root.get(key, otherwise)
+        if value is None:
+            raise _raised(f"{self.prefix}{key}", "missing", f"write a number from {low:g} to {high:g}")
+        if not (is_number(value) and low <= value <= high):
+            raise _fail(f"{self.prefix}{key}", value, f"write a number from {low:g} to {high:g}")
+        return float(value)
+
+    def choice(self, key: str, values: Sequence[str]) -> str:
+        """One of some names, the first if there is none."""
+        value = self.root.get(key, values[0])
+        if value not in values or not isinstance(value, str):
+            raise _fail(f"{self.prefix}{key}", value, f"write one of {', '.join(values)}")
+        return value
+
+    def region(self, key: str = "region") -> Region:
+        """The box under a key, or the mask beside the key region; all of the picture if there is neither."""
+        name = f"{self.prefix}{key}"
+        box, mask = self.root.get(key), self.root.get("mask") if key == "region" else None
+        if box is not None and mask is not None:
+            raise _raised(f"{self.prefix}mask", "given together with region", "write one of them")
+        if mask is not None:
+            if not isinstance(mask, str) or not mask:
+                raise _fail(f"{self.prefix}mask", mask, "write the name of a .png, relative to this file")
+            try:
+                return Region(mask=file_beside(self.folder, mask), name=f"{self.prefix}mask")
+            except InputError as error:
+                raise InputError(error.problem, field=f"{self.prefix}mask", fix=error.fix) from None
+        if box is None or box == "all":
+            return Region(name=name)
+        if not (isinstance(box, list) and len(box) == 4 and all(type(v) is int and 0 <= v < 1 << 20 for v in box)):
+            raise _fail(name, box, 'write pixels [x0, y0, x1, y1], whole numbers of at least 0, or "all"')
+        x0, y0, x1, y1 = box
+        if not (x0 < x1 and y0 < y1):
+            raise _fail(name, box, "write [x0, y0, x1, y1] with x0 < x1 and y0 < y1")
+        return Region(box=(x0, y0, x1, y1), name=name)
+
+
+def _below(number: float) -> float:
+    """The number before ``number``: what is above it is ``number`` or more."""
+    return float(np.nextafter(number, -np.inf))
+
+
+def _visible(source: _Source) -> Leaf:
+    root, prefix = source.root, source.prefix
+    if "select" not in root:
+        raise _raised(f"{prefix}select", "missing", 'write {"box": [[x0, y0, z0], [x1, y1, z1]]}')
+    select = parse_selection(root["select"], f"{prefix}select", _raised, source.folder)
+    weight, region = source.number("weight", MODERATE[0], 1.0, 0.5), source.region()
+    if "pixels" in root and "fraction" in root:
+        raise _raised(f"{prefix}fraction", "given together with pixels", "write one of them")
+    pixels: int | float = 1
+    if "fraction" in root:
+        pixels = source.number("fraction", 0.0, 1.0)
+        if pixels == 0.0:
+            raise _fail(f"{prefix}fraction", root["fraction"], "write a number above 0")
+        count = f"{pixels:.4g} of the pixels"
+    else:
+        pixels = root.get("pixels", 1)
+        if type(pixels) is not int or not 1 <= pixels < 1 << 40:
+            raise _fail(f"{prefix}pixels", pixels, "write a whole number of at least 1")
+        count = f"{pixels} {'pixel' if pixels == 1 else 'pixels'}"
+    sentence = f"at least {count} of {region} get a weight of at least {weight:g} from what is selected"
+    return Leaf(sentence, WeightPlane(select), "rank", region, pixels=pixels, low=_below(weight))
+
+
+def _clear(source: _Source) -> Leaf:
+    root, prefix = source.root, source.prefix
+    given = source.number("distance", *MODERATE)
+    scale = source.dataset_scale if source.choice("units", ("normalised", "dataset")) == "dataset" else 1.0
+    unit = "units of the data set" if scale != 1.0 else "normalised units"
+    distance, region = given * scale, source.region()
+    if source.choice("measure", ("weight", "expected")) == "expected":
+        if "weight" in root:
+            raise _raised(f"{prefix}weight", "given with the expected depth", "remove it, or measure")
+        sentence = f"the expected depth is above {given:g} {unit} everywhere in {region}"
+        # twice as far is as good as any
+        return Leaf(sentence, "depth", "least", region, low=distance, cap=2.0 * distance)
+    weight = source.number("weight", MODERATE[0], 1.0, 0.5)
+    sentence = f"no ray of {region} has collected a weight of {weight:g} nearer than {given:g} {unit}"
+    return Leaf(sentence, WeightPlane(nearer=distance), "greatest", region, high=weight)
+
+
+def _picture(source: _Source) -> Leaf:
+    root, prefix = source.root, source.prefix
+    statistic, channel = source.choice("statistic", _STATISTICS), source.choice("channel", tuple(CHANNELS))
+    region, minus = source.region(), source.region("minus") if "minus" in root else None
+    if "min" not in root and "max" not in root:
+        raise _raised(f"{prefix}min", "missing", "write min, max or both")
+    low = source.number("min", -1.0, 1.0) if "min" in root else -math.inf
+    high = source.number("max", -1.0, 1.0) if "max" in root else math.inf
+    if low > high:
+        raise _raised(f"{prefix}min", f"{low:g} is above max {high:g}", "write the smaller limit under min")
+    what = f"the {statistic} {channel} of {region}"
+    if minus is not None:
+        what += f" less that of {minus}"
+    limits = [f"at least {low:g}"] * math.isfinite(low) + [f"at most {high:g}"] * math.isfinite(high)
+    return Leaf(
+        f"{what} is {' and '.join(limits)}", "colors", statistic, region, minus, CHANNELS[channel],
+        low=_below(low) if math.isfinite(low) else low, high=-_below(-high) if math.isfinite(high) else high,
+    )  # fmt: skip
+
+
+class _Type(NamedTuple):
+    """The keys of a type of statement, and its parser."""
+
+    keys: tuple[str, ...]
+    parse: Callable[[_Source], Leaf]
+
+
+PICTURE_TYPES = {
+    "visible": _Type(("type", "select", "weight", "pixels", "fraction", *_PLACE), _visible),
+    "clear": _Type(("type", "distance", "units", "weight", "measure", *_PLACE), _clear),
+    "picture": _Type(("type", "statistic", "channel", "min", "max", "minus", *_PLACE), _picture),
+}
+
+
+def is_of_picture(root: Any) -> bool:
+    """Whether a parsed PROP.json states a property of the picture, for which there is no network."""
+    return isinstance(root, dict) and ("all" in root or "any" in root or root.get("type") in tuple(PICTURE_TYPES))
+
+
+def parse_picture_property(root: dict[str, Any], folder: Path, dataset_scale: float = 1.0) -> PictureProperty:
+    """Return the property of the picture that a parsed PROP.json states; files that it names lie in ``folder``.
+
+    Args:
+        root: Content of the file.
+        folder: See above.
+        dataset_scale: Normalised units per unit of the data set.
+
+    Raises:
+        InputError: A field cannot be used.
+    """
+    value = root.get("preprocess", {})
+    if isinstance(value, dict):
+        known(value, ("resize",), "preprocess.", _raised)
+    common: dict[str, Any] = {"preprocess": parse_preprocess(value), "partitions": parse_partitions(root)}
+    statement = parse_statement(root, folder, dataset_scale, _COMMON)
+    if sum(1 for _ in leaves(statement)) > _MOST_LEAVES:
+        raise _raised("type", f"more than {_MOST_LEAVES} statements", "split the file")
+    return PictureProperty(statement, **common)
+
+
+def parse_statement(
+    root: Any, folder: Path, dataset_scale: float, common: tuple[str, ...] = (), prefix: str = "", depth: int = 0
+) -> Statement:
+    """Return the statement of an object; ``prefix`` is its place, ``common`` are keys that may stand beside it.
+
+    Raises:
+        InputError: A field cannot be used.
+    """
+    if not isinstance(root, dict):
+        raise _fail(prefix.rstrip(".") or "type", root, 'write an object {"type": ...}')
+    kinds = [name for name in ("all", "any") if name in root]
+    if kinds:
+        known(root, (*kinds[:1], *common), prefix, _raised)
+        parts, name = root[kinds[0]], f"{prefix}{kinds[0]}"
+        if not isinstance(parts, list) or not parts or depth >= _DEEPEST:
+            raise _fail(name, parts, f"write a list of properties, nested at most {_DEEPEST} times")
+        inner = [
+            parse_statement(part, folder, dataset_scale, (), f"{name}[{k}].", depth + 1) for k, part in enumerate(parts)
+        ]
+        return Combined(kinds[0] == "all", tuple(inner))
+    kind = root.get("type")
+    if not isinstance(kind, str) or kind not in PICTURE_TYPES:
+        raise _raised(
+            f"{prefix}type", "missing" if kind is None else f"found {show(kind)}",
+            f"write one of {', '.join(PICTURE_TYPES)}",
+        )  # fmt: skip
+    known(root, (*PICTURE_TYPES[kind].keys, *common), prefix, _raised)
+    return PICTURE_TYPES[kind].parse(_Source(root, prefix, folder, dataset_scale))
