@@ -59,6 +59,11 @@ def test_claims_next_to_the_exact_minimum(arithmetic: NetworkArithmetic, tmp_pat
         offset = np.where(np.arange(3) == 1, broken, held)
         assert branch(network, images, rows, held, [[0], [1], [2]], MOST, arithmetic=arithmetic).proved
         assert not branch(network, images, rows, offset, [[0], [1]], 12, arithmetic=arithmetic).proved
+        for claim, most in ((held, MOST), (broken, 4)):
+            steps = branch(
+                network, images, rows, claim, [[0], [1], [2]], most, arithmetic=arithmetic, intermediate_steps=6
+            )
+            assert steps.proved == (claim is held)
         assert branch(network, images, rows, offset, [[1, 0], [2]], MOST, arithmetic=arithmetic).proved
     assert gained >= 4
 

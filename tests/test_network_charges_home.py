@@ -104,8 +104,8 @@ def instances() -> list[tuple[str, Activation]]:
     return [
         ("ReLU", layers.LeakyRelu(shape)),
         ("leaky ReLU", layers.LeakyRelu(shape, 0.1)),
-        ("sigmoid, tanh", layers.Sigmoid(shape)),
-        ("sigmoid, tanh", layers.Tanh(shape)),
+        ("sigmoid, tanh", activations.Sigmoid(shape)),
+        ("sigmoid, tanh", activations.Tanh(shape)),
         ("clip", activations.Clip(shape, least=-1.0, most=2.0)),
         ("hard sigmoid", activations.Clip(shape, factor=0.2, offset=0.5)),
         ("absolute value", activations.Abs(shape)),

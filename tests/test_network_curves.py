@@ -54,6 +54,8 @@ CURVES: dict[str, tuple[ScalarFunction, Exact, tuple[float, float]]] = {
     "elu": (activations.Elu((1,), alpha=1.5), lambda z: _elu(z, 1.5, 1, 1), (-20, 20)),
     "celu": (activations.Elu((1,), alpha=0.5, scale=1.25, width=0.5), lambda z: _elu(z, 0.5, 1.25, 0.5), (-20, 20)),
     "erf": (activations.Erf((1,)), lambda z: z.erf(), (-8, 8)),
+    "sigmoid": (activations.Sigmoid((1,)), _logistic, (-40, 40)),
+    "tanh": (activations.Tanh((1,)), lambda z: z.tanh(), (-20, 20)),
     "silu": (activations.Silu((1,)), lambda z: z * _logistic(z), (-40, 40)),
     "gelu": (activations.Gelu((1,)), lambda z: z * (-z / arb(2).sqrt()).erfc() / 2, (-20, 20)),
     "gelu tanh": (

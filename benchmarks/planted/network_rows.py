@@ -70,7 +70,7 @@ NETWORK_ROWS = (
     _curve("a ReLU flushes nothing", "LeakyRelu.error", "lower < FLUSH", "lower < 0.0", "ReLU-LeakyRelu", "layers.py"),
     _curve("a slope's product is exact", "LeakyRelu.error", "AFFINE * self.alpha * size", "0.0 * size",
            "leaky ReLU-LeakyRelu", "layers.py"),
-    _curve("sigmoid is exact", "_Sigmoidal.error", "LIBRARY", "0.0", "sigmoid, tanh-Sigmoid", "layers.py"),
+    _curve("sigmoid is exact", "_Sigmoidal.error", "LIBRARY", "0.0", "sigmoid, tanh-Sigmoid"),
     _curve("a clip flushes nothing", "Clip.error", "_FLUSHED * (1.0 + self.factor + _size(lower, upper))", "0.0",
            "clip-Clip"),
     _curve("hard sigmoid's line is exact", "Clip.error",

@@ -141,8 +141,6 @@ OWN_LINE = 32.0 * DOUBLE_UNIT
 OWN_SUMS = 2.0**7 * DOUBLE_UNIT
 #: torch's float64 functions are within 2^5 units; slopes and tangents of them multiply that by up to 2^4.
 OWN_FUNCTION = 2.0**9 * DOUBLE_UNIT
-#: Slopes of sigmoid and tanh, which torch gives within 2^-44, from below.
-SLOPES_DOWN = 1.0 - 2.0**23 * DOUBLE_UNIT
 #: A proof's last steps, joined sets, margins: up to 2^8 roundings of each term, twice.
 OWN_MARGIN = 2.0**9 * DOUBLE_UNIT
 #: Windows of maxima: sums of at most 2^8 terms, of 4 roundings, twice.

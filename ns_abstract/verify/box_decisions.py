@@ -25,6 +25,8 @@ _PARAMETERS = 16
 #: Boxes bounded together: as many as have so many numbers of layers between them, and no more than the second number;
 #: and the most that wait.
 _TOGETHER, _MOST, _WAITING = 1 << 18, 256, 1 << 14
+#: Steps towards the best lines for intermediate bounds of such a box.
+_STEPS = 12
 #: Branches of a box of many inputs, whose halves would hardly be easier.
 _BRANCHES = 1 << 14
 
@@ -123,6 +125,7 @@ class _BoxSearch:
                 _BRANCHES,
                 memory=self.memory,
                 arithmetic=self.arithmetic,
+                intermediate_steps=_STEPS,
             )
             self.boxes += branching.branches
             self.undecided |= not branching.proved

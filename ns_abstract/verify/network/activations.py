@@ -32,6 +32,7 @@ from ns_abstract.arithmetic.network_charges import (
     SQUARE,
 )
 from ns_abstract.verify.network.layers import Activation, LinearRelaxation
+from ns_abstract.verify.network.tangents import Tangents
 
 #: Intervals worked on at a time.
 _TOGETHER = 1 << 13
@@ -192,8 +193,18 @@ class ScalarFunction(Activation):
 
     def _lines(self, lower: Tensor, upper: Tensor) -> LinearRelaxation:
         cuts = self._cuts(*self._inside(lower, upper))
-        below, above = self._tangent(cuts, -1.0), self._tangent(cuts, 1.0)
-        return LinearRelaxation(below, self._extreme(cuts, below, -1.0), above, self._extreme(cuts, above, 1.0))
+        lines = []
+        for side in (-1.0, 1.0):
+            slope = self._tangent(cuts, side)
+            offset = self._extreme(cuts, slope, side)
+            if -side in self.bends:
+                tangents = Tangents.of(self, cuts.z[0], cuts.z[-1], side)
+                middle = 0.5 * (cuts.z[0] + cuts.z[-1])
+                exact = tangents.line(torch.minimum(torch.maximum(middle, tangents.first), tangents.last))
+                known = tangents.known & torch.isfinite(exact[1])
+                slope, offset = (torch.where(known, *pair) for pair in zip(exact, (slope, offset), strict=True))
+            lines += [slope, offset]
+        return LinearRelaxation(*lines)
 
     def _band(self, lower: Tensor, upper: Tensor) -> LinearRelaxation:
         cuts = self._cuts(*self._inside(lower, upper))
@@ -208,7 +219,7 @@ class ScalarFunction(Activation):
         flat = torch.zeros_like(lower)
         return LinearRelaxation(flat, self._extreme(cuts, flat, -1.0), flat, self._extreme(cuts, flat, 1.0))
 
-    def relaxation_gap(self, lower: Tensor, upper: Tensor) -> Tensor:
+    def relaxation_gap(self, lower: Tensor, upper: Tensor) -> Tensor | None:
         band = self.band(lower, upper)
         width = upper - lower
         # rounding alone keeps the lines of a point apart
@@ -216,7 +227,8 @@ class ScalarFunction(Activation):
         return torch.where(wide, (band.upper_offset - band.lower_offset) / width, torch.zeros_like(width))
 
     def unstable(self, lower: Tensor, upper: Tensor) -> Tensor:
-        return ~(self.relaxation_gap(lower, upper) <= _APART)
+        gap = self.relaxation_gap(lower, upper)
+        return torch.ones_like(lower, dtype=torch.bool) if gap is None else ~(gap <= _APART)
 
 
 class LibraryFunction(ScalarFunction):
@@ -569,6 +581,52 @@ class Erf(LibraryFunction):
 
     def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
         return 2.0 * LIBRARY
+
+
+class _Sigmoidal(ScalarFunction):
+    """An increasing function between -1 and 1 that is convex below 0 and concave above."""
+
+    @property
+    def breaks(self) -> tuple[float, ...]:
+        return (0.0,)
+
+    @property
+    def bends(self) -> tuple[int, ...]:
+        return 1, -1
+
+    def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
+        return LIBRARY
+
+    def range(self, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
+        return self.function(lower) - OWN_FUNCTION, self.function(upper) + OWN_FUNCTION
+
+    def relaxation_gap(self, lower: Tensor, upper: Tensor) -> Tensor | None:
+        return None
+
+    def unstable(self, lower: Tensor, upper: Tensor) -> Tensor:
+        return lower < upper
+
+
+@dataclass(frozen=True, eq=False)
+class Sigmoid(_Sigmoidal):
+    """``1 / (1 + exp(-z))``."""
+
+    def function(self, z: Tensor) -> Tensor:
+        return torch.sigmoid(z)
+
+    def slope(self, z: Tensor) -> Tensor:
+        return torch.sigmoid(z) * torch.sigmoid(-z)
+
+
+@dataclass(frozen=True, eq=False)
+class Tanh(_Sigmoidal):
+    """Hyperbolic tangent."""
+
+    def function(self, z: Tensor) -> Tensor:
+        return torch.tanh(z)
+
+    def slope(self, z: Tensor) -> Tensor:
+        return 1.0 / torch.cosh(z).square()
 
 
 class _Gated(LibraryFunction):

@@ -21,6 +21,7 @@ from ns_abstract.verify.network.neuron_bounds import NeuronBounds
 from ns_abstract.verify.network.neuron_selection import NeuronSelection
 from ns_abstract.verify.network.output_bounds import OutputRows
 from ns_abstract.verify.network.propagation import ForwardPropagation
+from ns_abstract.verify.network.row_ascent import RowAscent
 from ns_abstract.verify.network.subnormals import subnormals_kept
 
 
@@ -35,6 +36,7 @@ def bound_outputs(
     memory: int = 1 << 30,
     arithmetic: NetworkArithmetic = "float32",
     slope_steps: int = 0,
+    intermediate_steps: int = 0,
     assumed: Sequence[Mapping[int, ActivationPhases]] | None = None,
 ) -> OutputBounds:
     """Lower bounds of ``rows @ network(x) + offset`` over every image set.
@@ -48,8 +50,9 @@ def bound_outputs(
             ("everywhere"), only in the result ("end"), or not at all ("box").
         memory: Bytes to stay within, roughly; cells and rows are worked on in parts.
         arithmetic: Whether the bounds hold for every float32 evaluation and the exact network, or for that alone.
-        slope_steps: Steps towards the best slopes below open ReLUs, for every row of its own (N14); a bound never
-            is worse for them, and each takes as long as two passes of the rows.
+        slope_steps: Steps towards the best slopes below open ReLUs and the best tangents of curves, for every row of
+            its own (N14); a bound never is worse for them, and each takes as long as two passes of the rows.
+        intermediate_steps: The same for intermediate bounds, but in deep networks.
         assumed: By cell: signs of inputs of (leaky) ReLUs, by node; bounds are of the images for which these numbers
             have them in the evaluation that is bounded (N16). ``slope_steps`` must be positive then.
     """
@@ -65,8 +68,9 @@ def bound_outputs(
     for first in range(0, images.count, step):
         phases = None if assumed is None else assumed[first : first + step]
         cells = _NetworkBounds(
-            network, images[first : first + step], substitution, memory, arithmetic, slope_steps, phases
-        )
+            network, images[first : first + step], substitution, memory, arithmetic, slope_steps, phases, None,
+            intermediate_steps,
+        )  # fmt: skip
         parts.append(cells.outputs(rows, offset))
     if not parts:
         k, d = len(offset), images.dimensions
@@ -93,6 +97,7 @@ class _NetworkBounds:
         slope_steps: int = 0,
         assumed: Sequence[Mapping[int, ActivationPhases]] | None = None,
         sharing: CoefficientSource | None = None,
+        intermediate_steps: int = 0,
     ) -> None:
         sharing = CoefficientSource() if sharing is None else sharing
         fields, good = finite(images)
@@ -103,14 +108,15 @@ class _NetworkBounds:
         )
         schedule = WorkBudget(network)
         backward = BackwardPass(intermediate, memory, schedule.deep)
-        neuron_bounds = NeuronBounds(intermediate, backward, schedule, sharing)
+        inner = RowAscent(intermediate, backward, 0 if schedule.deep else intermediate_steps)
+        neuron_bounds = NeuronBounds(intermediate, backward, schedule, sharing, inner)
         selection = NeuronSelection(intermediate, neuron_bounds, schedule, sharing)
         pooling = MaxPoolPropagation(intermediate, backward, schedule, sharing)
-        propagation = ForwardPropagation(intermediate, sharing, bool(slope_steps))
+        propagation = ForwardPropagation(intermediate, sharing, bool(slope_steps or inner.steps))
         self.last = ForwardPass(intermediate, propagation, pooling, selection, schedule).run()
         if substitution == "end":
             intermediate.see(planes_of(fields, middle, network.input_shape, "everywhere"))
-        self._outputs = OutputRows(intermediate, backward, slope_steps)
+        self._outputs = OutputRows(intermediate, backward, RowAscent(intermediate, backward, slope_steps))
 
     def outputs(self, rows: Any, offset: Float64) -> OutputBounds:
         """Bounds of ``rows @ y + offset`` in every cell."""

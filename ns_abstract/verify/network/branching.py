@@ -61,6 +61,7 @@ def branch(
     *,
     memory: int = 1 << 30,
     arithmetic: NetworkArithmetic = "float32",
+    intermediate_steps: int = 0,
     enough: Callable[[], bool] = lambda: False,
 ) -> BranchingResult:
     """Try to prove that in every group some of ``rows @ network(x) + offset`` is positive, on one set of images.
@@ -74,6 +75,7 @@ def branch(
         images: One cell.
         groups: Numbers of rows.
         most: Branches after which it is given up.
+        intermediate_steps: Steps towards the best lines of intermediate bounds before anything is branched on.
         enough: Asked between batches of branches: whether to give up.
     """
     dense = np.asarray(rows.toarray() if hasattr(rows, "toarray") else rows, np.float64)
@@ -87,7 +89,21 @@ def branch(
         return [_branch_of(output_bounds, number, phases) for number, phases in enumerate(assumed)]
 
     count, least = 0, np.inf
-    for group in groups:
+    settled = np.full(len(groups), -np.inf)
+    if intermediate_steps and all(map(len, groups)):
+        for steps in (0, intermediate_steps):
+            if not (settled > 0.0).all():
+                check_cancelled()
+                found = bound_outputs(
+                    network, images, dense, offset, memory=memory, arithmetic=arithmetic, slope_steps=steps,
+                    intermediate_steps=steps,
+                ).lower[0]  # fmt: skip
+                count += 1
+                settled = np.fmax(settled, [found[list(group)].max() for group in groups])
+    for group, value in zip(groups, settled, strict=True):
+        if value > 0.0:
+            least = min(least, float(value))
+            continue
         if not len(group):
             return BranchingResult(False, count, -np.inf)
         waiting: list[_PhaseBranch] = []

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from ns_abstract.arithmetic.network_charges import LEAST_DIVISOR, OVERFLOW, gamma
 from ns_abstract.io.errors import InputError
+from ns_abstract.verify.network.activations import Sigmoid, Tanh
 from ns_abstract.verify.network.graph import Layer, Network, Node, as_double, item
 from ns_abstract.verify.network.layers import (
     ChannelEmbedding,
@@ -25,9 +26,7 @@ from ns_abstract.verify.network.layers import (
     Pad,
     ScaleLayer,
     Shape,
-    Sigmoid,
     Sum,
-    Tanh,
 )
 from ns_abstract.verify.network.max_pooling import MaxPool
 

@@ -37,9 +37,7 @@ from ns_abstract.verify.network.layers import (
     LinearLayer,
     ScaleLayer,
     Shape,
-    Sigmoid,
     Sum,
-    Tanh,
 )
 from ns_abstract.verify.network.max_pooling import MaxPool
 from ns_abstract.verify.network.sparse_layers import (
@@ -87,7 +85,7 @@ class CompositeBuilder(NetworkBuilder):
             return -math.inf
         node = self._node(index)
         layer = node.layer
-        if isinstance(layer, (activations.Exp, activations.Softplus, activations.Abs, Sigmoid)):
+        if isinstance(layer, (activations.Exp, activations.Softplus, activations.Abs, activations.Sigmoid)):
             return 0.0
         if isinstance(layer, LeakyRelu) and layer.alpha == 0.0:
             return 0.0
@@ -271,13 +269,13 @@ class CompositeBuilder(NetworkBuilder):
             return 0
         argument, t, c = self._affine(node.inputs[0])
         layer = node.layer
-        if isinstance(layer, Tanh) and c == 0.0 and t == 1.0 and shift == 0.0:
+        if isinstance(layer, activations.Tanh) and c == 0.0 and t == 1.0 and shift == 0.0:
             behind = self._node(argument)
             if behind is not None and isinstance(behind.layer, activations.Softplus) and behind.inputs[0] == root:
                 return self._times(self.curve(root, activations.Mish), s * factor)
         if argument != root:
             return 0
-        if isinstance(layer, Sigmoid) and c == 0.0 and shift == 0.0 and t != 0.0:
+        if isinstance(layer, activations.Sigmoid) and c == 0.0 and shift == 0.0 and t != 0.0:
             return self._times(self.curve(self._times(root, t), activations.Silu), s * factor / t)
         if (
             isinstance(layer, activations.Erf)

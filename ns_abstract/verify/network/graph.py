@@ -12,9 +12,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ns_abstract.verify.network.activations import LibraryFunction
+from ns_abstract.verify.network.activations import LibraryFunction, Sigmoid, Tanh
 from ns_abstract.verify.network.bilinear import Product
-from ns_abstract.verify.network.layers import Activation, LinearLayer, ScaleLayer, Shape, Sigmoid, Tanh
+from ns_abstract.verify.network.layers import Activation, LinearLayer, ScaleLayer, Shape
 from ns_abstract.verify.network.max_pooling import MaxPool
 
 Layer = LinearLayer | Activation | Product | MaxPool

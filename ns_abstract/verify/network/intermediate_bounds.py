@@ -16,7 +16,8 @@ from ns_abstract.verify.network.graph import Network, NetworkArithmetic
 from ns_abstract.verify.network.image_sets import ActivationPhases
 from ns_abstract.verify.network.input_planes import ImagePlanes, form_of
 from ns_abstract.verify.network.relaxations import Relaxations, ReusedRelaxation
-from ns_abstract.verify.network.slope_optimisation import SplitNeurons, UnstableNeurons
+from ns_abstract.verify.network.slope_choices import UnstableNeurons
+from ns_abstract.verify.network.slope_optimisation import SplitNeurons
 
 
 class IntermediateBounds:

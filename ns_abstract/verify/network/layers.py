@@ -25,11 +25,7 @@ from ns_abstract.arithmetic.network_charges import (
     AFFINE,
     FLUSH,
     FUNCTION_FLUSHES,
-    LIBRARY,
-    OWN_FUNCTION,
     OWN_LINE,
-    OWN_SUMS,
-    SLOPES_DOWN,
 )
 from ns_abstract.verify.network.coefficients import Coefficients, full, grid, interleave, unflatten
 
@@ -493,71 +489,3 @@ class LeakyRelu(Activation):
     def band(self, lower: Tensor, upper: Tensor) -> LinearRelaxation:
         slope, offset = self._chord(lower, upper)
         return LinearRelaxation(slope, torch.zeros_like(offset), slope, offset)
-
-
-class _Sigmoidal(Activation):
-    """An increasing function that is convex below 0 and concave above, with a slope that falls away from 0."""
-
-    room: ClassVar[float] = OWN_SUMS
-
-    def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
-        return LIBRARY
-
-    def slope(self, z: Tensor) -> Tensor:
-        raise AssertionError
-
-    def unstable(self, lower: Tensor, upper: Tensor) -> Tensor:
-        return lower < upper
-
-    def band(self, lower: Tensor, upper: Tensor) -> LinearRelaxation:
-        # with the least slope in the interval (at an end), f(z) - slope z does not decrease
-        slope = torch.minimum(self.slope(lower), self.slope(upper)) * SLOPES_DOWN
-        room = self.room + OWN_LINE * slope * torch.maximum(lower.abs(), upper.abs())
-        low, high = self.function(lower) - slope * lower, self.function(upper) - slope * upper
-        return LinearRelaxation(slope, low - room, slope, high + room)
-
-    def lines(self, lower: Tensor, upper: Tensor) -> LinearRelaxation:
-        band = self.band(lower, upper)
-        width = upper - lower
-        middle = 0.5 * (lower + upper)
-        ends = self.function(lower), self.function(upper)
-        chord = torch.where(width > 0.0, (ends[1] - ends[0]) / width, torch.zeros_like(width))
-        tangent = self.slope(middle)
-        size = torch.maximum(lower.abs(), upper.abs())
-        room = self.room + OWN_LINE * (chord.abs() + tangent) * size
-        # a chord is on the inner side of a curve and a tangent on the outer, whatever the rounding of
-        # their slopes: offsets are taken from the ends and, for the tangent, from where it touches
-        chord_low = torch.minimum(ends[0] - chord * lower, ends[1] - chord * upper) - room
-        chord_high = torch.maximum(ends[0] - chord * lower, ends[1] - chord * upper) + room
-        # a slope that is wrong by 2^-44 moves the tangent by that times the distance
-        touch = self.function(middle) - tangent * middle
-        slack = room + OWN_FUNCTION * tangent * width
-        convex, concave = upper <= 0.0, lower >= 0.0
-        return LinearRelaxation(
-            torch.where(convex, tangent, torch.where(concave, chord, band.lower_slope)),
-            torch.where(convex, touch - slack, torch.where(concave, chord_low, band.lower_offset)),
-            torch.where(convex, chord, torch.where(concave, tangent, band.upper_slope)),
-            torch.where(convex, chord_high, torch.where(concave, touch + slack, band.upper_offset)),
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class Sigmoid(_Sigmoidal):
-    """``1 / (1 + exp(-z))``."""
-
-    def function(self, z: Tensor) -> Tensor:
-        return torch.sigmoid(z)
-
-    def slope(self, z: Tensor) -> Tensor:
-        return torch.sigmoid(z) * torch.sigmoid(-z)
-
-
-@dataclass(frozen=True, eq=False)
-class Tanh(_Sigmoidal):
-    """Hyperbolic tangent."""
-
-    def function(self, z: Tensor) -> Tensor:
-        return torch.tanh(z)
-
-    def slope(self, z: Tensor) -> Tensor:
-        return 1.0 / torch.cosh(z).square()

@@ -11,6 +11,7 @@ from ns_abstract.verify.network.coefficients import Coefficients, Float64, Int64
 from ns_abstract.verify.network.cost_model import WorkBudget, on_threads
 from ns_abstract.verify.network.forms import NodeForm
 from ns_abstract.verify.network.intermediate_bounds import IntermediateBounds
+from ns_abstract.verify.network.row_ascent import RowAscent
 from ns_abstract.verify.network.stopping import BackwardBounds, BackwardTrace, NeuronTarget, StoppingCriterion
 
 
@@ -22,16 +23,25 @@ class NeuronBounds:
         backward: Passes rows back over it.
         schedule: What rows cost.
         sharing: Takes notice of the rows.
+        ascent: Chooses lines for them.
 
     Attributes:
         spared: Products that rows have not taken because they ended on the way.
     """
 
     def __init__(
-        self, intermediate: IntermediateBounds, backward: BackwardPass, schedule: WorkBudget, sharing: CoefficientSource
+        self,
+        intermediate: IntermediateBounds,
+        backward: BackwardPass,
+        schedule: WorkBudget,
+        sharing: CoefficientSource,
+        ascent: RowAscent,
     ) -> None:
         self.intermediate, self.network, self.backward = intermediate, intermediate.network, backward
         self.schedule, self.sharing = schedule, sharing
+        self.ascent = ascent
+        # rows in float64 pay where the network's own rounding is none
+        self._number = intermediate.relaxations[0 if schedule.deep else -1].number
         self.spared = 0.0
 
     def bounded(
@@ -61,6 +71,8 @@ class NeuronBounds:
         again = self._one_hot(index, where[left], -sign[left], enough(left, -sign[left]), cut)
         again.turn(sign[left] > 0.0)
         bounds.meet(left, again, sign[left] < 0.0)
+        if self.ascent.steps and not cut:
+            self._climb(index, where, reference, bounds, decides)
         c, r = form.c.flatten(1).clone(), form.r.flatten(1).clone()
         a = form.a.flatten(2).movedim(1, -1).clone()
         center, radius = bounds.middle()
@@ -81,6 +93,25 @@ class NeuronBounds:
         )
         return self.intermediate.within(tight, tight.lower, tight.upper)
 
+    def _climb(self, index: int, where: Int64, reference: Float64, bounds: BackwardBounds, decides: bool) -> None:
+        """Raise and lower ends of ``bounds`` with lines of their own; planes stay.
+
+        ``decides``: only of numbers whose sign is open, as far as it is.
+        """
+        shape = grid(self.network.shape(index))
+        for side, ends in ((1.0, bounds.lower), (-1.0, bounds.upper)):
+            low, high = bounds.lower + reference, bounds.upper + reference
+            at = np.flatnonzero((low < 0.0) & (high > 0.0)) if decides else np.arange(len(where))
+            if not len(at):
+                continue
+            cell, channel, y, x = (np.ascontiguousarray(v) for v in where[at].T)
+            value = np.zeros((len(at), shape[0], 1, 1), self.intermediate.relaxations[-1].number)
+            value[np.arange(len(at)), channel, 0, 0] = side
+            best = BackwardBounds.unknown(len(at), self.intermediate.d)
+            best.lower[:] = side * ends[at]
+            self.ascent.climb(index, Coefficients(value, y, x), cell, best, None)
+            ends[at] = side * best.lower
+
     def _one_hot(
         self, index: int, where: Int64, sign: Float64, enough: StoppingCriterion | None, cut: int = 0
     ) -> BackwardBounds:
@@ -96,9 +127,9 @@ class NeuronBounds:
         def bound(first: int) -> tuple[Int64, BackwardBounds, BackwardTrace | None]:
             number = np.arange(first, min(len(where), first + step))
             cell, channel, y, x = (np.ascontiguousarray(v) for v in where[number].T)
-            value = np.zeros((len(cell), channels, 1, 1), np.float32)
-            value[np.arange(len(cell)), channel, 0, 0] = sign[number]
             trace = self.sharing.trace(len(cell))
+            value = np.zeros((len(cell), channels, 1, 1), np.float32 if trace is not None else self._number)
+            value[np.arange(len(cell)), channel, 0, 0] = sign[number]
             criterion = None if enough is None else enough[number]
             part = self.backward.bound(index, Coefficients(value, y, x), cell, criterion, trace, cut)
             return number, part, trace

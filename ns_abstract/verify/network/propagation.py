@@ -22,6 +22,7 @@ from ns_abstract.arithmetic.network_charges import (
     UP,
     gamma,
 )
+from ns_abstract.verify.network.activations import ScalarFunction
 from ns_abstract.verify.network.bilinear import Product
 from ns_abstract.verify.network.coefficient_source import CoefficientSource
 from ns_abstract.verify.network.coefficients import grid
@@ -30,7 +31,7 @@ from ns_abstract.verify.network.intermediate_bounds import IntermediateBounds
 from ns_abstract.verify.network.layers import Activation, LeakyRelu, LinearLayer, ScaleLayer, Sum
 from ns_abstract.verify.network.relaxations import Relaxations, ReusedRelaxation
 from ns_abstract.verify.network.rounding import Rounding
-from ns_abstract.verify.network.slope_optimisation import UnstableNeurons
+from ns_abstract.verify.network.slope_choices import UnstableNeurons
 from ns_abstract.verify.network.sparse_layers import Variance
 
 
@@ -177,12 +178,12 @@ class ForwardPropagation:
             self.intermediate.reused_relaxations[k] = ReusedRelaxation(offered, torch.stack(tilts).flatten(3).numpy())
         if fold:
             self.intermediate.folded.add(source)
-        if self.chooses and isinstance(layer, LeakyRelu):
-            first = self.intermediate.relaxations[0]
+        if self.chooses and isinstance(layer, (LeakyRelu, ScalarFunction)):
+            first = self.intermediate.relaxations[-1]
             loose = (SPARE + self.network.readers[source]) * first.unit * z.width
             loose = loose + (first.noise[source] if fold else 0.0)
             arguments = (lower, upper, z.reference, reference, loose, room + torch.zeros_like(lower))
-            self.intermediate.unstable[k] = _unstable_neurons(layer, arguments)
+            self.intermediate.unstable[k] = _unstable_neurons(layer, first, arguments)
         lost = int(np.prod(layer.shape)) * 2 * FLUSH
         self.intermediate.flush += lost * z.width.reshape(self.intermediate.count, -1).amax(1).numpy()
         ends = layer.range(lower, upper)
@@ -252,11 +253,14 @@ def _around_slope(slope: Tensor, z: NodeForm, line: tuple[Tensor, Tensor, Tensor
 
 
 def _unstable_neurons(
-    layer: LeakyRelu, given: tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor]
+    layer: LeakyRelu | ScalarFunction,
+    relaxations: Relaxations,
+    given: tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor],
 ) -> UnstableNeurons:
-    """Return the unstable neurons [m, *shape] of a ReLU as `UnstableNeurons`."""
-    where = layer.unstable(given[0], given[1]).flatten(1).nonzero()
+    """Return the neurons [m, *shape] whose lines may be chosen as `UnstableNeurons`."""
+    lower, upper = given[:2]
+    where = (layer.unstable(lower, upper) if isinstance(layer, LeakyRelu) else lower < upper).flatten(1).nonzero()
     at = where[:, 0], where[:, 1]
     lower, upper, reference, image, loose, room = (v.flatten(1)[at].numpy() for v in given)
     cell, flat = (v.numpy() for v in at)
-    return UnstableNeurons(cell, flat, lower, upper, reference, image, loose, room, layer.alpha)
+    return UnstableNeurons(cell, flat, lower, upper, reference, image, loose, room, layer, relaxations)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -11,11 +11,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from ns_abstract.arithmetic.network_charges import OWN_LINE, OWN_SUMS, UP
+from ns_abstract.arithmetic.network_charges import OWN_LINE, UP
 from ns_abstract.verify.network.bilinear import Product
 from ns_abstract.verify.network.graph import Network
 from ns_abstract.verify.network.layers import Activation, LinearLayer
 from ns_abstract.verify.network.max_pooling import MaxPool
+from ns_abstract.verify.network.slope_choices import LineChoice
 
 Float64 = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -25,53 +26,6 @@ Int64 = NDArray[np.int64]
 _STEP, _DECAY, _FIRST, _SECOND = 0.3, 0.88, 0.8, 0.95
 #: A preference: added to divisors that may be zero.
 _NEXT_TO_NOTHING = 1e-30
-
-
-@dataclass(frozen=True)
-class UnstableNeurons:
-    """The unstable neurons of one node, in all cells.
-
-    Attributes:
-        cell, flat: [U] where they are.
-        lower, upper: [U] what they are at least and at most.
-        reference, image: [U] their reference and that of what they become.
-        loose: [U] charged for every part of a slope: rounding of rows and of the layer before.
-        room: [U] charged besides.
-        alpha: Slope below the kink.
-    """
-
-    cell: Int64
-    flat: Int64
-    lower: Float64
-    upper: Float64
-    reference: Float64
-    image: Float64
-    loose: Float64
-    room: Float64
-    alpha: float
-
-    def of(self, cell: int) -> UnstableNeurons:
-        """Those of one cell."""
-        at = np.flatnonzero(self.cell == cell)
-        names = ("cell", "flat", "lower", "upper", "reference", "image", "loose", "room")
-        return replace(self, **{name: getattr(self, name)[at] for name in names})
-
-    def losses(self, coefficient: Float32) -> Float64:
-        """[R, U] about what rows with ``coefficient`` on the units lose because these are open."""
-        gap = (1.0 - self.alpha) * self.upper * -self.lower / (self.upper - self.lower)
-        # a slope below was chosen for the row, the line above could not be
-        return np.where(coefficient < 0.0, 1.0, 0.5) * np.abs(coefficient) * gap
-
-    def offsets(self, slope: Float32) -> tuple[Float32, Float32]:
-        """Of lines with ``slope`` [R, U] between `alpha` and 1: below and above the function, as rows want them."""
-        s = slope.astype(np.float64)
-        base = s * self.reference - self.image
-        size = np.abs(self.reference) + np.abs(self.image) + np.abs(self.lower) + np.abs(self.upper)
-        give = s * self.loose + self.room + OWN_SUMS * size
-        # the function is convex: above a line by most at an end
-        top = np.maximum(self.alpha * self.lower - s * self.lower, self.upper - s * self.upper)
-        low, high = (base - give).astype(np.float32), (top + base + give).astype(np.float32)
-        return np.nextafter(low, np.float32(-np.inf)), np.nextafter(high, np.float32(np.inf))
 
 
 @dataclass(frozen=True)
@@ -138,53 +92,59 @@ class _Adam:
 
 
 class DualAscent:
-    """Adam's steps on the slopes and multipliers of a cell's rows.
+    """Adam's steps on the lines and multipliers of a cell's rows.
 
     Args:
-        units: Open units of the cell by node.
-        start: [U] slopes to start from, by node.
+        choices: What rows may choose, by node.
+        lines: The cell's lines [6, C, H, W], by node.
         rows: Number of rows.
         held: Numbers of the cell whose signs are assumed, by node.
     """
 
     def __init__(
         self,
-        units: Mapping[int, UnstableNeurons],
-        start: Mapping[int, Float32],
+        choices: Mapping[int, Sequence[LineChoice]],
+        lines: Mapping[int, Float32],
         rows: int,
         held: Mapping[int, SplitNeurons] | None = None,
     ) -> None:
-        self.units, self.split = units, held or {}
-        self.slopes = {k: np.repeat(start[k][None], rows, 0) for k in units}
+        self.choices, self.split = choices, held or {}
+        self._lines = {k: lines[k] for k in choices}
+        self.parameters = {
+            k: [np.repeat(choice.start(lines[k].reshape(6, -1))[None], rows, 0) for choice in own]
+            for k, own in choices.items()
+        }
         self.multipliers = {k: np.zeros((rows, len(v.flat)), np.float32) for k, v in self.split.items()}
-        self._slopes = {k: _Adam(v.shape) for k, v in self.slopes.items()}
+        self._steps = {k: [_Adam(v.shape) for v in own] for k, own in self.parameters.items()}
         self._multipliers = {k: _Adam(v.shape) for k, v in self.multipliers.items()}
         self._step = _STEP
 
-    def lines(self, intermediate: Mapping[int, Float32], cell: int) -> OptimisedSlopes:
-        """Lines of every row: those of the cell, with the slopes of open units."""
+    def lines(self) -> OptimisedSlopes:
+        """Lines of every row: those of the cell, but where it chooses."""
         lines_by_node = {}
-        for k, units in self.units.items():
-            slope = self.slopes[k]
-            lines = np.repeat(intermediate[k][:, cell : cell + 1], len(slope), 1)
-            flat = lines.reshape(6, len(slope), -1)
-            flat[0][:, units.flat] = slope
-            flat[1][:, units.flat], flat[2][:, units.flat] = units.offsets(slope)
+        for k, own in self.choices.items():
+            count = len(self.parameters[k][0])
+            lines = np.repeat(self._lines[k][:, None], count, 1)
+            for choice, parameter in zip(own, self.parameters[k], strict=True):
+                choice.put(parameter, lines.reshape(6, count, -1))
             lines_by_node[k] = lines
         return OptimisedSlopes(
             lines_by_node, {k: (held.flat, *held.pay(self.multipliers[k])) for k, held in self.split.items()}
         )
 
-    def climb(self, slopes: Mapping[int, Float64], forces: Mapping[int, Float64], size: Mapping[int, float]) -> None:
-        """Step along derivatives of the bounds, within what slopes and multipliers may be.
+    def climb(
+        self, slopes: Mapping[int, Sequence[Float64]], forces: Mapping[int, Float64], size: Mapping[int, float]
+    ) -> None:
+        """Step along derivatives of the bounds, within what parameters and multipliers may be.
 
         Args:
-            slopes, forces: Derivatives [R, U] by slopes and [R, B] by multipliers.
+            slopes, forces: Derivatives [R, U] by parameters and [R, B] by multipliers.
             size: What coefficients of rows on a node are about.
         """
-        for k, units in self.units.items():
-            moved = self.slopes[k] + self._step * self._slopes[k].step(slopes[k])
-            self.slopes[k] = np.clip(moved, units.alpha, 1.0).astype(np.float32)
+        for k, own in self.choices.items():
+            for number, choice in enumerate(own):
+                moved = self.parameters[k][number] + self._step * self._steps[k][number].step(slopes[k][number])
+                self.parameters[k][number] = choice.within(moved)
         for k in self.split:
             moved = self.multipliers[k] + self._step * size.get(k, 0.0) * self._multipliers[k].step(forces[k])
             self.multipliers[k] = np.maximum(moved, 0.0).astype(np.float32)
@@ -196,29 +156,31 @@ def slope_derivatives(
     image: Tensor,
     trace: Mapping[int, Float32],
     lines: Callable[[int], Float32],
-    units: Mapping[int, UnstableNeurons],
+    ascent: DualAscent,
     others: Mapping[int, Any],
-    held: Mapping[int, SplitNeurons],
-) -> tuple[dict[int, Float64], dict[int, Float64]]:
-    """Return, by node, the derivatives of bounds by lower slopes [R, U] and by multipliers [R, B].
+    last: int,
+) -> tuple[dict[int, list[Float64]], dict[int, Float64]]:
+    """Return, by node, the derivatives of bounds by parameters [R, U] and by multipliers [R, B].
 
     A row's bound is a sum of products along the lines that it took; read forwards from the image where it is least,
-    these lines give a value to every node. A slope counts its row's coefficient times that value, a multiplier the
-    value where it has not the sign that is assumed.
+    these lines give a value to every node. A slope counts its row's coefficient times how far that value is from where
+    the line touches, a multiplier the value where it has not the sign that is assumed.
 
     Args:
         network: The network.
         image: [R, *input_shape] float32 relative to the reference, where each row's bound is least.
         trace: Rows on the outputs of activations, products and maxima.
         lines: Of an activation's node: [6, R, C, H, W].
-        units: Open units of activations.
+        ascent: What rows have chosen, and numbers whose signs are assumed.
         others: Of products' and maxima's nodes: a function of rows and inputs that gives the output.
-        held: Numbers whose signs are assumed, by their node.
+        last: The node that the rows begin at.
     """
     values: list[Tensor | None] = [image]
+    held = ascent.split
     left = list(network.readers)
-    count, by_node, forces = image.shape[0], {}, {}
-    for k, node in enumerate(network.nodes, 1):
+    count, forces = image.shape[0], {}
+    by_node = {k: [np.zeros(v.shape) for v in own] for k, own in ascent.parameters.items()}
+    for k, node in enumerate(network.nodes[:last], 1):
         inputs = [v for v in (values[i] for i in node.inputs) if v is not None]
         rows = trace.get(k)
         if isinstance(node.layer, LinearLayer):
@@ -226,10 +188,10 @@ def slope_derivatives(
         elif rows is None:
             values.append(torch.zeros((count, *node.layer.shape), dtype=image.dtype))
         elif isinstance(node.layer, (Product, MaxPool)):
-            values.append(others[k](torch.from_numpy(rows), inputs).reshape(count, *node.layer.shape))
+            values.append(others[k](torch.from_numpy(rows), inputs).to(image.dtype).reshape(count, *node.layer.shape))
         else:
             assert isinstance(node.layer, Activation)
-            own = torch.from_numpy(lines(k)).reshape(6, -1, *node.layer.shape)
+            own = torch.from_numpy(lines(k)).to(image.dtype).reshape(6, -1, *node.layer.shape)
             a, u = torch.from_numpy(rows).reshape(inputs[0].shape), inputs[0]
             slope, offset = torch.where(a >= 0.0, own[0], own[3]), torch.where(a >= 0.0, own[1], own[4])
             source = node.inputs[0]
@@ -237,16 +199,13 @@ def slope_derivatives(
                 here = held[source]
                 forces[source] = -here.side * (u.flatten(1).numpy()[:, here.flat] + here.reference)
             values.append(slope * u + offset)
-            if k in units:
-                at = units[k]
+            for number, choice in enumerate(ascent.choices.get(k, ())):
+                at = choice.units
                 coefficient = rows.reshape(count, -1)[:, at.flat].astype(np.float64)
                 value = u.flatten(1).numpy()[:, at.flat] + at.reference
-                by_node[k] = np.maximum(coefficient, 0.0) * value
+                by_node[k][number] = choice.derivative(ascent.parameters[k][number], coefficient, value)
         for i in node.inputs:
             left[i] -= 1
             if not left[i]:
                 values[i] = None
-    return (
-        {k: by_node.get(k, np.zeros((count, len(v.flat)))) for k, v in units.items()},
-        {k: forces.get(k, np.zeros((count, len(v.flat)))) for k, v in held.items()},
-    )
+    return by_node, {k: forces.get(k, np.zeros((count, len(v.flat)))) for k, v in held.items()}

@@ -1,0 +1,140 @@
+"""Bounds of rows with the lines and multipliers that are best for each (docs/design.md, N14, N16)."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ns_abstract.verify.network.backward import BackwardPass, CoefficientBatch
+from ns_abstract.verify.network.coefficients import Coefficients, Float64, Int64, grid
+from ns_abstract.verify.network.intermediate_bounds import IntermediateBounds
+from ns_abstract.verify.network.max_pooling import MaxPool
+from ns_abstract.verify.network.slope_choices import LineChoice, ReluSlopes, ascending
+from ns_abstract.verify.network.slope_optimisation import DualAscent, OptimisedSlopes, slope_derivatives
+from ns_abstract.verify.network.stopping import BackwardBounds
+
+#: Bytes of lines of rows' own that are worked on at a time.
+_LINES_AT_ONCE = 32 << 20
+
+
+class RowAscent:
+    """Bounds rows with lines and multipliers of their own.
+
+    Args:
+        intermediate: What is known of the nodes.
+        backward: Passes rows back over it.
+        steps: Steps towards the best lines; 0: none. Rows are of the type that the outputs' are.
+    """
+
+    def __init__(self, intermediate: IntermediateBounds, backward: BackwardPass, steps: int) -> None:
+        self.intermediate, self.network, self.backward = intermediate, intermediate.network, backward
+        self.steps = steps
+
+    def climb(self, index: int, rows: Coefficients, cell: Int64, best: BackwardBounds, need: Float64 | None) -> Int64:
+        """Raise ``best.lower`` of rows on node ``index``, and planes with it, where lines of their own give more.
+
+        A cell whose rows are all above ``need`` [R] is done. Returns `OutputBounds.loosest` of the rows.
+        """
+        loosest = np.full((len(cell), 2), -1, np.int64)
+        for k in np.unique(cell):
+            choices, own = ascending(self.intermediate.unstable, k), np.flatnonzero(cell == k)
+            if not (choices or self.intermediate.split[k]) or not self.intermediate.good[k]:
+                continue
+            size = sum(6 * rows.value.itemsize * int(np.prod(self.network.shape(at))) for at in choices)
+            step = max(1, _LINES_AT_ONCE // max(1, size))
+            for first in range(0, len(own), step):
+                part = own[first : first + step]
+                target = None if need is None else need[part]
+                loosest[part] = self._climb(index, rows[part], k, part, best, target, choices)
+        return loosest
+
+    def _climb(
+        self,
+        index: int,
+        start: Coefficients,
+        k: int,
+        own: Int64,
+        best: BackwardBounds,
+        need: Float64 | None,
+        choices: Mapping[int, Sequence[LineChoice]],
+    ) -> Int64:
+        """`climb` for rows ``own`` of cell k."""
+        relaxations, cell = self.intermediate.relaxations[-1], np.full(len(own), k)
+        lines = {at: relaxations.lines[at][:, k] for at in choices}
+        ascent = DualAscent(choices, lines, len(own), self.intermediate.split[k])
+        for number in range(self.steps + 1):
+            if need is not None and bool((best.lower[own] > need).all()):
+                return np.full((len(own), 2), -1, np.int64)
+            chosen, bounds = ascent.lines(), BackwardBounds.unknown(len(own), self.intermediate.d)
+            # rows are changed in place
+            part = Coefficients(start.value.copy(), start.y, start.x)
+            total, numbers = np.zeros((len(own), 2)), np.arange(len(own))
+            batch = CoefficientBatch({index: part}, cell, total, numbers, relaxations, chosen)
+            self.backward.descend(index, index, batch, bounds, None)
+            better = bounds.lower > best.lower[own]
+            best.lower[own[better]], best.plane[own[better]] = bounds.lower[better], bounds.plane[better]
+            if number < self.steps:
+                slopes, forces = self._derivatives(index, k, chosen, bounds, ascent)
+                ascent.climb(slopes, forces, {at: self._size(chosen, at) for at in ascent.split})
+        return self._loosest(chosen, choices, len(own))
+
+    def _size(self, chosen: OptimisedSlopes, source: int) -> float:
+        """What coefficients of rows on the readers of node ``source`` are about."""
+        sizes = [
+            float(np.abs(chosen.trace[k]).mean())
+            for k, node in enumerate(self.network.nodes, 1)
+            if source in node.inputs and k in chosen.trace
+        ]
+        return max(sizes, default=0.0)
+
+    def _loosest(self, chosen: OptimisedSlopes, choices: Mapping[int, Sequence[LineChoice]], count: int) -> Int64:
+        """[R, 2] the node and place of the input of the open ReLU that costs each row most."""
+        loosest, most = np.full((count, 2), -1, np.int64), np.full(count, -1.0)
+        for k, own in choices.items():
+            if k not in chosen.trace or not isinstance(own[0], ReluSlopes):
+                continue
+            flat = own[0].units.flat
+            losses = own[0].losses(chosen.trace[k].reshape(count, -1)[:, flat])
+            at = losses.argmax(1)
+            value = losses[np.arange(count), at]
+            here = value > most
+            most[here] = value[here]
+            loosest[here, 0], loosest[here, 1] = self.network.nodes[k - 1].inputs[0], flat[at[here]]
+        return loosest
+
+    def _derivatives(
+        self, index: int, cell: int, chosen: OptimisedSlopes, found: BackwardBounds, ascent: DualAscent
+    ) -> tuple[dict[int, list[Float64]], dict[int, Float64]]:
+        """How the bounds of a cell's rows change with parameters and with multipliers."""
+        planes, relaxations = self.intermediate.image, self.intermediate.relaxations[-1]
+        rows = chosen.trace.get(0)
+        if rows is None:
+            rows = np.zeros((len(found.lower), *grid(self.network.input_shape)), np.float32)
+        p = -np.sign(np.nan_to_num(found.plane[:, 0, :-1]))
+        ends = np.einsum("schwd,rd->srchw", planes.slopes[cell], p) + planes.offsets[cell][:, None]
+        image = np.where(rows >= 0.0, ends[0], ends[1]).astype(np.float32)
+        others: dict[int, Any] = {}
+        for k, (one, two) in relaxations.products.items():
+            others[k] = functools.partial(_product, torch.from_numpy(one[:, cell]), torch.from_numpy(two[:, cell]))
+        for k, maxima in relaxations.maxima.items():
+            layer = self.network.nodes[k - 1].layer
+            assert isinstance(layer, MaxPool)
+            others[k] = functools.partial(maxima.forward, layer, cell)
+
+        def lines(k: int) -> np.ndarray:
+            return chosen.lines[k] if k in chosen.lines else relaxations.lines[k][:, cell : cell + 1]
+
+        shaped = torch.from_numpy(image).reshape(-1, *self.network.input_shape)
+        return slope_derivatives(self.network, shaped, chosen.trace, lines, ascent, others, index)
+
+
+def _product(one: Tensor, two: Tensor, rows: Tensor, inputs: list[Tensor]) -> Tensor:
+    """The planes that ``rows`` take of a product's factors."""
+    x, y = (v.reshape(rows.shape) for v in inputs)
+    offset = torch.where(rows >= 0.0, one[1] + two[1], one[4] + two[4])
+    return one[0] * x + two[0] * y + offset

@@ -1,0 +1,175 @@
+"""Neurons whose lines rows may choose: slopes below ReLUs, points that tangents touch (docs/design.md, N14)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
+from typing import Protocol
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from ns_abstract.arithmetic.network_charges import OWN_SUMS
+from ns_abstract.verify.network.activations import ScalarFunction
+from ns_abstract.verify.network.coefficients import Floats
+from ns_abstract.verify.network.layers import Activation, LeakyRelu
+from ns_abstract.verify.network.relaxations import Relaxations
+from ns_abstract.verify.network.tangents import Tangents
+
+Float64 = NDArray[np.float64]
+Int64 = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class UnstableNeurons:
+    """The neurons of one node, in all cells, whose lines may be chosen.
+
+    Attributes:
+        cell, flat: [U] where they are.
+        lower, upper: [U] what they are at least and at most.
+        reference, image: [U] their reference and that of what they become.
+        loose: [U] charged for every part of a slope: rounding of rows and of the layer before.
+        room: [U] charged besides.
+        layer: The activation behind them.
+        relaxations: Of rows that choose.
+    """
+
+    cell: Int64
+    flat: Int64
+    lower: Float64
+    upper: Float64
+    reference: Float64
+    image: Float64
+    loose: Float64
+    room: Float64
+    layer: Activation
+    relaxations: Relaxations
+
+    def __getitem__(self, at: np.ndarray) -> UnstableNeurons:
+        names = (entry.name for entry in fields(self) if entry.name not in ("layer", "relaxations"))
+        return replace(self, **{name: getattr(self, name)[at] for name in names})
+
+    def choices(self, cell: int) -> list[LineChoice]:
+        """The lines of one cell's neurons that may be chosen; none where nothing is left to choose."""
+        units = self[np.flatnonzero(self.cell == cell)]
+        if isinstance(self.layer, LeakyRelu):
+            return [ReluSlopes(units, self.layer.alpha)] if len(units.flat) else []
+        assert isinstance(self.layer, ScalarFunction)
+        found: list[LineChoice] = []
+        for side in (-1.0, 1.0):
+            tangents = Tangents.of(self.layer, torch.from_numpy(units.lower), torch.from_numpy(units.upper), side)
+            at = (tangents.first < tangents.last).nonzero()[:, 0]
+            if len(at):
+                found.append(TangentPoints(units[at.numpy()], tangents[at]))
+        return found
+
+    def shifted(self, slope: Float64, low: Float64, high: Float64) -> tuple[Floats, Floats]:
+        """Offsets below and above, relative to the references, of lines with stored ``slope`` [R, U] (N4)."""
+        base = slope * self.reference - self.image
+        size = np.abs(self.reference) + np.abs(self.image) + np.abs(self.lower) + np.abs(self.upper)
+        give = np.abs(slope) * self.loose + self.room + OWN_SUMS * (size + np.abs(low) + np.abs(high))
+        give = give + OWN_SUMS * np.abs(slope) * size
+        ends = ((low + base - give, -1.0), (high + base + give, 1.0))
+        below, above = (self.relaxations.outward(torch.from_numpy(v), side).numpy() for v, side in ends)
+        return below, above
+
+
+class LineChoice(Protocol):
+    """Lines of some neurons of a node, on one side, that a parameter of every row and neuron chooses."""
+
+    @property
+    def units(self) -> UnstableNeurons:
+        """The neurons."""
+        ...
+
+    def start(self, lines: Floats) -> Float64:
+        """[U] parameters of the cell's ``lines`` [6, N], or about."""
+        ...
+
+    def within(self, parameter: Float64) -> Float64:
+        """The closest parameters that are allowed."""
+        ...
+
+    def put(self, parameter: Float64, lines: Floats) -> None:
+        """Write the lines of parameters [R, U] into ``lines`` [6, R, N]."""
+        ...
+
+    def derivative(self, parameter: Float64, coefficient: Float64, value: Float64) -> Float64:
+        """[R, U] how bounds grow with parameters, for rows' coefficients and the neurons' values; scaled at will."""
+        ...
+
+
+@dataclass(frozen=True)
+class ReluSlopes:
+    """Slopes from ``alpha`` to 1 of lines below unstable (leaky) ReLUs."""
+
+    units: UnstableNeurons
+    alpha: float
+
+    def losses(self, coefficient: Floats) -> Float64:
+        """[R, U] about what rows with ``coefficient`` on the units lose because these are open."""
+        lower, upper = self.units.lower, self.units.upper
+        gap = (1.0 - self.alpha) * upper * -lower / (upper - lower)
+        # a slope below was chosen for the row, the line above could not be
+        return np.where(coefficient < 0.0, 1.0, 0.5) * np.abs(coefficient) * gap
+
+    def start(self, lines: Floats) -> Float64:
+        return lines[0][self.units.flat].astype(np.float64)
+
+    def within(self, parameter: Float64) -> Float64:
+        return np.clip(parameter, self.alpha, 1.0)
+
+    def put(self, parameter: Float64, lines: Floats) -> None:
+        slope = parameter.astype(self.units.relaxations.number).astype(np.float64)
+        lower, upper, flat = self.units.lower, self.units.upper, self.units.flat
+        # the function is convex: above a line by most at an end, below it at the kink or, past the limits, at an end
+        ends = self.alpha * lower - slope * lower, upper - slope * upper
+        below, above = self.units.shifted(slope, np.minimum(np.minimum(*ends), 0.0), np.maximum(*ends))
+        lines[0][:, flat], lines[1][:, flat], lines[2][:, flat] = slope, below, above
+
+    def derivative(self, parameter: Float64, coefficient: Float64, value: Float64) -> Float64:
+        return np.maximum(coefficient, 0.0) * value
+
+
+@dataclass(frozen=True)
+class TangentPoints:
+    """Points that tangents of curves touch, as parts of the way from the first to the last one."""
+
+    units: UnstableNeurons
+    tangents: Tangents
+
+    def _points(self, parameter: torch.Tensor) -> torch.Tensor:
+        first, last = self.tangents.first, self.tangents.last
+        return torch.minimum(torch.maximum(first + parameter * (last - first), first), last)
+
+    def start(self, lines: Floats) -> Float64:
+        first, last = self.tangents.first, self.tangents.last
+        middle = 0.5 * (self.tangents.lower + self.tangents.upper)
+        return ((middle - first) / (last - first)).clamp(0.0, 1.0).numpy()
+
+    def within(self, parameter: Float64) -> Float64:
+        return np.clip(parameter, 0.0, 1.0)
+
+    def put(self, parameter: Float64, lines: Floats) -> None:
+        touch = self._points(torch.from_numpy(parameter))
+        slope, offset = (v.numpy() for v in self.tangents.line(touch, self.units.relaxations.dtype))
+        lower, upper, flat = self.units.lower, self.units.upper, self.units.flat
+        least, most = (v.numpy() for v in self.units.layer.range(self.tangents.lower, self.tangents.upper))
+        # the other side of the row is asked for by nobody: any bound will do
+        if self.tangents.side < 0.0:
+            below, above = self.units.shifted(slope, offset, most - np.minimum(slope * lower, slope * upper))
+            lines[0][:, flat], lines[1][:, flat], lines[2][:, flat] = slope, below, above
+        else:
+            below, above = self.units.shifted(slope, least - np.maximum(slope * lower, slope * upper), offset)
+            lines[3][:, flat], lines[4][:, flat], lines[5][:, flat] = slope, above, below
+
+    def derivative(self, parameter: Float64, coefficient: Float64, value: Float64) -> Float64:
+        away = value - self._points(torch.from_numpy(parameter)).numpy()
+        return np.maximum(-self.tangents.side * coefficient, 0.0) * away
+
+
+def ascending(units: dict[int, UnstableNeurons], cell: int) -> dict[int, Sequence[LineChoice]]:
+    """By node: what rows of a cell may choose."""
+    found = {k: neurons.choices(cell) for k, neurons in units.items()}
+    return {k: choices for k, choices in found.items() if choices}
