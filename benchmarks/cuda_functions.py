@@ -45,7 +45,7 @@ CHARGES: dict[str, float] = {
     "rsqrt": 4.0,
     "division": 4.0,
     "torch_exp": 4.0,
-    # docs/design.md, G12: absolute from 0.5 to 2, elsewhere ulps
+    # docs/dev/design.md, G12: absolute from 0.5 to 2, elsewhere ulps
     "log_absolute": 2.0**24 * 2.0**-21.41,
     "log_ulps": 3.0,
     # of 2^-126, one operation (UNDERFLOW32 is 2^10 of them)

@@ -7,7 +7,7 @@ ratio above 1 is a bug; a ratio far below 1 is room.
 
     python benchmarks/ledger.py [--count N] [--write]
 
-prints the table; ``--write`` puts it into docs/measurements.md, between the marks of the ledger.
+prints the table; ``--write`` puts it into docs/dev/measurements.md, between the marks of the ledger.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ import numpy as np
 
 from ns_abstract.arithmetic.rounding import FLOAT32, REAL, Arithmetic, Charges, charges
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "measurements.md"
+PAGE = Path(__file__).resolve().parents[1] / "docs" / "dev" / "measurements.md"
 MARKS = "<!-- ledger of charges -->", "<!-- end of the ledger -->"
 #: What is not measured here, and why.
 UNMEASURED = {
@@ -416,7 +416,7 @@ def table(count: int) -> str:
 def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--count", type=int, default=2000, help="random inputs")
-    parser.add_argument("--write", action="store_true", help="put the table into docs/measurements.md")
+    parser.add_argument("--write", action="store_true", help="put the table into docs/dev/measurements.md")
     options = parser.parse_args()
     text = table(options.count)
     print(text)

@@ -1,4 +1,4 @@
-"""The page docs/network-charges.md: the table of what networks are charged with, and its constants."""
+"""The page docs/dev/network-charges.md: the table of what networks are charged with, and its constants."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from pathlib import Path
 from ns_abstract.arithmetic import network_charges
 from ns_abstract.arithmetic.network_table import FUNCTIONS, SUMS, SYMBOLS, Row
 
-CHARGES = Path(__file__).resolve().parents[1] / "docs" / "network-charges.md"
+CHARGES = Path(__file__).resolve().parents[1] / "docs" / "dev" / "network-charges.md"
 
 
 def page() -> str:
-    """docs/network-charges.md."""
+    """docs/dev/network-charges.md."""
 
     def rows(part: tuple[Row, ...]) -> str:
         lines = ["| layer | charge | programs | proof |", "|---|---|---|---|"]

@@ -7,7 +7,7 @@ numbers kept and flushed, and beside them with 200 bits. A ratio above 1 is a bu
 
     python benchmarks/network_ledger.py [--count N] [--compiled] [--write]
 
-prints the table; ``--write`` puts it into docs/measurements.md and writes docs/network-charges.md anew.
+prints the table; ``--write`` puts it into docs/dev/measurements.md and writes docs/dev/network-charges.md anew.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from ns_abstract.io.errors import InputError  # noqa: E402
 from ns_abstract.verify.network import ImageSets, bound_outputs  # noqa: E402
 from ns_abstract.verify.network.onnx_file import read_onnx  # noqa: E402
 
-PAGE = ROOT / "docs" / "measurements.md"
+PAGE = ROOT / "docs" / "dev" / "measurements.md"
 MARKS = "<!-- ledger of networks -->", "<!-- end of the ledger of networks -->"
 BITS = 200
 Array = np.ndarray
@@ -457,7 +457,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--count", type=int, default=24, help="networks of each kind and flavour")
     parser.add_argument("--compiled", action="store_true", help="torch.compile, too")
-    parser.add_argument("--write", action="store_true", help="write docs/measurements.md and docs/network-charges.md")
+    parser.add_argument("--write", action="store_true", help="write docs/dev/measurements.md and docs/dev/network-charges.md")
     options = parser.parse_args()
     found = ratios(options.count, everything=True, compiled=options.compiled)
     text = table(found)

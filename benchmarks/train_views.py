@@ -44,7 +44,7 @@ from ns_abstract.verify.properties import ANCHORS, TrueValues, decode
 _TURN = 0.02
 #: How small NeRFs are sampled, and where their rays begin.
 SAMPLES, NEAR_PLANE = 32, 1.2
-#: Classes and numbers of the head of the detection property (docs/design.md, V4), and its anchors.
+#: Classes and numbers of the head of the detection property (docs/dev/design.md, V4), and its anchors.
 _VOC, _ANCHORS = 20, 5
 
 

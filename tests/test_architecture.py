@@ -171,7 +171,7 @@ def drawing() -> str:
 
 @pytest.mark.skipif(not (ROOT / "docs").exists(), reason="the documentation is not beside the tests")
 def test_drawing_of_imports_is_that_of_the_sources() -> None:
-    page = (ROOT / "docs" / "architecture.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "dev" / "architecture.md").read_text(encoding="utf-8")
     assert f"```text\n{drawing()}\n```" in page, drawing()
 
 

@@ -1,4 +1,4 @@
-"""What CONTRIBUTING.md and docs/architecture.md cite exists, and what they count is so."""
+"""What CONTRIBUTING.md and docs/dev/architecture.md cite exists, and what they count is so."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = ROOT / "ns_abstract"
-PAGES = [ROOT / "CONTRIBUTING.md", ROOT / "docs" / "architecture.md"]
+PAGES = [ROOT / "CONTRIBUTING.md", ROOT / "docs" / "dev" / "architecture.md"]
 if not all(page.exists() for page in PAGES):
     pytest.skip("the documentation is not beside the tests", allow_module_level=True)
 #: What paths in the pages begin at.

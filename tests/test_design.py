@@ -1,4 +1,4 @@
-"""docs/design.md and the code name each other: every label cites functions that say so, and tests that exist."""
+"""docs/dev/design.md and the code name each other: every label cites functions that say so, and tests that exist."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-DESIGN = ROOT / "docs" / "design.md"
+DESIGN = ROOT / "docs" / "dev" / "design.md"
 if not DESIGN.exists():
     pytest.skip("the documents are not beside the tests", allow_module_level=True)
 TEXT = DESIGN.read_text(encoding="utf-8")

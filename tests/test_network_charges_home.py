@@ -39,7 +39,7 @@ ledger = script("network_ledger")
 attack = script("network_attack")
 
 NETWORK = Path(ns_abstract.__file__).parent / "verify" / "network"
-DESIGN = Path(__file__).resolve().parents[1] / "docs" / "design.md"
+DESIGN = Path(__file__).resolve().parents[1] / "docs" / "dev" / "design.md"
 CONSTANTS = {name: value for name, value in vars(network_charges).items() if name.isupper()}
 #: Names of the modules above that are no layers by themselves.
 BASES = {"Activation", "LibraryFunction", "ScalarFunction", "Weighted", "LinearRelaxation", "ResizeAxis"}

@@ -21,7 +21,7 @@ def test_method_page_names_what_is_registered() -> None:
     declare_missing()
     from nerfstudio.configs import external_methods
 
-    page = (ROOT / "docs" / "method.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs" / "dev" / "method.md").read_text(encoding="utf-8")
     text = next(block for block in re.findall(r"```python\n(.*?)```", page, re.S) if "external_methods" in block)
     known: list[external_methods.ExternalMethod] = []
     # the entry as nerfstudio's own file would hold it

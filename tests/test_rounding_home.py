@@ -1,4 +1,4 @@
-"""Charges for rounding stand in their home, with a label of docs/design.md, and nowhere else."""
+"""Charges for rounding stand in their home, with a label of docs/dev/design.md, and nowhere else."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ def stated() -> dict[str, str]:
 
 
 def test_every_charge_says_what_it_is_for() -> None:
-    design = ROOT / "docs" / "design.md"
+    design = ROOT / "docs" / "dev" / "design.md"
     if not design.exists():
         pytest.skip("the documents are not beside the tests")
     labels = set(re.findall(r"(?m)^\*\*([A-Z]\d+)[ .]", design.read_text(encoding="utf-8")))

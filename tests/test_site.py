@@ -59,7 +59,7 @@ def test_start_page_notebooks_and_commands(site):
 
 @pytest.mark.skipif(chromium() is None, reason="Chromium is not installed")
 def test_browser_shows_formulas(site, tmp_path):
-    with Browser((site / "design" / "index.html").as_uri(), tmp_path / "profile") as page:
+    with Browser((site / "dev" / "design" / "index.html").as_uri(), tmp_path / "profile") as page:
         until(lambda: page.ask("document.querySelectorAll('math').length > 700"), "the page")
         # on a busy machine the last ones are laid out after they are counted
         hidden = (

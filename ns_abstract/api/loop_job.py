@@ -1,4 +1,4 @@
-"""A network in the loop, opened: scene, camera, law of motion and network (docs/design.md, L1 to L5)."""
+"""A network in the loop, opened: scene, camera, law of motion and network (docs/dev/design.md, L1 to L5)."""
 
 from __future__ import annotations
 

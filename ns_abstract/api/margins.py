@@ -1,4 +1,4 @@
-"""Scene margins of certificates and loops (docs/design.md, V13)."""
+"""Scene margins of certificates and loops (docs/dev/design.md, V13)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Error constants of networks: what bounds of their outputs are charged with (docs/design.md, N2, N9-N11, N19-N22).
+"""Error constants of networks: what bounds of their outputs are charged with (docs/dev/design.md, N2, N9-N11, N19-N22).
 
 Beside `ns_abstract.arithmetic.rounding`, which holds those of pictures, this is the only place that knows how large a
 rounding error is. The charges of a layer hold for every program that computes it as sums of products in float32 or

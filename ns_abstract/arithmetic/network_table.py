@@ -1,4 +1,4 @@
-"""The table of what network bounds are charged with: a row for every kind of layer (docs/network-charges.md).
+"""The table of what network bounds are charged with: a row for every kind of layer (docs/dev/network-charges.md).
 
 The names in an expression are constants of `ns_abstract.arithmetic.network_charges`, with their counts, attributes of
 the layer, and the symbols of `SYMBOLS`. Expressions of functions of one number are Python, and tests evaluate them
@@ -39,7 +39,7 @@ class Row:
         layers: Classes of `ns_abstract.verify.network` that it is the row of.
         charge: How far a float32 evaluation may be from the exact value of the layer.
         programs: What that covers.
-        labels: Proofs in docs/design.md.
+        labels: Proofs in docs/dev/design.md.
         real: Whether the charge is made with network arithmetic "real", too.
     """
 
@@ -54,7 +54,7 @@ class Row:
 _OVERFLOWS = "every grouping of scales, sums before they are divided, one-pass sums of squares"
 _CONSTANTS = "constants folded by the exporter, by the program when it loads, or at every evaluation, "
 
-#: Layers of sums, scales and maps; their expressions are formulas of docs/design.md.
+#: Layers of sums, scales and maps; their expressions are formulas of docs/dev/design.md.
 SUMS = (
     Row(
         "layer of sums: fully connected, (transposed) convolution, mean, average pooling",

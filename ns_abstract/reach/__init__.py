@@ -1,1 +1,1 @@
-"""A network in the loop: states over time where control comes from rendered pictures (docs/design.md, L)."""
+"""A network in the loop: states over time where control comes from rendered pictures (docs/dev/design.md, L)."""

@@ -1,4 +1,4 @@
-"""The search for proofs and counterexamples over a box of initial states (docs/design.md, L5).
+"""The search for proofs and counterexamples over a box of initial states (docs/dev/design.md, L5).
 
 Two questions, each with its own cells: do all runs stay out of the unsafe sets ("safe"), and do they reach the goal as
 well ("reaches")? What becomes of a cell depends on the cell alone.

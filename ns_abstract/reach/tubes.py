@@ -1,4 +1,4 @@
-"""Tubes: sets of states over time as affine functions of initial state and disturbances (docs/design.md, L2-L4)."""
+"""Tubes: sets of states over time as affine functions of initial state and disturbances (docs/dev/design.md, L2-L4)."""
 
 from __future__ import annotations
 

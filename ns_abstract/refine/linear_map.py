@@ -1,4 +1,4 @@
-"""Linear bounds of a whole picture over a box of parameters, from the linear sets of cells (docs/design.md, R7)."""
+"""Linear bounds of a whole picture over a box of parameters, from the linear sets of cells (docs/dev/design.md, R7)."""
 
 from __future__ import annotations
 

@@ -69,7 +69,7 @@ def pair_maps(
     complete: bool,
     bins: int = BINS,
 ) -> PairMaps:
-    """What part of every place of two parameters, and of one, is certified and falsified (docs/design.md, V16).
+    """What part of every place of two parameters, and of one, is certified and falsified (docs/dev/design.md, V16).
 
     Args:
         lower, upper: [n, d] ends of cells that do not overlap.

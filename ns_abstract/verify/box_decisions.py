@@ -1,6 +1,6 @@
 """Decide whether a network has an unsafe output in a box of inputs: bounds, attacks, bisection, branch and bound.
 
-See docs/design.md, V11.
+See docs/dev/design.md, V11.
 """
 
 from __future__ import annotations

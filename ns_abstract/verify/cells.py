@@ -1,4 +1,4 @@
-"""Cells of a set of poses on an integer grid, which tile the set exactly (docs/design.md, V6, V7)."""
+"""Cells of a set of poses on an integer grid, which tile the set exactly (docs/dev/design.md, V6, V7)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The search for poses that explain a photo, one block of cells at a time (docs/design.md, Q).
+"""The search for poses that explain a photo, one block of cells at a time (docs/dev/design.md, Q).
 
 Cells are those of the frame that is searched, whose parameters may be sheared: there, a cell of the same image motion
 is far larger. A cell is excluded ("certified" in the store's terms), or its pose explains the photo ("falsified"), or

@@ -1,4 +1,4 @@
-"""Boxes of a set's own parameters that hold all poses of sheared cells (docs/design.md, U4)."""
+"""Boxes of a set's own parameters that hold all poses of sheared cells (docs/dev/design.md, U4)."""
 
 from __future__ import annotations
 

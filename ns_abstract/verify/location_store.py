@@ -1,4 +1,4 @@
-"""The store ``cells.sqlite`` of a search for poses (docs/design.md, U4).
+"""The store ``cells.sqlite`` of a search for poses (docs/dev/design.md, U4).
 
 While the search runs, its cells count parameters as the frame that is searched does; the table ``cells`` is written at
 its end, in the set's own parameters.

@@ -1,4 +1,4 @@
-"""A network with its preprocessing, as the search for certificates uses it (docs/design.md, V9)."""
+"""A network with its preprocessing, as the search for certificates uses it (docs/dev/design.md, V9)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Numbers that are read off a picture, its depths or its blending weights, and their bounds (docs/design.md, Q4).
+"""Numbers that are read off a picture, its depths or its blending weights, and their bounds (docs/dev/design.md, Q4).
 
 A measure is a mean or an order statistic of the pixels of a region: it grows with every pixel, so that bounds of the
 pixels bound it. Over a cell it is bounded part by part, where the pixels' linear bounds hold: pixels that rise and fall

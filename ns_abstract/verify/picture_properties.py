@@ -1,7 +1,7 @@
 """Properties of the picture itself, without a network: ``visible``, ``clear``, ``picture``, ``all`` and ``any``.
 
 A property is a tree whose leaves say that a measure of the picture lies within limits; its margin is the least or the
-greatest of theirs (docs/design.md, Q4).
+greatest of theirs (docs/dev/design.md, Q4).
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Preprocessing from rendered pictures to a network's input, for pictures and for linear sets of pictures.
 
-Resizing is done by the renderer, which draws at the network's resolution (docs/design.md, V1).
+Resizing is done by the renderer, which draws at the network's resolution (docs/dev/design.md, V1).
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ class Preprocess:
         lower: np.ndarray,
         upper: np.ndarray,
     ) -> ImageSets:
-        """Linear sets of network inputs from those of pictures (docs/design.md, V1).
+        """Linear sets of network inputs from those of pictures (docs/dev/design.md, V1).
 
         Args:
             linear: A_lower [m, H, W, 3, d], b_lower [m, H, W, 3], A_upper, b_upper of m cells.

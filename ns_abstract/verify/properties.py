@@ -1,7 +1,7 @@
 """Properties of a network on every image of a set: their file, their concrete check, and their proof.
 
 A property is a margin, a function of the network's outputs and the pose: it holds where the margin is
-above 0 (docs/design.md, V2-V5). ``Property`` is what the file says; ``bind`` makes it a ``Claim`` about
+above 0 (docs/dev/design.md, V2-V5). ``Property`` is what the file says; ``bind`` makes it a ``Claim`` about
 one frame's set of poses, which knows the margin of concrete outputs, the linear rows whose lower bounds are
 needed for a proof, and what they prove.
 """

@@ -1,4 +1,4 @@
-"""The interfaces of pictures and networks that a search uses (docs/design.md, V6, V15)."""
+"""The interfaces of pictures and networks that a search uses (docs/dev/design.md, V6, V15)."""
 
 from __future__ import annotations
 

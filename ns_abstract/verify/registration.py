@@ -1,4 +1,4 @@
-"""Pictures of a scene whose registration is uncertain: the whole scene may be shifted (docs/design.md, V13, P3).
+"""Pictures of a scene whose registration is uncertain: the whole scene may be shifted (docs/dev/design.md, V13, P3).
 
 Where the scene stands is three parameters more, which the sets of pictures and the network's bounds keep; only what is
 left of them at the end is taken at its worst.

@@ -1,4 +1,4 @@
-"""The search for a proof or a counterexample, one block of cells at a time (docs/design.md, V6).
+"""The search for a proof or a counterexample, one block of cells at a time (docs/dev/design.md, V6).
 
 What becomes of a block depends on the block alone, so the result is the same in whatever order, on however
 many machines and after however many interruptions blocks are examined.

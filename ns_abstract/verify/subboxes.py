@@ -1,4 +1,4 @@
-"""Prove a cell by proving sub-boxes that cover it (docs/design.md, V15).
+"""Prove a cell by proving sub-boxes that cover it (docs/dev/design.md, V15).
 
 A cell of several parameters is mostly too wide for its own linear sets, which lose by what they leave out and not by
 what the pictures do. So parts of it are bounded, slanted ones where that helps (P2); a few neighbours are joined to one

@@ -1,4 +1,4 @@
-"""Which samples of a field are white where blending weights are asked for (docs/design.md, Q3)."""
+"""Which samples of a field are white where blending weights are asked for (docs/dev/design.md, Q3)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Activations that are convex, concave or linear between known points (docs/design.md, N10, N21).
+"""Activations that are convex, concave or linear between known points (docs/dev/design.md, N10, N21).
 
 One relaxation serves them all. The interval is cut at evenly spaced points and at the known ones, so that every
 part has one curvature. A line with any slope becomes a sound one by the greatest or least distance of the function

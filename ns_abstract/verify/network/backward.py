@@ -1,4 +1,4 @@
-"""The backward pass of CROWN: coefficients propagated from a node to the input (docs/design.md, N5, N17, N18)."""
+"""The backward pass of CROWN: coefficients propagated from a node to the input (docs/dev/design.md, N5, N17, N18)."""
 
 from __future__ import annotations
 

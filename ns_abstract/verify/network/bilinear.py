@@ -1,4 +1,4 @@
-"""Products of two values that both depend on the image: McCormick's planes (docs/design.md, N9)."""
+"""Products of two values that both depend on the image: McCormick's planes (docs/dev/design.md, N9)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bounds of a network's outputs over sets of images (docs/design.md, N, N0)."""
+"""Bounds of a network's outputs over sets of images (docs/dev/design.md, N, N0)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Branch and bound on the activation phases of unstable neurons (docs/design.md, N16)."""
+"""Branch and bound on the activation phases of unstable neurons (docs/dev/design.md, N16)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Where a cell takes references, slopes and coefficients from: by default from itself (docs/design.md, N15)."""
+"""Where a cell takes references, slopes and coefficients from: by default from itself (docs/dev/design.md, N15)."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Activations that a graph writes out with constants of its own, bounded with these constants.
 
 A file's 0.70710677 is not ``1 / sqrt(2)``. In exact arithmetic the difference may decide a verdict, so that the
-curves here take the file's numbers (docs/design.md, N24).
+curves here take the file's numbers (docs/dev/design.md, N24).
 """
 
 from __future__ import annotations

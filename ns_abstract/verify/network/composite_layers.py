@@ -1,4 +1,4 @@
-"""Build operators that consist of several basic layers (docs/design.md, N11, N19)."""
+"""Build operators that consist of several basic layers (docs/dev/design.md, N11, N19)."""
 
 from __future__ import annotations
 

@@ -1,6 +1,6 @@
 """Enclosures of constants that programs compute from stored ones: exact values, and every float32 order.
 
-A folded constant is not the one number that one library returns (docs/design.md, N23). Every result is enclosed
+A folded constant is not the one number that one library returns (docs/dev/design.md, N23). Every result is enclosed
 twice: ``real`` holds the exact value, ``single`` what any evaluation in the constant's own type may give, with sums
 in any order, fused multiply-add and flushed subnormals. Where both are one number, the constant is exact.
 """

@@ -1,4 +1,4 @@
-"""The cost model of backward passes and of refined neurons (docs/design.md, N13, N17, N18)."""
+"""The cost model of backward passes and of refined neurons (docs/dev/design.md, N13, N17, N18)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Affine forms in the parameters, and intervals, that enclose a node's values (docs/design.md, N0, N1)."""
+"""Affine forms in the parameters, and intervals, that enclose a node's values (docs/dev/design.md, N0, N1)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Linear sets of images, assumed activation phases, and output bounds over them (docs/design.md, N)."""
+"""Linear sets of images, assumed activation phases, and output bounds over them (docs/dev/design.md, N)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Intermediate bounds and relaxations of all nodes over several cells (docs/design.md, N1, N16, N18)."""
+"""Intermediate bounds and relaxations of all nodes over several cells (docs/dev/design.md, N1, N16, N18)."""
 
 from __future__ import annotations
 

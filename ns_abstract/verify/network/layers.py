@@ -6,7 +6,7 @@ A layer is linear (`LinearLayer` and the classes built on it) or acts on every n
 A linear layer has three faces that share one matrix W: the concrete ``W x + bias``, its magnitude
 ``|W| x`` (for radii and for rounding), and its transpose ``rows W`` on windows of rows
 (`ns_abstract.verify.network.coefficients`). An activation has its concrete value and lines that enclose it over
-an interval. Labels N1, N2, ... are those of docs/design.md.
+an interval. Labels N1, N2, ... are those of docs/dev/design.md.
 """
 
 from __future__ import annotations

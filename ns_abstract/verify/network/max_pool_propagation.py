@@ -1,4 +1,4 @@
-"""Forward and backward propagation through max pooling (docs/design.md, N12)."""
+"""Forward and backward propagation through max pooling (docs/dev/design.md, N12)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Max pooling, relaxed by one plane per window (docs/design.md, N12)."""
+"""Max pooling, relaxed by one plane per window (docs/dev/design.md, N12)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Intermediate bounds by backward passes that start at single neurons (docs/design.md, N5, N6, N18)."""
+"""Intermediate bounds by backward passes that start at single neurons (docs/dev/design.md, N5, N6, N18)."""
 
 from __future__ import annotations
 

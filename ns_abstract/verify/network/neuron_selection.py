@@ -1,4 +1,4 @@
-"""Choose which neurons before an activation or product are refined (docs/design.md, N6, N13, N17, N18)."""
+"""Choose which neurons before an activation or product are refined (docs/dev/design.md, N6, N13, N17, N18)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bounds of linear functions of the outputs, with optimised slopes and multipliers (docs/design.md, N14, N16)."""
+"""Bounds of linear functions of the outputs, with optimised slopes and multipliers (docs/dev/design.md, N14, N16)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Bounds of the partial sums of a sum in any order (docs/design.md, N20)."""
+"""Bounds of the partial sums of a sum in any order (docs/dev/design.md, N20)."""
 
 from __future__ import annotations
 

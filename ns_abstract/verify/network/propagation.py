@@ -1,4 +1,4 @@
-"""Forward propagation of forms through layers, activations and products (docs/design.md, N1-N4, N9, N21, N22)."""
+"""Forward propagation of forms through layers, activations and products (docs/dev/design.md, N1-N4, N9, N21, N22)."""
 
 from __future__ import annotations
 

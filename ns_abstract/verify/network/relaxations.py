@@ -1,4 +1,4 @@
-"""Linear relaxations and rounding errors that the backward pass applies (docs/design.md, N2, N4, N9, N12)."""
+"""Linear relaxations and rounding errors that the backward pass applies (docs/dev/design.md, N2, N4, N9, N12)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rounding errors of float32 evaluations and of the backward pass (docs/design.md, N2, N20-N22)."""
+"""Rounding errors of float32 evaluations and of the backward pass (docs/dev/design.md, N2, N20-N22)."""
 
 from __future__ import annotations
 

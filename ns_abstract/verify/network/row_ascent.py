@@ -1,4 +1,4 @@
-"""Bounds of rows with the lines and multipliers that are best for each (docs/design.md, N14, N16)."""
+"""Bounds of rows with the lines and multipliers that are best for each (docs/dev/design.md, N14, N16)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Backward coefficients of one cell, reused to bound others (docs/design.md, N15)."""
+"""Backward coefficients of one cell, reused to bound others (docs/dev/design.md, N15)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Neurons whose lines rows may choose: slopes below ReLUs, points that tangents touch (docs/design.md, N14)."""
+"""Neurons whose lines rows may choose: slopes below ReLUs, points that tangents touch (docs/dev/design.md, N14)."""
 
 from __future__ import annotations
 

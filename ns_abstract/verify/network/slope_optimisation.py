@@ -1,4 +1,4 @@
-"""Optimised slopes (alpha) and multipliers (beta) of alpha-beta-CROWN (docs/design.md, N14, N16)."""
+"""Optimised slopes (alpha) and multipliers (beta) of alpha-beta-CROWN (docs/dev/design.md, N14, N16)."""
 
 from __future__ import annotations
 

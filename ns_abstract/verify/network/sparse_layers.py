@@ -1,6 +1,6 @@
 """Sparse linear layers: sparse matrices, pairwise differences, transposed convolutions.
 
-See docs/design.md, N11, N19; the plain ones are in `ns_abstract.verify.network.layers`.
+See docs/dev/design.md, N11, N19; the plain ones are in `ns_abstract.verify.network.layers`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Tangents that lie on one side of a function over an interval (docs/design.md, N10, N14)."""
+"""Tangents that lie on one side of a function over an interval (docs/dev/design.md, N10, N14)."""
 
 from __future__ import annotations
 
