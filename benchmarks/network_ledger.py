@@ -457,7 +457,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--count", type=int, default=24, help="networks of each kind and flavour")
     parser.add_argument("--compiled", action="store_true", help="torch.compile, too")
-    parser.add_argument("--write", action="store_true", help="write docs/dev/measurements.md and docs/dev/network-charges.md")
+    parser.add_argument("--write", action="store_true", help="write the tables of docs/dev")
     options = parser.parse_args()
     found = ratios(options.count, everything=True, compiled=options.compiled)
     text = table(found)

@@ -86,7 +86,7 @@ class Cells:
 def cells(method: Method, poses: PoseBox, values: np.ndarray, half: np.ndarray, sheared: bool = False) -> Cells:
     """Bounded cells of half-widths [d] around parameter values [n, d], cut off at the ends of the set.
 
-    ``slanted``: the cells' parameters, but not ``values``, are counted as certificates count them (docs/dev/design.md, P2).
+    ``slanted``: the cells' parameters, but not ``values``, are counted as certificates count them (design.md, P2).
     """
     shown = FramePictures(method, poses, sheared=sheared)
     whole, found, boxes = shown.box, [], []

@@ -20,7 +20,7 @@ from ns_abstract.refine.protocol import Frame
 
 #: Seconds between two lines on progress, and between two times that kernels are published.
 _PACE = 5.0
-#: Functions of a stage and the seconds that one core took for them; measured for one parameter (docs/dev/benchmarks.md).
+#: Functions of a stage and the seconds that one core took for them; measured for one parameter (benchmarks.md).
 _MEASURED = {
     "pixel_stage": (233, 30.0), "gaussian_stage": (111, 18.0), "moving_colors": (33, 8.0), "render": (9, 3.0),
 }  # fmt: skip

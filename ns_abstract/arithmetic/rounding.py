@@ -23,7 +23,7 @@ UNDERFLOW64 = 2.0**-1060
 UNDERFLOW32 = 2.0**-116
 
 # What the package's own float64 evaluation is charged with, and how many roundings each constant stands for. Every one
-# begins with its label in docs/dev/design.md, and is relative to the sum of absolute terms, if nothing else is said. Names
+# begins with its label in design.md, and is relative to the sum of absolute terms, if nothing else is said. Names
 # in ``UP`` are factors of sums of numbers that are not negative, those in ``DOWN`` the same for lower bounds.
 
 # ---------------------------------------------------------------- forms and functions (A, E)
@@ -347,7 +347,7 @@ def gamma(operations: int, unit: float = UNIT64) -> float:
 class Charges(NamedTuple):
     """What splat bounds are charged for the bounded program's rounding, as kernels take it; made by `charges`.
 
-    Each is relative to what the label of docs/dev/design.md that `charges` names beside it says, but for ``flush``, which
+    Each is relative to what the label of design.md that `charges` names beside it says, but for ``flush``, which
     is absolute, and ``overflow``, a limit.
     """
 
@@ -403,7 +403,7 @@ class Charges(NamedTuple):
 
 
 def charges(a: Arithmetic) -> Charges:
-    """Every charge of the splat kernels, with the count of roundings it covers (docs/dev/design.md, the label named)."""
+    """Every charge of the splat kernels, with the count of roundings it covers (design.md, the label named)."""
     u = a.unit
     # what the package's own float64 evaluation of the same formula adds to each rounding
     both = u + 8.0 * UNIT64

@@ -1,4 +1,4 @@
-"""Discrete dynamics ``x' = f(x, u)``: one concrete step in float64, and its enclosure over a box (docs/dev/design.md, L1).
+"""Discrete dynamics ``x' = f(x, u)``: one concrete step in float64, and its enclosure over a box (design.md, L1).
 
 Every law is written once, over an arithmetic: `Floats` evaluates it, `Forms` encloses it, and `TermSizes` follows
 how large its terms are, which is what a float64 evaluation's rounding is charged by.

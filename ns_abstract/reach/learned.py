@@ -1,4 +1,4 @@
-"""Dynamics in an ONNX file: one step as onnxruntime computes it, and bounds over linear sets (docs/dev/design.md, L6)."""
+"""Dynamics in an ONNX file: one step as onnxruntime computes it, and bounds over linear sets (design.md, L6)."""
 
 from __future__ import annotations
 

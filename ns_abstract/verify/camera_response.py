@@ -1,4 +1,4 @@
-"""Cameras with uncertain response: brightness, white balance and gamma of the whole picture (docs/dev/design.md, V14)."""
+"""Cameras with uncertain response: brightness, white balance and gamma of the whole picture (design.md, V14)."""
 
 from __future__ import annotations
 

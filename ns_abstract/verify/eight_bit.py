@@ -1,4 +1,4 @@
-"""8-bit pictures, as files and cameras store them: rounding, and enclosures after rounding (docs/dev/design.md, V10)."""
+"""8-bit pictures, as files and cameras store them: rounding, and enclosures after rounding (design.md, V10)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A photo as a claim about poses: which pictures may have made it, and which cells of poses cannot (docs/dev/design.md, Q).
+"""A photo as a claim about poses: which pictures may have made it, and which cells of poses cannot (design.md, Q).
 
 A picture explains a photo where all but a few of the pixels lie within the noise of the photo's values.
 """

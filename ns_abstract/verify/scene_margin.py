@@ -1,4 +1,4 @@
-"""The scene margin: the largest variation of the scene that keeps a certificate, by bisection (docs/dev/design.md, V13).
+"""The scene margin: the largest variation of the scene that keeps a certificate, by bisection (design.md, V13).
 
 Cells that were certified for the stored scene are bounded again for all scenes around it. Sets of scenes are nested, so
 what is proved of a radius holds of every smaller one, and one pass over the cells with the smallest radius so far does.

@@ -1,4 +1,4 @@
-"""Blending weights of chosen Gaussians: pictures in which these are white, the others black (docs/dev/design.md, Q1, Q2).
+"""Blending weights of chosen Gaussians: pictures in which these are white, the others black (design.md, Q1, Q2).
 
 A pixel of gsplat is a sum of colours, each times its Gaussian's weight, so that a channel of such a picture is the sum
 of the weights of the white Gaussians. Nothing else of the program depends on colours.

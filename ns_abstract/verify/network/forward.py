@@ -1,4 +1,4 @@
-"""The forward pass: affine forms of all nodes, tighter bounds of unstable neurons (docs/dev/design.md, N1, N16, N18)."""
+"""The forward pass: affine forms of all nodes, tighter bounds of unstable neurons (design.md, N1, N16, N18)."""
 
 from __future__ import annotations
 

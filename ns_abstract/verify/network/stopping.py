@@ -1,4 +1,4 @@
-"""Concretised bounds of the backward pass, and the criterion that stops it early (docs/dev/design.md, N5, N6, N15, N17)."""
+"""Concretised bounds of the backward pass, and the criterion that stops it early (design.md, N5, N6, N15, N17)."""
 
 from __future__ import annotations
 
