@@ -19,7 +19,7 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.location import between, inner_cell, nearby, slabs
-from ns_abstract.verify.location_cover import SlantedBoxes, cover
+from ns_abstract.verify.location_cover import ShearedBoxes, cover
 from ns_abstract.verify.photo import Photo, TiledPhoto
 
 #: Half a step of 8 bits.
@@ -145,7 +145,7 @@ def test_a_cover_holds_every_pose_of_sheared_boxes(seed: int) -> None:
     count = 12
     lower = np.stack([generator.uniform(a, b, count) for a, b in zip(box.lower, box.upper, strict=True)], axis=1)
     upper = lower + generator.uniform(0.0, 0.05, lower.shape)
-    found = cover(box, SlantedBoxes(lower, upper, box.names, shear), 200)
+    found = cover(box, ShearedBoxes(lower, upper, box.names, shear), 200)
     cells = [*found.left, *found.excluded]
     assert sum(cell.volume for cell in cells) == found.grid.volume
     left = [found.grid.box_of(cell) for cell in found.left]

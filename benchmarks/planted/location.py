@@ -55,6 +55,6 @@ LOCATION = (
     ),
     Fault(
         "location: a shear moves the ends of boxes one way",
-        _COVER, "SlantedBoxes.within", "least + np.minimum(a, b)", "least + np.maximum(a, b)", _BOXES,
+        _COVER, "ShearedBoxes.within", "least + np.minimum(a, b)", "least + np.maximum(a, b)", _BOXES,
     ),
 )  # fmt: skip

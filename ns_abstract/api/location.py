@@ -20,7 +20,7 @@ from ns_abstract.io.photos import read_mask, read_photo
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.location import LocationResult, LocationSearch
-from ns_abstract.verify.location_cover import PoseCover, SlantedBoxes, cover
+from ns_abstract.verify.location_cover import PoseCover, ShearedBoxes, cover
 from ns_abstract.verify.photo import Photo
 
 #: Of the search's rules: results of different ones are not mixed.
@@ -113,8 +113,8 @@ class Location:
             np.array([getattr(box, end) for box in boxes], np.float64).reshape(len(boxes), d)
             for end in ("lower", "upper")
         )
-        slanted = SlantedBoxes(lower, upper, search.frame.box.names, search.frame.pose_set.shear)
-        return cover(search.plain.box, slanted)
+        sheared = ShearedBoxes(lower, upper, search.frame.box.names, search.frame.pose_set.shear)
+        return cover(search.plain.box, sheared)
 
     @property
     def fingerprint(self) -> dict[str, Any]:

@@ -46,7 +46,7 @@ class PoseCover:
         return self.grid.box_of(Cell(first, past))
 
 
-class SlantedBoxes:
+class ShearedBoxes:
     """Boxes of sheared parameters, and where they are in the set's own.
 
     Args:
@@ -90,7 +90,7 @@ class SlantedBoxes:
         return chosen[some], lower[some], upper[some]
 
 
-def cover(box: ParameterBox, boxes: SlantedBoxes, most: int = MOST) -> PoseCover:
+def cover(box: ParameterBox, boxes: ShearedBoxes, most: int = MOST) -> PoseCover:
     """Tile a set by cells of its own parameters, about ``most`` of which hold what is in ``boxes``."""
     d = box.dimensions
     grid = CellGrid(box, (1 << UNITS,) * d, (1,) * d)
@@ -131,7 +131,7 @@ def cover(box: ParameterBox, boxes: SlantedBoxes, most: int = MOST) -> PoseCover
     return PoseCover(grid, (*finished, *(entry[2] for entry in queue)), tuple(excluded))
 
 
-def _hull_volume(grid: CellGrid, boxes: SlantedBoxes, parts: list[Cell], chosen: np.ndarray) -> float:
+def _hull_volume(grid: CellGrid, boxes: ShearedBoxes, parts: list[Cell], chosen: np.ndarray) -> float:
     """Volume of the hulls of what is in each of the parts."""
     if len(parts) == 1:
         return np.inf
