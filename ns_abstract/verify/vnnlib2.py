@@ -1,4 +1,4 @@
-"""VNN-LIB queries of version 2: read by turning them into the assertions of version 1, and written.
+"""VNN-LIB queries of version 2, read as the assertions of version 1 (design.md, V11), and written.
 
 One network with one input and one output is read. Comparisons with ``<=``, ``>=`` and ``==`` are closed sets; ``<``,
 ``>`` and ``!=`` are refused. The semantics follow the declared type. ``real``: numbers are exact. ``float32``: numbers
