@@ -26,7 +26,7 @@ def optional_package(module: str, extra: str, command: str) -> ModuleType:
         return importlib.import_module(module)
     except ImportError:
         fix = f"pip install 'ns-abstract[{extra}]'"
-        raise InputError(f"needs the package {module}", field=command, fix=fix) from None
+        raise InputError(f"needs the package {module.partition('.')[0]}", field=command, fix=fix) from None
 
 
 def write_exr(results: Results, folder: Path) -> list[Path]:
