@@ -27,7 +27,7 @@ from ns_abstract.verify.network.comparison import compare
 from ns_abstract.verify.network.explain import check_cell
 from ns_abstract.verify.network.load import onnx_runner
 from ns_abstract.verify.vnnlib import InputRegion, load_query
-from ns_abstract.verify.vnnlib2 import Query
+from ns_abstract.verify.vnnlib2 import Vnnlib2Query
 
 _LIST_LIMIT = 16 << 20
 _INSTANCES = 100_000
@@ -187,7 +187,7 @@ def run_folder(
             limit = one.seconds if seconds is None else min(one.seconds, seconds)
             start = time.perf_counter()
             ready, answer, why = start, None, ""
-            query: Query | None = None
+            query: Vnnlib2Query | None = None
             try:
                 files = networks_of(one.network)
                 if len(files) > 1:
@@ -229,7 +229,7 @@ def _stem(name: str) -> str:
     return last
 
 
-def assignment(answer: Decision, query: Query | None = None) -> str:
+def assignment(answer: Decision, query: Vnnlib2Query | None = None) -> str:
     """A counterexample as the competitions want it, of a query of version 2 in its form; nothing without one."""
     if answer.x is None or answer.y is None:
         return ""
@@ -242,7 +242,7 @@ def assignment(answer: Decision, query: Query | None = None) -> str:
 
 def _question(
     network: Network, run: Any, file: Path, name: str, memory: int, arithmetic: NetworkArithmetic
-) -> tuple[tuple[InputRegion, ...], Query | None]:
+) -> tuple[tuple[InputRegion, ...], Vnnlib2Query | None]:
     """What a property file asks of the network, which is compared with the program that runs it.
 
     Raises:

@@ -283,7 +283,7 @@ def _raised(name: str, problem: str, fix: str) -> InputError:
     return InputError(problem, field=name, fix=fix)
 
 
-class _Source(NamedTuple):
+class _PropertyObject(NamedTuple):
     """An object of the file, the name of its place in it for errors, the folder of files that it names."""
 
     root: dict[str, Any]
@@ -335,7 +335,7 @@ def _below(number: float) -> float:
     return float(np.nextafter(number, -np.inf))
 
 
-def _visible(source: _Source) -> Leaf:
+def _visible(source: _PropertyObject) -> Leaf:
     root, prefix = source.root, source.prefix
     if "select" not in root:
         raise _raised(f"{prefix}select", "missing", 'write {"box": [[x0, y0, z0], [x1, y1, z1]]}')
@@ -358,7 +358,7 @@ def _visible(source: _Source) -> Leaf:
     return Leaf(sentence, WeightPlane(select), "rank", region, pixels=pixels, low=_below(weight))
 
 
-def _clear(source: _Source) -> Leaf:
+def _clear(source: _PropertyObject) -> Leaf:
     root, prefix = source.root, source.prefix
     given = source.number("distance", *MODERATE)
     scale = source.dataset_scale if source.choice("units", ("normalised", "dataset")) == "dataset" else 1.0
@@ -375,7 +375,7 @@ def _clear(source: _Source) -> Leaf:
     return Leaf(sentence, WeightPlane(nearer=distance), "greatest", region, high=weight)
 
 
-def _picture(source: _Source) -> Leaf:
+def _picture(source: _PropertyObject) -> Leaf:
     root, prefix = source.root, source.prefix
     statistic, channel = source.choice("statistic", STATISTICS), source.choice("channel", tuple(CHANNELS))
     region, minus = source.region(), source.region("minus") if "minus" in root else None
@@ -395,17 +395,17 @@ def _picture(source: _Source) -> Leaf:
     )  # fmt: skip
 
 
-class _Type(NamedTuple):
+class _StatementType(NamedTuple):
     """The keys of a type of statement, and its parser."""
 
     keys: tuple[str, ...]
-    parse: Callable[[_Source], Leaf]
+    parse: Callable[[_PropertyObject], Leaf]
 
 
 PICTURE_TYPES = {
-    "visible": _Type(("type", "select", "weight", "pixels", "fraction", *_PLACE), _visible),
-    "clear": _Type(("type", "distance", "units", "weight", "measure", *_PLACE), _clear),
-    "picture": _Type(("type", "statistic", "channel", "min", "max", "minus", *_PLACE), _picture),
+    "visible": _StatementType(("type", "select", "weight", "pixels", "fraction", *_PLACE), _visible),
+    "clear": _StatementType(("type", "distance", "units", "weight", "measure", *_PLACE), _clear),
+    "picture": _StatementType(("type", "statistic", "channel", "min", "max", "minus", *_PLACE), _picture),
 }
 
 
@@ -462,4 +462,4 @@ def parse_statement(
             f"write one of {', '.join(PICTURE_TYPES)}",
         )  # fmt: skip
     known(root, (*PICTURE_TYPES[kind].keys, *common), prefix, _raised)
-    return PICTURE_TYPES[kind].parse(_Source(root, prefix, folder, dataset_scale))
+    return PICTURE_TYPES[kind].parse(_PropertyObject(root, prefix, folder, dataset_scale))

@@ -23,7 +23,7 @@ import numpy as np
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import read_text
 from ns_abstract.io.packed import unpacked
-from ns_abstract.verify.vnnlib2 import Query, is_version_2, joined, parse_query
+from ns_abstract.verify.vnnlib2 import Vnnlib2Query, is_version_2, joined, parse_query
 
 _LIMIT = 64 << 20
 _TOKEN = re.compile(r'\s+|;[^\n]*|(?P<text>[()]|"[^"]*"|[^\s();"]+)|(?P<bad>.)', re.DOTALL)
@@ -119,7 +119,7 @@ def load_vnnlib(path: Path, output_shape: Shape, input_shape: Shape | None = Non
         raise error.within(path) from None
 
 
-def _read(text: str, input_shape: Shape | None, output_shape: Shape) -> tuple[list[Any], Query | None]:
+def _read(text: str, input_shape: Shape | None, output_shape: Shape) -> tuple[list[Any], Vnnlib2Query | None]:
     """The expressions of version 1 that a file means, and the query that a file of version 2 is."""
     if not is_version_2(text):
         return _expressions(text), None
@@ -168,7 +168,7 @@ def load_regions(
 
 def load_query(
     path: Path, input_shape: Shape, output_shape: Shape, text: str | None = None
-) -> tuple[tuple[InputRegion, ...], Query | None]:
+) -> tuple[tuple[InputRegion, ...], Vnnlib2Query | None]:
     """`load_regions` with the query that a file of version 2 is; None for version 1."""
     text = _text(path) if text is None else text
     try:

@@ -58,7 +58,7 @@ class Tensor:
 
 
 @dataclass(frozen=True)
-class Query:
+class Vnnlib2Query:
     """A query as assertions of version 1 about ``X_0, ...`` and ``Y_0, ...``, elements in rows.
 
     Attributes:
@@ -95,7 +95,7 @@ def joined(text: str) -> str:
 
 def parse_query(
     expressions: list[Any], input_shape: Sequence[int] | int | None, output_shape: Sequence[int] | int
-) -> Query:
+) -> Vnnlib2Query:
     """Return the query that the nested tokens of a file are.
 
     Args:
@@ -127,7 +127,7 @@ def parse_query(
         if not (isinstance(expression, list) and len(expression) == 2 and expression[0] == "assert"):
             raise _fail(expression, "write assertions behind the network")
         converted.append(["assert", reader.condition(expression[1])])
-    return Query(name, given, result, converted)
+    return Vnnlib2Query(name, given, result, converted)
 
 
 def _network(expression: Any) -> tuple[str, tuple[Tensor, Tensor]]:

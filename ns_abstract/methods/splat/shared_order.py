@@ -44,7 +44,7 @@ class BoundedFrame(Protocol):
         ...
 
 
-class _OrderedBounds(SplatBounds):
+class _SharedOrderBounds(SplatBounds):
     """Bounds in one given order; or, while there is none, in all orders, with a record of what decides them.
 
     Attributes:
@@ -120,7 +120,7 @@ class SplatOrder:
 
     def __init__(self, first: BoundedFrame, second: BoundedFrame, names: np.ndarray) -> None:
         self.frames = copy.copy(first), copy.copy(second)
-        self._bounds = _OrderedBounds(first.bounds), _OrderedBounds(second.bounds)
+        self._bounds = _SharedOrderBounds(first.bounds), _SharedOrderBounds(second.bounds)
         for frame, bounds in zip(self.frames, self._bounds, strict=True):
             frame.bounds = bounds
         self.names = np.arange(first.bounds.splats.count), names
