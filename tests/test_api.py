@@ -65,6 +65,16 @@ def _fields(camera: PinholeCamera) -> dict[str, Any]:
     return {field.name: getattr(camera, field.name) for field in dataclasses.fields(PinholeCamera)}
 
 
+def test_cameras_have_intrinsics() -> None:
+    camera = nsa.Camera(np.eye(4), width=30, height=20, fx=25.0)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (25.0, 25.0, 15.0, 10.0)
+    camera = nsa.Camera(np.eye(4), width=30, height=20, fx=25.0, fy=24.0, cx=14.5, cy=0.0)
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (25.0, 24.0, 14.5, 0.0)
+    for name, value in (("fx", 0.0), ("fy", float("nan")), ("cx", "middle"), ("cy", float("inf"))):
+        with pytest.raises(nsa.InputError, match=name):
+            nsa.Camera(np.eye(4), **{name: value})  # pyright: ignore[reportArgumentType]
+
+
 def test_pictures_are_not_rounded_and_need_no_sums_of_bounds(blobs: Inputs, monkeypatch: pytest.MonkeyPatch) -> None:
     """The renderer's own float64 numbers; what bounds alone need is made by the first of them, once for a scene."""
     made: list[int] = []

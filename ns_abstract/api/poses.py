@@ -13,7 +13,14 @@ from numpy.typing import ArrayLike
 
 from ns_abstract.api.scenes import Scene, not_a_camera
 from ns_abstract.geometry import poses
-from ns_abstract.geometry.camera_path import PinholeCamera, checked_pose, checked_side, focal_length
+from ns_abstract.geometry.camera_path import (
+    PinholeCamera,
+    checked_pose,
+    checked_side,
+    focal_length,
+    focal_pixels,
+    principal_place,
+)
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import show
 from ns_abstract.perturbation.specification import Perturbation, parse_perturbation
@@ -24,19 +31,34 @@ _UNSAID: Any = object()
 
 
 class Camera(PinholeCamera):
-    """A camera with square pixels that looks at the middle of its picture.
+    """A camera; by default one with square pixels that looks at the middle of its picture.
 
     Args:
         camera_to_world: [4, 4] or [3, 4], OpenGL axes (x right, y up, z back), in the normalised frame of the run.
         fov: Vertical field of view, degrees.
         width: Pixels.
         height: Pixels.
+        fx: Focal length, pixels, in place of ``fov``.
+        fy: The same along the other axis; None: ``fx``.
+        cx: Principal point from the left edge, pixels; None: the middle.
+        cy: Principal point from the top edge, pixels; None: the middle.
 
     Raises:
         InputError: A value cannot be used.
     """
 
-    def __init__(self, camera_to_world: ArrayLike, fov: float = 45.0, width: int = 100, height: int = 100) -> None:
+    def __init__(
+        self,
+        camera_to_world: ArrayLike,
+        fov: float = 45.0,
+        width: int = 100,
+        height: int = 100,
+        *,
+        fx: float | None = None,
+        fy: float | None = None,
+        cx: float | None = None,
+        cy: float | None = None,
+    ) -> None:
         try:
             matrix = np.asarray(camera_to_world, np.float64)
         except (TypeError, ValueError):
@@ -49,8 +71,10 @@ class Camera(PinholeCamera):
             raise InputError(problem, field="camera_to_world", fix="give a 4x4 or 3x4 matrix of numbers")
         pose = checked_pose(matrix.tolist(), "camera_to_world")
         across, down = checked_side(width, "width"), checked_side(height, "height")
-        focal = focal_length(fov, down, "fov")
-        super().__init__(pose, focal, focal, 0.5 * across, 0.5 * down, across, down)
+        focal = focal_length(fov, down, "fov") if fx is None else focal_pixels(fx, "fx")
+        other = focal if fy is None else focal_pixels(fy, "fy")
+        middle = principal_place(cx, across, "cx"), principal_place(cy, down, "cy")
+        super().__init__(pose, focal, other, *middle, across, down)
 
 
 def _plain(value: Any) -> Any:

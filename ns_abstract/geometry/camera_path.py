@@ -191,8 +191,8 @@ def _photo_path(found: Iterable[FileCamera], source: str, downscale_factor: floa
     for entry in found:
         camera = PinholeCamera(
             camera_to_world=checked_pose([*entry.camera_to_world, [0, 0, 0, 1]], entry.field),
-            fx=_pixels(entry.fx, f"{entry.field}: focal length"),
-            fy=_pixels(entry.fy, f"{entry.field}: focal length"),
+            fx=focal_pixels(entry.fx, f"{entry.field}: focal length"),
+            fy=focal_pixels(entry.fy, f"{entry.field}: focal length"),
             cx=entry.cx,
             cy=entry.cy,
             width=checked_side(entry.width, f"{entry.field}: width"),
@@ -202,14 +202,23 @@ def _photo_path(found: Iterable[FileCamera], source: str, downscale_factor: floa
     return CameraPath(tuple(cameras), None, (None,) * len(cameras), None, False, source)
 
 
-def _pixels(value: Any, field: str) -> float:
+def focal_pixels(value: Any, field: str) -> float:
+    """``value`` as a focal length in pixels.
+
+    Raises:
+        InputError: It is no moderate number above 0.
+    """
     if not is_moderate(value) or not value > 0:
         raise InputError(f"found {show(value)}", field=field, fix="write a number of pixels above 0")
     return float(value)
 
 
-def _place(value: Any, side: int, field: str) -> float:
-    """A coordinate of the principal point; without it the middle of a side."""
+def principal_place(value: Any, side: int, field: str) -> float:
+    """A coordinate of the principal point, pixels; without it the middle of a side.
+
+    Raises:
+        InputError: It is no moderate number.
+    """
     if value is not None and not is_moderate(value):
         raise InputError(f"found {show(value)}", field=field, fix="write a number of pixels")
     return side / 2 if value is None else float(value)
@@ -223,13 +232,13 @@ def _parse(root: dict[str, Any], source: str, downscale_factor: float) -> Camera
     overrides = []
     for field, entry in _entries(root, unknown):
         own = {key: entry.get(key, root.get(key)) for key in ("fx", "fy", "cx", "cy")}
-        focal = _focal(entry, root, field, height) if own["fx"] is None else _pixels(own["fx"], f"{field}.fx")
+        focal = _focal(entry, root, field, height) if own["fx"] is None else focal_pixels(own["fx"], f"{field}.fx")
         camera = PinholeCamera(
             camera_to_world=checked_pose(entry.get("camera_to_world"), f"{field}.camera_to_world"),
             fx=focal,
-            fy=focal if own["fy"] is None else _pixels(own["fy"], f"{field}.fy"),
-            cx=_place(own["cx"], width, f"{field}.cx"),
-            cy=_place(own["cy"], height, f"{field}.cy"),
+            fy=focal if own["fy"] is None else focal_pixels(own["fy"], f"{field}.fy"),
+            cx=principal_place(own["cx"], width, f"{field}.cx"),
+            cy=principal_place(own["cy"], height, f"{field}.cy"),
             width=width,
             height=height,
         )
