@@ -110,7 +110,7 @@ def test_slider_to_picture(server: Server, tmp_path: Path) -> None:
         assert picture.std() > 5.0, "nothing is drawn"
 
         # the slider by its keys: the set shrinks from 10 to 5 thousandths
-        x, y = browser.place(slider("± x"))
+        x, y = browser.place(slider("± x (0.001 units)"))
         browser.click(x, y)
         browser.ask(f"{slider('± x (0.001 units)')}.focus()")
         before = float(browser.ask(f"{number_field('± x (0.001 units)')}.value"))

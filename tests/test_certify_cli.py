@@ -442,7 +442,7 @@ def test_parts_without_a_number_are_not_right(
     assert parts["undecided"] == frame["partition"]["undecided"] / 20 >= 0.1
     assert parts["PCP-V"] <= parts["PCP-S"] <= 1.0 - parts["undecided"] - frame["coverage"]["falsified"]
     assert document["unknown_because"]["the margin of a picture is no finite number"] >= 2
-    assert "undecided (no finite margin)" in (tmp_path / "out" / "report.html").read_text()
+    assert "unknown (no finite margin)" in (tmp_path / "out" / "report.html").read_text()
     # no part with such a picture at its ends or middle is certified, and every one is counted
     width, low = 0.3 / 20, -0.15
     rows = [

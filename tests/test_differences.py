@@ -483,8 +483,8 @@ def test_a_run_and_its_export(blobs: Inputs, tmp_path: Path, in_process: InProce
     assert code == 0 and "falsified" in said, said
 
 
-def test_the_python_function() -> None:
-    scene = _opened(blob_scene(count=10))
+def test_the_python_function(tmp_path: Path) -> None:
+    scene = nsa.load_scene(write(tmp_path, blob_scene(count=10), "blobs"))
     given = ring()[0]
     camera = nsa.Camera(given.camera_to_world, given.fov, 16, 16)
     found = nsa.compare(scene, scene, nsa.PoseSet(camera, translation={"x": 0.01}), tolerance=0.2, time_budget=10.0)

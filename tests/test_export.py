@@ -133,7 +133,7 @@ def test_odd_sizes_and_missing_bounds(bounded: Path, tmp_path: Path, call: Call)
     cut["lower"], cut["upper"] = np.zeros_like(cut["lower"]), np.ones_like(cut["upper"])
     save_frame(
         tmp_path / "frame_00000.npz",
-        dataclasses.replace(result, **cut, bounded=False),
+        dataclasses.replace(result, **cut, views=None, bounded=False),
         status="missing",
         about=ABOUT,
     )
@@ -188,7 +188,7 @@ def test_sizes_must_agree(bounded: Path, tmp_path: Path) -> None:
     first, second = frames(bounded)[:2]
     cut = {name: np.ascontiguousarray(getattr(second, name)[:16]) for name in IMAGES}
     save_frame(tmp_path / "frame_00000.npz", first, about=ABOUT)
-    save_frame(tmp_path / "frame_00001.npz", dataclasses.replace(second, **cut), about=ABOUT)
+    save_frame(tmp_path / "frame_00001.npz", dataclasses.replace(second, **cut, views=None), about=ABOUT)
     with pytest.raises(InputError, match="one size"):
         Results(tmp_path)
 

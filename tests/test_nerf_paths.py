@@ -180,7 +180,7 @@ def test_samples_are_where_and_what_they_are_said_to_be(kind: str, grid: bool) -
     seed, changes = FIELDS[kind]
     scene, pose_set = tiny_scene(seed, **changes), poses({"rotation": {"yaw": 2e-4}})
     scene = dataclasses.replace(scene, occupancy=checkered() if grid else None)
-    paths, pixels = NerfBounds(scene, BINS, 1).paths, pixels_of(pose_set.camera)[:RAYS]
+    paths, pixels = NerfBounds(scene, BINS, 1).paths, pixels_of(pose_set.camera)[:6]
     assert paths is not None
     work = BundleBounds(
         paths, RayBundle(pose_set, pose_set.box, pixels, paths.degree), Division((), 1, 2), np.zeros(6, np.int64), 1.0,

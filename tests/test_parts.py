@@ -134,7 +134,7 @@ def test_joined_groups_are_sound_and_reach_the_target(blobs: Inputs) -> None:
     assert any("4 groups of tiles" in sentence for sentence in result.plan)
     dim = job.joined([*parts[:3], dataclasses.replace(parts[3], floor=0.0041)])
     said = [sentence for sentence in dim.plan if sentence not in result.plan]
-    assert len(said) == 1 and "at most 0.41% of the light" in said[0]
+    assert len(said) == 1 and "at most 0.41% of a pixel" in said[0]
     # bounds are about as tight as those of the frame as a whole
     whole = job.bound(0, RefinementGoal(1.1, FOREVER, 4000))
     assert mean_pixel_gap(result.lower, result.upper) <= 1.1 * mean_pixel_gap(whole.lower, whole.upper)

@@ -249,8 +249,9 @@ def test_planted_depth_order(monkeypatch: pytest.MonkeyPatch) -> None:
     right = bounds_module.pixel_stage
 
     def certain(*arguments):
-        lists, pixels, gaussians, *rest = arguments
-        right(lists, pixels, gaussians._replace(depth_error=np.zeros_like(gaussians.depth_error)), *rest)
+        lists, pixels, inputs, bounds = arguments
+        gaussians = inputs.gaussians._replace(depth_error=np.zeros_like(inputs.gaussians.depth_error))
+        right(lists, pixels, inputs._replace(gaussians=gaussians), bounds)
 
     monkeypatch.setattr(bounds_module, "pixel_stage", certain)
     assert case.attack()[0].violations > 0

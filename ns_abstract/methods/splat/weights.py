@@ -11,10 +11,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
 from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, Arithmetic
-from ns_abstract.geometry.differentiable_pose import differentiable_pose
 from ns_abstract.geometry.poses import PoseBox, PoseForms
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.activate import Splats
@@ -27,6 +25,8 @@ from ns_abstract.methods.splat.variations import VariedSplats, selected
 from ns_abstract.refine.protocol import MOST_PLANES, SceneSample, WeightPlane
 
 if TYPE_CHECKING:
+    import torch
+
     from ns_abstract.methods.splat.reference import Reference
 
 
@@ -166,6 +166,10 @@ class SplatWeightFrame(SplatFrame):
 
     def differentiable(self, values: torch.Tensor) -> torch.Tensor:
         """See `ns_abstract.refine.protocol.WeightFrame`, by the reference renderer."""
+        import torch
+
+        from ns_abstract.geometry.differentiable_pose import differentiable_pose
+
         rotation, position = self.pose_set.world_to_camera(values.detach().numpy())
         colors = self.white.at((self.varied.nearest.means - position) @ rotation[2])
         pose = differentiable_pose(self.pose_set)(values)
