@@ -116,7 +116,7 @@ def wrong(row: Row, options: argparse.Namespace, folder: Path, count: int) -> tu
     rng, contradictions, shares, looked = np.random.default_rng(11), 0, [], 0
     with sqlite3.connect(folder / "out" / "cells.sqlite") as base:
         rows = base.execute("SELECT frame, lower, upper FROM cells WHERE verdict = 'certified'").fetchall()
-    names = [name for name, _ in job.parameters]
+    names = [name for name, _ in job.job.parameters]
     each = max(1, count // job.job.frame_count)
     for frame in range(job.job.frame_count):
         pictures, boxes = job.pictures(frame), [(json.loads(a), json.loads(b)) for k, a, b in rows if k == frame]

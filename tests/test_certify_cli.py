@@ -164,7 +164,7 @@ def attack(case: Case, folder: Path, frame: int = 0, poses: int = 6) -> tuple[in
     splat = job.job.method
     assert isinstance(splat, SplatMethod)
     reference = Reference(splat.scene, splat.rasteriser)
-    names = [name for name, _ in job.parameters]
+    names = [name for name, _ in job.job.parameters]
     order = [names.index(name) for name in pictures.box.names]
     session = onnxruntime.InferenceSession(str(case.net), providers=["CPUExecutionProvider"])
     rng = np.random.default_rng(7)
@@ -627,7 +627,7 @@ def test_dask_worker_killed(planted: Case, finished: Path, tmp_path: Path) -> No
 
     job = planted.job
     recipe, grid = job.recipe, job.grid(0)
-    store = Store(tmp_path / "out", job.fingerprint, job.parameters, job.fixed, resume=False)
+    store = Store(tmp_path / "out", job.fingerprint, job.job.parameters, job.job.fixed, resume=False)
     store.begin(0, grid, job.first_blocks(grid))
     with connected(None, 2) as client:
         engine = Cluster(client)

@@ -51,7 +51,7 @@ class CertificateReport:
         rows = {tally.frame: store.leaves(tally.frame) for tally in store.tallies()}
         entries = [self._entry(tally, rows[tally.frame]) for tally in store.tallies()]
         sets = {frame: self.job.job.pose_sets[frame] for frame in rows}
-        cells, left_out = cell_cameras(sets, rows, [name for name, _ in self.job.parameters])
+        cells, left_out = cell_cameras(sets, rows, [name for name, _ in self.job.job.parameters])
         self.cameras = CameraDrawings(cells, left_out, self._standing, self._outside, upward(sets))
         document = certificate_document(
             self.about,
@@ -106,9 +106,9 @@ class CertificateReport:
 
     def _entry(self, tally: Tally, rows: list[dict[str, Any]]) -> dict[str, Any]:
         shares = fractions(tally)
-        names = [name for name, _ in self.job.parameters]
+        names = [name for name, _ in self.job.job.parameters]
         box = self.job.job.pose_sets[tally.frame].box
-        fixed = self.job.fixed[tally.frame]
+        fixed = self.job.job.fixed[tally.frame]
         sides = {n: (low, high) for n, low, high in zip(box.names, box.lower, box.upper, strict=True)}
         counts = {kind: sum(row["verdict"] == kind for row in rows) for kind in ("certified", "falsified", "unknown")}
         # cells that an ended command has left open stand as unknown without a margin or a time
@@ -125,7 +125,7 @@ class CertificateReport:
                     "lower": sides.get(name, (fixed.get(name, 0.0),) * 2)[0],
                     "upper": sides.get(name, (fixed.get(name, 0.0),) * 2)[1],
                 }
-                for name, unit in self.job.parameters
+                for name, unit in self.job.job.parameters
             ],
             "coverage": {
                 "certified": shares["certified"],
@@ -158,7 +158,7 @@ class CertificateReport:
 
     def _pictures(self, rows: Mapping[int, list[dict[str, Any]]]) -> list[dict[str, Any]]:
         """A sample, the certified image with the smallest margin, and counterexamples."""
-        names = [name for name, _ in self.job.parameters]
+        names = [name for name, _ in self.job.job.parameters]
         wanted: list[tuple[str, str, int, list[float]]] = []
         first = min(rows)
         box = self.job.job.pose_sets[first].box
@@ -186,7 +186,7 @@ class CertificateReport:
         Raises:
             WorkCancelledError: There is no time for more pictures.
         """
-        known = dict(zip((name for name, _ in self.job.parameters), values, strict=True))
+        known = dict(zip((name for name, _ in self.job.job.parameters), values, strict=True))
         pictures = self.job.pictures(frame)
         pose = np.array([known[name] for name in pictures.box.names])
         # of another scene of the set, maybe

@@ -218,7 +218,6 @@ class Certification:
         job: The scene and the sets, one by frame, as `Question.drawn` makes them.
         question: The property, with its network if it has one.
         memory: Bytes for the network's bounds of one process.
-        origin: File that the sets come from, for errors.
         network_arithmetic: Whether every float32 evaluation of the network is meant, or the exact one alone.
         picture: Whether the network is shown floats or pictures of 8 bits.
 
@@ -231,7 +230,6 @@ class Certification:
         job: Job,
         question: AnyQuestion,
         memory: int = MEMORY,
-        origin: Path | None = None,
         network_arithmetic: NetworkArithmetic = "float32",
         picture: Picture = "float",
     ) -> None:
@@ -266,14 +264,6 @@ class Certification:
         return Recipe(again, self.fingerprint, self.job.source.file)
 
     @property
-    def parameters(self) -> list[tuple[str, str]]:
-        """Names and units of all frames' parameters, in the order of boxes."""
-        units: dict[str, str] = {}
-        for poses in sorted(self.job.pose_sets, key=lambda p: -p.box.dimensions):
-            units |= {n: u for n, u in zip(poses.box.names, poses.box.units, strict=True) if n not in units}
-        return list(units.items())
-
-    @property
     def scenes(self) -> tuple[str, ...]:
         """That the set holds scenes besides poses, if it does."""
         if not any(poses.perturbation.scene for poses in self.job.pose_sets):
@@ -282,11 +272,6 @@ class Certification:
             "every pose stands for the images of all scenes of the set: each Gaussian that the key scene picks varies "
             "by itself; falsified cells name a pose and a scene",
         )
-
-    @property
-    def fixed(self) -> dict[int, dict[str, float]]:
-        """Values of parameters that do not vary, by frame."""
-        return {k: dict(poses.fixed) for k, poses in enumerate(self.job.pose_sets)}
 
     @property
     def assumptions(self) -> tuple[Assumption, ...]:
@@ -623,4 +608,4 @@ def open_certification(settings: CertifySettings) -> Certification:
         )  # fmt: skip
     except InputError as error:
         raise error.within(origin) if error.field and not error.field.startswith("--") else error from None
-    return Certification(job, question, settings.memory, origin, settings.network_arithmetic, settings.picture)
+    return Certification(job, question, settings.memory, settings.network_arithmetic, settings.picture)

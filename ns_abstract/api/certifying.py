@@ -60,7 +60,7 @@ def check_network_memory(found: Certification, limit: float | None, workers: int
     Raises:
         InputError: It does, about.
     """
-    found.question.check_memory(len(found.parameters), allowed_memory(limit) / (1 if found.job.rays else workers))
+    found.question.check_memory(len(found.job.parameters), allowed_memory(limit) / (1 if found.job.rays else workers))
 
 
 @dataclass(frozen=True)
@@ -103,7 +103,8 @@ class CertificateQuestion(CellQuestion[CertifyProgress]):
     def __init__(
         self, job: Certification, frames: Sequence[int], settings: Mapping[str, Any], command: tuple[str, ...]
     ) -> None:
-        super().__init__(job, job.parameters, {index: job.job.pose_sets[index].box for index in frames}, job.fixed)
+        sets = {index: job.job.pose_sets[index].box for index in frames}
+        super().__init__(job, job.job.parameters, sets, job.job.fixed)
         self.job, self.waits = job, not job.job.rays
         self.about = CertifiedRun(
             guarantee=job.job.method.guarantee,
@@ -364,7 +365,7 @@ def certificate(job: Certification, rows: Mapping[int, list[Row]], document: Map
         unknown=covered["unknown"],
         cells=tuple(cells),
         verdict=verdict(document["frames"]),
-        parameters=tuple(job.parameters),
+        parameters=tuple(job.job.parameters),
         sentence=job.property.sentence(),
         guarantee=short_guarantee(job.job.method.guarantee, document["scene"].get("bounded")),
         network_guarantee=tuple(document["network_guarantee"]),

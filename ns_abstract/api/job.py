@@ -117,6 +117,19 @@ class Job:
         """Whether what is known of a frame saves work on it; others are covered anew as a whole."""
         return self.rays
 
+    @property
+    def parameters(self) -> list[tuple[str, str]]:
+        """Names and units of all frames' parameters, in the order of boxes."""
+        units: dict[str, str] = {}
+        for poses in sorted(self.pose_sets, key=lambda p: -p.box.dimensions):
+            units |= {n: u for n, u in zip(poses.box.names, poses.box.units, strict=True) if n not in units}
+        return list(units.items())
+
+    @property
+    def fixed(self) -> dict[int, dict[str, float]]:
+        """Values of parameters that do not vary, by frame."""
+        return {k: dict(poses.fixed) for k, poses in enumerate(self.pose_sets)}
+
     # ---------------------------------------------------------------- memory
 
     @property

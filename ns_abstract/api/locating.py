@@ -77,7 +77,7 @@ class LocationQuestion(CellQuestion[LocateProgress]):
         self, job: Location, frames: Sequence[int], settings: Mapping[str, Any], command: tuple[str, ...]
     ) -> None:
         self.job = job
-        super().__init__(job, job.parameters, {k: job.search(k).frame.box for k in frames}, job.fixed)
+        super().__init__(job, job.job.parameters, {k: job.search(k).frame.box for k in frames}, job.job.fixed)
         self.about = LocatedRun(
             guarantee=job.job.method.guarantee,
             renderer=dict(job.job.method.program),
@@ -316,7 +316,7 @@ def located(job: Location, rows: Mapping[int, list[Row]], document: Mapping[str,
         best=document["best"],
         answer=document["answer"],
         cells=tuple(cells),
-        parameters=tuple(job.parameters),
+        parameters=tuple(job.job.parameters),
         guarantee=short_guarantee(job.job.method.guarantee, document["scene"].get("bounded")),
         state=document["state"],
         seconds=document["seconds"],

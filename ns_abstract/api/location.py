@@ -135,19 +135,6 @@ class Location:
         again = partial(_open, self.job.recipe.open, photo.levels, photo.counted, self.options)
         return Recipe(again, self.fingerprint, self.job.source.file)
 
-    @property
-    def parameters(self) -> list[tuple[str, str]]:
-        """Names and units of all frames' parameters, in the order of boxes."""
-        units: dict[str, str] = {}
-        for poses in sorted(self.job.pose_sets, key=lambda p: -p.box.dimensions):
-            units |= {n: u for n, u in zip(poses.box.names, poses.box.units, strict=True) if n not in units}
-        return list(units.items())
-
-    @property
-    def fixed(self) -> dict[int, dict[str, float]]:
-        """Values of parameters that do not vary, by frame."""
-        return {k: dict(poses.fixed) for k, poses in enumerate(self.job.pose_sets)}
-
 
 def _open(open_job: Callable[[], Job], levels: np.ndarray, counted: np.ndarray, options: PhotoOptions) -> Location:
     return Location(open_job(), levels, counted, options)

@@ -33,7 +33,7 @@ class _PoseRenderer:
 
     def __init__(self, job: Certification, cached: Callable[[int, np.ndarray], np.ndarray | None]) -> None:
         self._job, self._kept = job, cached
-        self._names = [name for name, _ in job.parameters]
+        self._names = [name for name, _ in job.job.parameters]
         self._frames: dict[int, tuple[FramePictures, Claim]] = {}
 
     def look(self, title: str, frame: int, values: Sequence[float]) -> PoseImage:

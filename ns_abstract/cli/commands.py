@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
@@ -73,22 +73,7 @@ class Render(GivenSet):
         Raises:
             InputError: Options do not go together.
         """
-        from ns_abstract.api.files import Settings
-
-        return Settings(
-            self.load_config,
-            self.camera_path_filename,
-            self.perturbation_filename,
-            downscale_factor=self.downscale_factor,
-            arithmetic=self.arithmetic,
-            seed=self.seed,
-            memory_limit=self.memory_limit,
-            workers=self.where.ray_processes,
-            given_set=given_set(self),
-            outputs=self.outputs,
-            program=self.program,
-            overrides=self.overrides,
-        )
+        return _files(self, seed=self.seed, outputs=self.outputs)
 
 
 @dataclass
@@ -219,21 +204,7 @@ class Compare(GivenSet):
         Raises:
             InputError: Options do not go together.
         """
-        from ns_abstract.api.files import Settings
-
-        return Settings(
-            self.load_config,
-            self.camera_path_filename,
-            self.perturbation_filename,
-            downscale_factor=self.downscale_factor,
-            arithmetic=self.arithmetic,
-            seed=self.seed,
-            memory_limit=self.memory_limit,
-            workers=self.where.ray_processes,
-            given_set=given_set(self),
-            program=self.program,
-            overrides=self.overrides,
-        )
+        return _files(self, seed=self.seed)
 
     @property
     def other_source(self) -> SceneSource:
@@ -306,20 +277,30 @@ class Locate(GivenSet):
         Raises:
             InputError: Options do not go together.
         """
-        from ns_abstract.api.files import Settings
         from ns_abstract.api.location import LocateSettings, PhotoOptions
 
-        files = Settings(
-            self.load_config,
-            self.camera_path_filename,
-            self.perturbation_filename,
-            downscale_factor=self.downscale_factor,
-            arithmetic=self.arithmetic,
-            memory_limit=self.memory_limit,
-            workers=self.where.ray_processes,
-            given_set=given_set(self),
-            program=self.program,
-            overrides=self.overrides,
-        )
         photo = PhotoOptions(self.noise, self.outliers, not self.no_contraction)
-        return LocateSettings(files, self.image, self.mask, photo)
+        return LocateSettings(_files(self), self.image, self.mask, photo)
+
+
+def _files(options: Render | Compare | Locate, **more: Any) -> Settings:
+    """The files of a command, and what is bounded of them.
+
+    Raises:
+        InputError: Options do not go together.
+    """
+    from ns_abstract.api.files import Settings
+
+    return Settings(
+        options.load_config,
+        options.camera_path_filename,
+        options.perturbation_filename,
+        downscale_factor=options.downscale_factor,
+        arithmetic=options.arithmetic,
+        memory_limit=options.memory_limit,
+        workers=options.where.ray_processes,
+        given_set=given_set(options),
+        program=options.program,
+        overrides=options.overrides,
+        **more,
+    )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from contextlib import ExitStack
 from typing import TYPE_CHECKING, Any
 
@@ -13,18 +12,14 @@ from ns_abstract.api.comparing import ComparisonJob, check_comparison, open_comp
 from ns_abstract.api.compiling import compile_beside
 from ns_abstract.api.job import check_frames, platform_problems
 from ns_abstract.cli.common import SignalStop, plain_console
-from ns_abstract.cli.options import stated
+from ns_abstract.cli.frames import run_record, seconds_of, tell_missing, tell_problems
 from ns_abstract.io.folder import claim
 from ns_abstract.report.comparison import ComparisonReport
 from ns_abstract.report.figures import listed, number
 from ns_abstract.report.progress import ProgressBar, ShownProgress
-from ns_abstract.report.record import RunRecord, failed_self_check
 
 if TYPE_CHECKING:
     from ns_abstract.cli.commands import Compare
-
-#: Seconds by frame where no time budget is given.
-_SECONDS_BY_FRAME = 60.0
 
 
 def compare_path(options: Compare, stop: SignalStop) -> bool:
@@ -43,16 +38,13 @@ def compare_path(options: Compare, stop: SignalStop) -> bool:
         stack.enter_context(claim(folder))
         workers = bounding.local_workers(job) if options.where.engine == "dask" else 1
         engine = stack.enter_context(options.where.started(workers))
-        run = _run_record(job, options, frames, problems)
+        run = run_record("ns-abstract-compare", job, options, frames, problems)
         report = ComparisonReport(folder, run, job.pictures, options.tolerance, keep_stored=options.resume)
-        for problem in problems:
-            console.print(f"warning: {problem}", markup=False)
-        for reason in report.ignored:
-            console.print(f"not used: {reason}", markup=False)
+        tell_problems(console, report, problems)
         _introduce(console, job, report)
         stack.enter_context(stop.last_words(report.interrupted))
         pending = report.pending
-        budget = options.time_budget if options.time_budget is not None else _SECONDS_BY_FRAME * max(1, len(pending))
+        budget = seconds_of(options, pending)
         try:
             if pending and options.where.engine == "local":
                 with stop.at_once():
@@ -74,32 +66,11 @@ def compare_path(options: Compare, stop: SignalStop) -> bool:
         finally:
             # also after a failure: what is finished is written
             document = report.finish("interrupted" if stop() else "budget" if report.missing else "done")
-    if report.missing:
-        console.print(
-            f"no bounds yet for frames {listed(report.missing)}: raise --time-budget, --resume", soft_wrap=True
-        )
-    elif options.tolerance is not None:
+    tell_missing(console, report)
+    if not report.missing and options.tolerance is not None:
         console.print(f"{document['verdict']}: tolerance {number(options.tolerance)}", markup=False)
     console.print(f"report: {folder / 'report.html'}", markup=False, soft_wrap=True)
     return not report.missing
-
-
-def _run_record(job: ComparisonJob, options: Compare, frames: tuple[int, ...], problems: tuple[str, ...]) -> RunRecord:
-    """What the report says about the command; ``problems`` of the platform take the guarantee away."""
-    camera = job.pose_sets[0].camera
-    return RunRecord(
-        guarantee="sampled" if problems else job.method.guarantee,
-        renderer=job.method.program,
-        scene=job.describe(),
-        assumptions=job.assumptions,
-        frames=frames,
-        fingerprint=job.fingerprint,
-        settings=stated(options),
-        plan=job.plan,
-        command=("ns-abstract-compare", *sys.argv[1:]),
-        limits=tuple(map(failed_self_check, problems)),
-        size=(camera.height, camera.width),
-    )
 
 
 def _introduce(console: Console, job: ComparisonJob, report: ComparisonReport) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import sys
 from contextlib import ExitStack
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -12,41 +11,22 @@ from rich.console import Console
 from ns_abstract.api import bounding
 from ns_abstract.api.compiling import compile_beside
 from ns_abstract.api.explaining import check_explained, explain
-from ns_abstract.api.files import PathJob, open_job
+from ns_abstract.api.files import open_job
 from ns_abstract.api.job import Job, check_frames, platform_problems
 from ns_abstract.cli.common import SignalStop, plain_console
-from ns_abstract.cli.options import stated
+from ns_abstract.cli.frames import run_record, seconds_of, tell_missing, tell_problems
 from ns_abstract.execution.engines import Engine
 from ns_abstract.io.folder import claim
 from ns_abstract.refine.result import Leaves
 from ns_abstract.report.figures import listed
 from ns_abstract.report.progress import ProgressBar
-from ns_abstract.report.record import Report, RunRecord, failed_self_check
+from ns_abstract.report.record import Report
 
 if TYPE_CHECKING:
     from ns_abstract.cli.commands import Render
 
-#: Seconds by frame where no time budget is given.
-_SECONDS_BY_FRAME = 60.0
 #: Bytes of linear sets by frame up to which they are stored without --save-cells, and cells that a small frame takes.
 _SMALL_LEAVES, _USUAL_CELLS = 8 << 20, 16
-
-
-def make_run(job: PathJob, options: Render, frames: tuple[int, ...], problems: tuple[str, ...]) -> RunRecord:
-    """What the report says about the command; ``problems`` of the platform take the guarantee away."""
-    return RunRecord(
-        guarantee="sampled" if problems else job.method.guarantee,
-        renderer=job.method.program,
-        scene=job.describe(),
-        assumptions=job.assumptions,
-        frames=frames,
-        fingerprint=job.fingerprint,
-        settings=stated(options),
-        plan=job.plan,
-        command=("ns-abstract-render", *sys.argv[1:]),
-        limits=tuple(map(failed_self_check, problems)),
-        size=(job.path.cameras[0].height, job.path.cameras[0].width),
-    )
 
 
 def render_path(options: Render, stop: SignalStop) -> bool:
@@ -69,19 +49,13 @@ def render_path(options: Render, stop: SignalStop) -> bool:
         # frames follow one another in this process; a NeRF has processes of its own
         workers = bounding.local_workers(job) if options.where.engine == "dask" else 1
         engine = stack.enter_context(options.where.started(workers))
-        run = make_run(job, options, frames, problems)
+        run = run_record("ns-abstract-render", job, options, frames, problems)
         report = (Report.resume if options.resume else Report)(folder, run)
-        for problem in problems:
-            console.print(f"warning: {problem}", markup=False)
-        for reason in report.ignored:
-            console.print(f"not used: {reason}", markup=False)
+        tell_problems(console, report, problems)
         _introduce(console, job, report)
         stack.enter_context(stop.last_words(report.interrupted))
         _fill(report, job, options, engine, stop, console)
-    if report.missing:
-        console.print(
-            f"no bounds yet for frames {listed(report.missing)}: raise --time-budget, --resume", soft_wrap=True
-        )
+    tell_missing(console, report)
     console.print(f"report: {folder / 'report.html'}", markup=False, soft_wrap=True)
     return not report.missing
 
@@ -91,7 +65,7 @@ def _fill(report: Report, job: Job, options: Render, engine: Engine, stop: Signa
     # a frame without bounds comes before one that could be tighter
     missing = set(report.missing)
     pending = sorted(report.pending, key=lambda index: index not in missing)
-    budget = options.time_budget if options.time_budget is not None else _SECONDS_BY_FRAME * max(1, len(pending))
+    budget = seconds_of(options, pending)
     small = bool(pending) and _leaf_bytes(job, pending[0]) * _USUAL_CELLS <= _SMALL_LEAVES
     try:
         if pending and options.where.engine == "local":

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ns_abstract.io.errors import InputError, first_line
+from ns_abstract.io.jsonio import read_bytes
 
-#: Most pixels of a photo.
-_MOST_PIXELS = 1 << 26
+#: Most pixels of a photo or a mask, and most bytes of a mask of greys.
+_MOST_PIXELS, _MOST_MASK_BYTES = 1 << 26, 64 << 20
+#: Grey level of 255 from which on a pixel of such a mask is white.
+_WHITE = 128
 #: Formats that hold values without loss of meaning: a .jpg's compression is noise like others.
 _FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "PPM")
 
@@ -55,6 +59,28 @@ def read_mask(file: Path, size: tuple[int, int], field: str = "--mask") -> np.nd
             fix="write white where pixels count and black elsewhere",
         )  # fmt: skip
     return white
+
+
+def read_grey_mask(file: Path) -> np.ndarray:
+    """Return [H, W] bool: the white pixels of a .png.
+
+    Raises:
+        InputError: It cannot be read, or is no .png.
+    """
+    from PIL import Image
+
+    data = read_bytes(file, "mask", _MOST_MASK_BYTES)
+    try:
+        with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
+            width, height = image.size
+            if width * height > _MOST_PIXELS:
+                raise InputError(f"{width} x {height} pixels", file=file, fix="give a mask of the picture's size")
+            return np.asarray(image.convert("L")) >= _WHITE
+    except InputError:
+        raise
+    except Exception as error:  # Pillow raises many types on damaged files
+        text = " ".join(str(error).split())[:120] or type(error).__name__
+        raise InputError(f"no .png: {text}", file=file, fix="write a .png, white where pixels count") from None
 
 
 def _opened(file: Path, field: str) -> Any:

@@ -23,7 +23,7 @@ from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import ImageSets, Network, load_network
 from ns_abstract.verify.network.onnx_tensors import parse_model
-from ns_abstract.verify.vnnlib2 import write_query
+from ns_abstract.verify.vnnlib2 import violation, write_query
 
 Form = Literal["slice", "gemm"]
 #: Version of VNN-LIB that is written.
@@ -176,9 +176,5 @@ def _vnnlib(d: int, n: int, groups: Sequence[Sequence[int]], k: int, notes: Sequ
     lines = [f"; {note}" for note in notes]
     lines += [f"(declare-const X_{i} Real)" for i in range(d + n)]
     lines += [f"(declare-const Y_{i} Real)" for i in range(k)]
-    for i in range(d + n):
-        lines += [f"(assert (>= X_{i} -1.0))", f"(assert (<= X_{i} 1.0))"]
-    lines.append("(assert (or")
-    lines += ["    (and " + " ".join(f"(<= Y_{i} 0.0)" for i in group) + ")" for group in groups]
-    lines.append("))")
+    lines += violation("X_{}", "Y_{}", d + n, groups)
     return "\n".join(lines) + "\n"

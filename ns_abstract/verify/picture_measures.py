@@ -17,7 +17,7 @@ import torch
 
 from ns_abstract.arithmetic.network_charges import OWN_MARGIN
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.images import read_mask
+from ns_abstract.io.photos import read_grey_mask
 from ns_abstract.refine.protocol import WeightPlane
 
 #: What a measure is read off: the picture's colours, its expected depths, or weights.
@@ -65,7 +65,7 @@ class Region:
         """
         chosen = np.ones((height, width), bool)
         if self.mask is not None:
-            chosen = read_mask(self.mask)
+            chosen = read_grey_mask(self.mask)
             if chosen.shape != (height, width):
                 raise InputError(
                     f"the mask has {chosen.shape[1]} x {chosen.shape[0]} pixels, the picture {width} x {height}",

@@ -287,9 +287,21 @@ def write_query(d: int, n: int, groups: Sequence[Sequence[int]], k: int, notes: 
     """
     lines = ["(vnnlib-version <2.0>)", *(f"; {note}" for note in notes)]
     lines += [f"(declare-network f (declare-input X float32 [1,{d + n}]) (declare-output Y float32 [1,{k}]))"]
-    for i in range(d + n):
-        lines += [f"(assert (>= X[0,{i}] -1.0))", f"(assert (<= X[0,{i}] 1.0))"]
-    lines.append("(assert (or")
-    lines += ["    (and " + " ".join(f"(<= Y[0,{i}] 0.0)" for i in group) + ")" for group in groups]
-    lines.append("))")
+    lines += violation("X[0,{}]", "Y[0,{}]", d + n, groups)
     return "\n".join(lines) + "\n"
+
+
+def violation(source: str, result: str, count: int, groups: Sequence[Sequence[int]]) -> list[str]:
+    """The assertions that ``count`` inputs lie in [-1, 1] and that a group of outputs is <= 0, in either version.
+
+    Args:
+        source, result: Names of an input and of an output, with {} for the number.
+        count: Of the inputs.
+        groups: Numbers of the outputs of each group.
+    """
+    lines = []
+    for name in map(source.format, range(count)):
+        lines += [f"(assert (>= {name} -1.0))", f"(assert (<= {name} 1.0))"]
+    lines.append("(assert (or")
+    lines += ["    (and " + " ".join(f"(<= {result.format(i)} 0.0)" for i in group) + ")" for group in groups]
+    return [*lines, "))"]
