@@ -677,6 +677,8 @@ def test_report(planted: Case, finished: Path) -> None:
     assert document["property"]["type"] == "classification"
     (frame,) = document["frames"]
     assert frame["parameters"] == [{"name": "x", "unit": "normalised units", "lower": -0.15, "upper": 0.15}]
+    assert frame["intrinsics"] == planted.job.job.pose_sets[0].camera.intrinsics._asdict()
+    assert (frame["intrinsics"]["width"], frame["intrinsics"]["height"]) == (SIZE, SIZE)
     assert frame["least_margin"] > 0.0 and frame["counterexamples"][0]["margin"] <= 0.0
     assert frame["counterexamples"][0]["values"].keys() == {"x"}
     volumes = dict.fromkeys(("certified", "falsified", "unknown"), 0.0)

@@ -26,6 +26,7 @@ from ns_abstract.api.files import Settings, open_job
 from ns_abstract.cli import demo as demo_command
 from ns_abstract.cli import render as render_command
 from ns_abstract.cli.common import complaint
+from ns_abstract.geometry.camera_path import load_camera_path
 from ns_abstract.geometry.keyframe_cameras import KeyframeCamera, path_json
 from ns_abstract.io.atomic import write_json
 from ns_abstract.io.folder import MARK
@@ -452,6 +453,8 @@ def test_other_renderers(
     document = report(tmp_path)
     assert (document["guarantee"], document["renderer"]["name"]) == (guarantee, name)
     assert document["frames"][0]["ratio"] <= 1.05
+    camera = load_camera_path(blobs.path).cameras[1]
+    assert document["frames"][0]["intrinsics"] == camera.intrinsics._asdict()
     check_samples(blobs, tmp_path, 1, **options)
 
 

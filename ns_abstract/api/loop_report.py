@@ -159,6 +159,7 @@ class LoopReport:
                 "network_guarantee": job.network.guarantee(job.model.arithmetic),
                 "renderer": {name: program[name] for name in ("name", "version")},
                 "scene": scene,
+                "intrinsics": job.job.pose_sets[0].camera.intrinsics._asdict(),
                 "assumptions": [vars(entry) for entry in job.assumptions],
                 "model": file_stamp(loop.network),
                 "loop": loop.value,

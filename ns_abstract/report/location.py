@@ -193,6 +193,7 @@ def _frame(
         best = {"pose": pose, "outliers": found[0].outliers, "camera_to_world": matrix}
     return {
         "index": index,
+        "intrinsics": poses.camera.intrinsics._asdict(),
         "parameters": [
             {"name": name, "unit": unit, "lower": known[name][0], "upper": known[name][1]} for name, unit in parameters
         ],

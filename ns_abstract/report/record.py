@@ -10,7 +10,7 @@ import os
 import platform
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -194,6 +194,7 @@ class RunRecord:
         limits: Further conditions on the guarantee, one sentence each.
         size: Height and width of the pictures; None: any that stored frames have.
         assumptions: What the bounds rest on, and where each choice came from.
+        intrinsics: By frame the pictures' `Intrinsics`.
     """
 
     guarantee: str
@@ -207,6 +208,7 @@ class RunRecord:
     limits: tuple[str, ...] = ()
     size: tuple[int, int] | None = None
     assumptions: tuple[Assumption, ...] = ()
+    intrinsics: Mapping[int, Mapping[str, float]] = field(default_factory=dict)
 
 
 def _leaves_of(value: Any, path: str = "") -> dict[str, Any]:
@@ -594,6 +596,7 @@ class Report:
         """The content of report.json (contract, version 1)."""
         run = self.run
         name = str(run.renderer.get("name", ""))
+        beside = {"intrinsics": run.intrinsics, "explanation": self._explained}
         written = {file for entry in self._entries.values() for file in entry["files"].values()}
         return plain(
             {
@@ -606,7 +609,7 @@ class Report:
                 "assumptions": [vars(entry) for entry in run.assumptions],
                 "plan": run.plan,
                 "frames": [
-                    self._entries[k] | ({"explanation": why} if (why := self._explained.get(k)) else {})
+                    self._entries[k] | {name: value for name, about in beside.items() if (value := about.get(k))}
                     for k in sorted(self._entries)
                 ],
                 "frames_asked": run.frames,
