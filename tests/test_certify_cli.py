@@ -665,6 +665,7 @@ def test_cluster_on_this_machine_keeps_torch_quick() -> None:
 # ---------------------------------------------------------------- reports
 
 
+@pytest.mark.slow
 def test_report(planted: Case, finished: Path) -> None:
     document = report(finished)
     for key in (

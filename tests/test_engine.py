@@ -268,6 +268,7 @@ def test_only_a_cover_that_may_reach_the_goal_is_allowed_to_be_looser() -> None:
             assert 0.0 < before[0] <= (ratio - 1.0) * after_cover(result).mpg_witness
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dimensions", [1, 2])
 def test_trace_begins_with_the_first_cells(dimensions: int) -> None:
     """A set that is not covered yet has nothing but [0, 1], however tight the cells so far are."""

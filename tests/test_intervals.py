@@ -157,6 +157,7 @@ def test_parts_cover_the_cell(counts):
         assert ((low <= place) & (place <= high)).all(axis=1).any()
 
 
+@pytest.mark.slow
 def test_more_parts_say_more():
     """Parts of parts are never worse, and with many of them hardly more is left than what poses show."""
     pixel = _Pixel((2, 2, 2), 24, 1, 0.5)
@@ -178,6 +179,7 @@ def test_more_parts_say_more():
     assert widths[2].mean() < 1.3 * np.ptp(seen, axis=0).mean()
 
 
+@pytest.mark.slow
 def test_slopes_tell_what_varies():
     """The slope of a parameter that moves things more is larger, and 0 for one whose axis is not divided."""
     pixel = _Pixel((4, 2, 1), 8, 2, 0.1)

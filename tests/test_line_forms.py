@@ -65,6 +65,7 @@ def test_pairs(name, size):
     assert same(result, kernel(a, b))
 
 
+@pytest.mark.slow_cases(every=3)
 @pytest.mark.parametrize("size", ["plain", "exact", "narrow", "constant", "uncertain"])
 @pytest.mark.parametrize("name", SINGLE)
 def test_functions(name, size):

@@ -401,6 +401,7 @@ def _two_layers(front, behind, radius=0.0, bounds=None):
     return t.reshape(-1, 4)[:m, 0], out[0], out[4], out[8]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("straight", [0.0, 0.1])
 def test_curvatures_of_two_layers(straight):
     """Whatever products of parameters two alphas bend by, also where they never bend together (B10)."""

@@ -168,6 +168,7 @@ def test_killed_write(tmp_path):
     assert os.listdir(tmp_path) == ["report.json"]
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_damaged(tmp_path, data):
@@ -457,6 +458,7 @@ def test_curves_begin_where_something_is_known():
     assert [p["seconds"] for p in page._seen(entry_of(never_seen)["trace"])] == [3.0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("witness", "kind"), [(0.97, "good"), (0.3, "fair")])
 def test_only_tight_bounds_are_green(tmp_path, witness, kind):
     report = Report(tmp_path, run(frames=(0,)))

@@ -134,6 +134,7 @@ def damaged(value: Any) -> Iterator[Any]:
     yield from walk(copy.deepcopy(value), lambda new: new)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", EXAMPLES)
 def test_what_the_reader_takes_the_schema_takes(kind: str, folder: Path) -> None:
     refused = noticed = 0

@@ -93,6 +93,7 @@ def test_fingerprint_of_images_and_numbers_of_rules(blobs: Inputs) -> None:
     assert certification._RULES > 4 and loop_job._RULES > 1
 
 
+@pytest.mark.slow
 @others
 def test_render_is_not_resumed(name: str, blobs: Inputs, tmp_path: Path, in_process: InProcess) -> None:
     write_results(blobs, tmp_path / "out", OTHERS[name])
@@ -122,6 +123,7 @@ def test_same_version_is_resumed_and_exported(blobs: Inputs, tmp_path: Path, in_
     assert Report.resume(tmp_path / "out", run).kept == [0]
 
 
+@pytest.mark.slow_cases(every=5)
 @others
 @pytest.mark.parametrize("kind", ["npz", "png"])
 def test_results_are_not_exported(kind: str, name: str, blobs: Inputs, tmp_path: Path, in_process: InProcess) -> None:

@@ -141,6 +141,7 @@ SINGLE = {
 }
 
 
+@pytest.mark.slow_cases(every=8)
 @pytest.mark.parametrize("basis", BASES, ids=str)
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("name", PAIRS)
