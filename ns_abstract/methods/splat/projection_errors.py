@@ -25,6 +25,7 @@ from numba import njit
 
 from ns_abstract.arithmetic.rounding import (
     COMPENSATION_ROUNDING,
+    COVARIANCE_ERROR,
     ELLIPSE_ERROR,
     ELLIPSE_SHARPNESS,
     ELLIPSE_SPAN,
@@ -431,6 +432,8 @@ def compensations(s, n, rules, charges):
         a, c = (a + move_x) * (a + move_x), (c + move_y) * (c + move_y)
         error = c * error_a + a * error_c + 2.0 * np.sqrt(a * c) * error_b + error_a * error_c + error_b * error_b
         error = SECOND_ORDER * (error + charges.determinant * (a + error_a) * (c + error_c) + flush) / det
+        # the least factor of the determinant; G7's where that is known
+        remains = max(1.0 - spread, (1.0 - s[ETA + q]) ** 2) if s[ETA + q] < COVARIANCE_ERROR else 1.0 - spread
         # the square of the compensation lies in [0, 1]; bounds that are no numbers say nothing
         low = s[SQLO + q] if s[SQLO + q] > 0.0 else 0.0
         high = s[SQHI + q] if s[SQHI + q] < 1.0 else 1.0
@@ -438,10 +441,10 @@ def compensations(s, n, rules, charges):
         bottom = max(0.0, low_root * (1.0 - ROOT_ROUNDING) - moved)
         bottom = np.sqrt(max(0.0, bottom * bottom - error) / (1.0 + spread)) * shrink
         top = high_root * (1.0 + ROOT_ROUNDING) + moved
-        top = np.sqrt((top * top + error) / (1.0 - spread)) * grow
+        top = np.sqrt((top * top + error) / remains) * grow
         change = (moved * (2.0 * low_root + moved) + error) / low
         # 1.6.0 has a least factor
-        formed = (low > _LEAST_SQUARE) & (change < 0.25) & (0.45 * low > least * least)
+        formed = (low > _LEAST_SQUARE) & (change < 0.25) & (spread < 0.5) & (0.45 * low > least * least)
         bottom = max(bottom, least * (1.0 - charges.compensation))
         top = max(top, least * (1.0 + charges.compensation))
         s[CTOP + q] = top if top < np.inf else np.inf
@@ -551,7 +554,7 @@ def _tile_ranges(s, n, rules, camera, charges):
         top, bottom = mean_y_low - radius_high - snap_y, mean_y_high + radius_high + snap_y
         # a place that is not finite is no number in some of these
         placed = front & (right - left < np.inf) & (bottom - top < np.inf)
-        bounded = placed & (cut | (room > 0.0))
+        bounded = placed & (rules.view_margin >= 0.0)
         # image-border culls of fully_fused_projection_fwd.cu:171-180
         gone = bounded & ((right <= 0.0) | (left >= width) | (bottom <= 0.0) | (top >= height))
         # the tiles of an ellipse come from the conic, which may be wrong by any amount
@@ -590,10 +593,10 @@ def _opacities(s, n, rules, charges):
         det = s[DET + q]
         finite = s[FINITE + q] != 0.0
         # G7: relative error of the exponent
-        sharp_enough = (s[FRONT + q] != 0.0) & (det > 0.0) & (s[EDET + q] < 0.5 * det)
         kappa = s[ETA + q]
-        region_is_known = (s[PLACED + q] != 0.0) & sharp_enough & (kappa < 0.25)
-        kappa = kappa * (1.0 + 4.0 * kappa)
+        sharp_enough = (s[FRONT + q] != 0.0) & (det > 0.0) & ((s[EDET + q] < 0.5 * det) | (kappa < COVARIANCE_ERROR))
+        region_is_known = (s[PLACED + q] != 0.0) & sharp_enough & (kappa < COVARIANCE_ERROR)
+        kappa = kappa * (1.0 + 2.0 * kappa)
         lower = s[OPLOW + q] * (1.0 - charges.opacity)
         upper = s[OPHIGH + q] * (1.0 + charges.opacity)
         limit = s[OPLIMIT + q]
