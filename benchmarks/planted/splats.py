@@ -170,17 +170,17 @@ SPLATS = (
     Fault(
         "a ratio's slope has the wrong sign",
         _LINE_PROJECTION,
-        "project_line",
-        "n00 = _lowered(_rotated(r0, b0, b1, b2, still, 0.0, 0.0), u, deep)",
-        "n00 = _lowered(_rotated(r0, b0, b1, b2, still, 0.0, 0.0), u._replace(slope=-u.slope), deep)",
+        "_seen_axis",
+        "n0 = _lowered(_rotated(rows[0], x, y, z, still, 0.0, 0.0), u, deep)",
+        "n0 = _lowered(_rotated(rows[0], x, y, z, still, 0.0, 0.0), u._replace(slope=-u.slope), deep)",
         "test_bounds.py::test_needle[2]",
     ),
     Fault(
         "the vertical ratio's slope has the wrong sign",
         _LINE_PROJECTION,
-        "project_line",
-        "n10 = _lowered(_rotated(r1, b0, b1, b2, still, 0.0, 0.0), v, deep)",
-        "n10 = _lowered(_rotated(r1, b0, b1, b2, still, 0.0, 0.0), v._replace(slope=-v.slope), deep)",
+        "_seen_axis",
+        "n1 = _lowered(_rotated(rows[1], x, y, z, still, 0.0, 0.0), v, deep)",
+        "n1 = _lowered(_rotated(rows[1], x, y, z, still, 0.0, 0.0), v._replace(slope=-v.slope), deep)",
         "test_bounds.py::test_needle[2]",
     ),
     Fault(
