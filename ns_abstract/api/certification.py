@@ -33,7 +33,7 @@ from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.refine.protocol import Frame, Method, RayFrame
-from ns_abstract.report.record import file_stamp
+from ns_abstract.report.run import file_stamp
 from ns_abstract.verify.camera_response import CameraResponse
 from ns_abstract.verify.cells import Cell, CellGrid, initial_divisions
 from ns_abstract.verify.eight_bit import Picture
