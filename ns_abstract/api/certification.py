@@ -32,7 +32,7 @@ from ns_abstract.io.jsonio import show
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.perturbation.specification import Perturbation
-from ns_abstract.refine.protocol import Frame, Method, RayFrame
+from ns_abstract.refine.protocol import Method, RayFrame
 from ns_abstract.report.run import file_stamp
 from ns_abstract.verify.camera_response import CameraResponse
 from ns_abstract.verify.cells import Cell, CellGrid, initial_divisions
@@ -492,10 +492,6 @@ class Certification:
                 field="--time-budget",
                 fix="give more, a smaller network or picture, fewer --num-samples, or declare an --occupancy-grid",
             )
-
-    def search_frame(self, index: int) -> Frame:
-        """The frame whose bounds the search of ``index`` will use."""
-        return self.search(index, self.grid(index)).scene.frame  # pyright: ignore[reportAttributeAccessIssue]
 
     def write_vnnlib(
         self, index: int, box: ParameterBox, target: Path, form: Form, version: LibraryVersion = "1.0"
