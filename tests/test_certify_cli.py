@@ -622,7 +622,7 @@ def test_two_dask_workers_equal_one_process(planted: Case, finished: Path, tmp_p
 @pytest.mark.slow
 @needs_dask
 def test_dask_worker_killed(planted: Case, finished: Path, tmp_path: Path) -> None:
-    from ns_abstract.execution.engines import Cluster, connected
+    from ns_abstract.execution.cluster import Cluster, connected
     from ns_abstract.verify.store import Store
 
     job = planted.job
@@ -653,7 +653,7 @@ def test_dask_worker_killed(planted: Case, finished: Path, tmp_path: Path) -> No
 @pytest.mark.slow
 @needs_dask
 def test_cluster_on_this_machine_keeps_torch_quick() -> None:
-    from ns_abstract.execution.engines import connected
+    from ns_abstract.execution.cluster import connected
 
     with connected(None, 1) as client:
         (found,) = client.run(lambda: os.environ.get("MALLOC_TRIM_THRESHOLD_")).values()

@@ -287,7 +287,7 @@ if __name__ == "__main__":
 
 
 UNGUARDED_CLUSTER = """
-from ns_abstract.execution.engines import connected
+from ns_abstract.execution.cluster import connected
 from ns_abstract.io.errors import InputError
 try:
     with connected(None, 1):
