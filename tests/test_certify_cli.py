@@ -31,12 +31,7 @@ from waiting import LONG, until
 
 from ns_abstract.api import showing
 from ns_abstract.api.cell_search import examine_block
-from ns_abstract.api.certification import (
-    Certification,
-    CertifySettings,
-    FramePictures,
-    open_certification,
-)
+from ns_abstract.api.certification import Certification, CertifySettings, FramePictures, open_certification
 from ns_abstract.api.showing import look_closer
 from ns_abstract.cli import certify as certify_command
 from ns_abstract.cli.certify import Certify, certify

@@ -24,15 +24,7 @@ from ns_abstract.arithmetic.simd.intrinsics import advanced, lowest_bit, signed
 from ns_abstract.arithmetic.simd.lanes import maximum, minimum, store
 from ns_abstract.methods.splat.blend import blend_quadratic, blend_several, flattened, form_range
 from ns_abstract.methods.splat.lists import BLOCK
-from ns_abstract.methods.splat.pixel_block import (
-    ALPHA_HIGH,
-    FORM,
-    OPEN,
-    RHO,
-    color_ends,
-    color_size,
-    listed_fragment,
-)
+from ns_abstract.methods.splat.pixel_block import ALPHA_HIGH, FORM, OPEN, RHO, color_ends, color_size, listed_fragment
 
 #: Lanes of accumulation and depth.
 _SUM, DEPTH = 0, 3
