@@ -31,12 +31,7 @@ from waiting import LONG, until
 
 from ns_abstract.api import showing
 from ns_abstract.api.cell_search import examine_block
-from ns_abstract.api.certification import (
-    Certification,
-    CertifySettings,
-    FramePictures,
-    open_certification,
-)
+from ns_abstract.api.certification import Certification, CertifySettings, FramePictures, open_certification
 from ns_abstract.api.showing import look_closer
 from ns_abstract.cli import certify as certify_command
 from ns_abstract.cli.certify import Certify, certify
@@ -622,7 +617,7 @@ def test_two_dask_workers_equal_one_process(planted: Case, finished: Path, tmp_p
 @pytest.mark.slow
 @needs_dask
 def test_dask_worker_killed(planted: Case, finished: Path, tmp_path: Path) -> None:
-    from ns_abstract.execution.engines import Cluster, connected
+    from ns_abstract.execution.cluster import Cluster, connected
     from ns_abstract.verify.store import Store
 
     job = planted.job
@@ -653,7 +648,7 @@ def test_dask_worker_killed(planted: Case, finished: Path, tmp_path: Path) -> No
 @pytest.mark.slow
 @needs_dask
 def test_cluster_on_this_machine_keeps_torch_quick() -> None:
-    from ns_abstract.execution.engines import connected
+    from ns_abstract.execution.cluster import connected
 
     with connected(None, 1) as client:
         (found,) = client.run(lambda: os.environ.get("MALLOC_TRIM_THRESHOLD_")).values()

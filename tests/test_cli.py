@@ -733,9 +733,9 @@ def test_worker_with_other_files_is_refused(blobs: Inputs, tmp_path: Path) -> No
 def test_no_scheduler_at_the_address(
     blobs: Inputs, tmp_path: Path, call: Callable[..., tuple[int, str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from ns_abstract.execution import engines
+    from ns_abstract.execution import cluster
 
-    monkeypatch.setattr(engines, "_CONNECT", "1s")
+    monkeypatch.setattr(cluster, "_CONNECT", "1s")
     options = blobs.options(tmp_path / "out", engine="dask", scheduler_address="127.0.0.1:1")
     one_line(*call(options), "--scheduler-address", "127.0.0.1:1", "dask scheduler")
 

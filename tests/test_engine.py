@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -159,8 +160,8 @@ class Waves:
         return self.pace * (np.array(box.upper) - np.array(box.lower))
 
 
-def refine(frame: Any, goal: RefinementGoal, **options: Any) -> FrameResult:
-    return Refinement(frame, 0, goal, **options).run()
+def refine(frame: Any, goal: RefinementGoal, keep_leaves: bool = False, **options: Any) -> FrameResult:
+    return Refinement(frame, 0, replace(goal, keep_leaves=keep_leaves), **options).run()
 
 
 def check(frame: Waves, result: FrameResult) -> None:

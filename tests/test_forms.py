@@ -24,10 +24,10 @@ from oracle import (
     weights,
 )
 
+from ns_abstract.arithmetic.form_array import FormArray
 from ns_abstract.arithmetic.forms import (
     MAX_DIMENSIONS,
     Basis,
-    FormArray,
     add_product,
     add_square,
     clamp_below,

@@ -12,7 +12,7 @@ from conftest import blob_scene
 from gsplat_kernels import Kernels, Unavailable, library
 from scene_attacks import bound_cells
 
-from ns_abstract.bench.stiff import all_cases
+from ns_abstract.bench.stiff_cases import all_cases
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.keyframe_cameras import look_at
 from ns_abstract.geometry.poses import PoseBox

@@ -12,6 +12,7 @@ from test_bounds import Case, moves, scene
 
 from ns_abstract.arithmetic.rounding import FLOAT32, REAL, UNIT64, charges
 from ns_abstract.arithmetic.simd.intrinsics import pointer
+from ns_abstract.methods.splat.block_buffers import block_of, new_buffers
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, raster_rules
 from ns_abstract.methods.splat.frame import SplatFrame
@@ -19,12 +20,10 @@ from ns_abstract.methods.splat.intervals import blend_parts
 from ns_abstract.methods.splat.pixel_block import (
     ALPHA_HIGH,
     EXPONENT,
-    block_of,
     color_ends,
     color_size,
     exponent_ends,
     fragment_width,
-    new_buffers,
     set_unknown,
 )
 from ns_abstract.methods.splat.stage_data import FormShape, Parts, PixelInputs, cell_parts, shared_out

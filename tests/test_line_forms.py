@@ -8,7 +8,8 @@ from oracle import between, escapes, points, random_forms, rational, value, weig
 from test_forms import BINARY, LANES, POSITIVE, SIZES, layout
 
 from ns_abstract.arithmetic import line_forms
-from ns_abstract.arithmetic.forms import Basis, FormArray, clamp_below, set_norms
+from ns_abstract.arithmetic.form_array import FormArray
+from ns_abstract.arithmetic.forms import Basis, clamp_below, set_norms
 
 BASIS = Basis(1, 2)
 

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from ns_abstract.arithmetic.forms import FormArray
+from ns_abstract.arithmetic.form_array import FormArray
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.splat.activate import activate

@@ -49,7 +49,7 @@ from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.methods.splat.write import write_splatfacto_run
 from ns_abstract.report import picture as pictures
 from ns_abstract.report.export import Results
-from ns_abstract.report.record import guarantee_text
+from ns_abstract.report.run import guarantee_text
 
 torch.set_num_threads(1)
 

@@ -15,8 +15,10 @@ import torch
 
 from ns_abstract.arithmetic.rounding import Arithmetic
 from ns_abstract.bench import stiff
-from ns_abstract.bench.stiff import ARITHMETICS, Case, WatchedFrame, all_cases, run_case
-from ns_abstract.cli.bench import Stiff, bench
+from ns_abstract.bench.stiff import ARITHMETICS, WatchedFrame, run_case
+from ns_abstract.bench.stiff_cases import Case, all_cases
+from ns_abstract.cli.bench import bench
+from ns_abstract.cli.bench_options import Stiff
 from ns_abstract.cli.common import DONE
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError

@@ -43,16 +43,15 @@ class Refinement:
     Args:
         frame: Bounds and renders.
         index: The frame's number.
-        goal: When to stop.
+        goal: When to stop, and whether leaves are kept.
         seed: Of the random poses that are rendered.
-        keep_leaves: Whether the result carries the leaves' linear sets.
         stopped: Asked between cells; true ends the work with what is known.
         progress: Called with (trace point, covered part of the set) after every initial cell and after every round.
         members: Where the scene varies too: other scenes of the set, each as a function like the frame's
             ``render``. They widen the inner bound; only poses are split.
         tiles: Numbers of the tiles that are looked at, ascending; None: all. Measures are those of its pixels (R6).
         known: What was found of the same set before, with bounds: results are no looser, and work goes where it
-            leaves most open. Not for ``keep_leaves``: leaves are to be as tight as the result.
+            leaves most open. Not where leaves are kept: these are to be as tight as the result.
         initial: Takes the cells of the initial partition with their bounds in these tiles; where it holds some, they
             are the initial partition.
         tuning: How time and memory are divided.
@@ -71,7 +70,6 @@ class Refinement:
         goal: RefinementGoal,
         *,
         seed: int = 0,
-        keep_leaves: bool = False,
         stopped: Callable[[], bool] = lambda: False,
         progress: Callable[[TracePoint, float], None] = lambda point, share: None,
         members: Iterator[Render] | None = None,
@@ -82,7 +80,7 @@ class Refinement:
     ) -> None:
         self.frame, self.index, self.goal, self.tuning = frame, index, goal, tuning
         self.stopped, self.progress = stopped, progress
-        self.tiles = FrameTiles(frame, tiles, keep_leaves)
+        self.tiles = FrameTiles(frame, tiles, goal.keep_leaves)
         scenes = iter(()) if members is None else members
         self.inner = InnerBound(self.tiles, np.random.default_rng([seed, index]), scenes, tuning)
         bounds: tuple[np.ndarray, np.ndarray] | None = None

@@ -13,8 +13,8 @@ from markupsafe import Markup, escape
 from ns_abstract.report.cameras import CameraDrawings
 from ns_abstract.report.figures import ShownUnits, number, percent, unit_of_axis
 from ns_abstract.report.html import set_of, uri, whole_page
-from ns_abstract.report.record import plain
 from ns_abstract.report.regions import FailureRegion, PoseImage, regions_html
+from ns_abstract.report.run import plain
 from ns_abstract.report.svg import PlotAxis, draw_line, draw_plot, draw_svg
 from ns_abstract.report.verdict_maps import free_parameters, maps_of, matrix_svg, mixed, pixels
 from ns_abstract.report.walk import WalkPose, walk_html

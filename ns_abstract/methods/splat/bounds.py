@@ -32,8 +32,9 @@ from ns_abstract.methods.splat.colors import color_magnitudes, fixed_colors, gat
 from ns_abstract.methods.splat.constants import Rasteriser, RasterRules, raster_rules
 from ns_abstract.methods.splat.gaussians import covariance_noise, gaussian_stage
 from ns_abstract.methods.splat.lists import TileLists, depth_order, pixel_sets, tile_lists, tile_mask, visible_again
+from ns_abstract.methods.splat.pixel_regions import exponent_limits
 from ns_abstract.methods.splat.pixels import pixel_stage
-from ns_abstract.methods.splat.projection_errors import columns, exponent_limits
+from ns_abstract.methods.splat.projection_errors import columns
 from ns_abstract.methods.splat.stage_data import (
     CellPoses,
     Colors,
