@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 
@@ -236,11 +236,14 @@ class Refinement:
             self.initial.extend(leaves)
         return self._begin_leaves(leaves)
 
-    def _begin_leaves(self, leaves: Sequence[BoundedCell]) -> bool:
-        """Take cells that cover the set; returns True."""
-        self.leaves.begin(leaves)
+    def _begin_leaves(self, leaves: list[BoundedCell]) -> bool:
+        """Take cells that cover the set, out of ``leaves`` where nobody keeps them; returns True."""
+        cells = [cell for cell, _, _ in leaves]
+        leaves = list(leaves) if self.initial is not None else leaves
+        leaves.reverse()
+        self.leaves.begin(cells, (leaves.pop()[1:] for _ in cells))
         self.covered = True
-        elements = [None if cell.context is None else cell.context.shown for cell, _, _ in leaves]
+        elements = [None if cell.context is None else cell.context.shown for cell in cells]
         numbered = [numbers for numbers in elements if numbers is not None]
         if len(numbered) == len(elements):
             self.shown = np.unique(np.concatenate(numbered))
