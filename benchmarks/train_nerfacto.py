@@ -52,6 +52,7 @@ def main() -> None:
     parser.add_argument("output_dir", type=Path)
     parser.add_argument("--steps", type=int, default=8000)
     parser.add_argument("--rays", type=int, default=512, help="of every step")
+    parser.add_argument("--log2-table", type=int, help="rows of every level of the field's table, as a power of two")
     parser.add_argument("--name", default="lego")
     parser.add_argument("--stock", action="store_true", help="the sizes and losses of nerfacto")
     parser.add_argument("--far", type=float, default=5.0, help="end of the rays, in units of the object's cube")
@@ -73,9 +74,11 @@ def main() -> None:
             camera_optimizer=ours.camera_optimizer, eval_num_rays_per_chunk=ours.eval_num_rays_per_chunk,
         )  # fmt: skip
     config.pipeline.model.far_plane = options.far
+    if options.log2_table is not None:
+        config.pipeline.model.log2_hashmap_size = options.log2_table
     config.experiment_name, config.timestamp, config.output_dir = options.name, "trained", options.output_dir
     config.vis, config.machine.device_type = "tensorboard", "cpu"
-    config.max_num_iterations, config.steps_per_save = options.steps, 500
+    config.max_num_iterations, config.steps_per_save = options.steps, 250
     config.steps_per_eval_batch = config.steps_per_eval_image = config.steps_per_eval_all_images = 10**9
     for one in config.optimizers.values():
         if one["scheduler"] is not None:
