@@ -186,6 +186,15 @@ class NerfactoMethod(FieldMethod):
             "notes": list(scene.notes),
         }
 
-    def differentiable(self, poses: PoseBox) -> Callable[[torch.Tensor], torch.Tensor] | None:
-        """None yet: certificates are not made of nerfacto."""
-        return None
+    def differentiable(self, poses: PoseBox) -> Callable[[torch.Tensor], torch.Tensor]:
+        """Parameter values [d] to the picture [H, W, 3], in torch."""
+        from ns_abstract.geometry.differentiable_pose import differentiable_pose
+        from ns_abstract.methods.nerf.hsv import color_shift
+        from ns_abstract.methods.nerf.nerfacto_torch import DifferentiableNerfacto
+        from ns_abstract.methods.nerf.render import differentiable_picture
+
+        field, pose = DifferentiableNerfacto(self.scene.field), differentiable_pose(poses.geometry)
+        count, camera = poses.geometry.box.dimensions, poses.camera
+        return lambda values: differentiable_picture(
+            field, camera, pose(values[:count]), color_shift(poses, values.unbind())
+        )
