@@ -169,7 +169,8 @@ def sampled(renderer: NerfRenderer, pose_set: PoseBox, values: np.ndarray, pixel
         bins = renderer._refined(bins, interval_weights(density, renderer._lengths(bins)))
         density, base, inside = renderer._densities(renderer.fine, pose[:, 3], world, bins)
         color = renderer.fine.color(base, world[:, None].expand(-1, density.shape[1], -1)[inside])
-        found = renderer._distances(bins), density, _filled(color, inside), interval_weights(density, renderer._lengths(bins))
+        weights = interval_weights(density, renderer._lengths(bins))
+        found = renderer._distances(bins), density, _filled(color, inside), weights
     return [part.numpy() for part in found]
 
 
