@@ -44,7 +44,8 @@ def write_nerf_run(
     # a data set of its own: a Splatfacto run may stand in the same folder
     return write_run(
         scene, Path(folder), "vanilla-nerf", timestamp, experiment_name, data=f"data-{experiment_name}",
-        checkpoint=checkpoint_bytes(_pipeline(scene), ("fields",)), config=config, steps=STEPS, views=views, render=render,
+        checkpoint=checkpoint_bytes(_pipeline(scene), ("fields",)), config=config, steps=STEPS, views=views,
+        render=render,
     )  # fmt: skip
 
 
