@@ -12,11 +12,11 @@ def random_net(rng: np.random.Generator, *widths: int, bias: float = 0.0) -> Den
     """Layers whose outputs have standard deviations of about 1, all values those of float32."""
 
     def near(values: np.ndarray) -> np.ndarray:
-        return values.astype(np.float32).astype(np.float64)
+        return np.asarray(values, np.float32).astype(np.float64)
 
     pairs = list(zip(widths[1:], widths[:-1], strict=True))
     biases = [near(0.3 * rng.standard_normal(n)) for n, _ in pairs]
-    biases[-1][0] += bias
+    biases[-1][0] = near(biases[-1][0] + bias)
     return DenseNet(tuple(near(rng.standard_normal((n, m)) * (2.0 / m) ** 0.5) for n, m in pairs), tuple(biases))
 
 

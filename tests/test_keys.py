@@ -380,7 +380,7 @@ USED = {
     "nerfacto": [
         "far_plane: 3.0", "background_color: white", "background_color: last_sample",
         "num_proposal_samples_per_ray: [9, 5]", "num_nerf_samples_per_ray: 7", "proposal_initial_sampler: uniform",
-        "average_init_density: 2.0", "num_proposal_iterations: 1",
+        "average_init_density: 2.0",
     ],
 }  # fmt: skip
 
