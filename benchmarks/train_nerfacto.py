@@ -6,7 +6,7 @@ PICTURES.npz is that of `train_lego.py`, or ``buoy`` for pictures of the analyti
 a data set of Nerfstudio's (``data-NAME``) and a run of the method abstract-nerfacto; with ``--stock`` its model has
 nerfacto's own sizes and losses instead, for comparison. Every eighth view is held back.
 
-The demo's weights: ``train_nerfacto.py buoy OUT --name buoy --steps 1500 --levels 6 --max-res 128 --log2-table 12
+The demo's weights: ``train_nerfacto.py buoy OUT --name buoy --steps 1800 --levels 6 --max-res 128 --log2-table 14
 --far 4 --weights ns_abstract/demo/buoy_nerfacto.npz``.
 """
 

@@ -141,7 +141,9 @@ def test_the_mean_embedding_is_rounded_once() -> None:
 
 
 def test_resolutions_are_rounded_down_in_float32() -> None:
+    # 2048 and 512 are exact; float64 rounds the latter to 511
     assert resolutions(16, 16, 2048).tolist()[-1] == 2047
+    assert resolutions(10, 16, 512).tolist()[-1] == 512
     assert resolutions(5, 16, 256).tolist() == [16, 32, 64, 128, 256]
     assert resolutions(6, 16, 500).tolist() == [16, 31, 63, 126, 251, 500]
     assert resolutions(1, 16, 500).tolist() == [16]
@@ -211,6 +213,24 @@ def test_torch_shows_the_same_picture(background: str | None, spacing: str) -> N
         pose[:, 3] = torch.from_numpy(origin)
         shown = DifferentiableNerfacto(field).rays(pose, torch.from_numpy(direction)[None], shift)
         np.testing.assert_allclose(shown[0].numpy(), color, rtol=0.0, atol=1e-11)
+
+
+def test_empty_rays_show_the_last_samples_colour() -> None:
+    field = tiny_nerfacto(3, density=-900.0).field
+    renderer = NerfactoRenderer(dataclasses.replace(field, background="last_sample"))
+    shown = renderer.rays(some_rays(5))
+    assert shown.min() > 0.0
+    for ray, color in zip(some_rays(5), shown, strict=True):
+        distances = renderer.edges(ray)
+        point = ray[0] + 0.5 * (distances[-2] + distances[-1]) * ray[1]
+        raw = np.empty(16)
+        inputs = np.empty(64)
+        kernel.grid_features(kernel.pack_grid(field.encoding), *kernel.contract(*point), inputs)
+        kernel.evaluate_net(kernel.pack(field.density_net), inputs, raw)
+        kernel.harmonics(*ray[1], inputs)
+        inputs[16:31] = raw[1:]
+        kernel.evaluate_net(kernel.pack(field.color_net), inputs, raw)
+        np.testing.assert_allclose(color, 1.0 / (1.0 + np.exp(-raw[:3])), rtol=1e-12)
 
 
 def test_pictures_of_the_interface_are_rendered(run: Path) -> None:
