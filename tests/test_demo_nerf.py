@@ -102,6 +102,7 @@ def test_files_that_are_no_archive_are_refused(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- nerfacto
 
 
+@pytest.mark.slow
 def test_the_nerfacto_shows_the_buoy(tmp_path: Path) -> None:
     """The run that is written has the weights that ship, and shows what the field was trained on."""
     config, path = write_nerfacto_demo(tmp_path)
