@@ -102,18 +102,6 @@ def times(a, b):
 
 
 @njit(cache=True, error_model="numpy")
-def _spaced(s, spacing):
-    """Distance at place ``s`` in the spacing: least and greatest after rounding."""
-    piecewise, first, last = spacing
-    t = s * last + (1.0 - s) * first
-    if not piecewise:
-        return t
-    if t < 0.5:
-        return 2.0 * t
-    return 1.0 / max(2.0 - 2.0 * t, 1e-300)
-
-
-@njit(cache=True, error_model="numpy")
 def space(edges, j, spacing, line, work):
     """Fill in the distance of edge ``j`` (design.md, H2).
 
@@ -450,27 +438,28 @@ def _one_bin(light, count, edges, k, share, line, out, work):
         pose_value += abs(value[s])
         pose_weight += abs(weight[s])
     reach = abs(value[0]) + pose_value + symbols + rest
-    reach_weight = pose_weight + rest_weight
-    reach_weight = min(reach_weight, max(high_weight - center, center - low_weight) * HASH_UP)
+    form_weight = pose_weight + rest_weight
+    reach_weight = min(form_weight, max(high_weight - center, center - low_weight) * HASH_UP)
+    bend, turn, slope = 0.0, 0.0, 0.0
+    products = reach * reach_weight / (center * low_weight)
     if line:
-        others, others_weight = reach - abs(value[1]), reach_weight - abs(weight[1])
-        if others_weight < 0.0:
-            others_weight = rest_weight + abs(weight[2])
-        bend = -value[1] * weight[1] / (center * center)
+        others, others_weight = reach - abs(value[1]), form_weight - abs(weight[1])
+        curved = value[1] * weight[1] / (center * center)
         second = abs(value[1]) * others_weight + others * (abs(weight[1]) + others_weight)
-        third = abs(bend) * reach_weight / low_weight
-        products = second / (center * low_weight) + third
+        followed_products = second / (center * low_weight) + abs(curved) * reach_weight / low_weight
+        if followed_products < products:
+            bend, products = -curved, followed_products
         slope = value[1] / center
         turn = slope * (behind[1] - before[1])
-        own_rest = (others / center + abs(bend) + products) * spread_length + abs(slope) * others_length
-        bend = length * bend + turn
-        out[0] += 0.5 * bend
-        out[2] += 0.5 * bend
-        rest = abs(scale) * rest + abs(length) * products + own_rest
-    else:
-        products = reach * reach_weight / (center * low_weight)
-        rest = abs(scale) * rest + abs(length) * products + (reach / center + products) * spread_length
-    return (followed + rest) * HASH_UP + 16.0 * UNIT64
+    own_rest = (max(reach / center - abs(slope), 0.0) + abs(bend) + products) * spread_length
+    if line:
+        own_rest += abs(slope) * others_length
+    bent = length * bend + turn
+    out[0] += 0.5 * bent
+    if line:
+        out[2] += 0.5 * bent
+    rest = abs(scale) * rest + abs(length) * products + own_rest
+    return (followed + rest) * HASH_UP + 16.0 * UNIT64 * (1.0 + abs(scale) * reach)
 
 
 @njit(cache=True, error_model="numpy")

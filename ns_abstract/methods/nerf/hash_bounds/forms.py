@@ -229,3 +229,30 @@ def sigmoid_band(center, low, high):
                 # too flat to tell where
                 return 0.5 * (least + most), 0.0, 0.0, 0.5 * (most - least) + HASH_BAND_ROUNDING
     return 0.5 * (top + bottom), slope, 0.0, 0.5 * (top - bottom) + HASH_BAND_ROUNDING * (1.0 + slope * reach)
+
+
+@njit(cache=True, error_model="numpy")
+def apply_band(form, band, line, out):
+    """``out = f(form)`` by what `exp_band` or `sigmoid_band` returned for the form's centre and range (H5)."""
+    n = form.shape[0] - 3
+    value, slope, curvature, rest = band
+    others = (abs(form[n + 1]) + form[n + 2]) * HASH_UP
+    for s in range(1, n + 2):
+        out[s] = slope * form[s]
+    spread = others
+    for s in range(1, n + 1):
+        spread += abs(form[s])
+    bent = 0.0
+    if curvature != 0.0:
+        if line:
+            own = form[1] * form[1]
+            remaining = others + abs(form[2])
+            bent = 0.5 * curvature * own
+            out[2] += bent
+            rest += abs(curvature) * (2.0 * abs(form[1]) * remaining + remaining * remaining)
+        else:
+            bent = 0.5 * curvature * spread * spread
+            rest += abs(bent)
+    out[0] = value + bent
+    rounding = FORM_ROUNDING * (abs(value) + slope * spread + abs(bent))
+    out[n + 2] = (rest + slope * form[n + 2] + rounding) * HASH_UP + UNDERFLOW64
