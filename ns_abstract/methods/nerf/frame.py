@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import secrets
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -19,13 +19,12 @@ from ns_abstract.execution.cancellation import WorkCancelledError, check_cancell
 from ns_abstract.execution.engines import Processes
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseBox
-from ns_abstract.geometry.tiles import tile_grid
 from ns_abstract.methods.nerf.bounds import NerfBounds, RayBounds, Shifts, typical_displacement
-from ns_abstract.methods.nerf.hsv import color_shift
+from ns_abstract.methods.nerf.ray_pictures import RayPictures
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.nerf.strips import PoseStrips
-from ns_abstract.refine.protocol import LinearSets, SceneSample
+from ns_abstract.refine.protocol import LinearSets
 
 
 @dataclass(frozen=True)
@@ -41,8 +40,6 @@ class FieldTuning:
     #: bounds are kept in float32, where a finer one shows nowhere.
     least_share: float = 0.02
     finest_tolerance: float = UNIT32
-    #: Step of the difference quotient that tells how far the picture moves, as a part of the parameter's range.
-    motion_step: float = 2.0**-10
     #: Rays and poses rendered to estimate that variation.
     look_rays: int = 256
     look_poses: int = 7
@@ -51,8 +48,8 @@ class FieldTuning:
 _TUNING = FieldTuning()
 #: Poses on the diagonal of a box that are rendered to see which colours it reaches, besides random ones.
 _LOOK_SHARES = np.linspace(0.0, 1.0, 9)
-#: Parts of every range of hues and saturations; pixels that a turn of the whole circle counts for.
-_SHIFT_PARTS, _SHIFT_MOTION = 12, 6.0
+#: Parts of every range of hues and saturations.
+_SHIFT_PARTS = 12
 #: Weights of one share of work, in units of rays times weights, and shares of a worker between two looks at the goal
 #: where there are several workers: they end at about the same time.
 _WORK, _SHARES = 1_600_000, 4
@@ -122,8 +119,8 @@ def _bound_share(frame: bytes, bounds: tuple[Any, ...], displacement: float, arg
     return _here[frame].rays(*arguments)
 
 
-class NerfFrame:
-    """Bounds and renders one frame's set of poses. Every ray is a tile of its own.
+class NerfFrame(RayPictures):
+    """Bounds and renders one frame's set of poses.
 
     The set as a whole is bounded by [0, 1] without work, so that refinement can take ray after ray.
 
@@ -136,19 +133,11 @@ class NerfFrame:
             among cores. Results do not depend on where a ray is bounded, but on what is bounded together.
     """
 
-    #: Every ray is work of its own.
-    tilewise = True
-    channels = 3
-    #: Poses rendered in every part of a cell that is split.
-    witnesses = 8
-
     def __init__(
         self, scene: NerfScene, sampling: Sampling, pose_set: PoseBox, device: str = "cpu", workers: int = 1
     ) -> None:
-        self.pose_set, self.camera, self.box = pose_set, pose_set.camera, pose_set.box
-        self.side = 1
-        self.across, self.down = tile_grid(self.camera, 1)
-        self.renderer = NerfRenderer(scene, sampling, device=device)
+        super().__init__(pose_set, NerfRenderer(scene, sampling, device=device))
+        self.renderer: NerfRenderer
         self._geometry = pose_set.geometry
         self._recipe: tuple[Any, ...] = (scene, sampling, self._geometry.box.dimensions, device)
         self._token = secrets.token_bytes(16)
@@ -164,20 +153,10 @@ class NerfFrame:
         #: Numbers of the rays that `sets` bounds; of others it says 0.
         self.rays = np.arange(self.tile_count)
 
-    #: Few kernels, which are compiled together.
-    stages: tuple[str, ...] = ()
-
     @property
-    def tile_count(self) -> int:
-        """Number of rays, row by row."""
-        return self.across * self.down
-
-    def scene_samples(self, seed: int) -> Iterator[SceneSample]:
-        """Other scenes of the set: none, only poses vary."""
-        return iter(())
-
-    def _pixels(self, tiles: np.ndarray) -> np.ndarray:
-        return np.stack([tiles // self.across, tiles % self.across], axis=1)
+    def typical_distance(self) -> float:
+        """That of the middle sample."""
+        return float(self.bounds.distances[self.bounds.distances.size // 2])
 
     def warm_up(self, stage: str | None = None) -> None:
         """Compile the kernels that this frame needs."""
@@ -186,44 +165,6 @@ class NerfFrame:
             box = box.split(axis, 1024)[0]
         self.bounds.rays(self._geometry, box.without(COLOR_SHIFTS), self._pixels(np.arange(1)), 1.0)
         self.render(box.middle, np.arange(1))
-
-    def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
-        """Rays [t, 1, 1, 3] float32 of the concrete image at parameter values [d]."""
-        return self.precise(values, tiles).astype(np.float32)
-
-    def precise(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
-        """What `render` rounds: float64."""
-        which = np.arange(self.tile_count) if tiles is None else tiles
-        shift = color_shift(self.pose_set, values)
-        colors = self.renderer.pixels(self.pose_set.camera, self.pose_set.pose(values), self._pixels(which), shift)
-        return colors[:, None, None, :]
-
-    def feasible(self, box: ParameterBox) -> ParameterBox | None:
-        """All of ``box``: every parameter in it belongs to a pose of the set."""
-        return box
-
-    def depths(self) -> None:
-        """A field is everywhere; nothing in it has a distance of its own."""
-
-    def motion(self, box: ParameterBox) -> np.ndarray:
-        """[d] pixels that points at a typical distance move by over each parameter's range (an estimate)."""
-        d = box.dimensions
-        low, high = np.array(box.lower), np.array(box.upper)
-        distance = self.bounds.distances[self.bounds.distances.size // 2]
-        largest = np.zeros(d)
-        here = self._point(box.middle, distance)
-        for k in range(d):
-            step = np.zeros(d)
-            step[k] = _TUNING.motion_step * (high[k] - low[k])
-            moved = np.linalg.norm(self._point(box.middle + step, distance) - here) / _TUNING.motion_step
-            largest[k] = moved / distance * self.camera.fx
-            if box.names[k] in COLOR_SHIFTS:
-                largest[k] = _SHIFT_MOTION * (high[k] - low[k])
-        return largest
-
-    def _point(self, values: np.ndarray, distance: float) -> np.ndarray:
-        pose = self.pose_set.pose(values)
-        return pose[:, 3] - distance * pose[:, 2]
 
     def bound(
         self, box: ParameterBox, tiles: np.ndarray, within: RayContext | None = None, keep_linear: bool = False

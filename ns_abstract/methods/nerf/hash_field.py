@@ -6,7 +6,8 @@ The semantics are those of Nerfstudio's torch implementation (nerfstudio/field_c
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import dataclasses
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -142,7 +143,7 @@ class NerfactoScene:
     """
 
     field: NerfactoField
-    dataparser: DataparserTransform = field(default_factory=DataparserTransform)
+    dataparser: DataparserTransform = dataclasses.field(default_factory=DataparserTransform)
     name: str = "scene"
     source: str = ""
     notes: tuple[str, ...] = ()
