@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import blob_scene, ring
+from nerfactos import tiny_nerfacto
 from nerfs import tiny_scene
 from nerfstudio_runs import needs_nerfstudio
 
@@ -29,6 +30,8 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.io.keys import Key, KeyTable
 from ns_abstract.methods import config_keys
 from ns_abstract.methods.load import load_any
+from ns_abstract.methods.nerf.hash_field import NerfactoField
+from ns_abstract.methods.nerf.nerfacto_write import write_nerfacto_run
 from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.methods.splat.write import write_splatfacto_run
 from ns_abstract.nerfstudio.torchvision_operators import declare_missing
@@ -37,7 +40,9 @@ from ns_abstract.reach.loop import parse_loop
 from ns_abstract.verify.properties import parse_property
 
 TABLES = (*config_keys.TABLES, *path_keys.TABLES)
-MODELS = {"splatfacto": config_keys.SPLATFACTO, "vanilla-nerf": config_keys.VANILLA_NERF}
+MODELS = {
+    "splatfacto": config_keys.SPLATFACTO, "vanilla-nerf": config_keys.VANILLA_NERF, "nerfacto": config_keys.NERFACTO,
+}  # fmt: skip
 
 
 def named(table: KeyTable) -> dict[str, Key]:
@@ -55,7 +60,8 @@ def nerfstudio() -> SimpleNamespace:
         name: importlib.import_module(name)
         for name in (
             "ns_abstract.nerfstudio.methods", "nerfstudio.configs.method_configs", "nerfstudio.models.splatfacto",
-            "nerfstudio.models.vanilla_nerf", "nerfstudio.cameras.cameras", "nerfstudio.cameras.rays",
+            "nerfstudio.models.vanilla_nerf", "nerfstudio.models.nerfacto", "nerfstudio.cameras.cameras",
+            "nerfstudio.cameras.rays",
             "nerfstudio.data.scene_box",
         )
     }  # fmt: skip
@@ -97,7 +103,10 @@ def test_every_field_of_the_models_is_in_a_table(nerfstudio: SimpleNamespace, me
 
 
 @needs_nerfstudio
-@pytest.mark.parametrize(("method", "ours"), [("splatfacto", "abstract_splatfacto"), ("vanilla-nerf", "abstract_nerf")])
+@pytest.mark.parametrize(
+    ("method", "ours"),
+    [("splatfacto", "abstract_splatfacto"), ("vanilla-nerf", "abstract_nerf"), ("nerfacto", "abstract_nerfacto")],
+)
 def test_every_field_of_our_models_is_in_a_table(nerfstudio: SimpleNamespace, method: str, ours: str) -> None:
     config = getattr(nerfstudio.methods, ours).config
     assert missing(MODELS[method], fields_of(config), "pipeline.model.") == []
@@ -267,6 +276,8 @@ def write_config(folder: Path, method: str, edit: str = "", where: str = "model"
     """A run with one more line in its configuration, under pipeline.model or at the top level."""
     if method == "splatfacto":
         config = write_splatfacto_run(blob_scene(5), folder, timestamp="t", experiment_name="e")
+    elif method == "nerfacto":
+        config = write_nerfacto_run(tiny_nerfacto(1), folder, timestamp="t", experiment_name="e")
     else:
         config = write_nerf_run(tiny_scene(1), folder, timestamp="t", experiment_name="e")
     lines = config.read_text().splitlines()
@@ -288,7 +299,10 @@ def write_config(folder: Path, method: str, edit: str = "", where: str = "model"
 
 def arrays_of(scene: Any) -> list[Any]:
     """What of a scene the picture depends on."""
-    values = {k: v for k, v in vars(scene).items() if k not in ("source", "notes", "coarse", "fine")}
+    values = {k: v for k, v in vars(scene).items() if k not in ("source", "notes", "coarse", "fine", "field")}
+    if isinstance(field := getattr(scene, "field", None), NerfactoField):
+        values |= {f"array {k}": a for k, a in enumerate(field.arrays())}
+        values |= {k: getattr(field, k) for k in ("samples", "far", "spacing", "background", "average_init_density")}
     for name in ("coarse", "fine"):
         if (field := getattr(scene, name, None)) is not None:
             values |= {f"{name}{k}": a for k, a in enumerate(field.arrays())} | {f"{name} encodings": field.position}
@@ -320,6 +334,11 @@ USED = {
         "num_coarse_samples: 8", "num_importance_samples: 9", "background_color: black",
         "collider_params: {near_plane: 2.0, far_plane: 5.5}",
     ],
+    "nerfacto": [
+        "far_plane: 3.0", "background_color: white", "background_color: last_sample",
+        "num_proposal_samples_per_ray: [9, 5]", "num_nerf_samples_per_ray: 7", "proposal_initial_sampler: uniform",
+        "average_init_density: 2.0", "num_proposal_iterations: 1",
+    ],
 }  # fmt: skip
 
 
@@ -339,6 +358,20 @@ REFUSED = [
     ("vanilla-nerf", "num_importance_samples: 0", "num_importance_samples"),
     ("vanilla-nerf", "collider_params: {far_plane: 4.0, slope: 1.0}", "pipeline.model.collider_params.slope"),
     ("vanilla-nerf", "use_temporal_distortion: true", "pipeline.model.use_temporal_distortion"),
+    ("nerfacto", "disable_scene_contraction: true", "ends at a box"),
+    ("nerfacto", "predict_normals: true", "predicted normals"),
+    ("nerfacto", "background_color: Last_Sample", "background_color"),
+    ("nerfacto", "implementation: cuda", "tcnn, torch"),
+    ("nerfacto", "use_transient_embedding: true", "pipeline.model.use_transient_embedding"),
+    ("nerfacto", "num_proposal_samples_per_ray: [9]", "write 2 numbers"),
+    ("nerfacto", "num_proposal_samples_per_ray: [9, 0]", "write 2 numbers"),
+    ("nerfacto", "average_init_density: 0", "above 0"),
+    ("nerfacto", "far_plane: .inf", "above 0"),
+    ("nerfacto", "use_appearance_embedding: 1", "true or false"),
+    ("nerfacto", "proposal_net_args_list: [{use_linear: true}]", "without a network"),
+    ("nerfacto", "proposal_net_args_list: [{num_levels: 0}]", "proposal_net_args_list.num_levels"),
+    ("nerfacto", "proposal_net_args_list: [{levels: 3}]", "unknown key 'levels'"),
+    ("nerfacto", "proposal_net_args_list: 3", "list of mappings"),
     ("splatfacto", "use_exposure: true", "pipeline.model.use_exposure"),
     ("splatfacto", "radius_clip: 3.0", "pipeline.model.radius_clip"),
     ("splatfacto", "7: 3.0", "pipeline.model.7"),

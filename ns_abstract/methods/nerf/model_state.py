@@ -118,8 +118,7 @@ def background(run: runs.RunConfig, overrides: Overrides, default: str) -> tuple
     """
     named, origin = "background_color" in run.model, "config.yml: pipeline.model.background_color"
     stored: Any = LAST_SAMPLE
-    # Nerfstudio's names are letter by letter
-    if run.model.get("background_color", default) != LAST_SAMPLE:
+    if str(run.model.get("background_color", default)).lower() != LAST_SAMPLE:
         stored = tuple(float(part) for part in run.color("background_color", default, _BACKGROUNDS))
         if named and not isinstance(run.model["background_color"], str):
             origin += ", three numbers, at which Nerfstudio's own model stops"

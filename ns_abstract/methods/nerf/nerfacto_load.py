@@ -96,6 +96,9 @@ def load_nerfacto(run: runs.RunConfig, overrides: Overrides | None = None) -> Ne
     unused = config_keys.check_keys(run, config_keys.NERFACTO)
     run.choice("implementation", "tcnn", ("tcnn", "torch"))
     record, background = model_state.background(run, overrides, model_state.LAST_SAMPLE)
+    if isinstance(background, str):
+        # letter by letter: Nerfstudio stops at "Last_Sample"
+        run.choice("background_color", model_state.LAST_SAMPLE, (model_state.LAST_SAMPLE,))
     grid, proposals, samples = _grid(run), _proposal_arguments(run), _samples(run)
     transform, notes = runs.read_dataparser_transform(run)
     checkpoint = runs.find_checkpoint(run, overrides.load_step)
