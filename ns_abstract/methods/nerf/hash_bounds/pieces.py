@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from ns_abstract.arithmetic.rounding import HASH_BAND_ROUNDING, HASH_UP, UNIT64
+from ns_abstract.arithmetic.rounding import HASH_BAND_ROUNDING, HASH_UP, PIECE_END_ROUNDING, UNIT64
 from ns_abstract.methods.nerf.hash_bounds.composition import (
     form_bounds,
     form_color,
@@ -257,7 +257,7 @@ def _start(rays, ray, middle, half, field, line, room):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def bound_piece(field, rays, ray, middle, half, limits, room, out):
+def bound_piece(field, rays, ray, middle, half, limits, room, out, shown):
     """Bounds ``out`` [2, 3] of a ray's colour over the box ``middle`` +- ``half`` [d] (design.md, H6, H7).
 
     Args:
@@ -268,8 +268,11 @@ def bound_piece(field, rays, ray, middle, half, limits, room, out):
         limits: `Limits`.
         room: `PieceRoom`.
         out: [2, 3]; overwritten: [0, 1] where nothing is known.
+        shown: [3, n + 3] forms of the colours (`composition.form_color`), of infinite radius where nothing is known.
     """
     out[0], out[1] = 0.0, 1.0
+    shown[:] = 0.0
+    shown[:, -1] = np.inf
     line, rounds = middle.shape[0] == 1, len(room.light) - 1
     _start(rays, ray, middle, half, field, line, room)
     work = room.work[0]
@@ -302,10 +305,9 @@ def bound_piece(field, rays, ray, middle, half, limits, room, out):
             give_up(light, i + 1, count)
             break
     interval_colors(light, count, bounds[0], bounds[1], field.background, field.last, out)
-    form = work[0]
     for c in range(3):
-        form_color(light, count, forms[:, c], field.background[c], field.last, line, form)
-        low, high = form_bounds(form, line)
+        form_color(light, count, forms[:, c], field.background[c], field.last, line, shown[c])
+        low, high = form_bounds(shown[c], line)
         out[0, c] = min(max(max(out[0, c], low), 0.0), 1.0)
         out[1, c] = min(max(min(out[1, c], high), 0.0), 1.0)
         if not out[0, c] <= out[1, c]:
@@ -329,87 +331,150 @@ def _longest_axis(rays, ray, half):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def bound_ray(field, rays, ray, levels, aim, limits, room, out):
-    """Bounds of a ray by part of the box, pieces halved until they are within the aim or as small as allowed (H8).
-
-    Args:
-        field, rays, ray, limits, room: See `bound_piece`.
-        levels: [4] halvings of the box into first pieces, into the parts that bounds are kept for, and at most, in
-            all; then the most pieces.
-        aim: [2, 3] bounds that are good enough.
-        out: [parts, 2, 3]; overwritten. Parts of a line in order, or one part.
-
-    Returns:
-        The number of pieces that were bounded, and of those that were kept.
-    """
-    d = rays.exponents.shape[1]
-    first, kept, deepest, most = levels
-    parts = out.shape[0]
-    stack = np.empty((2 * deepest + (1 << first) + 4, 2, d))
-    depth = np.empty(stack.shape[0], np.int64)
-    known = np.empty((stack.shape[0], 2, 3))
-    found, middle, half = np.empty((2, 3)), np.empty(d), np.empty(d)
-    height = 0
-    for k in range(1 << first):
-        stack[height] = 0.0
-        stack[height, 0], stack[height, 1] = -1.0, 1.0
-        for bit in range(first):
-            # the first axis is halved: there is one
-            side = (k >> (first - 1 - bit)) & 1
-            stack[height, 1 - side, 0] = 0.5 * (stack[height, 0, 0] + stack[height, 1, 0])
-        depth[height] = first
-        known[height, 0], known[height, 1] = 0.0, 1.0
-        height += 1
-    out[:, 0], out[:, 1] = 1.0, 0.0
-    tried, leaves = 0, 0
-    while height:
-        height -= 1
-        for k in range(d):
-            low, high = stack[height, 0, k], stack[height, 1, k]
-            middle[k] = 0.5 * (low + high)
-            half[k] = max(high - middle[k], middle[k] - low)
-        level, before = depth[height], known[height].copy()
-        begin_part, end_part = 0, parts
-        if parts > 1:
-            begin_part = int((stack[height, 0, 0] + 1.0) * 0.5 * parts)
-            end_part = max(int((stack[height, 1, 0] + 1.0) * 0.5 * parts), begin_part + 1)
-        bound_piece(field, rays, ray, middle, half, limits, room, found)
-        tried += 1
-        good = True
-        for c in range(3):
-            found[0, c], found[1, c] = max(found[0, c], before[0, c]), min(found[1, c], before[1, c])
-            if not found[0, c] <= found[1, c]:
-                found[0, c], found[1, c] = before[0, c], before[1, c]
-            good &= found[0, c] >= aim[0, c] and found[1, c] <= aim[1, c]
-        if good or level >= deepest or tried + height >= most:
-            leaves += 1
-            for p in range(begin_part, end_part):
-                for c in range(3):
-                    out[p, 0, c], out[p, 1, c] = min(out[p, 0, c], found[0, c]), max(out[p, 1, c], found[1, c])
-            continue
-        axis = _longest_axis(rays, ray, half)
-        box = stack[height].copy()
-        for side in range(2):
-            stack[height] = box
-            stack[height, 1 - side, axis] = middle[axis]
-            depth[height] = level + 1
-            known[height] = found
-            height += 1
-    return tried, leaves
+def _on_part(form, line, low, high):
+    """Bounds of a ``form`` where its parameters lie between ``low`` and ``high`` [d] in [-1, 1]."""
+    n = form.shape[0] - 3
+    rest = form[n + 2]
+    if not rest < np.inf:
+        return -np.inf, np.inf
+    least = most = form[0]
+    size = abs(form[0])
+    if line:
+        g, q, a, b = form[1], form[2], low[0], high[0]
+        ends = g * a + q * (2.0 * a * a - 1.0), g * b + q * (2.0 * b * b - 1.0)
+        down, up = min(ends[0], ends[1]), max(ends[0], ends[1])
+        if q != 0.0 and a < -g / (4.0 * q) < b:
+            vertex = -q - g * g / (8.0 * q)
+            down, up = min(down, vertex), max(up, vertex)
+        least, most, size = least + down, most + up, size + abs(g) + abs(q)
+    else:
+        for k in range(n):
+            ends = form[1 + k] * low[k], form[1 + k] * high[k]
+            least, most = least + min(ends[0], ends[1]), most + max(ends[0], ends[1])
+            size += abs(form[1 + k])
+    rest += 32.0 * UNIT64 * size
+    return least - rest, most + rest
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def bound_rays(field, rays, which, levels, aim, limits, room, out, pieces):
-    """`bound_ray` of several rays.
+def _keep(out, counts, place, cells, found, shown, line, low, high):
+    """Unite the bounds of a piece with those ``out`` [parts, 2, 3] of all parts that it meets.
 
     Args:
-        which: [r] numbers of the rays.
-        aim: [r, 2, 3].
-        out: [r, parts, 2, 3]; overwritten.
-        pieces: [r, 2] pieces that were bounded and kept; overwritten.
+        counts: [d] parts by axis.
+        place, cells: [d] the piece is number ``place`` of ``cells`` by axis.
+        found, shown: What `bound_piece` made.
+        line: See `forms`.
+        low, high: [d] scratch.
     """
-    for k in range(which.shape[0]):
-        pieces[k] = bound_ray(field, rays, which[k], levels, aim[k], limits, room, out[k])
+    d = counts.shape[0]
+    first, past, at = np.empty(d, np.int64), np.empty(d, np.int64), np.empty(d, np.int64)
+    for k in range(d):
+        first[k] = place[k] * counts[k] // cells[k]
+        past[k] = -((-(place[k] + 1) * counts[k]) // cells[k])
+        at[k] = first[k]
+    while True:
+        part = 0
+        for k in range(d):
+            part = part * counts[k] + at[k]
+            # where the part begins and ends in the piece, with room for rounding
+            scale = 2.0 * cells[k] / counts[k]
+            low[k] = max(at[k] * scale - 2.0 * place[k] - 1.0 - 2.0 * PIECE_END_ROUNDING * cells[k], -1.0)
+            high[k] = min((at[k] + 1) * scale - 2.0 * place[k] - 1.0 + 2.0 * PIECE_END_ROUNDING * cells[k], 1.0)
+        for c in range(3):
+            least, most = _on_part(shown[c], line, low, high)
+            least, most = max(least, found[0, c]), min(most, found[1, c])
+            if not least <= most:
+                least, most = found[0, c], found[1, c]
+            out[part, 0, c], out[part, 1, c] = min(out[part, 0, c], least), max(out[part, 1, c], most)
+        k = d - 1
+        while k >= 0:
+            at[k] += 1
+            if at[k] < past[k]:
+                break
+            at[k] = first[k]
+            k -= 1
+        if k < 0:
+            return
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def bound_ray(field, rays, ray, cells, deepest, most, goal, limits, room, counts, out):
+    """Bounds of a ray by part of the box, pieces halved until they are good or as small as allowed (design.md, H8).
+
+    Args:
+        field, rays, ray, limits, room: See `bound_piece`.
+        cells: [d] first pieces by axis.
+        deepest, most: Halvings of these, and pieces in all.
+        goal: [3, 3] bounds between which all is good, and a form's rest that is good wherever it lies.
+        counts: [d] parts by axis.
+        out: [parts, 2, 3]; overwritten.
+
+    Returns:
+        The number of first pieces, of pieces that were bounded, and of those that were kept.
+    """
+    d = cells.shape[0]
+    first = 1
+    for k in range(d):
+        first *= cells[k]
+    # place and cells by axis, and halvings
+    stack = np.empty((first + deepest + 1, 2, d), np.int64)
+    depth = np.zeros(first + deepest + 1, np.int64)
+    known = np.empty((first + deepest + 1, 2, 3))
+    found, middle, half = np.empty((2, 3)), np.empty(d), np.empty(d)
+    low, high, shown = np.empty(d), np.empty(d), np.empty((3, room.features.shape[1]))
+    for i in range(first):
+        rest = i
+        for k in range(d - 1, -1, -1):
+            stack[i, 0, k], stack[i, 1, k] = rest % cells[k], cells[k]
+            rest //= cells[k]
+        known[i, 0], known[i, 1] = 0.0, 1.0
+    out[:, 0], out[:, 1] = 1.0, 0.0
+    height, tried, kept = first, 0, 0
+    while height:
+        height -= 1
+        for k in range(d):
+            place, count = stack[height, 0, k], stack[height, 1, k]
+            middle[k] = (2.0 * place + 1.0) / count - 1.0
+            half[k] = 1.0 / count + PIECE_END_ROUNDING
+        bound_piece(field, rays, ray, middle, half, limits, room, found, shown)
+        tried += 1
+        good = True
+        for c in range(3):
+            found[0, c], found[1, c] = max(found[0, c], known[height, 0, c]), min(found[1, c], known[height, 1, c])
+            if not found[0, c] <= found[1, c]:
+                found[0, c], found[1, c] = known[height, 0, c], known[height, 1, c]
+            inside = found[0, c] >= goal[0, c] and found[1, c] <= goal[1, c]
+            good &= inside or shown[c, -1] <= goal[2, c]
+        if good or depth[height] >= deepest or tried + height >= most:
+            kept += 1
+            _keep(out, counts, stack[height, 0], stack[height, 1], found, shown, d == 1, low, high)
+            continue
+        axis = _longest_axis(rays, ray, half)
+        stack[height, 0, axis] *= 2
+        stack[height, 1, axis] *= 2
+        depth[height] += 1
+        known[height] = found
+        stack[height + 1] = stack[height]
+        stack[height + 1, 0, axis] += 1
+        depth[height + 1] = depth[height]
+        known[height + 1] = found
+        height += 2
+    return first, tried, kept
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def bound_rays(field, rays, cells, deepest, most, goal, limits, room, counts, out, pieces):
+    """`bound_ray` of all rays.
+
+    Args:
+        cells: [r, d].
+        goal: [r, 3, 3].
+        out: [r, parts, 2, 3]; overwritten.
+        pieces: [r, 3] what `bound_ray` returns; overwritten.
+    """
+    for k in range(cells.shape[0]):
+        pieces[k] = bound_ray(field, rays, k, cells[k], deepest, most, goal[k], limits, room, counts, out[k])
 
 
 def form_width(dimensions: int) -> int:
