@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.device import check_device

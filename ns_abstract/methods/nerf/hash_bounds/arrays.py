@@ -7,7 +7,14 @@ import numpy as np
 from ns_abstract.arithmetic.simd.lanes import LINE
 from ns_abstract.arithmetic.simd.products import ROWS
 from ns_abstract.methods.nerf.hash_bounds.distribution import edges_of, light_of
-from ns_abstract.methods.nerf.hash_bounds.network import HeadWeights, NetWeights, Zonotope, head_weights, net_weights, zonotope
+from ns_abstract.methods.nerf.hash_bounds.network import (
+    HeadWeights,
+    NetWeights,
+    Zonotope,
+    head_weights,
+    net_weights,
+    zonotope,
+)
 from ns_abstract.methods.nerf.hash_bounds.pieces import DensityArrays, FieldArrays, PieceRoom, form_width
 from ns_abstract.methods.nerf.hash_field import DenseNet, HashEncoding, NerfactoField
 

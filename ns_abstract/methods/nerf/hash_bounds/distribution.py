@@ -218,7 +218,7 @@ def add_depth(edges, i, density, bounds, shares, line, light, work):
     longest = edges.far[i + 1] - edges.near[i]
     pose_low, pose_high = pose_range(length, line, n)
     rest = abs(length[n + 1]) + abs(length[n + 2]) + length[n + 3]
-    shortest = max(0.0, max(shortest, length[0] + pose_low - rest)) * (1.0 - DEPTH_PRODUCT_ROUNDING)
+    shortest = max(0.0, shortest, length[0] + pose_low - rest) * (1.0 - DEPTH_PRODUCT_ROUNDING)
     longest = min(longest, length[0] + pose_high + rest) * (1.0 + DEPTH_PRODUCT_ROUNDING)
     room = SPACING_ROUNDING * (abs(a[0]) + abs(b[0]))
     shortest, longest = max(shortest - room, 0.0), max(longest + room, 0.0)
@@ -407,7 +407,7 @@ def _one_bin(light, count, edges, k, share, line, out, work):
     """Place of an edge that surely lies in bin k (design.md, H6)."""
     n = out.shape[0] - 3
     value, weight = work[0], work[1]
-    _, _, rest_here = _excess(light, count, k, share, line, value)
+    _excess(light, count, k, share, line, value)
     rest_weight, low_weight, high_weight = _bin(light, k, line, weight)
     center = weight[0]
     if not (center > 0.0 and low_weight > 0.0):

@@ -136,7 +136,7 @@ def level_features(table, resolution, point, ranges, out):
         place[a], low[a], high[a] = q - begin, below - begin, above - begin
         # beyond any number of nodes that is looked at
         nodes = min(nodes * min(counts[a], 1 << 16), 1 << 30)
-    if nodes > FORM_NODES or max(counts[0], max(counts[1], counts[2])) > 6:
+    if nodes > FORM_NODES or max(counts[0], counts[1], counts[2]) > 6:
         least, most = np.empty(features), np.empty(features)
         if nodes <= HULL_NODES:
             _hull(table, first, counts, least, most)

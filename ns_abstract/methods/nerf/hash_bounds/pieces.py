@@ -308,7 +308,7 @@ def bound_piece(field, rays, ray, middle, half, limits, room, out, shown):
     for c in range(3):
         form_color(light, count, forms[:, c], field.background[c], field.last, line, shown[c])
         low, high = form_bounds(shown[c], line)
-        out[0, c] = min(max(max(out[0, c], low), 0.0), 1.0)
+        out[0, c] = min(max(out[0, c], low, 0.0), 1.0)
         out[1, c] = min(max(min(out[1, c], high), 0.0), 1.0)
         if not out[0, c] <= out[1, c]:
             out[0, c], out[1, c] = 0.0, 1.0

@@ -151,7 +151,7 @@ def _hull_of_slopes(low, high, jacobian):
     """Slopes [2, 3, 3] of the contraction, least and largest over a box (design.md, H2)."""
     nearest, least_of_all = np.empty(3), 0.0
     for i in range(3):
-        nearest[i] = max(0.0, max(low[i], -high[i]))
+        nearest[i] = max(0.0, low[i], -high[i])
         least_of_all = max(least_of_all, nearest[i])
     jacobian[0], jacobian[1] = np.inf, -np.inf
     if least_of_all < 1.0:
@@ -183,8 +183,8 @@ def _hull_of_slopes(low, high, jacobian):
                     below, above = max(low[i], -far), min(high[i], far)
                     size = max(abs(below), abs(above))
                     values = (-above * flattest, -above * steepest, -below * flattest, -below * steepest)
-                    least = min(min(values[0], values[1]), min(values[2], values[3]))
-                    most = max(max(values[0], values[1]), max(values[2], values[3]))
+                    least = min(values[0], values[1], values[2], values[3])
+                    most = max(values[0], values[1], values[2], values[3])
                     if high[j] <= 0.0:
                         least, most = -most, -least
                     elif low[j] < 0.0:
@@ -196,7 +196,7 @@ def _hull_of_slopes(low, high, jacobian):
 @njit(cache=True, error_model="numpy")
 def contracted(x):
     """[3] nerfstudio's contraction of a point [3] by the maximum norm."""
-    m = max(abs(x[0]), max(abs(x[1]), abs(x[2])))
+    m = max(abs(x[0]), abs(x[1]), abs(x[2]))
     if m < 1.0:
         return x.copy()
     return (2.0 - 1.0 / m) * (x / m)
@@ -247,7 +247,7 @@ def point(ray, distance, line, out, work):
     for i in range(3):
         low[i] -= POINT_PLACE_ROUNDING * size
         high[i] += POINT_PLACE_ROUNDING * size
-        radius = max(radius, max(abs(low[i]), abs(high[i])))
+        radius = max(radius, abs(low[i]), abs(high[i]))
     if not radius < np.inf:
         return False
     axis, nearest = -1, 0.0
@@ -256,7 +256,7 @@ def point(ray, distance, line, out, work):
         others = 0.0
         for i in range(3):
             if i != j:
-                others = max(others, max(high[i], -low[i]))
+                others = max(others, high[i], -low[i])
         if near >= 1.0 and near >= others:
             axis, nearest = j, near
     if radius < 1.0:
