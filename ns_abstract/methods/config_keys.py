@@ -135,7 +135,7 @@ NERFACTO = KeyTable(
         Key("camera_optimizer", "irrelevant", "moves rays under `self.training` alone", f"{_FACTO}:300"),
         Key("use_gradient_scaling", "irrelevant", "scales gradients; values stay", f"{_FACTO}:305"),
         Key("loss_coefficients", "irrelevant", "weights of a NeRF's losses; nerfacto has its own", f"{_BASE}:50"),
-        *_all("jitter of samples in training (`self.config.{}`)", _FACTO, {"use_single_jitter": 219}),
+        *_all("jitter of samples in training (`self.config.{}`)", _FACTO, {"use_single_jitter": 224}),
         *_all("how often proposals are trained (`self.config.{}`)", _FACTO, {
             "proposal_update_every": 212, "proposal_warmup": 210,
         }),

@@ -16,6 +16,7 @@ from typing import Any, Literal, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import is_number, show
 from ns_abstract.io.memory import check_memory
@@ -140,7 +141,7 @@ def load_nerfacto(run: runs.RunConfig, overrides: Overrides | None = None) -> Ne
         name=run.experiment_name,
         source=str(checkpoint),
         notes=(*notes, *unused, *_close_resolutions(grids)),
-        assumptions=(record, *others),
+        assumptions=(record, *others, _resolution_record(field)),
     )
 
 
@@ -157,6 +158,13 @@ def resolutions(levels: int, least: int, most: int) -> NDArray[np.int64]:
 
 def _growth(levels: int, least: int, most: int) -> float:
     return float(np.exp((np.log(most) - np.log(least)) / (levels - 1))) if levels > 1 else 1.0
+
+
+def _resolution_record(field: NerfactoField) -> Assumption:
+    """The resolutions of all grids."""
+    encodings = field.encoding, *(one.encoding for one in field.proposals)
+    sizes = "; ".join(" ".join(map(str, one.resolutions.tolist())) for one in encodings)
+    return Assumption("resolutions", sizes, "config.yml, as torch rounds them in float32: field, then proposals")
 
 
 def _close_resolutions(grids: list[_Grid]) -> tuple[str, ...]:
