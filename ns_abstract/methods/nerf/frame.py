@@ -20,10 +20,10 @@ from ns_abstract.execution.engines import Processes
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseBox
 from ns_abstract.methods.nerf.bounds import NerfBounds, RayBounds, Shifts, typical_displacement
-from ns_abstract.methods.nerf.ray_pictures import RayPictures
+from ns_abstract.methods.nerf.ray_pictures import PixelRenderer, RayPictures
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
-from ns_abstract.methods.nerf.strips import PoseStrips
+from ns_abstract.methods.nerf.strips import FieldBounds, PoseStrips
 from ns_abstract.refine.protocol import LinearSets
 
 
@@ -119,34 +119,27 @@ def _bound_share(frame: bytes, bounds: tuple[Any, ...], displacement: float, arg
     return _here[frame].rays(*arguments)
 
 
-class NerfFrame(RayPictures):
-    """Bounds and renders one frame's set of poses.
+class FieldFrame(RayPictures):
+    """Bounds and renders one frame's set of poses of a field.
 
     The set as a whole is bounded by [0, 1] without work, so that refinement can take ray after ray.
 
     Args:
-        scene: The fields.
-        sampling: Where they are evaluated.
         pose_set: The poses.
-        device: Where the network is bounded.
-        workers: Processes that bound rays side by side, one core each: the matrices are too small to be shared
-            among cores. Results do not depend on where a ray is bounded, but on what is bounded together.
+        renderer: Draws the field.
+        bounds: Of its rays.
+        share: Rays that are bounded together.
+        at_once: Rays between two looks at the goal.
+        workers: Shares that are bounded side by side.
     """
 
     def __init__(
-        self, scene: NerfScene, sampling: Sampling, pose_set: PoseBox, device: str = "cpu", workers: int = 1
+        self, pose_set: PoseBox, renderer: PixelRenderer, bounds: FieldBounds, share: int, at_once: int, workers: int
     ) -> None:
-        super().__init__(pose_set, NerfRenderer(scene, sampling, device=device))
-        self.renderer: NerfRenderer
+        super().__init__(pose_set, renderer)
         self._geometry = pose_set.geometry
-        self._recipe: tuple[Any, ...] = (scene, sampling, self._geometry.box.dimensions, device)
-        self._token = secrets.token_bytes(16)
-        self.bounds = NerfBounds(*self._recipe)
-        weights = sum(array.size for array in scene.fine.arrays())
-        self.workers = workers
-        compiled = self.bounds.field.compiled
-        self._share = int(np.clip(_WORK // weights, 1, 32)) if compiled else _RAYS_ON_DEVICE
-        self.tiles_at_once = workers * self._share * (_SHARES if compiled and workers > 1 else 1)
+        self.bounds, self.workers = bounds, workers
+        self._share, self.tiles_at_once = share, at_once
         self._inner: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         #: whether boxes need not wait for what others tell of the width of cells
         self._steady = False
@@ -274,33 +267,7 @@ class NerfFrame(RayPictures):
 
     def _tried(self, calls: Sequence[Sequence[Any]]) -> list[RayBounds | None]:
         """See `_run`; None: there was no time for a call."""
-        if len(calls) == 1 or self.workers == 1:
-            parts: list[RayBounds | None] = []
-            with suppress(WorkCancelledError):
-                for call in calls:
-                    parts.append(self.bounds.rays(*call))
-            return parts + [None] * (len(calls) - len(parts))
-        engine = _processes(self.workers)
-        for number, call in enumerate(calls):
-            engine.submit(number, _bound_share, self._token, self._recipe, self.bounds.displacement, call)
-        done: dict[int, RayBounds] = {}
-        patience = None
-        try:
-            while len(done) < len(calls):
-                for number, answer in engine.collect(_PATIENCE):
-                    if not isinstance(answer, WorkCancelledError):
-                        done[number] = answer
-                if patience is None and is_cancelled():
-                    patience = time.monotonic() + _GRACE
-                    engine.abandon()
-                if patience is not None and (not engine.unfinished or time.monotonic() > patience):
-                    break
-        finally:
-            # what is still at work would answer those who ask next
-            if engine.unfinished:
-                _processes.cache_clear()
-                engine.close()
-        return [done.get(number) for number in range(len(calls))]
+        raise NotImplementedError
 
     @cached_property
     def _strips(self) -> PoseStrips:
@@ -422,3 +389,58 @@ class NerfFrame(RayPictures):
         values = [*self.box.sample(_TUNING.look_poses - 2, rng), np.array(self.box.lower), np.array(self.box.upper)]
         pictures = np.stack([self.render(v, tiles) for v in values])
         return float((pictures.max(axis=0) - pictures.min(axis=0)).mean())
+
+
+class NerfFrame(FieldFrame):
+    """Bounds and renders one frame's set of poses of a vanilla NeRF.
+
+    Args:
+        scene: The fields.
+        sampling: Where they are evaluated.
+        pose_set: The poses.
+        device: Where the network is bounded.
+        workers: Processes that bound rays side by side, one core each: the matrices are too small to be shared
+            among cores. Results do not depend on where a ray is bounded, but on what is bounded together.
+    """
+
+    def __init__(
+        self, scene: NerfScene, sampling: Sampling, pose_set: PoseBox, device: str = "cpu", workers: int = 1
+    ) -> None:
+        self._recipe: tuple[Any, ...] = (scene, sampling, pose_set.geometry.box.dimensions, device)
+        self._token = secrets.token_bytes(16)
+        bounds = NerfBounds(*self._recipe)
+        weights = sum(array.size for array in scene.fine.arrays())
+        share = int(np.clip(_WORK // weights, 1, 32)) if bounds.compiled else _RAYS_ON_DEVICE
+        at_once = workers * share * (_SHARES if bounds.compiled and workers > 1 else 1)
+        super().__init__(pose_set, NerfRenderer(scene, sampling, device=device), bounds, share, at_once, workers)
+        self.renderer: NerfRenderer
+
+    def _tried(self, calls: Sequence[Sequence[Any]]) -> list[RayBounds | None]:
+        """See `_run`; None: there was no time for a call."""
+        if len(calls) == 1 or self.workers == 1:
+            parts: list[RayBounds | None] = []
+            with suppress(WorkCancelledError):
+                for call in calls:
+                    parts.append(self.bounds.rays(*call))
+            return parts + [None] * (len(calls) - len(parts))
+        engine = _processes(self.workers)
+        for number, call in enumerate(calls):
+            engine.submit(number, _bound_share, self._token, self._recipe, self.bounds.displacement, call)
+        done: dict[int, RayBounds] = {}
+        patience = None
+        try:
+            while len(done) < len(calls):
+                for number, answer in engine.collect(_PATIENCE):
+                    if not isinstance(answer, WorkCancelledError):
+                        done[number] = answer
+                if patience is None and is_cancelled():
+                    patience = time.monotonic() + _GRACE
+                    engine.abandon()
+                if patience is not None and (not engine.unfinished or time.monotonic() > patience):
+                    break
+        finally:
+            # what is still at work would answer those who ask next
+            if engine.unfinished:
+                _processes.cache_clear()
+                engine.close()
+        return [done.get(number) for number in range(len(calls))]

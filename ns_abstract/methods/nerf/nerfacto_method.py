@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.device import check_device
+from ns_abstract.methods.nerf.hash_bounds.frame import NerfactoFrame
 from ns_abstract.methods.nerf.hash_field import NerfactoScene
-from ns_abstract.methods.nerf.nerfacto_render import NerfactoRenderer
-from ns_abstract.methods.nerf.ray_pictures import FieldMethod, RayPictures, check_arithmetic
+from ns_abstract.methods.nerf.ray_pictures import FieldMethod, check_arithmetic
 from ns_abstract.methods.program_options import ProgramOptions
 
 if TYPE_CHECKING:
@@ -26,52 +25,6 @@ _OTHERS = {
     "near_plane": "rays of nerfacto begin at the camera, as in Nerfstudio's evaluation",
     "occupancy_grid": "grids are declared for fields of vanilla-nerf",
 }
-
-
-class NerfactoFrame(RayPictures):
-    """Renders one frame's set of poses.
-
-    Args:
-        scene: The scene.
-        pose_set: The poses.
-    """
-
-    tiles_at_once: int | None = None
-
-    def __init__(self, scene: NerfactoScene, pose_set: PoseBox) -> None:
-        super().__init__(pose_set, NerfactoRenderer(scene.field))
-
-    @property
-    def typical_distance(self) -> float:
-        """Where the first round's middle edge lies."""
-        return min(1.0, 0.5 * self.renderer.field.far)  # pyright: ignore[reportAttributeAccessIssue]
-
-    def warm_up(self, stage: str | None = None) -> None:
-        """Compile the kernels of a render."""
-        self.render(self.box.middle, np.arange(1))
-
-    def bound(self, box: ParameterBox, tiles: np.ndarray, within: Any = None, keep_linear: bool = False) -> Any:
-        """Refuse: nerfacto is rendered, and not yet bounded.
-
-        Raises:
-            InputError: Always.
-        """
-        raise InputError(
-            "nerfacto is rendered, its bounds are not computed yet",
-            field="--load-config",
-            fix="use ns_abstract.render, or bound a run of splatfacto or vanilla-nerf",
-        )
-
-    def observe(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
-        """See `ns_abstract.refine.protocol.Frame`."""
-
-    def set_tolerance(self, excess: float) -> float:
-        """Nothing is left out."""
-        return 0.0
-
-    def plan(self, visible: int | None, lower: np.ndarray, upper: np.ndarray) -> list[str]:
-        """Nothing is left out."""
-        return []
 
 
 class NerfactoMethod(FieldMethod):
@@ -137,7 +90,7 @@ class NerfactoMethod(FieldMethod):
         """
         if layers:
             raise InputError("depth and accumulation of a NeRF are not bounded", field="--outputs", fix="leave it out")
-        return NerfactoFrame(self.scene, poses)
+        return NerfactoFrame(self.scene, poses, self.workers)
 
     def ablations(self, poses: PoseBox) -> Iterator[tuple[str, NerfactoFrame]]:
         """None are known."""
