@@ -18,6 +18,7 @@ import json
 import math
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -134,7 +135,7 @@ def main() -> None:
     from ns_abstract.nerfstudio.loading import lpips_weights
     from ns_abstract.nerfstudio.methods import abstract_nerfacto
 
-    config = copy.deepcopy(abstract_nerfacto.config)
+    config: Any = copy.deepcopy(abstract_nerfacto.config)
     if options.stock:
         ours = config.pipeline.model
         config.pipeline.model = NerfactoModelConfig(
@@ -180,7 +181,7 @@ def main() -> None:
     print(f"held back, {len(found)} views on black: {np.mean(found):.2f} dB")
     file = config.get_base_dir() / "config.yml"
     if options.weights is not None:
-        arrays = quantised(file)
+        arrays: dict[str, Any] = quantised(file)
         write_atomic(options.weights, lambda stream: np.savez_compressed(stream, **arrays))
     print(f"run {file}")
 

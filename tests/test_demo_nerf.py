@@ -114,7 +114,7 @@ def test_the_nerfacto_shows_the_buoy(tmp_path: Path) -> None:
     shown = NerfactoRenderer(field).pixels(camera, camera.camera_to_world, grid)
     pose = camera.camera_to_world.copy()
     pose[:, 3] /= NERFACTO_SCALE
-    wanted = NerfRenderer(buoy_scene(), Sampling("hierarchical", 0.0, 6.0, 64, 128, (0.0,) * 3), torch.float32)
+    wanted = NerfRenderer(buoy_scene(), Sampling("hierarchical", 0.0, 6.0, 64, 128, (0.0, 0.0, 0.0)), torch.float32)
     difference = shown - wanted.pixels(camera, pose, grid)
     assert np.abs(difference).mean() < 0.02 and shown.std() > 0.1
     assert NERFACTO.stat().st_size < 300_000

@@ -162,15 +162,15 @@ def test_features_are_those_of_torch() -> None:
     x[:40] = np.round(16.0 * x[:40]) / 16.0
     wanted = grid_features(encoding, torch.from_numpy(x)).numpy()
     found = np.empty(encoding.size)
-    for point, features in zip(x, wanted, strict=True):
-        kernel.grid_features(kernel.pack_grid(encoding), *point, found)
+    for (px, py, pz), features in zip(x, wanted, strict=True):
+        kernel.grid_features(kernel.pack_grid(encoding), px, py, pz, found)
         np.testing.assert_allclose(found, features, rtol=0.0, atol=2e-15)
 
 
 def test_harmonics_are_of_shifted_directions() -> None:
     direction = np.array([0.48, -0.6, 0.64])
     found = np.empty(16)
-    kernel.harmonics(*direction, found)
+    kernel.harmonics(direction[0], direction[1], direction[2], found)
     # linear harmonics of (d + 1) / 2
     np.testing.assert_allclose(found[[3, 1, 2]], 0.4886025119029199 * (direction + 1.0) / 2.0, rtol=1e-15)
     np.testing.assert_allclose(found, harmonics(torch.from_numpy(direction)).numpy(), rtol=0.0, atol=1e-15)
@@ -222,12 +222,13 @@ def test_empty_rays_show_the_last_samples_colour() -> None:
     assert shown.min() > 0.0
     for ray, color in zip(some_rays(5), shown, strict=True):
         distances = renderer.edges(ray)
-        point = ray[0] + 0.5 * (distances[-2] + distances[-1]) * ray[1]
+        x, y, z = kernel.contract(*(ray[0] + 0.5 * (distances[-2] + distances[-1]) * ray[1]))
+        dx, dy, dz = ray[1]
         raw = np.empty(16)
         inputs = np.empty(64)
-        kernel.grid_features(kernel.pack_grid(field.encoding), *kernel.contract(*point), inputs)
+        kernel.grid_features(kernel.pack_grid(field.encoding), x, y, z, inputs)
         kernel.evaluate_net(kernel.pack(field.density_net), inputs, raw)
-        kernel.harmonics(*ray[1], inputs)
+        kernel.harmonics(dx, dy, dz, inputs)
         inputs[16:31] = raw[1:]
         kernel.evaluate_net(kernel.pack(field.color_net), inputs, raw)
         np.testing.assert_allclose(color, 1.0 / (1.0 + np.exp(-raw[:3])), rtol=1e-12)

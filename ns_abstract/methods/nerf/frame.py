@@ -139,17 +139,13 @@ class FieldFrame(RayPictures):
         super().__init__(pose_set, renderer)
         self._geometry = pose_set.geometry
         self.bounds, self.workers = bounds, workers
+        self.typical_distance = float(bounds.distances[bounds.distances.size // 2])
         self._share, self.tiles_at_once = share, at_once
         self._inner: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         #: whether boxes need not wait for what others tell of the width of cells
         self._steady = False
         #: Numbers of the rays that `sets` bounds; of others it says 0.
         self.rays = np.arange(self.tile_count)
-
-    @property
-    def typical_distance(self) -> float:
-        """That of the middle sample."""
-        return float(self.bounds.distances[self.bounds.distances.size // 2])
 
     def warm_up(self, stage: str | None = None) -> None:
         """Compile the kernels that this frame needs."""

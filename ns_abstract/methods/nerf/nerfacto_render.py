@@ -43,7 +43,7 @@ class NerfactoRenderer:
         self._density, self._color = kernel.pack(field.density_net), kernel.pack(field.color_net)
         self._proposals = [(kernel.pack_grid(p.encoding), kernel.pack(p.net)) for p in field.proposals]
         nets = (self._density, self._color, *(net for _, net in self._proposals))
-        self._buffers = np.empty((2, max(int(net.widths.max()) for net in nets)))
+        self._width = max(int(net.widths.max()) for net in nets)
         self._piecewise = field.spacing == "piecewise"
         place = kernel.spacing if self._piecewise else float
         self._ends = place(field.near), place(field.far)
@@ -52,10 +52,10 @@ class NerfactoRenderer:
 
     def edges(self, ray: NDArray[np.float64]) -> NDArray[np.float64]:
         """[samples + 1] distances between which the picture's samples lie, on ``ray`` [2, 3] (origin, direction)."""
-        places = self._first
+        places, buffers = self._first, np.empty((2, self._width))
         for field, (grid, net), wanted in zip(self.field.proposals, self._proposals, self._quantiles, strict=True):
             places = kernel.place_samples(
-                grid, net, field.average_init_density, ray, self._ends, self._piecewise, places, wanted, self._buffers
+                grid, net, field.average_init_density, ray, self._ends, self._piecewise, places, wanted, buffers
             )
         return np.array([kernel.distance_at(place, *self._ends, self._piecewise) for place in places])
 
@@ -66,11 +66,11 @@ class NerfactoRenderer:
         """
         count = self.field.samples[-1]
         weights, colors = np.empty((len(rays), count)), np.empty((len(rays), count, 3))
-        last = isinstance(self.field.background, str)
+        last, buffers = isinstance(self.field.background, str), np.empty((2, self._width))
         for k, ray in enumerate(rays):
             kernel.color_samples(
                 self._grid, self._density, self._color, self.field.average_init_density, ray, self.edges(ray), last,
-                self._buffers, weights[k], colors[k],
+                buffers, weights[k], colors[k],
             )  # fmt: skip
         if shift is not None:
             colors = shifted(torch.from_numpy(colors), *shift).numpy()

@@ -48,17 +48,14 @@ class RayPictures:
     witnesses = 8
     #: Few kernels, which are compiled together.
     stages: tuple[str, ...] = ()
+    #: A distance that is typical of what a ray meets, normalised units; subclasses set it.
+    typical_distance: float
 
     def __init__(self, pose_set: PoseBox, renderer: PixelRenderer) -> None:
         self.pose_set, self.camera, self.box = pose_set, pose_set.camera, pose_set.box
         self.side = 1
         self.across, self.down = tile_grid(self.camera, 1)
         self.renderer = renderer
-
-    @property
-    def typical_distance(self) -> float:
-        """A distance that is typical of what a ray meets, normalised units."""
-        raise NotImplementedError
 
     @property
     def tile_count(self) -> int:
