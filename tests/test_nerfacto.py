@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import importlib
 import math
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,12 +14,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from benchmark_scripts import BENCHMARKS
 from nerfactos import tiny_nerfacto
 from nerfs import view
-from nerfstudio_runs import needs_nerfstudio
+from nerfstudio_runs import environment, needs_nerfstudio
 from scene_files import change, checkpoint_of
 
 import ns_abstract as nsa
+from ns_abstract.geometry.keyframe_cameras import look_at
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.load import load_any
 from ns_abstract.methods.nerf import nerfacto_kernel as kernel
@@ -346,3 +350,22 @@ def test_nerfstudio_shows_the_same_picture_in_float64(tmp_path: Path, monkeypatc
         np.testing.assert_allclose(NerfactoRenderer(uniform).rays(rays[:50]), shown(50), rtol=0.0, atol=1e-12)
     finally:
         torch.set_default_dtype(torch.float32)
+
+
+@pytest.mark.slow
+@needs_nerfstudio
+def test_runs_that_nerfstudio_trains_are_read(tmp_path: Path) -> None:
+    """Two steps of abstract-nerfacto on four small pictures; all that the run holds is known."""
+    poses = np.stack([look_at((3.0, k, 1.0), (0.0, 0.0, 0.0)) for k in range(4)])
+    images = np.random.default_rng(0).integers(0, 256, (4, 8, 8, 4), dtype=np.uint8)
+    np.savez(tmp_path / "pictures.npz", images=images, c2w=poses, focal=9.0)
+    options = ["--steps", "2", "--rays", "16", "--log2-table", "8", "--levels", "3", "--max-res", "40"]
+    # in a process of its own: Nerfstudio's training leaves writers behind
+    subprocess.run(
+        [sys.executable, BENCHMARKS / "train_nerfacto.py", tmp_path / "pictures.npz", tmp_path, *options],
+        env=environment(tmp_path), cwd=tmp_path, check=True, capture_output=True, timeout=800,
+    )  # fmt: skip
+    scene = load_any(tmp_path / "lego" / "abstract-nerfacto" / "trained")
+    assert (scene.field.samples, scene.field.far, scene.dataparser.scale) == ((64, 32, 24), 5.0, 0.8)
+    assert scene.field.encoding.table.shape == (3, 256, 2)
+    assert NerfactoRenderer(scene.field).rays(some_rays(3)).shape == (3, 3)
