@@ -14,6 +14,7 @@ from ns_abstract.arithmetic.rounding import (
     FRAGMENT_ROUNDING,
     GRAM_ROOM,
     GRAM_UP,
+    REAL,
     REGION,
     SHIFTED_ROUNDING,
     STILL_POSITION,
@@ -184,7 +185,9 @@ class SplatBounds:
         self.varied = VariedSplats.fixed(splats) if varied is None else varied
         self.rasteriser = rasteriser
         self.arithmetic = arithmetic
-        self.rules = raster_rules(rasteriser, splats.antialiased)
+        rules = raster_rules(rasteriser, splats.antialiased)
+        # G12: tiles from 1.5 on change no picture in real numbers, and our renderer has none
+        self.rules = rules._replace(tile_room=0.0) if arithmetic == REAL else rules
         self.side = rasteriser.work_tile
         self.charges = charges(arithmetic)
         self._buffers: dict[tuple[int, str], np.ndarray] = {}

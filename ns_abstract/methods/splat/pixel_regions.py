@@ -6,6 +6,7 @@ import numpy as np
 from numba import njit
 
 from ns_abstract.arithmetic.rounding import (
+    COVARIANCE_ERROR,
     ELLIPSE_ERROR,
     ELLIPSE_SHARPNESS,
     ELLIPSE_SPAN,
@@ -119,7 +120,7 @@ def _tile_ranges(s, n, rules, camera, charges):
         top, bottom = mean_y_low - radius_high - snap_y, mean_y_high + radius_high + snap_y
         # a place that is not finite is no number in some of these
         placed = front & (right - left < np.inf) & (bottom - top < np.inf)
-        bounded = placed & (cut | (room > 0.0))
+        bounded = placed & (rules.view_margin >= 0.0)
         # image-border culls of fully_fused_projection_fwd.cu:171-180
         gone = bounded & ((right <= 0.0) | (left >= width) | (bottom <= 0.0) | (top >= height))
         # the tiles of an ellipse come from the conic, which may be wrong by any amount
@@ -158,10 +159,11 @@ def _opacities(s, n, rules, charges):
         det = s[row.DET + q]
         finite = s[row.FINITE + q] != 0.0
         # G7: relative error of the exponent
-        sharp_enough = (s[row.FRONT + q] != 0.0) & (det > 0.0) & (s[row.EDET + q] < 0.5 * det)
         kappa = s[row.ETA + q]
-        region_is_known = (s[row.PLACED + q] != 0.0) & sharp_enough & (kappa < 0.25)
-        kappa = kappa * (1.0 + 4.0 * kappa)
+        sharp = (s[row.EDET + q] < 0.5 * det) | (kappa < COVARIANCE_ERROR)
+        sharp_enough = (s[row.FRONT + q] != 0.0) & (det > 0.0) & sharp
+        region_is_known = (s[row.PLACED + q] != 0.0) & sharp_enough & (kappa < COVARIANCE_ERROR)
+        kappa = kappa * (1.0 + 2.0 * kappa)
         lower = s[row.OPLOW + q] * (1.0 - charges.opacity)
         upper = s[row.OPHIGH + q] * (1.0 + charges.opacity)
         limit = s[row.OPLIMIT + q]

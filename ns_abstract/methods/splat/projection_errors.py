@@ -23,7 +23,14 @@ from dataclasses import dataclass
 import numpy as np
 from numba import njit
 
-from ns_abstract.arithmetic.rounding import COMPENSATION_ROUNDING, REGION, ROOT_ROUNDING, SECOND_ORDER, UP
+from ns_abstract.arithmetic.rounding import (
+    COMPENSATION_ROUNDING,
+    COVARIANCE_ERROR,
+    REGION,
+    ROOT_ROUNDING,
+    SECOND_ORDER,
+    UP,
+)
 
 #: Lanes of one block of the compiled stage.
 LANES = 32
@@ -419,6 +426,8 @@ def compensations(s, n, rules, charges):
         a, c = (a + move_x) * (a + move_x), (c + move_y) * (c + move_y)
         error = c * error_a + a * error_c + 2.0 * np.sqrt(a * c) * error_b + error_a * error_c + error_b * error_b
         error = SECOND_ORDER * (error + charges.determinant * (a + error_a) * (c + error_c) + flush) / det
+        # the least factor of the determinant; G7's where that is known
+        remains = max(1.0 - spread, (1.0 - s[ETA + q]) ** 2) if s[ETA + q] < COVARIANCE_ERROR else 1.0 - spread
         # the square of the compensation lies in [0, 1]; bounds that are no numbers say nothing
         low = s[SQLO + q] if s[SQLO + q] > 0.0 else 0.0
         high = s[SQHI + q] if s[SQHI + q] < 1.0 else 1.0
@@ -426,10 +435,10 @@ def compensations(s, n, rules, charges):
         bottom = max(0.0, low_root * (1.0 - ROOT_ROUNDING) - moved)
         bottom = np.sqrt(max(0.0, bottom * bottom - error) / (1.0 + spread)) * shrink
         top = high_root * (1.0 + ROOT_ROUNDING) + moved
-        top = np.sqrt((top * top + error) / (1.0 - spread)) * grow
+        top = np.sqrt((top * top + error) / remains) * grow
         change = (moved * (2.0 * low_root + moved) + error) / low
         # 1.6.0 has a least factor
-        formed = (low > _LEAST_SQUARE) & (change < 0.25) & (0.45 * low > least * least)
+        formed = (low > _LEAST_SQUARE) & (change < 0.25) & (spread < 0.5) & (0.45 * low > least * least)
         bottom = max(bottom, least * (1.0 - charges.compensation))
         top = max(top, least * (1.0 + charges.compensation))
         s[CTOP + q] = top if top < np.inf else np.inf
