@@ -187,9 +187,9 @@ class CertificateReport:
         Raises:
             WorkCancelledError: There is no time for more pictures.
         """
-        known = dict(zip((name for name, _ in self.job.job.parameters), values, strict=True))
+        by_name = dict(zip((name for name, _ in self.job.job.parameters), values, strict=True))
         pictures = self.job.pictures(frame)
-        pose = np.array([known[name] for name in pictures.box.names])
+        pose = np.array([by_name[name] for name in pictures.box.names])
         # of another scene of the set, maybe
         image = self._kept_image(frame, pose) if pictures.pose_set.perturbation.scene else None
         if image is None:

@@ -100,10 +100,10 @@ class LoopReport:
 
     def show_tubes(self, store: Store, deadline: Deadline) -> None:
         """Tubes of a few certified cells beside simulated runs and what less dependence would give."""
-        found = [row for number in self.job.questions for row in store.leaves(number, "certified")]
-        if not found:
+        certified = [row for number in self.job.questions for row in store.leaves(number, "certified")]
+        if not certified:
             return
-        chosen = [found[len(found) * (2 * k + 1) // (2 * _SHOWN)] for k in range(_SHOWN)]
+        chosen = [certified[len(certified) * (2 * k + 1) // (2 * _SHOWN)] for k in range(_SHOWN)]
         for row in {json.dumps([row["lower"], row["upper"]]): row for row in chosen}.values():
             try:
                 with deadline.enforced():

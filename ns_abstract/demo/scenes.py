@@ -49,10 +49,10 @@ def _stored(file: Path) -> Iterator[_ArchiveUnpickler]:
         def read(name: str, kind: type, *shape: int | None) -> NDArray[Any]:
             if name not in archive.declared:
                 raise InputError("is missing", field=name)
-            found, stored = archive.declared[name]
-            wanted = tuple(m if n is None else n for n, m in zip(shape, found, strict=False))
-            if stored != kind or found != wanted or len(found) != len(shape):
-                raise InputError(f"{stored}{list(found)}, not {kind.__name__}{list(shape)}", field=name)
+            stored_shape, stored = archive.declared[name]
+            wanted = tuple(m if n is None else n for n, m in zip(shape, stored_shape, strict=False))
+            if stored != kind or stored_shape != wanted or len(stored_shape) != len(shape):
+                raise InputError(f"{stored}{list(stored_shape)}, not {kind.__name__}{list(shape)}", field=name)
             values = archive.read(name)
             if not np.isfinite(values).all():
                 raise InputError("not finite", field=name)

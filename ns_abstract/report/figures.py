@@ -156,17 +156,17 @@ class ShownUnits:
         ]
 
     def interval(self, name: str, unit: str, low: float, high: float) -> str:
-        """One side of a box for people, in the unit that was asked and in the other one."""
+        """One side of a box for people, in the unit that was requested and in the other one."""
         text, ends = interval(name, unit, low, high), (low, high)
         if unit == "rad":
-            other, asked, ends = "degrees", self.angle == "degrees", [math.degrees(end) for end in ends]
+            other, is_requested, ends = "degrees", self.angle == "degrees", [math.degrees(end) for end in ends]
         elif unit == "normalised units" and (self.translation == "dataset" or self.dataset_scale != 1.0):
-            other, asked = "units of the data set", self.translation == "dataset"
+            other, is_requested = "units of the data set", self.translation == "dataset"
             ends = [end / self.dataset_scale for end in ends]
         else:
             return text
         beside = interval(name, other, *ends)
-        first, second = (beside, text) if asked else (text, beside)
+        first, second = (beside, text) if is_requested else (text, beside)
         return f"{first} ({second.removeprefix(name).strip().removeprefix('∈ ')})"
 
 

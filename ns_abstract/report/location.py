@@ -139,7 +139,7 @@ def _frame(
 ) -> dict[str, Any]:
     box = poses.box
     sides = {n: (low, high) for n, low, high in zip(box.names, box.lower, box.upper, strict=True)}
-    known = {name: sides.get(name, (poses.fixed.get(name, 0.0),) * 2) for name, _ in parameters}
+    ranges = {name: sides.get(name, (poses.fixed.get(name, 0.0),) * 2) for name, _ in parameters}
     left = [row for row in rows if row["verdict"] != "excluded"]
     columns = [[name for name, _ in parameters].index(name) for name in box.names]
 
@@ -156,14 +156,15 @@ def _frame(
     best = None
     if found:
         values = dict(zip(box.names, found[0].values, strict=True))
-        pose = [values.get(name, known[name][0]) for name, _ in parameters]
+        pose = [values.get(name, ranges[name][0]) for name, _ in parameters]
         matrix = poses.pose(np.array(found[0].values))
         best = {"pose": pose, "outliers": found[0].outliers, "camera_to_world": matrix}
     return {
         "index": index,
         "intrinsics": poses.camera.intrinsics._asdict(),
         "parameters": [
-            {"name": name, "unit": unit, "lower": known[name][0], "upper": known[name][1]} for name, unit in parameters
+            {"name": name, "unit": unit, "lower": ranges[name][0], "upper": ranges[name][1]}
+            for name, unit in parameters
         ],
         "possible_volume": min(1.0, sum(map(volume, left))),
         "hull": hull,
