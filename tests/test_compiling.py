@@ -32,7 +32,7 @@ def test_stages_are_shared_out() -> None:
 
 def test_one_stage_alone_is_run_and_the_others_come_back(blobs: Inputs, monkeypatch: pytest.MonkeyPatch) -> None:
     """Each stage is called with what it is called with otherwise, and afterwards bounds are what they were."""
-    frame = open_job(Settings(blobs.config, blobs.path, blobs.spec)).frame(0)
+    frame: Any = open_job(Settings(blobs.config, blobs.path, blobs.spec)).frame(0)
     tiles = np.arange(frame.tile_count)
     before = frame.bound(frame.box, tiles)
     kernels = frame.bounds.stages
@@ -74,7 +74,7 @@ def test_one_stage_alone_is_run_and_the_others_come_back(blobs: Inputs, monkeypa
 
 
 def test_no_stage_is_missing_after_all_were_compiled(blobs: Inputs) -> None:
-    frame = open_job(Settings(blobs.config, blobs.path, blobs.spec)).frame(0)
+    frame: Any = open_job(Settings(blobs.config, blobs.path, blobs.spec)).frame(0)
     frame.warm_up()
     assert compiling.missing(frame) == []
 
