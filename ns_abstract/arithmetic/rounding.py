@@ -269,8 +269,8 @@ DEPTH_PRODUCT_ROUNDING, DEPTH_SUM_ROUNDING = 16.0 * UNIT64, 4.0 * UNIT64
 SHARE_ROUNDING = 16.0 * UNIT64
 #: H6: bins' worth of these beside one by bin.
 SHARE_BINS = 16
-#: H8: the middle of a piece of a box, half its width and the ends of its parts: quotients, products and sums, 8; as many
-#: to spare; by the number of pieces where they are told in half-widths of a piece.
+#: H8: the middle of a piece of a box, half its width and the ends of its parts: quotients, products and sums, 8; as
+#: many to spare; by the number of pieces where they are told in half-widths of a piece.
 PIECE_END_ROUNDING = 16.0 * UNIT64
 #: H7: compositing in both evaluations, absolute, by sample: at most 12 operations on numbers of at most 1; 4 to spare.
 HASH_SAMPLE_ROUNDING = 16.0 * UNIT64
