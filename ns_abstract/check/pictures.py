@@ -195,8 +195,8 @@ class Picture:
 
 def units(scene: Any, report: dict[str, Any]) -> tuple[float, ...]:
     """Roundoffs of the pictures that are tried: float32's first, where that is claimed and this program has charges."""
-    mine = isinstance(scene, ActivatedScene) and scene.rules.tiles
-    return (FLOAT, 0.0) if mine and report.get("guarantee") == "float32-sound" else (0.0,)
+    splats = isinstance(scene, ActivatedScene)
+    return (FLOAT, 0.0) if splats and report.get("guarantee") == "float32-sound" else (0.0,)
 
 
 def divided(low: Array, high: Array, motion: Array, full: Array) -> list[tuple[Array, Array]]:

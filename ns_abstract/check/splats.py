@@ -26,18 +26,21 @@ LONGEST = 96
 
 
 class VersionRules(NamedTuple):
-    """What differs between gsplat's versions: alpha's cap, least compensation, tiles that cut."""
+    """What differs between gsplat's versions: alpha's cap, least compensation, tiles that cut, tiles of ellipses.
+
+    Where tiles do not cut they hold every pixel with an alpha above the threshold, in real numbers; in float32 `_kept`.
+    """
 
     cap: float
     least_factor: float
     tiles: bool
+    ellipses: bool
 
 
 RULES = {
-    "1.4.0": VersionRules(0.999, 0.0, True),
-    # from 1.5 on a box holds every pixel with an alpha above the threshold, so that tiles change nothing
-    "1.5.3": VersionRules(0.999, 0.0, False),
-    "1.6.0": VersionRules(float(np.float32(0.99)), float(np.float32(0.005)), False),
+    "1.4.0": VersionRules(0.999, 0.0, True, False),
+    "1.5.3": VersionRules(0.999, 0.0, False, False),
+    "1.6.0": VersionRules(float(np.float32(0.99)), float(np.float32(0.005)), False, True),
 }
 
 
@@ -103,17 +106,21 @@ def reaches(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit:
     faint = opacity < LEAST_ALPHA
     with np.errstate(all="ignore"):
         reach = np.sqrt(2.0 * np.log(np.maximum(opacity * 255.0, 1.0)))
+        limits = [(max(c, n - c) + 0.15 * n) / f for f, c, n in
+                  ((cam.fx, cam.cx, cam.width), (cam.fy, cam.cy, cam.height))]  # fmt: skip
+        longest = 1.05 * max(cam.fx, cam.fy) * splats.scales.max(axis=1) * np.sqrt(1.0 + np.square(limits).sum())
         for t, f, centre, side in ((x, cam.fx, cam.cx, cam.width), (y, cam.fy, cam.cy, cam.height)):
             a, b = (v[0] for v in t.range())
             least, most = np.minimum(a / zl, a / zh), np.maximum(b / zl, b / zh)
-            limit = (max(centre, side - centre) + 0.15 * side) / f * (1.0 + ROOM)
             # keyframes' rotations stretch by a hundredth at most
+            limit = (max(centre, side - centre) + 0.15 * side) / f * (1.0 + ROOM)
             spread = 1.05 * f / zl * splats.scales.max(axis=1) * np.sqrt(1.0 + limit * limit)
             room = reach * np.sqrt(spread * spread + BLUR) * (1.0 + 1e-9) + 1e-9 * (np.abs(least) + np.abs(most)) * f
             if unit:
                 faint &= spread < 4.0
-                # exponents of small ones err by less than a tenth; those of large ones may be anything in their tiles
-                room = np.where(spread < 4.0, 1.06 * room, np.maximum(1.06 * room, 3.3 * spread) + 2.0 * TILE)
+                # exponents of small ones err by less than a tenth; those of large ones may be anything in their tiles,
+                # whose side is that of the longer axis, 3.33 deviations at most
+                room = np.where(spread < 4.0, 1.06 * room, np.maximum(1.06 * room, 3.4 * longest / zl) + 2.0 * TILE)
             open_ = near | ~np.isfinite(room)
             sides += [np.where(open_, -np.inf, f * least + centre - room - 1e-9)]
             sides += [np.where(open_, np.inf, f * most + centre + room + 1e-9)]
@@ -250,6 +257,9 @@ def _fragments(
         squares = [e.wider(error) for e, error in zip(p.squares, p.errors, strict=True)]
         maybe, certain = _tiles(cam, pixel, (mx, my), squares, unit)
         shows, surely = shows & maybe, surely & certain & ~wild
+    elif unit:
+        kept, level = _kept(p, rules.ellipses)
+        surely = surely & kept & (least >= LEAST_ALPHA * level)
     alow, ahigh = alpha.range()
     # the form must say no less than the interval, and stay below the cap
     rough = ~((ahigh - alow) <= 1.5 * (most - least)) | ~(ahigh <= rules.cap) | ~(alow >= 0.0) | ~surely
@@ -291,8 +301,7 @@ def _factor(flat: Affine, det: Affine, least: float, unit: float) -> Affine:
     top = np.minimum(np.where(np.isfinite(top), top, limit), limit)
     root = (flat * det.reciprocal()).root()
     root = root.wider(16.0 * unit * np.minimum(root.size(), limit))
-    rough = ~(2.0 * root.width <= 1.5 * (top - bottom))
-    return root.boxed(rough, bottom, np.maximum(top, bottom)).clamped(least, limit + ROOM)
+    return root.within(bottom, np.maximum(top, bottom)).clamped(least, limit + ROOM)
 
 
 def _tiles(cam: CheckedCamera, pixel: Any, centre: Any, squares: Any, unit: float) -> tuple[Array, Array]:
@@ -318,6 +327,24 @@ def _tiles(cam: CheckedCamera, pixel: Any, centre: Any, squares: Any, unit: floa
         # the negations keep what is not a number
         maybe = maybe & ~(low - rh > last + slack) & ~(high + rh < first - slack)
     return maybe, certain
+
+
+def _kept(p: ProjectedForms, ellipses: bool) -> tuple[Array, Array]:
+    """Where float32 tiles from 1.5 on lose no pixel whose alpha is above the threshold by a factor, and the factor.
+
+    The box (1.5.3) and the ellipse (1.6.0) of this level are computed from the floats that alpha is computed from, and
+    pixels' centres lie half a pixel from every tile's edge: what rounds there moves the level (docs/check.md).
+    """
+    (_, a), (_, c), _ = (e.range() for e in p.squares)
+    a, c = a + BLUR, c + BLUR
+    # along the image's axes, in pixels: where a Gaussian may reach
+    span = p.centre[0].size() + p.centre[1].size() + 8.0 * np.sqrt(a + c)
+    kept, room = (p.kappa < 0.03) & (span < 4000.0), 2.0**10
+    if ellipses:
+        thin, room = 1.0 / (p.inverse.range()[1] * a * c), 2.0**19
+        kept &= (p.kappa < 2.0**-10) & (thin * thin > 2.0**10 * FLOAT)
+        kept &= (thin * np.sqrt(BLUR) > 2.0**10 * FLOAT * span) & (span * np.sqrt(np.maximum(a, c) / BLUR) < 2.0**-6 / FLOAT)
+    return kept, 1.0 + 16.0 * p.kappa + room * FLOAT
 
 
 def _colors(splats: ActivatedScene, view: CameraForms, at: Array, like: Affine, unit: float) -> Affine:
