@@ -7,7 +7,7 @@ numbers; with ``FLOAT`` every evaluation of gsplat's formulas in float32 lies wi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -65,6 +65,16 @@ class ActivatedScene:
     antialiased: bool
     background: Array
     rules: VersionRules
+    paint: Any = None
+
+    def painted(self, paint: Any) -> ActivatedScene:
+        """The scene whose picture is weights: Gaussians that count are white, all others and the background black.
+
+        Those in a box [2, 3] count, or those nearer than a distance; None: the scene itself.
+        """
+        if isinstance(paint, np.ndarray):
+            paint = ((self.means >= paint[0]) & (self.means <= paint[1])).all(axis=1) * 1.0
+        return self if paint is None else replace(self, paint=paint, background=np.zeros(3))
 
 
 def activated(
@@ -343,7 +353,8 @@ def _kept(p: ProjectedForms, ellipses: bool) -> tuple[Array, Array]:
     if ellipses:
         thin, room = 1.0 / (p.inverse.range()[1] * a * c), 2.0**19
         kept &= (p.kappa < 2.0**-10) & (thin * thin > 2.0**10 * FLOAT)
-        kept &= (thin * np.sqrt(BLUR) > 2.0**10 * FLOAT * span) & (span * np.sqrt(np.maximum(a, c) / BLUR) < 2.0**-6 / FLOAT)
+        kept &= thin * np.sqrt(BLUR) > 2.0**10 * FLOAT * span
+        kept &= span * np.sqrt(np.maximum(a, c) / BLUR) < 2.0**-6 / FLOAT
     return kept, 1.0 + 16.0 * p.kappa + room * FLOAT
 
 
@@ -351,6 +362,12 @@ def _colors(splats: ActivatedScene, view: CameraForms, at: Array, like: Affine, 
     """Colours [B, n, 3]."""
     sh = splats.sh[at]
     flat = like.of(lambda a: np.broadcast_to(a[..., None], (*a.shape, 3)))
+    if isinstance(splats.paint, float):
+        # a depth that is not a number may be any
+        low, high = flat.range()
+        return flat.boxed(np.array(True), (high < splats.paint) * 1.0, ~(low >= splats.paint) * 1.0)
+    if splats.paint is not None:
+        return Affine.constant(splats.paint[at][..., None], flat)
     if splats.sigmoid:
         value = 1.0 / (1.0 + np.exp(-sh[..., 0, :]))
         return Affine.constant(value, flat, (32.0 * U + 16.0 * unit) * value)
@@ -563,4 +580,4 @@ def picture(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit:
             place[: len(numbers)] = numbers
         part, pixel = whole.among(index), (np.full(cam.width, row), columns)
         parts.append(pixels(splats, cam, part, index, pixel, unit)[0].clamped(0.0, 1.0))
-    return Affine(*(np.stack([getattr(p, name) for p in parts], axis=-3) for name in ("c", "g", "r")))
+    return Affine.joined(parts, -3, np.stack)
