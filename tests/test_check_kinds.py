@@ -27,7 +27,7 @@ from ns_abstract.check.forms import Affine
 from ns_abstract.check.inputs import BadInput, read_poses, read_scene
 from ns_abstract.check.networks import CheckedNetwork
 from ns_abstract.check.poses import CheckedCamera, Poses
-from ns_abstract.check.splats import FLOAT, activated, meeting, picture, pixels, reaches
+from ns_abstract.check.splats import FLOAT, activated, meeting, pictures, pixels, reaches
 from ns_abstract.cli import check as check_command
 from ns_abstract.demo.writing import write_loop_demo
 from ns_abstract.geometry.camera_path import PinholeCamera as PathCamera
@@ -55,7 +55,7 @@ def test_float32_pictures_are_enclosed_and_need_their_charges(mode: str) -> None
     cam, none = CheckedCamera(*values), np.zeros((1, 0))
     seen = Poses(cam, ()).view(none, none)
     for unit, holds in ((FLOAT, True), (0.0, False)):
-        form = picture(splats, cam, seen, unit)
+        form = pictures(splats, cam, seen, unit).of(lambda a: a[..., 0, :, :, :])
         low, high = form.range()
         outside = (np.clip(low, 0.0, 1.0) > image) | (np.clip(high, 0.0, 1.0) < image)
         assert outside.any() != holds

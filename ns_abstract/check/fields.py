@@ -81,7 +81,8 @@ class CheckedField:
         ends = [np.logaddexp(0.0, e) * (1.0 + s * 1e-9) for e, s in ((low, -1.0), (high, 1.0))]
         density = density.within(*ends)
         thin = (density * -lengths).exp()
-        thin = thin.within(*(np.exp(-e * lengths) * (1.0 + s * 1e-12) for e, s in zip(ends[::-1], (-1.0, 1.0), strict=True)))
+        thick, thinned = (np.exp(-e * lengths) for e in ends)
+        thin = thin.within(thinned * (1.0 - 1e-12), thick * (1.0 + 1e-12))
         x = _Zonotope.of(direction).stretched(x).beside(x)
         for weight, bias in self.head:
             x = x.layer(weight, bias).bent()

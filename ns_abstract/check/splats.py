@@ -23,6 +23,8 @@ FLOAT = 2.0**-24
 ROOM = 1e-12
 #: Places in the order that a Gaussian may move by before a box is given up.
 LONGEST = 96
+#: Pixels times Gaussians that are looked at together.
+TOGETHER = 20_000
 
 
 class VersionRules(NamedTuple):
@@ -191,16 +193,17 @@ class ProjectedForms(NamedTuple):
     errors: list[Array]
     kappa: Array
 
-    def among(self, index: Array) -> ProjectedForms:
-        """Rows of Gaussians ``index`` [W, n] out of one row of all [1, N]."""
+    def among(self, box: Array, index: Array) -> ProjectedForms:
+        """Rows of Gaussians ``index`` [W, n] over the boxes [W] out of all [B, N]."""
+        box = box[:, None]
 
         def pick(part: Any) -> Any:
             if isinstance(part, list):
                 return [pick(e) for e in part]
-            return part.of(lambda a: a[..., 0, index]) if isinstance(part, Affine) else part[0, index]
+            return part.of(lambda a: a[..., box, index]) if isinstance(part, Affine) else part[box, index]
 
         rest = {name: pick(getattr(self, name)) for name in self._fields if name != "color"}
-        return ProjectedForms(**rest, color=self.color.of(lambda a: a[..., 0, index, :]))
+        return ProjectedForms(**rest, color=self.color.of(lambda a: a[..., box, index, :]))
 
 
 def projected(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, at: Array, unit: float) -> ProjectedForms:
@@ -564,20 +567,27 @@ def pixels(
         return form, kept, f.motion
 
 
-def picture(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit: float) -> Affine:
-    """The picture [H, W, 3] over one box of poses."""
-    ends, columns, parts = reaches(splats, cam, view, unit), np.arange(cam.width), []
-    inside = (ends[:, 0] <= cam.width) & (ends[:, 1] >= 0.0) & (ends[:, 2] <= cam.height) & (ends[:, 3] >= 0.0)
+def pictures(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit: float) -> Affine:
+    """The pictures [B, H, W, 3] over B boxes of poses."""
+    count, size = len(view.origin), cam.height * cam.width
+    lists, parts = [], []
+    for k in range(count):
+        ends = reaches(splats, cam, view.of(lambda a, k=k: a[..., k : k + 1]), unit)
+        inside = (ends[:, 0] <= cam.width) & (ends[:, 1] >= 0.0) & (ends[:, 2] <= cam.height) & (ends[:, 3] >= 0.0)
+        some = np.flatnonzero(inside)
+        lists += [some[meeting(ends[some], *divmod(p, cam.width))] for p in range(size)]
     # one more, so that there is one
-    some = np.append(np.flatnonzero(inside), 0)
-    ends = np.concatenate([ends[some[:-1]], [[np.inf, -np.inf] * 2]])
+    every = np.unique(np.concatenate([*lists, [0]]).astype(np.int64))
     with np.errstate(all="ignore"):
-        whole = projected(splats, cam, view, some[None], unit)
-    for row in range(cam.height):
-        lists = [meeting(ends, row, int(column)) for column in columns]
-        index = np.full((cam.width, max(1, *map(len, lists))), -1)
-        for place, numbers in zip(index, lists, strict=True):
-            place[: len(numbers)] = numbers
-        part, pixel = whole.among(index), (np.full(cam.width, row), columns)
-        parts.append(pixels(splats, cam, part, index, pixel, unit)[0].clamped(0.0, 1.0))
-    return Affine.joined(parts, -3, np.stack)
+        whole = projected(splats, cam, view, np.broadcast_to(every, (count, len(every))), unit)
+    longest = max(1, *map(len, lists))
+    step = max(1, TOGETHER // longest)
+    for start in range(0, len(lists), step):
+        chosen = lists[start : start + step]
+        index = np.full((len(chosen), longest), -1)
+        for place, numbers in zip(index, chosen, strict=True):
+            place[: len(numbers)] = np.searchsorted(every, numbers)
+        box, place = np.divmod(np.arange(start, start + len(chosen)), size)
+        part = whole.among(box, index)
+        parts.append(pixels(splats, cam, part, index, np.divmod(place, cam.width), unit)[0].clamped(0.0, 1.0))
+    return Affine.joined(parts, -2).of(lambda a: a.reshape(*a.shape[:-2], count, cam.height, cam.width, 3))

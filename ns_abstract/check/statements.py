@@ -15,15 +15,15 @@ _CHANNELS = {"luminance": (0.2126, 0.7152, 0.0722), "r": (1.0, 0.0, 0.0), "g": (
 
 
 class Combined(NamedTuple):
-    """All (`min`) or any (`max`) of some statements hold; ``picture`` gives the forms [H, W, 3] of a plane."""
+    """All or any of some statements hold: the least or the largest of their margins counts."""
 
-    pick: Callable[..., float]
+    pick: Any
     parts: list[Any]
 
-    def margin(self, picture: Callable[[Any], Affine]) -> tuple[float, float]:
-        """Lower and upper bounds of the margin."""
-        ends = [part.margin(picture) for part in self.parts]
-        return self.pick(e[0] for e in ends), self.pick(e[1] for e in ends)
+    def margin(self, picture: Callable[[Any], Affine]) -> tuple[Array, Array]:
+        """Lower and upper bounds [B] of the margin over B boxes; ``picture`` gives forms [B, H, W, 3] of a plane."""
+        lower, upper = zip(*(part.margin(picture) for part in self.parts), strict=True)
+        return self.pick(lower, axis=0), self.pick(upper, axis=0)
 
 
 class Measured(NamedTuple):
@@ -43,23 +43,23 @@ class Measured(NamedTuple):
     low: float
     high: float
 
-    def margin(self, picture: Callable[[Any], Affine]) -> tuple[float, float]:
-        """Lower and upper bounds of the margin."""
+    def margin(self, picture: Callable[[Any], Affine]) -> tuple[Array, Array]:
+        """Lower and upper bounds [B] of the margin; see `Combined`."""
         plane = picture(self.paint)
         single = total(plane.of(lambda a, k=k: a[..., k]) * w for k, w in enumerate(self.channels))
         parts = [single.of(lambda a, k=k: a.reshape(*a.shape[:-2], -1)[..., k]) for k in self.regions]
         if self.rank == 0:
-            means = [p.of(lambda a: a.mean(axis=-1)).wider(2.0 * U * p.size().sum()) for p in parts]
-            least, most = (float(e) for e in (means[0] - means[1] if parts[1:] else means[0]).range())
+            means = [p.of(lambda a: a.mean(axis=-1)).wider(2.0 * U * p.size().sum(axis=-1)) for p in parts]
+            least, most = (means[0] - means[1] if parts[1:] else means[0]).range()
         else:
-            ends = [[float(np.sort(e)[0 if self.rank < 0 else -self.rank]) for e in p.range()] for p in parts]
+            ends = [[np.sort(e, axis=-1)[:, 0 if self.rank < 0 else -self.rank] for e in p.range()] for p in parts]
             (least, most), (off, on) = ends[0], ends[1] if parts[1:] else (0.0, 0.0)
             least, most = least - on, most - off
-        room = 4.0 * U * (1.0 + abs(least) + abs(most))
-        least, most = least - room, most + room
-        if not math.isfinite(least + most):
-            return -math.inf, math.inf
-        return min(least - self.low, self.high - most), min(most - self.low, self.high - least)
+        room = 4.0 * U * (1.0 + np.abs(least) + np.abs(most))
+        lower = np.minimum(least - room - self.low, self.high - most - room)
+        upper = np.minimum(most + room - self.low, self.high - least + room)
+        # what is not a number says nothing
+        return np.where(np.isnan(lower), -np.inf, lower), np.where(np.isnan(upper), np.inf, upper)
 
 
 def parsed(root: dict[str, Any], size: tuple[int, int], scale: float) -> Combined | Measured:
@@ -73,7 +73,7 @@ def parsed(root: dict[str, Any], size: tuple[int, int], scale: float) -> Combine
     Raises:
         BadInput: It says something that this program does not check.
     """
-    for name, pick in (("all", min), ("any", max)):
+    for name, pick in (("all", np.min), ("any", np.max)):
         if name in root:
             return Combined(pick, [parsed(part, size, scale) for part in root[name]])
     kind, weight = root.get("type"), float(root.get("weight", 0.5))

@@ -18,7 +18,7 @@ from ns_abstract.check.networks import CheckedNetwork
 from ns_abstract.check.pictures import FIRST, Verdict, divided, units
 from ns_abstract.check.poses import TURNS, CameraForms, CheckedCamera, Poses
 from ns_abstract.check.results import StoredCells
-from ns_abstract.check.splats import FLOAT, ActivatedScene, picture
+from ns_abstract.check.splats import FLOAT, ActivatedScene, pictures
 from ns_abstract.check.statements import parsed
 
 #: Boxes that are looked at together.
@@ -105,10 +105,9 @@ class _OfNetwork(_Verdicts):
         except Exception as error:  # onnx raises whatever a damaged file makes it run into
             raise BadInput(" ".join(str(error).split())[:160] or "cannot be read", model) from None
 
-    def inputs(self, camera: CheckedCamera, views: list[CameraForms], unit: float) -> Affine:
-        """The network's inputs [B, 3, H, W] over boxes of poses, one view each."""
-        image = Affine.joined([picture(self.scene, camera, view, unit) for view in views], -4, np.stack)
-        image = image.of(lambda a: np.moveaxis(a, -1, -3))
+    def inputs(self, camera: CheckedCamera, view: CameraForms, unit: float) -> Affine:
+        """The network's inputs [B, 3, H, W] over B boxes of poses."""
+        image = pictures(self.scene, camera, view, unit).of(lambda a: np.moveaxis(a, -1, -3))
         if self.shape.get("channels", "RGB") == "BGR":
             image = image.of(lambda a: a[..., ::-1, :, :])
         low, high = self.shape.get("range") or (0.0, 1.0)
@@ -131,8 +130,7 @@ class CheckedCertificate(_OfNetwork):
         self.rivals = torch.cat([rows[: self.label], rows[self.label + 1 :]])
 
     def _inputs(self, low: Array, high: Array, unit: float) -> Affine:
-        views = [self.poses.view(low[k : k + 1], high[k : k + 1]) for k in range(len(low))]
-        return self.inputs(self.camera, views, unit)
+        return self.inputs(self.camera, self.poses.view(low, high), unit)
 
     def margins(self, low: Array, high: Array, unit: float) -> Array:
         """Lower bounds [B] of the class' output less the largest other one."""
@@ -153,15 +151,15 @@ class CheckedStatement(_Verdicts):
 
     def margins(self, low: Array, high: Array, unit: float) -> Array:
         """Lower bounds [B] of the statement's margin."""
-        return np.array([self._margin(low[k : k + 1], high[k : k + 1], unit)[0] for k in range(len(low))])
+        return self._margin(low, high, unit)[0]
 
     def most(self, point: Array) -> float:
         """An upper bound of that at one point [1, d]."""
-        return self._margin(point, point, 0.0)[1]
+        return float(self._margin(point, point, 0.0)[1][0])
 
-    def _margin(self, low: Array, high: Array, unit: float) -> tuple[float, float]:
+    def _margin(self, low: Array, high: Array, unit: float) -> tuple[Array, Array]:
         view = self.poses.view(low, high)
-        return self.statement.margin(lambda paint: picture(self.scene.painted(paint), self.camera, view, unit))
+        return self.statement.margin(lambda paint: pictures(self.scene.painted(paint), self.camera, view, unit))
 
 
 class CheckedLoop(_OfNetwork):
@@ -209,8 +207,7 @@ class CheckedLoop(_OfNetwork):
         half = np.maximum(high - middle, middle - low) * (1.0 + 4.0 * U)
         own = parameters(middle[:, self.seen], half[:, self.seen])
         local = [own[self.seen.index(k)] if k in self.seen else own[0] * 0.0 + middle[:, k] for k in range(len(x))]
-        views = [self._view([e.of(lambda a, k=k: a[..., k : k + 1]) for e in local]) for k in range(len(low))]
-        y, outputs = self.network.outputs(self.inputs(self.camera, views, unit)), []
+        y, outputs = self.network.outputs(self.inputs(self.camera, self._view(local), unit)), []
         inverse = np.where(half > 1e-150, 1.0 / np.maximum(half, 1e-150), 0.0)
         scaled = [(x[k] + -middle[:, k]) * inverse[:, k] for k in self.seen]
         for j in range(y.c.shape[-1]):
