@@ -160,7 +160,7 @@ class Picture:
         if not isinstance(self.scene, ActivatedScene):
             return np.zeros(0, np.int64)
         view = self.poses.view(low[None], high[None])
-        return meeting(reaches(self.scene, self.poses.camera, view, unit), claim.row, claim.column)
+        return meeting(reaches(self.scene, self.poses.camera, view, unit)[0], claim.row, claim.column)
 
     def _forms(
         self, low: Array, high: Array, index: Array, claim: PixelClaim, unit: float

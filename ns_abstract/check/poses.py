@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from copy import copy
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -103,14 +101,6 @@ class CameraForms:
         self.rotation = [[turn[s][r] * (1.0, -1.0, -1.0)[r] for s in range(3)] for r in range(3)]
         self.shift = [row[0] for row in product(self.rotation, [[-e] for e in self.position])]
         self.origin = np.stack([e.c for e in place], axis=-1)
-
-    def of(self, pick: Any) -> CameraForms:
-        """The cameras over what ``pick`` takes of the boxes."""
-        found = copy(self)
-        found.turn, found.rotation = ([[e.of(pick) for e in row] for row in m] for m in (self.turn, self.rotation))
-        found.position, found.shift = ([e.of(pick) for e in v] for v in (self.position, self.shift))
-        found.stretch, found.origin = pick(self.stretch), pick(self.origin.T).T
-        return found
 
 
 def _nearest_rotation(matrix: Array) -> Array:

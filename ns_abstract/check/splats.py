@@ -103,12 +103,12 @@ def activated(
 
 
 def reaches(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit: float) -> Array:
-    """Ends [N, 4] in pixels (left, right, top, bottom) of where each Gaussian may show for some pose of one box.
+    """Ends [B, N, 4] in pixels (left, right, top, bottom) of where each Gaussian may show for some pose of each box.
 
     A Gaussian that shows nowhere has crossed ends.
     """
     x, y, z = _points(splats, view, np.arange(len(splats.means))[None], unit)
-    zl, zh = (v[0] for v in z.range())
+    zl, zh = z.range()
     near = ~(zl > 0.5 * NEAR)
     zl = np.where(near, 1.0, zl)
     hidden = ~((zh >= NEAR * (1.0 - ROOM)) & ~(zl > FAR * (1.0 + ROOM)))
@@ -122,14 +122,14 @@ def reaches(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit:
                   ((cam.fx, cam.cx, cam.width), (cam.fy, cam.cy, cam.height))]  # fmt: skip
         longest = 1.05 * max(cam.fx, cam.fy) * splats.scales.max(axis=1) * np.sqrt(1.0 + np.square(limits).sum())
         for t, f, centre, side in ((x, cam.fx, cam.cx, cam.width), (y, cam.fy, cam.cy, cam.height)):
-            a, b = (v[0] for v in t.range())
+            a, b = t.range()
             least, most = np.minimum(a / zl, a / zh), np.maximum(b / zl, b / zh)
             # keyframes' rotations stretch by a hundredth at most
             limit = (max(centre, side - centre) + 0.15 * side) / f * (1.0 + ROOM)
             spread = 1.05 * f / zl * splats.scales.max(axis=1) * np.sqrt(1.0 + limit * limit)
             room = reach * np.sqrt(spread * spread + BLUR) * (1.0 + 1e-9) + 1e-9 * (np.abs(least) + np.abs(most)) * f
             if unit:
-                faint &= spread < 4.0
+                faint = faint & (spread < 4.0)
                 # exponents of small ones err by less than a tenth; those of large ones may be anything in their tiles,
                 # whose side is that of the longer axis, 3.33 deviations at most
                 room = np.where(spread < 4.0, 1.06 * room, np.maximum(1.06 * room, 3.4 * longest / zl) + 2.0 * TILE)
@@ -137,7 +137,7 @@ def reaches(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit:
             sides += [np.where(open_, -np.inf, f * least + centre - room - 1e-9)]
             sides += [np.where(open_, np.inf, f * most + centre + room + 1e-9)]
     sides[0] = np.where(hidden | faint, np.inf, sides[0])
-    return np.stack(sides, axis=1)
+    return np.stack(sides, axis=-1)
 
 
 def meeting(ends: Array, row: int, column: int) -> Array:
@@ -174,6 +174,13 @@ class _PixelFragments(NamedTuple):
     depth: Affine
     shows: Array
     motion: Array
+
+    def among(self, places: Array) -> _PixelFragments:
+        """Those at ``places`` [B, m] of each row."""
+        row = np.arange(len(places))[:, None]
+        alpha, depth = (e.of(lambda a: a[..., row, places]) for e in (self.alpha, self.depth))
+        color = self.color.of(lambda a: a[..., row, places, :])
+        return _PixelFragments(alpha, color, depth, self.shows[row, places], self.motion)
 
 
 class ProjectedForms(NamedTuple):
@@ -286,11 +293,7 @@ def _fragments(
 def _rounded(det: Affine, squares: Any, h: list[Array], sizes: Array) -> tuple[list[Array], Array, Array]:
     """Errors in float32 of the covariance's entries (xx, yy, xy), of the exponent (relative) and of determinants.
 
-    The covariance J R M M^T R^T J^T is a sum of products of factors that err by 12 (J), 2 (R) and 64 units of a scale
-    (M: 46 of a quaternion's rotation, 18 of scale and product), in 15 products and sums of three: below 165 units a
-    side of h h^T, h = |J| |R| |M|. What the entries do to the exponent is bounded by eta, their size against the
-    covariance; conic and exponent carry 48 units of their terms, whose sum is 4 ac / det times the exponent at most.
-    Where kappa is not below 1/8 nothing is known of the exponent.
+    Where kappa is not below 1/8 nothing is known of the exponent; docs/check.md derives the charges.
     """
     square, (hx, hy) = (sizes * sizes).sum(axis=-1) * (1.0 + 1e-9), h
     a, c = (e.size() + BLUR for e in squares)
@@ -420,15 +423,7 @@ def blended(f: _PixelFragments, background: Array, unit: float) -> tuple[Affine,
     """The blended colours [B, 3] before the clamp, and which of the fragments [B, n] matter."""
     # those that do not show stand behind all others
     order = np.argsort(np.where(f.shows, f.depth.c, np.inf), axis=1, kind="stable")
-    shows = np.take_along_axis(f.shows, order, 1)
-
-    def sort(a: Array) -> Array:
-        return np.take_along_axis(a, np.broadcast_to(order, a.shape), -1)
-
-    def sort_colors(a: Array) -> Array:
-        return np.take_along_axis(a, np.broadcast_to(order[..., None], a.shape), -2)
-
-    alpha, depth, color = f.alpha.of(sort), f.depth.of(sort), f.color.of(sort_colors)
+    alpha, color, depth, shows, _ = f.among(order)
     count, n = shows.shape
     al, ah = (np.clip(a, 0.0, 1.0) for a in alpha.range())
     cl, ch = color.range()
@@ -557,11 +552,7 @@ def pixels(
             plain = np.zeros((len(index), 3))
             form = Affine(plain + splats.background, np.zeros((len(f.alpha.g), *plain.shape)), plain + 16.0 * unit)
             return form, f.shows, f.motion
-        some = _PixelFragments(
-            f.alpha.of(lambda a: a[..., used]), f.color.of(lambda a: a[..., used, :]),
-            f.depth.of(lambda a: a[..., used]), f.shows[:, used], f.motion,
-        )  # fmt: skip
-        form, keep = blended(some, splats.background, unit)
+        form, keep = blended(f.among(np.broadcast_to(used, (len(index), len(used)))), splats.background, unit)
         kept = np.zeros(f.shows.shape, bool)
         kept[:, used] = keep
         return form, kept, f.motion
@@ -569,10 +560,8 @@ def pixels(
 
 def pictures(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit: float) -> Affine:
     """The pictures [B, H, W, 3] over B boxes of poses."""
-    count, size = len(view.origin), cam.height * cam.width
-    lists, parts = [], []
-    for k in range(count):
-        ends = reaches(splats, cam, view.of(lambda a, k=k: a[..., k : k + 1]), unit)
+    count, size, lists = len(view.origin), cam.height * cam.width, []
+    for ends in reaches(splats, cam, view, unit):
         inside = (ends[:, 0] <= cam.width) & (ends[:, 1] >= 0.0) & (ends[:, 2] <= cam.height) & (ends[:, 3] >= 0.0)
         some = np.flatnonzero(inside)
         lists += [some[meeting(ends[some], *divmod(p, cam.width))] for p in range(size)]
@@ -581,7 +570,7 @@ def pictures(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit
     with np.errstate(all="ignore"):
         whole = projected(splats, cam, view, np.broadcast_to(every, (count, len(every))), unit)
     longest = max(1, *map(len, lists))
-    step = max(1, TOGETHER // longest)
+    step, parts = max(1, TOGETHER // longest), []
     for start in range(0, len(lists), step):
         chosen = lists[start : start + step]
         index = np.full((len(chosen), longest), -1)
