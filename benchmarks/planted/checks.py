@@ -148,8 +148,8 @@ CHECKS = (
         "checker: weights have the scene's background",
         _SPLATS,
         "ActivatedScene.painted",
-        "background=np.zeros(3)",
-        "background=np.ones(3)",
+        "np.zeros(3)",
+        "np.ones(3)",
         "test_check_kinds.py::test_measures_are_those_of_another_program[visible--0.0]",
     ),
     Fault(

@@ -212,7 +212,9 @@ class CheckedLoop(_OfNetwork):
         scaled = [(x[k] + -middle[:, k]) * inverse[:, k] for k in self.seen]
         for j in range(y.c.shape[-1]):
             parts = [s * y.g[k, :, j] for k, s in enumerate(scaled)]
-            outputs.append(total([Affine.constant(y.c[:, j], x[0], y.r[:, j]), *parts]))
+            # what moves by almost nothing is an error
+            still = sum(np.where(inverse[:, k] == 0.0, np.abs(y.g[n, :, j]), 0.0) for n, k in enumerate(self.seen))
+            outputs.append(total([Affine.constant(y.c[:, j], x[0], y.r[:, j] + still), *parts]))
         return outputs
 
     def _next(self, x: list[Affine], unit: float) -> list[Affine]:
