@@ -199,6 +199,7 @@ def main() -> None:
                 continue
             with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as temporary:
                 package = Path(temporary) / "package"
+                package.mkdir()
                 copy_package(package)
                 blind(package)
                 if fault is not None:

@@ -4,6 +4,7 @@ from planted.fault import Fault
 
 _AUDIT, _FORMS, _RESULTS, _SPLATS = "check/audit.py", "check/forms.py", "check/results.py", "check/splats.py"
 _PICTURES, _NETWORKS, _FIELDS = "check/pictures.py", "check/networks.py", "check/fields.py"
+_STATEMENTS, _VERDICTS = "check/statements.py", "check/verdicts.py"
 _PIXELS = "test_check.py::test_pixels_contain_pictures_of_another_renderer[classic-1.4.0]"
 
 CHECKS = (
@@ -134,5 +135,45 @@ CHECKS = (
         '[rows, f"{total % (1 << 256):064x}"] != [report["cells_seal"][k] for k in ("rows", "sum")]',
         "False",
         "test_check_kinds.py::test_an_edited_table_is_refused",
+    ),
+    Fault(
+        "checker: a limit from above is not looked at",
+        _STATEMENTS,
+        "Measured.margin",
+        "np.minimum(least - room - self.low, self.high - most - room)",
+        "least - room - self.low",
+        "test_check_kinds.py::test_measures_are_those_of_another_program[clear--0.0]",
+    ),
+    Fault(
+        "checker: weights have the scene's background",
+        _SPLATS,
+        "ActivatedScene.painted",
+        "np.zeros(3)",
+        "np.ones(3)",
+        "test_check_kinds.py::test_measures_are_those_of_another_program[visible--0.0]",
+    ),
+    Fault(
+        "checker: errors of states are forgotten",
+        _VERDICTS,
+        "_lifted",
+        "np.concatenate([e.g, errors[:, k]])",
+        "e.g",
+        "test_check_kinds.py::test_errors_of_states_become_symbols",
+    ),
+    Fault(
+        "checker: a clamp is its chord",
+        _FORMS,
+        "Affine.clamped",
+        "rest.max(axis=0) + rounding",
+        "rest.min(axis=0) + rounding",
+        "test_check.py::test_forms_contain_exact_values[clamp]",
+    ),
+    Fault(
+        "checker: no needle misses a tile",
+        _SPLATS,
+        "_kept",
+        "kept, room = (p.kappa < 0.03) & (span < 4000.0), 2.0**10",
+        "kept, room = (p.kappa < 0.03), 2.0**10",
+        "test_check_kinds.py::test_needles_may_miss_their_tiles_in_float32",
     ),
 )

@@ -17,7 +17,7 @@ from ns_abstract.check.inputs import BadInput, dataset_scale, given_set, read_po
 from ns_abstract.check.pictures import Picture
 from ns_abstract.check.results import StoredCells, read_cells, read_report, read_verdicts, structure
 from ns_abstract.check.splats import RULES
-from ns_abstract.check.verdicts import CheckedCertificate, CheckedLoop
+from ns_abstract.check.verdicts import CheckedCertificate, CheckedLoop, CheckedStatement
 
 #: Part of the claims that must be settled; level of what is stated of all claims.
 ENOUGH, CONFIDENCE = 0.8, 0.95
@@ -135,8 +135,8 @@ def opened(folder: Path, report: dict[str, Any], moved: dict[str, Path | None]) 
         model = moved.get("model") or file("loop").parent / report["loop"]["network"]
         return parts, [CheckedLoop(c, scene, report, model) for c in parts if CheckedLoop.claims(c)]
     path, given = file("camera_path_filename"), given_set(settings, moved.get("perturbation_filename"))
+    without = "sha256" not in report.get("model", {})
     if (folder / "cells.sqlite").exists():
-        without = "sha256" not in report.get("model", {})
         parts, model = read_verdicts(folder, report), Path() if without else file("model")
     else:
         parts, model = [], None
@@ -158,6 +158,8 @@ def opened(folder: Path, report: dict[str, Any], moved: dict[str, Path | None]) 
             raise BadInput(f"frame {cells.index} of the result is another set of poses or size", path, fix=fix)
         if model is None:
             subjects.append(Picture(cells, scene, poses, report))
+        elif CheckedCertificate.claims(cells) and without:
+            subjects.append(CheckedStatement(cells, scene, poses, report, dataset_scale(config)))
         elif CheckedCertificate.claims(cells):
             subjects.append(CheckedCertificate(cells, scene, poses, report, model))
     return parts, subjects

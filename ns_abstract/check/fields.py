@@ -60,7 +60,7 @@ class CheckedField:
             some = [[e.of(lambda a, k=k: a[..., k : k + TOGETHER, :]) for e in es] for es in (places, along)]
             with np.errstate(all="ignore"):
                 parts.append(self._ray(some[0], some[1], lengths))
-        return Affine(*(np.concatenate([getattr(p, name) for p in parts], axis=-2) for name in ("c", "g", "r")))
+        return Affine.joined(parts, -2)
 
     def _ray(self, places: list[Affine], along: list[Affine], lengths: Array) -> Affine:
         d, (position, direction) = (
@@ -74,22 +74,23 @@ class CheckedField:
         raw = x.layer(*self.density[0]).form(d).of(lambda a: a[..., 0])
         low, high = raw.range()
         f, slope = np.logaddexp(0.0, raw.c), 1.0 / (1.0 + np.exp(-raw.c))
+        # half the second derivative is at most 1/8, and half the exponential of its argument
+        bend = np.minimum(0.5 * np.exp(np.minimum(high, 0.0)) * (1.0 + 1e-12), 0.125)
         # torch's softplus is its argument from 20 on
-        density = raw.composed(f, slope, 0.0 * f, 0.125 + 0.0 * f).wider(np.where(high > 19.0, 2.1e-9, 1e-14))
-        density = density.boxed(
-            ~(density.r <= high - low + 1.0),
-            np.logaddexp(0.0, low) * (1 - 1e-14),
-            np.logaddexp(0.0, high) * (1 + 1e-14),
-        )
+        density = raw.composed(f, slope, 0.0 * f, bend).wider(np.where(high > 19.0, 2.1e-9, 0.0))
+        ends = [np.logaddexp(0.0, e) * (1.0 + s * 1e-9) for e, s in ((low, -1.0), (high, 1.0))]
+        density = density.within(*ends)
         thin = (density * -lengths).exp()
-        thin = thin.boxed(~((thin.range()[1] <= 1.0) & (thin.range()[0] >= 0.0)), *np.clip(thin.range(), 0.0, 1.0))
+        thick, thinned = (np.exp(-e * lengths) for e in ends)
+        thin = thin.within(thinned * (1.0 - 1e-12), thick * (1.0 + 1e-12))
         x = _Zonotope.of(direction).stretched(x).beside(x)
         for weight, bias in self.head:
             x = x.layer(weight, bias).bent()
         raw = x.layer(*self.color[0]).form(d)
         f = 1.0 / (1.0 + np.exp(-raw.c))
         color = raw.composed(f, f * (1.0 - f), -0.0482 + 0.0 * f, 0.0482 + 0.0 * f)
-        color = color.boxed(~(color.width <= 0.5), *(1.0 / (1.0 + np.exp(-e)) for e in raw.range()))
+        ends = zip(raw.range(), (-1e-12, 1e-12), strict=True)
+        color = color.within(*(1.0 / (1.0 + np.exp(-e)) * (1.0 + room) for e, room in ends))
         alpha = -thin + 1.0
         return from_the_back(alpha, color, np.ones(alpha.c.shape, bool), np.array(self.background), 0.0)
 
@@ -101,7 +102,7 @@ def _encoded(x: list[Affine], count: int, most: float) -> Affine:
     angles = [wide(e) * (2.0 * np.pi * f) for e in x for f in frequencies]
     waves = [e.sine() for e in angles]
     parts = [*(s for s, _ in waves), *(c for _, c in waves), *(wide(e) for e in x)]
-    return Affine(*(np.concatenate([getattr(p, name) for p in parts], axis=-1) for name in ("c", "g", "r")))
+    return Affine.joined(parts, -1)
 
 
 class _Zonotope:

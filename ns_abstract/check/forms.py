@@ -144,11 +144,37 @@ class Affine:
         radius = np.maximum(high - middle, middle - low) * (1.0 + 4.0 * U) + TINY
         return Affine(np.where(where, middle, self.c), np.where(where, 0.0, self.g), np.where(where, radius, self.r))
 
+    def within(self, low: Array, high: Array) -> Affine:
+        """The form, but the interval [low, high], which holds as well, where the form says less."""
+        return self.boxed(~(2.0 * self.width <= 1.5 * (high - low)), low, high)
+
     def clamped(self, low: float | Array, high: float | Array) -> Affine:
-        """The form of the value limited to [low, high]: itself where no limit is met, else an interval."""
+        """The form of the value limited to [low, high]: the chord's slope, and what is left of it.
+
+        Value less ``slope`` times argument is linear between the argument's ends and the limits inside of them, so
+        that it is least and largest at one of these.
+        """
         least, most = self.range()
-        met = ~((least >= low) & (most <= high))
-        return self.boxed(met, np.clip(least, low, high), np.clip(most, low, high))
+        bottom, top = np.clip(least, low, high), np.clip(most, low, high)
+        with np.errstate(all="ignore"):
+            slope = np.where(most > least, np.clip((top - bottom) / (most - least), 0.0, 1.0), 1.0)
+            places = [least, most, np.clip(low, least, most), np.clip(high, least, most)]
+            rest = np.stack([np.clip(x, low, high) - slope * x for x in places])
+            rounding = 4.0 * U * (np.abs(least) + np.abs(most) + np.abs(bottom) + np.abs(top))
+            small, large = rest.min(axis=0) - rounding, rest.max(axis=0) + rounding
+            form = (self * slope + 0.5 * (small + large)).wider(0.5 * (large - small) * (1.0 + 4.0 * U))
+        inside, bad = (least >= low) & (most <= high), ~(np.isfinite(form.r) & np.isfinite(form.c))
+        return Affine.chosen(inside, self, form).boxed(bad & ~inside, bottom, top)
+
+    @staticmethod
+    def chosen(where: Array, a: Affine, b: Affine) -> Affine:
+        """The form ``a`` where it is asked for, elsewhere ``b``."""
+        return Affine(np.where(where, a.c, b.c), np.where(where, a.g, b.g), np.where(where, a.r, b.r))
+
+    @staticmethod
+    def joined(forms: Any, axis: int, join: Any = np.concatenate) -> Affine:
+        """Forms one behind the other along an axis that is counted from the last one; or stacked along a new one."""
+        return Affine(*(join([getattr(f, name) for f in forms], axis=axis) for name in ("c", "g", "r")))
 
     def of(self, pick: Any) -> Affine:
         """The form of what ``pick`` makes of its arrays, whose axes it must count from the last one."""

@@ -30,6 +30,8 @@ _MODES = {"mip": "antialiased", "1": "antialiased", "true": "antialiased"}
 _MODES |= {"default": "classic", "0": "classic", "false": "classic"}
 _MOVED = "say with --load-config where the scene lies now"
 _SCENE = "give the run of the result"
+_CONVERT = "of another format: ns-abstract-export ply --load-config FILE --output-filename scene.ply, then check with "
+_CONVERT += "--load-config scene.ply; the digest says whether these are the result's numbers"
 
 
 class BadInput(ValueError):
@@ -80,9 +82,10 @@ def read_scene(file: Path, report: dict[str, Any]) -> ActivatedScene | CheckedFi
         report: Of the result.
     """
     settings, about, renderer = report["settings"], report["scene"], report["renderer"]
-    file = file / "config.yml" if file.is_dir() else file
+    folder = file.is_dir()
+    file = file / "config.yml" if folder else file
     if not file.is_file():
-        raise BadInput("no such run", file, fix=_MOVED)
+        raise BadInput("no such run", file, fix=_CONVERT if folder else _MOVED)
     with file.open("rb") as stream:
         ply = stream.read(4) in (b"ply\n", b"ply\r")
     if renderer["name"] == "nerf-uniform":
@@ -124,7 +127,7 @@ def _read_run(file: Path, settings: dict[str, Any]) -> tuple[dict[str, Any], dic
         folder = file.parent / (parts if isinstance(parts, str) else "/".join(parts))
         step = root.get("load_step") if settings.get("load_step") is None else settings["load_step"]
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, yaml.YAMLError):
-        raise BadInput("cannot be read as a run's configuration", file) from None
+        raise BadInput("cannot be read as a run's configuration", file, fix=_CONVERT) from None
     steps = ((re.fullmatch(r"step-(\d+)\.ckpt", p.name), p) for p in sorted(folder.glob("step-*.ckpt")))
     names = {int(match[1]): p for match, p in steps if match}
     if not names or (step is not None and int(step) not in names):
@@ -180,9 +183,9 @@ def _read_ply(file: Path, settings: dict[str, Any]) -> tuple[Any, ...]:
         with file.open("rb") as stream:
             header = stream.read(1 << 16).partition(b"end_header")[0].decode("latin-1").split("\n")
     except Exception:  # plyfile raises whatever a damaged file makes it run into
-        raise BadInput("cannot be read as a 3DGS .ply", file) from None
+        raise BadInput("cannot be read as a 3DGS .ply", file, fix=_CONVERT) from None
     if "filter_3D" in columns:
-        raise BadInput("has a filter, which this program does not apply", file, "filter_3D", "convert the file")
+        raise BadInput("has a filter, which this program does not apply", file, "filter_3D", _CONVERT)
     mode = "classic"
     for line in header:
         pattern = r"(?:comment|obj_info)\s+(splatrendermode|antialiased)\b[\s:=]*(.*)"

@@ -160,7 +160,7 @@ class Picture:
         if not isinstance(self.scene, ActivatedScene):
             return np.zeros(0, np.int64)
         view = self.poses.view(low[None], high[None])
-        return meeting(reaches(self.scene, self.poses.camera, view, unit), claim.row, claim.column)
+        return meeting(reaches(self.scene, self.poses.camera, view, unit)[0], claim.row, claim.column)
 
     def _forms(
         self, low: Array, high: Array, index: Array, claim: PixelClaim, unit: float
@@ -195,8 +195,8 @@ class Picture:
 
 def units(scene: Any, report: dict[str, Any]) -> tuple[float, ...]:
     """Roundoffs of the pictures that are tried: float32's first, where that is claimed and this program has charges."""
-    mine = isinstance(scene, ActivatedScene) and scene.rules.tiles
-    return (FLOAT, 0.0) if mine and report.get("guarantee") == "float32-sound" else (0.0,)
+    splats = isinstance(scene, ActivatedScene)
+    return (FLOAT, 0.0) if splats and report.get("guarantee") == "float32-sound" else (0.0,)
 
 
 def divided(low: Array, high: Array, motion: Array, full: Array) -> list[tuple[Array, Array]]:

@@ -7,7 +7,7 @@ numbers; with ``FLOAT`` every evaluation of gsplat's formulas in float32 lies wi
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,21 +23,26 @@ FLOAT = 2.0**-24
 ROOM = 1e-12
 #: Places in the order that a Gaussian may move by before a box is given up.
 LONGEST = 96
+#: Pixels times Gaussians that are looked at together.
+TOGETHER = 20_000
 
 
 class VersionRules(NamedTuple):
-    """What differs between gsplat's versions: alpha's cap, least compensation, tiles that cut."""
+    """What differs between gsplat's versions: alpha's cap, least compensation, tiles that cut, tiles of ellipses.
+
+    Where tiles do not cut they hold every pixel with an alpha above the threshold, in real numbers; in float32 `_kept`.
+    """
 
     cap: float
     least_factor: float
     tiles: bool
+    ellipses: bool
 
 
 RULES = {
-    "1.4.0": VersionRules(0.999, 0.0, True),
-    # from 1.5 on a box holds every pixel with an alpha above the threshold, so that tiles change nothing
-    "1.5.3": VersionRules(0.999, 0.0, False),
-    "1.6.0": VersionRules(float(np.float32(0.99)), float(np.float32(0.005)), False),
+    "1.4.0": VersionRules(0.999, 0.0, True, False),
+    "1.5.3": VersionRules(0.999, 0.0, False, False),
+    "1.6.0": VersionRules(float(np.float32(0.99)), float(np.float32(0.005)), False, True),
 }
 
 
@@ -62,6 +67,16 @@ class ActivatedScene:
     antialiased: bool
     background: Array
     rules: VersionRules
+    paint: Any = None
+
+    def painted(self, paint: Any) -> ActivatedScene:
+        """The scene whose picture is weights: Gaussians that count are white, all others and the background black.
+
+        Those in a box [2, 3] count, or those nearer than a distance; None: the scene itself.
+        """
+        if isinstance(paint, np.ndarray):
+            paint = ((self.means >= paint[0]) & (self.means <= paint[1])).all(axis=1) * 1.0
+        return self if paint is None else replace(self, paint=paint, background=np.zeros(3))
 
 
 def activated(
@@ -88,12 +103,12 @@ def activated(
 
 
 def reaches(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit: float) -> Array:
-    """Ends [N, 4] in pixels (left, right, top, bottom) of where each Gaussian may show for some pose of one box.
+    """Ends [B, N, 4] in pixels (left, right, top, bottom) of where each Gaussian may show for some pose of each box.
 
     A Gaussian that shows nowhere has crossed ends.
     """
     x, y, z = _points(splats, view, np.arange(len(splats.means))[None], unit)
-    zl, zh = (v[0] for v in z.range())
+    zl, zh = z.range()
     near = ~(zl > 0.5 * NEAR)
     zl = np.where(near, 1.0, zl)
     hidden = ~((zh >= NEAR * (1.0 - ROOM)) & ~(zl > FAR * (1.0 + ROOM)))
@@ -103,22 +118,26 @@ def reaches(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit:
     faint = opacity < LEAST_ALPHA
     with np.errstate(all="ignore"):
         reach = np.sqrt(2.0 * np.log(np.maximum(opacity * 255.0, 1.0)))
+        limits = [(max(c, n - c) + 0.15 * n) / f for f, c, n in
+                  ((cam.fx, cam.cx, cam.width), (cam.fy, cam.cy, cam.height))]  # fmt: skip
+        longest = 1.05 * max(cam.fx, cam.fy) * splats.scales.max(axis=1) * np.sqrt(1.0 + np.square(limits).sum())
         for t, f, centre, side in ((x, cam.fx, cam.cx, cam.width), (y, cam.fy, cam.cy, cam.height)):
-            a, b = (v[0] for v in t.range())
+            a, b = t.range()
             least, most = np.minimum(a / zl, a / zh), np.maximum(b / zl, b / zh)
-            limit = (max(centre, side - centre) + 0.15 * side) / f * (1.0 + ROOM)
             # keyframes' rotations stretch by a hundredth at most
+            limit = (max(centre, side - centre) + 0.15 * side) / f * (1.0 + ROOM)
             spread = 1.05 * f / zl * splats.scales.max(axis=1) * np.sqrt(1.0 + limit * limit)
             room = reach * np.sqrt(spread * spread + BLUR) * (1.0 + 1e-9) + 1e-9 * (np.abs(least) + np.abs(most)) * f
             if unit:
-                faint &= spread < 4.0
-                # exponents of small ones err by less than a tenth; those of large ones may be anything in their tiles
-                room = np.where(spread < 4.0, 1.06 * room, np.maximum(1.06 * room, 3.3 * spread) + 2.0 * TILE)
+                faint = faint & (spread < 4.0)
+                # exponents of small ones err by less than a tenth; those of large ones may be anything in their tiles,
+                # whose side is that of the longer axis, 3.33 deviations at most
+                room = np.where(spread < 4.0, 1.06 * room, np.maximum(1.06 * room, 3.4 * longest / zl) + 2.0 * TILE)
             open_ = near | ~np.isfinite(room)
             sides += [np.where(open_, -np.inf, f * least + centre - room - 1e-9)]
             sides += [np.where(open_, np.inf, f * most + centre + room + 1e-9)]
     sides[0] = np.where(hidden | faint, np.inf, sides[0])
-    return np.stack(sides, axis=1)
+    return np.stack(sides, axis=-1)
 
 
 def meeting(ends: Array, row: int, column: int) -> Array:
@@ -156,6 +175,13 @@ class _PixelFragments(NamedTuple):
     shows: Array
     motion: Array
 
+    def among(self, places: Array) -> _PixelFragments:
+        """Those at ``places`` [B, m] of each row."""
+        row = np.arange(len(places))[:, None]
+        alpha, depth = (e.of(lambda a: a[..., row, places]) for e in (self.alpha, self.depth))
+        color = self.color.of(lambda a: a[..., row, places, :])
+        return _PixelFragments(alpha, color, depth, self.shows[row, places], self.motion)
+
 
 class ProjectedForms(NamedTuple):
     """Gaussians on the image plane, forms [B, n]: all that does not depend on the pixel.
@@ -174,16 +200,17 @@ class ProjectedForms(NamedTuple):
     errors: list[Array]
     kappa: Array
 
-    def among(self, index: Array) -> ProjectedForms:
-        """Rows of Gaussians ``index`` [W, n] out of one row of all [1, N]."""
+    def among(self, box: Array, index: Array) -> ProjectedForms:
+        """Rows of Gaussians ``index`` [W, n] over the boxes [W] out of all [B, N]."""
+        box = box[:, None]
 
         def pick(part: Any) -> Any:
             if isinstance(part, list):
                 return [pick(e) for e in part]
-            return part.of(lambda a: a[..., 0, index]) if isinstance(part, Affine) else part[0, index]
+            return part.of(lambda a: a[..., box, index]) if isinstance(part, Affine) else part[box, index]
 
         rest = {name: pick(getattr(self, name)) for name in self._fields if name != "color"}
-        return ProjectedForms(**rest, color=self.color.of(lambda a: a[..., 0, index, :]))
+        return ProjectedForms(**rest, color=self.color.of(lambda a: a[..., box, index, :]))
 
 
 def projected(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, at: Array, unit: float) -> ProjectedForms:
@@ -250,6 +277,9 @@ def _fragments(
         squares = [e.wider(error) for e, error in zip(p.squares, p.errors, strict=True)]
         maybe, certain = _tiles(cam, pixel, (mx, my), squares, unit)
         shows, surely = shows & maybe, surely & certain & ~wild
+    elif unit:
+        kept, level = _kept(p, rules.ellipses)
+        surely = surely & kept & (least >= LEAST_ALPHA * level)
     alow, ahigh = alpha.range()
     # the form must say no less than the interval, and stay below the cap
     rough = ~((ahigh - alow) <= 1.5 * (most - least)) | ~(ahigh <= rules.cap) | ~(alow >= 0.0) | ~surely
@@ -263,11 +293,7 @@ def _fragments(
 def _rounded(det: Affine, squares: Any, h: list[Array], sizes: Array) -> tuple[list[Array], Array, Array]:
     """Errors in float32 of the covariance's entries (xx, yy, xy), of the exponent (relative) and of determinants.
 
-    The covariance J R M M^T R^T J^T is a sum of products of factors that err by 12 (J), 2 (R) and 64 units of a scale
-    (M: 46 of a quaternion's rotation, 18 of scale and product), in 15 products and sums of three: below 165 units a
-    side of h h^T, h = |J| |R| |M|. What the entries do to the exponent is bounded by eta, their size against the
-    covariance; conic and exponent carry 48 units of their terms, whose sum is 4 ac / det times the exponent at most.
-    Where kappa is not below 1/8 nothing is known of the exponent.
+    Where kappa is not below 1/8 nothing is known of the exponent; docs/check.md derives the charges.
     """
     square, (hx, hy) = (sizes * sizes).sum(axis=-1) * (1.0 + 1e-9), h
     a, c = (e.size() + BLUR for e in squares)
@@ -291,8 +317,7 @@ def _factor(flat: Affine, det: Affine, least: float, unit: float) -> Affine:
     top = np.minimum(np.where(np.isfinite(top), top, limit), limit)
     root = (flat * det.reciprocal()).root()
     root = root.wider(16.0 * unit * np.minimum(root.size(), limit))
-    rough = ~(2.0 * root.width <= 1.5 * (top - bottom))
-    return root.boxed(rough, bottom, np.maximum(top, bottom)).clamped(least, limit + ROOM)
+    return root.within(bottom, np.maximum(top, bottom)).clamped(least, limit + ROOM)
 
 
 def _tiles(cam: CheckedCamera, pixel: Any, centre: Any, squares: Any, unit: float) -> tuple[Array, Array]:
@@ -320,10 +345,35 @@ def _tiles(cam: CheckedCamera, pixel: Any, centre: Any, squares: Any, unit: floa
     return maybe, certain
 
 
+def _kept(p: ProjectedForms, ellipses: bool) -> tuple[Array, Array]:
+    """Where float32 tiles from 1.5 on lose no pixel whose alpha is above the threshold by a factor, and the factor.
+
+    The box (1.5.3) and the ellipse (1.6.0) of this level are computed from the floats that alpha is computed from, and
+    pixels' centres lie half a pixel from every tile's edge: what rounds there moves the level (docs/check.md).
+    """
+    (_, a), (_, c), _ = (e.range() for e in p.squares)
+    a, c = a + BLUR, c + BLUR
+    # along the image's axes, in pixels: where a Gaussian may reach
+    span = p.centre[0].size() + p.centre[1].size() + 8.0 * np.sqrt(a + c)
+    kept, room = (p.kappa < 0.03) & (span < 4000.0), 2.0**10
+    if ellipses:
+        thin, room = 1.0 / (p.inverse.range()[1] * a * c), 2.0**19
+        kept &= (p.kappa < 2.0**-10) & (thin * thin > 2.0**10 * FLOAT)
+        kept &= thin * np.sqrt(BLUR) > 2.0**10 * FLOAT * span
+        kept &= span * np.sqrt(np.maximum(a, c) / BLUR) < 2.0**-6 / FLOAT
+    return kept, 1.0 + 16.0 * p.kappa + room * FLOAT
+
+
 def _colors(splats: ActivatedScene, view: CameraForms, at: Array, like: Affine, unit: float) -> Affine:
     """Colours [B, n, 3]."""
     sh = splats.sh[at]
     flat = like.of(lambda a: np.broadcast_to(a[..., None], (*a.shape, 3)))
+    if isinstance(splats.paint, float):
+        # a depth that is not a number may be any
+        low, high = flat.range()
+        return flat.boxed(np.array(True), (high < splats.paint) * 1.0, ~(low >= splats.paint) * 1.0)
+    if splats.paint is not None:
+        return Affine.constant(splats.paint[at][..., None], flat)
     if splats.sigmoid:
         value = 1.0 / (1.0 + np.exp(-sh[..., 0, :]))
         return Affine.constant(value, flat, (32.0 * U + 16.0 * unit) * value)
@@ -373,15 +423,7 @@ def blended(f: _PixelFragments, background: Array, unit: float) -> tuple[Affine,
     """The blended colours [B, 3] before the clamp, and which of the fragments [B, n] matter."""
     # those that do not show stand behind all others
     order = np.argsort(np.where(f.shows, f.depth.c, np.inf), axis=1, kind="stable")
-    shows = np.take_along_axis(f.shows, order, 1)
-
-    def sort(a: Array) -> Array:
-        return np.take_along_axis(a, np.broadcast_to(order, a.shape), -1)
-
-    def sort_colors(a: Array) -> Array:
-        return np.take_along_axis(a, np.broadcast_to(order[..., None], a.shape), -2)
-
-    alpha, depth, color = f.alpha.of(sort), f.depth.of(sort), f.color.of(sort_colors)
+    alpha, color, depth, shows, _ = f.among(order)
     count, n = shows.shape
     al, ah = (np.clip(a, 0.0, 1.0) for a in alpha.range())
     cl, ch = color.range()
@@ -510,30 +552,31 @@ def pixels(
             plain = np.zeros((len(index), 3))
             form = Affine(plain + splats.background, np.zeros((len(f.alpha.g), *plain.shape)), plain + 16.0 * unit)
             return form, f.shows, f.motion
-        some = _PixelFragments(
-            f.alpha.of(lambda a: a[..., used]), f.color.of(lambda a: a[..., used, :]),
-            f.depth.of(lambda a: a[..., used]), f.shows[:, used], f.motion,
-        )  # fmt: skip
-        form, keep = blended(some, splats.background, unit)
+        form, keep = blended(f.among(np.broadcast_to(used, (len(index), len(used)))), splats.background, unit)
         kept = np.zeros(f.shows.shape, bool)
         kept[:, used] = keep
         return form, kept, f.motion
 
 
-def picture(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit: float) -> Affine:
-    """The picture [H, W, 3] over one box of poses."""
-    ends, columns, parts = reaches(splats, cam, view, unit), np.arange(cam.width), []
-    inside = (ends[:, 0] <= cam.width) & (ends[:, 1] >= 0.0) & (ends[:, 2] <= cam.height) & (ends[:, 3] >= 0.0)
+def pictures(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit: float) -> Affine:
+    """The pictures [B, H, W, 3] over B boxes of poses."""
+    count, size, lists = len(view.origin), cam.height * cam.width, []
+    for ends in reaches(splats, cam, view, unit):
+        inside = (ends[:, 0] <= cam.width) & (ends[:, 1] >= 0.0) & (ends[:, 2] <= cam.height) & (ends[:, 3] >= 0.0)
+        some = np.flatnonzero(inside)
+        lists += [some[meeting(ends[some], *divmod(p, cam.width))] for p in range(size)]
     # one more, so that there is one
-    some = np.append(np.flatnonzero(inside), 0)
-    ends = np.concatenate([ends[some[:-1]], [[np.inf, -np.inf] * 2]])
+    every = np.unique(np.concatenate([*lists, [0]]).astype(np.int64))
     with np.errstate(all="ignore"):
-        whole = projected(splats, cam, view, some[None], unit)
-    for row in range(cam.height):
-        lists = [meeting(ends, row, int(column)) for column in columns]
-        index = np.full((cam.width, max(1, *map(len, lists))), -1)
-        for place, numbers in zip(index, lists, strict=True):
-            place[: len(numbers)] = numbers
-        part, pixel = whole.among(index), (np.full(cam.width, row), columns)
-        parts.append(pixels(splats, cam, part, index, pixel, unit)[0].clamped(0.0, 1.0))
-    return Affine(*(np.stack([getattr(p, name) for p in parts], axis=-3) for name in ("c", "g", "r")))
+        whole = projected(splats, cam, view, np.broadcast_to(every, (count, len(every))), unit)
+    longest = max(1, *map(len, lists))
+    step, parts = max(1, TOGETHER // longest), []
+    for start in range(0, len(lists), step):
+        chosen = lists[start : start + step]
+        index = np.full((len(chosen), longest), -1)
+        for place, numbers in zip(index, chosen, strict=True):
+            place[: len(numbers)] = np.searchsorted(every, numbers)
+        box, place = np.divmod(np.arange(start, start + len(chosen)), size)
+        part = whole.among(box, index)
+        parts.append(pixels(splats, cam, part, index, np.divmod(place, cam.width), unit)[0].clamped(0.0, 1.0))
+    return Affine.joined(parts, -2).of(lambda a: a.reshape(*a.shape[:-2], count, cam.height, cam.width, 3))

@@ -1,0 +1,103 @@
+"""Statements about the picture itself: ``visible``, ``clear``, ``picture``, and ``all`` and ``any`` of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ns_abstract.check.forms import Affine, Array, U, total
+from ns_abstract.check.inputs import BadInput
+
+_CHANNELS = {"luminance": (0.2126, 0.7152, 0.0722), "r": (1.0, 0.0, 0.0), "g": (0.0, 1.0, 0.0), "b": (0.0, 0.0, 1.0)}
+
+
+class Combined(NamedTuple):
+    """All or any of some statements hold: the least or the largest of their margins counts."""
+
+    pick: Any
+    parts: list[Any]
+
+    def margin(self, picture: Callable[[Any], Affine]) -> tuple[Array, Array]:
+        """Lower and upper bounds [B] of the margin over B boxes; ``picture`` gives forms [B, H, W, 3] of a plane."""
+        lower, upper = zip(*(part.margin(picture) for part in self.parts), strict=True)
+        return self.pick(lower, axis=0), self.pick(upper, axis=0)
+
+
+class Measured(NamedTuple):
+    """A number of a plane lies between ``low`` and ``high``.
+
+    Attributes:
+        paint: The plane: colours (None), the weights of Gaussians in a box ([2, 3]) or nearer than a distance.
+        channels: [3] weights.
+        regions: Numbers of pixels; what is measured of a second region is subtracted.
+        rank: The so many-th largest pixel counts; 0: their mean; -1: the least.
+    """
+
+    paint: Any
+    channels: tuple[float, ...]
+    regions: list[Array]
+    rank: int
+    low: float
+    high: float
+
+    def margin(self, picture: Callable[[Any], Affine]) -> tuple[Array, Array]:
+        """Lower and upper bounds [B] of the margin; see `Combined`."""
+        plane = picture(self.paint)
+        single = total(plane.of(lambda a, k=k: a[..., k]) * w for k, w in enumerate(self.channels))
+        parts = [single.of(lambda a, k=k: a.reshape(*a.shape[:-2], -1)[..., k]) for k in self.regions]
+        if self.rank == 0:
+            means = [p.of(lambda a: a.mean(axis=-1)).wider(2.0 * U * p.size().sum(axis=-1)) for p in parts]
+            least, most = (means[0] - means[1] if parts[1:] else means[0]).range()
+        else:
+            ends = [[np.sort(e, axis=-1)[:, 0 if self.rank < 0 else -self.rank] for e in p.range()] for p in parts]
+            (least, most), (off, on) = ends[0], ends[1] if parts[1:] else (0.0, 0.0)
+            least, most = least - on, most - off
+        room = 4.0 * U * (1.0 + np.abs(least) + np.abs(most))
+        lower = np.minimum(least - room - self.low, self.high - most - room)
+        upper = np.minimum(most + room - self.low, self.high - least + room)
+        # what is not a number says nothing
+        return np.where(np.isnan(lower), -np.inf, lower), np.where(np.isnan(upper), np.inf, upper)
+
+
+def parsed(root: dict[str, Any], size: tuple[int, int], scale: float) -> Combined | Measured:
+    """The statement of a property file.
+
+    Args:
+        root: The property, or a part of it.
+        size: Height and width of the picture.
+        scale: Normalised units per unit of the data set.
+
+    Raises:
+        BadInput: It says something that this program does not check.
+    """
+    for name, pick in (("all", np.min), ("any", np.max)):
+        if name in root:
+            return Combined(pick, [parsed(part, size, scale) for part in root[name]])
+    kind, weight = root.get("type"), float(root.get("weight", 0.5))
+    first = _region(root.get("region"), size)
+    below, above = (lambda v: float(np.nextafter(v, -np.inf))), (lambda v: float(np.nextafter(v, np.inf)))
+    if "mask" in root or (kind == "visible" and list(root["select"]) != ["box"]) or root.get("measure") == "expected":
+        fix = "audit one of regions that are boxes, of Gaussians in a box, and of weights"
+        raise BadInput("has a mask, a selection or a depth that is not checked", "report.json", "property", fix)
+    if kind == "visible":
+        count = int(root.get("pixels", 1)) if "fraction" not in root else math.ceil(root["fraction"] * len(first))
+        box = np.array(root["select"]["box"], np.float64)
+        return Measured(box, (1.0, 0.0, 0.0), [first], count, below(weight), math.inf)
+    if kind == "clear":
+        distance = float(root["distance"]) * (scale if root.get("units") == "dataset" else 1.0)
+        return Measured(distance, (1.0, 0.0, 0.0), [first], 1, -math.inf, weight)
+    if kind != "picture":
+        raise BadInput(f"found {kind!r}, which is not checked", "report.json", "property.type")
+    rank = {"mean": 0, "least": -1, "greatest": 1}[root.get("statistic", "mean")]
+    regions = [first, *([_region(root["minus"], size)] if "minus" in root else [])]
+    low, high = below(float(root.get("min", -math.inf))), above(float(root.get("max", math.inf)))
+    return Measured(None, _CHANNELS[root.get("channel", "luminance")], regions, rank, low, high)
+
+
+def _region(box: Any, size: tuple[int, int]) -> Array:
+    """Numbers of the pixels in [x0, y0, x1, y1], or all."""
+    x0, y0, x1, y1 = (0, 0, size[1], size[0]) if box in (None, "all") else box
+    return np.arange(size[0] * size[1]).reshape(size)[y0:y1, x0:x1].ravel()
