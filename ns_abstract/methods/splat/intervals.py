@@ -5,7 +5,6 @@ SIMD lanes are the three channels, and a fourth one of nothing; or eight parts o
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 from numba import njit
@@ -19,6 +18,7 @@ from ns_abstract.methods.splat.pixel_block import (
     ALPHA_LOW,
     EXPONENT,
     EXPONENT_CUT,
+    PART_ENDS,
     color_ends,
     exponent_ends,
     listed_fragment,
@@ -96,10 +96,9 @@ def _alphas_of_parts(values, at, part, inputs, thresholds):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _add_parts(out, slopes, channel, low, high, part, inputs):
-    """Take eight parts' ends of a channel into ``out`` and the sums ``slopes``, see `blend_parts`."""
-    least, most = PART_LANES * channel, PART_LANES * (3 + channel)
-    store(out, least, minimum(load8(out, least), low))
-    store(out, most, maximum(load8(out, most), high))
+    """Write eight parts' ends of a channel to ``out`` and add them to the sums ``slopes``, see `blend_parts`."""
+    store(out, PART_ENDS + inputs.shape.parts * channel + part, low)
+    store(out, PART_ENDS + inputs.shape.parts * (3 + channel) + part, high)
     for k in range(inputs.shape.dimensions):
         middle = load8(inputs.parts.middles, inputs.shape.parts * k + part)
         slopes[4 * k + channel] += lane_sum(middle * (low + high))
@@ -153,10 +152,6 @@ def blend_parts(begin, end, block, inputs, slopes):
     ``slopes`` [d, 4] receives how much the channels vary along the parameters, as far as the parts tell.
     """
     out, parts, d = block.part_ends, inputs.parts, inputs.shape.dimensions
-    zero = 0.0 * load8(parts.middles, 0)
-    for channel in range(3):
-        store(out, PART_LANES * channel, zero + math.inf)
-        store(out, PART_LANES * (3 + channel), zero - math.inf)
     for k in range(4 * d):
         slopes[k] = 0.0
     darkest, brightest = _blend_eight(begin, end, 0, block, inputs, slopes)
@@ -166,12 +161,33 @@ def blend_parts(begin, end, block, inputs, slopes):
         store(slopes, 4 * k, parts.slope[k] * load4(slopes, 4 * k))
     for side in range(2):
         for channel in range(3):
-            at = PART_LANES * (3 * side + channel)
-            value = out[at]
+            at = PART_ENDS + inputs.shape.parts * (3 * side + channel)
+            ends = load8(out, at)
+            for part in range(PART_LANES, inputs.shape.parts, PART_LANES):
+                more = load8(out, at + part)
+                ends = maximum(ends, more) if side else minimum(ends, more)
+            store(out, PART_LANES, ends)
+            value = out[PART_LANES]
             for lane in range(1, PART_LANES):
-                value = max(value, out[at + lane]) if side else min(value, out[at + lane])
-            # what stands there is not read any more
+                other = out[PART_LANES + lane]
+                value = max(value, other) if side else min(value, other)
             out[4 * side + channel] = value
         # the lane of nothing
         out[4 * side + 3] = 0.0
     return BlendBounds(load4(out, 0), load4(out, 4), darkest, brightest)
+
+
+@njit(cache=True, error_model="numpy")
+def write_parts(fall, rise, part_ends, out, u):
+    """Write the ends of `blend_parts` in each part, widened by ``fall`` and ``rise``, to ``out`` [6, parts].
+
+    Ends that cross or are no numbers are written as they are: they bound nothing. ``u`` is scratch for 8 numbers.
+    """
+    parts = out.shape[1]
+    store(u, 0, -fall)
+    store(u, 4, rise)
+    for side in range(2):
+        for channel in range(3):
+            row = 3 * side + channel
+            for part in range(parts):
+                out[row, part] = part_ends[PART_ENDS + parts * row + part] + u[4 * side + channel]

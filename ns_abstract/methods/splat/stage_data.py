@@ -240,6 +240,8 @@ class PixelBounds(NamedTuple):
             were uncertain, pixels with results that were not numbers.
         layers: [t, side, side, 4] bounds of the accumulation, and of the expected depth where anything is drawn (see
             `depths`; infinity before its negative: nothing can be), or empty.
+        parts: [t, side, side, 6, parts] least of the three channels and most in each part of the cell, where pixels are
+            wanted, or empty.
         marks: [n] uint8; set to 1 for every Gaussian that some wanted pixel of these tiles may draw or stop at. Those
             that stay 0 are hidden or too faint for every pose: leaving them out changes nothing.
     """
@@ -250,6 +252,7 @@ class PixelBounds(NamedTuple):
     layers: np.ndarray
     slopes: np.ndarray
     statistics: np.ndarray
+    parts: np.ndarray
     marks: np.ndarray
 
 
