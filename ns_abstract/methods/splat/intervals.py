@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 from numba import njit
 
 from ns_abstract.arithmetic.elementary import exp_kernel, fma
-from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, UP
+from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, MOVE_SHARE_UP, UP
 from ns_abstract.arithmetic.simd.intrinsics import prefetch
 from ns_abstract.arithmetic.simd.lanes import LINE, lane_sum, load4, load8, maximum, minimum, store, where
 from ns_abstract.methods.splat.pixel_block import (
@@ -57,6 +57,23 @@ def _most(behind, color, a_low, a_high):
     """Most of a fragment of ``color`` over what is at most ``behind`` (design.md, B7)."""
     v = color - behind
     return fma(where(v > 0.0, a_high, a_low), v, behind)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _least_moved(behind, color, brightest, a_low, a_high, move):
+    """`_least` of a fragment that may be drawn behind some of those listed behind it (design.md, B12, O2, O3).
+
+    ``brightest`` bounds their colours, ``move`` what the swap bound allows.
+    """
+    front = _least(behind, color, a_low, a_high)
+    return maximum(front - move, minimum(front, fma(a_high, min(0.0, color - brightest), behind)))
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _most_moved(behind, color, darkest, a_low, a_high, move):
+    """`_most` of a fragment that may be drawn behind some of those listed behind it; see `_least_moved`."""
+    front = _most(behind, color, a_low, a_high)
+    return minimum(front + move, maximum(front, fma(a_high, max(0.0, color - darkest), behind)))
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -125,20 +142,25 @@ def _blend_eight(begin, end, part, block, inputs, slopes):
         at, key, move = listed_fragment(fragments, entry, forms)
         a_low, a_high = _alphas_of_parts(values, at, part, inputs, thresholds)
         c = key + color_ends(forms)
-        darkest, brightest = minimum(darkest, load4(colors, c)), maximum(brightest, load4(colors, c + 4))
-        low0 = _least(low0, colors[c], a_low, a_high)
-        low1 = _least(low1, colors[c + 1], a_low, a_high)
-        low2 = _least(low2, colors[c + 2], a_low, a_high)
-        high0 = _most(high0, colors[c + 4], a_low, a_high)
-        high1 = _most(high1, colors[c + 5], a_low, a_high)
-        high2 = _most(high2, colors[c + 6], a_low, a_high)
         if move != 0:
-            low0 = low0 - moves[move]
-            low1 = low1 - moves[move + 1]
-            low2 = low2 - moves[move + 2]
-            high0 = high0 + moves[move + 4]
-            high1 = high1 + moves[move + 5]
-            high2 = high2 + moves[move + 6]
+            # of the colours behind this one
+            store(out, 0, darkest)
+            store(out, 4, brightest)
+            share = minimum(1.0, a_high * (MOVE_SHARE_UP / values[at + ALPHA_HIGH]))
+            low0 = _least_moved(low0, colors[c], out[4], a_low, a_high, share * moves[move])
+            low1 = _least_moved(low1, colors[c + 1], out[5], a_low, a_high, share * moves[move + 1])
+            low2 = _least_moved(low2, colors[c + 2], out[6], a_low, a_high, share * moves[move + 2])
+            high0 = _most_moved(high0, colors[c + 4], out[0], a_low, a_high, share * moves[move + 4])
+            high1 = _most_moved(high1, colors[c + 5], out[1], a_low, a_high, share * moves[move + 5])
+            high2 = _most_moved(high2, colors[c + 6], out[2], a_low, a_high, share * moves[move + 6])
+        else:
+            low0 = _least(low0, colors[c], a_low, a_high)
+            low1 = _least(low1, colors[c + 1], a_low, a_high)
+            low2 = _least(low2, colors[c + 2], a_low, a_high)
+            high0 = _most(high0, colors[c + 4], a_low, a_high)
+            high1 = _most(high1, colors[c + 5], a_low, a_high)
+            high2 = _most(high2, colors[c + 6], a_low, a_high)
+        darkest, brightest = minimum(darkest, load4(colors, c)), maximum(brightest, load4(colors, c + 4))
     _add_parts(out, slopes, 0, low0, high0, part, inputs)
     _add_parts(out, slopes, 1, low1, high1, part, inputs)
     _add_parts(out, slopes, 2, low2, high2, part, inputs)
