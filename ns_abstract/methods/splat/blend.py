@@ -408,7 +408,7 @@ def shade(pixels, left, above, reordered, block, inputs, bounds):
         begin = q * fragments.capacity
         end = begin + int(fragments.lengths[q])
         if inputs.shape.parts > 0:
-            own = blend_parts(begin, end, block, inputs, advanced(t, 4))
+            own = blend_parts(begin, end, reordered, block, inputs, advanced(t, 4))
             pixel_bounds = _PixelResult(own.low, own.high, own, 0.5 * (own.low + own.high), 0.5 * (own.high - own.low))
         else:
             pixel_bounds = _form_bounds(begin, end, block, inputs, linear.shape[0] > 0)

@@ -11,13 +11,14 @@ from numba import njit
 
 from ns_abstract.arithmetic.elementary import exp_kernel, fma
 from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, MOVE_SHARE_UP, UP
-from ns_abstract.arithmetic.simd.intrinsics import prefetch
+from ns_abstract.arithmetic.simd.intrinsics import advanced, prefetch
 from ns_abstract.arithmetic.simd.lanes import LINE, lane_sum, load4, load8, maximum, minimum, store, where
 from ns_abstract.methods.splat.pixel_block import (
     ALPHA_HIGH,
     ALPHA_LOW,
     EXPONENT,
     EXPONENT_CUT,
+    LISTED,
     PART_ENDS,
     color_ends,
     exponent_ends,
@@ -122,10 +123,61 @@ def _add_parts(out, slopes, channel, low, high, part, inputs):
 
 
 @njit(cache=True, error_model="numpy")
-def _blend_eight(begin, end, part, block, inputs, slopes):
+def sort_keys(keys, order, count):
+    """Sort the first ``count`` of ``keys``, least first; ``order`` receives where each stood."""
+    for e in range(count):
+        order[e] = e
+    # by insertion, after sorting what lies far apart: most groups are small
+    step = 1
+    while step < count // 3:
+        step = 3 * step + 1
+    while step > 0:
+        for e in range(step, count):
+            key, place = keys[e], order[e]
+            other = e
+            while other >= step and keys[other - step] > key:
+                keys[other], order[other] = keys[other - step], order[other - step]
+                other -= step
+            keys[other], order[other] = key, place
+        step //= 3
+
+
+@njit(cache=True, error_model="numpy")
+def _ordered_end(value, start, stop, channel, side, block, alphas):
+    """One end of a channel over eight parts of list entries [start, stop) in every order (design.md, B12, O4).
+
+    Args:
+        value: The end of what lies behind them.
+        start, stop: The entries of a group.
+        channel: 0 to 2.
+        side: 0: the least, 1: the most.
+        block: The pixel's block.
+        alphas: Bounds of alpha over the parts, two times eight for each entry.
+    """
+    fragments, palette = block.fragments, block.palette
+    keys, order, forms, count = block.entries.depth_radius, block.entries.first, palette.forms, stop - start
+    for e in range(count):
+        _, key, _ = listed_fragment(fragments, start + e, forms)
+        ends = key + color_ends(forms) + channel
+        keys[e] = palette.values[ends] if side == 0 else -palette.values[ends + 4]
+    sort_keys(keys, order, count)
+    # nearest first: darkest for the least, brightest for the most
+    for position in range(count - 1, -1, -1):
+        at = 2 * PART_LANES * order[position]
+        a_low, a_high = load8(alphas, at), load8(alphas, at + PART_LANES)
+        if side == 0:
+            value = _least(value, keys[position], a_low, a_high)
+        else:
+            value = _most(value, -keys[position], a_low, a_high)
+    return value
+
+
+@njit(cache=True, error_model="numpy")
+def _blend_eight(begin, end, part, reordered, block, inputs, slopes):
     """`blend_parts` of eight parts from ``part`` on; returns the darkest and the brightest colour."""
     fragments, palette, moves, out = block.fragments, block.palette, block.reordering.moves, block.part_ends
     values, colors, forms = fragments.values, palette.values, palette.forms
+    alphas = advanced(out, PART_ENDS + 6 * inputs.shape.parts)
     rules, charges = inputs.rules, inputs.charges
     thresholds = _Thresholds(rules.alpha_min * (1.0 - charges.threshold), rules.alpha_max * (1.0 - charges.threshold))
     darkest = load4(palette.background, 0)
@@ -135,32 +187,53 @@ def _blend_eight(begin, end, part, block, inputs, slopes):
     low1 = zero + palette.background[1]
     low2 = zero + palette.background[2]
     high0, high1, high2 = low0, low1, low2
-    for entry in range(end - 1, begin - 1, -1):
-        ahead, _, _ = listed_fragment(fragments, max(entry - AHEAD, begin), forms)
-        for byte in range(0, 8 * fragments.width, LINE):
-            prefetch(values, ahead, byte)
-        at, key, move = listed_fragment(fragments, entry, forms)
-        a_low, a_high = _alphas_of_parts(values, at, part, inputs, thresholds)
-        c = key + color_ends(forms)
-        if move != 0:
-            # of the colours behind this one
-            store(out, 0, darkest)
-            store(out, 4, brightest)
-            share = minimum(1.0, a_high * (MOVE_SHARE_UP / values[at + ALPHA_HIGH]))
-            low0 = _least_moved(low0, colors[c], out[4], a_low, a_high, share * moves[move])
-            low1 = _least_moved(low1, colors[c + 1], out[5], a_low, a_high, share * moves[move + 1])
-            low2 = _least_moved(low2, colors[c + 2], out[6], a_low, a_high, share * moves[move + 2])
-            high0 = _most_moved(high0, colors[c + 4], out[0], a_low, a_high, share * moves[move + 4])
-            high1 = _most_moved(high1, colors[c + 5], out[1], a_low, a_high, share * moves[move + 5])
-            high2 = _most_moved(high2, colors[c + 6], out[2], a_low, a_high, share * moves[move + 6])
-        else:
-            low0 = _least(low0, colors[c], a_low, a_high)
-            low1 = _least(low1, colors[c + 1], a_low, a_high)
-            low2 = _least(low2, colors[c + 2], a_low, a_high)
-            high0 = _most(high0, colors[c + 4], a_low, a_high)
-            high1 = _most(high1, colors[c + 5], a_low, a_high)
-            high2 = _most(high2, colors[c + 6], a_low, a_high)
-        darkest, brightest = minimum(darkest, load4(colors, c)), maximum(brightest, load4(colors, c + 4))
+    groups, lists = block.entries.far, fragments.lists
+    stop = end
+    while stop > begin:
+        start, moved = stop - 1, False
+        if reordered:
+            group = groups[int(lists[LISTED * start + 1])]
+            while start > begin and groups[int(lists[LISTED * (start - 1) + 1])] == group:
+                start -= 1
+        behind = low0, low1, low2, high0, high1, high2
+        for entry in range(stop - 1, start - 1, -1):
+            ahead, _, _ = listed_fragment(fragments, max(entry - AHEAD, begin), forms)
+            for byte in range(0, 8 * fragments.width, LINE):
+                prefetch(values, ahead, byte)
+            at, key, move = listed_fragment(fragments, entry, forms)
+            a_low, a_high = _alphas_of_parts(values, at, part, inputs, thresholds)
+            c = key + color_ends(forms)
+            if stop - start > 1:
+                store(alphas, 2 * PART_LANES * (entry - start), a_low)
+                store(alphas, 2 * PART_LANES * (entry - start) + PART_LANES, a_high)
+            if move != 0:
+                moved = True
+                # of the colours behind this one
+                store(out, 0, darkest)
+                store(out, 4, brightest)
+                share = minimum(1.0, a_high * (MOVE_SHARE_UP / values[at + ALPHA_HIGH]))
+                low0 = _least_moved(low0, colors[c], out[4], a_low, a_high, share * moves[move])
+                low1 = _least_moved(low1, colors[c + 1], out[5], a_low, a_high, share * moves[move + 1])
+                low2 = _least_moved(low2, colors[c + 2], out[6], a_low, a_high, share * moves[move + 2])
+                high0 = _most_moved(high0, colors[c + 4], out[0], a_low, a_high, share * moves[move + 4])
+                high1 = _most_moved(high1, colors[c + 5], out[1], a_low, a_high, share * moves[move + 5])
+                high2 = _most_moved(high2, colors[c + 6], out[2], a_low, a_high, share * moves[move + 6])
+            else:
+                low0 = _least(low0, colors[c], a_low, a_high)
+                low1 = _least(low1, colors[c + 1], a_low, a_high)
+                low2 = _least(low2, colors[c + 2], a_low, a_high)
+                high0 = _most(high0, colors[c + 4], a_low, a_high)
+                high1 = _most(high1, colors[c + 5], a_low, a_high)
+                high2 = _most(high2, colors[c + 6], a_low, a_high)
+            darkest, brightest = minimum(darkest, load4(colors, c)), maximum(brightest, load4(colors, c + 4))
+        if moved:
+            low0 = maximum(low0, _ordered_end(behind[0], start, stop, 0, 0, block, alphas))
+            low1 = maximum(low1, _ordered_end(behind[1], start, stop, 1, 0, block, alphas))
+            low2 = maximum(low2, _ordered_end(behind[2], start, stop, 2, 0, block, alphas))
+            high0 = minimum(high0, _ordered_end(behind[3], start, stop, 0, 1, block, alphas))
+            high1 = minimum(high1, _ordered_end(behind[4], start, stop, 1, 1, block, alphas))
+            high2 = minimum(high2, _ordered_end(behind[5], start, stop, 2, 1, block, alphas))
+        stop = start
     _add_parts(out, slopes, 0, low0, high0, part, inputs)
     _add_parts(out, slopes, 1, low1, high1, part, inputs)
     _add_parts(out, slopes, 2, low2, high2, part, inputs)
@@ -168,17 +241,17 @@ def _blend_eight(begin, end, part, block, inputs, slopes):
 
 
 @njit(cache=True, error_model="numpy")
-def blend_parts(begin, end, block, inputs, slopes):
+def blend_parts(begin, end, reordered, block, inputs, slopes):
     """Bounds of the list entries [begin, end) of a pixel by intervals over the parts of the cell (design.md, B12).
 
-    ``slopes`` [d, 4] receives how much the channels vary along the parameters, as far as the parts tell.
+    ``reordered`` tells whether fragments may change places, ``slopes`` [d, 4] receives how much the channels vary along the parameters, as far as the parts tell.
     """
     out, parts, d = block.part_ends, inputs.parts, inputs.shape.dimensions
     for k in range(4 * d):
         slopes[k] = 0.0
-    darkest, brightest = _blend_eight(begin, end, 0, block, inputs, slopes)
+    darkest, brightest = _blend_eight(begin, end, 0, reordered, block, inputs, slopes)
     for part in range(PART_LANES, inputs.shape.parts, PART_LANES):
-        _blend_eight(begin, end, part, block, inputs, slopes)
+        _blend_eight(begin, end, part, reordered, block, inputs, slopes)
     for k in range(d):
         store(slopes, 4 * k, parts.slope[k] * load4(slopes, 4 * k))
     for side in range(2):

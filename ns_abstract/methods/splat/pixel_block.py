@@ -18,6 +18,7 @@ from ns_abstract.arithmetic.rounding import UP
 from ns_abstract.arithmetic.simd.intrinsics import pointer
 from ns_abstract.arithmetic.simd.lanes import bits, maximum, minimum, where
 from ns_abstract.methods.splat.lists import BLOCK, PIXELS
+from ns_abstract.methods.splat.stage_data import PART_LANES
 
 assert PIXELS == 64 and BLOCK == 8
 
@@ -198,7 +199,7 @@ class PixelBlock(NamedTuple):
     Attributes:
         shifted: Depths of one pixel's list against its own reference (see `depths`).
         part_ends: Over parts of the cell: least of the channels and most, [2, 4], scratch, and from `PART_ENDS` on the
-            least of three channels and the most in each part, [6, parts].
+            least of three channels and the most in each part, [6, parts]; then scratch for a list's alphas.
         sums: [3 m + bends + 5, 4] scratch by channel: polynomials, then what `blend` and `depths` need beside them.
         ray: [3] the block's central ray at the cell's middle, world axes, of unit depth.
     """
@@ -294,6 +295,12 @@ def _aligned(size):
 
 
 @njit(cache=True, error_model="numpy")
+def _part_ends(shape, capacity):
+    """Memory for `PixelBlock.part_ends` with lists of ``capacity`` fragments."""
+    return np.empty(PART_ENDS + (6 * shape.parts + 2 * PART_LANES * capacity if shape.parts > 0 else 0))
+
+
+@njit(cache=True, error_model="numpy")
 def new_buffers(shape, forms, pair_limit, background):
     """Memory for fragments of ``shape``, colours of ``forms`` coefficients and ``pair_limit`` pairs."""
     per_pixel = np.zeros(ROWS * PIXELS)
@@ -311,7 +318,7 @@ def new_buffers(shape, forms, pair_limit, background):
         background=behind,
         nothing=np.zeros(4),
         unseen=np.zeros(8),
-        part_ends=np.empty(PART_ENDS + 6 * shape.parts),
+        part_ends=_part_ends(shape, _CAPACITY),
         sums=np.zeros(4 * (3 * m + 5 + bends_of(shape))),
         ray=np.empty(3),
         positions=np.empty((7, _POSITIONS), np.int64),
@@ -342,7 +349,7 @@ def resized(old, positions, capacity, shape, forms):
     values, lists, light, drawn, of_slots, moves = (
         old.values, old.lists, old.light, old.drawn, old.places, old.moves,
     )  # fmt: skip
-    skipped, distances, jumps = old.skipped, old.distances, old.jumps
+    skipped, distances, jumps, part_ends = old.skipped, old.distances, old.jumps, old.part_ends
     if capacity > lists.shape[1]:
         values = _aligned(capacity * PIXELS * fragment_width(shape))
         lists = np.empty((PIXELS, capacity, LISTED), np.uint32)
@@ -352,6 +359,7 @@ def resized(old, positions, capacity, shape, forms):
         moves = np.empty((32 * capacity, MOVES))
         skipped, distances = np.empty(capacity, np.int64), np.empty(8 * capacity)
         jumps = np.zeros((crossing_rows(shape), _crossing_columns(shape, capacity)))
+        part_ends = _part_ends(shape, capacity)
     return Buffers(
         per_pixel=old.per_pixel,
         offsets=old.offsets,
@@ -362,7 +370,7 @@ def resized(old, positions, capacity, shape, forms):
         background=old.background,
         nothing=old.nothing,
         unseen=old.unseen,
-        part_ends=old.part_ends,
+        part_ends=part_ends,
         sums=old.sums,
         ray=old.ray,
         positions=places,
