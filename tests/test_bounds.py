@@ -22,9 +22,9 @@ from ns_abstract.methods.splat.activate import Splats, rotation_matrices
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, PAPER
 from ns_abstract.methods.splat.frame import SplatFrame
+from ns_abstract.methods.splat.intervals import sort_keys as sort_group
 from ns_abstract.methods.splat.projection_errors import FORMS, SPREAD, UNBOUNDED, columns
 from ns_abstract.methods.splat.render import Renderer
-from ns_abstract.methods.splat.intervals import sort_keys as sort_group
 from ns_abstract.methods.splat.stage_data import shared_out
 from ns_abstract.perturbation.specification import Perturbation
 

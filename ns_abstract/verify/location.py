@@ -15,11 +15,11 @@ from functools import cached_property
 
 import numpy as np
 
-from ns_abstract.arithmetic.rounding import CUT_VALUE_ROUNDING, HALF_UP
+from ns_abstract.arithmetic.rounding import CUT_VALUE_ROUNDING, HALF_UP, SUB_BOX_LINE_ROUNDING, SUB_BOX_LINES
 from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import Float64Array, ParameterBox
 from ns_abstract.geometry.tiles import assemble, in_tiles
-from ns_abstract.refine.protocol import Bounds, Frame, LinearSets, PartsFrame
+from ns_abstract.refine.protocol import Bounds, Frame, LinearSets, PartsFrame, SubBoxFrame
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.photo import Photo
 from ns_abstract.verify.search import BlockResult, FinishedCell
@@ -36,9 +36,19 @@ class LocationTuning:
 
     #: Image motion over a cell, pixels: beyond it, cells are cut without bounds; up to it, they are contracted.
     coarse: float = 4.5
+    #: The same where single sub-boxes are excluded, their number, the image motion over one from which on they are
+    #: worth it, and the part of a box that has to be left for it to become one cell.
+    divided: float = 2.5
+    sub_boxes: int = 512
+    least_sub_box: float = 0.05
+    filled: float = 0.5
+    #: Grid lines that cells begin and end at, as a power of two of their width.
+    aligned: int = 5
     contracted: float = 0.3
     #: Pixels that are bounded to exclude a cell: so many times those that may show anything.
     surplus: float = 4.0
+    #: How much wider a cell of as loose bounds is than a sub-box, about.
+    wider: float = 1.8
     #: Image motion over the cell whose bounds tell how loose they are; pixels that must be likely to be excluded, as a
     #: part of those that exclude a cell, for it to be bounded.
     reference: float = 2.4
@@ -192,6 +202,12 @@ class _Examination:
             if box.dimensions and moved > tuning.coarse:
                 break
             picture, number = self._look(box.middle)
+            if tuning.contracted < moved <= tuning.divided:
+                some = self._sub_boxes(box, picture)
+                if some:
+                    return None
+                if some is False:
+                    break
             bounds = self._bounds(box, picture)
             if bounds is None or self._settled(bounds):
                 break
@@ -209,12 +225,50 @@ class _Examination:
         """Whether what is left of the cell has a verdict."""
         return bool(self.leaves) and self.leaves[-1].cell == self.cell
 
+    def _sub_boxes(self, box: ParameterBox, picture: np.ndarray) -> bool | None:
+        """Exclude sub-boxes of the cell; returns whether some were, or None: the frame has no bounds of sub-boxes."""
+        search, tuning = self.search, self.search.tuning
+        moved = search.moved(box)
+        counts = sub_box_counts(self.cell, moved, tuning.sub_boxes)
+        if not isinstance(search.frame, SubBoxFrame) or not search.contract or not resolved(box, counts):
+            return None
+        finest = float(np.linalg.norm(moved / counts))
+        if finest < tuning.least_sub_box:
+            return None
+        chosen = self._promising(picture, float(np.linalg.norm(moved)), finest)
+        if chosen.sum() <= search.tiled.allowed:
+            return False
+        tiles = np.flatnonzero(chosen.any(axis=(1, 2)))
+        self.bounded += 1
+        ends = search.frame.sub_box_ends(box, counts, tiles, chosen[tiles])
+        if ends is None:
+            return None
+        number = search.tiled.excluded(*ends, chosen)
+        left = (number <= search.tiled.allowed).reshape(counts)
+        self.share = float(np.median(number)) / (search.tiled.allowed + 1)
+        if left.all():
+            return False
+        kept: list[Cell] = []
+        for cell, some in divided(self.cell, left, tuning.filled):
+            if some:
+                kept.append(cell)
+            else:
+                self.leaves.append(FinishedCell(cell, "certified", 1.0, 0.0))
+        if len(kept) == 1 and kept[0].volume > (1.0 - tuning.worth) * self.cell.volume:
+            self.cell = kept[0]
+            self._cut()
+        else:
+            self.children = kept
+        return True
+
     def _exclude(self, margin: float) -> None:
         self.leaves.append(FinishedCell(self.cell, "certified", margin, 0.0))
 
     def _shrink(self, box: ParameterBox) -> None:
         """Exclude what of the cell lies outside of ``box``, in whole grid units."""
         inner = inner_cell(self.search.grid, self.cell, box)
+        if float(np.linalg.norm(self.search.moved(box))) > self.search.tuning.contracted:
+            inner = aligned(self.cell, inner, self.search.tuning.aligned)
         self.leaves += [FinishedCell(slab, "certified", 1.0, 0.0) for slab in slabs(self.cell, inner)]
         self.cell = inner
 
@@ -257,15 +311,17 @@ class _Examination:
             self._exclude(float(number - allowed))
         return self.done
 
-    def _promising(self, picture: np.ndarray, moved: float) -> np.ndarray:
+    def _promising(self, picture: np.ndarray, moved: float, loose: float | None = None) -> np.ndarray:
         """[T, side, side] counted pixels that bounds are most likely to exclude: a guess of work.
 
-        None are chosen where too few are likely to be.
+        None are chosen where too few are likely to be. The picture moves by ``moved`` pixels over the cell, and by
+        ``loose`` over the cells whose bounds count; None: by as much.
         """
         search, tiled, side = self.search, self.search.tiled, self.search.frame.side
         least, most = nearby(assemble(picture, search.frame.camera), max(1, round(0.5 * moved)))
         low, high = in_tiles(least, side), in_tiles(most, side)
-        below, above = (part * (moved / search.tuning.reference) for part in search.looseness)
+        scale = (moved if loose is None else search.tuning.wider * loose) / search.tuning.reference
+        below, above = (part * scale for part in search.looseness)
         gaps = np.maximum(low - tiled.high, tiled.low - high).max(axis=-1)
         likely = np.maximum(low - below - tiled.high, tiled.low - high - above).max(axis=-1)
         chosen = tiled.counted & (gaps > 0.0)
@@ -393,6 +449,71 @@ def inner_cell(grid: CellGrid, cell: Cell, box: ParameterBox) -> Cell:
             b += 1
         first[k], past[k] = a, b
     return Cell(tuple(first), tuple(past))
+
+
+def aligned(cell: Cell, inner: Cell, bits: int) -> Cell:
+    """``inner`` grown within ``cell`` to grid lines that are multiples of a power of two, so that it can be halved."""
+    first, past = list(inner.first), list(inner.past)
+    for k, (a, b) in enumerate(zip(cell.first, cell.past, strict=True)):
+        step = 1 << max(0, (b - a).bit_length() - bits)
+        first[k], past[k] = max(a, first[k] // step * step), min(b, -(-past[k] // step) * step)
+    return Cell(tuple(first), tuple(past))
+
+
+def sub_box_counts(cell: Cell, moved: Float64Array, most: int) -> np.ndarray:
+    """Numbers of sub-boxes [d] along a cell's axes, powers of two that divide its units, at most ``most`` together.
+
+    They move the picture about as much along every axis; ``moved`` [d] pixels are what the cell does.
+    """
+    sizes = np.array(cell.past, np.int64) - np.array(cell.first, np.int64)
+    counts = np.ones(sizes.size, np.int64)
+    while 2 * counts.prod() <= most:
+        free = np.where(sizes % (2 * counts) == 0, moved / counts, -1.0)
+        axis = int(np.argmax(free)) if free.size else 0
+        if not free.size or free[axis] < 0.0:
+            break
+        counts[axis] *= 2
+    return counts
+
+
+def resolved(box: ParameterBox, counts: np.ndarray) -> bool:
+    """Whether the overlap of a cell's sub-boxes covers what grid lines are rounded by (B12, U5)."""
+    low, high = np.array(box.lower), np.array(box.upper)
+    rounding = SUB_BOX_LINE_ROUNDING * (np.abs(low) + np.abs(high))
+    return bool(counts.prod() >= 8 and (rounding <= SUB_BOX_LINES * 0.5 * (high - low)).all())
+
+
+def divided(cell: Cell, left: np.ndarray, filled: float) -> Iterator[tuple[Cell, bool]]:
+    """Cells that tile ``cell``, each with whether some of its sub-boxes are left (U5).
+
+    Args:
+        cell: The cell.
+        left: [counts] which of its equal sub-boxes are left; counts divide the cell's units.
+        filled: Part of a box that has to be left for it to become one cell.
+    """
+    if not left.any():
+        yield cell, False
+        return
+    units = [(b - a) // n for a, b, n in zip(cell.first, cell.past, left.shape, strict=True)]
+    spans = []
+    for axis in range(left.ndim):
+        some = np.flatnonzero(left.any(axis=tuple(k for k in range(left.ndim) if k != axis)))
+        spans.append((int(some[0]), int(some[-1]) + 1))
+    inner = Cell(
+        tuple(a + unit * start for a, unit, (start, _) in zip(cell.first, units, spans, strict=True)),
+        tuple(a + unit * stop for a, unit, (_, stop) in zip(cell.first, units, spans, strict=True)),
+    )
+    yield from ((slab, False) for slab in slabs(cell, inner))
+    part = left[tuple(slice(*span) for span in spans)]
+    if part.mean() >= filled:
+        yield inner, True
+        return
+    axis = int(np.argmax(part.shape))
+    half = part.shape[axis] // 2
+    line = inner.first[axis] + units[axis] * half
+    before, behind = np.split(part, [half], axis=axis)
+    yield from divided(replace(inner, past=(*inner.past[:axis], line, *inner.past[axis + 1 :])), before, filled)
+    yield from divided(replace(inner, first=(*inner.first[:axis], line, *inner.first[axis + 1 :])), behind, filled)
 
 
 def slabs(cell: Cell, inner: Cell) -> Iterator[Cell]:

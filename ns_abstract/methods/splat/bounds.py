@@ -17,6 +17,7 @@ from ns_abstract.arithmetic.rounding import (
     REGION,
     SHIFTED_ROUNDING,
     STILL_POSITION,
+    SUB_BOX_OVERLAP,
     TIE_ROUNDING,
     Arithmetic,
     Charges,
@@ -271,7 +272,7 @@ class SplatBounds:
             self.charges,
             self._cutoffs(floor),
             shape,
-            cell_parts(np.ones(shape.dimensions, np.int64) if parts is None else parts),
+            cell_parts(np.ones(shape.dimensions, np.int64) if parts is None else parts, SUB_BOX_OVERLAP * keep_parts),
         )
         sets = pixel_sets(np.broadcast_to(True, bounds.lower.shape[:3]) if pixels is None else pixels)
         pixel_stage(TileLists(wanted, offsets, entries), sets, inputs, bounds)

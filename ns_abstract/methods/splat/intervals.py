@@ -244,7 +244,8 @@ def _blend_eight(begin, end, part, reordered, block, inputs, slopes):
 def blend_parts(begin, end, reordered, block, inputs, slopes):
     """Bounds of the list entries [begin, end) of a pixel by intervals over the parts of the cell (design.md, B12).
 
-    ``reordered`` tells whether fragments may change places, ``slopes`` [d, 4] receives how much the channels vary along the parameters, as far as the parts tell.
+    ``reordered`` tells whether fragments may change places. ``slopes`` [d, 4] receives how much the channels vary along
+    the parameters, as far as the parts tell.
     """
     out, parts, d = block.part_ends, inputs.parts, inputs.shape.dimensions
     for k in range(4 * d):

@@ -220,13 +220,16 @@ def shared_out(weights: np.ndarray, parts: int) -> np.ndarray:
     return counts
 
 
-def cell_parts(counts: np.ndarray) -> Parts:
-    """The parts of a cell, ``counts`` [d] of them along its axes: powers of two, so that all is exact (B12)."""
+def cell_parts(counts: np.ndarray, overlap: float = 0.0) -> Parts:
+    """The parts of a cell, ``counts`` [d] of them along its axes: powers of two, so that all is exact (B12).
+
+    They reach beyond their ends by ``overlap`` of the cell's half-width.
+    """
     along = [(2.0 * np.arange(n) + 1.0) / n - 1.0 for n in counts.tolist()]
     grid = np.array(np.meshgrid(*along, indexing="ij"), np.float64)
     middles = np.ascontiguousarray(grid.reshape(counts.size, counts.prod()))
     squares = np.square(middles).sum(axis=1)
-    return Parts(middles, 1.0 / counts, np.where(counts > 1, 0.5 / np.where(counts > 1, squares, 1.0), 0.0))
+    return Parts(middles, 1.0 / counts + overlap, np.where(counts > 1, 0.5 / np.where(counts > 1, squares, 1.0), 0.0))
 
 
 class PixelBounds(NamedTuple):
