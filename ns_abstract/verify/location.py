@@ -36,11 +36,9 @@ class LocationTuning:
 
     #: Image motion over a cell, pixels: beyond it, cells are cut without bounds; up to it, they are contracted.
     coarse: float = 4.5
-    #: The same where single sub-boxes are excluded, their number, the image motion over one from which on they are
-    #: worth it, and the part of a box that has to be left for it to become one cell.
-    divided: float = 2.5
-    sub_boxes: int = 512
-    least_sub_box: float = 0.05
+    #: Sub-boxes that are excluded one by one, at most, in cells over which the image moves by no more than so many
+    #: pixels; and the part of a box of them that has to be left for it to become one cell.
+    sub_boxes: tuple[tuple[float, int], ...] = ((2.0, 512), (3.5, 128), (math.inf, 32))
     filled: float = 0.5
     #: Grid lines that cells begin and end at, as a power of two of their width.
     aligned: int = 5
@@ -202,7 +200,7 @@ class _Examination:
             if box.dimensions and moved > tuning.coarse:
                 break
             picture, number = self._look(box.middle)
-            if tuning.contracted < moved <= tuning.divided:
+            if moved > tuning.contracted:
                 some = self._sub_boxes(box, picture)
                 if some:
                     return None
@@ -229,13 +227,11 @@ class _Examination:
         """Exclude sub-boxes of the cell; returns whether some were, or None: the frame has no bounds of sub-boxes."""
         search, tuning = self.search, self.search.tuning
         moved = search.moved(box)
-        counts = sub_box_counts(self.cell, moved, tuning.sub_boxes)
+        total = float(np.linalg.norm(moved))
+        counts = sub_box_counts(self.cell, moved, next(most for width, most in tuning.sub_boxes if total <= width))
         if not isinstance(search.frame, SubBoxFrame) or not search.contract or not resolved(box, counts):
             return None
-        finest = float(np.linalg.norm(moved / counts))
-        if finest < tuning.least_sub_box:
-            return None
-        chosen = self._promising(picture, float(np.linalg.norm(moved)), finest)
+        chosen = self._promising(picture, total, float(np.linalg.norm(moved / counts)))
         if chosen.sum() <= search.tiled.allowed:
             return False
         tiles = np.flatnonzero(chosen.any(axis=(1, 2)))
