@@ -226,7 +226,7 @@ def _blend_eight(begin, end, part, reordered, block, inputs, slopes):
                 high1 = _most(high1, colors[c + 5], a_low, a_high)
                 high2 = _most(high2, colors[c + 6], a_low, a_high)
             darkest, brightest = minimum(darkest, load4(colors, c)), maximum(brightest, load4(colors, c + 4))
-        if moved:
+        if moved and stop - start > 1:
             low0 = maximum(low0, _ordered_end(behind[0], start, stop, 0, 0, block, alphas))
             low1 = maximum(low1, _ordered_end(behind[1], start, stop, 1, 0, block, alphas))
             low2 = maximum(low2, _ordered_end(behind[2], start, stop, 2, 0, block, alphas))
