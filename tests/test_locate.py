@@ -17,8 +17,9 @@ from ns_abstract.api.location import Location, PhotoOptions
 from ns_abstract.cli.locate import main
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.tiles import assemble
+from ns_abstract.verify.cell_boxes import divided, inner_cell, resolved, slabs, sub_box_counts
 from ns_abstract.verify.cells import Cell, CellGrid
-from ns_abstract.verify.location import between, divided, inner_cell, nearby, resolved, slabs, sub_box_counts
+from ns_abstract.verify.location import between, nearby
 from ns_abstract.verify.location_cover import ShearedBoxes, cover
 from ns_abstract.verify.photo import Photo, TiledPhoto
 

@@ -3,6 +3,7 @@
 from planted.fault import Fault
 
 _PHOTO, _SEARCH, _COVER = "verify/photo.py", "verify/location.py", "verify/location_cover.py"
+_CELLS = "verify/cell_boxes.py"
 _ENDS = "test_locate.py::test_a_photo_allows_its_noise_and_every_rounding"
 _REACH = "test_locate.py::test_contraction_keeps_every_pose_that_explains_the_photo"
 _NUMBERS = "test_locate.py::test_what_is_no_number_explains_and_excludes_nothing"
@@ -53,7 +54,7 @@ LOCATION = (
     ),
     Fault(
         "location: the last slab is left out",
-        _SEARCH, "slabs", "inner.past[k] < cell.past[k]", "inner.past[k] < cell.past[k] and k > 0", _SLABS,
+        _CELLS, "slabs", "inner.past[k] < cell.past[k]", "inner.past[k] < cell.past[k] and k > 0", _SLABS,
     ),
     Fault(
         "location: sub-boxes whose bounds cross are excluded",
@@ -61,11 +62,11 @@ LOCATION = (
     ),
     Fault(
         "location: a sub-box that is left is called empty",
-        _SEARCH, "divided", "yield from divided(replace(inner, past=", "yield from divided(replace(cell, past=", _EMPTY,
+        _CELLS, "divided", "yield from divided(replace(inner, past=", "yield from divided(replace(cell, past=", _EMPTY,
     ),
     Fault(
         "location: rounding of lines may exceed the overlap of sub-boxes",
-        _SEARCH, "resolved", "SUB_BOX_LINES * 0.5 * (high - low)", "(high - low)", _LINES,
+        _CELLS, "resolved", "SUB_BOX_LINES * 0.5 * (high - low)", "(high - low)", _LINES,
     ),
     Fault(
         "location: a shear moves the ends of boxes one way",

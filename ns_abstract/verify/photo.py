@@ -90,7 +90,7 @@ class TiledPhoto:
         return sane & self.counted[tiles] & ((lower > self.high[tiles]) | (upper < self.low[tiles])).any(axis=-1)
 
     def excluded(self, lower: np.ndarray, upper: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-        """[k] by how many of the pixels each of ``k`` sub-boxes is beyond what explains them (U2).
+        """[k] how many pixels each of ``k`` sub-boxes excludes: its bounds lie beyond what explains them (U2, U5).
 
         Args:
             lower, upper: [n, 3, k] bounds of the pictures of each sub-box.

@@ -295,7 +295,7 @@ class SplatFrame:
     def sub_box_ends(
         self, box: ParameterBox, counts: np.ndarray, tiles: np.ndarray, pixels: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray] | None:
-        """See `ns_abstract.refine.protocol.SubBoxFrame`."""
+        """See `ns_abstract.refine.protocol.SubBoxFrame` (design.md, U5)."""
         if box.dimensions < 2:
             return None
         check_cancelled()
