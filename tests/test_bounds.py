@@ -22,10 +22,10 @@ from ns_abstract.methods.splat.activate import Splats, rotation_matrices
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, PAPER
 from ns_abstract.methods.splat.frame import SplatFrame
+from ns_abstract.methods.splat.intervals import sort_keys as sort_group
 from ns_abstract.methods.splat.projection_errors import FORMS, SPREAD, UNBOUNDED, columns
 from ns_abstract.methods.splat.render import Renderer
-from ns_abstract.methods.splat.reordering import _sort as sort_group
-from ns_abstract.methods.splat.stage_data import shared_out
+from ns_abstract.methods.splat.stage_data import cell_parts, shared_out
 from ns_abstract.perturbation.specification import Perturbation
 
 both_orders = pytest.mark.parametrize("order", [1, 2])
@@ -105,8 +105,11 @@ class Case:
             found = [(lower, upper)]
             if order == 1:
                 divided = shared_out(np.ones(box.dimensions), 16)
-                by_parts = self.bounds(box, 1, arithmetic, floor=floor, parts=divided)
+                by_parts = self.bounds(box, 1, arithmetic, floor=floor, parts=divided, keep_parts=True)
                 assert by_parts.statistics[4] == 0
+                parts = cell_parts(divided)
+                ends = assemble(by_parts.parts.reshape(*by_parts.parts.shape[:3], -1), self.camera)
+                ends = ends.reshape(*ends.shape[:2], 2, 3, -1).clip(0.0, 1.0)
                 found.append((assemble(by_parts.lower, self.camera), assemble(by_parts.upper, self.camera)))
             pairs = self.poses.enclosure(box, order).rotation.basis.pairs
             for values in self.samples(box, count):
@@ -117,6 +120,11 @@ class Case:
                 radius = linear[..., -1] + 1e-12
                 assert (np.minimum(1.0, middle - radius) <= image).all(), (box, values)
                 assert (np.maximum(0.0, middle + radius) >= image).all(), (box, values)
+                if order == 1:
+                    # and each of the parts holds the pictures of its own poses
+                    within = (np.abs(p[:, None] - parts.middles) <= parts.half[:, None]).all(axis=0)
+                    assert within.any()
+                    assert (ends[:, :, 0, :, within] <= image).all() and (ends[:, :, 1, :, within] >= image).all()
                 for low, high in found:
                     assert (low <= image).all() and (image <= high).all(), (box, values, worst(low, image, high))
                 least, most = np.minimum(least, image), np.maximum(most, image)

@@ -47,7 +47,7 @@ def _blended(values, palette, shape, parts, rules, charges_, unknown, out, slope
     buffers.palette[: palette.size] = palette
     of_parts = Parts(pointer(parts.middles), pointer(parts.half), pointer(parts.slope))
     inputs = PixelInputs(None, None, None, None, rules, charges_, None, shape, of_parts)
-    ends = blend_parts(0, count, block, inputs, pointer(slopes))
+    ends = blend_parts(0, count, False, block, inputs, pointer(slopes))
     for k in range(4):
         out[k], out[4 + k] = block.part_ends[k], block.part_ends[4 + k]
     # the owner of the block's memory lives to here

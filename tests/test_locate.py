@@ -18,8 +18,9 @@ from ns_abstract.cli.locate import main
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import load_camera_path
 from ns_abstract.geometry.tiles import assemble
+from ns_abstract.verify.cell_boxes import divided, inner_cell, resolved, slabs, sub_box_counts
 from ns_abstract.verify.cells import Cell, CellGrid
-from ns_abstract.verify.location import between, inner_cell, nearby, slabs
+from ns_abstract.verify.location import between, nearby
 from ns_abstract.verify.location_cover import ShearedBoxes, cover
 from ns_abstract.verify.photo import Photo, TiledPhoto
 
@@ -64,6 +65,10 @@ def test_what_is_no_number_explains_and_excludes_nothing() -> None:
     assert not photo.beyond(np.ones_like(nothing), np.full_like(nothing, 0.5), tiles).any()
     assert photo.beyond(np.full_like(nothing, 0.5), np.ones_like(nothing), tiles).all()
     assert photo.explained(nothing, nothing, tiles) == 0
+    # nor over sub-boxes: the first may be anything, the second's bounds cross, the third is beyond the photo
+    lower = np.full((16, 3, 4), [np.nan, 1.0, 0.5, 0.0])
+    upper = np.full((16, 3, 4), [np.nan, 0.5, 1.0, 1.0])
+    assert photo.excluded(lower, upper, photo.counted).tolist() == [0, 0, 16, 0]
 
 
 @pytest.mark.parametrize("seed", range(30))
@@ -136,6 +141,37 @@ def test_slabs_and_the_inner_cell_tile_a_cell() -> None:
         for p, q in ((p, q) for k, p in enumerate(parts) for q in parts[:k]):
             both = zip(p.first, p.past, q.first, q.past, strict=True)
             assert any(b <= c or e <= a for a, b, c, e in both)
+
+
+def test_sub_boxes_that_are_left_are_kept() -> None:
+    """What `divided` calls empty holds no sub-box that is left, and its cells tile the cell."""
+    generator = np.random.default_rng(0)
+    for trial in range(60):
+        counts = np.array(2 ** generator.integers(0, 4, int(generator.integers(1, 5))))
+        first = generator.integers(0, 100, counts.size)
+        units = generator.integers(1, 5, counts.size)
+        cell = Cell(tuple(first.tolist()), tuple((first + units * counts).tolist()))
+        left = generator.random(counts) < generator.choice([0.0, 0.05, 0.5, 0.95, 1.0])
+        parts = list(divided(cell, left, 0.5))
+        assert sum(part.volume for part, _ in parts) == cell.volume
+        for place in np.ndindex(*left.shape):
+            low = first + units * place
+            holding = [
+                some for part, some in parts
+                if ((np.array(part.first) < low + units) & (low < np.array(part.past))).all()
+            ]  # fmt: skip
+            assert holding and (not left[place] or holding == [True]), (trial, place)
+
+
+def test_numbers_of_sub_boxes_divide_the_units() -> None:
+    cell = Cell((0, 3, 7), (1 << 10, 3 + 12, 7 + 5))
+    counts = sub_box_counts(cell, np.array([1.0, 1.0, 9.0]), 64)
+    assert counts.tolist() == [16, 4, 1]
+    grid = CellGrid(box_of([1.0, 1.0], [1.0 + 1e-3, 2.0]), (1 << 20,) * 2, (1, 1))
+    assert resolved(grid.box_of(Cell((0, 0), (1 << 20, 1 << 20))), np.array([4, 4]))
+    # lines of so small a cell are rounded by more than sub-boxes overlap, and two of them are too few
+    assert not resolved(grid.box_of(Cell((4, 0), (8, 1 << 20))), np.array([4, 4]))
+    assert not resolved(grid.box_of(Cell((0, 0), (1 << 20, 1 << 20))), np.array([2, 1]))
 
 
 @pytest.mark.parametrize("seed", range(6))

@@ -3,10 +3,13 @@
 from planted.fault import Fault
 
 _PHOTO, _SEARCH, _COVER = "verify/photo.py", "verify/location.py", "verify/location_cover.py"
+_CELLS = "verify/cell_boxes.py"
 _ENDS = "test_locate.py::test_a_photo_allows_its_noise_and_every_rounding"
 _REACH = "test_locate.py::test_contraction_keeps_every_pose_that_explains_the_photo"
 _NUMBERS = "test_locate.py::test_what_is_no_number_explains_and_excludes_nothing"
 _SLABS = "test_locate.py::test_slabs_and_the_inner_cell_tile_a_cell"
+_EMPTY = "test_locate.py::test_sub_boxes_that_are_left_are_kept"
+_LINES = "test_locate.py::test_numbers_of_sub_boxes_divide_the_units"
 _BOXES = "test_locate.py::test_a_cover_holds_every_pose_of_sheared_boxes"
 
 LOCATION = (
@@ -51,7 +54,19 @@ LOCATION = (
     ),
     Fault(
         "location: the last slab is left out",
-        _SEARCH, "slabs", "inner.past[k] < cell.past[k]", "inner.past[k] < cell.past[k] and k > 0", _SLABS,
+        _CELLS, "slabs", "inner.past[k] < cell.past[k]", "inner.past[k] < cell.past[k] and k > 0", _SLABS,
+    ),
+    Fault(
+        "location: sub-boxes whose bounds cross are excluded",
+        _PHOTO, "TiledPhoto.excluded", "(lower <= upper).all(axis=1) & ", "", _NUMBERS,
+    ),
+    Fault(
+        "location: a sub-box that is left is called empty",
+        _CELLS, "divided", "yield from divided(replace(inner, past=", "yield from divided(replace(cell, past=", _EMPTY,
+    ),
+    Fault(
+        "location: rounding of lines may exceed the overlap of sub-boxes",
+        _CELLS, "resolved", "SUB_BOX_LINES * 0.5 * (high - low)", "(high - low)", _LINES,
     ),
     Fault(
         "location: a shear moves the ends of boxes one way",

@@ -622,10 +622,18 @@ SPLATS = (
     Fault(
         "parts: fragments that may change places stay",
         _INTERVALS,
-        "_blend_eight",
-        "low0 - moves[move]",
-        "low0",
+        "_least_moved",
+        "maximum(front - move, minimum(front, fma(a_high, min(0.0, color - brightest), behind)))",
+        "front",
         "test_bounds.py::test_depth_swap[1]",
+    ),
+    Fault(
+        "parts: a group is drawn darkest first for the most, too",
+        _INTERVALS,
+        "_ordered_end",
+        "palette.values[ends] if side == 0 else -palette.values[ends + 4]",
+        "palette.values[ends] if side == 0 else palette.values[ends + 4]",
+        "test_bounds.py::test_three_layers_swap[1]",
     ),
     Fault(
         "parts: the weakest part of the clamp is forgotten",

@@ -24,7 +24,7 @@ from ns_abstract.verify.location_cover import PoseCover, ShearedBoxes, cover
 from ns_abstract.verify.photo import Photo
 
 #: Of the search's rules: results of different ones are not mixed.
-_RULES = 1
+_RULES = 2
 
 
 @dataclass(frozen=True)

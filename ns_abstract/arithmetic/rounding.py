@@ -122,6 +122,13 @@ CUBIC_SERIES_REST = 1.5e-4
 LAYER_ROUNDING = 4.0 * UNIT64
 #: B11: sums of what skipping changes, one rounding by fragment. O2: swaps, one by pair; 1 to spare.
 JUMP_ROUNDING, SWAP_ROUNDING = UNIT64, 2.0 * UNIT64
+#: B12: by how much of a cell's half-width sub-boxes reach beyond their ends, so that they hold what lies between the
+#: grid's lines however these are rounded; and the most, of that, that the lines' rounding may come to.
+SUB_BOX_OVERLAP, SUB_BOX_LINES = 2.0**-24, 2.0**-26
+#: B12: a grid's line and the middle and half-width of a cell, relative to the sizes of its ends: 6; 10 to spare.
+SUB_BOX_LINE_ROUNDING = 16.0 * UNIT64
+#: B12: a part's share of a swap bound: a quotient and two products, 3; 5 to spare.
+MOVE_SHARE_UP = 1.0 + 8.0 * UNIT64
 #: B11: light has two roundings by layer of `LAYER_ROUNDING`; a weight as many as so many layers more.
 WEIGHT_LAYERS = 8
 #: B11: roundings of planes' sums beside one by fragment: lines of two sums and two products, 24; 40 to spare.

@@ -258,6 +258,25 @@ class PartsFrame(Protocol):
         ...
 
 
+@runtime_checkable
+class SubBoxFrame(Protocol):
+    """An optional interface of a `Frame`: bounds over each of many equal sub-boxes of a wide cell."""
+
+    def sub_box_ends(
+        self, box: ParameterBox, counts: np.ndarray, tiles: np.ndarray, pixels: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """Lower and upper bounds [n, 3, k] of ``n`` pixels over ``k`` sub-boxes; None: there are none for this set.
+
+        Args:
+            box: The cell.
+            counts: [d] sub-boxes along its axes, powers of two, at least 8 together; they are numbered like the
+                entries of an array of this shape. Each is widened by `SUB_BOX_OVERLAP` of the cell's half-widths.
+            tiles: [t] numbers.
+            pixels: [t, side, side] the ``n`` pixels.
+        """
+        ...
+
+
 class SharedOrder(Protocol):
     """Two scenes some of whose elements lie at the same places, and so are drawn in the same order in both."""
 

@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
@@ -19,7 +19,8 @@ from ns_abstract.arithmetic.rounding import CUT_VALUE_ROUNDING, HALF_UP
 from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import Float64Array, ParameterBox
 from ns_abstract.geometry.tiles import assemble, in_tiles
-from ns_abstract.refine.protocol import Bounds, Frame, LinearSets, PartsFrame
+from ns_abstract.refine.protocol import Bounds, Frame, LinearSets, PartsFrame, SubBoxFrame
+from ns_abstract.verify.cell_boxes import aligned, divided, inner_cell, resolved, slabs, sub_box_counts
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.photo import Photo
 from ns_abstract.verify.search import BlockResult, FinishedCell
@@ -36,9 +37,17 @@ class LocationTuning:
 
     #: Image motion over a cell, pixels: beyond it, cells are cut without bounds; up to it, they are contracted.
     coarse: float = 4.5
+    #: Sub-boxes that are excluded one by one, at most, in cells over which the image moves by no more than so many
+    #: pixels; and the part of a box of them that has to be left for it to become one cell.
+    sub_boxes: tuple[tuple[float, int], ...] = ((2.0, 512), (3.5, 128), (math.inf, 32))
+    filled: float = 0.5
+    #: Grid lines that cells begin and end at, as a power of two of their width.
+    aligned: int = 5
     contracted: float = 0.3
     #: Pixels that are bounded to exclude a cell: so many times those that may show anything.
     surplus: float = 4.0
+    #: How much wider a cell of as loose bounds is than a sub-box, about.
+    wider: float = 1.8
     #: Image motion over the cell whose bounds tell how loose they are; pixels that must be likely to be excluded, as a
     #: part of those that exclude a cell, for it to be bounded.
     reference: float = 2.4
@@ -192,6 +201,12 @@ class _Examination:
             if box.dimensions and moved > tuning.coarse:
                 break
             picture, number = self._look(box.middle)
+            if moved > tuning.contracted:
+                some = self._sub_boxes(box, picture)
+                if some:
+                    return None
+                if some is False:
+                    break
             bounds = self._bounds(box, picture)
             if bounds is None or self._settled(bounds):
                 break
@@ -209,12 +224,48 @@ class _Examination:
         """Whether what is left of the cell has a verdict."""
         return bool(self.leaves) and self.leaves[-1].cell == self.cell
 
+    def _sub_boxes(self, box: ParameterBox, picture: np.ndarray) -> bool | None:
+        """Exclude sub-boxes of the cell; returns whether some were, or None: the frame has no bounds of sub-boxes."""
+        search, tuning = self.search, self.search.tuning
+        moved = search.moved(box)
+        total = float(np.linalg.norm(moved))
+        counts = sub_box_counts(self.cell, moved, next(most for width, most in tuning.sub_boxes if total <= width))
+        if not isinstance(search.frame, SubBoxFrame) or not search.contract or not resolved(box, counts):
+            return None
+        chosen = self._promising(picture, total, float(np.linalg.norm(moved / counts)))
+        if chosen.sum() <= search.tiled.allowed:
+            return False
+        tiles = np.flatnonzero(chosen.any(axis=(1, 2)))
+        self.bounded += 1
+        ends = search.frame.sub_box_ends(box, counts, tiles, chosen[tiles])
+        if ends is None:
+            return None
+        number = search.tiled.excluded(*ends, chosen)
+        left = (number <= search.tiled.allowed).reshape(counts)
+        self.share = float(np.median(number)) / (search.tiled.allowed + 1)
+        if left.all():
+            return False
+        kept: list[Cell] = []
+        for cell, some in divided(self.cell, left, tuning.filled):
+            if some:
+                kept.append(cell)
+            else:
+                self.leaves.append(FinishedCell(cell, "certified", 1.0, 0.0))
+        if len(kept) == 1 and kept[0].volume > (1.0 - tuning.worth) * self.cell.volume:
+            self.cell = kept[0]
+            self._cut()
+        else:
+            self.children = kept
+        return True
+
     def _exclude(self, margin: float) -> None:
         self.leaves.append(FinishedCell(self.cell, "certified", margin, 0.0))
 
     def _shrink(self, box: ParameterBox) -> None:
         """Exclude what of the cell lies outside of ``box``, in whole grid units."""
         inner = inner_cell(self.search.grid, self.cell, box)
+        if float(np.linalg.norm(self.search.moved(box))) > self.search.tuning.contracted:
+            inner = aligned(self.cell, inner, self.search.tuning.aligned)
         self.leaves += [FinishedCell(slab, "certified", 1.0, 0.0) for slab in slabs(self.cell, inner)]
         self.cell = inner
 
@@ -257,15 +308,17 @@ class _Examination:
             self._exclude(float(number - allowed))
         return self.done
 
-    def _promising(self, picture: np.ndarray, moved: float) -> np.ndarray:
+    def _promising(self, picture: np.ndarray, moved: float, loose: float | None = None) -> np.ndarray:
         """[T, side, side] counted pixels that bounds are most likely to exclude: a guess of work.
 
-        None are chosen where too few are likely to be.
+        None are chosen where too few are likely to be. The picture moves by ``moved`` pixels over the cell, and by
+        ``loose`` over the cells whose bounds count; None: by as much.
         """
         search, tiled, side = self.search, self.search.tiled, self.search.frame.side
         least, most = nearby(assemble(picture, search.frame.camera), max(1, round(0.5 * moved)))
         low, high = in_tiles(least, side), in_tiles(most, side)
-        below, above = (part * (moved / search.tuning.reference) for part in search.looseness)
+        scale = (moved if loose is None else search.tuning.wider * loose) / search.tuning.reference
+        below, above = (part * scale for part in search.looseness)
         gaps = np.maximum(low - tiled.high, tiled.low - high).max(axis=-1)
         likely = np.maximum(low - below - tiled.high, tiled.low - high - above).max(axis=-1)
         chosen = tiled.counted & (gaps > 0.0)
@@ -376,34 +429,6 @@ def between(box: ParameterBox, least: Float64Array, most: Float64Array) -> Param
         first, last = min(first, high), max(last, low)
         box = box.replace(k, first, last)
     return box
-
-
-def inner_cell(grid: CellGrid, cell: Cell, box: ParameterBox) -> Cell:
-    """The smallest part of a cell, in whole units, that holds all of ``box`` within it (U3)."""
-    first, past = list(cell.first), list(cell.past)
-    for k in range(grid.box.dimensions):
-        low, high = grid.box.lower[k], grid.box.upper[k]
-        scale = grid.units[k] / (high - low)
-        a = min(max(int((box.lower[k] - low) * scale), first[k]), past[k] - 1)
-        # the ends themselves are compared, whatever the product was rounded to
-        while a > first[k] and grid.end(k, a) > box.lower[k]:
-            a -= 1
-        b = max(min(int((box.upper[k] - low) * scale) + 1, past[k]), a + 1)
-        while b < past[k] and grid.end(k, b) < box.upper[k]:
-            b += 1
-        first[k], past[k] = a, b
-    return Cell(tuple(first), tuple(past))
-
-
-def slabs(cell: Cell, inner: Cell) -> Iterator[Cell]:
-    """Cells that tile what of ``cell`` lies outside of ``inner``."""
-    for k in range(len(cell.first)):
-        if cell.first[k] < inner.first[k]:
-            yield replace(cell, past=(*cell.past[:k], inner.first[k], *cell.past[k + 1 :]))
-        if inner.past[k] < cell.past[k]:
-            yield replace(cell, first=(*cell.first[:k], inner.past[k], *cell.first[k + 1 :]))
-        first = (*cell.first[:k], inner.first[k], *cell.first[k + 1 :])
-        cell = Cell(first, (*cell.past[:k], inner.past[k], *cell.past[k + 1 :]))
 
 
 def nearby(image: np.ndarray, radius: int) -> tuple[np.ndarray, np.ndarray]:

@@ -10,8 +10,9 @@ import numpy as np
 
 from ns_abstract.arithmetic.rounding import POSE_ROUNDING
 from ns_abstract.geometry.box import Float64Array, ParameterBox
+from ns_abstract.verify.cell_boxes import inner_cell, slabs
 from ns_abstract.verify.cells import Cell, CellGrid
-from ns_abstract.verify.location import UNITS, inner_cell, slabs
+from ns_abstract.verify.location import UNITS
 
 #: Most cells of a cover that are left, and by how much their volume may exceed that of what they hold.
 MOST, SPARE = 1500, 1.3

@@ -21,7 +21,7 @@ from ns_abstract.arithmetic.rounding import (
 )
 from ns_abstract.arithmetic.simd.intrinsics import advanced, lowest_bit, prefetch, signed
 from ns_abstract.arithmetic.simd.lanes import LINE, bits, load4, maximum, minimum, store, where
-from ns_abstract.methods.splat.intervals import AHEAD, BlendBounds, blend_interval, blend_parts
+from ns_abstract.methods.splat.intervals import AHEAD, BlendBounds, blend_interval, blend_parts, write_parts
 from ns_abstract.methods.splat.lists import BLOCK
 from ns_abstract.methods.splat.pixel_block import (
     ALPHA_HIGH,
@@ -408,7 +408,7 @@ def shade(pixels, left, above, reordered, block, inputs, bounds):
         begin = q * fragments.capacity
         end = begin + int(fragments.lengths[q])
         if inputs.shape.parts > 0:
-            own = blend_parts(begin, end, block, inputs, advanced(t, 4))
+            own = blend_parts(begin, end, reordered, block, inputs, advanced(t, 4))
             pixel_bounds = _PixelResult(own.low, own.high, own, 0.5 * (own.low + own.high), 0.5 * (own.high - own.low))
         else:
             pixel_bounds = _form_bounds(begin, end, block, inputs, linear.shape[0] > 0)
@@ -431,6 +431,8 @@ def shade(pixels, left, above, reordered, block, inputs, bounds):
         for channel in range(3):
             lower[row, column, channel] = u[channel]
             upper[row, column, channel] = u[4 + channel]
+        if bounds.parts.shape[0] > 0:
+            write_parts(fall, rise, block.part_ends, bounds.parts[0, row, column], u)
         if linear.shape[0] > 0:
             store(t, 0, pixel_bounds.center)
             store(u, 0, (pixel_bounds.radius + maximum(fall, rise)) * UP)

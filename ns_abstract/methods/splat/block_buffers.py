@@ -15,6 +15,7 @@ from ns_abstract.methods.splat.pixel_block import (
     LISTED,
     MOVES,
     NUMBERS,
+    PART_ENDS,
     ROWS,
     FragmentBatch,
     Fragments,
@@ -29,6 +30,7 @@ from ns_abstract.methods.splat.pixel_block import (
     crossing_rows,
     fragment_width,
 )
+from ns_abstract.methods.splat.stage_data import PART_LANES
 
 #: Fragments that each pixel's list has room for at first.
 _CAPACITY = 256
@@ -82,6 +84,12 @@ def _aligned(size):
 
 
 @njit(cache=True, error_model="numpy")
+def _part_ends(shape, capacity):
+    """Memory for `PixelBlock.part_ends` with lists of ``capacity`` fragments."""
+    return np.empty(PART_ENDS + (6 * shape.parts + 2 * PART_LANES * capacity if shape.parts > 0 else 0))
+
+
+@njit(cache=True, error_model="numpy")
 def new_buffers(shape, forms, pair_limit, background):
     """Memory for fragments of ``shape``, colours of ``forms`` coefficients and ``pair_limit`` pairs."""
     per_pixel = np.zeros(ROWS * PIXELS)
@@ -99,7 +107,7 @@ def new_buffers(shape, forms, pair_limit, background):
         background=behind,
         nothing=np.zeros(4),
         unseen=np.zeros(8),
-        part_ends=np.empty(48),
+        part_ends=_part_ends(shape, _CAPACITY),
         sums=np.zeros(4 * (3 * m + 5 + bends_of(shape))),
         ray=np.empty(3),
         positions=np.empty((7, _POSITIONS), np.int64),
@@ -130,7 +138,7 @@ def resized(old, positions, capacity, shape, forms):
     values, lists, light, drawn, of_slots, moves = (
         old.values, old.lists, old.light, old.drawn, old.places, old.moves,
     )  # fmt: skip
-    skipped, distances, jumps = old.skipped, old.distances, old.jumps
+    skipped, distances, jumps, part_ends = old.skipped, old.distances, old.jumps, old.part_ends
     if capacity > lists.shape[1]:
         values = _aligned(capacity * PIXELS * fragment_width(shape))
         lists = np.empty((PIXELS, capacity, LISTED), np.uint32)
@@ -140,6 +148,7 @@ def resized(old, positions, capacity, shape, forms):
         moves = np.empty((32 * capacity, MOVES))
         skipped, distances = np.empty(capacity, np.int64), np.empty(8 * capacity)
         jumps = np.zeros((crossing_rows(shape), _crossing_columns(shape, capacity)))
+        part_ends = _part_ends(shape, capacity)
     return Buffers(
         per_pixel=old.per_pixel,
         offsets=old.offsets,
@@ -150,7 +159,7 @@ def resized(old, positions, capacity, shape, forms):
         background=old.background,
         nothing=old.nothing,
         unseen=old.unseen,
-        part_ends=old.part_ends,
+        part_ends=part_ends,
         sums=old.sums,
         ray=old.ray,
         positions=places,

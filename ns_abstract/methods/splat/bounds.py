@@ -18,6 +18,7 @@ from ns_abstract.arithmetic.rounding import (
     REGION,
     SHIFTED_ROUNDING,
     STILL_POSITION,
+    SUB_BOX_OVERLAP,
     TIE_ROUNDING,
     Arithmetic,
     Charges,
@@ -84,6 +85,7 @@ class CellBounds:
         slopes: [d] mean absolute linear coefficients; 0 where pixels were not wanted.
         statistics: Blocks, layers, uncertain pairs, blocks that gave up on order, pixels with results that were not
             numbers.
+        parts: [t, side, side, 6, parts] as in `PixelBounds`, or None.
     """
 
     wanted: np.ndarray
@@ -95,6 +97,7 @@ class CellBounds:
     layers: np.ndarray | None
     slopes: np.ndarray
     statistics: np.ndarray
+    parts: np.ndarray | None
 
 
 class SceneSums:
@@ -221,6 +224,7 @@ class SplatBounds:
         layers: bool = False,
         pixels: np.ndarray | None = None,
         parts: np.ndarray | None = None,
+        keep_parts: bool = False,
     ) -> CellBounds:
         """Bounds of the tiles ``wanted`` over the poses enclosed by ``forms`` (design.md, G10).
 
@@ -236,6 +240,8 @@ class SplatBounds:
             pixels: [t, side, side] which of the tiles' pixels are wanted, nothing is said of the others; all if None.
             parts: [d] numbers of parts along the cell's axes, powers of two and at least `PART_LANES` together: bound
                 pixels by intervals over each of them, not by forms (B12).
+
+            keep_parts: Whether to return bounds over each of these parts.
 
         Raises:
             ValueError: Linear sets or layers are asked for together with ``parts``, or these are not as above.
@@ -260,7 +266,7 @@ class SplatBounds:
         if layers:
             colors = _four_channels(colors, self._depths(poses, candidates, alive, gaussians.delta, m), alive, m)
             common = np.ascontiguousarray(poses.offset[: m + 1, 2])
-        bounds = self._allocate_bounds(wanted.size, candidates.size, shape, keep_linear, layers)
+        bounds = self._allocate_bounds(wanted.size, candidates.size, shape, keep_linear, layers, keep_parts)
         inputs = PixelInputs(
             gaussians,
             self._viewing_axes(forms, poses.rotation_magnitude, gaussians),
@@ -270,7 +276,7 @@ class SplatBounds:
             self.charges,
             self._cutoffs(floor),
             shape,
-            cell_parts(np.ones(shape.dimensions, np.int64) if parts is None else parts),
+            cell_parts(np.ones(shape.dimensions, np.int64) if parts is None else parts, SUB_BOX_OVERLAP * keep_parts),
         )
         sets = pixel_sets(np.broadcast_to(True, bounds.lower.shape[:3]) if pixels is None else pixels)
         self.stages.pixel_stage(TileLists(wanted, offsets, entries), sets, inputs, bounds)
@@ -279,6 +285,7 @@ class SplatBounds:
             *visible_again(bounds.marks, candidates, gaussians.box, gaussians.tiles, self.side),
             bounds.linear if keep_linear else None, bounds.layers if layers else None,
             bounds.slopes.sum(axis=0) / (max(wanted.size, 1) * self.side**2 * 3), bounds.statistics.sum(axis=0),
+            bounds.parts if keep_parts else None,
         )  # fmt: skip
 
     def _projected(
@@ -294,7 +301,7 @@ class SplatBounds:
         return gaussians, np.flatnonzero(state)
 
     def _allocate_bounds(
-        self, tiles: int, gaussians: int, shape: FormShape, keep_linear: bool, layers: bool
+        self, tiles: int, gaussians: int, shape: FormShape, keep_linear: bool, layers: bool, keep_parts: bool
     ) -> PixelBounds:
         """The output of the pixel stage for so many tiles and candidates, not filled in."""
         shaped = (tiles, self.side, self.side, 3)
@@ -305,6 +312,8 @@ class SplatBounds:
             layers=np.zeros((tiles if layers else 0, self.side, self.side, 4)),
             slopes=np.zeros((tiles, shape.dimensions)),
             statistics=np.zeros((threads(), 5), np.int64),
+            # memory is taken where it is written: for the pixels that are wanted
+            parts=np.empty((tiles if keep_parts else 0, self.side, self.side, 6, shape.parts)),
             marks=np.zeros(gaussians, np.uint8),
         )
 

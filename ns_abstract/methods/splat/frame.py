@@ -295,6 +295,24 @@ class SplatFrame:
         candidates = self.candidates(tiles, within, pixels)
         return each(lambda box: self._bound(box, tiles, within, candidates, keep_linear, pixels), boxes)
 
+    def sub_box_ends(
+        self, box: ParameterBox, counts: np.ndarray, tiles: np.ndarray, pixels: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """See `ns_abstract.refine.protocol.SubBoxFrame` (design.md, U5)."""
+        if box.dimensions < 2:
+            return None
+        check_cancelled()
+        forms = self.pose_set.enclosure(box, self.order)
+        cell = self.bounds.cell(
+            self.camera, forms, tiles, floor=self._floor, pixels=pixels, parts=counts, keep_parts=True
+        )
+        assert cell.parts is not None
+        ends = cell.parts[pixels]
+        lower, upper = ends[:, :COLORS], ends[:, COLORS:]
+        # crossed or not a number: nothing is known
+        sane = lower <= upper
+        return np.where(sane, lower, 0.0).clip(0.0, 1.0), np.where(sane, upper, 1.0).clip(0.0, 1.0)
+
     def _bound(
         self, box: ParameterBox, tiles: np.ndarray, within: VisibleContext | None, candidates: np.ndarray | None,
         keep_linear: bool, pixels: np.ndarray | None,

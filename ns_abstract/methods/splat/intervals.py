@@ -5,20 +5,21 @@ SIMD lanes are the three channels, and a fourth one of nothing; or eight parts o
 
 from __future__ import annotations
 
-import math
 from typing import Any, NamedTuple
 
 from numba import njit
 
 from ns_abstract.arithmetic.elementary import exp_kernel, fma
-from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, UP
-from ns_abstract.arithmetic.simd.intrinsics import prefetch
+from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, MOVE_SHARE_UP, UP
+from ns_abstract.arithmetic.simd.intrinsics import advanced, prefetch
 from ns_abstract.arithmetic.simd.lanes import LINE, lane_sum, load4, load8, maximum, minimum, store, where
 from ns_abstract.methods.splat.pixel_block import (
     ALPHA_HIGH,
     ALPHA_LOW,
     EXPONENT,
     EXPONENT_CUT,
+    LISTED,
+    PART_ENDS,
     color_ends,
     exponent_ends,
     listed_fragment,
@@ -60,6 +61,23 @@ def _most(behind, color, a_low, a_high):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
+def _least_moved(behind, color, brightest, a_low, a_high, move):
+    """`_least` of a fragment that may be drawn behind some of those listed behind it (design.md, B12, O2, O3).
+
+    ``brightest`` bounds their colours, ``move`` what the swap bound allows.
+    """
+    front = _least(behind, color, a_low, a_high)
+    return maximum(front - move, minimum(front, fma(a_high, min(0.0, color - brightest), behind)))
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _most_moved(behind, color, darkest, a_low, a_high, move):
+    """`_most` of a fragment that may be drawn behind some of those listed behind it; see `_least_moved`."""
+    front = _most(behind, color, a_low, a_high)
+    return minimum(front + move, maximum(front, fma(a_high, max(0.0, color - darkest), behind)))
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
 def blend_interval(behind, values, at, colors, ends):
     """One fragment over what is ``behind`` (design.md, B7); its colour's bounds stand at ``ends``."""
     a_low, a_high = values[at + ALPHA_LOW], values[at + ALPHA_HIGH]
@@ -96,20 +114,70 @@ def _alphas_of_parts(values, at, part, inputs, thresholds):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _add_parts(out, slopes, channel, low, high, part, inputs):
-    """Take eight parts' ends of a channel into ``out`` and the sums ``slopes``, see `blend_parts`."""
-    least, most = PART_LANES * channel, PART_LANES * (3 + channel)
-    store(out, least, minimum(load8(out, least), low))
-    store(out, most, maximum(load8(out, most), high))
+    """Write eight parts' ends of a channel to ``out`` and add them to the sums ``slopes``, see `blend_parts`."""
+    store(out, PART_ENDS + inputs.shape.parts * channel + part, low)
+    store(out, PART_ENDS + inputs.shape.parts * (3 + channel) + part, high)
     for k in range(inputs.shape.dimensions):
         middle = load8(inputs.parts.middles, inputs.shape.parts * k + part)
         slopes[4 * k + channel] += lane_sum(middle * (low + high))
 
 
 @njit(cache=True, error_model="numpy")
-def _blend_eight(begin, end, part, block, inputs, slopes):
+def sort_keys(keys, order, count):
+    """Sort the first ``count`` of ``keys``, least first; ``order`` receives where each stood."""
+    for e in range(count):
+        order[e] = e
+    # by insertion, after sorting what lies far apart: most groups are small
+    step = 1
+    while step < count // 3:
+        step = 3 * step + 1
+    while step > 0:
+        for e in range(step, count):
+            key, place = keys[e], order[e]
+            other = e
+            while other >= step and keys[other - step] > key:
+                keys[other], order[other] = keys[other - step], order[other - step]
+                other -= step
+            keys[other], order[other] = key, place
+        step //= 3
+
+
+@njit(cache=True, error_model="numpy")
+def _ordered_end(value, start, stop, channel, side, block, alphas):
+    """One end of a channel over eight parts of list entries [start, stop) in every order (design.md, B12, O4).
+
+    Args:
+        value: The end of what lies behind them.
+        start, stop: The entries of a group.
+        channel: 0 to 2.
+        side: 0: the least, 1: the most.
+        block: The pixel's block.
+        alphas: Bounds of alpha over the parts, two times eight for each entry.
+    """
+    fragments, palette = block.fragments, block.palette
+    keys, order, forms, count = block.entries.depth_radius, block.entries.first, palette.forms, stop - start
+    for e in range(count):
+        _, key, _ = listed_fragment(fragments, start + e, forms)
+        ends = key + color_ends(forms) + channel
+        keys[e] = palette.values[ends] if side == 0 else -palette.values[ends + 4]
+    sort_keys(keys, order, count)
+    # nearest first: darkest for the least, brightest for the most
+    for position in range(count - 1, -1, -1):
+        at = 2 * PART_LANES * order[position]
+        a_low, a_high = load8(alphas, at), load8(alphas, at + PART_LANES)
+        if side == 0:
+            value = _least(value, keys[position], a_low, a_high)
+        else:
+            value = _most(value, -keys[position], a_low, a_high)
+    return value
+
+
+@njit(cache=True, error_model="numpy")
+def _blend_eight(begin, end, part, reordered, block, inputs, slopes):
     """`blend_parts` of eight parts from ``part`` on; returns the darkest and the brightest colour."""
     fragments, palette, moves, out = block.fragments, block.palette, block.reordering.moves, block.part_ends
     values, colors, forms = fragments.values, palette.values, palette.forms
+    alphas = advanced(out, PART_ENDS + 6 * inputs.shape.parts)
     rules, charges = inputs.rules, inputs.charges
     thresholds = _Thresholds(rules.alpha_min * (1.0 - charges.threshold), rules.alpha_max * (1.0 - charges.threshold))
     darkest = load4(palette.background, 0)
@@ -119,27 +187,53 @@ def _blend_eight(begin, end, part, block, inputs, slopes):
     low1 = zero + palette.background[1]
     low2 = zero + palette.background[2]
     high0, high1, high2 = low0, low1, low2
-    for entry in range(end - 1, begin - 1, -1):
-        ahead, _, _ = listed_fragment(fragments, max(entry - AHEAD, begin), forms)
-        for byte in range(0, 8 * fragments.width, LINE):
-            prefetch(values, ahead, byte)
-        at, key, move = listed_fragment(fragments, entry, forms)
-        a_low, a_high = _alphas_of_parts(values, at, part, inputs, thresholds)
-        c = key + color_ends(forms)
-        darkest, brightest = minimum(darkest, load4(colors, c)), maximum(brightest, load4(colors, c + 4))
-        low0 = _least(low0, colors[c], a_low, a_high)
-        low1 = _least(low1, colors[c + 1], a_low, a_high)
-        low2 = _least(low2, colors[c + 2], a_low, a_high)
-        high0 = _most(high0, colors[c + 4], a_low, a_high)
-        high1 = _most(high1, colors[c + 5], a_low, a_high)
-        high2 = _most(high2, colors[c + 6], a_low, a_high)
-        if move != 0:
-            low0 = low0 - moves[move]
-            low1 = low1 - moves[move + 1]
-            low2 = low2 - moves[move + 2]
-            high0 = high0 + moves[move + 4]
-            high1 = high1 + moves[move + 5]
-            high2 = high2 + moves[move + 6]
+    groups, lists = block.entries.far, fragments.lists
+    stop = end
+    while stop > begin:
+        start, moved = stop - 1, False
+        if reordered:
+            group = groups[int(lists[LISTED * start + 1])]
+            while start > begin and groups[int(lists[LISTED * (start - 1) + 1])] == group:
+                start -= 1
+        behind = low0, low1, low2, high0, high1, high2
+        for entry in range(stop - 1, start - 1, -1):
+            ahead, _, _ = listed_fragment(fragments, max(entry - AHEAD, begin), forms)
+            for byte in range(0, 8 * fragments.width, LINE):
+                prefetch(values, ahead, byte)
+            at, key, move = listed_fragment(fragments, entry, forms)
+            a_low, a_high = _alphas_of_parts(values, at, part, inputs, thresholds)
+            c = key + color_ends(forms)
+            if stop - start > 1:
+                store(alphas, 2 * PART_LANES * (entry - start), a_low)
+                store(alphas, 2 * PART_LANES * (entry - start) + PART_LANES, a_high)
+            if move != 0:
+                moved = True
+                # of the colours behind this one
+                store(out, 0, darkest)
+                store(out, 4, brightest)
+                share = minimum(1.0, a_high * (MOVE_SHARE_UP / values[at + ALPHA_HIGH]))
+                low0 = _least_moved(low0, colors[c], out[4], a_low, a_high, share * moves[move])
+                low1 = _least_moved(low1, colors[c + 1], out[5], a_low, a_high, share * moves[move + 1])
+                low2 = _least_moved(low2, colors[c + 2], out[6], a_low, a_high, share * moves[move + 2])
+                high0 = _most_moved(high0, colors[c + 4], out[0], a_low, a_high, share * moves[move + 4])
+                high1 = _most_moved(high1, colors[c + 5], out[1], a_low, a_high, share * moves[move + 5])
+                high2 = _most_moved(high2, colors[c + 6], out[2], a_low, a_high, share * moves[move + 6])
+            else:
+                low0 = _least(low0, colors[c], a_low, a_high)
+                low1 = _least(low1, colors[c + 1], a_low, a_high)
+                low2 = _least(low2, colors[c + 2], a_low, a_high)
+                high0 = _most(high0, colors[c + 4], a_low, a_high)
+                high1 = _most(high1, colors[c + 5], a_low, a_high)
+                high2 = _most(high2, colors[c + 6], a_low, a_high)
+            darkest, brightest = minimum(darkest, load4(colors, c)), maximum(brightest, load4(colors, c + 4))
+        if moved and stop - start > 1:
+            low0 = maximum(low0, _ordered_end(behind[0], start, stop, 0, 0, block, alphas))
+            low1 = maximum(low1, _ordered_end(behind[1], start, stop, 1, 0, block, alphas))
+            low2 = maximum(low2, _ordered_end(behind[2], start, stop, 2, 0, block, alphas))
+            high0 = minimum(high0, _ordered_end(behind[3], start, stop, 0, 1, block, alphas))
+            high1 = minimum(high1, _ordered_end(behind[4], start, stop, 1, 1, block, alphas))
+            high2 = minimum(high2, _ordered_end(behind[5], start, stop, 2, 1, block, alphas))
+        stop = start
     _add_parts(out, slopes, 0, low0, high0, part, inputs)
     _add_parts(out, slopes, 1, low1, high1, part, inputs)
     _add_parts(out, slopes, 2, low2, high2, part, inputs)
@@ -147,31 +241,49 @@ def _blend_eight(begin, end, part, block, inputs, slopes):
 
 
 @njit(cache=True, error_model="numpy")
-def blend_parts(begin, end, block, inputs, slopes):
+def blend_parts(begin, end, reordered, block, inputs, slopes):
     """Bounds of the list entries [begin, end) of a pixel by intervals over the parts of the cell (design.md, B12).
 
-    ``slopes`` [d, 4] receives how much the channels vary along the parameters, as far as the parts tell.
+    ``reordered`` tells whether fragments may change places. ``slopes`` [d, 4] receives how much the channels vary along
+    the parameters, as far as the parts tell.
     """
     out, parts, d = block.part_ends, inputs.parts, inputs.shape.dimensions
-    zero = 0.0 * load8(parts.middles, 0)
-    for channel in range(3):
-        store(out, PART_LANES * channel, zero + math.inf)
-        store(out, PART_LANES * (3 + channel), zero - math.inf)
     for k in range(4 * d):
         slopes[k] = 0.0
-    darkest, brightest = _blend_eight(begin, end, 0, block, inputs, slopes)
+    darkest, brightest = _blend_eight(begin, end, 0, reordered, block, inputs, slopes)
     for part in range(PART_LANES, inputs.shape.parts, PART_LANES):
-        _blend_eight(begin, end, part, block, inputs, slopes)
+        _blend_eight(begin, end, part, reordered, block, inputs, slopes)
     for k in range(d):
         store(slopes, 4 * k, parts.slope[k] * load4(slopes, 4 * k))
     for side in range(2):
         for channel in range(3):
-            at = PART_LANES * (3 * side + channel)
-            value = out[at]
+            at = PART_ENDS + inputs.shape.parts * (3 * side + channel)
+            ends = load8(out, at)
+            for part in range(PART_LANES, inputs.shape.parts, PART_LANES):
+                more = load8(out, at + part)
+                ends = maximum(ends, more) if side else minimum(ends, more)
+            store(out, PART_LANES, ends)
+            value = out[PART_LANES]
             for lane in range(1, PART_LANES):
-                value = max(value, out[at + lane]) if side else min(value, out[at + lane])
-            # what stands there is not read any more
+                other = out[PART_LANES + lane]
+                value = max(value, other) if side else min(value, other)
             out[4 * side + channel] = value
         # the lane of nothing
         out[4 * side + 3] = 0.0
     return BlendBounds(load4(out, 0), load4(out, 4), darkest, brightest)
+
+
+@njit(cache=True, error_model="numpy")
+def write_parts(fall, rise, part_ends, out, u):
+    """Write the ends of `blend_parts` in each part, widened by ``fall`` and ``rise``, to ``out`` [6, parts].
+
+    Ends that cross or are no numbers are written as they are: they bound nothing. ``u`` is scratch for 8 numbers.
+    """
+    parts = out.shape[1]
+    store(u, 0, -fall)
+    store(u, 4, rise)
+    for side in range(2):
+        for channel in range(3):
+            row = 3 * side + channel
+            for part in range(parts):
+                out[row, part] = part_ends[PART_ENDS + parts * row + part] + u[4 * side + channel]

@@ -36,6 +36,8 @@ ROWS = 8
 #: then its radius; where curvature is kept (B10), coefficients of products of two parameters follow, and the alpha up
 #: to which the fragment may be skipped, or 0 (`crossing_column`).
 ALPHA_LOW, ALPHA_HIGH, BEND, BEND_SPREAD, FORM = range(5)
+#: Where the ends of single parts begin in `PixelBlock.part_ends`.
+PART_ENDS = 16
 #: Where pixels are bounded over parts of the cell (B12), a fragment is bounds of alpha and then: centres of y1 and y2,
 #: their slopes, parameter by parameter, their radii over a part; alpha at exponent 0, at its least and its most; and
 #: the alpha below which the fragment may be skipped.
@@ -190,7 +192,8 @@ class PixelBlock(NamedTuple):
 
     Attributes:
         shifted: Depths of one pixel's list against its own reference (see `depths`).
-        part_ends: [6, 8] scratch: least of three channels, and most, over parts of the cell.
+        part_ends: Over parts of the cell: least of the channels and most, [2, 4], scratch, and from `PART_ENDS` on the
+            least of three channels and the most in each part, [6, parts]; then scratch for a list's alphas.
         sums: [3 m + bends + 5, 4] scratch by channel: polynomials, then what `blend` and `depths` need beside them.
         ray: [3] the block's central ray at the cell's middle, world axes, of unit depth.
     """

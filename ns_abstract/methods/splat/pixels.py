@@ -51,6 +51,18 @@ def _set_trivial(pixels, left, above, bounds, m):
 
 
 @njit(cache=True, error_model="numpy")
+def _set_trivial_parts(pixels, left, above, bounds):
+    """`_set_trivial` of the parts of the cell, where these are asked for."""
+    while pixels != 0 and bounds.parts.shape[0] > 0:
+        q = lowest_bit(pixels)
+        pixels = signed(pixels & (pixels - 1))
+        ends = bounds.parts[0, above + q // BLOCK, left + q % BLOCK]
+        for part in range(ends.shape[1]):
+            for channel in range(3):
+                ends[channel, part], ends[3 + channel, part] = 0.0, 1.0
+
+
+@njit(cache=True, error_model="numpy")
 def _bound_block(numbers, place, inputs, block, bounds):
     """Bounds of one block of pixels. Returns whether the buffers sufficed.
 
@@ -76,6 +88,7 @@ def _bound_block(numbers, place, inputs, block, bounds):
         for k in range(numbers.size):
             bounds.marks[numbers[k]] = 1
         _set_trivial(signed(place.wanted), left, above, bounds, m)
+        _set_trivial_parts(signed(place.wanted), left, above, bounds)
         return True
     if slots > 0:
         swap_bounds(pairs, slots, block)
@@ -110,11 +123,11 @@ def _borrowed_inputs(inputs):
 @njit(cache=True, error_model="numpy")
 def _tile_bounds(bounds, number, thread):
     """The parts of ``bounds`` that tile ``number`` of those wanted and ``thread`` write."""
-    linear, layers = borrowed(bounds.linear), borrowed(bounds.layers)
+    linear, layers, parts = borrowed(bounds.linear), borrowed(bounds.layers), borrowed(bounds.parts)
     return PixelBounds(
         borrowed(bounds.lower)[number], borrowed(bounds.upper)[number], linear[min(number, linear.shape[0]) :],
         layers[min(number, layers.shape[0]) :], borrowed(bounds.slopes)[number],
-        borrowed(bounds.statistics)[thread], borrowed(bounds.marks),
+        borrowed(bounds.statistics)[thread], parts[min(number, parts.shape[0]) :], borrowed(bounds.marks),
     )  # fmt: skip
 
 

@@ -14,7 +14,7 @@ from ns_abstract.arithmetic.elementary import fma
 from ns_abstract.arithmetic.rounding import SWAP_ROUNDING, UP
 from ns_abstract.arithmetic.simd.intrinsics import lowest_bit
 from ns_abstract.arithmetic.simd.lanes import bits, load4, load8, maximum, minimum, store
-from ns_abstract.methods.splat.intervals import BlendBounds, blend_interval
+from ns_abstract.methods.splat.intervals import BlendBounds, blend_interval, sort_keys
 from ns_abstract.methods.splat.lists import PIXELS
 from ns_abstract.methods.splat.pixel_block import (
     ALPHA_HIGH,
@@ -91,26 +91,6 @@ def swap_bounds(pairs, slots, block):
 
 
 @njit(cache=True, error_model="numpy")
-def _sort(keys, order, count):
-    """Sort the first ``count`` of ``keys``, least first; ``order`` receives where each stood."""
-    for e in range(count):
-        order[e] = e
-    # by insertion, after sorting what lies far apart: most groups are small
-    step = 1
-    while step < count // 3:
-        step = 3 * step + 1
-    while step > 0:
-        for e in range(step, count):
-            key, place = keys[e], order[e]
-            other = e
-            while other >= step and keys[other - step] > key:
-                keys[other], order[other] = keys[other - step], order[other - step]
-                other -= step
-            keys[other], order[other] = key, place
-        step //= 3
-
-
-@njit(cache=True, error_model="numpy")
 def _interval_group(start, stop, behind, fragments, palette, moves, scratch):
     """One step of the interval blend for list entries [start, stop) whose order is uncertain (design.md, O2-O4).
 
@@ -142,7 +122,7 @@ def _interval_group(start, stop, behind, fragments, palette, moves, scratch):
                 _, key, _ = listed_fragment(fragments, start + e, forms)
                 ends = key + color_ends(forms) + channel
                 keys[e] = colors[ends] if side == 0 else -colors[ends + 4]
-            _sort(keys, order, count)
+            sort_keys(keys, order, count)
             value = t[8 + 4 * side + channel]
             # nearest first: darkest for the lower bound, brightest for the upper one
             for position in range(count - 1, -1, -1):

@@ -220,13 +220,16 @@ def shared_out(weights: np.ndarray, parts: int) -> np.ndarray:
     return counts
 
 
-def cell_parts(counts: np.ndarray) -> Parts:
-    """The parts of a cell, ``counts`` [d] of them along its axes: powers of two, so that all is exact (B12)."""
+def cell_parts(counts: np.ndarray, overlap: float = 0.0) -> Parts:
+    """The parts of a cell, ``counts`` [d] of them along its axes: powers of two, so that all is exact (B12).
+
+    They reach beyond their ends by ``overlap`` of the cell's half-width.
+    """
     along = [(2.0 * np.arange(n) + 1.0) / n - 1.0 for n in counts.tolist()]
     grid = np.array(np.meshgrid(*along, indexing="ij"), np.float64)
     middles = np.ascontiguousarray(grid.reshape(counts.size, counts.prod()))
     squares = np.square(middles).sum(axis=1)
-    return Parts(middles, 1.0 / counts, np.where(counts > 1, 0.5 / np.where(counts > 1, squares, 1.0), 0.0))
+    return Parts(middles, 1.0 / counts + overlap, np.where(counts > 1, 0.5 / np.where(counts > 1, squares, 1.0), 0.0))
 
 
 class PixelBounds(NamedTuple):
@@ -240,6 +243,8 @@ class PixelBounds(NamedTuple):
             were uncertain, pixels with results that were not numbers.
         layers: [t, side, side, 4] bounds of the accumulation, and of the expected depth where anything is drawn (see
             `depths`; infinity before its negative: nothing can be), or empty.
+        parts: [t, side, side, 6, parts] least of the three channels and most in each part of the cell, where pixels are
+            wanted, or empty.
         marks: [n] uint8; set to 1 for every Gaussian that some wanted pixel of these tiles may draw or stop at. Those
             that stay 0 are hidden or too faint for every pose: leaving them out changes nothing.
     """
@@ -250,6 +255,7 @@ class PixelBounds(NamedTuple):
     layers: np.ndarray
     slopes: np.ndarray
     statistics: np.ndarray
+    parts: np.ndarray
     marks: np.ndarray
 
 

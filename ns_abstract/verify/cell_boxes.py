@@ -1,0 +1,105 @@
+"""Boxes of whole grid units in a cell: what is cut off, and which sub-boxes are left (docs/dev/design.md, U3, U5)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+
+from ns_abstract.arithmetic.rounding import SUB_BOX_LINE_ROUNDING, SUB_BOX_LINES
+from ns_abstract.geometry.box import Float64Array, ParameterBox
+from ns_abstract.verify.cells import Cell, CellGrid
+
+
+def inner_cell(grid: CellGrid, cell: Cell, box: ParameterBox) -> Cell:
+    """The smallest part of a cell, in whole units, that holds all of ``box`` within it (U3)."""
+    first, past = list(cell.first), list(cell.past)
+    for k in range(grid.box.dimensions):
+        low, high = grid.box.lower[k], grid.box.upper[k]
+        scale = grid.units[k] / (high - low)
+        a = min(max(int((box.lower[k] - low) * scale), first[k]), past[k] - 1)
+        # the ends themselves are compared, whatever the product was rounded to
+        while a > first[k] and grid.end(k, a) > box.lower[k]:
+            a -= 1
+        b = max(min(int((box.upper[k] - low) * scale) + 1, past[k]), a + 1)
+        while b < past[k] and grid.end(k, b) < box.upper[k]:
+            b += 1
+        first[k], past[k] = a, b
+    return Cell(tuple(first), tuple(past))
+
+
+def slabs(cell: Cell, inner: Cell) -> Iterator[Cell]:
+    """Cells that tile what of ``cell`` lies outside of ``inner``."""
+    for k in range(len(cell.first)):
+        if cell.first[k] < inner.first[k]:
+            yield replace(cell, past=(*cell.past[:k], inner.first[k], *cell.past[k + 1 :]))
+        if inner.past[k] < cell.past[k]:
+            yield replace(cell, first=(*cell.first[:k], inner.past[k], *cell.first[k + 1 :]))
+        first = (*cell.first[:k], inner.first[k], *cell.first[k + 1 :])
+        cell = Cell(first, (*cell.past[:k], inner.past[k], *cell.past[k + 1 :]))
+
+
+def aligned(cell: Cell, inner: Cell, bits: int) -> Cell:
+    """``inner`` grown within ``cell`` to grid lines that are multiples of a power of two, so that it can be halved."""
+    first, past = list(inner.first), list(inner.past)
+    for k, (a, b) in enumerate(zip(cell.first, cell.past, strict=True)):
+        step = 1 << max(0, (b - a).bit_length() - bits)
+        first[k], past[k] = max(a, first[k] // step * step), min(b, -(-past[k] // step) * step)
+    return Cell(tuple(first), tuple(past))
+
+
+def sub_box_counts(cell: Cell, moved: Float64Array, most: int) -> np.ndarray:
+    """Numbers of sub-boxes [d] along a cell's axes, powers of two that divide its units, at most ``most`` together.
+
+    They move the picture about as much along every axis; ``moved`` [d] pixels are what the cell does.
+    """
+    sizes = np.array(cell.past, np.int64) - np.array(cell.first, np.int64)
+    counts = np.ones(sizes.size, np.int64)
+    while 2 * counts.prod() <= most:
+        free = np.where(sizes % (2 * counts) == 0, moved / counts, -1.0)
+        axis = int(np.argmax(free)) if free.size else 0
+        if not free.size or free[axis] < 0.0:
+            break
+        counts[axis] *= 2
+    return counts
+
+
+def resolved(box: ParameterBox, counts: np.ndarray) -> bool:
+    """Whether the overlap of a cell's sub-boxes covers what grid lines are rounded by (B12, U5)."""
+    low, high = np.array(box.lower), np.array(box.upper)
+    rounding = SUB_BOX_LINE_ROUNDING * (np.abs(low) + np.abs(high))
+    return bool(counts.prod() >= 8 and (rounding <= SUB_BOX_LINES * 0.5 * (high - low)).all())
+
+
+def divided(cell: Cell, left: np.ndarray, filled: float) -> Iterator[tuple[Cell, bool]]:
+    """Cells that tile ``cell``, each with whether some of its sub-boxes are left (U5).
+
+    Args:
+        cell: The cell.
+        left: [counts] which of its equal sub-boxes are left; counts divide the cell's units.
+        filled: Part of a box that has to be left for it to become one cell.
+    """
+    if not left.any():
+        yield cell, False
+        return
+    units = [(b - a) // n for a, b, n in zip(cell.first, cell.past, left.shape, strict=True)]
+    spans = []
+    for axis in range(left.ndim):
+        some = np.flatnonzero(left.any(axis=tuple(k for k in range(left.ndim) if k != axis)))
+        spans.append((int(some[0]), int(some[-1]) + 1))
+    inner = Cell(
+        tuple(a + unit * start for a, unit, (start, _) in zip(cell.first, units, spans, strict=True)),
+        tuple(a + unit * stop for a, unit, (_, stop) in zip(cell.first, units, spans, strict=True)),
+    )
+    yield from ((slab, False) for slab in slabs(cell, inner))
+    part = left[tuple(slice(*span) for span in spans)]
+    if part.mean() >= filled:
+        yield inner, True
+        return
+    axis = int(np.argmax(part.shape))
+    half = part.shape[axis] // 2
+    line = inner.first[axis] + units[axis] * half
+    before, behind = np.split(part, [half], axis=axis)
+    yield from divided(replace(inner, past=(*inner.past[:axis], line, *inner.past[axis + 1 :])), before, filled)
+    yield from divided(replace(inner, first=(*inner.first[:axis], line, *inner.first[axis + 1 :])), behind, filled)
