@@ -149,6 +149,7 @@ def run_folder(
     output_dir: Path,
     *,
     only: Sequence[str] = (),
+    numbers: Sequence[int] | None = None,
     seconds: float | None = None,
     memory: int = 2 << 30,
     arithmetic: NetworkArithmetic = "float32",
@@ -163,6 +164,7 @@ def run_folder(
         folder: Holds instances.csv and what it names, also packed (.gz); or the folders 2.0 or 1.0 that do.
         output_dir: Folder of the results.
         only: Parts of names of networks or properties; all if there are none.
+        numbers: Places in the list, from 0; None: all.
         seconds: Limit beside those of the list.
         memory: Bytes that bounds may take.
         arithmetic: What "unsat" covers.
@@ -174,8 +176,9 @@ def run_folder(
     benchmark, folder = folder, version_folder(folder)
     chosen = [
         one
-        for one in instances(folder)
-        if not only or any(part in name for part in only for name in (one.network, one.property))
+        for number, one in enumerate(instances(folder))
+        if (not only or any(part in name for part in only for name in (one.network, one.property)))
+        and (numbers is None or number in numbers)
     ]
     if not chosen:
         raise InputError("no instance is chosen", file=folder / "instances.csv", fix="check --only")

@@ -67,7 +67,7 @@ def bound_outputs(
     parts = []
     for first in range(0, images.count, step):
         phases = None if assumed is None else assumed[first : first + step]
-        cells = _NetworkBounds(
+        cells = NetworkBounds(
             network, images[first : first + step], substitution, memory, arithmetic, slope_steps, phases, None,
             intermediate_steps,
         )  # fmt: skip
@@ -79,7 +79,7 @@ def bound_outputs(
     return OutputBounds(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
-class _NetworkBounds:
+class NetworkBounds:
     """Bounds of one network over several cells: builds the passes and runs them over all nodes.
 
     Attributes:
