@@ -85,6 +85,7 @@ class NetworkBounds:
     Attributes:
         intermediate: What is known of the nodes.
         last: The form of the last one.
+        output_rows: Bounds rows of the outputs.
     """
 
     def __init__(
@@ -116,8 +117,8 @@ class NetworkBounds:
         self.last = ForwardPass(intermediate, propagation, pooling, selection, schedule).run()
         if substitution == "end":
             intermediate.see(planes_of(fields, middle, network.input_shape, "everywhere"))
-        self._outputs = OutputRows(intermediate, backward, RowAscent(intermediate, backward, slope_steps))
+        self.output_rows = OutputRows(intermediate, backward, RowAscent(intermediate, backward, slope_steps))
 
     def outputs(self, rows: Any, offset: Float64) -> OutputBounds:
         """Bounds of ``rows @ y + offset`` in every cell."""
-        return self._outputs.bound(self.last, rows, offset)
+        return self.output_rows.bound(self.last, rows, offset)
