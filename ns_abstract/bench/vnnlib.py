@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from ns_abstract.execution.cancellation import Deadline
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import file_beside, read_text
 from ns_abstract.io.packed import unpacked
@@ -199,12 +200,7 @@ def run_folder(
                 network, run = networks.load(_stored(folder, file))
                 regions, query = _question(network, run, _stored(folder, one.property), name, memory, arithmetic)
                 ready = time.perf_counter()
-                end = ready + limit
-
-                def over(end: float = end) -> bool:
-                    return time.perf_counter() > end
-
-                answer = decide(network, run, regions, over, memory=memory, arithmetic=arithmetic)
+                answer = decide(network, run, regions, Deadline(limit), memory=memory, arithmetic=arithmetic)
             except InputError as error:
                 why = str(error)
             word = "error" if answer is None else answer.word
@@ -289,10 +285,10 @@ def verify_query(
     if len(networks) != 1:
         raise InputError(f"{len(networks)} networks", field="--network", fix=_ONE_NETWORK)
     ((name, path),) = networks.items()
-    end = time.perf_counter() + (_LONGEST if seconds is None else seconds)
+    deadline = Deadline(_LONGEST if seconds is None else seconds)
     with tempfile.TemporaryDirectory() as scratch:
         network, run = _Networks(Path(scratch), output).load(path)
         regions, query = _question(network, run, file, name, memory, arithmetic)
-        answer = decide(network, run, regions, lambda: time.perf_counter() > end, memory=memory, arithmetic=arithmetic)
+        answer = decide(network, run, regions, deadline, memory=memory, arithmetic=arithmetic)
     word = "timed-out" if answer.word == "timeout" else answer.word
     return f"{word}\n{assignment(answer, query)}"

@@ -45,7 +45,7 @@ def bound_outputs(
         network: The network.
         images: m cells in d parameters.
         rows: [k, output_size] array or scipy sparse matrix.
-        offset: [k].
+        offset: [k], or [m, k] by image set.
         substitution: Where the parameters' correlation is used: in every intermediate bound
             ("everywhere"), only in the result ("end"), or not at all ("box").
         memory: Bytes to stay within, roughly; cells and rows are worked on in parts.
@@ -59,8 +59,8 @@ def bound_outputs(
     offset = np.asarray(offset, np.float64)
     if images.a_lower.shape[1] != network.input_size:
         raise ValueError(f"images of {network.input_size} numbers expected, got {images.a_lower.shape[1]}")
-    if rows.shape != (offset.shape[0], network.output_size):
-        raise ValueError(f"rows {(offset.shape[0], network.output_size)} expected, got {rows.shape}")
+    if rows.shape != (offset.shape[-1], network.output_size):
+        raise ValueError(f"rows {(offset.shape[-1], network.output_size)} expected, got {rows.shape}")
     numbers = 3 * images.dimensions + 14 + (7 if arithmetic == "real" else 0)
     by_cell = sum(int(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1)) * 8 * numbers
     step = max(1, int(0.5 * memory) // by_cell)
@@ -71,9 +71,9 @@ def bound_outputs(
             network, images[first : first + step], substitution, memory, arithmetic, slope_steps, phases, None,
             intermediate_steps,
         )  # fmt: skip
-        parts.append(cells.outputs(rows, offset))
+        parts.append(cells.outputs(rows, offset[first : first + step] if offset.ndim > 1 else offset))
     if not parts:
-        k, d = len(offset), images.dimensions
+        k, d = offset.shape[-1], images.dimensions
         return OutputBounds(np.zeros((0, k)), np.zeros((0, k, d)), np.zeros((0, k)))
     names = ("lower", "a", "b") if assumed is None else ("lower", "a", "b", "loosest")
     return OutputBounds(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))

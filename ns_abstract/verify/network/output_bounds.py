@@ -62,7 +62,7 @@ class OutputRows:
     def bound(self, last: NodeForm, rows: Any, offset: Float64) -> OutputBounds:
         """Bounds of ``rows @ y + offset`` in every cell, y as ``last`` says."""
         index = len(self.network.nodes)
-        m, k = self.intermediate.count, len(offset)
+        m, k = self.intermediate.count, offset.shape[-1]
         plane, lower = np.zeros((m, k, self.intermediate.d + 1)), np.zeros((m, k))
         loosest = np.zeros((m, k, 2), np.int64)
         shape = grid(self.network.shape(index))

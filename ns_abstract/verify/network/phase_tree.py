@@ -37,10 +37,10 @@ class TreeTuning:
 
     together: int = 64
     root_steps: int = 20
-    steps: int = 8
+    steps: int = 4
     first: float = 0.2
-    tried: int = 4
-    easier: float = 0.1
+    tried: int = 10
+    easier: float = 1.0
     waiting: int = 1 << 14
 
 
