@@ -259,7 +259,7 @@ CERTIFICATES = (
     ),
     Fault(
         "unsafe sets: of joined assertions the last counts",
-        _VNNLIB, "_ways", "[[*old, *new] for old in ways for new in more]", "[[*new] for old in ways for new in more]",
+        _VNNLIB, "_ways", "way += more[0]", "way[:] = more[0]",
         _UNSAFE,
     ),
     Fault(

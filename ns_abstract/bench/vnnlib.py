@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from ns_abstract.execution.cancellation import Deadline
+from ns_abstract.execution.cancellation import Deadline, WorkCancelledError
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import file_beside, read_text
 from ns_abstract.io.packed import unpacked
@@ -166,7 +166,7 @@ def run_folder(
         output_dir: Folder of the results.
         only: Parts of names of networks or properties; all if there are none.
         numbers: Places in the list, from 0; None: all.
-        seconds: Limit beside those of the list.
+        seconds: Limit beside those of the list; loading and checking count, compiling kernels cannot be interrupted.
         memory: Bytes that bounds may take.
         arithmetic: What "unsat" covers.
         output: Name of the networks' output; None: the only one.
@@ -192,15 +192,19 @@ def run_folder(
             start = time.perf_counter()
             ready, answer, why = start, None, ""
             query: Vnnlib2Query | None = None
+            deadline = Deadline(limit)
             try:
-                files = networks_of(one.network)
-                if len(files) > 1:
-                    raise InputError("is about several networks", field=one.property, fix=_ONE_NETWORK)
-                ((name, file),) = files.items()
-                network, run = networks.load(_stored(folder, file))
-                regions, query = _question(network, run, _stored(folder, one.property), name, memory, arithmetic)
+                with deadline.enforced():
+                    files = networks_of(one.network)
+                    if len(files) > 1:
+                        raise InputError("is about several networks", field=one.property, fix=_ONE_NETWORK)
+                    ((name, file),) = files.items()
+                    network, run = networks.load(_stored(folder, file))
+                    regions, query = _question(network, run, _stored(folder, one.property), name, memory, arithmetic)
                 ready = time.perf_counter()
-                answer = decide(network, run, regions, Deadline(limit), memory=memory, arithmetic=arithmetic)
+                answer = decide(network, run, regions, deadline, memory=memory, arithmetic=arithmetic)
+            except WorkCancelledError:
+                answer = Decision("timeout")
             except InputError as error:
                 why = str(error)
             word = "error" if answer is None else answer.word
@@ -286,9 +290,13 @@ def verify_query(
         raise InputError(f"{len(networks)} networks", field="--network", fix=_ONE_NETWORK)
     ((name, path),) = networks.items()
     deadline = Deadline(_LONGEST if seconds is None else seconds)
-    with tempfile.TemporaryDirectory() as scratch:
-        network, run = _Networks(Path(scratch), output).load(path)
-        regions, query = _question(network, run, file, name, memory, arithmetic)
+    query = None
+    try:
+        with tempfile.TemporaryDirectory() as scratch, deadline.enforced():
+            network, run = _Networks(Path(scratch), output).load(path)
+            regions, query = _question(network, run, file, name, memory, arithmetic)
         answer = decide(network, run, regions, deadline, memory=memory, arithmetic=arithmetic)
+    except WorkCancelledError:
+        answer = Decision("timeout")
     word = "timed-out" if answer.word == "timeout" else answer.word
     return f"{word}\n{assignment(answer, query)}"

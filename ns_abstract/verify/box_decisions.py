@@ -28,6 +28,8 @@ _PARAMETERS = 16
 #: Boxes bounded together: as many as have so many numbers of layers between them, and no more than the second number;
 #: and the most that wait beside those of the question.
 _TOGETHER, _MOST, _WAITING = 1 << 18, 256, 1 << 14
+#: Numbers of layers of the inputs that are attacked at a time.
+_ATTACKED = 1 << 23
 #: Steps towards the best lines for intermediate bounds of a box that is not cut.
 _STEPS = 12
 #: Branches of a box of many inputs, whose halves would hardly be easier.
@@ -44,7 +46,7 @@ class BoxTuning:
     steps: int = 25
     later: tuple[int, int] = (64, 60)
     near: float = 1e-5
-    #: Inputs that are attacked at a time.
+    #: Most inputs that are attacked at a time.
     attacked: int = 1024
     #: Inputs that vary up to which a box is cut; phases are assumed in boxes of more.
     cut: int = 6
@@ -165,6 +167,7 @@ class _BoxSearch:
         self.boxes = 0
         total = sum(int(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1))
         self.together = min(_MOST, max(8, _TOGETHER // total))
+        self.attacked = min(_TUNING.attacked, max(4, _ATTACKED // total))
         self.undecided = False
         self.found: tuple[np.ndarray, np.ndarray] = (np.zeros(0), np.zeros(0))
 
@@ -305,13 +308,16 @@ class _BoxSearch:
         steps: int,
         groups: Sequence[Sequence[int]] | None = None,
     ) -> bool:
-        """Gradient descent by signs from middles, from corners and from random inputs; of several groups, each alone."""
-        starts = max(2, min(starts, _TUNING.attacked // len(regions)))
+        """Gradient descent by signs from middles, corners and random inputs; of several groups, each alone."""
+        # a few steps where there are many regions: most are tiny
+        steps = min(steps, max(3, 4 * self.attacked // len(regions)))
+        starts = max(2, min(starts, self.attacked, _TUNING.attacked // len(regions)))
         generator = torch.Generator().manual_seed(0)
-        step = max(1, _TUNING.attacked // starts)
+        step = max(1, self.attacked // starts)
         for first in range(0, len(regions), step):
             which = regions[first : first + step]
-            lower, upper = (torch.from_numpy(v[which]).repeat_interleave(starts, 0) for v in (family.lower, family.upper))
+            ends = family.lower[which], family.upper[which]
+            lower, upper = (torch.from_numpy(end).repeat_interleave(starts, 0) for end in ends)
             part = torch.rand((len(which), starts, lower.shape[1]), generator=generator, dtype=torch.float64)
             part[:, 0] = 0.5
             part[:, 1 : starts // 2] = (part[:, 1 : starts // 2] < 0.5).double()

@@ -195,9 +195,7 @@ class PhaseTree:
             found.append(_Branch(branches[number].phases, best[place], parameters, paid, splits[place]))
         return found
 
-    def _candidates(
-        self, chosen: OptimisedSlopes, at: Int64, phases: Sequence[Phases]
-    ) -> list[list[tuple[int, int]]]:
+    def _candidates(self, chosen: OptimisedSlopes, at: Int64, phases: Sequence[Phases]) -> list[list[tuple[int, int]]]:
         """By branch: the neurons that cost row ``at`` most because they are unstable."""
         scores, nodes, places = [], [], []
         for k, own in self.relus.items():
@@ -211,9 +209,7 @@ class PhaseTree:
             return [[] for _ in at]
         score, node, place = np.concatenate(scores, 1), np.concatenate(nodes), np.concatenate(places)
         order = np.argsort(-score, axis=1, kind="stable")[:, : self.tuning.tried]
-        return [
-            [(int(node[j]), int(place[j])) for j in row if score[i, j] >= 0.0] for i, row in enumerate(order)
-        ]
+        return [[(int(node[j]), int(place[j])) for j in row if score[i, j] >= 0.0] for i, row in enumerate(order)]
 
     def _halves(self, rows: _GroupRows, branches: Sequence[_Branch]) -> list[_Branch]:
         """Both halves of each branch, of the candidates the one whose worse half is bounded best."""

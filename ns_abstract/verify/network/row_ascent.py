@@ -90,9 +90,7 @@ class RowAscent:
         self.backward.descend(index, index, batch, bounds, None)
         return chosen, bounds
 
-    def move(
-        self, index: int, k: int, chosen: OptimisedSlopes, bounds: BackwardBounds, ascent: DualAscent
-    ) -> None:
+    def move(self, index: int, k: int, chosen: OptimisedSlopes, bounds: BackwardBounds, ascent: DualAscent) -> None:
         """Step from what has been chosen to what is better for the bounds."""
         slopes, forces = self._derivatives(index, k, chosen, bounds, ascent)
         ascent.climb(slopes, forces, {at: self._size(chosen, at) for at in ascent.split})

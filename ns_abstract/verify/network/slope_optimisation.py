@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ns_abstract.arithmetic.network_charges import OWN_LINE, UP
+from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.verify.network.bilinear import Product
 from ns_abstract.verify.network.graph import Network
 from ns_abstract.verify.network.layers import Activation, LinearLayer
@@ -204,6 +205,7 @@ def slope_derivatives(
     count, forces = image.shape[0], {}
     by_node = {k: [np.zeros(v.shape) for v in own] for k, own in ascent.parameters.items()}
     for k, node in enumerate(network.nodes[:last], 1):
+        check_cancelled()
         inputs = [v for v in (values[i] for i in node.inputs) if v is not None]
         rows = trace.get(k)
         if isinstance(node.layer, LinearLayer):
