@@ -207,7 +207,7 @@ class _BoxSearch:
         return False
 
     def _assume(self, family: _Family, which: int) -> bool:
-        """`settle` of one region by assuming phases of neurons (N16, N23)."""
+        """`settle` of one region by assuming phases of neurons (N16)."""
         images = self._images(*(v[which][None] for v in (family.lower, family.upper)))
         tree, left = self._tree(family, which, images, 0, family.unsafe.groups)
         if left and self._attack(family, np.array([which]), *_TUNING.later, left):

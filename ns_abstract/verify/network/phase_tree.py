@@ -1,4 +1,4 @@
-"""Branch and bound on activation phases over fixed intermediate bounds, many branches at a time (design.md, N23)."""
+"""Branch and bound on activation phases over fixed intermediate bounds, many branches at a time (design.md, N16)."""
 
 from __future__ import annotations
 
@@ -28,7 +28,8 @@ class TreeTuning:
 
     Attributes:
         together: Rows that are bounded together.
-        root_steps, steps: Steps towards better slopes and multipliers, of the whole cell and of a branch.
+        root_steps, steps, last_steps: Steps towards better slopes and multipliers, of the whole cell, of a branch, and
+            of one without unstable neurons.
         first: The first step's size.
         tried: Neurons of which both halves are bounded before one is chosen.
         easier: What the better half counts beside the worse one.
@@ -38,6 +39,7 @@ class TreeTuning:
     together: int = 64
     root_steps: int = 20
     steps: int = 4
+    last_steps: int = 60
     first: float = 0.2
     tried: int = 10
     easier: float = 1.0
@@ -123,8 +125,14 @@ class PhaseTree:
             check_cancelled()
             taken = [heapq.heappop(waiting)[2] for _ in range(min(size, len(waiting)))]
             worst = float(taken[0].lower.max())
-            if count >= most or len(waiting) > self.tuning.waiting or over() or not all(b.splits for b in taken):
+            if count >= most or len(waiting) > self.tuning.waiting or over():
                 return TreeResult(False, count, worst)
+            ended = [branch for branch in taken if not branch.splits]
+            if ended and self._climbed(rows, ended, self.tuning.last_steps):
+                return TreeResult(False, count, worst)
+            taken = [branch for branch in taken if branch.splits]
+            if not taken:
+                continue
             halves = self._halves(rows, taken)
             count += len(halves)
             for branch in self._climbed(rows, halves, self.tuning.steps):
