@@ -90,7 +90,7 @@ def least_excess(network: Network, tree: PhaseTree, images: ImageSets, rows: np.
     """By how much bounds of branches that an image is in are below its outputs, at least; negative: above."""
     rng, least = np.random.default_rng(seed), np.inf
     group = _GroupRows.of(tree.shifted, list(range(len(rows))), (1, 1, network.output_size))
-    for _ in range(20):
+    for _ in range(8):
         # corners, and what is near them
         part = np.where(rng.uniform(size=images.lower.shape[1]) < 0.7, rng.integers(0, 2, images.lower.shape[1]), 0.5)
         x = images.lower[0] + part * (images.upper[0] - images.lower[0])
@@ -164,7 +164,7 @@ def test_deadlines_are_asked_often(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     def request() -> bool:
         nonlocal asked, most, work
         asked, most, work = asked + 1, max(most, work), 0
-        return asked > 6000
+        return asked > 1500
 
     x = np.random.default_rng(0).uniform(size=36)
     unsafe = UnsafeSet(np.array([[1.0, -1.0, 0.0]]), np.array([0.0]), ((0,),), 0)
@@ -176,5 +176,5 @@ def test_deadlines_are_asked_often(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     nothing: Sequence[float] = [np.nan] * 3
     answer = box_decisions.decide(network, lambda _: np.array(nothing), [region], Deadline(request=request))
     assert answer.word in ("timeout", "unknown")
-    assert asked > 1000
+    assert asked > 500
     assert most <= 12
