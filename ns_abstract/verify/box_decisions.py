@@ -52,8 +52,10 @@ class BoxTuning:
     cut: int = 6
     #: What the width of an input counts beside its slope.
     width: float = 1e-9
-    #: Part of the time that is left for lines of intermediate bounds.
+    #: Part of the time that is left for lines of intermediate bounds, and what a step towards these takes beside bounds
+    #: with plain ones.
     lines: float = 0.3
+    dear: float = 2.0
 
 
 _TUNING = BoxTuning()
@@ -145,8 +147,8 @@ def _families(regions: Sequence[InputRegion]) -> Iterator[_Family]:
         if not bool((region.lower > region.upper).any()):
             kinds.setdefault((region.unsafe.rows.tobytes(), region.unsafe.groups), []).append(region)
     for kind in kinds.values():
-        ends = (np.stack([getattr(region, name) for region in kind]) for name in ("lower", "upper"))
-        yield _Family(kind, *ends, np.stack([region.unsafe.offset for region in kind]))
+        lower, upper = (np.stack([getattr(region, name) for region in kind]) for name in ("lower", "upper"))
+        yield _Family(kind, lower, upper, np.stack([region.unsafe.offset for region in kind]))
 
 
 #: A box and the region that it is part of.
@@ -209,13 +211,16 @@ class _BoxSearch:
     def _assume(self, family: _Family, which: int) -> bool:
         """`settle` of one region by assuming phases of neurons (N16)."""
         images = self._images(*(v[which][None] for v in (family.lower, family.upper)))
+        start = self.deadline.left
         tree, left = self._tree(family, which, images, 0, family.unsafe.groups)
+        allowed = _TUNING.lines * self.deadline.left
+        steps = min(_STEPS, int(min(1e6, allowed / max(1e-6, _TUNING.dear * (start - self.deadline.left)))))
         if left and self._attack(family, np.array([which]), *_TUNING.later, left):
             return True
-        if left:
+        if left and steps:
             try:
-                with self.deadline.within(_TUNING.lines * self.deadline.left).enforced():
-                    tree, left = self._tree(family, which, images, _STEPS, left)
+                with self.deadline.within(allowed).enforced():
+                    tree, left = self._tree(family, which, images, steps, left)
             except WorkCancelledError:
                 # what is known without goes on
                 check_cancelled()
@@ -369,7 +374,7 @@ class _BoxSearch:
         for k in order:
             if not float(value[k]) <= _TUNING.near * (1.0 + abs(float(value[k]))):
                 continue
-            region = family.regions[which[k]]
+            region = family.regions[int(which[k])]
             point = np.clip(x[k].numpy(), region.lower, region.upper)
             y = run_once(self.network, self.run, point)
             if bool(np.isfinite(y).all()) and region.holds(y):

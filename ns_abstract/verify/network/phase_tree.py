@@ -191,12 +191,12 @@ class PhaseTree:
                 if not len(left):
                     return []
         at = np.arange(len(left)) * g + best.argmax(1)
-        splits = self._candidates(chosen, at, [branches[k].phases for k in left])
+        splits = self._candidates(chosen, at, [branches[int(k)].phases for k in left])
         multipliers = {k: np.zeros((len(left) * g, len(own.units.flat)), np.float32) for k, own in self.relus.items()}
         for source, (k, used) in places.items():
             multipliers[k][:, used] = ascent.multipliers[source]
         found = []
-        for place, number in enumerate(left):
+        for place, number in enumerate(left.tolist()):
             own = slice(place * g, (place + 1) * g)
             parameters = {k: [v[own].astype(np.float32) for v in vs] for k, vs in ascent.parameters.items()}
             paid = {k: v[own] for k, v in multipliers.items()}
