@@ -20,7 +20,7 @@ from ns_abstract.api import compiling
 from ns_abstract.api.files import Settings, open_job
 from ns_abstract.arithmetic.kernel_cache import SESSION, KernelMissingError, store
 from ns_abstract.cli.common import show_log
-from ns_abstract.methods.splat import bounds
+from ns_abstract.methods.splat.bounds import Stages
 
 
 def test_stages_are_shared_out() -> None:
@@ -35,8 +35,8 @@ def test_one_stage_alone_is_run_and_the_others_come_back(blobs: Inputs, monkeypa
     frame = open_job(Settings(blobs.config, blobs.path, blobs.spec)).frame(0)
     tiles = np.arange(frame.tile_count)
     before = frame.bound(frame.box, tiles)
-    kernels = {name: getattr(bounds, name) for name in bounds.STAGES}
-    seen: dict[str, list[list[Any]]] = {name: [] for name in bounds.STAGES}
+    kernels = frame.bounds.stages
+    seen: dict[str, list[list[Any]]] = {name: [] for name in Stages._fields}
 
     def types(arguments: tuple[Any, ...]) -> list[Any]:
         import numba
@@ -46,28 +46,28 @@ def test_one_stage_alone_is_run_and_the_others_come_back(blobs: Inputs, monkeypa
     def spy(name: str) -> Any:
         def kernel(*arguments: Any) -> Any:
             seen[name].append(types(arguments))
-            return kernels[name](*arguments)
+            return getattr(kernels, name)(*arguments)
 
         return kernel
 
-    for name in bounds.STAGES:
-        monkeypatch.setattr(bounds, name, spy(name))
-    assert set(bounds.STAGES) | {"render"} == set(frame.stages)
+    frame.bounds.stages = spies = Stages(*map(spy, Stages._fields))
+    assert set(Stages._fields) | {"render"} == set(frame.stages)
     frame.warm_up()
     assert all(len(calls) == 1 for calls in seen.values())
     for name in frame.stages:
         frame.warm_up(name)
         assert [len(calls) for calls in seen.values()] == [
-            2 if other in frame.stages[: frame.stages.index(name) + 1] else 1 for other in bounds.STAGES
+            2 if other in frame.stages[: frame.stages.index(name) + 1] else 1 for other in Stages._fields
         ]
         # so that what was compiled is what will be used
         assert name not in seen or seen[name][0] == seen[name][1]
+    assert frame.bounds.stages is spies
+    monkeypatch.setattr(frame, "bound", lambda *_: 1 // 0)
+    with pytest.raises(ZeroDivisionError):
+        frame.warm_up("pixel_stage")
+    assert frame.bounds.stages is spies
     monkeypatch.undo()
-    assert {name: getattr(bounds, name) for name in bounds.STAGES} == kernels
-    with pytest.raises(ZeroDivisionError), bounds.compile_alone("pixel_stage"):
-        assert bounds.gaussian_stage is not kernels["gaussian_stage"]
-        raise ZeroDivisionError
-    assert bounds.gaussian_stage is kernels["gaussian_stage"]
+    frame.bounds.stages = kernels
     after = frame.bound(frame.box, tiles)
     np.testing.assert_array_equal(before.lower, after.lower)
     np.testing.assert_array_equal(before.upper, after.upper)

@@ -11,12 +11,15 @@ import pytest
 import torch
 from benchmark_scripts import script
 
-from ns_abstract.demo.scenes import DATA, buoy_scene, buoy_weights
-from ns_abstract.demo.writing import write_nerf_demo
+from ns_abstract.demo.scenes import DATA, NERFACTO_SCALE, buoy_scene, buoy_weights, nerfacto_scene
+from ns_abstract.demo.writing import write_nerf_demo, write_nerfacto_demo
+from ns_abstract.geometry.camera_path import load_camera_path
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.load import load_any
+from ns_abstract.methods.nerf.nerfacto_render import NerfactoRenderer
+from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
 
-WEIGHTS = DATA / "buoy.npz"
+WEIGHTS, NERFACTO = DATA / "buoy.npz", DATA / "buoy_nerfacto.npz"
 NerfNetwork = script("nerf_network").NerfNetwork
 
 
@@ -94,3 +97,41 @@ def test_files_that_are_no_archive_are_refused(tmp_path: Path) -> None:
     for file in (tmp_path / "cut.npz", tmp_path / "none.npz"):
         with pytest.raises(InputError, match=r"cannot be read|no such scene"):
             buoy_weights(file)
+
+
+# ---------------------------------------------------------------- nerfacto
+
+
+@pytest.mark.slow
+def test_the_nerfacto_shows_the_buoy(tmp_path: Path) -> None:
+    """The run that is written has the weights that ship, and shows what the field was trained on."""
+    config, path = write_nerfacto_demo(tmp_path)
+    field = load_any(config).field
+    for found, wanted in zip(field.arrays(), nerfacto_scene().field.arrays(), strict=True):
+        np.testing.assert_array_equal(found, wanted)
+    camera = load_camera_path(path).cameras[0].rescaled(0.5)
+    grid = np.indices((camera.height, camera.width)).reshape(2, -1).T
+    shown = NerfactoRenderer(field).pixels(camera, camera.camera_to_world, grid)
+    pose = camera.camera_to_world.copy()
+    pose[:, 3] /= NERFACTO_SCALE
+    wanted = NerfRenderer(buoy_scene(), Sampling("hierarchical", 0.0, 6.0, 64, 128, (0.0, 0.0, 0.0)), torch.float32)
+    difference = shown - wanted.pixels(camera, pose, grid)
+    assert np.abs(difference).mean() < 0.02 and shown.std() > 0.1
+    assert NERFACTO.stat().st_size < 300_000
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda a: a.pop("field.table"), "field.table"),
+        (lambda a: a.update({"proposal0.scale": np.ones((3, 1, 1), np.float32)}), "proposal0.scale"),
+        (lambda a: a.update({"color.0.weight": np.zeros((32, 30), np.float32)}), "color.0.weight"),
+        (lambda a: a.update({"density.1.bias": np.full(16, np.nan, np.float32)}), "not finite"),
+    ],
+)
+def test_damaged_nerfacto_weights_are_refused(tmp_path: Path, change: Any, words: str) -> None:
+    arrays = dict(np.load(NERFACTO))
+    change(arrays)
+    np.savez(tmp_path / "changed.npz", **arrays)
+    with pytest.raises(InputError, match=words):
+        nerfacto_scene(tmp_path / "changed.npz")

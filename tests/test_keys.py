@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import blob_scene, ring
+from nerfactos import tiny_nerfacto
 from nerfs import tiny_scene
 from nerfstudio_runs import needs_nerfstudio
 
@@ -29,6 +30,8 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.io.keys import Key, KeyTable
 from ns_abstract.methods import config_keys
 from ns_abstract.methods.load import load_any
+from ns_abstract.methods.nerf.hash_field import NerfactoField
+from ns_abstract.methods.nerf.nerfacto_write import write_nerfacto_run
 from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.methods.splat.write import write_splatfacto_run
 from ns_abstract.nerfstudio.torchvision_operators import declare_missing
@@ -37,7 +40,9 @@ from ns_abstract.reach.loop import parse_loop
 from ns_abstract.verify.properties import parse_property
 
 TABLES = (*config_keys.TABLES, *path_keys.TABLES)
-MODELS = {"splatfacto": config_keys.SPLATFACTO, "vanilla-nerf": config_keys.VANILLA_NERF}
+MODELS = {
+    "splatfacto": config_keys.SPLATFACTO, "vanilla-nerf": config_keys.VANILLA_NERF, "nerfacto": config_keys.NERFACTO,
+}  # fmt: skip
 
 
 def named(table: KeyTable) -> dict[str, Key]:
@@ -55,7 +60,8 @@ def nerfstudio() -> SimpleNamespace:
         name: importlib.import_module(name)
         for name in (
             "ns_abstract.nerfstudio.methods", "nerfstudio.configs.method_configs", "nerfstudio.models.splatfacto",
-            "nerfstudio.models.vanilla_nerf", "nerfstudio.cameras.cameras", "nerfstudio.cameras.rays",
+            "nerfstudio.models.vanilla_nerf", "nerfstudio.models.nerfacto", "nerfstudio.cameras.cameras",
+            "nerfstudio.cameras.rays",
             "nerfstudio.data.scene_box",
         )
     }  # fmt: skip
@@ -96,13 +102,18 @@ def test_every_field_of_the_models_is_in_a_table(nerfstudio: SimpleNamespace, me
     assert missing(MODELS[method], fields_of(nerfstudio.configs[method]), "pipeline.model.") == []
 
 
+@pytest.mark.slow
 @needs_nerfstudio
-@pytest.mark.parametrize(("method", "ours"), [("splatfacto", "abstract_splatfacto"), ("vanilla-nerf", "abstract_nerf")])
+@pytest.mark.parametrize(
+    ("method", "ours"),
+    [("splatfacto", "abstract_splatfacto"), ("vanilla-nerf", "abstract_nerf"), ("nerfacto", "abstract_nerfacto")],
+)
 def test_every_field_of_our_models_is_in_a_table(nerfstudio: SimpleNamespace, method: str, ours: str) -> None:
     config = getattr(nerfstudio.methods, ours).config
     assert missing(MODELS[method], fields_of(config), "pipeline.model.") == []
 
 
+@pytest.mark.slow
 @needs_nerfstudio
 @pytest.mark.parametrize("method", MODELS)
 def test_every_field_of_a_run_is_in_a_table(nerfstudio: SimpleNamespace, method: str) -> None:
@@ -136,8 +147,12 @@ def test_lines_of_nerfstudio_are_those_that_show_it(table: KeyTable) -> None:
 
 def other(name: str, value: Any) -> Any:
     """Another value of a key, as far from the old one as its type allows."""
-    if name in ("background_color", "rasterize_mode", "sh_degree"):
-        return {"background_color": "black", "rasterize_mode": "antialiased", "sh_degree": 2}[name]
+    names = {
+        "background_color": "black", "rasterize_mode": "antialiased", "sh_degree": 2,
+        "proposal_initial_sampler": "uniform",
+    }  # fmt: skip
+    if name in names:
+        return names[name]
     if isinstance(value, bool):
         return not value
     if isinstance(value, (int, float)):
@@ -209,6 +224,44 @@ def test_nerfstudio_nerf_pictures_depend_on_what_is_used_or_refused(nerfstudio: 
 @pytest.mark.slow
 @needs_nerfstudio
 @pytest.mark.usefixtures("no_metric")
+def test_nerfstudio_nerfacto_pictures_depend_on_what_is_used_or_refused(nerfstudio: SimpleNamespace) -> None:
+    """Nerfstudio's own model in evaluation, one key changed at a time."""
+    RayBundle, SceneBox = nerfstudio.rays.RayBundle, nerfstudio.scene_box.SceneBox
+    config = dataclasses.replace(
+        nerfstudio.configs["nerfacto"].pipeline.model, implementation="torch", log2_hashmap_size=8, num_levels=3,
+        num_proposal_samples_per_ray=(6, 5), num_nerf_samples_per_ray=4,
+    )  # fmt: skip
+    generator = torch.Generator().manual_seed(0)
+    directions = torch.nn.functional.normalize(torch.randn(9, 3, generator=generator), dim=-1)
+
+    def picture(changed: Any) -> list[np.ndarray] | None:
+        torch.manual_seed(1)
+        try:
+            model = nerfstudio.nerfacto.NerfactoModel(
+                changed, scene_box=SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3])), num_train_data=3
+            ).eval()
+            for name, value in model.named_parameters():
+                # neither opaque nor empty, and colourful
+                value.data.mul_(3000.0 if "hash_table" in name else 2.0)
+            bundle = RayBundle(
+                torch.full((9, 3), 0.4), directions, torch.ones(9, 1), camera_indices=torch.zeros(9, 1).long()
+            )[:, None]  # fmt: skip
+            return [model.get_outputs_for_camera_ray_bundle(bundle)["rgb"].detach().numpy()]
+        except (AssertionError, RuntimeError, TypeError, IndexError):
+            # there is no picture at all
+            assert changed is not config
+            return None
+
+    listed = named(config_keys.NERFACTO)
+    # a text, and mappings in a list
+    names = [name for name in listed if name not in ("_target", "implementation", "proposal_net_args_list")]
+    changing = pictures_that_differ(config, names, picture)
+    assert changing == {name for name in names if listed[name].status != "irrelevant"}
+
+
+@pytest.mark.slow
+@needs_nerfstudio
+@pytest.mark.usefixtures("no_metric")
 def test_nerfstudio_splat_pictures_depend_on_what_is_used(
     nerfstudio: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -267,6 +320,8 @@ def write_config(folder: Path, method: str, edit: str = "", where: str = "model"
     """A run with one more line in its configuration, under pipeline.model or at the top level."""
     if method == "splatfacto":
         config = write_splatfacto_run(blob_scene(5), folder, timestamp="t", experiment_name="e")
+    elif method == "nerfacto":
+        config = write_nerfacto_run(tiny_nerfacto(1), folder, timestamp="t", experiment_name="e")
     else:
         config = write_nerf_run(tiny_scene(1), folder, timestamp="t", experiment_name="e")
     lines = config.read_text().splitlines()
@@ -288,7 +343,10 @@ def write_config(folder: Path, method: str, edit: str = "", where: str = "model"
 
 def arrays_of(scene: Any) -> list[Any]:
     """What of a scene the picture depends on."""
-    values = {k: v for k, v in vars(scene).items() if k not in ("source", "notes", "coarse", "fine")}
+    values = {k: v for k, v in vars(scene).items() if k not in ("source", "notes", "coarse", "fine", "field")}
+    if isinstance(field := getattr(scene, "field", None), NerfactoField):
+        values |= {f"array {k}": a for k, a in enumerate(field.arrays())}
+        values |= {k: getattr(field, k) for k in ("samples", "far", "spacing", "background", "average_init_density")}
     for name in ("coarse", "fine"):
         if (field := getattr(scene, name, None)) is not None:
             values |= {f"{name}{k}": a for k, a in enumerate(field.arrays())} | {f"{name} encodings": field.position}
@@ -305,13 +363,14 @@ VALUES = {
 @pytest.mark.slow
 @pytest.mark.parametrize("method", MODELS)
 def test_irrelevant_keys_leave_the_scene_as_it_is(tmp_path: Path, method: str) -> None:
-    before = arrays_of(load_any(write_config(tmp_path / "before", method)))
+    scene = load_any(write_config(tmp_path / "before", method))
+    before, notes = arrays_of(scene), scene.notes
     for key in MODELS[method].keys:
         if key.status == "irrelevant" and "." not in key.name:
             line = f"{key.name}: {VALUES.get(key.name, '7')}"
             scene = load_any(write_config(tmp_path / key.name, method, line))
             assert arrays_of(scene) == before, key.name
-            assert scene.notes == (), key.name
+            assert scene.notes == notes, key.name
 
 
 USED = {
@@ -319,6 +378,11 @@ USED = {
     "vanilla-nerf": [
         "num_coarse_samples: 8", "num_importance_samples: 9", "background_color: black",
         "collider_params: {near_plane: 2.0, far_plane: 5.5}",
+    ],
+    "nerfacto": [
+        "far_plane: 3.0", "background_color: white", "background_color: last_sample",
+        "num_proposal_samples_per_ray: [9, 5]", "num_nerf_samples_per_ray: 7", "proposal_initial_sampler: uniform",
+        "average_init_density: 2.0",
     ],
 }  # fmt: skip
 
@@ -339,6 +403,20 @@ REFUSED = [
     ("vanilla-nerf", "num_importance_samples: 0", "num_importance_samples"),
     ("vanilla-nerf", "collider_params: {far_plane: 4.0, slope: 1.0}", "pipeline.model.collider_params.slope"),
     ("vanilla-nerf", "use_temporal_distortion: true", "pipeline.model.use_temporal_distortion"),
+    ("nerfacto", "disable_scene_contraction: true", "ends at a box"),
+    ("nerfacto", "predict_normals: true", "predicted normals"),
+    ("nerfacto", "background_color: Last_Sample", "background_color"),
+    ("nerfacto", "implementation: cuda", "tcnn, torch"),
+    ("nerfacto", "use_transient_embedding: true", "pipeline.model.use_transient_embedding"),
+    ("nerfacto", "num_proposal_samples_per_ray: [9]", "write 2 numbers"),
+    ("nerfacto", "num_proposal_samples_per_ray: [9, 0]", "write 2 numbers"),
+    ("nerfacto", "average_init_density: 0", "above 0"),
+    ("nerfacto", "far_plane: .inf", "above 0"),
+    ("nerfacto", "use_appearance_embedding: 1", "true or false"),
+    ("nerfacto", "proposal_net_args_list: [{use_linear: true}]", "without a network"),
+    ("nerfacto", "proposal_net_args_list: [{num_levels: 0}]", "proposal_net_args_list.num_levels"),
+    ("nerfacto", "proposal_net_args_list: [{levels: 3}]", "unknown key 'levels'"),
+    ("nerfacto", "proposal_net_args_list: 3", "list of mappings"),
     ("splatfacto", "use_exposure: true", "pipeline.model.use_exposure"),
     ("splatfacto", "radius_clip: 3.0", "pipeline.model.radius_clip"),
     ("splatfacto", "7: 3.0", "pipeline.model.7"),
@@ -346,6 +424,7 @@ REFUSED = [
 ]
 
 
+@pytest.mark.slow_cases(every=6)
 @pytest.mark.parametrize(("method", "line", "said"), REFUSED)
 def test_keys_that_may_change_the_picture_are_refused(tmp_path: Path, method: str, line: str, said: str) -> None:
     config = write_config(tmp_path, method, line)
@@ -363,8 +442,9 @@ def test_values_that_switch_a_refused_key_off_are_taken(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("method", MODELS)
 def test_unknown_keys_elsewhere_are_named_in_the_notes(tmp_path: Path, method: str) -> None:
+    usual = load_any(write_config(tmp_path / "usual", method)).notes
     config = write_config(tmp_path, method, "camera_tweaks:\n  on: true", where="top")
-    assert load_any(config).notes == ("unknown keys of config.yml, which are not used: camera_tweaks",)
+    assert load_any(config).notes == ("unknown keys of config.yml, which are not used: camera_tweaks", *usual)
     text = config.read_text()
     assert "  datamanager:" in text
     start = text.index("  datamanager:")

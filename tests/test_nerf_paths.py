@@ -17,7 +17,7 @@ from ns_abstract.methods.nerf.division import ENDS, Division, regroup_parts
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.occupancy import OccupancyGrid
 from ns_abstract.methods.nerf.ray_bundle import RayBundle
-from ns_abstract.methods.nerf.render import NerfRenderer, _filled, _weights, camera_rays
+from ns_abstract.methods.nerf.render import NerfRenderer, _filled, camera_rays, interval_weights
 from ns_abstract.methods.nerf.sample_paths import BundleBounds, FollowedSamples, RayCells, SampleLines, SamplePaths
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.refine.engine import Refinement, RefinementGoal
@@ -94,6 +94,7 @@ def test_declared_voxels_are_heeded(kind: str) -> None:
     assert (found.upper - found.lower).mean() < 0.02
 
 
+@pytest.mark.slow
 def test_shifted_colours_are_enclosed() -> None:
     spec = {"rotation": {"yaw": 1e-4}, "hue": [0.0, 0.2], "saturation": 0.1}
     pose_set = poses(spec)
@@ -166,10 +167,11 @@ def sampled(renderer: NerfRenderer, pose_set: PoseBox, values: np.ndarray, pixel
     bins = torch.linspace(0.0, 1.0, BINS.samples + 1, dtype=torch.float64).expand(len(pixels), -1)
     with torch.inference_mode():
         density, _, _ = renderer._densities(renderer.coarse, pose[:, 3], world, bins)
-        bins = renderer._refined(bins, _weights(density, renderer._lengths(bins)))
+        bins = renderer._refined(bins, interval_weights(density, renderer._lengths(bins)))
         density, base, inside = renderer._densities(renderer.fine, pose[:, 3], world, bins)
         color = renderer.fine.color(base, world[:, None].expand(-1, density.shape[1], -1)[inside])
-        found = renderer._distances(bins), density, _filled(color, inside), _weights(density, renderer._lengths(bins))
+        weights = interval_weights(density, renderer._lengths(bins))
+        found = renderer._distances(bins), density, _filled(color, inside), weights
     return [part.numpy() for part in found]
 
 

@@ -15,7 +15,7 @@ import pytest
 from ns_abstract.arithmetic import rounding
 from ns_abstract.arithmetic.chebyshev import ChebyshevBasis
 from ns_abstract.methods.nerf import bounds as fields
-from ns_abstract.methods.splat import fragments
+from ns_abstract.methods.splat import depth_pairs
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGE = Path(rounding.__file__).resolve().parents[1]
@@ -220,13 +220,13 @@ def test_turns_near_one_are_charged_absolutely() -> None:
         m = int(random.integers(2, 9))
         slope, ray = random.normal(size=(m + 1, 3)), random.normal(size=3)
         slope[m] = np.abs(slope[m]) * random.choice([0.0, 1e-3])
-        slope *= (1.0 - 10.0 ** random.uniform(-9.0, -3.0)) / fragments._turn(slope, ray, m)
-        along = fragments._turn(slope, ray, m)
+        slope *= (1.0 - 10.0 ** random.uniform(-9.0, -3.0)) / depth_pairs._turn(slope, ray, m)
+        along = depth_pairs._turn(slope, ray, m)
         rows = [[Fraction(float(x)) for x in row] for row in slope]
         there = [Fraction(float(x)) for x in ray]
         true = sum((abs(sum(a * b for a, b in zip(row, there, strict=True))) for row in rows[1:m]), Fraction(0))
         true += sum(a * abs(b) for a, b in zip(rows[m], there, strict=True))
-        assert Fraction(float(fragments._steadiness(along))) <= 1 - true
+        assert Fraction(float(depth_pairs._steadiness(along))) <= 1 - true
         below += Fraction((1.0 - along) * (1.0 - rounding.TURN_ROOM)) > 1 - true
     # a part of the difference would not do
     assert below > 0

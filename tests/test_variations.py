@@ -113,6 +113,7 @@ def test_blobs(degree: int, dimensions: int) -> None:
     assert found.violations == 0 and found.pictures["gradient"] == 2 * 4 * 6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dimensions", [0, 3])
 def test_float32_blobs(dimensions: int) -> None:
     """Float32 evaluations of members, whose values are rounded to float32, lie inside as well."""
@@ -231,29 +232,29 @@ def test_directions(dimensions: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """A mean that moves changes the direction it is seen from; colours that ignore it are found."""
     case = direction_case(dimensions)
     assert case.attack()[0].violations == 0
-    fixed, moving = bounds_module.fixed_colors, bounds_module.moving_colors
+    fixed, stages = bounds_module.fixed_colors, SplatBounds.stages
     monkeypatch.setattr(
         bounds_module, "fixed_colors", lambda scene, *rest: fixed(scene._replace(mean_radius=NONE), *rest)
     )
-    monkeypatch.setattr(
-        bounds_module,
-        "moving_colors",
-        lambda indices, scene, *rest: moving(indices, scene._replace(mean_radius=NONE), *rest),
-    )
+
+    def moving(indices, scene, *rest):
+        stages.moving_colors(indices, scene._replace(mean_radius=NONE), *rest)
+
+    monkeypatch.setattr(SplatBounds, "stages", stages._replace(moving_colors=moving))
     assert case.attack()[0].violations > 0
 
 
 def test_planted_depth_order(monkeypatch: pytest.MonkeyPatch) -> None:
     """Depth orders taken for certain though means move."""
     case = swap()
-    right = bounds_module.pixel_stage
+    stages = SplatBounds.stages
 
     def certain(*arguments):
         lists, pixels, inputs, bounds = arguments
         gaussians = inputs.gaussians._replace(depth_error=np.zeros_like(inputs.gaussians.depth_error))
-        right(lists, pixels, inputs._replace(gaussians=gaussians), bounds)
+        stages.pixel_stage(lists, pixels, inputs._replace(gaussians=gaussians), bounds)
 
-    monkeypatch.setattr(bounds_module, "pixel_stage", certain)
+    monkeypatch.setattr(SplatBounds, "stages", stages._replace(pixel_stage=certain))
     assert case.attack()[0].violations > 0
 
 

@@ -401,7 +401,7 @@ CERTIFICATES = (
     ),
     Fault(
         "store: another search is continued",
-        "verify/store_file.py", "StoreFile._check", "stored.get(key) != asked.get(key)", "False",
+        "verify/store_file.py", "StoreFile._check", "stored.get(key) != expected.get(key)", "False",
         "test_certify_search.py::test_another_search_is_not_continued",
     ),
 )  # fmt: skip

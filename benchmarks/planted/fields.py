@@ -24,7 +24,7 @@ _POINTS = "test_nerf_occupancy.py::test_ranges_of_points_are_enclosed_and_tight"
 FIELDS = (
     Fault(
         "fields: narrow sets are bounded no better than wide ones",
-        "methods/nerf/frame.py", "NerfFrame._tolerance",
+        "methods/nerf/frame.py", "FieldFrame._tolerance",
         "min(_TUNING.least_tolerance, max(_TUNING.finest_tolerance, _TUNING.least_share * self._variation))",
         "_TUNING.least_tolerance",
         "test_nerf_frame.py::test_a_tolerance_is_not_finer_than_bounds_are_kept",

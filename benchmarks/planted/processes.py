@@ -61,7 +61,7 @@ PROCESSES = (
         "processes: the demo's damaged weights are used",
         "demo/scenes.py",
         "_stored.read",
-        "stored != kind or found != wanted or len(found) != len(shape)",
+        "stored != kind or stored_shape != wanted or len(stored_shape) != len(shape)",
         "False",
         "test_demo_nerf.py::test_damaged_weights_are_refused",
         compiled=True,

@@ -33,7 +33,7 @@ RESULTS = (
         "a search of other rules goes on",
         "verify/store_file.py",
         "StoreFile._check",
-        "stale(stored, asked)",
+        "stale(stored, expected)",
         "None",
         "test_stale.py::test_search_is_not_resumed[other rules of the search]",
     ),

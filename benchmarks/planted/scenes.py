@@ -50,8 +50,8 @@ SCENES = (
     ),
     Fault(
         "scenes: tensors that a NeRF does not have are left out in silence",
-        "methods/nerf/load.py", "_refuse_unknown",
-        "key not in state.read and not key.startswith(tuple(_IDLE))", "False",
+        "methods/nerf/model_state.py", "ModelState.refuse_unread",
+        "key not in self.read and not key.startswith(tuple(_IDLE))", "False",
         _FILES + "test_a_nerf_of_another_class_or_with_more_is_refused[changes1-edits1-medium.weight]",
     ),
     Fault(

@@ -118,6 +118,7 @@ class CertificateReport:
         total = self.job.partitions(self.search.grids[tally.frame])
         return {
             "index": tally.frame,
+            "intrinsics": self.job.job.pose_sets[tally.frame].camera.intrinsics._asdict(),
             "parameters": [
                 {
                     "name": name,
@@ -186,9 +187,9 @@ class CertificateReport:
         Raises:
             WorkCancelledError: There is no time for more pictures.
         """
-        known = dict(zip((name for name, _ in self.job.job.parameters), values, strict=True))
+        by_name = dict(zip((name for name, _ in self.job.job.parameters), values, strict=True))
         pictures = self.job.pictures(frame)
-        pose = np.array([known[name] for name in pictures.box.names])
+        pose = np.array([by_name[name] for name in pictures.box.names])
         # of another scene of the set, maybe
         image = self._kept_image(frame, pose) if pictures.pose_set.perturbation.scene else None
         if image is None:

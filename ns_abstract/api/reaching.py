@@ -24,7 +24,7 @@ from ns_abstract.api.loop_job import LoopJob, open_loop
 from ns_abstract.api.loop_report import LoopReport
 from ns_abstract.api.scenes import Scene, checked_scene
 from ns_abstract.execution.cancellation import Deadline
-from ns_abstract.execution.engines import EngineName, started
+from ns_abstract.execution.starting import EngineName, started
 from ns_abstract.io.arguments import file_path
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.reach.search import QUESTIONS
@@ -255,12 +255,12 @@ def result(job: LoopJob, rows: Mapping[int, list[Row]], document: Mapping[str, A
         for number, entries in sorted(rows.items())
         for row in entries
     ]
-    asked = document["questions"]
-    fractions = {name: asked[name]["certified"] if name in asked else None for name in QUESTIONS}
+    questions = document["questions"]
+    fractions = {name: questions[name]["certified"] if name in questions else None for name in QUESTIONS}
     return ReachResult(
         safe=fractions["safe"],
         reaches=fractions["reaches"],
-        falsified=list(asked.values())[-1]["falsified"],
+        falsified=list(questions.values())[-1]["falsified"],
         verdict=document["verdict"],
         cells=tuple(cells),
         parameters=tuple(zip(job.loop.box.names, job.loop.box.units, strict=True)),

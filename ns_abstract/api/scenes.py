@@ -154,7 +154,7 @@ def load_scene(
     """Read a scene; nothing in the files is executed.
 
     Args:
-        path: ``config.yml`` of a Splatfacto or vanilla-nerf run, or a scene file (docs/formats.md).
+        path: ``config.yml`` of a Splatfacto, vanilla-nerf or nerfacto run, or a scene file (docs/formats.md).
         renderer: "gsplat" (what Nerfstudio shows of splats; their default) or "paper" (Algorithm 1 or 2 of "Abstract
             Rendering").
         sampling: NeRF: "uniform" (default) or "hierarchical".

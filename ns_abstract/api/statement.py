@@ -10,7 +10,7 @@ from ns_abstract.check.results import read_report, read_verdicts
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import load_json
 from ns_abstract.io.version import ADVISORY, computed_by, stale
-from ns_abstract.report.record import file_stamp
+from ns_abstract.report.run import file_stamp
 
 STATEMENT, PREDICATE = "https://in-toto.io/Statement/v1", "urn:ns-abstract:certificate:1"
 #: What of report.json is the statement's predicate.
@@ -79,11 +79,11 @@ def _run_files(report: dict[str, Any], notes: list[str]) -> list[dict[str, Any]]
 
 def _given_file(report: dict[str, Any], name: str) -> list[dict[str, Any]]:
     """The file of the property or the loop, where it still says what was certified."""
-    given = report["settings"].get(name)
+    file = report["settings"].get(name)
     try:
-        if not isinstance(given, str) or load_json(Path(given)) != report.get(name):
+        if not isinstance(file, str) or load_json(Path(file)) != report.get(name):
             return []
-        stamp = file_stamp(Path(given))
+        stamp = file_stamp(Path(file))
     except (InputError, OSError):
         return []
     return [_subject(stamp["name"], stamp["sha256"], of=f"the file of the {name}")]

@@ -57,11 +57,11 @@ class InstanceFolder:
             return
         text = read_text(self.folder / _KEPT[0], "list of instances", _LIST_LIMIT)
         self.lines = [row for row in csv.reader(io.StringIO(text)) if row]
-        for name, kept in zip(_KEPT[1:], (self.boxes, self.origins), strict=True):
+        for name, target in zip(_KEPT[1:], (self.boxes, self.origins), strict=True):
             content = load_json(self.folder / name, "list of instances")
             if not isinstance(content, dict):
                 raise InputError("is no object", file=self.folder / name, fix="remove it, or write to another folder")
-            kept.update(content)
+            target.update(content)
 
     def add(self, job: Certification, frame: int, parts: Sequence[int], name: str = "") -> None:
         """Cut the set of poses of ``frame`` into boxes and write an instance of each.

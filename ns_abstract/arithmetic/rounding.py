@@ -148,6 +148,9 @@ LINEAR_UP, LINEAR_ROUNDING = 1.0 + 2.0**-40, 2.0**-44
 DIFFERENCE_ROUNDING = 2.0**-44
 #: B8: alphas below are left out by the paper's rasteriser, which draws all; so much is added for each that is.
 NEGLIGIBLE_ALPHA = 2.0**-40
+#: G7: the covariance's relative error x below which the exponent's is at most x (1 + 2 x), below 0.695: an inverse by
+#: 1 - x, and 36 of the 80 charged units times ((1 + x) / (1 - x))^2.
+COVARIANCE_ERROR = 0.39
 #: G12: units of the program by which alpha may exceed its threshold where a tile is missed: 298 of a box (16 and 32 of
 #: its side, 178 + 78 + 34 + 8 in the exponent), 2^17 of an ellipse, twice.
 BOX_ROOM, ELLIPSE_ROOM = 2.0**9, 2.0**18
@@ -241,6 +244,36 @@ LINE_ROUNDING = 2.0**-44
 #: F16: rests of lines, light and weights: sums of at most 48 products, an exponential; up to 2^13. Light has 49 of its
 #: logarithm's size, which is less than that while light is above 2^-240; what is off below is within `SAMPLE_ROUNDING`.
 FOLLOWED_UP = 1.0 + 2.0**-40
+
+# ---------------------------------------------------------------- hash-grid fields (H)
+
+#: H1: sums of at most 2^12 numbers that are not negative, of a few roundings each.
+HASH_UP = 1.0 + 2.0**-40
+#: H1: a line's polynomial at a place: at most 84 terms of 12 roundings, and derivatives of at most 36 times their size;
+#: 2^10 are charged of each term that many times.
+HASH_RAY_ROUNDING = 2.0**10 * UNIT64
+#: H2: a point, its contraction and normalisation, here and by the concrete renderer: at most 16; 16 to spare. Relative
+#: to the sum of absolute terms of the point over the largest coordinate's size, and to 2.
+POINT_PLACE_ROUNDING = 32.0 * UNIT64
+#: H2: a distance from its place in the spacing, 6 here and there, 10 to spare.
+SPACING_ROUNDING = 16.0 * UNIT64
+#: H3: a coordinate in cells, 2; 2 to spare. A trilinear value and slopes, in both evaluations, 24; 8 to spare, of the
+#: largest node's size.
+CELL_ROUNDING, TRILINEAR_ROUNDING = 4.0 * UNIT64, 32.0 * UNIT64
+#: H5: exponentials, logarithms and logistic functions, products with slopes and halves, here and by the concrete
+#: renderer: at most 28; up to 2^7.
+HASH_BAND_ROUNDING = 2.0**-46
+#: H6: an interval's optical depth, 6 here and there, 10 to spare; a sum of depths one more by interval, twice.
+DEPTH_PRODUCT_ROUNDING, DEPTH_SUM_ROUNDING = 16.0 * UNIT64, 4.0 * UNIT64
+#: H6: shares of the distribution, by bin: weights 4, their sum and the cumulated shares one each, twice; up to 2^4.
+SHARE_ROUNDING = 16.0 * UNIT64
+#: H6: bins' worth of these beside one by bin.
+SHARE_BINS = 16
+#: H8: the middle of a piece of a box, half its width and the ends of its parts: quotients, products and sums, 8; as many
+#: to spare; by the number of pieces where they are told in half-widths of a piece.
+PIECE_END_ROUNDING = 16.0 * UNIT64
+#: H7: compositing in both evaluations, absolute, by sample: at most 12 operations on numbers of at most 1; 4 to spare.
+HASH_SAMPLE_ROUNDING = 16.0 * UNIT64
 
 # ---------------------------------------------------------------- refinement, certificates, loops (R, V, L)
 

@@ -109,11 +109,11 @@ def recording() -> Iterator[_Recorder]:
 def _measured(recipe: Recipe[Any], poses: PoseBox) -> list[dict[str, Any]]:
     """The rows of one process, which has no kernel."""
     view = load(recipe).method.frame(poses)
-    with recording() as found:
+    with recording() as recorded:
         for stage in (*view.stages, None):
-            found.stage = stage or "the rest"
+            recorded.stage = stage or "the rest"
             view.warm_up(stage)
-    return found.rows
+    return recorded.rows
 
 
 @contextmanager

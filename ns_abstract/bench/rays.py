@@ -46,7 +46,7 @@ def measure(job: PathJob, name: str, frame: int, scale: float, **options: Any) -
         InputError: The run is not a NeRF.
     """
     if not isinstance(job.method, NerfMethod):
-        raise InputError("rays are those of a NeRF", field="--load-config", fix="give a run of vanilla-nerf")
+        raise InputError("rays are those of a vanilla NeRF", field="--load-config", fix="give a run of vanilla-nerf")
     poses = pose_set(job, name, frame, scale)
     sample: Any = RaySample(job.method, poses, options["rays"], options["seed"])
     sample.warm_up()

@@ -29,7 +29,7 @@ class Render(GivenSet):
     """
 
     load_config: Path
-    """config.yml of a Splatfacto or vanilla-nerf run, or a scene file (.ply, .sog, .spz, .splat, .glb, .pt)."""
+    """config.yml of a Splatfacto, vanilla-nerf or nerfacto run, or a file (.ply, .sog, .spz, .splat, .glb, .pt)."""
     camera_path_filename: Path
     """Camera path as Nerfstudio's viewer writes it."""
     output_dir: Path | None = None
@@ -88,7 +88,7 @@ class Certify(GivenSet):
     """
 
     load_config: Path
-    """config.yml of a Splatfacto or vanilla-nerf run, or a scene file (.ply, .sog, .spz, .splat, .glb, .pt)."""
+    """config.yml of a Splatfacto, vanilla-nerf or nerfacto run, or a file (.ply, .sog, .spz, .splat, .glb, .pt)."""
     camera_path_filename: Path
     """Camera path as Nerfstudio's viewer writes it."""
     property: Path
@@ -238,7 +238,7 @@ class Locate(GivenSet):
     """
 
     load_config: Path
-    """config.yml of a Splatfacto or vanilla-nerf run, or a scene file (.ply, .sog, .spz, .splat, .glb, .pt)."""
+    """config.yml of a Splatfacto, vanilla-nerf or nerfacto run, or a file (.ply, .sog, .spz, .splat, .glb, .pt)."""
     image: Path
     """The photo: RGB of 8 bits, of the size of the camera path's pictures."""
     camera_path_filename: Path

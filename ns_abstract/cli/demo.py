@@ -1,4 +1,4 @@
-"""``ns-abstract-demo``: scenes as runs of Splatfacto and vanilla-nerf, with sets of poses and a network in a loop."""
+"""``ns-abstract-demo``: runs of Splatfacto, vanilla-nerf and nerfacto, with sets of poses and a network in a loop."""
 
 from __future__ import annotations
 
@@ -17,13 +17,14 @@ class Demo:
     """Write scenes as real run folders, with camera paths, sets of poses and a network in a loop.
 
     An airfield as a Splatfacto run; a gate as another one, with a network that steers towards it (LOOP.json); and a
-    buoy as a vanilla-nerf run of full size. Needs no network connection and takes about ten seconds.
+    buoy as a vanilla-nerf run of full size and as a small nerfacto run. Needs no network connection and takes about ten
+    seconds.
     """
 
     output_dir: Path
     """Folder for the runs; made if missing."""
     splats_only: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
-    """Leave out the NeRF."""
+    """Leave out the NeRFs."""
 
 
 def demo(options: Demo) -> int:
@@ -34,7 +35,7 @@ def demo(options: Demo) -> int:
     """
     from rich.console import Console
 
-    from ns_abstract.demo.writing import write_demo, write_loop_demo, write_nerf_demo
+    from ns_abstract.demo.writing import write_demo, write_loop_demo, write_nerf_demo, write_nerfacto_demo
 
     folder = options.output_dir
     console = Console(stderr=True, highlight=False)
@@ -43,10 +44,10 @@ def demo(options: Demo) -> int:
             config, files = write_demo(folder)
         with console.status("modelling the gate, fitting the network of its loop"):
             course, loop = write_loop_demo(folder / "gate")
-        nerf = None
+        fields = {}
         if not options.splats_only:
-            with console.status("writing the NeRF"):
-                nerf = write_nerf_demo(folder)
+            with console.status("writing the NeRFs"):
+                fields = {"NeRF": write_nerf_demo(folder), "nerfacto": write_nerfacto_demo(folder)}
     except OSError as error:
         raise InputError(
             f"cannot be written ({error.strerror})", file=folder, field="--output-dir", fix="choose another folder"
@@ -64,12 +65,11 @@ def demo(options: Demo) -> int:
         f"  ns-abstract-reach --load-config {course} --loop {loop} \\\n"
         f"    --output-dir {folder / 'loop'} --time-budget 600"
     )
-    if nerf is not None:
-        config, path = nerf
+    for name, (config, path) in fields.items():
         lines.append(
-            f"\nNeRF run     {config}\n"
+            f"\n{name + ' run':12s} {config}\n"
             f"  ns-abstract-render --load-config {config} --camera-path-filename {path} \\\n"
-            f"    --output-dir {folder / 'abstract-nerf'}"
+            f"    --output-dir {folder / f'abstract-{name.lower()}'}"
         )
     print("\n".join(visible(line) for line in "\n".join(lines).split("\n")))
     return DONE

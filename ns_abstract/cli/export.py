@@ -299,7 +299,7 @@ def _occupancy(options: Occupancy) -> list[str]:
         raise InputError(f"found {options.threshold}", field="--threshold", fix="give 0 or more")
     scene = load_any(options.load_config, options.overrides)
     if not isinstance(scene, NerfScene):
-        raise InputError("this run is a splat", file=options.load_config, fix="give a run of vanilla-nerf")
+        raise InputError("is no run of vanilla-nerf", file=options.load_config, fix="give a run of vanilla-nerf")
     density = Field(scene.fine).density
     with Progress(console=Console(stderr=True)) as bar:
         task = bar.add_task("sampling the field", total=1.0)

@@ -148,9 +148,9 @@ def _paragraphs(kind: type, width: int) -> str:
 
 
 def _examples(program: str, width: int) -> str:
-    found = EXAMPLES.get(program, ())
+    examples = EXAMPLES.get(program, ())
     lines = []
-    for text, command in found:
+    for text, command in examples:
         lines += [_wrapped(text, width, "  # "), _command(f"{program} {command}", width)]
     return "\n".join(["", "examples:", *lines]) if lines else ""
 
@@ -173,7 +173,7 @@ def command_help(program: str, kind: type, given: Any = None) -> str:
     options = list(_options(kind, given, flags))
     usage = [f"usage: {program}", *(_flag(o) for o in options if o.required), "[options]"]
     lines = [_paragraphs(kind, width), "", _wrapped(" ".join(usage), width)]
-    lines += [found] if (found := _examples(program, width)) else []
+    lines += [examples] if (examples := _examples(program, width)) else []
     for group in _GROUPS:
         members = [option for option in options if option.group == group]
         # what is required comes first
@@ -210,5 +210,5 @@ def shown(program: str, kind: Any, words: list[str], parts: Mapping[str, Any], a
     part = parts.get(words[0])
     if part is None:
         return parts_help(program, parts, about)
-    given = None if isinstance(part, type) else part
-    return command_help(f"{program} {words[0]}", part if given is None else type(part), given)
+    defaults = None if isinstance(part, type) else part
+    return command_help(f"{program} {words[0]}", part if defaults is None else type(part), defaults)

@@ -16,12 +16,12 @@ def _is(word: str, kind: type) -> bool:
 
 
 def _value(detail: str) -> tuple[str, str] | None:
-    """What was found in place of numbers, and the fix, from tyro's text on a value that cannot be parsed."""
-    found = re.search(r"(?:from|float:|base 10:|arguments:) (\[.*\]|'.*')", detail)
-    words = re.findall(r"'([^']*)'", found[1]) if found else []
+    """What stands in place of numbers, and the fix, from tyro's text on a value that cannot be parsed."""
+    quoted = re.search(r"(?:from|float:|base 10:|arguments:) (\[.*\]|'.*')", detail)
+    words = re.findall(r"'([^']*)'", quoted[1]) if quoted else []
     expected = detail.split(" could be", maxsplit=1)[0]
     numbers = [word for word in words if not _is(word, float)]
-    if not words or (found and "type" in detail and not re.search("FLOAT|INT", expected)):
+    if not words or (quoted and "type" in detail and not re.search("FLOAT|INT", expected)):
         return None
     whole = "INT" in expected or "int()" in detail or (not numbers and "arguments:" in detail)
     bad = (numbers or [word for word in words if not _is(word, int)]) if whole else numbers

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ns_abstract.geometry.keyframe_cameras import KeyframeCamera, look_at, path_json
 from ns_abstract.io.arrays import open_archive
 from ns_abstract.io.errors import InputError
+from ns_abstract.methods.nerf.hash_field import DenseNet, HashEncoding, NerfactoField, NerfactoScene, ProposalField
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer, NerfScene
 from ns_abstract.methods.splat.scene import SplatScene
 
@@ -23,6 +24,11 @@ _FIX = "install the package again"
 _POSITION, _DIRECTION = Encoding(10, 0.0, 8.0), Encoding(4, 0.0, 4.0)
 #: Width and layers of the base of Nerfstudio's field, the layer that takes the encoding again, and the head's width.
 _WIDTH, _LAYERS, _SKIP, _HEAD = 256, 8, 4, 128
+
+
+#: abstract-nerfacto as the buoy's was trained, and its units by one of the buoy.
+NERFACTO_SCALE = 0.8
+_INIT_DENSITY, _NERFACTO_SAMPLES, _NERFACTO_FAR = 0.01, (64, 32, 24), 4.0
 
 
 class _ArchiveUnpickler(Protocol):
@@ -43,10 +49,10 @@ def _stored(file: Path) -> Iterator[_ArchiveUnpickler]:
         def read(name: str, kind: type, *shape: int | None) -> NDArray[Any]:
             if name not in archive.declared:
                 raise InputError("is missing", field=name)
-            found, stored = archive.declared[name]
-            wanted = tuple(m if n is None else n for n, m in zip(shape, found, strict=False))
-            if stored != kind or found != wanted or len(found) != len(shape):
-                raise InputError(f"{stored}{list(found)}, not {kind.__name__}{list(shape)}", field=name)
+            stored_shape, stored = archive.declared[name]
+            wanted = tuple(m if n is None else n for n, m in zip(shape, stored_shape, strict=False))
+            if stored != kind or stored_shape != wanted or len(stored_shape) != len(shape):
+                raise InputError(f"{stored}{list(stored_shape)}, not {kind.__name__}{list(shape)}", field=name)
             values = archive.read(name)
             if not np.isfinite(values).all():
                 raise InputError("not finite", field=name)
@@ -114,14 +120,65 @@ def buoy_scene() -> NerfScene:
     return NerfScene(weights, weights, background=np.array([1.0, 1.0, 1.0], np.float32), name="buoy")
 
 
-def buoy_views(count: int = 8, size: int = 64) -> list[KeyframeCamera]:
-    """Views all around the buoy for the data set beside the run."""
+def nerfacto_scene(file: Path = DATA / "buoy_nerfacto.npz") -> NerfactoScene:
+    """A small nerfacto of the buoy, which Nerfstudio trained on pictures of it.
+
+    Args:
+        file: Holds networks in float32, and tables in int8 beside ``NAME.scale`` [levels, 1, 1] in float32.
+
+    Raises:
+        InputError: The file is damaged.
+    """
+    with _stored(file) as read:
+
+        def grid(name: str) -> HashEncoding:
+            table = read(f"{name}.table", np.int8, None, None, 2)
+            scale = read(f"{name}.scale", np.float32, len(table), 1, 1)
+            sizes = read(f"{name}.resolutions", np.int64, len(table))
+            # float32, as the checkpoint that is written
+            return HashEncoding((table * scale).astype(np.float64), sizes)
+
+        def net(name: str, layers: int, inputs: int) -> DenseNet:
+            weights, biases = [], []
+            for k in range(layers):
+                weights.append(read(f"{name}.{k}.weight", np.float32, None, inputs).astype(np.float64))
+                inputs = len(weights[-1])
+                biases.append(read(f"{name}.{k}.bias", np.float32, inputs).astype(np.float64))
+            return DenseNet(tuple(weights), tuple(biases))
+
+        def proposal(name: str) -> ProposalField:
+            encoding = grid(name)
+            return ProposalField(encoding, net(name, 2, encoding.size), _INIT_DENSITY)
+
+        encoding = grid("field")
+        density = net("density", 2, encoding.size)
+        # 16 harmonics of the direction, and what the first network says beside the density
+        color = net("color", 3, 15 + len(density.biases[-1]))
+        rounds = proposal("proposal0"), proposal("proposal1")
+    field = NerfactoField(
+        encoding, density, color, _INIT_DENSITY, rounds, _NERFACTO_SAMPLES, far=_NERFACTO_FAR, background=np.zeros(3)
+    )
+    return NerfactoScene(field, name="buoy-nerfacto")
+
+
+def nerfacto_path(size: int = 16) -> dict[str, Any]:
+    """The view of `buoy_path` as nerfacto shows it, and a yaw of 0.0001 rad either way."""
+    return _buoy_path(size, NERFACTO_SCALE, 0.0001)
+
+
+def buoy_views(count: int = 8, size: int = 64, scale: float = 1.0) -> list[KeyframeCamera]:
+    """Views all around the buoy for the data set beside the run; ``scale``: the run's units by one of the buoy."""
     angles = 2.0 * np.pi * np.arange(count) / count
-    eyes = [(3.2 * np.cos(a), 3.2 * np.sin(a), 1.2) for a in angles]
-    return [KeyframeCamera(look_at(eye, (0.0, 0.0, 0.1)), 40.0, size, size) for eye in eyes]
+    eyes = [(scale * 3.2 * np.cos(a), scale * 3.2 * np.sin(a), scale * 1.2) for a in angles]
+    return [KeyframeCamera(look_at(eye, (0.0, 0.0, scale * 0.1)), 40.0, size, size) for eye in eyes]
 
 
 def buoy_path(size: int = 16) -> dict[str, Any]:
     """One small view of the buoy, and a yaw of 0.002 rad either way."""
-    view = KeyframeCamera(look_at((2.6, -1.8, 1.2), (0.0, 0.0, 0.1)), 40.0, size, size)
-    return path_json([view], seconds=1.0, perturbation={"version": 1, "rotation": {"yaw": 0.002}})
+    return _buoy_path(size, 1.0, 0.002)
+
+
+def _buoy_path(size: int, scale: float, yaw: float) -> dict[str, Any]:
+    eye = tuple(scale * place for place in (2.6, -1.8, 1.2))
+    view = KeyframeCamera(look_at(eye, (0.0, 0.0, scale * 0.1)), 40.0, size, size)
+    return path_json([view], seconds=1.0, perturbation={"version": 1, "rotation": {"yaw": yaw}})

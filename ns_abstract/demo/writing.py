@@ -10,10 +10,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ns_abstract.demo.paths import dataset_views, gate_views, write_airfield_paths
-from ns_abstract.demo.scenes import DATA, buoy_path, buoy_scene, buoy_views, splat_scene
+from ns_abstract.demo.scenes import (
+    DATA,
+    NERFACTO_SCALE,
+    buoy_path,
+    buoy_scene,
+    buoy_views,
+    nerfacto_path,
+    nerfacto_scene,
+    splat_scene,
+)
 from ns_abstract.geometry.camera_path import PinholeCamera, focal_length
 from ns_abstract.geometry.keyframe_cameras import KeyframeCamera
 from ns_abstract.io.atomic import write_json
+from ns_abstract.methods.nerf.nerfacto_write import write_nerfacto_run
 from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
@@ -29,6 +39,15 @@ def write_nerf_demo(folder: Path) -> tuple[Path, Path]:
     scene = buoy_scene()
     config = write_nerf_run(scene, folder, timestamp=TIMESTAMP, experiment_name="buoy", views=buoy_views())
     return config, write_json(folder / "camera_path_buoy.json", buoy_path())
+
+
+def write_nerfacto_demo(folder: Path) -> tuple[Path, Path]:
+    """Write the nerfacto and its camera path; returns config.yml and the path."""
+    config = write_nerfacto_run(
+        nerfacto_scene(), folder, timestamp=TIMESTAMP, experiment_name="buoy-nerfacto",
+        views=buoy_views(scale=NERFACTO_SCALE),
+    )  # fmt: skip
+    return config, write_json(folder / "camera_path_nerfacto.json", nerfacto_path())
 
 
 def _picture(renderer: Renderer) -> Callable[[KeyframeCamera], NDArray[np.float64]]:

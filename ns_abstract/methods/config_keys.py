@@ -11,6 +11,7 @@ from ns_abstract.methods import runs
 
 _MODEL = "pipeline.model."
 _SPLAT, _NERF, _BASE = "models/splatfacto.py", "models/vanilla_nerf.py", "models/base_model.py"
+_FACTO = "models/nerfacto.py"
 _STRATEGY = "densification (`self.config.{}`), which runs in training alone"
 _START = "how training starts (`self.config.{}`); the checkpoint replaces it"
 _LOSS = "the loss of training (`self.config.{}`)"
@@ -94,6 +95,61 @@ VANILLA_NERF = KeyTable(
     ),
 )  # fmt: skip
 
+_SIZE = "the size of layers and grids, as in the checkpoint (`self.config.{}`)"
+_REPLACED = "ends of rays that `self.collider` replaces"
+NERFACTO = KeyTable(
+    "`pipeline.model` of nerfacto",
+    (
+        *_EVERY_MODEL,
+        Key("far_plane", "used", "where rays end", f"{_FACTO}:230"),
+        Key("near_plane", "irrelevant", "0 outside of training (`self.training`)",
+            "model_components/scene_colliders.py:188"),
+        Key("background_color", "used", "the colour behind the last sample, or that of the last sample",
+            f"{_FACTO}:233"),
+        *(Key(name, "used", _SIZE.format(name), f"{_FACTO}:{line}") for name, line in {
+            "hidden_dim": 158, "hidden_dim_color": 164, "num_levels": 159, "features_per_level": 162,
+            "log2_hashmap_size": 163,
+        }.items()),
+        Key("base_res", "used", "resolutions of the grids", f"{_FACTO}:161"),
+        Key("max_res", "used", "resolutions of the grids", f"{_FACTO}:160"),
+        Key("hidden_dim_transient", "irrelevant", "layers of transient and semantic heads, which are never built",
+            f"{_FACTO}:165"),
+        Key("num_proposal_samples_per_ray", "used", "samples of every ray in the proposal fields", f"{_FACTO}:222"),
+        Key("num_nerf_samples_per_ray", "used", "samples of every ray in the field", f"{_FACTO}:221"),
+        Key("num_proposal_iterations", "used", "rounds of proposals", f"{_FACTO}:223"),
+        Key("use_same_proposal_network", "used", "one proposal field for all rounds", f"{_FACTO}:182"),
+        Key("proposal_net_args_list", "used", "sizes and resolutions of the proposal fields", f"{_FACTO}:196"),
+        Key("proposal_initial_sampler", "used", "how the first samples are spaced", f"{_FACTO}:217"),
+        Key("use_appearance_embedding", "used", "whether colours depend on an embedding", f"{_FACTO}:153"),
+        Key("use_average_appearance_embedding", "used", "the mean embedding, or zeros", f"{_FACTO}:169"),
+        Key("appearance_embed_dim", "used", "the length of the embedding", f"{_FACTO}:153"),
+        Key("average_init_density", "used", "a factor of all densities", f"{_FACTO}:171"),
+        Key("implementation", "used", "whether grids and networks are those of torch; a checkpoint of tcnn is refused",
+            f"{_FACTO}:172"),
+        Key("disable_scene_contraction", "refused", "a field that ends at a box cannot be bounded", f"{_FACTO}:148",
+            (False,)),
+        Key("predict_normals", "refused", "fields with predicted normals are not supported", f"{_FACTO}:168",
+            (False,)),
+        Key("enable_collider", "irrelevant", _REPLACED, f"{_FACTO}:230"),
+        Key("collider_params", "irrelevant", _REPLACED, f"{_FACTO}:230"),
+        Key("camera_optimizer", "irrelevant", "moves rays under `self.training` alone", f"{_FACTO}:300"),
+        Key("use_gradient_scaling", "irrelevant", "scales gradients; values stay", f"{_FACTO}:305"),
+        Key("loss_coefficients", "irrelevant", "weights of a NeRF's losses; nerfacto has its own", f"{_BASE}:50"),
+        *_all("jitter of samples in training (`self.config.{}`)", _FACTO, {"use_single_jitter": 224}),
+        *_all("how often proposals are trained (`self.config.{}`)", _FACTO, {
+            "proposal_update_every": 212, "proposal_warmup": 210,
+        }),
+        *_all("an exponent of weights in training, which a loaded model leaves at 1 (`self.config.{}`)", _FACTO, {
+            "use_proposal_weight_anneal": 266, "proposal_weights_anneal_slope": 279,
+            "proposal_weights_anneal_max_num_iters": 268,
+        }),
+        *_all(_LOSS, _FACTO, {
+            "interlevel_loss_mult": 374, "distortion_loss_mult": 378, "orientation_loss_mult": 381,
+            "pred_normal_loss_mult": 386,
+        }),
+    ),
+)  # fmt: skip
+
 _DATA = "pipeline.datamanager."
 _PHOTOS = "photos and batches of training; the cameras of a path are drawn without them"
 _HERE = "the run is read from the folder of config.yml"
@@ -145,7 +201,7 @@ RUN = KeyTable(
     ),
 )  # fmt: skip
 
-TABLES = (SPLATFACTO, VANILLA_NERF, RUN)
+TABLES = (SPLATFACTO, VANILLA_NERF, NERFACTO, RUN)
 
 
 def check_keys(run: runs.RunConfig, model: KeyTable, refuse_unknown: bool = True) -> tuple[str, ...]:
@@ -153,7 +209,7 @@ def check_keys(run: runs.RunConfig, model: KeyTable, refuse_unknown: bool = True
 
     Args:
         run: The run.
-        model: The keys of ``pipeline.model``: `SPLATFACTO` or `VANILLA_NERF`.
+        model: The keys of ``pipeline.model``: `SPLATFACTO`, `VANILLA_NERF` or `NERFACTO`.
         refuse_unknown: Whether a key of ``pipeline.model`` that is in no table is refused, or named in the notes.
 
     Raises:
@@ -166,7 +222,7 @@ def check_keys(run: runs.RunConfig, model: KeyTable, refuse_unknown: bool = True
             raise InputError(
                 f"unknown key; it may change the picture, and nothing here draws by it ({', '.join(inner)})",
                 field=_MODEL + inner[0],
-                fix="give a run of splatfacto or vanilla-nerf, or remove the key if it changes nothing",
+                fix="give a run of splatfacto, nerfacto or vanilla-nerf, or remove the key if it changes nothing",
             )
     except InputError as error:
         raise error.within(run.file) from None

@@ -8,14 +8,14 @@ from typing import Any
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods import runs
-from ns_abstract.methods.nerf.representation import NERF
+from ns_abstract.methods.nerf.representation import NERF, NERFACTO
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.representation import Representation
 from ns_abstract.methods.splat.formats.readers import scene_file
 from ns_abstract.methods.splat.method import SPLAT
 
 #: What is asked in turn; the last one explains what it cannot read.
-REPRESENTATIONS: list[Representation] = [NERF, SPLAT]
+REPRESENTATIONS: list[Representation] = [NERF, NERFACTO, SPLAT]
 
 
 def open_scene(path: str | os.PathLike[str], overrides: Overrides | None = None) -> tuple[Representation, Any]:

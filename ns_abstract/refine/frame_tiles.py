@@ -112,8 +112,8 @@ def usable(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray
     low, high = np.where(good, low, np.zeros_like(low)), np.where(good, high, np.ones_like(high))
     if lower.shape[-1] > DEPTH:
         near, far = lower[..., DEPTH], upper[..., DEPTH]
-        known = ((near <= far) & np.isfinite(near) & (near >= 0.0)) | ((near == np.inf) & (far == -np.inf))
-        low[..., DEPTH], high[..., DEPTH] = np.where(known, near, 0.0), np.where(known, far, np.inf)
+        is_range = ((near <= far) & np.isfinite(near) & (near >= 0.0)) | ((near == np.inf) & (far == -np.inf))
+        low[..., DEPTH], high[..., DEPTH] = np.where(is_range, near, 0.0), np.where(is_range, far, np.inf)
     return low, high
 
 

@@ -193,8 +193,8 @@ def bounds_at(
             slope, offset = sign * A[n].astype(np.float64), sign * b[n].astype(np.float64)
             size = np.abs(offset) + 2.0 * np.abs(slope).sum(axis=-1)
             value = offset + (slope * place).sum(axis=-1) - MAP_ROUNDING * size
-            found = sign * outward(value, value)[0]
-            pixels = bound[row : row + found.shape[0], column : column + found.shape[1]]
-            found = found[: pixels.shape[0], : pixels.shape[1]]
-            np.copyto(pixels, np.maximum(sign * pixels, sign * found) * np.float32(sign))
+            rounded = sign * outward(value, value)[0]
+            pixels = bound[row : row + rounded.shape[0], column : column + rounded.shape[1]]
+            rounded = rounded[: pixels.shape[0], : pixels.shape[1]]
+            np.copyto(pixels, np.maximum(sign * pixels, sign * rounded) * np.float32(sign))
     return low, high

@@ -137,9 +137,9 @@ class ComparisonReport(Report):
         for name in ("largest_upper", "largest_lower"):
             document[name] = max((entry[name] for entry in frames), default=None)
         if self.tolerance is not None:
-            known = {entry["index"] for entry in frames}
+            indices = {entry["index"] for entry in frames}
             verdicts = [entry["verdict"] for entry in frames if entry["index"] in self.run.frames]
-            document["verdict"] = overall(verdicts, known >= set(self.run.frames))
+            document["verdict"] = overall(verdicts, indices >= set(self.run.frames))
         return document
 
     def _draw(self, result: FrameResult) -> None:
@@ -183,8 +183,8 @@ class ComparisonReport(Report):
     def _write_page(self, document: dict[str, Any]) -> None:
         begin = time.monotonic()
         frames = sorted(document["frames"], key=lambda entry: -entry["largest_upper"])[:PAGE_FRAMES]
-        shown = sorted(frames, key=lambda entry: entry["index"])
-        text = comparison_page(document, {entry["index"]: self._preview(entry["index"]) for entry in shown})
+        ordered = sorted(frames, key=lambda entry: entry["index"])
+        text = comparison_page(document, {entry["index"]: self._preview(entry["index"]) for entry in ordered})
         write_atomic(self.folder / "report.html", lambda stream: stream.write(text.encode()))
         self._page_due = time.monotonic() + max(10.0, 20.0 * (time.monotonic() - begin))
 

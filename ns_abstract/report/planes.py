@@ -21,13 +21,13 @@ def planes_picture(image: np.ndarray, wanted: np.ndarray, depth: int | None) -> 
         depth: Channel of the depths, or None.
     """
     colors = np.clip(image[..., :3], 0.0, 1.0)
-    shown = [to_bytes(np.where(wanted[..., None], colors, _DIM * colors))]
+    images = [to_bytes(np.where(wanted[..., None], colors, _DIM * colors))]
     for channel in range(3, min(image.shape[2], 3 + _MOST)):
         plane, top = image[..., channel], 1.0
         if channel == depth:
             near = plane < np.max(plane)
             top = float(plane[near].max(initial=0.0)) or 1.0
-        shown.append(heat(np.clip(plane, 0.0, top), top, _MAP))
+        images.append(heat(np.clip(plane, 0.0, top), top, _MAP))
     gap = np.full((image.shape[0], _GAP, 3), 255, np.uint8)
-    parts = [part for one in shown for part in (one, gap)][:-1]
+    parts = [part for one in images for part in (one, gap)][:-1]
     return np.concatenate(parts, axis=1)

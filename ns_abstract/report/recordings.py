@@ -114,11 +114,11 @@ def write_viser(
                 "/scene", centers=scene.means.astype(np.float32), covariances=covariances.astype(np.float32),
                 rgbs=scene.colors.astype(np.float32), opacities=scene.opacities[:, None].astype(np.float32),
             )  # fmt: skip
-        shown: Any = None
+        frustum: Any = None
         for result in results:  # pyright: ignore[reportGeneralTypeIssues]
             camera = cameras[result.index]
-            former, rotation = shown, camera.camera_to_world[:3, :3] @ _FLIP
-            shown = server.scene.add_camera_frustum(
+            former, rotation = frustum, camera.camera_to_world[:3, :3] @ _FLIP
+            frustum = server.scene.add_camera_frustum(
                 f"/frames/{result.index:05d}", fov=2.0 * float(np.arctan2(0.5 * camera.height, camera.fy)),
                 aspect=camera.width / camera.height, scale=0.15, image=results.picture(result, "gap"),
                 wxyz=viser.transforms.SO3.from_matrix(rotation).wxyz, position=camera.camera_to_world[:3, 3],

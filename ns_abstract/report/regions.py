@@ -169,7 +169,7 @@ def regions_html(
     """The page's part about regions; ``pictures`` are of the first ones, ``why`` there are no more of them."""
     if not regions:
         return Markup()
-    shown = []
+    blocks = []
     for region, (broken, right) in zip(regions, pictures, strict=False):
         sides = parameters[region.frame]
         box = ", ".join(
@@ -179,7 +179,7 @@ def regions_html(
         )
         told = reported_outputs(broken.outputs, right and right.outputs)
         both = [broken, right] if right else [broken]
-        shown.append(
+        blocks.append(
             {
                 "region": region,
                 "box": box,
@@ -189,7 +189,7 @@ def regions_html(
                 "more": len(broken.outputs) - len(told),
             }
         )
-    return fill("regions.html", regions=regions, shown=shown, why=why)
+    return fill("regions.html", regions=regions, shown=blocks, why=why)
 
 
 def _pose(one: PoseImage, other: PoseImage, sides: Sequence[Mapping[str, Any]]) -> str:

@@ -101,8 +101,8 @@ def draw_legend(entries: Sequence[tuple[str, str]], right: float) -> str:
 
 def stairs(points: Sequence[tuple[float, float]], end: float) -> list[tuple[float, float]]:
     """What is known between the points: a bound holds until a better one is there."""
-    found: list[tuple[float, float]] = []
+    corners: list[tuple[float, float]] = []
     stops = [*(start for start, _ in points[1:]), end]
     for (start, value), stop in zip(points, stops, strict=False):
-        found += [(start, value), (stop, value)]
-    return found
+        corners += [(start, value), (stop, value)]
+    return corners

@@ -230,8 +230,8 @@ class StoreFile:
             parts = _parts_of(empty)
         if _parts_of(self._base) != parts:
             raise self._damaged("its tables are others")
-        known = self._base.execute("SELECT * FROM parameters ORDER BY position").fetchall()
-        if known != [(k, *names) for k, names in enumerate(parameters)]:
+        names_stored = self._base.execute("SELECT * FROM parameters ORDER BY position").fetchall()
+        if names_stored != [(k, *names) for k, names in enumerate(parameters)]:
             raise self._damaged("its parameters are others")
         written = self._reported()
         checksums = _Checksums()
@@ -329,15 +329,15 @@ class StoreFile:
                 field="--resume",
                 fix=f"leave it out to search again; {ADVISORY}",
             )
-        stored, asked = self._get("fingerprint"), json.loads(json.dumps(dict(fingerprint)))
-        if problem := stale(stored, asked):
+        stored, expected = self._get("fingerprint"), json.loads(json.dumps(dict(fingerprint)))
+        if problem := stale(stored, expected):
             raise InputError(
                 f"holds a search {problem}",
                 file=self.file,
                 field="--resume",
                 fix=f"leave it out to search again; {ADVISORY}",
             )
-        different = [key for key in {**stored, **asked} if stored.get(key) != asked.get(key)]
+        different = [key for key in {**stored, **expected} if stored.get(key) != expected.get(key)]
         if different:
             raise InputError(
                 f"holds a search with another {', '.join(different)}",

@@ -112,14 +112,16 @@ def parse_query(
     if not isinstance(version, str) or not _VERSION.fullmatch(version):
         raise InputError(f"found version {_show(version)}", field="vnnlib-version", fix="give a query of 1.0 or 2.0")
     name, tensors = _network(expressions[1])
-    given, result = tensors
+    inputs, result = tensors
     if input_shape is not None:
-        _check_shape(given, input_shape, "input")
-    elif given.size > _LARGEST:
-        raise InputError(f"{given.name} has {given.size} elements", field="declare-input", fix="use a smaller network")
+        _check_shape(inputs, input_shape, "input")
+    elif inputs.size > _LARGEST:
+        raise InputError(
+            f"{inputs.name} has {inputs.size} elements", field="declare-input", fix="use a smaller network"
+        )
     _check_shape(result, output_shape, "output")
-    reader = _Reader({given.name: ("X", given), result.name: ("Y", result)}, given.kind)
-    converted: list[Any] = [["declare-const", f"X_{k}", "Real"] for k in range(given.size)]
+    reader = _Reader({inputs.name: ("X", inputs), result.name: ("Y", result)}, inputs.kind)
+    converted: list[Any] = [["declare-const", f"X_{k}", "Real"] for k in range(inputs.size)]
     converted += [["declare-const", f"Y_{k}", "Real"] for k in range(result.size)]
     for expression in expressions[2:]:
         if isinstance(expression, list) and expression and expression[0] == "declare-network":
@@ -127,7 +129,7 @@ def parse_query(
         if not (isinstance(expression, list) and len(expression) == 2 and expression[0] == "assert"):
             raise _fail(expression, "write assertions behind the network")
         converted.append(["assert", reader.condition(expression[1])])
-    return Vnnlib2Query(name, given, result, converted)
+    return Vnnlib2Query(name, inputs, result, converted)
 
 
 def _network(expression: Any) -> tuple[str, tuple[Tensor, Tensor]]:
@@ -140,12 +142,12 @@ def _network(expression: Any) -> tuple[str, tuple[Tensor, Tensor]]:
         if head not in tensors or len(part) != 3:
             raise _fail(part, _ONE)
         tensors[head].append(_tensor(part))
-    found = [*tensors["declare-input"], *tensors["declare-output"]]
-    if [len(group) for group in tensors.values()] != [1, 1] or found[0].name == found[1].name:
+    declared = [*tensors["declare-input"], *tensors["declare-output"]]
+    if [len(group) for group in tensors.values()] != [1, 1] or declared[0].name == declared[1].name:
         raise InputError("declares other tensors than one input and one output", field="declare-network", fix=_ONE)
-    if found[0].kind != found[1].kind:
+    if declared[0].kind != declared[1].kind:
         raise InputError("declares two types", field="declare-network", fix="declare both as real, or as float32")
-    return expression[1], (found[0], found[1])
+    return expression[1], (declared[0], declared[1])
 
 
 def _tensor(part: list[Any]) -> Tensor:

@@ -338,6 +338,11 @@ class NerfBounds:
         )
         return low.reshape(-1, low.shape[2]), high.reshape(-1, high.shape[2])
 
+    @property
+    def compiled(self) -> bool:
+        """Whether kernels for a processor bound the field."""
+        return self.field.compiled
+
     def division(self, moves: np.ndarray, most: int = _PARTS, deeper: int | None = None) -> Division | None:
         """`division_for` for samples that move by ``moves`` [n, samples, d], as wide as the network's bounds bear."""
         d = moves.shape[2]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import secrets
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
@@ -19,13 +19,12 @@ from ns_abstract.execution.cancellation import WorkCancelledError, check_cancell
 from ns_abstract.execution.engines import Processes
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseBox
-from ns_abstract.geometry.tiles import tile_grid
 from ns_abstract.methods.nerf.bounds import NerfBounds, RayBounds, Shifts, typical_displacement
-from ns_abstract.methods.nerf.hsv import color_shift
+from ns_abstract.methods.nerf.ray_pictures import PixelRenderer, RayPictures
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
-from ns_abstract.methods.nerf.strips import PoseStrips
-from ns_abstract.refine.protocol import LinearSets, SceneSample
+from ns_abstract.methods.nerf.strips import FieldBounds, PoseStrips
+from ns_abstract.refine.protocol import LinearSets
 
 
 @dataclass(frozen=True)
@@ -41,8 +40,6 @@ class FieldTuning:
     #: bounds are kept in float32, where a finer one shows nowhere.
     least_share: float = 0.02
     finest_tolerance: float = UNIT32
-    #: Step of the difference quotient that tells how far the picture moves, as a part of the parameter's range.
-    motion_step: float = 2.0**-10
     #: Rays and poses rendered to estimate that variation.
     look_rays: int = 256
     look_poses: int = 7
@@ -51,8 +48,8 @@ class FieldTuning:
 _TUNING = FieldTuning()
 #: Poses on the diagonal of a box that are rendered to see which colours it reaches, besides random ones.
 _LOOK_SHARES = np.linspace(0.0, 1.0, 9)
-#: Parts of every range of hues and saturations; pixels that a turn of the whole circle counts for.
-_SHIFT_PARTS, _SHIFT_MOTION = 12, 6.0
+#: Parts of every range of hues and saturations.
+_SHIFT_PARTS = 12
 #: Weights of one share of work, in units of rays times weights, and shares of a worker between two looks at the goal
 #: where there are several workers: they end at about the same time.
 _WORK, _SHARES = 1_600_000, 4
@@ -122,62 +119,33 @@ def _bound_share(frame: bytes, bounds: tuple[Any, ...], displacement: float, arg
     return _here[frame].rays(*arguments)
 
 
-class NerfFrame:
-    """Bounds and renders one frame's set of poses. Every ray is a tile of its own.
+class FieldFrame(RayPictures):
+    """Bounds and renders one frame's set of poses of a field.
 
     The set as a whole is bounded by [0, 1] without work, so that refinement can take ray after ray.
 
     Args:
-        scene: The fields.
-        sampling: Where they are evaluated.
         pose_set: The poses.
-        device: Where the network is bounded.
-        workers: Processes that bound rays side by side, one core each: the matrices are too small to be shared
-            among cores. Results do not depend on where a ray is bounded, but on what is bounded together.
+        renderer: Draws the field.
+        bounds: Of its rays.
+        share: Rays that are bounded together.
+        at_once: Rays between two looks at the goal.
+        workers: Shares that are bounded side by side.
     """
 
-    #: Every ray is work of its own.
-    tilewise = True
-    channels = 3
-    #: Poses rendered in every part of a cell that is split.
-    witnesses = 8
-
     def __init__(
-        self, scene: NerfScene, sampling: Sampling, pose_set: PoseBox, device: str = "cpu", workers: int = 1
+        self, pose_set: PoseBox, renderer: PixelRenderer, bounds: FieldBounds, share: int, at_once: int, workers: int
     ) -> None:
-        self.pose_set, self.camera, self.box = pose_set, pose_set.camera, pose_set.box
-        self.side = 1
-        self.across, self.down = tile_grid(self.camera, 1)
-        self.renderer = NerfRenderer(scene, sampling, device=device)
+        super().__init__(pose_set, renderer)
         self._geometry = pose_set.geometry
-        self._recipe: tuple[Any, ...] = (scene, sampling, self._geometry.box.dimensions, device)
-        self._token = secrets.token_bytes(16)
-        self.bounds = NerfBounds(*self._recipe)
-        weights = sum(array.size for array in scene.fine.arrays())
-        self.workers = workers
-        compiled = self.bounds.field.compiled
-        self._share = int(np.clip(_WORK // weights, 1, 32)) if compiled else _RAYS_ON_DEVICE
-        self.tiles_at_once = workers * self._share * (_SHARES if compiled and workers > 1 else 1)
+        self.bounds, self.workers = bounds, workers
+        self.typical_distance = float(bounds.distances[bounds.distances.size // 2])
+        self._share, self.tiles_at_once = share, at_once
         self._inner: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         #: whether boxes need not wait for what others tell of the width of cells
         self._steady = False
         #: Numbers of the rays that `sets` bounds; of others it says 0.
         self.rays = np.arange(self.tile_count)
-
-    #: Few kernels, which are compiled together.
-    stages: tuple[str, ...] = ()
-
-    @property
-    def tile_count(self) -> int:
-        """Number of rays, row by row."""
-        return self.across * self.down
-
-    def scene_samples(self, seed: int) -> Iterator[SceneSample]:
-        """Other scenes of the set: none, only poses vary."""
-        return iter(())
-
-    def _pixels(self, tiles: np.ndarray) -> np.ndarray:
-        return np.stack([tiles // self.across, tiles % self.across], axis=1)
 
     def warm_up(self, stage: str | None = None) -> None:
         """Compile the kernels that this frame needs."""
@@ -186,44 +154,6 @@ class NerfFrame:
             box = box.split(axis, 1024)[0]
         self.bounds.rays(self._geometry, box.without(COLOR_SHIFTS), self._pixels(np.arange(1)), 1.0)
         self.render(box.middle, np.arange(1))
-
-    def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
-        """Rays [t, 1, 1, 3] float32 of the concrete image at parameter values [d]."""
-        return self.precise(values, tiles).astype(np.float32)
-
-    def precise(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
-        """What `render` rounds: float64."""
-        which = np.arange(self.tile_count) if tiles is None else tiles
-        shift = color_shift(self.pose_set, values)
-        colors = self.renderer.pixels(self.pose_set.camera, self.pose_set.pose(values), self._pixels(which), shift)
-        return colors[:, None, None, :]
-
-    def feasible(self, box: ParameterBox) -> ParameterBox | None:
-        """All of ``box``: every parameter in it belongs to a pose of the set."""
-        return box
-
-    def depths(self) -> None:
-        """A field is everywhere; nothing in it has a distance of its own."""
-
-    def motion(self, box: ParameterBox) -> np.ndarray:
-        """[d] pixels that points at a typical distance move by over each parameter's range (an estimate)."""
-        d = box.dimensions
-        low, high = np.array(box.lower), np.array(box.upper)
-        distance = self.bounds.distances[self.bounds.distances.size // 2]
-        largest = np.zeros(d)
-        here = self._point(box.middle, distance)
-        for k in range(d):
-            step = np.zeros(d)
-            step[k] = _TUNING.motion_step * (high[k] - low[k])
-            moved = np.linalg.norm(self._point(box.middle + step, distance) - here) / _TUNING.motion_step
-            largest[k] = moved / distance * self.camera.fx
-            if box.names[k] in COLOR_SHIFTS:
-                largest[k] = _SHIFT_MOTION * (high[k] - low[k])
-        return largest
-
-    def _point(self, values: np.ndarray, distance: float) -> np.ndarray:
-        pose = self.pose_set.pose(values)
-        return pose[:, 3] - distance * pose[:, 2]
 
     def bound(
         self, box: ParameterBox, tiles: np.ndarray, within: RayContext | None = None, keep_linear: bool = False
@@ -333,33 +263,7 @@ class NerfFrame:
 
     def _tried(self, calls: Sequence[Sequence[Any]]) -> list[RayBounds | None]:
         """See `_run`; None: there was no time for a call."""
-        if len(calls) == 1 or self.workers == 1:
-            parts: list[RayBounds | None] = []
-            with suppress(WorkCancelledError):
-                for call in calls:
-                    parts.append(self.bounds.rays(*call))
-            return parts + [None] * (len(calls) - len(parts))
-        engine = _processes(self.workers)
-        for number, call in enumerate(calls):
-            engine.submit(number, _bound_share, self._token, self._recipe, self.bounds.displacement, call)
-        done: dict[int, RayBounds] = {}
-        patience = None
-        try:
-            while len(done) < len(calls):
-                for number, answer in engine.collect(_PATIENCE):
-                    if not isinstance(answer, WorkCancelledError):
-                        done[number] = answer
-                if patience is None and is_cancelled():
-                    patience = time.monotonic() + _GRACE
-                    engine.abandon()
-                if patience is not None and (not engine.unfinished or time.monotonic() > patience):
-                    break
-        finally:
-            # what is still at work would answer those who ask next
-            if engine.unfinished:
-                _processes.cache_clear()
-                engine.close()
-        return [done.get(number) for number in range(len(calls))]
+        raise NotImplementedError
 
     @cached_property
     def _strips(self) -> PoseStrips:
@@ -481,3 +385,58 @@ class NerfFrame:
         values = [*self.box.sample(_TUNING.look_poses - 2, rng), np.array(self.box.lower), np.array(self.box.upper)]
         pictures = np.stack([self.render(v, tiles) for v in values])
         return float((pictures.max(axis=0) - pictures.min(axis=0)).mean())
+
+
+class NerfFrame(FieldFrame):
+    """Bounds and renders one frame's set of poses of a vanilla NeRF.
+
+    Args:
+        scene: The fields.
+        sampling: Where they are evaluated.
+        pose_set: The poses.
+        device: Where the network is bounded.
+        workers: Processes that bound rays side by side, one core each: the matrices are too small to be shared
+            among cores. Results do not depend on where a ray is bounded, but on what is bounded together.
+    """
+
+    def __init__(
+        self, scene: NerfScene, sampling: Sampling, pose_set: PoseBox, device: str = "cpu", workers: int = 1
+    ) -> None:
+        self._recipe: tuple[Any, ...] = (scene, sampling, pose_set.geometry.box.dimensions, device)
+        self._token = secrets.token_bytes(16)
+        bounds = NerfBounds(*self._recipe)
+        weights = sum(array.size for array in scene.fine.arrays())
+        share = int(np.clip(_WORK // weights, 1, 32)) if bounds.compiled else _RAYS_ON_DEVICE
+        at_once = workers * share * (_SHARES if bounds.compiled and workers > 1 else 1)
+        super().__init__(pose_set, NerfRenderer(scene, sampling, device=device), bounds, share, at_once, workers)
+        self.renderer: NerfRenderer
+
+    def _tried(self, calls: Sequence[Sequence[Any]]) -> list[RayBounds | None]:
+        """See `_run`; None: there was no time for a call."""
+        if len(calls) == 1 or self.workers == 1:
+            parts: list[RayBounds | None] = []
+            with suppress(WorkCancelledError):
+                for call in calls:
+                    parts.append(self.bounds.rays(*call))
+            return parts + [None] * (len(calls) - len(parts))
+        engine = _processes(self.workers)
+        for number, call in enumerate(calls):
+            engine.submit(number, _bound_share, self._token, self._recipe, self.bounds.displacement, call)
+        done: dict[int, RayBounds] = {}
+        patience = None
+        try:
+            while len(done) < len(calls):
+                for number, answer in engine.collect(_PATIENCE):
+                    if not isinstance(answer, WorkCancelledError):
+                        done[number] = answer
+                if patience is None and is_cancelled():
+                    patience = time.monotonic() + _GRACE
+                    engine.abandon()
+                if patience is not None and (not engine.unfinished or time.monotonic() > patience):
+                    break
+        finally:
+            # what is still at work would answer those who ask next
+            if engine.unfinished:
+                _processes.cache_clear()
+                engine.close()
+        return [done.get(number) for number in range(len(calls))]

@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ns_abstract.io.assumptions import Assumption
-from ns_abstract.io.errors import InputError, visible
+from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import is_number, show
 from ns_abstract.methods import config_keys, runs
-from ns_abstract.methods.checkpoint import to_float32
+from ns_abstract.methods.nerf import model_state
+from ns_abstract.methods.nerf.model_state import ModelState
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer, NerfScene
-from ns_abstract.methods.overrides import Overrides, assumption_of
+from ns_abstract.methods.overrides import Overrides
 
 _FIX = "give a run of vanilla-nerf or abstract-nerf"
 _LAYERS_LIMIT = 64
@@ -33,25 +34,6 @@ _FREQUENCIES = {"num_frequencies": 6, "num_direction_frequencies": 2}
 _MAX_EXPONENT, _MAX_EXPONENT_LIMIT = 5.0, 60.0
 _FREQUENCIES_LIMIT = 64
 _STOCK, _OURS = "nerfstudio.models.vanilla_nerf.NeRFModel", "ns_abstract.nerfstudio.nerf.AbstractNerfModel"
-#: nerfstudio/model_components/renderers.py:75-145, utils/colors.py: what it shows outside training; at others, also
-#: of another case, it stops.
-_BACKGROUNDS = {
-    "random": (0.0, 0.0, 0.0),
-    "white": (1.0, 1.0, 1.0),
-    "black": (0.0, 0.0, 0.0),
-    "red": (1.0, 0.0, 0.0),
-    "green": (0.0, 1.0, 0.0),
-    "blue": (0.0, 0.0, 1.0),
-}
-#: Modules of vanilla NeRF that draw nothing in evaluation, and what they are for.
-_IDLE = {
-    "device_indicator_param": "no values",
-    "lpips.": "a metric",
-    "psnr.": "a metric",
-    "ssim.": "a metric",
-    "camera_optimizer.": "poses of the training pictures, used in training alone",
-}
-_SHOWN = 8
 #: nerfstudio/models/base_model.py: default of ``collider_params``.
 _PLANES = {"near_plane": 2.0, "far_plane": 6.0}
 
@@ -72,16 +54,14 @@ def load_nerf(run: runs.RunConfig, overrides: Overrides | None = None) -> NerfSc
         InputError: For any content of the files, or an override, that cannot be used.
     """
     overrides = overrides or Overrides()
-    splats = ("rasterize_mode", "assume_splatfacto", "drop_nan_gaussians")
-    overrides.refuse(splats, "is for splats, this run is a NeRF")
-    _refuse_other_class(run)
+    model_state.check_model(run, overrides, (_STOCK, _OURS), "vanilla-nerf", _FIX)
     unused = config_keys.check_keys(run, config_keys.VANILLA_NERF)
-    color = _background(run, overrides)
+    color = _color(run, overrides)
     coarse_samples = run.integer("num_coarse_samples", 64, 1, _SAMPLES_LIMIT)
     importance_samples = run.integer("num_importance_samples", 128, 1, _SAMPLES_LIMIT)
     transform, notes = runs.read_dataparser_transform(run)
     checkpoint = runs.find_checkpoint(run, overrides.load_step)
-    state = _ReadState(runs.read_model_state(checkpoint))
+    state = ModelState(runs.read_model_state(checkpoint))
     if not any(key.startswith("field_fine.") for key in state):
         raise InputError(
             f"no NeRF fields in this checkpoint (method {show(run.method_name)})",
@@ -93,10 +73,7 @@ def load_nerf(run: runs.RunConfig, overrides: Overrides | None = None) -> NerfSc
     coarse, fine = (
         field_weights(state, name, checkpoint, exponents, counts) for name in ("field_coarse", "field_fine")
     )
-    _refuse_unknown(state, checkpoint)
-    target = runs.target_class(run)
-    whose = "config.yml: pipeline.model._target" if target else "default: config.yml names no class"
-    units = "dataparser_transforms.json" if not notes else "default: dataparser_transforms.json is missing"
+    state.refuse_unread(checkpoint, "vanilla-nerf", _FIX)
     return NerfScene(
         coarse=coarse,
         fine=fine,
@@ -112,75 +89,22 @@ def load_nerf(run: runs.RunConfig, overrides: Overrides | None = None) -> NerfSc
         notes=(*notes, *unused),
         assumptions=(
             color[0],
-            runs.step_assumption(run, checkpoint, overrides.load_step),
-            Assumption("model", target or _STOCK.rpartition(".")[2], whose),
-            *(
-                Assumption(f"module {prefix.rstrip('.')}", f"left out: {why}", "checkpoint")
-                for prefix, why in _IDLE.items()
-                if why != "no values" and any(key.startswith(prefix) for key in state)
-            ),
-            Assumption("units", f"1 of the data set is {transform.scale:.9g}", units),
+            *model_state.records(run, state, checkpoint, overrides, _STOCK, transform, bool(notes)),
         ),
     )
 
 
-class _ReadState(dict[str, Any]):
-    """A model's state that remembers which tensors were read."""
-
-    def __init__(self, state: Mapping[str, Any]) -> None:
-        super().__init__(state)
-        self.read: set[str] = set()
-
-    def __getitem__(self, key: str) -> Any:
-        self.read.add(key)
-        return super().__getitem__(key)
-
-
-def _refuse_other_class(run: runs.RunConfig) -> None:
-    """Refuse model classes whose picture may not be that of the two fields."""
-    target = runs.target_class(run)
-    if target and target not in (_STOCK, _OURS):
-        raise InputError(
-            f"names the model class {show(target)}, which may draw another picture than vanilla-nerf",
-            file=run.file,
-            field="pipeline.model._target",
-            fix=_FIX,
-        )
-
-
-def _background(run: runs.RunConfig, overrides: Overrides) -> tuple[Assumption, NDArray[np.float32]]:
+def _color(run: runs.RunConfig, overrides: Overrides) -> tuple[Assumption, NDArray[np.float32]]:
     """The record of the background's choice, and its colour."""
-    named, origin = "background_color" in run.model, "config.yml: pipeline.model.background_color"
-    if str(run.model.get("background_color")).lower() == "last_sample":
-        if overrides.background is None:
-            raise InputError(
-                "last_sample, which continues the colour of a ray's last sample, is not supported",
-                file=run.file,
-                field="pipeline.model.background_color",
-                fix="give --background R G B to bound the field before a constant colour, which is another picture",
-            )
-        stored: Any = "last_sample"
-    else:
-        stored = tuple(float(part) for part in run.color("background_color", "white", _BACKGROUNDS))
-        if named and not isinstance(run.model["background_color"], str):
-            origin += ", three numbers, at which Nerfstudio's own model stops"
-    override = overrides.background
-    record = assumption_of(
-        "background", override, "--background", stored, origin if named else "default of nerfstudio 1.1.5"
-    )
-    return record, np.array(stored if override is None else override, np.float32)
-
-
-def _refuse_unknown(state: _ReadState, checkpoint: Path) -> None:
-    unknown = sorted(key for key in state if key not in state.read and not key.startswith(tuple(_IDLE)))
-    if unknown:
-        more = f" and {len(unknown) - _SHOWN} more" if len(unknown) > _SHOWN else ""
+    record, color = model_state.background(run, overrides, "white")
+    if isinstance(color, str):
         raise InputError(
-            f"holds tensors that vanilla-nerf does not have: {visible(', '.join(unknown[:_SHOWN]))}{more}",
-            file=checkpoint,
-            field="pipeline",
-            fix=_FIX,
+            "last_sample, which continues the colour of a ray's last sample, is not supported",
+            file=run.file,
+            field="pipeline.model.background_color",
+            fix="give --background R G B to bound the field before a constant colour, which is another picture",
         )
+    return record, color
 
 
 def _encodings(run: runs.RunConfig) -> tuple[tuple[float, float], tuple[int | None, int | None]]:
@@ -236,16 +160,7 @@ def field_weights(
     """
 
     def layer(key: str, skip: bool = False) -> Layer:
-        where = f"pipeline._model.{name}.{key}"
-        for part in ("weight", "bias"):
-            if f"{name}.{key}.{part}" not in state:
-                raise InputError("missing", file=file, field=f"{where}.{part}", fix=_FIX)
-        weight = to_float32(state[f"{name}.{key}.weight"], file, f"{where}.weight")
-        bias = to_float32(state[f"{name}.{key}.bias"], file, f"{where}.bias")
-        if weight.ndim != 2 or 0 in weight.shape or bias.shape != weight.shape[:1]:
-            problem = f"shapes {list(weight.shape)} and {list(bias.shape)} are not those of a linear layer"
-            raise InputError(problem, file=file, field=where, fix=_FIX)
-        return Layer(weight, bias, skip)
+        return Layer(*model_state.read_linear(state, f"{name}.{key}", file, _FIX), skip)
 
     def layers(key: str) -> list[Layer]:
         layer_list = []

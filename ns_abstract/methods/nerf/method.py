@@ -9,18 +9,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.bounds import basis_of, device_bytes
 from ns_abstract.methods.nerf.device import check_device, processes_that_fit
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.occupancy import VOXEL_BYTES, OccupancyGrid
+from ns_abstract.methods.nerf.ray_pictures import FieldMethod, check_arithmetic
 from ns_abstract.methods.nerf.render import Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.nerf.weights import NerfWeightFrame
-from ns_abstract.perturbation.specification import Perturbation
-from ns_abstract.refine.protocol import Frame, WeightPlane
+from ns_abstract.refine.protocol import WeightPlane
 
 if TYPE_CHECKING:
     import torch
@@ -30,7 +29,7 @@ _SAMPLES = 64
 _SAMPLES_LIMIT = 4096
 
 
-class NerfMethod:
+class NerfMethod(FieldMethod):
     """A vanilla NeRF and the program that is bounded: the fine field at N uniform samples.
 
     Args:
@@ -62,12 +61,7 @@ class NerfMethod:
     ) -> None:
         if renderer not in (None, "paper"):
             raise InputError(f"{renderer} draws splats, this run is a NeRF", field="--renderer", fix="leave it out")
-        if arithmetic not in (None, "real"):
-            raise InputError(
-                "float32 evaluations of a NeRF's networks cannot be enclosed tightly",
-                field="--arithmetic",
-                fix="use real",
-            )
+        check_arithmetic(arithmetic)
         if sampling not in (None, "uniform", "hierarchical"):
             raise InputError(f"found {sampling}", field="--sampling", fix="use uniform or hierarchical")
         hierarchical = sampling == "hierarchical"
@@ -85,6 +79,7 @@ class NerfMethod:
         near = scene.near if near_plane is None else near_plane
         if not 0.0 <= near < scene.far:
             raise InputError(f"found {near}", field="--near-plane", fix=f"give 0 or more, below {scene.far:g}")
+        super().__init__(scene)
         self.scene = scene if occupancy is None else replace(scene, occupancy=occupancy)
         self.workers = workers
         self.device = check_device(device)
@@ -95,21 +90,6 @@ class NerfMethod:
         if hierarchical:
             bins, importance = scene.coarse_samples, scene.importance_samples
             self.sampling = Sampling("hierarchical", near, scene.far, bins, importance, (red, green, blue))
-
-    @property
-    def name(self) -> str:
-        """The scene's name."""
-        return self.scene.name
-
-    @property
-    def notes(self) -> tuple[str, ...]:
-        """What was assumed on reading the scene."""
-        return tuple(self.scene.notes)
-
-    @property
-    def dataset_scale(self) -> float:
-        """Normalised units per unit of the data set."""
-        return self.scene.dataparser.scale
 
     @property
     def program(self) -> dict[str, Any]:
@@ -125,11 +105,6 @@ class NerfMethod:
             "near": s.near,
             "far": s.far,
         }
-
-    @property
-    def guarantee(self) -> str:
-        """What bounds of this program are called."""
-        return "real-sound"
 
     @property
     def content(self) -> str:
@@ -165,22 +140,6 @@ class NerfMethod:
     def ablations(self, poses: PoseBox) -> Iterator[tuple[str, NerfFrame]]:
         """None are known."""
         return iter(())
-
-    def attribution(self, frame: Frame, box: ParameterBox, tile: int, count: int) -> list[tuple[int, float]]:
-        """A field has no elements."""
-        return []
-
-    def elements(self) -> None:
-        """A field has none."""
-
-    def prepare(self, perturbations: Sequence[Perturbation]) -> None:
-        """Refuse what needs Gaussians.
-
-        Raises:
-            InputError: A set varies the scene.
-        """
-        if any(perturbation.scene for perturbation in perturbations):
-            raise InputError("a NeRF has no Gaussians", field="scene", fix="leave the key out")
 
     def memory(self, pixels: int, threads: int) -> int:
         """See `Method.memory`; rays are bounded one after another."""

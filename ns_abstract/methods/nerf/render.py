@@ -8,7 +8,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 import numpy as np
 import torch
@@ -110,9 +110,9 @@ class NerfRenderer:
         bins = bins.expand(directions.shape[0], -1)
         if s.kind == "hierarchical":
             density, _, _ = self._densities(self.coarse, origin, world, bins)
-            bins = self._refined(bins, _weights(density, self._lengths(bins)))
+            bins = self._refined(bins, interval_weights(density, self._lengths(bins)))
         density, base, inside = self._densities(self.fine, origin, world, bins)
-        weights = _weights(density, self._lengths(bins))
+        weights = interval_weights(density, self._lengths(bins))
         if self.white is not None:
             distances = self._middles(bins)
             color = self.white.at(origin + world[:, None] * distances[..., None], distances)
@@ -135,8 +135,7 @@ class NerfRenderer:
         """Colours [n, 3] float64 of ``pixels`` [n, 2] (row, column) from camera-to-world ``pose`` [3, 4]."""
         directions = torch.from_numpy(camera_rays(camera, pixels)).to(self.device, self.dtype)
         matrix = torch.tensor(np.asarray(pose)).to(self.device, self.dtype)
-        count = self.sampling.samples + (self.sampling.importance if self.sampling.kind == "hierarchical" else 0)
-        step = max(1, _CHUNK // count)
+        step = max(1, _CHUNK // self.points)
         with torch.inference_mode():
             parts = []
             for part in directions.split(step):
@@ -149,21 +148,15 @@ class NerfRenderer:
         grid = np.indices((camera.height, camera.width)).reshape(2, -1).T
         return self.pixels(camera, pose, grid, shift).reshape(camera.height, camera.width, 3)
 
+    @property
+    def points(self) -> int:
+        """Points that are evaluated for a ray."""
+        s = self.sampling
+        return s.samples + (s.importance if s.kind == "hierarchical" else 0)
+
     def picture(self, camera: PinholeCamera, pose: Tensor, shift: Shift | None = None) -> Tensor:
-        """The image [H, W, 3] from camera-to-world ``pose`` [3, 4]; differentiable.
-
-        Rays are worked on some at a time, and once more where slopes are asked for, so that memory stays small.
-        """
-        grid = np.indices((camera.height, camera.width)).reshape(2, -1).T
-        directions = torch.from_numpy(camera_rays(camera, grid)).to(self.device, self.dtype)
-        count = self.sampling.samples + (self.sampling.importance if self.sampling.kind == "hierarchical" else 0)
-
-        def part(pose: Tensor, directions: Tensor) -> Tensor:
-            check_cancelled()
-            return self.rays(pose, directions, shift)
-
-        parts = [recompute(part, pose, some, use_reentrant=False) for some in directions.split(max(1, _CHUNK // count))]
-        return torch.cat(parts).reshape(camera.height, camera.width, 3)
+        """The image [H, W, 3] from camera-to-world ``pose`` [3, 4]; differentiable."""
+        return differentiable_picture(self, camera, pose, shift, self.device, self.dtype)
 
     def _distances(self, bins: Tensor) -> Tensor:
         s = self.sampling
@@ -209,6 +202,43 @@ class NerfRenderer:
         return torch.sort(torch.cat([bins, new], dim=-1), dim=-1).values.detach()
 
 
+class DifferentiableRays(Protocol):
+    """Draws rays by differentiable operations."""
+
+    @property
+    def points(self) -> int:
+        """Points that are evaluated for a ray."""
+        ...
+
+    def rays(self, pose: Tensor, directions: Tensor, shift: Shift | None = None) -> Tensor:
+        """Colours [n, 3] along camera-axes ``directions`` [n, 3] from ``pose`` [3, 4]."""
+        ...
+
+
+def differentiable_picture(
+    field: DifferentiableRays,
+    camera: PinholeCamera,
+    pose: Tensor,
+    shift: Shift | None = None,
+    device: torch.device | str = "cpu",
+    dtype: torch.dtype = torch.float64,
+) -> Tensor:
+    """The image [H, W, 3] of a field from camera-to-world ``pose`` [3, 4]; differentiable.
+
+    Rays are worked on some at a time, and once more where slopes are asked for, so that memory stays small.
+    """
+    grid = np.indices((camera.height, camera.width)).reshape(2, -1).T
+    directions = torch.from_numpy(camera_rays(camera, grid)).to(device, dtype)
+
+    def part(pose: Tensor, directions: Tensor) -> Tensor:
+        check_cancelled()
+        return field.rays(pose, directions, shift)
+
+    step = max(1, _CHUNK // field.points)
+    parts = [recompute(part, pose, some, use_reentrant=False) for some in directions.split(step)]
+    return torch.cat(parts).reshape(camera.height, camera.width, 3)
+
+
 def _filled(values: Tensor, inside: Any) -> Tensor:
     """``values`` [p, ...] in the places ``inside`` [n, k], zeros elsewhere; all of them where it selects all."""
     if inside is ...:
@@ -216,7 +246,7 @@ def _filled(values: Tensor, inside: Any) -> Tensor:
     return values.new_zeros((*inside.shape, *values.shape[1:])).index_put(inside.nonzero(as_tuple=True), values)
 
 
-def _weights(density: Tensor, lengths: Tensor) -> Tensor:
+def interval_weights(density: Tensor, lengths: Tensor) -> Tensor:
     """Weights [n, k] of densities [n, k] on bins of ``lengths`` [n, k] (``RaySamples.get_weights``)."""
     depth = lengths * density
     before = torch.cumsum(depth, dim=1) - depth

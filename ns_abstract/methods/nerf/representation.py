@@ -1,11 +1,13 @@
-"""The representation of vanilla-NeRF runs; torch and the bounds are imported when one is opened."""
+"""The representations of vanilla-NeRF and nerfacto runs; torch and the bounds are imported when one is opened."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from ns_abstract.methods.nerf.hash_field import NerfactoScene
 from ns_abstract.methods.nerf.load import holds_nerf, load_nerf
+from ns_abstract.methods.nerf.nerfacto_load import holds_nerfacto, load_nerfacto
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.representation import ProgramOptions, Representation
@@ -13,6 +15,7 @@ from ns_abstract.methods.runs import RunConfig
 
 if TYPE_CHECKING:
     from ns_abstract.methods.nerf.method import NerfMethod
+    from ns_abstract.methods.nerf.nerfacto_method import NerfactoMethod
 
 
 def _load(source: RunConfig | Path, overrides: Overrides) -> NerfScene:
@@ -32,4 +35,23 @@ def _method(scene: NerfScene, options: ProgramOptions, arithmetic: str | None, w
     )  # fmt: skip
 
 
+def _load_nerfacto(source: RunConfig | Path, overrides: Overrides) -> NerfactoScene:
+    assert isinstance(source, RunConfig)
+    return load_nerfacto(source, overrides)
+
+
+def _nerfacto_method(
+    scene: NerfactoScene, options: ProgramOptions, arithmetic: str | None, workers: int
+) -> NerfactoMethod:
+    from ns_abstract.methods.nerf.nerfacto_method import NerfactoMethod
+
+    return NerfactoMethod(scene, options, arithmetic, workers)
+
+
 NERF = Representation(lambda source: isinstance(source, RunConfig) and holds_nerf(source), _load, _method, rays=True)
+NERFACTO = Representation(
+    lambda source: isinstance(source, RunConfig) and holds_nerfacto(source),
+    _load_nerfacto,
+    _nerfacto_method,
+    rays=True,
+)

@@ -13,13 +13,14 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 
 from ns_abstract.arithmetic.rounding import PART_END_ROUNDING
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseBox
-from ns_abstract.methods.nerf.bounds import NerfBounds, RayBounds, Shifts
+from ns_abstract.methods.nerf.bounds import RayBounds, Shifts
 from ns_abstract.methods.nerf.division import Division
 from ns_abstract.methods.nerf.planes import fit_planes
 from ns_abstract.methods.nerf.ray_bundle import RayBundle
@@ -78,6 +79,35 @@ class StripLayout:
     displacement: float
 
 
+class FieldBounds(Protocol):
+    """Bounds of a field's rays over boxes of poses."""
+
+    #: Half the way of a sample over a first cell, as learned from earlier rays.
+    displacement: float
+    #: [samples] distances, and lengths of bins around them.
+    distances: np.ndarray
+    lengths: np.ndarray
+    #: Degree of the Taylor models of poses.
+    taylor: int
+
+    @property
+    def compiled(self) -> bool:
+        """Whether kernels for a processor bound rays, a few at a time."""
+        ...
+
+    def division(self, moves: np.ndarray, most: int = ..., deeper: int | None = None) -> Division | None:
+        """The cells of a box, as wide as the network's bounds bear; see `NerfBounds.division`."""
+        ...
+
+    def rays(
+        self, pose_set: PoseBox, box: ParameterBox, pixels: np.ndarray, tolerance: float,
+        known: np.ndarray | None = None, aim: tuple[np.ndarray, np.ndarray] | None = None,
+        shifts: list[Shifts] | None = None, division: Division | None = None,
+    ) -> RayBounds:  # fmt: skip
+        """Bounds of the colours of ``pixels``; see `NerfBounds.rays`."""
+        ...
+
+
 class PoseStrips:
     """Bounds of all rays of a frame over strips of its set (design.md, F13).
 
@@ -88,12 +118,12 @@ class PoseStrips:
         run: Bounds groups of rays, here or in other processes.
     """
 
-    def __init__(self, bounds: NerfBounds, pose_set: PoseBox, pixels: np.ndarray, run: Run) -> None:
+    def __init__(self, bounds: FieldBounds, pose_set: PoseBox, pixels: np.ndarray, run: Run) -> None:
         self.bounds, self.pose_set, self.geometry = bounds, pose_set, pose_set.geometry
         self.pixels, self.run = pixels, run
         self.poses = self.geometry.box
         self.shifting = tuple(name for name in pose_set.box.names if name in COLOR_SHIFTS)
-        group = _GROUP if bounds.field.compiled else _GROUP_ON_DEVICE
+        group = _GROUP if bounds.compiled else _GROUP_ON_DEVICE
         self.groups = [slice(k, min(k + group, len(pixels))) for k in range(0, len(pixels), group)]
         self._known: OrderedDict[tuple, _StripBounds] = OrderedDict()
         self._bytes = 0

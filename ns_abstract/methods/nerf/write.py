@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from string import Template
 
@@ -35,6 +35,7 @@ def write_nerf_run(
         InputError: ``timestamp`` or ``experiment_name`` is not a plain folder name.
     """
     config = _CONFIG.safe_substitute(
+        datamanager=DATAMANAGER,
         background=background_name(scene.background),
         far=repr(float(scene.far)),
         coarse=scene.coarse_samples,
@@ -43,24 +44,38 @@ def write_nerf_run(
     # a data set of its own: a Splatfacto run may stand in the same folder
     return write_run(
         scene, Path(folder), "vanilla-nerf", timestamp, experiment_name, data=f"data-{experiment_name}",
-        checkpoint=_checkpoint_bytes(scene), config=config, steps=_STEPS, views=views, render=render,
+        checkpoint=checkpoint_bytes(_pipeline(scene), ("fields",)), config=config, steps=STEPS, views=views,
+        render=render,
     )  # fmt: skip
 
 
-def _checkpoint_bytes(scene: NerfScene) -> bytes:
-    """A checkpoint of plain tensors, numbers, lists and dictionaries: loads with weights_only."""
+def _pipeline(scene: NerfScene) -> dict[str, ArrayLike]:
+    """The fields' arrays under Nerfstudio's names."""
+    return {
+        f"field_{name}.{key}": array
+        for name, weights in (("coarse", scene.coarse), ("fine", scene.fine))
+        for key, array in _named(weights).items()
+    }
+
+
+def checkpoint_bytes(model: Mapping[str, ArrayLike], optimizers: Sequence[str]) -> bytes:
+    """A checkpoint of plain tensors, numbers, lists and dictionaries: loads with weights_only.
+
+    Args:
+        model: Arrays of the model by name; equal objects are stored once.
+        optimizers: Names of the groups of parameters.
+    """
     import torch
 
+    tensors = {id(array): torch.tensor(array) for array in model.values()}
     pipeline = {"_model.device_indicator_param": torch.empty(0, dtype=torch.float32)}
-    for name, weights in (("coarse", scene.coarse), ("fine", scene.fine)):
-        for key, array in _named(weights).items():
-            pipeline[f"_model.field_{name}.{key}"] = torch.tensor(array)
+    pipeline |= {f"_model.{key}": tensors[id(array)] for key, array in model.items()}
     pipeline |= lpips_state("_model.lpips.net.")
     group = {"lr": 0.0005, "betas": (0.9, 0.999), "eps": 1e-8, "weight_decay": 0, "params": []}
     state = {
         "step": STEP,
         "pipeline": pipeline,
-        "optimizers": {"fields": {"state": {}, "param_groups": [group]}},
+        "optimizers": {name: {"state": {}, "param_groups": [group]} for name in optimizers},
         "schedulers": {},
         "scalers": {},
     }
@@ -78,30 +93,8 @@ def _named(weights: FieldWeights) -> dict[str, ArrayLike]:
     return {f"{key}.{part}": getattr(layer, part) for key, layer in layers.items() for part in ("weight", "bias")}
 
 
-# what config.yml of vanilla-nerf says; $dataparser is for the writer
-_CONFIG = Template(
-    """\
-max_num_iterations: 1000000
-method_name: vanilla-nerf
-mixed_precision: false
-optimizers:
-  fields:
-    optimizer: !!python/object:nerfstudio.engine.optimizers.RAdamOptimizerConfig
-      _target: &id001 !!python/name:torch.optim.radam.RAdam ''
-      eps: 1.0e-08
-      lr: 0.0005
-      max_norm: null
-      weight_decay: 0
-    scheduler: null
-  temporal_distortion:
-    optimizer: !!python/object:nerfstudio.engine.optimizers.RAdamOptimizerConfig
-      _target: *id001
-      eps: 1.0e-08
-      lr: 0.0005
-      max_norm: null
-      weight_decay: 0
-    scheduler: null
-output_dir: !!python/object/apply:pathlib.PosixPath []
+# what config.yml of both methods says of data; $dataparser is for the writer
+DATAMANAGER = """\
 pipeline: !!python/object:nerfstudio.pipelines.base_pipeline.VanillaPipelineConfig
   _target: !!python/name:nerfstudio.pipelines.base_pipeline.VanillaPipeline ''
   datamanager: !!python/object:nerfstudio.data.datamanagers.base_datamanager.VanillaDataManagerConfig
@@ -130,7 +123,32 @@ $dataparser
       rejection_sample_mask: true
     train_num_images_to_sample_from: -1
     train_num_rays_per_batch: 1024
-    train_num_times_to_repeat_images: -1
+    train_num_times_to_repeat_images: -1"""
+# what config.yml of vanilla-nerf says
+_CONFIG = Template(
+    """\
+max_num_iterations: 1000000
+method_name: vanilla-nerf
+mixed_precision: false
+optimizers:
+  fields:
+    optimizer: !!python/object:nerfstudio.engine.optimizers.RAdamOptimizerConfig
+      _target: &id001 !!python/name:torch.optim.radam.RAdam ''
+      eps: 1.0e-08
+      lr: 0.0005
+      max_norm: null
+      weight_decay: 0
+    scheduler: null
+  temporal_distortion:
+    optimizer: !!python/object:nerfstudio.engine.optimizers.RAdamOptimizerConfig
+      _target: *id001
+      eps: 1.0e-08
+      lr: 0.0005
+      max_norm: null
+      weight_decay: 0
+    scheduler: null
+output_dir: !!python/object/apply:pathlib.PosixPath []
+$datamanager
   model: !!python/object:nerfstudio.models.vanilla_nerf.VanillaModelConfig
     _target: !!python/name:nerfstudio.models.vanilla_nerf.NeRFModel ''
     background_color: $background
@@ -151,7 +169,7 @@ $dataparser
       - dnerf
     use_gradient_scaling: false"""
 )
-_STEPS = """\
+STEPS = """\
 steps_per_eval_all_images: 25000
 steps_per_eval_batch: 500
 steps_per_eval_image: 500

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from ns_abstract.arithmetic.rounding import (
     FRAGMENT_ROUNDING,
     GRAM_ROOM,
     GRAM_UP,
+    REAL,
     REGION,
     SHIFTED_ROUNDING,
     STILL_POSITION,
@@ -31,8 +32,9 @@ from ns_abstract.methods.splat.colors import color_magnitudes, fixed_colors, gat
 from ns_abstract.methods.splat.constants import Rasteriser, RasterRules, raster_rules
 from ns_abstract.methods.splat.gaussians import covariance_noise, gaussian_stage
 from ns_abstract.methods.splat.lists import TileLists, depth_order, pixel_sets, tile_lists, tile_mask, visible_again
+from ns_abstract.methods.splat.pixel_regions import exponent_limits
 from ns_abstract.methods.splat.pixels import pixel_stage
-from ns_abstract.methods.splat.projection_errors import columns, exponent_limits
+from ns_abstract.methods.splat.projection_errors import columns
 from ns_abstract.methods.splat.stage_data import (
     CellPoses,
     Colors,
@@ -50,27 +52,22 @@ from ns_abstract.methods.splat.stage_data import (
 )
 from ns_abstract.methods.splat.variations import VariedSplats
 
-#: Kernels of a cell that write into memory that they are given, the slowest to compile first.
-STAGES = ("pixel_stage", "gaussian_stage", "moving_colors")
 #: Most pairs of fragments whose depth order is examined in one block of pixels.
 PAIR_LIMIT = 30_000
 
 
-@contextmanager
-def compile_alone(stage: str) -> Iterator[None]:
-    """Replace all `STAGES` but one by no-ops inside the block, so that only that one is compiled.
+class Stages(NamedTuple):
+    """Kernels of a cell, which write into memory that they are given; the slowest to compile first."""
 
-    What `SplatBounds.cell` then returns is no bound of anything.
-    """
-    stages = {name: globals()[name] for name in STAGES}
-    nothing = {name: lambda *arguments: None for name in STAGES}
-    # nothing is seen
-    nothing["gaussian_stage"] = lambda *arguments: arguments[-1].fill(0)
-    globals().update({name: nothing[name] for name in STAGES if name != stage})
-    try:
-        yield
-    finally:
-        globals().update(stages)
+    pixel_stage: Callable[..., object] = pixel_stage
+    gaussian_stage: Callable[..., object] = gaussian_stage
+    moving_colors: Callable[..., object] = moving_colors
+
+    def alone(self, stage: str) -> Stages:
+        """The same with no-ops in place of all but one: what `SplatBounds.cell` then returns bounds nothing."""
+        # no Gaussian is seen
+        nothing = Stages(lambda *_: None, lambda *arguments: arguments[-1].fill(0), lambda *_: None)
+        return nothing._replace(**{stage: getattr(self, stage)})
 
 
 @dataclass
@@ -169,7 +166,12 @@ class SplatBounds:
         arithmetic: What that program computes with.
         varied: The set of scenes that is bounded with each pose; None: ``splats`` alone.
         sums: Those of this scene, where other frames have them, too.
+
+    Attributes:
+        stages: The compiled kernels that `cell` runs.
     """
+
+    stages = Stages()
 
     def __init__(
         self,
@@ -183,7 +185,9 @@ class SplatBounds:
         self.varied = VariedSplats.fixed(splats) if varied is None else varied
         self.rasteriser = rasteriser
         self.arithmetic = arithmetic
-        self.rules = raster_rules(rasteriser, splats.antialiased)
+        rules = raster_rules(rasteriser, splats.antialiased)
+        # G12: tiles from 1.5 on change no picture in real numbers, and our renderer has none
+        self.rules = rules._replace(tile_room=0.0) if arithmetic == REAL else rules
         self.side = rasteriser.work_tile
         self.charges = charges(arithmetic)
         self._buffers: dict[tuple[int, str], np.ndarray] = {}
@@ -269,7 +273,7 @@ class SplatBounds:
             cell_parts(np.ones(shape.dimensions, np.int64) if parts is None else parts),
         )
         sets = pixel_sets(np.broadcast_to(True, bounds.lower.shape[:3]) if pixels is None else pixels)
-        pixel_stage(TileLists(wanted, offsets, entries), sets, inputs, bounds)
+        self.stages.pixel_stage(TileLists(wanted, offsets, entries), sets, inputs, bounds)
         return CellBounds(
             wanted, bounds.lower, bounds.upper,
             *visible_again(bounds.marks, candidates, gaussians.box, gaussians.tiles, self.side),
@@ -283,7 +287,7 @@ class SplatBounds:
         """The candidates' forms, and the places [k] of those that some pose shows."""
         n = candidates.size
         gaussians, state = self._room(n, shape.monomials), self._buffer("state", (n,), np.uint8)
-        gaussian_stage(
+        self.stages.gaussian_stage(
             candidates, self._sums.gaussians, poses, camera.intrinsics, self.rules, self.charges, shape, gaussians,
             state,
         )  # fmt: skip
@@ -395,7 +399,9 @@ class SplatBounds:
         self._seen_from.pop(lane(), None)
         shape = form_shape(position.basis)
         colors = self._buffer("colors", (n, 3 * (shape.monomials + 1)))
-        moving_colors(indices, scene, position.data, forms.origin, position_error, self.charges, shape, colors)
+        self.stages.moving_colors(
+            indices, scene, position.data, forms.origin, position_error, self.charges, shape, colors
+        )
         return colors
 
 

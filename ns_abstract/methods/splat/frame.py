@@ -18,7 +18,7 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseBox, translation_only
 from ns_abstract.geometry.tiles import laid_out, tile_grid
 from ns_abstract.methods.splat.activate import Splats
-from ns_abstract.methods.splat.bounds import STAGES, SceneSums, SplatBounds, compile_alone
+from ns_abstract.methods.splat.bounds import SceneSums, SplatBounds, Stages
 from ns_abstract.methods.splat.constants import Rasteriser
 from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW, DEPTH_HIGH, DEPTH_LOW
 from ns_abstract.methods.splat.lists import summed_area, touching
@@ -164,7 +164,7 @@ class SplatFrame:
     #: What tiles share is most of the work: every call bounds as many as it is given.
     tilewise = False
     tiles_at_once: int | None = None
-    stages = (*STAGES, "render")
+    stages = (*Stages._fields, "render")
     #: Poses rendered in every part of a cell that is split.
     witnesses = 1
 
@@ -211,8 +211,11 @@ class SplatFrame:
         if stage is None:
             self.bound(box, np.arange(1))
         elif stage != "render":
-            with compile_alone(stage):
+            whole, self.bounds.stages = self.bounds.stages, self.bounds.stages.alone(stage)
+            try:
                 self.bound(box, np.arange(1))
+            finally:
+                self.bounds.stages = whole
         if stage in (None, "render"):
             self.render(box.middle)
 

@@ -137,14 +137,14 @@ class SplatOrder:
         orders = self._orders(visible)
         if orders is None:
             return None
-        found = []
+        by_order = []
         for ranks in orders:
             pair = []
             for frame, bounds, names, context in zip(self.frames, self._bounds, self.names, visible, strict=True):
                 bounds.ranks = ranks[names]
                 pair.append(frame.bound(box, np.array([tile]), context, True, pixels[None]))
-            found.append((pair[0], pair[1]))
-        return found
+            by_order.append((pair[0], pair[1]))
+        return by_order
 
     def _orders(self, visible: list[Any]) -> list[np.ndarray] | None:
         """[names] ranks of the Gaussians that either scene may show, for every order that they may have."""
@@ -165,12 +165,12 @@ class SplatOrder:
         total = int(np.prod([len(c) for c in choices], dtype=np.float64)) if choices else 1
         if not 1 < total <= _TUNING.most_orders:
             return None
-        found = []
+        orders = []
         for chosen in itertools.product(*choices):
             ranks = np.zeros(self.count)
             ranks[union[list(itertools.chain(*chosen))]] = np.arange(union.size)
-            found.append(ranks)
-        return found
+            orders.append(ranks)
+        return orders
 
 
 def uncertain(delta: np.ndarray, error: np.ndarray, slope: np.ndarray) -> np.ndarray:

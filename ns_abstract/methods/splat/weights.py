@@ -154,8 +154,8 @@ class SplatWeightFrame(SplatFrame):
         rotation, position = self.pose_set.world_to_camera(values)
         scene = self.varied.nearest if member is None else member
         colors = self.white.at((scene.means - position) @ rotation[2])
-        shown = replace(self._black, means=scene.means, opacity=scene.opacity, sh=colors[:, None])
-        return self.renderer.tiles(self.camera, rotation, position, tiles, shown)
+        weighted = replace(self._black, means=scene.means, opacity=scene.opacity, sh=colors[:, None])
+        return self.renderer.tiles(self.camera, rotation, position, tiles, weighted)
 
     def of_sample(self, values: np.ndarray, sample: SceneSample | None) -> np.ndarray:
         """See `ns_abstract.refine.protocol.WeightFrame`."""

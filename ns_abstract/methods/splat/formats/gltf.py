@@ -199,8 +199,8 @@ def _harmonics(attributes: dict[str, int]) -> list[str]:
             raise InputError("missing", field=f"{_EXTENSION}:{wanted[there.index(False)]}", fix=_AGAIN)
         names += wanted
     # COLOR_0 is for programs that draw points
-    known = {"POSITION", "COLOR_0", *(f"{_EXTENSION}:{name}" for name in (*_ATTRIBUTES, *names))}
-    if unknown := sorted(set(attributes) - known):
+    readable = {"POSITION", "COLOR_0", *(f"{_EXTENSION}:{name}" for name in (*_ATTRIBUTES, *names))}
+    if unknown := sorted(set(attributes) - readable):
         raise InputError(
             f"holds {', '.join(unknown)[:120]}", field="attributes", fix="export with degree 3 or less, as .ply"
         )
@@ -241,10 +241,10 @@ class _Accessors:
     ) -> NDArray[np.float64]:
         """[count, width] numbers of an attribute."""
         accessor = self._at(self.accessors, attributes[name], name)
-        given = accessor.get("componentType"), accessor.get("type"), accessor.get("count")
-        component = given[0]
-        if component not in types or given[1] != kind or given[2] != count or type(component) is not int:
-            problem = f"{show(given[2])} rows of {show(given[1])}, component type {show(given[0])}"
+        stored = accessor.get("componentType"), accessor.get("type"), accessor.get("count")
+        component = stored[0]
+        if component not in types or stored[1] != kind or stored[2] != count or type(component) is not int:
+            problem = f"{show(stored[2])} rows of {show(stored[1])}, component type {show(stored[0])}"
             raise InputError(problem, field=name, fix=f"store {count} rows of {kind} as float32")
         scaled = accessor.get("normalized", False)
         if "sparse" in accessor or "extensions" in accessor or type(scaled) is not bool:

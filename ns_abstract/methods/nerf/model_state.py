@@ -1,0 +1,165 @@
+"""What the loaders of both kinds of fields share: the model's class, its tensors, its background, and its records."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ns_abstract.geometry.transform import DataparserTransform
+from ns_abstract.io.assumptions import Assumption
+from ns_abstract.io.errors import InputError, visible
+from ns_abstract.io.jsonio import show
+from ns_abstract.methods import runs
+from ns_abstract.methods.checkpoint import to_float32
+from ns_abstract.methods.overrides import Overrides, assumption_of
+
+#: nerfstudio/model_components/renderers.py:75-145, utils/colors.py: what it shows outside training; at others, also
+#: of another case, it stops.
+_BACKGROUNDS = {
+    "random": (0.0, 0.0, 0.0),
+    "white": (1.0, 1.0, 1.0),
+    "black": (0.0, 0.0, 0.0),
+    "red": (1.0, 0.0, 0.0),
+    "green": (0.0, 1.0, 0.0),
+    "blue": (0.0, 0.0, 1.0),
+}
+LAST_SAMPLE = "last_sample"
+#: Modules that draw nothing in evaluation, and what they are for.
+_IDLE = {
+    "device_indicator_param": "no values",
+    "lpips.": "a metric",
+    "psnr.": "a metric",
+    "ssim.": "a metric",
+    "camera_optimizer.": "poses of the training pictures, used in training alone",
+}
+_SHOWN = 8
+_SPLATS = ("rasterize_mode", "assume_splatfacto", "drop_nan_gaussians")
+
+
+class ModelState(dict[str, Any]):
+    """A model's state that remembers which tensors were read."""
+
+    def __init__(self, state: Mapping[str, Any]) -> None:
+        super().__init__(state)
+        self.read: set[str] = set()
+
+    def __getitem__(self, key: str) -> Any:
+        self.read.add(key)
+        return super().__getitem__(key)
+
+    def refuse_unread(self, checkpoint: Path, method: str, fix: str) -> None:
+        """Raise InputError that names the tensors that were not read and may draw something."""
+        unknown = sorted(key for key in self if key not in self.read and not key.startswith(tuple(_IDLE)))
+        if unknown:
+            more = f" and {len(unknown) - _SHOWN} more" if len(unknown) > _SHOWN else ""
+            raise InputError(
+                f"holds tensors that {method} does not have: {visible(', '.join(unknown[:_SHOWN]))}{more}",
+                file=checkpoint,
+                field="pipeline",
+                fix=fix,
+            )
+
+
+def read_linear(
+    state: Mapping[str, Any], key: str, file: Path, fix: str
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Weight [out, in] and bias [out] of a linear layer.
+
+    Args:
+        state: Tensors by name.
+        key: The layer's name there.
+        file, fix: For messages.
+
+    Raises:
+        InputError: One is missing, or their shapes are not those of a linear layer.
+    """
+    where = f"pipeline._model.{key}"
+    for part in ("weight", "bias"):
+        if f"{key}.{part}" not in state:
+            raise InputError("missing", file=file, field=f"{where}.{part}", fix=fix)
+    weight, bias = (to_float32(state[f"{key}.{part}"], file, f"{where}.{part}") for part in ("weight", "bias"))
+    if weight.ndim != 2 or 0 in weight.shape or bias.shape != weight.shape[:1]:
+        problem = f"shapes {list(weight.shape)} and {list(bias.shape)} are not those of a linear layer"
+        raise InputError(problem, file=file, field=where, fix=fix)
+    return weight, bias
+
+
+def check_model(run: runs.RunConfig, overrides: Overrides, classes: Sequence[str], method: str, fix: str) -> None:
+    """Refuse options of splats, and model classes whose picture may not be that of ``method``.
+
+    Raises:
+        InputError: Names the class, which is none of ``classes``, or the option.
+    """
+    overrides.refuse(_SPLATS, "is for splats, this run is a NeRF")
+    target = runs.target_class(run)
+    if target and target not in classes:
+        raise InputError(
+            f"names the model class {show(target)}, which may draw another picture than {method}",
+            file=run.file,
+            field="pipeline.model._target",
+            fix=fix,
+        )
+
+
+def background(run: runs.RunConfig, overrides: Overrides, default: str) -> tuple[Assumption, NDArray[np.float32] | str]:
+    """The record of the background's choice, and its colour [3] or `LAST_SAMPLE`.
+
+    Args:
+        run: Its ``background_color`` is read.
+        overrides: ``background`` takes its place.
+        default: Name of the model's own default.
+
+    Raises:
+        InputError: No such background.
+    """
+    named, origin = "background_color" in run.model, "config.yml: pipeline.model.background_color"
+    stored: Any = LAST_SAMPLE
+    if str(run.model.get("background_color", default)).lower() != LAST_SAMPLE:
+        stored = tuple(float(part) for part in run.color("background_color", default, _BACKGROUNDS))
+        if named and not isinstance(run.model["background_color"], str):
+            origin += ", three numbers, at which Nerfstudio's own model stops"
+    override = overrides.background
+    record = assumption_of(
+        "background", override, "--background", stored, origin if named else "default of nerfstudio 1.1.5"
+    )
+    chosen = stored if override is None else override
+    return record, chosen if isinstance(chosen, str) else np.array(chosen, np.float32)
+
+
+def records(
+    run: runs.RunConfig,
+    state: ModelState,
+    checkpoint: Path,
+    overrides: Overrides,
+    stock: str,
+    transform: DataparserTransform,
+    assumed_units: bool,
+) -> tuple[Assumption, ...]:
+    """Which step, class, modules and units are taken, and where each choice came from.
+
+    Args:
+        run: The configuration.
+        state: What the checkpoint holds.
+        checkpoint: Its file.
+        overrides: What the user says.
+        stock: Nerfstudio's own class, where config.yml names none.
+        transform: Units of the data set.
+        assumed_units: Whether ``transform`` is a default.
+    """
+    target = runs.target_class(run)
+    whose = "config.yml: pipeline.model._target" if target else "default: config.yml names no class"
+    units = "default: dataparser_transforms.json is missing" if assumed_units else "dataparser_transforms.json"
+    return (
+        runs.step_assumption(run, checkpoint, overrides.load_step),
+        Assumption("model", target or stock.rpartition(".")[2], whose),
+        *(
+            Assumption(f"module {prefix.rstrip('.')}", f"left out: {why}", "checkpoint")
+            for prefix, why in _IDLE.items()
+            if why != "no values" and any(key.startswith(prefix) for key in state)
+        ),
+        Assumption("units", f"1 of the data set is {transform.scale:.9g}", units),
+    )

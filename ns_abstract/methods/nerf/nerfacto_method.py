@@ -1,0 +1,153 @@
+"""Nerfacto runs as the command lines see them; see `ns_abstract.refine.protocol.Method`."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ns_abstract.geometry.poses import PoseBox
+from ns_abstract.io.errors import InputError
+from ns_abstract.methods.nerf.device import check_device
+from ns_abstract.methods.nerf.hash_bounds.frame import NerfactoFrame
+from ns_abstract.methods.nerf.hash_field import NerfactoScene
+from ns_abstract.methods.nerf.ray_pictures import FieldMethod, check_arithmetic
+from ns_abstract.methods.program_options import ProgramOptions
+
+if TYPE_CHECKING:
+    import torch
+
+#: Options of vanilla fields, and why nerfacto does not take them.
+_OTHERS = {
+    "num_samples": "nerfacto has the run's numbers of samples",
+    "near_plane": "rays of nerfacto begin at the camera, as in Nerfstudio's evaluation",
+    "occupancy_grid": "grids are declared for fields of vanilla-nerf",
+}
+
+
+class NerfactoMethod(FieldMethod):
+    """A nerfacto and Nerfstudio's own picture of it, in real numbers and in float64.
+
+    Args:
+        scene: The scene.
+        options: Which program is bounded: there is one.
+        arithmetic: "real" or None: float32 evaluations are not enclosed.
+        workers: Processes that bound rays.
+
+    Raises:
+        InputError: An option does not go with nerfacto.
+    """
+
+    def __init__(
+        self,
+        scene: NerfactoScene,
+        options: ProgramOptions | None = None,
+        arithmetic: str | None = None,
+        workers: int = 1,
+    ) -> None:
+        super().__init__(scene)
+        options = options or ProgramOptions()
+        check_arithmetic(arithmetic)
+        if options.renderer is not None:
+            fix = "leave it out"
+            raise InputError(f"{options.renderer} does not draw nerfacto", field="--renderer", fix=fix)
+        options.refuse(("gsplat_version",), "is for splats, this run is a NeRF")
+        for name, why in _OTHERS.items():
+            options.refuse((name,), why)
+        if options.sampling not in (None, "hierarchical"):
+            raise InputError(
+                "nerfacto is sampled where its proposal fields say", field="--sampling", fix="leave it out"
+            )
+        if check_device(options.device) != "cpu":
+            raise InputError("nerfacto is evaluated on the CPU", field="--device", fix="use cpu")
+        self.scene, self.workers = scene, workers
+
+    @property
+    def program(self) -> dict[str, Any]:
+        """Name and version of the bounded program."""
+        f = self.scene.field
+        return {
+            "name": "nerfacto",
+            "version": "nerfstudio-1.1.5-torch",
+            "sampling": f.spacing,
+            "samples": list(f.samples),
+            "near": f.near,
+            "far": f.far,
+        }
+
+    @property
+    def content(self) -> str:
+        """The scene in a few words."""
+        return f"nerfacto, {self.scene.field.text}"
+
+    def frame(self, poses: PoseBox, sheared: bool = False, layers: bool = False) -> NerfactoFrame:
+        """One frame.
+
+        Raises:
+            InputError: Layers are asked for: a NeRF's depth is a median.
+        """
+        if layers:
+            raise InputError("depth and accumulation of a NeRF are not bounded", field="--outputs", fix="leave it out")
+        return NerfactoFrame(self.scene, poses, self.workers)
+
+    def ablations(self, poses: PoseBox) -> Iterator[tuple[str, NerfactoFrame]]:
+        """None are known."""
+        return iter(())
+
+    def memory(self, pixels: int, threads: int) -> int:
+        """See `Method.memory`; rays are bounded one after another."""
+        weights = sum(array.nbytes for array in self.scene.field.arrays())
+        return 2 * weights + pixels * (400 + 4 * sum(self.scene.field.samples)) + (1 << 30)
+
+    @property
+    def plan(self) -> tuple[str, ...]:
+        """What is left out for this scene, whatever the frame."""
+        f = self.scene.field
+        rounds = " and ".join(map(str, f.samples[:-1]))
+        return (
+            f"bounded: Nerfstudio's own {f.samples[-1]} samples from {f.near:g} to {f.far:g}, where proposal fields at "
+            f"{rounds} samples put them; in real numbers and in float64, of which Nerfstudio's float32 may differ",
+        )
+
+    @property
+    def fingerprint(self) -> dict[str, Any]:
+        """Scene and program, for results that are continued."""
+        f, digest = self.scene.field, hashlib.sha256()
+        for array in f.arrays():
+            digest.update(repr(array.shape).encode())
+            digest.update(np.ascontiguousarray(array).tobytes())
+        behind = f.background if isinstance(f.background, str) else f.background.tolist()
+        factors = f.average_init_density, *(one.average_init_density for one in f.proposals)
+        digest.update(repr((f.samples, f.near, f.far, f.spacing, behind, factors, f.contraction)).encode())
+        return {"scene": digest.hexdigest(), "renderer": self.program["name"], "arithmetic": "real"}
+
+    def describe(self) -> dict[str, Any]:
+        """The scene for reports."""
+        scene, f = self.scene, self.scene.field
+        return {
+            "name": scene.name,
+            "source": str(scene.source),
+            "field": f.text,
+            "resolutions": f.encoding.resolutions.tolist(),
+            "device": "cpu",
+            "samples": list(f.samples),
+            "near": f.near,
+            "far": f.far,
+            "background": f.background if isinstance(f.background, str) else f.background.tolist(),
+            "notes": list(scene.notes),
+        }
+
+    def differentiable(self, poses: PoseBox) -> Callable[[torch.Tensor], torch.Tensor]:
+        """Parameter values [d] to the picture [H, W, 3], in torch."""
+        from ns_abstract.geometry.differentiable_pose import differentiable_pose
+        from ns_abstract.methods.nerf.hsv import color_shift
+        from ns_abstract.methods.nerf.nerfacto_torch import DifferentiableNerfacto
+        from ns_abstract.methods.nerf.render import differentiable_picture
+
+        field, pose = DifferentiableNerfacto(self.scene.field), differentiable_pose(poses.geometry)
+        count, camera = poses.geometry.box.dimensions, poses.camera
+        return lambda values: differentiable_picture(
+            field, camera, pose(values[:count]), color_shift(poses, values.unbind())
+        )

@@ -1,0 +1,197 @@
+"""Writes a nerfacto as a run folder of ``ns-train nerfacto`` (Nerfstudio 1.1.5), without importing Nerfstudio."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from string import Template
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ns_abstract.geometry.keyframe_cameras import KeyframeCamera
+from ns_abstract.methods.nerf.hash_field import DenseNet, HashEncoding, NerfactoScene
+from ns_abstract.methods.nerf.write import DATAMANAGER, STEPS, checkpoint_bytes
+from ns_abstract.methods.run_writer import background_name, write_run
+
+
+def write_nerfacto_run(
+    scene: NerfactoScene,
+    folder: str | Path,
+    *,
+    timestamp: str,
+    experiment_name: str,
+    views: Sequence[KeyframeCamera] | None = None,
+    render: Callable[[KeyframeCamera], ArrayLike] | None = None,
+) -> Path:
+    """Write ``scene`` as a nerfacto run of the torch implementation; the grids begin at resolution 16 or the scene's.
+
+    Files and arguments are those of `ns_abstract.methods.splat.write.write_splatfacto_run`. Proposal fields are written
+    one by round, each with two layers; the appearance embedding is a part of the colours' bias.
+
+    Returns:
+        The path of config.yml.
+
+    Raises:
+        InputError: ``timestamp`` or ``experiment_name`` is not a plain folder name.
+    """
+    field = scene.field
+    grid = _grid(field.encoding)
+    proposals = [
+        {"hidden_dim": one.net.weights[0].shape[0], **_grid(one.encoding), "use_linear": False}
+        for one in field.proposals
+    ]
+    behind = field.background
+    config = _CONFIG.safe_substitute(
+        datamanager=DATAMANAGER,
+        background=behind if isinstance(behind, str) else background_name(behind.astype(np.float32)),
+        far=repr(float(field.far)),
+        density=repr(float(field.average_init_density)),
+        hidden=field.density_net.weights[0].shape[0],
+        color=field.color_net.weights[0].shape[0],
+        spacing=field.spacing,
+        rounds=len(field.proposals),
+        nerf_samples=field.samples[-1],
+        samples=list(field.samples[:-1]),
+        proposals="".join(f"\n    - {one!r}".replace("'", "").replace("False", "false") for one in proposals),
+        **grid,
+    )
+    return write_run(
+        _Shown(scene), Path(folder), "nerfacto", timestamp, experiment_name, data=f"data-{experiment_name}",
+        checkpoint=checkpoint_bytes(_arrays(scene), ("fields", "proposal_networks")), config=config, steps=STEPS,
+        views=views, render=render,
+    )  # fmt: skip
+
+
+class _Shown:
+    """What a data set shows of a scene."""
+
+    def __init__(self, scene: NerfactoScene) -> None:
+        behind = scene.field.background
+        self.background = np.zeros(3, np.float32) if isinstance(behind, str) else behind.astype(np.float32)
+        self.dataparser = scene.dataparser
+
+
+def _grid(encoding: HashEncoding) -> dict[str, int]:
+    """The sizes of a grid, of which the greatest resolution is the least that gives its own."""
+    from ns_abstract.methods.nerf.nerfacto_load import resolutions
+
+    levels, rows, features = encoding.table.shape
+    least, most = int(encoding.resolutions[0]), int(encoding.resolutions[-1])
+    for greatest in (most, most + 1):
+        if np.array_equal(resolutions(levels, least, greatest), encoding.resolutions):
+            break
+    else:
+        raise ValueError("resolutions are not those of Nerfstudio's growth")
+    return {
+        "num_levels": levels, "base_res": least, "max_res": greatest, "log2_hashmap_size": rows.bit_length() - 1,
+        "features_per_level": features,
+    }  # fmt: skip
+
+
+def _arrays(scene: NerfactoScene) -> dict[str, ArrayLike]:
+    """The arrays of the fields under Nerfstudio's names, float32."""
+    field = scene.field
+    found: dict[str, ArrayLike] = {"field.aabb": np.array([[-1.0] * 3, [1.0] * 3], np.float32)}
+
+    def net(name: str, layers: DenseNet) -> None:
+        for k, (weight, bias) in enumerate(zip(layers.weights, layers.biases, strict=True)):
+            found[f"{name}.layers.{k}.weight"] = weight.astype(np.float32)
+            found[f"{name}.layers.{k}.bias"] = bias.astype(np.float32)
+
+    def grid(name: str, encoding: HashEncoding) -> np.ndarray:
+        sizes = _grid(encoding)
+        for key in ("max_res", "num_levels", "log2_hashmap_size"):
+            found[f"{name}.{key}"] = np.array(sizes[key])
+        return encoding.table.reshape(-1, encoding.table.shape[2]).astype(np.float32)
+
+    found["field.mlp_base.model.0.hash_table"] = grid("field", field.encoding)
+    net("field.mlp_base.model.1", field.density_net)
+    net("field.mlp_head", field.color_net)
+    for k, one in enumerate(field.proposals):
+        name = f"proposal_networks.{k}"
+        found[f"{name}.aabb"] = found["field.aabb"]
+        found[f"{name}.encoding.hash_table"] = found[f"{name}.mlp_base.0.hash_table"] = grid(name, one.encoding)
+        net(f"{name}.mlp_base.1", one.net)
+    return found
+
+
+# what config.yml of nerfacto says
+_CONFIG = Template(
+    """\
+max_num_iterations: 30000
+method_name: nerfacto
+mixed_precision: false
+optimizers:
+  fields:
+    optimizer: !!python/object:nerfstudio.engine.optimizers.AdamOptimizerConfig
+      _target: &id001 !!python/name:torch.optim.adam.Adam ''
+      eps: 1.0e-15
+      lr: 0.01
+      max_norm: null
+      weight_decay: 0
+    scheduler: null
+  proposal_networks:
+    optimizer: !!python/object:nerfstudio.engine.optimizers.AdamOptimizerConfig
+      _target: *id001
+      eps: 1.0e-15
+      lr: 0.01
+      max_norm: null
+      weight_decay: 0
+    scheduler: null
+output_dir: !!python/object/apply:pathlib.PosixPath []
+$datamanager
+  model: !!python/object:nerfstudio.models.nerfacto.NerfactoModelConfig
+    _target: !!python/name:nerfstudio.models.nerfacto.NerfactoModel ''
+    appearance_embed_dim: 32
+    average_init_density: $density
+    background_color: $background
+    base_res: $base_res
+    camera_optimizer: !!python/object:nerfstudio.cameras.camera_optimizers.CameraOptimizerConfig
+      _target: !!python/name:nerfstudio.cameras.camera_optimizers.CameraOptimizer ''
+      mode: 'off'
+      optimizer: null
+      rot_l2_penalty: 0.001
+      scheduler: null
+      trans_l2_penalty: 0.01
+    collider_params:
+      far_plane: 6.0
+      near_plane: 2.0
+    disable_scene_contraction: false
+    distortion_loss_mult: 0.002
+    enable_collider: true
+    eval_num_rays_per_chunk: 4096
+    far_plane: $far
+    features_per_level: $features_per_level
+    hidden_dim: $hidden
+    hidden_dim_color: $color
+    hidden_dim_transient: 64
+    implementation: torch
+    interlevel_loss_mult: 1.0
+    log2_hashmap_size: $log2_hashmap_size
+    loss_coefficients:
+      rgb_loss_coarse: 1.0
+      rgb_loss_fine: 1.0
+    max_res: $max_res
+    near_plane: 0.05
+    num_levels: $num_levels
+    num_nerf_samples_per_ray: $nerf_samples
+    num_proposal_iterations: $rounds
+    num_proposal_samples_per_ray: !!python/tuple $samples
+    orientation_loss_mult: 0.0001
+    pred_normal_loss_mult: 0.001
+    predict_normals: false
+    prompt: null
+    proposal_initial_sampler: $spacing
+    proposal_net_args_list:$proposals
+    proposal_update_every: 5
+    proposal_warmup: 5000
+    proposal_weights_anneal_max_num_iters: 1000
+    proposal_weights_anneal_slope: 10.0
+    use_appearance_embedding: false
+    use_average_appearance_embedding: true
+    use_gradient_scaling: false
+    use_proposal_weight_anneal: true
+    use_same_proposal_network: false
+    use_single_jitter: true"""
+)
