@@ -33,7 +33,7 @@ from ns_abstract.verify.network import (
     neuron_selection,
     output_bounds,
 )
-from ns_abstract.verify.network.bounds import _NetworkBounds
+from ns_abstract.verify.network.bounds import NetworkBounds
 from ns_abstract.verify.network.coefficients import columns_of, concretize
 from ns_abstract.verify.network.forward import ForwardPass
 from ns_abstract.verify.network.intermediate_bounds import IntermediateBounds
@@ -528,7 +528,7 @@ def test_early_rows_keep_later_ones_exact(tmp_path: Path, monkeypatch: pytest.Mo
     gaps = []
     for cheap in (0.0, 0.03):
         monkeypatch.setattr(cost_model, "_CHEAP", cheap)
-        cells = _NetworkBounds(network, images, "everywhere", 1 << 30, "real")
+        cells = NetworkBounds(network, images, "everywhere", 1 << 30, "real")
         # rows of outputs in float64 lose next to nothing of themselves
         cells.intermediate.relaxations.pop()
         gaps.append((middle.T - cells.outputs(rows, np.zeros(3)).lower).mean())

@@ -17,6 +17,7 @@ from onnx_files import OnnxFile, session
 from ns_abstract.bench import vnnlib as module
 from ns_abstract.bench.vnnlib import run_folder
 from ns_abstract.cli import bench
+from ns_abstract.execution.cancellation import Deadline
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify import box_decisions
 from ns_abstract.verify.network import load_network
@@ -139,12 +140,12 @@ def test_unsafe_instances_are_never_proved(tmp_path: Path, monkeypatch: pytest.M
     assert shown >= 4
 
 
-def proved(file: Path, condition: str, asks: int = 45) -> str:
+def proved(file: Path, condition: str, asks: int = 1500) -> str:
     """What proofs alone say, since no output that the program computes is finite, until time has been asked for."""
     times = itertools.count()
     regions = load_regions(file.parent / "a", 2, 2, text(condition))
     return box_decisions.decide(
-        load_network(file), lambda image: np.full(2, np.nan), regions, lambda: next(times) > asks
+        load_network(file), lambda image: np.full(2, np.nan), regions, Deadline(request=lambda: next(times) > asks)
     ).word
 
 
@@ -175,7 +176,7 @@ def test_planted_faults_are_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 def test_time_is_kept(tmp_path: Path) -> None:
     file = net(tmp_path, 1)
     regions = load_regions(tmp_path / "a", 2, 2, text("(<= Y_0 -1e9)"))
-    answer = box_decisions.decide(load_network(file), session(file), regions, lambda: True)
+    answer = box_decisions.decide(load_network(file), session(file), regions, Deadline(request=lambda: True))
     assert answer.word == "timeout"
 
 

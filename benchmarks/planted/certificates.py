@@ -28,6 +28,8 @@ _BOXES = "verify/box_decisions.py"
 _EITHER = "test_vnnlib_runner.py::test_proofs_alone_never_decide_unsafe_instances"
 _BRANCHING, _SLOPES = "verify/network/branching.py", "verify/network/slope_optimisation.py"
 _BRANCHES = "test_network_branching.py::test_claims_next_to_the_exact_minimum"
+_TREE = "verify/network/phase_tree.py"
+_HELD = "test_phase_tree.py::test_branches_hold_for_the_images_in_them[small-1.0]"
 _LEVELS = "test_eight_bit.py::test_sets_hold_rounded_pictures"
 
 _FAMILY, _COVER = "verify/network/shared_coefficients.py", "verify/subboxes.py"
@@ -259,7 +261,7 @@ CERTIFICATES = (
     ),
     Fault(
         "unsafe sets: of joined assertions the last counts",
-        _VNNLIB, "_ways", "[[*old, *new] for old in ways for new in more]", "[[*new] for old in ways for new in more]",
+        _VNNLIB, "_ways", "way += more[0]", "way[:] = more[0]",
         _UNSAFE,
     ),
     Fault(
@@ -294,6 +296,20 @@ CERTIFICATES = (
         _BRANCHING, "_branch_of", "np.where(np.isnan(found.lower[number]), -np.inf, found.lower[number])",
         "np.where(np.isnan(found.lower[number]), np.inf, found.lower[number])",
         "test_network_branching.py::test_an_end_comes_soon",
+    ),
+    Fault(
+        "phase tree: one half is left out",
+        _TREE, "_Branch.halves", "(1, -1)", "(1,)", "test_phase_tree.py::test_claims_next_to_the_exact_minimum[real]",
+    ),
+    Fault(
+        "phase tree: lines of the other phase",
+        "verify/network/slope_choices.py", "ReluSlopes.fix", "np.nonzero(phases == side)",
+        "np.nonzero(phases == -side)", _HELD,
+    ),
+    Fault(
+        "phase tree: a branch that fails by little is proved",
+        _TREE, "PhaseTree._climbed", "~(best > 0.0).any(1)", "~(best > -0.5).any(1)",
+        "test_phase_tree.py::test_claims_next_to_the_exact_minimum[real]",
     ),
     Fault(
         "search: a bound below 0 is a proof",

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from ns_abstract.execution.cancellation import Deadline, WorkCancelledError
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import file_beside, read_text
 from ns_abstract.io.packed import unpacked
@@ -149,6 +150,7 @@ def run_folder(
     output_dir: Path,
     *,
     only: Sequence[str] = (),
+    numbers: Sequence[int] | None = None,
     seconds: float | None = None,
     memory: int = 2 << 30,
     arithmetic: NetworkArithmetic = "float32",
@@ -163,7 +165,8 @@ def run_folder(
         folder: Holds instances.csv and what it names, also packed (.gz); or the folders 2.0 or 1.0 that do.
         output_dir: Folder of the results.
         only: Parts of names of networks or properties; all if there are none.
-        seconds: Limit beside those of the list.
+        numbers: Places in the list, from 0; None: all.
+        seconds: Limit beside those of the list; loading and checking count, compiling kernels cannot be interrupted.
         memory: Bytes that bounds may take.
         arithmetic: What "unsat" covers.
         output: Name of the networks' output; None: the only one.
@@ -174,8 +177,9 @@ def run_folder(
     benchmark, folder = folder, version_folder(folder)
     chosen = [
         one
-        for one in instances(folder)
-        if not only or any(part in name for part in only for name in (one.network, one.property))
+        for number, one in enumerate(instances(folder))
+        if (not only or any(part in name for part in only for name in (one.network, one.property)))
+        and (numbers is None or number in numbers)
     ]
     if not chosen:
         raise InputError("no instance is chosen", file=folder / "instances.csv", fix="check --only")
@@ -188,20 +192,19 @@ def run_folder(
             start = time.perf_counter()
             ready, answer, why = start, None, ""
             query: Vnnlib2Query | None = None
+            deadline = Deadline(limit)
             try:
-                files = networks_of(one.network)
-                if len(files) > 1:
-                    raise InputError("is about several networks", field=one.property, fix=_ONE_NETWORK)
-                ((name, file),) = files.items()
-                network, run = networks.load(_stored(folder, file))
-                regions, query = _question(network, run, _stored(folder, one.property), name, memory, arithmetic)
+                with deadline.enforced():
+                    files = networks_of(one.network)
+                    if len(files) > 1:
+                        raise InputError("is about several networks", field=one.property, fix=_ONE_NETWORK)
+                    ((name, file),) = files.items()
+                    network, run = networks.load(_stored(folder, file))
+                    regions, query = _question(network, run, _stored(folder, one.property), name, memory, arithmetic)
                 ready = time.perf_counter()
-                end = ready + limit
-
-                def over(end: float = end) -> bool:
-                    return time.perf_counter() > end
-
-                answer = decide(network, run, regions, over, memory=memory, arithmetic=arithmetic)
+                answer = decide(network, run, regions, deadline, memory=memory, arithmetic=arithmetic)
+            except WorkCancelledError:
+                answer = Decision("timeout")
             except InputError as error:
                 why = str(error)
             word = "error" if answer is None else answer.word
@@ -286,10 +289,14 @@ def verify_query(
     if len(networks) != 1:
         raise InputError(f"{len(networks)} networks", field="--network", fix=_ONE_NETWORK)
     ((name, path),) = networks.items()
-    end = time.perf_counter() + (_LONGEST if seconds is None else seconds)
-    with tempfile.TemporaryDirectory() as scratch:
-        network, run = _Networks(Path(scratch), output).load(path)
-        regions, query = _question(network, run, file, name, memory, arithmetic)
-        answer = decide(network, run, regions, lambda: time.perf_counter() > end, memory=memory, arithmetic=arithmetic)
+    deadline = Deadline(_LONGEST if seconds is None else seconds)
+    query = None
+    try:
+        with tempfile.TemporaryDirectory() as scratch, deadline.enforced():
+            network, run = _Networks(Path(scratch), output).load(path)
+            regions, query = _question(network, run, file, name, memory, arithmetic)
+        answer = decide(network, run, regions, deadline, memory=memory, arithmetic=arithmetic)
+    except WorkCancelledError:
+        answer = Decision("timeout")
     word = "timed-out" if answer.word == "timeout" else answer.word
     return f"{word}\n{assignment(answer, query)}"

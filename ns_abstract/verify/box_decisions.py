@@ -5,42 +5,57 @@ See docs/dev/design.md, V11.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 import torch
 
-from ns_abstract.execution.cancellation import WorkCancelledError, cancel_when, check_cancelled
+from ns_abstract.execution.cancellation import Deadline, WorkCancelledError, check_cancelled
 from ns_abstract.verify.network import ImageSets, Network, NetworkArithmetic, OutputBounds, bound_outputs
+from ns_abstract.verify.network.bounds import NetworkBounds
 from ns_abstract.verify.network.branching import branch
-from ns_abstract.verify.vnnlib import InputRegion
+from ns_abstract.verify.network.phase_tree import PhaseTree
+from ns_abstract.verify.network.subnormals import subnormals_kept
+from ns_abstract.verify.vnnlib import InputRegion, UnsafeSet
 
 #: The competitions' words: an unsafe output was found; there is none; not decided; not decided in time.
 Verdict = Literal["sat", "unsat", "unknown", "timeout"]
 
-#: Inputs up to which every input is a parameter of its own.
+#: Inputs that vary up to which each is a parameter of its own.
 _PARAMETERS = 16
 #: Boxes bounded together: as many as have so many numbers of layers between them, and no more than the second number;
-#: and the most that wait.
+#: and the most that wait beside those of the question.
 _TOGETHER, _MOST, _WAITING = 1 << 18, 256, 1 << 14
-#: Steps towards the best lines for intermediate bounds of such a box.
+#: Numbers of layers of the inputs that are attacked at a time.
+_ATTACKED = 1 << 23
+#: Steps towards the best lines for intermediate bounds of a box that is not cut.
 _STEPS = 12
 #: Branches of a box of many inputs, whose halves would hardly be easier.
-_BRANCHES = 1 << 14
+_BRANCHES = 1 << 20
 
 
 @dataclass(frozen=True)
 class BoxTuning:
     """Preferences of the search over boxes; a verdict needs a proof or a run."""
 
-    #: Starts and steps of the first attack on a region; what is no further from unsafe, relative to one, is run.
+    #: Starts and steps of the first attack on a region, and of the one on groups that resist a proof; what is no
+    #: further from unsafe, relative to one, is run.
     starts: int = 12
     steps: int = 25
+    later: tuple[int, int] = (64, 60)
     near: float = 1e-5
+    #: Most inputs that are attacked at a time.
+    attacked: int = 1024
+    #: Inputs that vary up to which a box is cut; phases are assumed in boxes of more.
+    cut: int = 6
     #: What the width of an input counts beside its slope.
     width: float = 1e-9
+    #: Part of the time that is left for lines of intermediate bounds, and what a step towards these takes beside bounds
+    #: with plain ones.
+    lines: float = 0.3
+    dear: float = 2.0
 
 
 _TUNING = BoxTuning()
@@ -62,11 +77,12 @@ class Decision:
     boxes: int = 0
 
 
+@subnormals_kept()
 def decide(
     network: Network,
     run: Callable[[np.ndarray], np.ndarray],
     regions: Sequence[InputRegion],
-    over: Callable[[], bool],
+    deadline: Deadline,
     *,
     memory: int = 1 << 30,
     arithmetic: NetworkArithmetic = "float32",
@@ -78,150 +94,287 @@ def decide(
         run: The program that counts: outputs [k] for one image [1, *input_shape] float32. Only what it
             computes is a counterexample.
         regions: Boxes of inputs, and what is unsafe there.
-        over: Whether time is up.
+        deadline: When to end.
         memory: Bytes that bounds may take.
         arithmetic: What a proof covers.
     """
-    search = _BoxSearch(network, run, memory, arithmetic)
+    search = _BoxSearch(network, run, deadline, memory, arithmetic)
     try:
-        with cancel_when(over):
-            for region in regions:
-                if search.settle(region):
+        with deadline.enforced():
+            for family in _families(regions):
+                if search.settle(family):
                     return Decision("sat", *search.found, search.boxes)
     except WorkCancelledError:
         return Decision("timeout", boxes=search.boxes)
     return Decision("unknown" if search.undecided else "unsat", boxes=search.boxes)
 
 
+@dataclass(frozen=True)
+class _Family:
+    """Regions of which the same functions of the outputs are asked.
+
+    Attributes:
+        regions: With an input each.
+        lower, upper: [m, n].
+        offset: [m, k].
+    """
+
+    regions: Sequence[InputRegion]
+    lower: np.ndarray
+    upper: np.ndarray
+    offset: np.ndarray
+
+    @property
+    def unsafe(self) -> UnsafeSet:
+        """Rows and groups; offsets are the first region's."""
+        return self.regions[0].unsafe
+
+    def value(self, y: torch.Tensor, which: np.ndarray, group: Sequence[int] | None) -> torch.Tensor:
+        """[B] of outputs [B, ...] for inputs of regions ``which``: unsafe where it is not positive, differentiable.
+
+        ``group``: of this group alone.
+        """
+        rows = y.flatten(1) @ torch.from_numpy(self.unsafe.rows).T + torch.from_numpy(self.offset[which])
+        wanted = self.unsafe.groups if group is None else [group]
+        groups = [rows[:, list(one)].amax(1) for one in wanted if one]
+        return torch.stack(groups).amin(0) if groups else torch.zeros(len(rows), dtype=rows.dtype)
+
+
+def _families(regions: Sequence[InputRegion]) -> Iterator[_Family]:
+    """The regions that are not empty, those together that ask for the same."""
+    kinds: dict[tuple[bytes, Any], list[InputRegion]] = {}
+    for region in regions:
+        if not bool((region.lower > region.upper).any()):
+            kinds.setdefault((region.unsafe.rows.tobytes(), region.unsafe.groups), []).append(region)
+    for kind in kinds.values():
+        lower, upper = (np.stack([getattr(region, name) for region in kind]) for name in ("lower", "upper"))
+        yield _Family(kind, lower, upper, np.stack([region.unsafe.offset for region in kind]))
+
+
+#: A box and the region that it is part of.
+_Box = tuple[int, np.ndarray, np.ndarray]
+
+
 class _BoxSearch:
     def __init__(
-        self, network: Network, run: Callable[[np.ndarray], np.ndarray], memory: int, arithmetic: NetworkArithmetic
+        self,
+        network: Network,
+        run: Callable[[np.ndarray], np.ndarray],
+        deadline: Deadline,
+        memory: int,
+        arithmetic: NetworkArithmetic,
     ) -> None:
-        self.network, self.run, self.memory = network, run, memory
+        self.network, self.run, self.deadline, self.memory = network, run, deadline, memory
         self.arithmetic: NetworkArithmetic = arithmetic
         self.boxes = 0
         total = sum(int(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1))
         self.together = min(_MOST, max(8, _TOGETHER // total))
+        self.attacked = min(_TUNING.attacked, max(4, _ATTACKED // total))
         self.undecided = False
         self.found: tuple[np.ndarray, np.ndarray] = (np.zeros(0), np.zeros(0))
 
-    def settle(self, region: InputRegion) -> bool:
-        """Whether the region has a counterexample, which `found` then is; `undecided` if that is not known."""
-        if bool((region.lower > region.upper).any()):
-            return False
-        if self._attack(region):
+    def settle(self, family: _Family) -> bool:
+        """Whether a region has a counterexample, which `found` then is; `undecided` if that is not known."""
+        if self._attack(family, np.arange(len(family.regions)), _TUNING.starts, _TUNING.steps):
             return True
-        if not all(region.unsafe.groups):
+        if not all(family.unsafe.groups):
             # any output is unsafe, and no input could be shown to have one
             self.undecided = True
             return False
-        if len(region.lower) > _PARAMETERS:
-            branching = branch(
-                self.network,
-                self._images(region.lower[None], region.upper[None]),
-                region.unsafe.rows,
-                region.unsafe.offset,
-                region.unsafe.groups,
-                _BRANCHES,
-                memory=self.memory,
-                arithmetic=self.arithmetic,
-                intermediate_steps=_STEPS,
-            )
-            self.boxes += branching.branches
-            self.undecided |= not branching.proved
-            return False
-        waiting = [(region.lower, region.upper)]
-        while waiting:
-            check_cancelled()
-            boxes, waiting = waiting[-self.together :], waiting[: -self.together]
-            bounds = self._bound(region, boxes)
-            proved = proves(bounds, region.unsafe.groups)
-            self.boxes += len(boxes)
-            left = np.flatnonzero(~proved)
-            if len(left) and self._probe(region, [(*boxes[k], bounds.a[k]) for k in left]):
-                return True
-            for k in left:
-                halves = _cut(*boxes[k], bounds.a[k])
-                if halves is None or len(waiting) > _WAITING:
-                    self.undecided = True
-                    return False
-                waiting += halves
-        return False
+        if int((family.upper > family.lower).sum(1).max()) <= _TUNING.cut:
+            return self._bisect(family)
+        return any(self._assume(family, which) for which in range(len(family.regions)))
 
     # ------------------------------------------------------------ proofs
 
+    def _bisect(self, family: _Family) -> bool:
+        """`settle` by cutting boxes in halves."""
+        waiting: list[_Box] = list(zip(range(len(family.regions)), family.lower, family.upper, strict=True))
+        most = _WAITING + len(waiting)
+        while waiting:
+            check_cancelled()
+            boxes, waiting = waiting[-self.together :], waiting[: -self.together]
+            bounds = self._bound(family, boxes)
+            proved = proves(bounds, family.unsafe.groups)
+            self.boxes += len(boxes)
+            left = np.flatnonzero(~proved)
+            if len(left) and self._probe(family, [(boxes[k], bounds.a[k]) for k in left]):
+                return True
+            for k in left:
+                halves = _cut(*boxes[k][1:], bounds.a[k])
+                if halves is None or len(waiting) > most:
+                    self.undecided = True
+                    return False
+                waiting += [(boxes[k][0], *half) for half in halves]
+        return False
+
+    def _assume(self, family: _Family, which: int) -> bool:
+        """`settle` of one region by assuming phases of neurons (N16)."""
+        images = self._images(*(v[which][None] for v in (family.lower, family.upper)))
+        start = self.deadline.left
+        tree, left = self._tree(family, which, images, 0, family.unsafe.groups)
+        allowed = _TUNING.lines * self.deadline.left
+        steps = min(_STEPS, int(min(1e6, allowed / max(1e-6, _TUNING.dear * (start - self.deadline.left)))))
+        if left and self._attack(family, np.array([which]), *_TUNING.later, left):
+            return True
+        if left and steps:
+            try:
+                with self.deadline.within(allowed).enforced():
+                    tree, left = self._tree(family, which, images, steps, left)
+            except WorkCancelledError:
+                # what is known without goes on
+                check_cancelled()
+        for group in left:
+            result = tree.prove(group, _BRANCHES)
+            self.boxes += result.branches
+            if not result.proved and not self._anew(family, which, images, group):
+                self.undecided = True
+                return False
+        return False
+
+    def _tree(
+        self, family: _Family, which: int, images: ImageSets, steps: int, groups: Sequence[tuple[int, ...]]
+    ) -> tuple[PhaseTree, list[tuple[int, ...]]]:
+        """A tree over bounds with so many steps for intermediate ones, and the groups that its root leaves open."""
+        cells = NetworkBounds(
+            self.network, images, "everywhere", self.memory, self.arithmetic, 1, intermediate_steps=steps
+        )
+        tree, left = PhaseTree(cells, family.unsafe.rows, family.offset[which]), []
+        for group in groups:
+            result = tree.prove(group, 1)
+            self.boxes += result.branches
+            if not result.proved:
+                left.append(group)
+        return tree, left
+
+    def _anew(self, family: _Family, which: int, images: ImageSets, group: Sequence[int]) -> bool:
+        """Whether a group is proved by branches with intermediate bounds of their own."""
+        branching = branch(
+            self.network,
+            images,
+            family.unsafe.rows,
+            family.offset[which],
+            [group],
+            _BRANCHES,
+            memory=self.memory,
+            arithmetic=self.arithmetic,
+        )
+        self.boxes += branching.branches
+        return branching.proved
+
     def _images(self, lower: np.ndarray, upper: np.ndarray) -> ImageSets:
-        """Boxes [m, n]: every input is a parameter, if they are few."""
+        """Boxes [m, n]: every input that varies is a parameter, if they are few; p numbers them in their order."""
+        varies = upper > lower
         # the program rounds an input to float32, and rounding keeps the order
         lower = np.minimum(lower, lower.astype(np.float32).astype(np.float64))
         upper = np.maximum(upper, upper.astype(np.float32).astype(np.float64))
         m, n = lower.shape
-        if n > _PARAMETERS:
+        d = int(varies.sum(1).max())
+        if not 0 < d <= _PARAMETERS:
             none = np.zeros((m, n, 1))
             return ImageSets(none, lower, none, upper, lower, upper)
         middle = 0.5 * (lower + upper)
         half = np.nextafter(np.maximum(upper - middle, middle - lower), np.inf)
-        a = half[:, :, None] * np.eye(n)
-        return ImageSets(a, middle, a, middle, lower, upper)
+        a = np.zeros((m, n, d))
+        cell, at = np.nonzero(varies)
+        a[cell, at, (np.cumsum(varies, 1) - 1)[cell, at]] = half[cell, at]
+        return ImageSets(a, np.where(varies, middle, lower), a, np.where(varies, middle, upper), lower, upper)
 
-    def _bound(self, region: InputRegion, boxes: Sequence[tuple[np.ndarray, np.ndarray]]) -> OutputBounds:
-        lower, upper = (np.stack(ends) for ends in zip(*boxes, strict=True))
-        return bound_outputs(
+    def _bound(self, family: _Family, boxes: Sequence[_Box]) -> OutputBounds:
+        """Bounds of boxes, with slopes by all inputs."""
+        which, lower, upper = (np.stack(ends) for ends in zip(*boxes, strict=True))
+        bounds = bound_outputs(
             self.network,
             self._images(lower, upper),
-            region.unsafe.rows,
-            region.unsafe.offset,
+            family.unsafe.rows,
+            family.offset[which],
             memory=self.memory,
             arithmetic=self.arithmetic,
         )
+        varies = upper > lower
+        slopes = np.zeros((*bounds.lower.shape, lower.shape[1]))
+        cell, at = np.nonzero(varies)
+        slopes[cell, :, at] = bounds.a[cell, :, (np.cumsum(varies, 1) - 1)[cell, at]]
+        return OutputBounds(bounds.lower, slopes, bounds.b)
 
     # ------------------------------------------------------------ counterexamples
 
-    def _value(self, region: InputRegion, x: torch.Tensor) -> torch.Tensor:
-        """[B]; an output is unsafe where it is not positive, differentiable."""
-        y = self.network(x.reshape(-1, *self.network.input_shape))
-        rows = y @ torch.from_numpy(region.unsafe.rows).T + torch.from_numpy(region.unsafe.offset)
-        groups = [rows[:, list(group)].amax(1) for group in region.unsafe.groups if group]
-        return torch.stack(groups).amin(0) if groups else torch.zeros(len(x), dtype=x.dtype)
+    def _value(
+        self, family: _Family, x: torch.Tensor, which: np.ndarray, group: Sequence[int] | None = None
+    ) -> torch.Tensor:
+        """`_Family.value` of inputs."""
+        return family.value(self.network(x.reshape(-1, *self.network.input_shape)), which, group)
 
-    def _attack(self, region: InputRegion) -> bool:
-        """Gradient descent by signs from the middle, from corners and from random inputs."""
-        lower, upper = torch.from_numpy(region.lower), torch.from_numpy(region.upper)
+    def _attack(
+        self,
+        family: _Family,
+        regions: np.ndarray,
+        starts: int,
+        steps: int,
+        groups: Sequence[Sequence[int]] | None = None,
+    ) -> bool:
+        """Gradient descent by signs from middles, corners and random inputs; of several groups, each alone."""
+        # a few steps where there are many regions: most are tiny
+        steps = min(steps, max(3, 4 * self.attacked // len(regions)))
+        starts = max(2, min(starts, self.attacked, _TUNING.attacked // len(regions)))
         generator = torch.Generator().manual_seed(0)
-        part = torch.rand((_TUNING.starts, len(lower)), generator=generator, dtype=torch.float64)
-        part[0] = 0.5
-        part[1 : _TUNING.starts // 2] = (part[1 : _TUNING.starts // 2] < 0.5).double()
-        x = lower + part * (upper - lower)
-        step = 0.25
-        for _ in range(_TUNING.steps):
+        step = max(1, self.attacked // starts)
+        for first in range(0, len(regions), step):
+            which = regions[first : first + step]
+            ends = family.lower[which], family.upper[which]
+            lower, upper = (torch.from_numpy(end).repeat_interleave(starts, 0) for end in ends)
+            part = torch.rand((len(which), starts, lower.shape[1]), generator=generator, dtype=torch.float64)
+            part[:, 0] = 0.5
+            part[:, 1 : starts // 2] = (part[:, 1 : starts // 2] < 0.5).double()
+            x = lower + part.flatten(0, 1) * (upper - lower)
+            for group in groups or [None]:
+                if self._descend(family, np.repeat(which, starts), x, (lower, upper), steps, group):
+                    return True
+        return False
+
+    def _descend(
+        self,
+        family: _Family,
+        which: np.ndarray,
+        x: torch.Tensor,
+        ends: tuple[torch.Tensor, torch.Tensor],
+        steps: int,
+        group: Sequence[int] | None,
+    ) -> bool:
+        """Whether descent from inputs of regions ``which`` finds a counterexample."""
+        lower, upper = ends
+        size = 0.25
+        for _ in range(steps):
             check_cancelled()
             x = x.detach().requires_grad_()
-            value = self._value(region, x)
-            if self._any(region, x.detach(), value.detach()):
+            value = self._value(family, x, which, group)
+            if self._any(family, x.detach(), which, value.detach()):
                 return True
             if not value.requires_grad:
                 break
             (slope,) = torch.autograd.grad(value.sum(), x)
-            x = torch.minimum(torch.maximum(x.detach() - step * slope.sign() * (upper - lower), lower), upper)
-            step *= 0.85
+            x = torch.minimum(torch.maximum(x.detach() - size * slope.sign() * (upper - lower), lower), upper)
+            size *= 0.001 ** (1.0 / steps)
         return False
 
-    def _probe(self, region: InputRegion, boxes: Sequence[tuple[np.ndarray, np.ndarray, np.ndarray]]) -> bool:
-        """The middles of boxes (lower, upper, slopes of planes below), and the corners where the planes are least."""
-        x = []
-        for lower, upper, slopes in boxes:
+    def _probe(self, family: _Family, boxes: Sequence[tuple[_Box, np.ndarray]]) -> bool:
+        """The middles of boxes (with slopes of planes below), and the corners where the planes are least."""
+        x, which = [], []
+        for (region, lower, upper), slopes in boxes:
             x.append(0.5 * (lower + upper))
             x += [np.where(row > 0.0, lower, upper) for row in slopes]
+            which += [region] * (1 + len(slopes))
         with torch.no_grad():
-            tried = torch.from_numpy(np.stack(x))
-            return self._any(region, tried, self._value(region, tried))
+            tried, regions = torch.from_numpy(np.stack(x)), np.array(which)
+            return self._any(family, tried, regions, self._value(family, tried, regions))
 
-    def _any(self, region: InputRegion, x: torch.Tensor, value: torch.Tensor) -> bool:
+    def _any(self, family: _Family, x: torch.Tensor, which: np.ndarray, value: torch.Tensor) -> bool:
         """Whether one of the inputs that look unsafe is, for the program that counts."""
         order = torch.argsort(value)[:2].tolist()
         for k in order:
             if not float(value[k]) <= _TUNING.near * (1.0 + abs(float(value[k]))):
                 continue
+            region = family.regions[int(which[k])]
             point = np.clip(x[k].numpy(), region.lower, region.upper)
             y = run_once(self.network, self.run, point)
             if bool(np.isfinite(y).all()) and region.holds(y):

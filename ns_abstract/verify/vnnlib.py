@@ -20,6 +20,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import read_text
 from ns_abstract.io.packed import unpacked
@@ -40,6 +41,8 @@ _PLAIN, _SPREAD, _FAR = 30, 90, 120
 #: Least size at which a product of numbers keeps all of its digits.
 _SMALLEST = float(np.finfo(np.float64).tiny)
 
+#: Tokens that are read between questions whether to go on.
+_ASKED = 1 << 12
 #: Numbers that the boxes of a file may have together.
 _BOXES = 1 << 25
 #: Coefficients of outputs by number (of input i by -1 - i), and a constant.
@@ -184,6 +187,7 @@ def _regions(expressions: list[Any], sizes: _VariableCounts) -> tuple[InputRegio
     ends = np.full((2, sizes.inputs), np.inf) * np.array([[-1.0], [1.0]])
     cases: list[_Conjunction] = [[]]
     for expression in expressions:
+        check_cancelled()
         if _declares(expression, declared):
             continue
         ways = _ways(expression[1], declared, sizes)
@@ -198,6 +202,7 @@ def _regions(expressions: list[Any], sizes: _VariableCounts) -> tuple[InputRegio
     _check_declared(declared, "Y", sizes.outputs)
     boxes: dict[bytes, tuple[np.ndarray, list[_Conjunction]]] = {}
     for case in cases:
+        check_cancelled()
         own = ends.copy()
         outputs = [v for v in case if not _bound(v, own)]
         if (len(boxes) + 1) * ends.size > _BOXES:
@@ -256,7 +261,9 @@ def _declares(expression: Any, declared: set[str]) -> bool:
 def _expressions(text: str) -> list[Any]:
     """Nested lists of tokens."""
     stack: list[list[Any]] = [[]]
-    for match in _TOKEN.finditer(text):
+    for number, match in enumerate(_TOKEN.finditer(text)):
+        if number % _ASKED == 0:
+            check_cancelled()
         token = match["text"]
         if match["bad"]:
             line = text.count("\n", 0, match.start()) + 1
@@ -368,9 +375,14 @@ def _ways(expression: Any, declared: set[str], size: _VariableCounts) -> list[_C
     if head == "or" and len(expression) > 1:
         return [way for part in expression[1:] for way in _ways(part, declared, size)]
     if head == "and" and len(expression) > 1:
+        check_cancelled()
         ways: list[_Conjunction] = [[]]
         for part in expression[1:]:
             more = _ways(part, declared, size)
+            if len(more) == 1:
+                for way in ways:
+                    way += more[0]
+                continue
             if len(ways) * len(more) > _CONJUNCTIONS:
                 raise InputError(f"more than {_CONJUNCTIONS} combinations of cases", fix="use fewer nested (or")
             ways = [[*old, *new] for old in ways for new in more]
@@ -397,7 +409,7 @@ def _added(total: float, factor: float, value: float) -> float:
     """
     product = factor * value
     sum_ = total + product
-    if not np.isfinite(sum_) or (factor and value and abs(product) < _SMALLEST):
+    if not math.isfinite(sum_) or (factor and value and abs(product) < _SMALLEST):
         raise InputError(f"numbers overflow or vanish at {factor:g} times {value:g}", fix="use factors nearer to 1")
     return sum_
 
@@ -432,7 +444,7 @@ def _atom(text: str, declared: set[str], size: _VariableCounts) -> _Linear:
         if number is None:
             raise _fail(text, "write a number or a variable such as Y_0")
         value = float(text)
-        if not np.isfinite(value) or (re.search("[1-9]", number[1]) and abs(value) < _SMALLEST):
+        if not math.isfinite(value) or (abs(value) < _SMALLEST and re.search("[1-9]", number[1])):
             raise _fail(text, "write a number that float64 can hold")
         return {}, value
     if text not in declared:

@@ -110,11 +110,11 @@ class BackwardPass:
         cut: int = 0,
     ) -> None:
         """Pass a batch from node ``at`` on to the image, or to the nodes up to ``cut``."""
-        check_cancelled()
         while at > cut:
             if at not in batch.waiting:
                 at -= 1
                 continue
+            check_cancelled()
             if batch.bytes > min(ROWS_AT_ONCE, self.memory // 16) and len(batch.cell) > 1:
                 half = len(batch.cell) // 2
                 for part in (slice(0, half), slice(half, None)):

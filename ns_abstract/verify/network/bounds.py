@@ -45,7 +45,7 @@ def bound_outputs(
         network: The network.
         images: m cells in d parameters.
         rows: [k, output_size] array or scipy sparse matrix.
-        offset: [k].
+        offset: [k], or [m, k] by image set.
         substitution: Where the parameters' correlation is used: in every intermediate bound
             ("everywhere"), only in the result ("end"), or not at all ("box").
         memory: Bytes to stay within, roughly; cells and rows are worked on in parts.
@@ -59,32 +59,33 @@ def bound_outputs(
     offset = np.asarray(offset, np.float64)
     if images.a_lower.shape[1] != network.input_size:
         raise ValueError(f"images of {network.input_size} numbers expected, got {images.a_lower.shape[1]}")
-    if rows.shape != (offset.shape[0], network.output_size):
-        raise ValueError(f"rows {(offset.shape[0], network.output_size)} expected, got {rows.shape}")
+    if rows.shape != (offset.shape[-1], network.output_size):
+        raise ValueError(f"rows {(offset.shape[-1], network.output_size)} expected, got {rows.shape}")
     numbers = 3 * images.dimensions + 14 + (7 if arithmetic == "real" else 0)
     by_cell = sum(int(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1)) * 8 * numbers
     step = max(1, int(0.5 * memory) // by_cell)
     parts = []
     for first in range(0, images.count, step):
         phases = None if assumed is None else assumed[first : first + step]
-        cells = _NetworkBounds(
+        cells = NetworkBounds(
             network, images[first : first + step], substitution, memory, arithmetic, slope_steps, phases, None,
             intermediate_steps,
         )  # fmt: skip
-        parts.append(cells.outputs(rows, offset))
+        parts.append(cells.outputs(rows, offset[first : first + step] if offset.ndim > 1 else offset))
     if not parts:
-        k, d = len(offset), images.dimensions
+        k, d = offset.shape[-1], images.dimensions
         return OutputBounds(np.zeros((0, k)), np.zeros((0, k, d)), np.zeros((0, k)))
     names = ("lower", "a", "b") if assumed is None else ("lower", "a", "b", "loosest")
     return OutputBounds(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
-class _NetworkBounds:
+class NetworkBounds:
     """Bounds of one network over several cells: builds the passes and runs them over all nodes.
 
     Attributes:
         intermediate: What is known of the nodes.
         last: The form of the last one.
+        output_rows: Bounds rows of the outputs.
     """
 
     def __init__(
@@ -116,8 +117,8 @@ class _NetworkBounds:
         self.last = ForwardPass(intermediate, propagation, pooling, selection, schedule).run()
         if substitution == "end":
             intermediate.see(planes_of(fields, middle, network.input_shape, "everywhere"))
-        self._outputs = OutputRows(intermediate, backward, RowAscent(intermediate, backward, slope_steps))
+        self.output_rows = OutputRows(intermediate, backward, RowAscent(intermediate, backward, slope_steps))
 
     def outputs(self, rows: Any, offset: Float64) -> OutputBounds:
         """Bounds of ``rows @ y + offset`` in every cell."""
-        return self._outputs.bound(self.last, rows, offset)
+        return self.output_rows.bound(self.last, rows, offset)

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 
 from ns_abstract.arithmetic.network_charges import SPARE, UNIT
+from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.verify.network.bilinear import Product
 from ns_abstract.verify.network.cost_model import WorkBudget
 from ns_abstract.verify.network.forms import NodeForm
@@ -51,6 +52,7 @@ class ForwardPass:
         left = list(self.network.readers)
         last = len(self.network.nodes)
         for k, node in enumerate(self.network.nodes, 1):
+            check_cancelled()
             inputs = []
             for index in node.inputs:
                 form = forms[index]

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.verify.network.activations import LibraryFunction, Sigmoid, Tanh
 from ns_abstract.verify.network.bilinear import Product
 from ns_abstract.verify.network.layers import Activation, LinearLayer, ScaleLayer, Shape
@@ -147,6 +148,7 @@ class Network:
         values: list[Tensor | None] = [images]
         left = list(self.readers)
         for node in self.nodes:
+            check_cancelled()
             values.append(node.layer([self._needed(values[index]) for index in node.inputs]))
             for index in node.inputs:
                 left[index] -= 1

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ns_abstract.arithmetic.network_charges import DOUBLE_UNIT, OWN_LINE
 from ns_abstract.verify.network.backward import ROWS_AT_ONCE, BackwardPass
-from ns_abstract.verify.network.coefficients import Coefficients, Float64, Int64, grid
+from ns_abstract.verify.network.coefficients import Coefficients, Float64, Floats, Int64, grid
 from ns_abstract.verify.network.forms import NodeForm
 from ns_abstract.verify.network.image_sets import OutputBounds
 from ns_abstract.verify.network.intermediate_bounds import IntermediateBounds
@@ -16,6 +16,24 @@ from ns_abstract.verify.network.row_ascent import RowAscent
 
 #: Room for rounding above zero where nothing better is looked for.
 _SURE = 1e-9
+
+
+class ShiftedRows(NamedTuple):
+    """Rows on the outputs' distance from their reference.
+
+    Attributes:
+        stored: [k, n] of the type of rows.
+        missing: [m, k] what the numbers that are not stored may be, and the rounding of ``offset``.
+        offset: [m, k].
+    """
+
+    stored: Floats
+    missing: Float64
+    offset: Float64
+
+    def room(self, plane: Float64) -> Float64:
+        """[m, k] charged for sums of ``plane`` [m, k, d + 1] and the offset."""
+        return OWN_LINE * (np.abs(plane).sum(-1) + np.abs(self.offset) + self.missing) + self.missing
 
 
 class OutputRows:
@@ -31,22 +49,27 @@ class OutputRows:
         self.intermediate, self.network, self.backward = intermediate, intermediate.network, backward
         self.ascent = ascent
 
+    def shifted(self, last: NodeForm, rows: Any, offset: Float64) -> ShiftedRows:
+        """``rows @ y + offset`` [k] or [m, k] as rows on the distance from the reference of ``last``."""
+        dense = np.asarray(rows.toarray() if hasattr(rows, "toarray") else rows, np.float64)
+        stored = dense.astype(self.intermediate.relaxations[-1].number)
+        size = last.width.reshape(self.intermediate.count, -1).numpy()
+        reference = last.reference.reshape(self.intermediate.count, -1).numpy()
+        missing = size @ np.abs(dense - stored).T
+        missing += 2.0 * DOUBLE_UNIT * (dense.shape[1] + 2) * (np.abs(reference) @ np.abs(dense).T)
+        return ShiftedRows(stored, missing, reference @ dense.T + offset)
+
     def bound(self, last: NodeForm, rows: Any, offset: Float64) -> OutputBounds:
         """Bounds of ``rows @ y + offset`` in every cell, y as ``last`` says."""
         index = len(self.network.nodes)
-        m, k = self.intermediate.count, len(offset)
+        m, k = self.intermediate.count, offset.shape[-1]
         plane, lower = np.zeros((m, k, self.intermediate.d + 1)), np.zeros((m, k))
         loosest = np.zeros((m, k, 2), np.int64)
         shape = grid(self.network.shape(index))
-        dense = np.asarray(rows.toarray() if hasattr(rows, "toarray") else rows, np.float64)
-        stored = dense.astype(self.intermediate.relaxations[-1].number)
-        size = last.width.reshape(m, -1).numpy()
-        reference = last.reference.reshape(m, -1).numpy()
-        missing = size @ np.abs(dense - stored).T
-        missing += 2.0 * DOUBLE_UNIT * (dense.shape[1] + 2) * (np.abs(reference) @ np.abs(dense).T)
-        offset = reference @ dense.T + offset
+        shifted = self.shifted(last, rows, offset)
+        stored, offset = shifted.stored, shifted.offset
         need = -offset + _SURE * (1.0 + np.abs(offset))
-        for top, left, height, width, number in _windows(stored.reshape(k, *shape)):
+        for top, left, height, width, number in windows(stored.reshape(k, *shape)):
             part = stored.reshape(k, *shape)[:, :, top : top + height, left : left + width]
             step = max(1, ROWS_AT_ONCE // (stored.itemsize * shape[0] * height * width))
             for first in range(0, m * len(number), step):
@@ -60,7 +83,7 @@ class OutputRows:
                     wanted = None if self.intermediate.assumed is None else need[cell, row]
                     loosest[cell, row] = self.ascent.climb(index, rows, cell, bounds, wanted)
                 plane[cell, row], lower[cell, row] = bounds.plane[:, 0], bounds.lower
-        room = OWN_LINE * (np.abs(plane).sum(-1) + np.abs(offset) + missing) + missing
+        room = shifted.room(plane)
         lower, b = lower + offset - room, plane[..., -1] + offset - room
         a = plane[..., :-1]
         finite = self.intermediate.good[:, None] & np.isfinite(lower)
@@ -69,7 +92,7 @@ class OutputRows:
         return OutputBounds(lower, np.where(usable[..., None], a, 0.0), np.where(usable, b, -np.inf), loosest)
 
 
-def _windows(rows: np.ndarray) -> list[tuple[int, int, int, int, Int64]]:
+def windows(rows: np.ndarray) -> list[tuple[int, int, int, int, Int64]]:
     """Windows (top, left, height, width) of rows [k, C, H, W] that are zero elsewhere, and which rows they hold."""
     used = (rows != 0.0).any(axis=1)
     groups: dict[tuple[int, int, int, int], list[int]] = {}

@@ -64,24 +64,36 @@ class RowAscent:
         choices: Mapping[int, Sequence[LineChoice]],
     ) -> Int64:
         """`climb` for rows ``own`` of cell k."""
-        relaxations, cell = self.intermediate.relaxations[-1], np.full(len(own), k)
-        lines = {at: relaxations.lines[at][:, k] for at in choices}
+        lines = {at: self.intermediate.relaxations[-1].lines[at][:, k] for at in choices}
         ascent = DualAscent(choices, lines, len(own), self.intermediate.split[k])
         for number in range(self.steps + 1):
             if need is not None and bool((best.lower[own] > need).all()):
                 return np.full((len(own), 2), -1, np.int64)
-            chosen, bounds = ascent.lines(), BackwardBounds.unknown(len(own), self.intermediate.d)
-            # rows are changed in place
-            part = Coefficients(start.value.copy(), start.y, start.x)
-            total, numbers = np.zeros((len(own), 2)), np.arange(len(own))
-            batch = CoefficientBatch({index: part}, cell, total, numbers, relaxations, chosen)
-            self.backward.descend(index, index, batch, bounds, None)
+            chosen, bounds = self.evaluate(index, start, k, ascent)
             better = bounds.lower > best.lower[own]
             best.lower[own[better]], best.plane[own[better]] = bounds.lower[better], bounds.plane[better]
             if number < self.steps:
-                slopes, forces = self._derivatives(index, k, chosen, bounds, ascent)
-                ascent.climb(slopes, forces, {at: self._size(chosen, at) for at in ascent.split})
+                self.move(index, k, chosen, bounds, ascent)
         return self._loosest(chosen, choices, len(own))
+
+    def evaluate(
+        self, index: int, start: Coefficients, k: int, ascent: DualAscent
+    ) -> tuple[OptimisedSlopes, BackwardBounds]:
+        """What rows of cell ``k`` have chosen by now, and their bounds with it."""
+        count = len(start.value)
+        chosen, bounds = ascent.lines(), BackwardBounds.unknown(count, self.intermediate.d)
+        # rows are changed in place
+        part = Coefficients(start.value.copy(), start.y, start.x)
+        total, numbers = np.zeros((count, 2)), np.arange(count)
+        relaxations = self.intermediate.relaxations[-1]
+        batch = CoefficientBatch({index: part}, np.full(count, k), total, numbers, relaxations, chosen)
+        self.backward.descend(index, index, batch, bounds, None)
+        return chosen, bounds
+
+    def move(self, index: int, k: int, chosen: OptimisedSlopes, bounds: BackwardBounds, ascent: DualAscent) -> None:
+        """Step from what has been chosen to what is better for the bounds."""
+        slopes, forces = self._derivatives(index, k, chosen, bounds, ascent)
+        ascent.climb(slopes, forces, {at: self._size(chosen, at) for at in ascent.split})
 
     def _size(self, chosen: OptimisedSlopes, source: int) -> float:
         """What coefficients of rows on the readers of node ``source`` are about."""

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from ns_abstract.arithmetic.network_charges import FLUSH, OWN_SUMS, gamma
 from ns_abstract.verify.network.bilinear import Product
-from ns_abstract.verify.network.bounds import _NetworkBounds, bound_outputs
+from ns_abstract.verify.network.bounds import NetworkBounds, bound_outputs
 from ns_abstract.verify.network.coefficient_source import CoefficientSource
 from ns_abstract.verify.network.coefficients import Float64, Int64, grid
 from ns_abstract.verify.network.forms import NodeForm
@@ -147,7 +147,7 @@ class _ReferenceCell(CoefficientSource):
         #: what all is relative to, by node, and what is followed at maxima
         self.references: dict[int, Tensor] = {}
         self.winners: dict[int, Tensor] = {}
-        self.cells = _NetworkBounds(network, images, "everywhere", memory, arithmetic, sharing=self)
+        self.cells = NetworkBounds(network, images, "everywhere", memory, arithmetic, sharing=self)
 
     def reference(self, k: int, passed_on: Callable[[], Tensor]) -> Tensor:
         self.references[k] = passed_on()
@@ -219,7 +219,7 @@ class _ReusingCells(CoefficientSource):
         self._last = max(first.stored, default=0) if fresh else None
         self._columns: dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
         self._count = images.count
-        self.cells = _NetworkBounds(first.network, images, "everywhere", memory, arithmetic, sharing=self)
+        self.cells = NetworkBounds(first.network, images, "everywhere", memory, arithmetic, sharing=self)
 
     def about(self, middle: Float64) -> Float64:
         # what rows gathered at maxima and products is relative to the first cell's references

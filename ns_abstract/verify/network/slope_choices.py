@@ -128,6 +128,19 @@ class ReluSlopes:
         below, above = self.units.shifted(slope, np.minimum(np.minimum(*ends), 0.0), np.maximum(*ends))
         lines[0][:, flat], lines[1][:, flat], lines[2][:, flat] = slope, below, above
 
+    def fix(self, phases: NDArray[np.int8], lines: Floats) -> None:
+        """Write the function's own piece into ``lines`` [6, R, N] where rows assume the neuron's phase [R, U] (N16)."""
+        for side, exact in ((1, 1.0), (-1, self.alpha)):
+            row, unit = np.nonzero(phases == side)
+            units = self.units[unit]
+            slope = np.full(len(row), exact).astype(units.relaxations.number).astype(np.float64)
+            # between 0 and the end on that side
+            end = (exact - slope) * (units.upper if side > 0 else units.lower)
+            below, above = units.shifted(slope, np.minimum(end, 0.0), np.maximum(end, 0.0))
+            for first, low, high in ((0, below, above), (3, above, below)):
+                for place, value in enumerate((slope, low, high), first):
+                    lines[place][row, units.flat] = value
+
     def derivative(self, parameter: Float64, coefficient: Float64, value: Float64) -> Float64:
         return np.maximum(coefficient, 0.0) * value
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ns_abstract.arithmetic.network_charges import OWN_LINE, UP
+from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.verify.network.bilinear import Product
 from ns_abstract.verify.network.graph import Network
 from ns_abstract.verify.network.layers import Activation, LinearLayer
 from ns_abstract.verify.network.max_pooling import MaxPool
-from ns_abstract.verify.network.slope_choices import LineChoice
+from ns_abstract.verify.network.slope_choices import LineChoice, ReluSlopes
 
 Float64 = NDArray[np.float64]
 Float32 = NDArray[np.float32]
@@ -34,7 +35,7 @@ class SplitNeurons:
 
     Attributes:
         flat: [B] where they are.
-        side: [B] 1 where they are assumed not to be negative, -1 where not positive.
+        side: [B] 1 where they are assumed not to be negative, -1 where not positive; or [R, B] by row, 0 for neither.
         reference: [B] their reference.
         noise: [B] charged for every part of a coefficient: rounding of the node and of rows.
     """
@@ -43,6 +44,10 @@ class SplitNeurons:
     side: Float64
     reference: Float64
     noise: Float64
+
+    def __getitem__(self, rows: np.ndarray) -> SplitNeurons:
+        """Those of some rows."""
+        return replace(self, side=self.side[rows]) if self.side.ndim > 1 else self
 
     def pay(self, multiplier: Float32) -> tuple[Float32, Float64]:
         """What rows gain for ``multiplier`` [R, B], not negative: coefficients [R, B], and [R] the least offset.
@@ -82,6 +87,10 @@ class _Adam:
     def __init__(self, shape: tuple[int, ...]) -> None:
         self._mean, self._square, self._count = np.zeros(shape), np.zeros(shape), 0
 
+    def keep(self, rows: np.ndarray) -> None:
+        """Go on with these rows alone."""
+        self._mean, self._square = self._mean[rows], self._square[rows]
+
     def step(self, g: Float64) -> Float64:
         """Directions, about one long, for derivatives ``g``."""
         self._count += 1
@@ -99,6 +108,8 @@ class DualAscent:
         lines: The cell's lines [6, C, H, W], by node.
         rows: Number of rows.
         held: Numbers of the cell whose signs are assumed, by node.
+        phases: By node, what rows assume of the neurons of its first choice [R, U]: 1, -1, or 0 for nothing.
+        step: The first step.
     """
 
     def __init__(
@@ -107,9 +118,11 @@ class DualAscent:
         lines: Mapping[int, Float32],
         rows: int,
         held: Mapping[int, SplitNeurons] | None = None,
+        phases: Mapping[int, NDArray[np.int8]] | None = None,
+        step: float = _STEP,
     ) -> None:
-        self.choices, self.split = choices, held or {}
-        self._lines = {k: lines[k] for k in choices}
+        self.choices, self.split, self.phases = choices, dict(held or {}), dict(phases or {})
+        self._lines = {k: np.repeat(lines[k][:, None], rows, 1) for k in choices}
         self.parameters = {
             k: [np.repeat(choice.start(lines[k].reshape(6, -1))[None], rows, 0) for choice in own]
             for k, own in choices.items()
@@ -117,19 +130,30 @@ class DualAscent:
         self.multipliers = {k: np.zeros((rows, len(v.flat)), np.float32) for k, v in self.split.items()}
         self._steps = {k: [_Adam(v.shape) for v in own] for k, own in self.parameters.items()}
         self._multipliers = {k: _Adam(v.shape) for k, v in self.multipliers.items()}
-        self._step = _STEP
+        self._step = step
+
+    def keep(self, rows: np.ndarray) -> None:
+        """Go on with these rows alone."""
+        self._lines = {k: np.ascontiguousarray(v[:, rows]) for k, v in self._lines.items()}
+        self.parameters = {k: [v[rows] for v in own] for k, own in self.parameters.items()}
+        self.multipliers = {k: v[rows] for k, v in self.multipliers.items()}
+        self.split = {k: v[rows] for k, v in self.split.items()}
+        self.phases = {k: v[rows] for k, v in self.phases.items()}
+        for adam in (*(one for own in self._steps.values() for one in own), *self._multipliers.values()):
+            adam.keep(rows)
 
     def lines(self) -> OptimisedSlopes:
         """Lines of every row: those of the cell, but where it chooses."""
-        lines_by_node = {}
         for k, own in self.choices.items():
-            count = len(self.parameters[k][0])
-            lines = np.repeat(self._lines[k][:, None], count, 1)
+            # the others stay as they are
+            lines = self._lines[k].reshape(6, len(self.parameters[k][0]), -1)
             for choice, parameter in zip(own, self.parameters[k], strict=True):
-                choice.put(parameter, lines.reshape(6, count, -1))
-            lines_by_node[k] = lines
+                choice.put(parameter, lines)
+            if k in self.phases:
+                assert isinstance(own[0], ReluSlopes)
+                own[0].fix(self.phases[k], lines)
         return OptimisedSlopes(
-            lines_by_node, {k: (held.flat, *held.pay(self.multipliers[k])) for k, held in self.split.items()}
+            self._lines, {k: (held.flat, *held.pay(self.multipliers[k])) for k, held in self.split.items()}
         )
 
     def climb(
@@ -181,6 +205,7 @@ def slope_derivatives(
     count, forces = image.shape[0], {}
     by_node = {k: [np.zeros(v.shape) for v in own] for k, own in ascent.parameters.items()}
     for k, node in enumerate(network.nodes[:last], 1):
+        check_cancelled()
         inputs = [v for v in (values[i] for i in node.inputs) if v is not None]
         rows = trace.get(k)
         if isinstance(node.layer, LinearLayer):

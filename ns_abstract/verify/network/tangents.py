@@ -75,7 +75,8 @@ class Tangents:
         first = torch.where(parts == 1.0, first, math.nan)
         corners = torch.stack([edges[0], edges[-1], *edges[1:-1]])
         found = Tangents(curve, side, first, last, lower, upper, corners, curve.function(corners))
-        return found._narrowed()
+        # functions without such parts may have no slope
+        return found._narrowed() if -side in curve.bends else found
 
     def _narrowed(self) -> Tangents:
         """With first and last points from which the interval's ends are on the right side."""

@@ -1,0 +1,276 @@
+"""Branch and bound on activation phases over fixed intermediate bounds, many branches at a time (design.md, N16)."""
+
+from __future__ import annotations
+
+import heapq
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ns_abstract.execution.cancellation import check_cancelled
+from ns_abstract.verify.network.bounds import NetworkBounds
+from ns_abstract.verify.network.coefficients import Coefficients, Float64, Floats, Int64, grid
+from ns_abstract.verify.network.output_bounds import ShiftedRows
+from ns_abstract.verify.network.slope_choices import LineChoice, ReluSlopes, ascending
+from ns_abstract.verify.network.slope_optimisation import DualAscent, OptimisedSlopes, SplitNeurons
+from ns_abstract.verify.network.stopping import BackwardBounds
+
+Phases = Mapping[int, NDArray[np.int8]]
+
+
+@dataclass(frozen=True)
+class TreeTuning:
+    """Preferences of branch and bound; they decide about time, and a proof needs a bound.
+
+    Attributes:
+        together: Rows that are bounded together.
+        root_steps, steps, last_steps: Steps towards better slopes and multipliers, of the whole cell, of a branch, and
+            of one without unstable neurons.
+        first: The first step's size.
+        tried: Neurons of which both halves are bounded before one is chosen.
+        easier: What the better half counts beside the worse one.
+        waiting: Most branches that wait.
+    """
+
+    together: int = 64
+    root_steps: int = 20
+    steps: int = 4
+    last_steps: int = 60
+    first: float = 0.2
+    tried: int = 10
+    easier: float = 1.0
+    waiting: int = 1 << 14
+
+
+_TUNING = TreeTuning()
+
+
+class TreeResult(NamedTuple):
+    """Whether all branches were proved, how many were bounded, and the weakest bound that is left."""
+
+    proved: bool
+    branches: int
+    least: float
+
+
+@dataclass(frozen=True)
+class _Branch:
+    """A branch.
+
+    Attributes:
+        phases: By activation: what is assumed of its unstable neurons [U].
+        lower: [g] bounds of the group's rows.
+        parameters: By activation: [g, U] what its rows have chosen.
+        multipliers: By activation [g, U].
+        splits: The activation and the number of neurons that may be assumed next; empty: none is unstable.
+    """
+
+    phases: Phases
+    lower: Float64
+    parameters: Mapping[int, Sequence[NDArray[np.float32]]] = field(default_factory=dict)
+    multipliers: Mapping[int, NDArray[np.float32]] = field(default_factory=dict)
+    splits: Sequence[tuple[int, int]] = ()
+
+    def halves(self, split: tuple[int, int]) -> list[_Branch]:
+        """The same with either phase of a neuron assumed besides."""
+        node, at = split
+        found = []
+        for side in (1, -1):
+            own = self.phases[node].copy()
+            own[at] = side
+            found.append(replace(self, phases={**self.phases, node: own}))
+        return found
+
+
+class PhaseTree:
+    """Proves that some row of a group is positive, by assuming phases of unstable ReLUs.
+
+    Intermediate bounds are those of the cell in every branch: they hold in it, too.
+
+    Args:
+        cells: Bounds of one cell, made to choose slopes.
+        rows, offset: Of the outputs, as in `ns_abstract.verify.network.bound_outputs`.
+        tuning: Preferences.
+    """
+
+    def __init__(self, cells: NetworkBounds, rows: Any, offset: Float64, tuning: TreeTuning = _TUNING) -> None:
+        self.intermediate, self.network = cells.intermediate, cells.intermediate.network
+        self.ascent, self.tuning = cells.output_rows.ascent, tuning
+        self.choices: dict[int, Sequence[LineChoice]] = ascending(self.intermediate.unstable, 0)
+        self.relus = {k: own[0] for k, own in self.choices.items() if isinstance(own[0], ReluSlopes)}
+        self.index = len(self.network.nodes)
+        self.shifted = cells.output_rows.shifted(cells.last, rows, offset)
+
+    def prove(self, group: Sequence[int], most: int, over: Callable[[], bool] = lambda: False) -> TreeResult:
+        """Try to prove that a row of ``group`` is positive for every image of the cell.
+
+        Args:
+            group: Numbers of rows.
+            most: Branches after which it is given up.
+            over: Asked between batches: whether to give up.
+        """
+        if not self.intermediate.good[0]:
+            return TreeResult(False, 0, -np.inf)
+        rows = _GroupRows.of(self.shifted, list(group), grid(self.network.shape(self.index)))
+        none = {k: np.zeros(len(own.units.flat), np.int8) for k, own in self.relus.items()}
+        number, count = itertools.count(), 1
+        opened = self._climbed(rows, [_Branch(none, np.full(len(group), -np.inf))], self.tuning.root_steps)
+        waiting = [(float(branch.lower.max()), next(number), branch) for branch in opened]
+        size = max(1, self.tuning.together // (2 * len(group)))
+        while waiting:
+            check_cancelled()
+            taken = [heapq.heappop(waiting)[2] for _ in range(min(size, len(waiting)))]
+            worst = float(taken[0].lower.max())
+            if count >= most or len(waiting) > self.tuning.waiting or over():
+                return TreeResult(False, count, worst)
+            ended = [branch for branch in taken if not branch.splits]
+            if ended and self._climbed(rows, ended, self.tuning.last_steps):
+                return TreeResult(False, count, worst)
+            taken = [branch for branch in taken if branch.splits]
+            if not taken:
+                continue
+            halves = self._halves(rows, taken)
+            count += len(halves)
+            for branch in self._climbed(rows, halves, self.tuning.steps):
+                heapq.heappush(waiting, (float(branch.lower.max()), next(number), branch))
+        return TreeResult(True, count, 0.0)
+
+    def _ascent(self, rows: _GroupRows, branches: Sequence[_Branch]) -> tuple[DualAscent, dict[int, tuple[int, Int64]]]:
+        """The rows of all branches, ready to choose, from what these have chosen before; and `_held`'s places."""
+        g = len(rows.offset)
+        phases = {k: np.repeat(np.stack([b.phases[k] for b in branches]), g, 0) for k in self.relus}
+        held, places = self._held(phases)
+        lines = {k: self.intermediate.relaxations[-1].lines[k][:, 0] for k in self.choices}
+        ascent = DualAscent(self.choices, lines, len(branches) * g, held, phases, self.tuning.first)
+        if branches[0].parameters:
+            for k, own in ascent.parameters.items():
+                for number in range(len(own)):
+                    own[number] = np.concatenate([b.parameters[k][number] for b in branches]).astype(np.float64)
+            for source, (k, used) in places.items():
+                ascent.multipliers[source] = np.concatenate([b.multipliers[k][:, used] for b in branches])
+        return ascent, places
+
+    def _held(self, phases: Phases) -> tuple[dict[int, SplitNeurons], dict[int, tuple[int, Int64]]]:
+        """By source: the neurons of which rows assume phases [R, U], and the activation and their numbers there."""
+        held: dict[int, SplitNeurons] = {}
+        places: dict[int, tuple[int, Int64]] = {}
+        noise = self.intermediate.relaxations[-1].noise
+        for k, sides in phases.items():
+            source, units = self.network.nodes[k - 1].inputs[0], self.relus[k].units
+            used = np.flatnonzero(sides.any(0))
+            if not len(used) or source in held:
+                continue
+            flat = units.flat[used]
+            # rounding of rows and of the node, whether or not it rides on the lines
+            shake = units.loose[used] + (noise[source].flatten(1).numpy()[0, flat] if source in noise else 0.0)
+            held[source] = SplitNeurons(flat, sides[:, used].astype(np.float64), units.reference[used], shake)
+            places[source] = k, used
+        return held, places
+
+    def _climbed(self, rows: _GroupRows, branches: Sequence[_Branch], steps: int) -> list[_Branch]:
+        """The branches that are not proved, with better bounds and with what may be assumed next."""
+        g, left = len(rows.offset), np.arange(len(branches))
+        ascent, places = self._ascent(rows, branches)
+        best = np.stack([b.lower for b in branches])
+        for number in range(steps + 1):
+            check_cancelled()
+            chosen, bounds = self.ascent.evaluate(self.index, rows.start(len(left)), 0, ascent)
+            best = np.fmax(best, rows.lower(bounds).reshape(-1, g))
+            if number < steps:
+                self.ascent.move(self.index, 0, chosen, bounds, ascent)
+            open_ = ~(best > 0.0).any(1)
+            if not open_.all():
+                kept = np.repeat(open_, g)
+                left, best = left[open_], best[open_]
+                ascent.keep(kept)
+                chosen.trace = {k: v[kept] for k, v in chosen.trace.items()}
+                if not len(left):
+                    return []
+        at = np.arange(len(left)) * g + best.argmax(1)
+        splits = self._candidates(chosen, at, [branches[int(k)].phases for k in left])
+        multipliers = {k: np.zeros((len(left) * g, len(own.units.flat)), np.float32) for k, own in self.relus.items()}
+        for source, (k, used) in places.items():
+            multipliers[k][:, used] = ascent.multipliers[source]
+        found = []
+        for place, number in enumerate(left.tolist()):
+            own = slice(place * g, (place + 1) * g)
+            parameters = {k: [v[own].astype(np.float32) for v in vs] for k, vs in ascent.parameters.items()}
+            paid = {k: v[own] for k, v in multipliers.items()}
+            found.append(_Branch(branches[number].phases, best[place], parameters, paid, splits[place]))
+        return found
+
+    def _candidates(self, chosen: OptimisedSlopes, at: Int64, phases: Sequence[Phases]) -> list[list[tuple[int, int]]]:
+        """By branch: the neurons that cost row ``at`` most because they are unstable."""
+        scores, nodes, places = [], [], []
+        for k, own in self.relus.items():
+            count = len(own.units.flat)
+            flat = chosen.trace[k].reshape(len(chosen.trace[k]), -1) if k in chosen.trace else None
+            score = np.zeros((len(at), count)) if flat is None else own.losses(flat[at][:, own.units.flat])
+            scores.append(np.where(np.stack([p[k] for p in phases]) == 0, score, -1.0))
+            nodes.append(np.full(count, k))
+            places.append(np.arange(count))
+        if not scores:
+            return [[] for _ in at]
+        score, node, place = np.concatenate(scores, 1), np.concatenate(nodes), np.concatenate(places)
+        order = np.argsort(-score, axis=1, kind="stable")[:, : self.tuning.tried]
+        return [[(int(node[j]), int(place[j])) for j in row if score[i, j] >= 0.0] for i, row in enumerate(order)]
+
+    def _halves(self, rows: _GroupRows, branches: Sequence[_Branch]) -> list[_Branch]:
+        """Both halves of each branch, of the candidates the one whose worse half is bounded best."""
+        g, halves, owner = len(rows.offset), [], []
+        for number, branch in enumerate(branches):
+            for split in branch.splits:
+                halves.append(branch.halves(split))
+                owner.append(number)
+        bounds = []
+        step = max(1, self.tuning.together // (2 * g))
+        for first in range(0, len(halves), step):
+            check_cancelled()
+            part = [half for pair in halves[first : first + step] for half in pair]
+            ascent, _ = self._ascent(rows, part)
+            _, found = self.ascent.evaluate(self.index, rows.start(len(part)), 0, ascent)
+            bounds.append(rows.lower(found).reshape(-1, 2, g).max(2))
+        # what is proved cannot become better
+        ends = np.minimum(np.concatenate(bounds), 0.0)
+        score = ends.min(1) + self.tuning.easier * ends.max(1)
+        chosen: dict[int, int] = {}
+        for k, number in enumerate(owner):
+            if number not in chosen or score[k] > score[chosen[number]]:
+                chosen[number] = k
+        return [half for k in chosen.values() for half in halves[k]]
+
+
+@dataclass(frozen=True)
+class _GroupRows:
+    """The rows of a group on the outputs, in the window that holds them."""
+
+    value: Floats
+    top: int
+    left: int
+    offset: Float64
+    missing: Float64
+
+    @staticmethod
+    def of(shifted: ShiftedRows, group: list[int], shape: tuple[int, int, int]) -> _GroupRows:
+        value = shifted.stored[group].reshape(len(group), *shape)
+        used = [np.flatnonzero((value != 0.0).any((0, 1, axis))) for axis in (3, 2)]
+        (top, bottom), (left, right) = ((int(v[0]), int(v[-1]) + 1) if len(v) else (0, 1) for v in used)
+        part = np.ascontiguousarray(value[:, :, top:bottom, left:right])
+        return _GroupRows(part, top, left, shifted.offset[0, group], shifted.missing[0, group])
+
+    def start(self, count: int) -> Coefficients:
+        """The rows of so many branches."""
+        value = np.tile(self.value, (count, 1, 1, 1))
+        return Coefficients(value, np.full(len(value), self.top), np.full(len(value), self.left))
+
+    def lower(self, bounds: BackwardBounds) -> Float64:
+        """[R] bounds of the rows; minus infinity where nothing is known."""
+        count = len(bounds.lower) // len(self.offset)
+        offset, missing = np.tile(self.offset, count), np.tile(self.missing, count)
+        room = ShiftedRows(self.value, missing, offset).room(bounds.plane[:, 0])
+        lower = bounds.lower + offset - room
+        return np.where(np.isfinite(lower), lower, -np.inf)

@@ -1,0 +1,194 @@
+"""Branches over fixed intermediate bounds: whatever rows choose, they hold for the images with the assumed phases."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from onnx_files import OnnxFile, session
+from test_network_bounds import exact_least, mlp, residual
+from test_network_branching import line
+
+from ns_abstract.execution.cancellation import Deadline
+from ns_abstract.verify import box_decisions
+from ns_abstract.verify.network import ImageSets, Network, NetworkArithmetic, bound_outputs, load_network
+from ns_abstract.verify.network.bounds import NetworkBounds
+from ns_abstract.verify.network.layers import Convolution, LeakyRelu, Matrix
+from ns_abstract.verify.network.phase_tree import PhaseTree, _Branch, _GroupRows
+from ns_abstract.verify.vnnlib import InputRegion, UnsafeSet
+
+MOST = 100
+
+
+def tree_of(
+    network: Network, images: ImageSets, rows: np.ndarray, offset: np.ndarray, arithmetic: NetworkArithmetic = "real"
+) -> PhaseTree:
+    return PhaseTree(NetworkBounds(network, images, "everywhere", 1 << 30, arithmetic, 1), rows, offset)
+
+
+def box(lower: np.ndarray, upper: np.ndarray) -> ImageSets:
+    none = np.zeros((1, len(lower), 1))
+    return ImageSets(none, lower[None], none, upper[None], lower[None], upper[None])
+
+
+@pytest.mark.parametrize("arithmetic", ["float32", "real"])
+def test_claims_next_to_the_exact_minimum(arithmetic: NetworkArithmetic, tmp_path: Path) -> None:
+    """What some image breaks exactly is never proved; a little below it is, where slopes alone prove less."""
+    gained = 0
+    for seed in (1,):
+        network, layers, _ = mlp(tmp_path, seed, 2.0)
+        rng = np.random.default_rng(seed)
+        images, rows = line(rng, 3), rng.normal(size=(3, 2))
+        least = [exact_least(layers, images.b_lower[0], images.a_lower[0, :, 0], row) for row in rows]
+        broken = -np.array([np.nextafter(float(v), np.inf) for v in least])
+        assert all(Fraction(float(b)) + v <= 0 for b, v in zip(broken, least, strict=True))
+        held = broken.copy()
+        for k in range(3):
+            assert not tree_of(network, images, rows, broken, arithmetic).prove([k], MOST).proved
+            # most of what the root misses is there to be gained
+            held[k] += 0.7 * -tree_of(network, images, rows, broken, arithmetic).prove([k], 1).least + 1e-6
+            found = tree_of(network, images, rows, held, arithmetic).prove([k], MOST)
+            assert found.proved
+            gained += found.branches > 1
+        # one row of a group is enough
+        either = np.where(np.arange(3) == 1, broken, held)
+        assert tree_of(network, images, rows, either, arithmetic).prove([1, 0], MOST).proved
+        assert not tree_of(network, images, rows, np.full(3, np.nan), arithmetic).prove([0], MOST).proved
+    assert gained >= 1
+
+
+def leaky(folder: Path) -> Path:
+    f = OnnxFile((1, 6, 6), 1)
+    f.conv(1, 4, pads=[1, 1, 1, 1])
+    f.node("LeakyRelu", alpha=0.3)
+    f.conv(4, 4, pads=[1, 1, 1, 1], strides=[2, 2])
+    f.node("Relu")
+    f.node("Flatten")
+    f.gemm(36, 3)
+    return f.write(folder / "leaky.onnx")
+
+
+def phases_at(network: Network, tree: PhaseTree, x: np.ndarray) -> dict[int, np.ndarray]:
+    """What the image [n] itself has at the unstable neurons."""
+    values = [torch.from_numpy(x).reshape(1, *network.input_shape)]
+    for node in network.nodes:
+        values.append(node.layer([values[i] for i in node.inputs]))
+    found = {}
+    for k, own in tree.relus.items():
+        z = values[network.nodes[k - 1].inputs[0]].reshape(-1).numpy()[own.units.flat]
+        found[k] = np.where(z >= 0.0, 1, -1).astype(np.int8)
+    return found
+
+
+def least_excess(network: Network, tree: PhaseTree, images: ImageSets, rows: np.ndarray, count: int) -> float:
+    """By how much bounds of branches that an image is in are below its outputs, at least; negative: above."""
+    rng, least = np.random.default_rng(0), np.inf
+    group = _GroupRows.of(tree.shifted, list(range(len(rows))), (1, 1, network.output_size))
+    for _ in range(count):
+        # corners, and what is near them
+        part = np.where(rng.uniform(size=images.lower.shape[1]) < 0.7, rng.integers(0, 2, images.lower.shape[1]), 0.5)
+        x = images.lower[0] + part * (images.upper[0] - images.lower[0])
+        own = phases_at(network, tree, x)
+        branches = []
+        for share in (0.0, 0.2, 1.0):
+            phases = {k: np.where(rng.uniform(size=v.shape) < share, v, 0).astype(np.int8) for k, v in own.items()}
+            sizes = {k: (len(rows), len(v)) for k, v in own.items()}
+            scale = rng.choice([0.0, 0.5])
+            multipliers = {k: rng.exponential(scale, size).astype(np.float32) for k, size in sizes.items()}
+            parameters = {k: [rng.uniform(size=size).astype(np.float32)] for k, size in sizes.items()}
+            branches.append(_Branch(phases, np.full(len(rows), -np.inf), parameters, multipliers))
+        ascent, _ = tree._ascent(group, branches)
+        _, bounds = tree.ascent.evaluate(tree.index, group.start(len(branches)), 0, ascent)
+        lower = group.lower(bounds).reshape(len(branches), -1)
+        assert np.isfinite(lower).all()
+        with torch.no_grad():
+            y = network(torch.from_numpy(x).reshape(1, *network.input_shape))[0].numpy()
+        least = min(least, float((rows @ y - lower).min()))
+    return least
+
+
+def small(folder: Path) -> Path:
+    """Few neurons, nearly all of them unstable: bounds of branches are nearly reached."""
+    f = OnnxFile((3,), 2)
+    f.gemm(3, 6)
+    f.node("LeakyRelu", alpha=0.3)
+    f.gemm(6, 4)
+    f.node("Relu")
+    f.gemm(4, 2)
+    return f.write(folder / "small.onnx")
+
+
+@pytest.mark.parametrize(("name", "radius"), [("small", 1.0), ("leaky", 0.05), ("residual", 0.05)])
+def test_branches_hold_for_the_images_in_them(name: str, radius: float, tmp_path: Path) -> None:
+    """Random slopes, multipliers and phases, of which an image has all: the bound is not above its output."""
+    makes = {"leaky": leaky, "residual": residual, "small": small}
+    network = load_network(makes[name](tmp_path))
+    rng = np.random.default_rng(3)
+    x = rng.uniform(size=network.input_size)
+    images, rows = box(x - radius, x + radius), rng.normal(size=(2, network.output_size))
+    rows = np.concatenate([rows, -rows])
+    tree = tree_of(network, images, rows, np.zeros(4))
+    assert sum(len(own.units.flat) for own in tree.relus.values()) >= 5
+    assert least_excess(network, tree, images, rows, 40 if name == "small" else 4) >= 0.0
+
+
+def test_functions_without_curved_parts_choose_nothing(tmp_path: Path) -> None:
+    """Clips and absolute values have no tangents; rows pass them with the lines of the cell."""
+    f = OnnxFile((4,), 0)
+    f.gemm(4, 6)
+    f.node("Clip", f.last, f.constant(-0.1), f.constant(0.3))
+    f.gemm(6, 6)
+    f.node("Abs")
+    f.gemm(6, 2)
+    network = load_network(f.write(tmp_path / "clip.onnx"))
+    x, rows = np.full(4, 0.3), np.eye(2)
+    images = box(x - 0.2, x + 0.2)
+    plain = bound_outputs(network, images, rows, np.zeros(2), arithmetic="real").lower[0]
+    chosen = bound_outputs(network, images, rows, np.zeros(2), arithmetic="real", slope_steps=2, intermediate_steps=2)
+    assert np.isfinite(plain).all() and (chosen.lower[0] >= plain).all()
+
+
+def test_deadlines_are_asked_often(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Between two questions whether time is up lies the work of a few layers, in attacks, bounds and branches."""
+    network, file = load_network(leaky(tmp_path)), tmp_path / "leaky.onnx"
+    work, asked, most = 0, 0, 0
+
+    def counted(kind: type, name: str) -> None:
+        before = getattr(kind, name)
+
+        def call(*given: Any, **named: Any) -> Any:
+            nonlocal work
+            work += 1
+            return before(*given, **named)
+
+        monkeypatch.setattr(kind, name, call)
+
+    for kind in (Convolution, Matrix):
+        for name in ("apply", "magnitude", "backward"):
+            counted(kind, name)
+    for name in ("function", "lines", "band"):
+        counted(LeakyRelu, name)
+
+    def request() -> bool:
+        nonlocal asked, most, work
+        asked, most, work = asked + 1, max(most, work), 0
+        return asked > 1500
+
+    x = np.random.default_rng(0).uniform(size=36)
+    unsafe = UnsafeSet(np.array([[1.0, -1.0, 0.0]]), np.array([0.0]), ((0,),), 0)
+    run = session(file)
+    y = run(x.astype(np.float32).reshape(1, 1, 6, 6))[0].astype(np.float64)
+    # unsafe at the middle, so nothing is proved; the program says nothing, so nothing is found
+    offset = np.array([-(y[0] - y[1])])
+    region = InputRegion(x - 0.1, x + 0.1, dataclasses.replace(unsafe, offset=offset))
+    nothing: Sequence[float] = [np.nan] * 3
+    answer = box_decisions.decide(network, lambda _: np.array(nothing), [region], Deadline(request=request))
+    assert answer.word in ("timeout", "unknown")
+    assert asked > 500
+    assert most <= 12
