@@ -29,8 +29,9 @@ from objects import KINDS, RUNS, write_nerf, write_run
 from train_views import CONFIDENCE, NEAR_PLANE, SAMPLES, orbit_of, target_of
 
 import ns_abstract as nsa
-from ns_abstract.api.certification import FramePictures, PropertySource, Question
+from ns_abstract.api.certification import FramePictures, PropertySource
 from ns_abstract.api.files import resized
+from ns_abstract.api.network_question import Question
 from ns_abstract.geometry.camera_path import load_camera_path
 from ns_abstract.io.atomic import write_json
 from ns_abstract.verify.model import NetworkModel

@@ -160,7 +160,7 @@ def prepare(options: argparse.Namespace) -> int:
 
     from ns_abstract.arithmetic.rounding import FLOAT32
     from ns_abstract.bench.sets import open_jobs, pose_set, splat_of
-    from ns_abstract.bench.stiff import all_cases
+    from ns_abstract.bench.stiff_cases import all_cases
     from ns_abstract.methods.splat.activate import activate
     from ns_abstract.methods.splat.bounds import SplatBounds
     from ns_abstract.methods.splat.constants import VERSIONS

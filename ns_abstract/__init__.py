@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING
 from ns_abstract.io import version as _version
 
 if TYPE_CHECKING:
-    from ns_abstract.api.bounding import BoundResult, Progress, bound
+    from ns_abstract.api.abstract_image import BoundResult
+    from ns_abstract.api.bounding import Progress, bound
     from ns_abstract.api.certifying import Certificate, CertifiedCell, CertifyProgress, certify
     from ns_abstract.api.checking import Audit, check
     from ns_abstract.api.comparing import Comparison, compare

@@ -472,7 +472,7 @@ def _tried(
 
 def _child(module: str, arguments: list[str], folder: str, memory: int, writer: int, room: int | None) -> None:
     """The command itself."""
-    from ns_abstract.execution import engines
+    from ns_abstract.execution import cluster
 
     code = 99
     try:
@@ -487,7 +487,7 @@ def _child(module: str, arguments: list[str], folder: str, memory: int, writer: 
         if room is not None:
             resource.setrlimit(resource.RLIMIT_FSIZE, (room, room))
         # a scheduler that does not answer is asked for that long
-        engines._CONNECT = 1.0
+        cluster._CONNECT = 1.0
         sys.argv = ["command", *arguments]
         sys.stdout, sys.stderr = os.fdopen(1, "w"), os.fdopen(2, "w")
         importlib.import_module(module).main()

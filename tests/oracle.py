@@ -15,7 +15,8 @@ import mpmath
 import numpy as np
 from flint import arb, fmpq
 
-from ns_abstract.arithmetic.forms import Basis, Float64Array, FormArray, set_norms
+from ns_abstract.arithmetic.form_array import FormArray
+from ns_abstract.arithmetic.forms import Basis, Float64Array, set_norms
 
 BITS = 200
 _MOST_BITS = 6400

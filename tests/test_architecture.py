@@ -169,6 +169,7 @@ def drawing() -> str:
 # ---------------------------------------------------------------- the tree
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not (ROOT / "docs").exists(), reason="the documentation is not beside the tests")
 def test_drawing_of_imports_is_that_of_the_sources() -> None:
     page = (ROOT / "docs" / "dev" / "architecture.md").read_text(encoding="utf-8")
@@ -187,6 +188,7 @@ def test_source_file(file: Path) -> None:
     assert not found
 
 
+@pytest.mark.slow
 def test_modules_import_one_way() -> None:
     texts = {module(file): file.read_text(encoding="utf-8") for file in sources()}
     assert len(texts) > 200 and circle(texts) == []
@@ -378,6 +380,7 @@ done
 """
 
 
+@pytest.mark.slow_cases(every=3)
 @pytest.mark.skipif(shutil.which("git") is None, reason="git is not installed")
 @pytest.mark.parametrize("fails", ["", "ruff", "pyright", "pytest"])
 def test_ci_lints_first_and_goes_on_after_a_failure(tmp_path: Path, fails: str) -> None:

@@ -133,7 +133,10 @@ def test_reports_and_results_have_them(blobs: Inputs, tmp_path: Path, in_process
 
 def test_page_escapes(tmp_path: Path) -> None:
     entry = Assumption(EVIL, EVIL, EVIL)
-    run = RunRecord("real-sound", {"name": "gsplat", "version": "1"}, {}, (0,), {}, {}, assumptions=(entry,))
+    run = RunRecord(
+        guarantee="real-sound", renderer={"name": "gsplat", "version": "1"}, scene={}, frames=(0,), fingerprint={},
+        settings={}, assumptions=(entry,),
+    )  # fmt: skip
     document = Report(tmp_path, run).document()
     assert document["assumptions"] == [{"name": EVIL, "value": EVIL, "origin": EVIL}]
     text = render_page(document, {})

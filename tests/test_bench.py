@@ -18,7 +18,8 @@ from ns_abstract.api.files import PathJob
 from ns_abstract.bench import certificates, plan, rules, scale
 from ns_abstract.bench import paper as paper_tables
 from ns_abstract.bench.sets import open_jobs, pose_set, splat_of
-from ns_abstract.cli.bench import Certificates, PlanBenchmark, RulesBenchmark, ScaleBenchmark, Tightness, bench
+from ns_abstract.cli.bench import bench
+from ns_abstract.cli.bench_options import Certificates, PlanBenchmark, RulesBenchmark, ScaleBenchmark, Tightness
 from ns_abstract.cli.common import DONE
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.program_options import ProgramOptions

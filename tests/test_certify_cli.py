@@ -31,12 +31,7 @@ from waiting import LONG, until
 
 from ns_abstract.api import showing
 from ns_abstract.api.cell_search import examine_block
-from ns_abstract.api.certification import (
-    Certification,
-    CertifySettings,
-    FramePictures,
-    open_certification,
-)
+from ns_abstract.api.certification import Certification, CertifySettings, FramePictures, open_certification
 from ns_abstract.api.showing import look_closer
 from ns_abstract.cli import certify as certify_command
 from ns_abstract.cli.certify import Certify, certify
@@ -622,7 +617,7 @@ def test_two_dask_workers_equal_one_process(planted: Case, finished: Path, tmp_p
 @pytest.mark.slow
 @needs_dask
 def test_dask_worker_killed(planted: Case, finished: Path, tmp_path: Path) -> None:
-    from ns_abstract.execution.engines import Cluster, connected
+    from ns_abstract.execution.cluster import Cluster, connected
     from ns_abstract.verify.store import Store
 
     job = planted.job
@@ -653,7 +648,7 @@ def test_dask_worker_killed(planted: Case, finished: Path, tmp_path: Path) -> No
 @pytest.mark.slow
 @needs_dask
 def test_cluster_on_this_machine_keeps_torch_quick() -> None:
-    from ns_abstract.execution.engines import connected
+    from ns_abstract.execution.cluster import connected
 
     with connected(None, 1) as client:
         (found,) = client.run(lambda: os.environ.get("MALLOC_TRIM_THRESHOLD_")).values()
@@ -665,6 +660,7 @@ def test_cluster_on_this_machine_keeps_torch_quick() -> None:
 # ---------------------------------------------------------------- reports
 
 
+@pytest.mark.slow
 def test_report(planted: Case, finished: Path) -> None:
     document = report(finished)
     for key in (
@@ -677,6 +673,8 @@ def test_report(planted: Case, finished: Path) -> None:
     assert document["property"]["type"] == "classification"
     (frame,) = document["frames"]
     assert frame["parameters"] == [{"name": "x", "unit": "normalised units", "lower": -0.15, "upper": 0.15}]
+    assert frame["intrinsics"] == planted.job.job.pose_sets[0].camera.intrinsics._asdict()
+    assert (frame["intrinsics"]["width"], frame["intrinsics"]["height"]) == (SIZE, SIZE)
     assert frame["least_margin"] > 0.0 and frame["counterexamples"][0]["margin"] <= 0.0
     assert frame["counterexamples"][0]["values"].keys() == {"x"}
     volumes = dict.fromkeys(("certified", "falsified", "unknown"), 0.0)

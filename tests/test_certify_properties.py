@@ -353,6 +353,7 @@ def test_decode_by_hand() -> None:
     assert boxes[0, 2, :, 1, 0].tolist() == pytest.approx([x - w / 2, y_ - h / 2, x + w / 2, y_ + h / 2])
 
 
+@pytest.mark.slow_cases(every=3)
 @pytest.mark.parametrize("label", [None, 7])
 @pytest.mark.parametrize("iou", [None, 0.2])
 def test_detection(label: int | None, iou: float | None, tmp_path: Path) -> None:

@@ -392,6 +392,7 @@ def test_cells_that_leave_a_gap_are_refuted(copy: Path, in_process: InProcess) -
     assert code == 1 and "no partition of the set" in out
 
 
+@pytest.mark.slow
 def test_too_little_time_is_no_success(copy: Path, in_process: InProcess) -> None:
     code, out, _ = in_process(check_command.main, [str(copy), "--claims", "50", "--seconds", "0.001"])
     assert code == 3 and "50 not settled" in out
@@ -421,7 +422,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
 }
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BAD)
 def test_bad_input_is_one_line(name: str, copy: Path, in_process: InProcess) -> None:
     damage, words = BAD[name]

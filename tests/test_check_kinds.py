@@ -194,12 +194,14 @@ def test_a_certificate_is_proved_again(copy: Path) -> None:
     assert found.uniform["claims"] == 2 and found.uniform["float32_at_least"] > 0.2
 
 
+@pytest.mark.slow
 def test_a_margin_that_is_too_large_is_refuted(copy: Path, in_process: InProcess) -> None:
     rewrite(copy, "UPDATE cells SET margin = margin + 10")
     code, out, _ = in_process(check_command.main, [str(copy), "--claims", "1", "--seconds", "60"])
     assert code == 1 and "the margin is" in out
 
 
+@pytest.mark.slow
 def test_another_class_is_refuted(copy: Path) -> None:
     file = copy / "report.json"
     document = json.loads(file.read_text())

@@ -26,6 +26,7 @@ from ns_abstract.api.files import Settings, open_job
 from ns_abstract.cli import demo as demo_command
 from ns_abstract.cli import render as render_command
 from ns_abstract.cli.common import complaint
+from ns_abstract.geometry.camera_path import load_camera_path
 from ns_abstract.geometry.keyframe_cameras import KeyframeCamera, path_json
 from ns_abstract.io.atomic import write_json
 from ns_abstract.io.folder import MARK
@@ -293,6 +294,7 @@ MISTAKES: dict[str, tuple[Change, tuple[str, ...]]] = {
 }  # fmt: skip
 
 
+@pytest.mark.slow_cases(every=28)
 @pytest.mark.parametrize("name", MISTAKES)
 def test_mistake_is_one_line(
     name: str, make_blobs: Callable[..., Inputs], tmp_path: Path, call: Callable[..., tuple[int, str]]
@@ -304,7 +306,7 @@ def test_mistake_is_one_line(
     assert not list((tmp_path / "out").glob("frame_*"))
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["path is no JSON", "unknown option", "half a checkpoint"])
 def test_mistake_is_one_line_from_a_shell(name: str, make_blobs: Callable[..., Inputs], tmp_path: Path) -> None:
     change, fragments = MISTAKES[name]
@@ -427,6 +429,7 @@ def test_a_run_writes_what_it_promises(blobs: Inputs, finished: Path) -> None:
         check_samples(blobs, finished, entry["index"])
 
 
+@pytest.mark.slow
 def test_frames_and_size_are_those_asked_for(
     blobs: Inputs, tmp_path: Path, call: Callable[..., tuple[int, str]]
 ) -> None:
@@ -452,6 +455,8 @@ def test_other_renderers(
     document = report(tmp_path)
     assert (document["guarantee"], document["renderer"]["name"]) == (guarantee, name)
     assert document["frames"][0]["ratio"] <= 1.05
+    camera = load_camera_path(blobs.path).cameras[1]
+    assert document["frames"][0]["intrinsics"] == camera.intrinsics._asdict()
     check_samples(blobs, tmp_path, 1, **options)
 
 
@@ -552,6 +557,7 @@ def test_budget_too_small_for_every_frame(blobs: Inputs, tmp_path: Path, call: C
     check_samples(blobs, tmp_path, 0)
 
 
+@pytest.mark.slow
 def test_budget_reached_with_a_result_for_every_frame_is_success(
     make_blobs: Callable[..., Inputs], tmp_path: Path, call: Callable[..., tuple[int, str]]
 ) -> None:
@@ -580,6 +586,7 @@ def test_resuming_keeps_finished_frames_and_ends_the_same(
     assert report(tmp_path)["state"] == "done"
 
 
+@pytest.mark.slow
 def test_resuming_with_any_budget_gets_on(blobs: Inputs, tmp_path: Path, call: Callable[..., tuple[int, str]]) -> None:
     missing = []
     for _ in range(3):
@@ -589,6 +596,7 @@ def test_resuming_with_any_budget_gets_on(blobs: Inputs, tmp_path: Path, call: C
     assert missing == [[1, 2], [2], []]
 
 
+@pytest.mark.slow
 def test_damaged_frames_are_computed_again(
     blobs: Inputs, finished: Path, tmp_path: Path, call: Callable[..., tuple[int, str]]
 ) -> None:
@@ -652,6 +660,7 @@ def test_signal_saves_what_is_finished(number: int, make_blobs: Callable[..., In
     assert "</html>" in (folder / "report.html").read_text()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "place",
     [
@@ -724,9 +733,9 @@ def test_worker_with_other_files_is_refused(blobs: Inputs, tmp_path: Path) -> No
 def test_no_scheduler_at_the_address(
     blobs: Inputs, tmp_path: Path, call: Callable[..., tuple[int, str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from ns_abstract.execution import engines
+    from ns_abstract.execution import cluster
 
-    monkeypatch.setattr(engines, "_CONNECT", "1s")
+    monkeypatch.setattr(cluster, "_CONNECT", "1s")
     options = blobs.options(tmp_path / "out", engine="dask", scheduler_address="127.0.0.1:1")
     one_line(*call(options), "--scheduler-address", "127.0.0.1:1", "dask scheduler")
 

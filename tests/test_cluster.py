@@ -22,8 +22,8 @@ from test_cli import call, environment, one_line  # noqa: F401
 from test_ending import alive
 from waiting import until
 
-from ns_abstract.execution import engines
-from ns_abstract.execution.engines import Cluster, Tls, connected
+from ns_abstract.execution import cluster
+from ns_abstract.execution.cluster import Cluster, Tls, connected
 from ns_abstract.io.errors import InputError
 
 pytestmark = pytest.mark.skipif(importlib.util.find_spec("distributed") is None, reason="dask is not installed")
@@ -110,7 +110,7 @@ def test_a_killed_worker_loses_nothing(parts: Parts, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_a_killed_scheduler_is_noticed(parts: Parts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(engines, "_GONE", 1.0)
+    monkeypatch.setattr(cluster, "_GONE", 1.0)
     with connected(parts.address) as client:
         engine = busy(client, tmp_path)
         parts.scheduler.kill()
@@ -124,7 +124,7 @@ def test_a_killed_scheduler_is_noticed(parts: Parts, tmp_path: Path, monkeypatch
 def test_workers_that_do_not_come_back_are_noticed(
     parts: Parts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(engines, "_GONE", 1.0)
+    monkeypatch.setattr(cluster, "_GONE", 1.0)
     with connected(parts.address) as client:
         engine = busy(client, tmp_path)
         for worker in parts.workers:
@@ -137,7 +137,7 @@ def test_workers_that_do_not_come_back_are_noticed(
 
 CLIENT = """
 import sys, os
-from ns_abstract.execution.engines import Cluster, connected
+from ns_abstract.execution.cluster import Cluster, connected
 from test_cluster import slow
 if __name__ == "__main__":
     address = sys.argv[2] if len(sys.argv) > 2 else None
@@ -294,7 +294,7 @@ def test_a_result_whose_worker_is_gone_is_not_waited_for(monkeypatch: pytest.Mon
 
     # nobody is left who could make it again
     asked.clear()
-    monkeypatch.setattr(engines, "_GONE", 0.0)
+    monkeypatch.setattr(cluster, "_GONE", 0.0)
     engine.submit(4, divmod, 7, 1)
     with pytest.raises(InputError, match="no workers left"):
         for _ in range(3):

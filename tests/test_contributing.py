@@ -60,6 +60,7 @@ def test_what_is_cited_exists(page: Path) -> None:
     assert problems(page.read_text(encoding="utf-8")) == []
 
 
+@pytest.mark.slow
 def test_what_is_missing_is_noticed() -> None:
     text = (
         "`no/such.py`, [a](docs/no.md), `NoSuchName`, `tests/wall.py`, `Rasteriser`\n```sh\npytest tests/no.py\n```\n"

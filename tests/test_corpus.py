@@ -52,7 +52,8 @@ from ns_abstract.methods.splat.ply import write_ply
 from ns_abstract.methods.splat.write import write_splatfacto_run
 from ns_abstract.refine.result import FrameResult, TracePoint
 from ns_abstract.report.certificate import write_certificate
-from ns_abstract.report.record import Report, RunRecord, file_stamp
+from ns_abstract.report.record import Report, RunRecord
+from ns_abstract.report.run import file_stamp
 from ns_abstract.verify.search import BlockResult, FinishedCell
 
 SIZE = 16

@@ -126,7 +126,7 @@ def test_rows_of_one_cell_hold_for_others(
             assert (found.lower[cell] <= least).all()
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize("local", ["", "product", "maximum", "short"])
 def test_rows_of_one_cell_hold_every_value(local: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What the first cell's rows say of every number, against the exact network on images of each other one."""
@@ -165,6 +165,7 @@ def test_rows_of_one_cell_hold_every_value(local: str, tmp_path: Path, monkeypat
                 assert (np.abs(number - plane) <= said.half[cell]).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("local", ["", "product", "maximum"])
 def test_products_of_rows_are_charged(local: str, tmp_path: Path) -> None:
     """Beside the same sums in float64, for whatever products of float32 lose."""
@@ -208,6 +209,7 @@ def test_products_of_rows_are_charged(local: str, tmp_path: Path) -> None:
     assert max(off) > 0.0
 
 
+@pytest.mark.slow
 def test_parts_have_the_references_and_winners_of_the_whole(tmp_path: Path) -> None:
     """What rows gathered at maxima is relative to them; by themselves parts would follow others."""
     net, _ = network(tmp_path, 0, "maximum")

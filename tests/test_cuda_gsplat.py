@@ -87,6 +87,7 @@ def prepared(cuda: Any, folder: Path, planted: bool = False, layers: bool = Fals
     return folder
 
 
+@pytest.mark.slow
 def test_nothing_is_outside(cuda: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     every = cuda.compare(prepared(cuda, tmp_path), "1.4.0", 1.0, ByReference, "cpu")
     (cells,) = every

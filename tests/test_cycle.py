@@ -187,6 +187,7 @@ def test_render_bounds_the_closing_leg(inputs: Inputs, tmp_path: Path, in_proces
     assert outside(frame.lower, frame.upper, scene, leg(path, np.linspace(0.0, 1.0, 23))) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("before", [False, True])
 def test_results_of_another_leg_are_not_continued(
     inputs: Inputs, tmp_path: Path, in_process: InProcess, before: bool

@@ -75,6 +75,7 @@ def test_describe_tells_units_distances_and_pixels(blobs: Inputs, call: Call, tm
     assert numbers(text, r"pitch moves what frame 0 shows by ([\d.]+)")[0] == pytest.approx(2 * yaw, rel=0.2)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rotation", "asks"), [((0.49,), False), ((0.0, 0.51, 0.0), True), ((60.0, 0.0, 0.0), False)])
 def test_wide_rotations_in_radians_ask_back(
     blobs: Inputs, call: Call, tmp_path: Path, rotation: tuple[float, ...], asks: bool

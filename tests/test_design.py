@@ -76,6 +76,7 @@ def test_labels_are_in_order() -> None:
     assert len(LABELS) == len(set(LABELS)) > 60
 
 
+@pytest.mark.slow_cases(every=4)
 @pytest.mark.parametrize("label", LABELS)
 def test_code_says_the_label(label: str) -> None:
     """Each function that a label names cites the label, in its docstring or (a module) in its own."""

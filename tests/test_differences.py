@@ -231,6 +231,7 @@ def test_polynomials_hold_exact_values(d: int, order: int) -> None:
             assert float(upper) <= float(most) + 2e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "spec", "arithmetic"),
     [
@@ -366,6 +367,7 @@ def test_floors_leave_nothing_out(change: float) -> None:
     assert (found.witness_upper < found.largest.value).mean() > 0.5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("change", ["rounded", "same"])
 def test_floors_of_splats(change: str) -> None:
     whole, _ = difference(change, SHIFT)
@@ -436,6 +438,7 @@ def write(folder: Path, scene: SplatScene, name: str) -> Path:
     return write_splatfacto_run(scene, folder, timestamp="2026-01-01_120000", experiment_name=name)
 
 
+@pytest.mark.slow
 def test_a_run_and_its_changed_version(blobs: Inputs, tmp_path: Path, in_process: InProcess) -> None:
     other, out = write(tmp_path / "other", rounded(blob_scene()), "rounded"), tmp_path / "out"
     options = blobs.options(out, other=other, time_budget=8, target_ratio=1.3, frames=[0])
@@ -466,6 +469,7 @@ def test_a_run_and_its_changed_version(blobs: Inputs, tmp_path: Path, in_process
     assert np.abs(a - b).max() == pytest.approx(entry["worst"]["difference"], abs=1e-7)
 
 
+@pytest.mark.slow
 def test_a_run_and_its_export(blobs: Inputs, tmp_path: Path, in_process: InProcess) -> None:
     scene = blob_scene()
     other = tmp_path / "blobs.ply"
@@ -533,6 +537,7 @@ def test_mistakes_are_one_line(
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_two_nerfs(tmp_path: Path, in_process: InProcess) -> None:
     run = nerf_run(tmp_path)
     options = [

@@ -14,7 +14,8 @@ from numba import njit
 from oracle import escapes, inside, points, rational, value, weights
 
 from ns_abstract.arithmetic.elementary import EXP_HIGHEST, EXP_LOWEST, exp_kernel
-from ns_abstract.arithmetic.forms import Basis, FormArray, set_norms
+from ns_abstract.arithmetic.form_array import FormArray
+from ns_abstract.arithmetic.forms import Basis, set_norms
 from ns_abstract.arithmetic.rounding import EXP_RELATIVE_ERROR, FLOAT32, REAL, UNIT32, UNIT64, arithmetic, gamma
 from ns_abstract.arithmetic.trigonometry import cos_sin
 

@@ -126,7 +126,7 @@ def test_one_ray_is_given_up_inside(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_refinement_ends_soundly_wherever_it_is_stopped(count: int) -> None:
     scene, pose_set = tiny_scene(0), poses(YAW)
     frame: Any = NerfFrame(scene, UNIFORM, pose_set)
-    refinement = Refinement(frame, 0, RefinementGoal(1.0, LONG, 60), keep_leaves=True, stopped=After(count))
+    refinement = Refinement(frame, 0, RefinementGoal(1.0, LONG, 60, keep_leaves=True), stopped=After(count))
     try:
         result = refinement.run()
     except WorkCancelledError:
@@ -287,7 +287,7 @@ if __name__ == "__main__":
 
 
 UNGUARDED_CLUSTER = """
-from ns_abstract.execution.engines import connected
+from ns_abstract.execution.cluster import connected
 from ns_abstract.io.errors import InputError
 try:
     with connected(None, 1):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -159,8 +160,8 @@ class Waves:
         return self.pace * (np.array(box.upper) - np.array(box.lower))
 
 
-def refine(frame: Any, goal: RefinementGoal, **options: Any) -> FrameResult:
-    return Refinement(frame, 0, goal, **options).run()
+def refine(frame: Any, goal: RefinementGoal, keep_leaves: bool = False, **options: Any) -> FrameResult:
+    return Refinement(frame, 0, replace(goal, keep_leaves=keep_leaves), **options).run()
 
 
 def check(frame: Waves, result: FrameResult) -> None:
@@ -268,6 +269,7 @@ def test_only_a_cover_that_may_reach_the_goal_is_allowed_to_be_looser() -> None:
             assert 0.0 < before[0] <= (ratio - 1.0) * after_cover(result).mpg_witness
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dimensions", [1, 2])
 def test_trace_begins_with_the_first_cells(dimensions: int) -> None:
     """A set that is not covered yet has nothing but [0, 1], however tight the cells so far are."""

@@ -198,6 +198,7 @@ def forge(file: Path, text: str) -> None:
         base.execute(text)
 
 
+@pytest.mark.slow_cases(every=4)
 @pytest.mark.parametrize(
     "text",
     [
@@ -231,6 +232,7 @@ def test_a_search_that_was_edited_is_not_continued(tmp_path: Path, text: str) ->
     open_store(tmp_path).close()
 
 
+@pytest.mark.slow_cases(every=5)
 @pytest.mark.parametrize("place", range(0, 100, 7))
 def test_damage_is_noticed_or_without_effect(tmp_path: Path, place: int) -> None:
     store = open_store(tmp_path)

@@ -143,6 +143,7 @@ FORMATS: dict[str, Written] = {
 }
 
 
+@pytest.mark.slow_cases(every=3)
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("name", FORMATS)
 def test_numbers_are_those_of_the_description(name: str, degree: int, tmp_path: Path) -> None:
@@ -162,6 +163,7 @@ def test_numbers_are_those_of_the_description(name: str, degree: int, tmp_path: 
     assert np.abs(found.opacity_logits - scene.opacity_logits).max() < 0.05
 
 
+@pytest.mark.slow_cases(every=3)
 @pytest.mark.parametrize("name", FORMATS)
 def test_bounds_hold_the_picture_of_another_decoder(name: str, tmp_path: Path) -> None:
     file, expected = FORMATS[name](tmp_path, source())
@@ -538,6 +540,7 @@ def _text(file: Path, text: str) -> Path:
     return file
 
 
+@pytest.mark.slow_cases(every=5)
 @pytest.mark.parametrize("name", BAD)
 def test_bad_files_end_in_one_line(name: str, tmp_path: Path) -> None:
     write, mentions = BAD[name]

@@ -24,10 +24,10 @@ from oracle import (
     weights,
 )
 
+from ns_abstract.arithmetic.form_array import FormArray
 from ns_abstract.arithmetic.forms import (
     MAX_DIMENSIONS,
     Basis,
-    FormArray,
     add_product,
     add_square,
     clamp_below,
@@ -111,6 +111,7 @@ SIZES = {
 }
 
 
+@pytest.mark.slow_cases(every=20)
 @by_basis
 @pytest.mark.parametrize("name", BINARY)
 @pytest.mark.parametrize("size", SIZES)
@@ -128,6 +129,7 @@ def test_binary_contains(name, size, basis):
     assert escapes(result, exact, [a, b], generator, 4) == []
 
 
+@pytest.mark.slow_cases(every=6)
 @by_basis
 @pytest.mark.parametrize("name", UNARY)
 @pytest.mark.parametrize("size", SIZES)
@@ -140,6 +142,7 @@ def test_unary_contains(name, size, basis):
     assert escapes(result, exact, [a], generator, 4) == []
 
 
+@pytest.mark.slow_cases(every=12)
 @by_basis
 @pytest.mark.parametrize("name", POSITIVE)
 @pytest.mark.parametrize("size", ["plain", "exact", "narrow", "constant", "uncertain", "large", "small"])

@@ -12,7 +12,7 @@ from conftest import blob_scene
 from gsplat_kernels import Kernels, Unavailable, library
 from scene_attacks import bound_cells
 
-from ns_abstract.bench.stiff import all_cases
+from ns_abstract.bench.stiff_cases import all_cases
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.keyframe_cameras import look_at
 from ns_abstract.geometry.poses import PoseBox
@@ -296,6 +296,46 @@ STIFF = ("squares at the overflow", "all scales at once",
 def test_stiff_cases_hold(name: str, version: str) -> None:
     case = next(case for case in all_cases() if case.name == name)
     assert violations(case.scene, case.camera, case.spec, 6, version, arithmetic="float32")[0] == 0
+
+
+def needle(mean: Any, scales: tuple[float, float, float], quaternion: Any, antialiased: bool) -> SplatScene:
+    """One bright Gaussian."""
+    blob = blob_scene(1)
+    turn = np.array([quaternion]) / np.linalg.norm(quaternion)
+    return replace(
+        blob, means=np.array([mean], np.float32), log_scales=np.log([scales]).astype(np.float32),
+        quats=turn.astype(np.float32), opacity_logits=np.array([2.2], np.float32),
+        sh=np.abs(blob.sh) + np.float32(1.0), rasterize_mode="antialiased" if antialiased else "classic",
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("version", ["1.4.0", "1.5.3"])
+@pytest.mark.parametrize("antialiased", [False, True], ids=["classic", "antialiased"])
+def test_needle_of_a_covariance_that_rounds_by_a_third(antialiased: bool, version: str) -> None:
+    """Seen nearly end on from beside it: its exponent is known, so that it shows along its own line alone (G7)."""
+    axis = np.array([0.7, 0.7, 0.14]) / np.linalg.norm([0.7, 0.7, 0.14])
+    turned = [1.0 + axis[2], -axis[1], axis[0], 0.0]
+    length = 4.9
+    mean = np.array([0.0, 0.0, -2.0]) - 0.7 * length * axis
+    scene = needle(mean, (4e-3, 1e-5, length), turned, antialiased)
+    view = PinholeCamera(np.eye(3, 4), 113.0, 113.0, 25.0, 20.0, 50, 40)
+    found, gap = violations(scene, view, {}, 9, version, arithmetic="float32")
+    assert found == 0
+    # half of the picture's values where nothing were known of it
+    assert gap < 0.05
+
+
+def test_real_pictures_have_no_tiles() -> None:
+    """A needle of thousands of pixels, which an ellipse's tiles may miss in float32 alone (G12)."""
+    scene = needle([0.0, 0.0, -3.0], (1e-3, 1e-3, 1e3), [0.9, 0.1, 0.4, 0.0], False)
+    view = PinholeCamera(np.eye(3, 4), 20.0, 20.0, 16.0, 16.0, 32, 32)
+    around = PoseBox.around(view, parse_perturbation({}))
+    picture = compiled_renderer(scene, around, GSPLAT_1_6_0)[0](around.box.middle)
+    assert picture.max() > 0.1
+    for arithmetic, least, most in (("real", 0.0, 1e-6), ("float32", 0.01, 1.0)):
+        (bounds,), _ = bound_cells(scene, around, [around.box], rasteriser=GSPLAT_1_6_0, arithmetic=arithmetic)
+        assert (bounds[0] <= picture).all() and (picture <= bounds[1]).all()
+        assert least <= float(np.mean(bounds[1] - bounds[0])) <= most
 
 
 def test_missing_compiler(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -157,6 +157,7 @@ def stated(call: Call, folder: Path, target: Path) -> tuple[dict[str, Any], str]
     return json.loads((target / "statement.json").read_text()), error
 
 
+@pytest.mark.slow
 def test_a_statement_names_what_was_certified(
     call: Call, certificate: Path, blobs: Inputs, tmp_path: Path,  # noqa: F811
 ) -> None:  # fmt: skip
@@ -173,6 +174,7 @@ def test_a_statement_names_what_was_certified(
         assert content["predicate"][name] == report[name], name
 
 
+@pytest.mark.slow
 def test_a_statement_does_not_name_files_that_have_changed(
     call: Call, certificate: Path, tmp_path: Path,  # noqa: F811
 ) -> None:  # fmt: skip

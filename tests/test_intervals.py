@@ -12,6 +12,7 @@ from test_bounds import Case, moves, scene
 
 from ns_abstract.arithmetic.rounding import FLOAT32, REAL, UNIT64, charges
 from ns_abstract.arithmetic.simd.intrinsics import pointer
+from ns_abstract.methods.splat.block_buffers import block_of, new_buffers
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, raster_rules
 from ns_abstract.methods.splat.frame import SplatFrame
@@ -19,12 +20,10 @@ from ns_abstract.methods.splat.intervals import blend_parts
 from ns_abstract.methods.splat.pixel_block import (
     ALPHA_HIGH,
     EXPONENT,
-    block_of,
     color_ends,
     color_size,
     exponent_ends,
     fragment_width,
-    new_buffers,
     set_unknown,
 )
 from ns_abstract.methods.splat.stage_data import FormShape, Parts, PixelInputs, cell_parts, shared_out
@@ -157,6 +156,7 @@ def test_parts_cover_the_cell(counts):
         assert ((low <= place) & (place <= high)).all(axis=1).any()
 
 
+@pytest.mark.slow
 def test_more_parts_say_more():
     """Parts of parts are never worse, and with many of them hardly more is left than what poses show."""
     pixel = _Pixel((2, 2, 2), 24, 1, 0.5)
@@ -178,6 +178,7 @@ def test_more_parts_say_more():
     assert widths[2].mean() < 1.3 * np.ptp(seen, axis=0).mean()
 
 
+@pytest.mark.slow
 def test_slopes_tell_what_varies():
     """The slope of a parameter that moves things more is larger, and 0 for one whose axis is not divided."""
     pixel = _Pixel((4, 2, 1), 8, 2, 0.1)

@@ -102,6 +102,7 @@ def test_every_field_of_the_models_is_in_a_table(nerfstudio: SimpleNamespace, me
     assert missing(MODELS[method], fields_of(nerfstudio.configs[method]), "pipeline.model.") == []
 
 
+@pytest.mark.slow
 @needs_nerfstudio
 @pytest.mark.parametrize(
     ("method", "ours"),
@@ -112,6 +113,7 @@ def test_every_field_of_our_models_is_in_a_table(nerfstudio: SimpleNamespace, me
     assert missing(MODELS[method], fields_of(config), "pipeline.model.") == []
 
 
+@pytest.mark.slow
 @needs_nerfstudio
 @pytest.mark.parametrize("method", MODELS)
 def test_every_field_of_a_run_is_in_a_table(nerfstudio: SimpleNamespace, method: str) -> None:
@@ -422,6 +424,7 @@ REFUSED = [
 ]
 
 
+@pytest.mark.slow_cases(every=6)
 @pytest.mark.parametrize(("method", "line", "said"), REFUSED)
 def test_keys_that_may_change_the_picture_are_refused(tmp_path: Path, method: str, line: str, said: str) -> None:
     config = write_config(tmp_path, method, line)

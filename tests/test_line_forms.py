@@ -8,7 +8,8 @@ from oracle import between, escapes, points, random_forms, rational, value, weig
 from test_forms import BINARY, LANES, POSITIVE, SIZES, layout
 
 from ns_abstract.arithmetic import line_forms
-from ns_abstract.arithmetic.forms import Basis, FormArray, clamp_below, set_norms
+from ns_abstract.arithmetic.form_array import FormArray
+from ns_abstract.arithmetic.forms import Basis, clamp_below, set_norms
 
 BASIS = Basis(1, 2)
 
@@ -65,6 +66,7 @@ def test_pairs(name, size):
     assert same(result, kernel(a, b))
 
 
+@pytest.mark.slow_cases(every=3)
 @pytest.mark.parametrize("size", ["plain", "exact", "narrow", "constant", "uncertain"])
 @pytest.mark.parametrize("name", SINGLE)
 def test_functions(name, size):

@@ -150,6 +150,7 @@ def result(blobs: Inputs) -> tuple[nsa.Scene, nsa.PoseSet, nsa.BoundResult]:
     return scene, poses, nsa.bound(scene, poses, target_ratio=1.2, time_budget=10.0, keep_cells=True)
 
 
+@pytest.mark.slow
 def test_pictures_lie_between_the_planes(result: tuple[nsa.Scene, nsa.PoseSet, nsa.BoundResult]) -> None:
     """Renders of random poses, the set's corners and a part's: inside, without a tolerance."""
     scene, poses, bounds = result

@@ -1083,6 +1083,7 @@ def test_fuzzed_index_with_right_checksums(run: Run, seed: int, flips: int) -> N
         run.checkpoint.write_bytes(original)
 
 
+@pytest.mark.slow
 @FUZZ
 @given(seed=st.integers(0, 2**32), flips=st.integers(1, 6), text=st.booleans(), header=st.booleans())
 def test_fuzzed_ply(tmp_path: Path, seed: int, flips: int, text: bool, header: bool) -> None:

@@ -16,6 +16,7 @@ from ns_abstract.api.job import Job
 from ns_abstract.api.location import Location, PhotoOptions
 from ns_abstract.cli.locate import main
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.camera_path import load_camera_path
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.location import between, inner_cell, nearby, slabs
@@ -260,6 +261,7 @@ def test_command_says_none_and_resumes(blobs: Inputs, tmp_path: Path, in_process
         code, _, err = in_process(main, options(blobs, tmp_path / "out", image, time_budget=60, **more))
         assert code == 0 and "none: no pose of the set made the photo" in err
     report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["frames"][0]["intrinsics"] == load_camera_path(blobs.path).cameras[0].intrinsics._asdict()
     assert report["answer"] == "none" and report["possible_volume"] == 0.0 and report["hull"] is None
     with sqlite3.connect(tmp_path / "out" / "cells.sqlite") as base:
         rows = base.execute("SELECT lower, upper, verdict, counterexample FROM cells").fetchall()

@@ -192,6 +192,7 @@ def a_quarter_strip_on(self: Any, axis: int, count: int, first: int, past: int, 
 original_ends = strips_module.PoseStrips._part_ends
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     ("target", "name", "fault"),
     [
@@ -319,6 +320,7 @@ def test_the_picture_is_differentiable() -> None:
 # ---------------------------------------------------------------- time
 
 
+@pytest.mark.slow
 def test_too_large_a_scene_says_what_it_would_take(run: Path, net: Path, tmp_path: Path) -> None:
     prop = claim_above(-15.0, tmp_path)
     camera = nsa.Camera(EYE, width=SIDE, height=SIDE)

@@ -166,6 +166,7 @@ def unreached(result: FrameResult) -> int:
     return int(((result.lower == 0.0) & (result.upper == 1.0)).all(axis=-1).sum())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("parts", [1, 2])
 def test_what_is_known_is_not_begun_anew(parts: int) -> None:
     """Rays that an earlier command has not reached come first, and nothing gets looser."""

@@ -34,7 +34,7 @@ def by_bins(scene: NerfScene, pose_set: PoseBox) -> RayBounds:
     return bounds._apart(asked, None, False, bounds_module._DISPLACEMENT)
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SETS)
 def test_every_choice_of_samples_is_enclosed(name: str) -> None:
     for seed, changes in ((3, {}), (1, {"density": 1e3})):

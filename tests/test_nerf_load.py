@@ -49,6 +49,7 @@ def test_a_run_is_read_as_it_was_written(run: Path) -> None:
     np.testing.assert_array_equal(scene.background, np.ones(3))
 
 
+@pytest.mark.slow_cases(every=3)
 @pytest.mark.parametrize(
     ("edit", "fragments"),
     [
@@ -70,6 +71,7 @@ def test_damaged_checkpoints(run: Path, edit: Callable[[dict], None], fragments:
         assert fragment in str(error.value)
 
 
+@pytest.mark.slow_cases(every=3)
 @pytest.mark.parametrize(
     ("old", "new", "fragment"),
     [
@@ -125,6 +127,7 @@ def flags(inputs: dict[str, Path], output: Path, *more: Any) -> list[Any]:
     return [*found, *more]
 
 
+@pytest.mark.slow
 def test_end_to_end_and_resume(inputs: dict[str, Path], tmp_path: Path, monkeypatch, capsys) -> None:
     out = tmp_path / "out"
     options = flags(inputs, out, "--num-samples", 16, "--time-budget", 60, "--target-ratio", 2, "--save-cells")

@@ -234,6 +234,7 @@ def call(monkeypatch: pytest.MonkeyPatch, main: Any, options: list[Any]) -> int:
     return leave.value.code
 
 
+@pytest.mark.slow
 def test_from_the_field_to_the_report(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys) -> None:
     run = write_nerf_run(tiny_scene(3), tmp_path / "runs", timestamp="t", experiment_name="tiny")
     pose = np.eye(4)

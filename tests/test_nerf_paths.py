@@ -94,6 +94,7 @@ def test_declared_voxels_are_heeded(kind: str) -> None:
     assert (found.upper - found.lower).mean() < 0.02
 
 
+@pytest.mark.slow
 def test_shifted_colours_are_enclosed() -> None:
     spec = {"rotation": {"yaw": 1e-4}, "hue": [0.0, 0.2], "saturation": 0.1}
     pose_set = poses(spec)

@@ -87,6 +87,7 @@ def test_fields_are_enclosed(name: str, half: float) -> None:
         assert excess <= 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("dimensions", "half"), [(0, 0.0), (2, 1e-3), (2, 1e-2), (3, 1e-3), (4, 1e-4), (6, 1e-5)])
 def test_several_parameters(dimensions: int, half: float) -> None:
     excess, compared, _ = worst(tiny_weights(4), half, dimensions, count=6)
@@ -188,6 +189,7 @@ def hidden_layer(field: FieldBounds) -> zonotope._FieldLayer:
 ROUNDING = 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("dimensions", "compiled"), [(1, True), (1, False), (2, False)])
 def test_every_unit_is_enclosed(dimensions: int, compiled: bool) -> None:
     """max(0, z) of one unit after the other, at the ends of its error terms and box."""
@@ -218,7 +220,7 @@ def test_every_unit_is_enclosed(dimensions: int, compiled: bool) -> None:
     assert kinds == {"open", "closed"}
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize(("compiled", "narrow"), [(True, True), (True, False), (False, False)])
 def test_linear_layers_are_enclosed(compiled: bool, narrow: bool) -> None:
     """Error terms keep their values through a layer: those that move one neuron, too."""
@@ -258,6 +260,7 @@ def test_linear_layers_are_enclosed(compiled: bool, narrow: bool) -> None:
         assert (away <= after.box + ROUNDING).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1.0, 1e-25, 1e-39])
 def test_columns_in_float32_are_charged(scale: float) -> None:
     """What float32 products of columns are off by lies in the box, which is hardly wider; gradual underflow, too."""
@@ -287,6 +290,7 @@ def test_columns_beyond_float32_fail() -> None:
     assert after.failed[7] and after.failed.sum() == 1
 
 
+@pytest.mark.slow_cases(every=8)
 @pytest.mark.parametrize("kind", [np.float64, np.float32])
 @pytest.mark.parametrize(("inputs", "live", "outputs"), [(5, 0, 3), (1, 1, 1), (7, 6, 3), (96, 71, 40), (64, 64, 1)])
 def test_products_leave_out_what_is_off(kind: type, inputs: int, live: int, outputs: int) -> None:
@@ -388,6 +392,7 @@ def test_compiled_and_torch_agree(monkeypatch: pytest.MonkeyPatch) -> None:
         torch.testing.assert_close(getattr(found[0], name), getattr(found[1], name), rtol=1e-9, atol=1e-11)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("layers", [3, 6])
 def test_chunks_are_as_good_as_layer_after_layer(layers: int) -> None:
     """Pieces of several chunks, the last one smaller, in fields whose early layers have float64 columns or not."""

@@ -137,6 +137,7 @@ def test_the_real_eval_setup_opens_the_run(opened: tuple[Any, Any], nerfstudio: 
     assert len(pipeline.datamanager.cached_eval) == 1
 
 
+@pytest.mark.slow
 def test_a_run_that_was_moved_opens(nerfstudio: SimpleNamespace, folder: Path, tmp_path: Path) -> None:
     shutil.copytree(folder / "blobs", tmp_path / "elsewhere" / "renamed")
     shutil.copytree(folder / "data", tmp_path / "elsewhere" / "data")

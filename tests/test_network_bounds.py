@@ -313,7 +313,6 @@ def test_rows_that_end_by_plan_lie_below_the_exact_minimum(
     assert gaps <= 7.0 * spans
 
 
-@pytest.mark.slow_cases
 @pytest.mark.parametrize("which", [0, 1, 2, None])
 @pytest.mark.parametrize("net", ["residual", "gate"])
 def test_rows_that_rest_on_several_nodes(

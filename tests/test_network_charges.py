@@ -74,7 +74,7 @@ def within(net: Extreme, folder: Path, low: Array, high: Array, seed: int = 0) -
 # ---------------------------------------------------------------- norms in one pass
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize("op", [True, False])
 @pytest.mark.parametrize(("mean", "spread"), [(15.1, 1e-3), (5.1, 0.02), (0.5, 1e-3), (20.0, 0.3), (300.0, 1e-3)])
 def test_norms_of_one_pass(op: bool, mean: float, spread: float, tmp_path: Path) -> None:

@@ -216,6 +216,7 @@ def test_the_ledger_measures_every_row() -> None:
     assert not set(ledger.MEASURED) & set(ledger.UNMEASURED)
 
 
+@pytest.mark.slow_cases(every=30)
 @pytest.mark.parametrize("kind", ledger.MEASURED)
 def test_every_charge_pays(kind: str) -> None:
     """No float32 program is farther from the value with 200 bits than is charged; nor are real bounds from it."""

@@ -168,6 +168,7 @@ REFUSED: dict[str, tuple[Callable[[Behind, Tensor], Tensor], str]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", REFUSED)
 def test_what_is_not_read_is_told(name: str, tmp_path: Path) -> None:
     function, message = REFUSED[name]

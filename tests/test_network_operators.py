@@ -318,7 +318,7 @@ def _rows(size: int) -> np.ndarray:
 LEDGER = {"layer norm in steps": 3.0, "attention": 2.6}
 
 
-@pytest.mark.slow_cases(every=8)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
 def test_contained_under_attack(name: str, tmp_path: Path) -> None:
     file = written(name, tmp_path)

@@ -237,6 +237,7 @@ def residual(folder: Path, blocks: int, seed: int = 0) -> Path:
     return f.write(folder / "deep.onnx")
 
 
+@pytest.mark.slow
 def test_small_margin_of_a_deep_network(tmp_path: Path) -> None:
     """One image of a network with 21 convolutions has its float32 outputs bounded within a part in a thousand."""
     file = residual(tmp_path, 10)
@@ -291,6 +292,7 @@ def test_units_that_may_be_on_are_terms(tmp_path: Path) -> None:
     assert (found.a[0, :, 0] + found.b[0] <= -y).all()
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("double", [False, True])
 def test_rounding_of_rows_over_sets(double: bool, tmp_path: Path) -> None:
     """Of a linear network, the least value in exact arithmetic is not exceeded, whatever rows of outputs are."""

@@ -23,7 +23,8 @@ from ns_abstract.api.bounding import TileTask, bound_frames, bound_part
 from ns_abstract.api.files import PathJob, Settings, open_job
 from ns_abstract.cli.render import Render, render
 from ns_abstract.execution import cancellation
-from ns_abstract.execution.engines import Cluster, Machine, connected
+from ns_abstract.execution.cluster import Cluster, connected
+from ns_abstract.execution.engines import Machine
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.frame import NerfFrame

@@ -363,6 +363,7 @@ FUZZ = settings(
 )
 
 
+@pytest.mark.slow
 @FUZZ
 @given(seed=st.integers(0, 2**32), flips=st.integers(1, 8))
 def test_fuzzed_path(tmp_path: Path, seed: int, flips: int) -> None:
@@ -380,6 +381,7 @@ def test_fuzzed_path(tmp_path: Path, seed: int, flips: int) -> None:
         assert len(str(error).splitlines()) == 1
 
 
+@pytest.mark.slow
 @FUZZ
 @given(field=st.sampled_from(sorted(content())), value=values)
 def test_fuzzed_fields(tmp_path: Path, field: str, value: Any) -> None:
@@ -389,6 +391,7 @@ def test_fuzzed_fields(tmp_path: Path, field: str, value: Any) -> None:
         assert len(str(error).splitlines()) == 1
 
 
+@pytest.mark.slow
 @FUZZ
 @given(field=st.sampled_from(["camera_to_world", "fov", "aspect", "crop", "perturbation"]), value=values)
 def test_fuzzed_entries(tmp_path: Path, field: str, value: Any) -> None:

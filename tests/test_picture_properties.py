@@ -210,7 +210,7 @@ PROPERTIES: dict[str, Callable[[float], dict[str, Any]]] = {
 }
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", PROPERTIES)
 def test_certificates_hold(kind: str, blobs: Inputs, tmp_path: Path, in_process: InProcess) -> None:
     line = np.linspace(-0.15, 0.15, 41)[:, None]
@@ -285,6 +285,7 @@ BAD: dict[str, tuple[Any, tuple[str, ...]]] = {
 }
 
 
+@pytest.mark.slow
 def test_bad_input_is_one_line(blobs: Inputs, tmp_path: Path, in_process: InProcess) -> None:
     Image.fromarray(np.full((8, 8), 255, np.uint8)).save(tmp_path / "mask.png")
     for name, (prop, mentions) in BAD.items():

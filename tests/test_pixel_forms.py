@@ -14,15 +14,8 @@ from numba import njit
 from ns_abstract.arithmetic.rounding import REAL, charges
 from ns_abstract.arithmetic.simd.intrinsics import advanced, pointer
 from ns_abstract.arithmetic.simd.lanes import load8, store
-from ns_abstract.methods.splat.alphas import (
-    _affine_forms,
-    _cubic_exponential,
-    _Exponent,
-    _exponent_of_several,
-    _fitted_exponential,
-    _Limits,
-    _set_curvature,
-)
+from ns_abstract.methods.splat.alpha_ranges import Exponent, Limits, cubic_exponential, fitted_exponential
+from ns_abstract.methods.splat.alphas import _affine_forms, _exponent_of_several, _set_curvature
 from ns_abstract.methods.splat.blend import flattened
 from ns_abstract.methods.splat.pixel_block import (
     ALPHA_HIGH,
@@ -45,8 +38,8 @@ from ns_abstract.methods.splat.stage_data import FormShape
 def _alpha(exponent_, limits, charged):
     exponent = pointer(exponent_)
     zero = 0.0 * load8(exponent, 0)
-    return _fitted_exponential(
-        _Exponent(
+    return fitted_exponential(
+        Exponent(
             load8(exponent, 0), load8(exponent, 8), load8(exponent, 16), zero, load8(exponent, 24),
             load8(exponent, 32), load8(exponent, 40),
         ),
@@ -71,7 +64,7 @@ def test_a_straight_exponent_is_fitted(middle):
     straight = np.zeros(8)
     exponent = np.stack([middle - slopes, middle + slopes, np.full(8, middle), slopes, straight, straight]).ravel()
     out = np.zeros(32)
-    limits = _Limits(1.0, 1.0, 0.0, 60.0, 1e-12, 1e-12, 0.999, 1.0)
+    limits = Limits(1.0, 1.0, 0.0, 60.0, 1e-12, 1e-12, 0.999, 1.0)
     _fitted(exponent, limits, charges(REAL), out)
     center, radius, weight, curve = out.reshape(4, 8)
     for lane, slope in enumerate(slopes):
@@ -96,7 +89,7 @@ def test_a_bent_exponent_is_fitted(distance, toward):
     middle = 0.5 * distance * distance
     share = slopes**2 / (2.0 * distance**2 * bends)
     out = np.zeros(32)
-    limits = _Limits(1.0, 1.0, 0.0, 60.0, 1e-12, 1e-12, 0.9999999, 1.0)
+    limits = Limits(1.0, 1.0, 0.0, 60.0, 1e-12, 1e-12, 0.9999999, 1.0)
     for turn in (bends, bends * (1.0 + 0.5 * share)):
         low = np.maximum(0.0, middle - slopes)
         exponent = np.stack([low, middle + slopes + bends, np.full(8, middle), slopes, bends, turn])
@@ -117,7 +110,7 @@ def test_a_bent_exponent_is_fitted(distance, toward):
 @njit(error_model="numpy")
 def _cubic(exponent_, limits, charged, out_):
     exponent, out = pointer(exponent_), pointer(out_)
-    alpha, tilt, bend = _cubic_exponential(
+    alpha, tilt, bend = cubic_exponential(
         load8(exponent, 0), load8(exponent, 8), load8(exponent, 16), load8(exponent, 24), load8(exponent, 32),
         load8(exponent, 40), limits, charged,
     )  # fmt: skip
@@ -143,7 +136,7 @@ def test_an_exponent_of_one_parameter_is_fitted(bend, off):
     exponent[0] -= 1e-3
     exponent[1] += 1e-3
     out = np.zeros(48)
-    limits = _Limits(1.0, 1.0, 0.0, 60.0, 1e-12, 1e-12, 0.9999999, 1.0)
+    limits = Limits(1.0, 1.0, 0.0, 60.0, 1e-12, 1e-12, 0.9999999, 1.0)
     _cubic(np.stack(exponent).ravel(), limits, charges(REAL), out)
     low, high, center, tilt, curve, radius = out.reshape(6, 8)
     form = center[:, None] + tilt[:, None] * grid + curve[:, None] * grid * grid
@@ -164,7 +157,7 @@ def test_the_fit_of_degree_three_holds_everywhere():
     grid = np.linspace(-1.0, 1.0, 401)
     zero, out = np.zeros(8), np.zeros(48)
     exponent = np.stack([2.0 - slopes, 2.0 + slopes, np.full(8, 2.0), zero, slopes, zero])
-    limits = _Limits(1.0, 1.0, 0.0, 60.0, 1e-12, 1e-12, 2.0, 1.0)
+    limits = Limits(1.0, 1.0, 0.0, 60.0, 1e-12, 1e-12, 2.0, 1.0)
     _cubic(exponent.ravel(), limits, charges(REAL), out)
     _, _, center, tilt, curve, radius = out.reshape(6, 8)
     assert (tilt[:-1] < 0.0).all()
@@ -179,7 +172,7 @@ def _moved(record_, offsets_, rows_, limits, charged, m, out_):
     exponent = _exponent_of_several(
         record, _affine_forms(record, m, False), load8(offsets, 0), load8(offsets, 8), rows, 8 * 24, m, False
     )
-    alpha = _fitted_exponential(exponent, limits, charged)
+    alpha = fitted_exponential(exponent, limits, charged)
     store(out, 0, alpha.center)
     store(out, 8, alpha.radius)
     store(out, 16, alpha.weight)
@@ -197,7 +190,7 @@ def test_what_moves_along_or_across_its_offset(across):
     record[FORMS + 3 * (m + 1) + 1], record[FORMS + 4 * (m + 1) + 2] = moved, across * moved
     offsets = np.array([[0.1, 0.5, 1.0, 1.5, 2.0, 1.0, 0.2, 0.7], [0.0, 0.1, 0.0, 0.5, 0.3, 1.0, 1.5, 0.7]])
     rows, out = np.zeros(8 * 64), np.zeros(32)
-    limits = _Limits(1.0, 1.0, 0.0, 60.0, 1e-12, 1e-12, 0.9999999, 1.0)
+    limits = Limits(1.0, 1.0, 0.0, 60.0, 1e-12, 1e-12, 0.9999999, 1.0)
     _moved(record, offsets.ravel(), rows, limits, charges(REAL), m, out)
     center, radius, weight, curve = out.reshape(4, 8)
     slopes, bends = rows.reshape(-1, 8)[FORM + 1 : FORM + 3], rows.reshape(-1, 8)[FORM + m + 1 : FORM + m + 4]
@@ -229,7 +222,7 @@ def test_the_range_of_alpha_s_curvature(d):
             rows[FORM + m + 1 + number] = generator.uniform(-0.3, 0.3, 8) * (1.0 if i == k else mixed)
         slopes, sizes = np.abs(rows[FORM + 1 : FORM + m]).sum(axis=0), np.abs(rows[FORM + m + 1 :]).sum(axis=0)
         exponent = np.stack([1.0 - slopes, 1.0 + slopes + sizes, np.ones(8), slopes, sizes, 0.0 * sizes])
-        limits = _Limits(1.0, 1.0, 0.0, 60.0, 1e-12, 1e-12, 0.9999999, 1.0)
+        limits = Limits(1.0, 1.0, 0.0, 60.0, 1e-12, 1e-12, 0.9999999, 1.0)
         flat = rows.ravel()
         _curved(exponent.ravel(), limits, charges(REAL), flat, 8 * (FORM + m + 1 + bends), m)
         found = flat.reshape(-1, 8)
@@ -401,6 +394,7 @@ def _two_layers(front, behind, radius=0.0, bounds=None):
     return t.reshape(-1, 4)[:m, 0], out[0], out[4], out[8]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("straight", [0.0, 0.1])
 def test_curvatures_of_two_layers(straight):
     """Whatever products of parameters two alphas bend by, also where they never bend together (B10)."""

@@ -266,6 +266,7 @@ def thin_escapes(poses: PoseBox, order: int = 1) -> list:
     ]
 
 
+@pytest.mark.slow_cases(every=9)
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("angle", [0.01, 0.3, 1.0, 2.0, 3.0])
 def test_segment(angle, order):

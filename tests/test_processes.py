@@ -79,7 +79,7 @@ def test_a_report_with_a_faulty_worker_is_sampled(
         return json.loads((tmp_path / "report.json").read_text())
 
     with monkeypatch.context() as patch:
-        patch.setattr("ns_abstract.execution.engines.started", lambda *_: nullcontext(FaultyWorker()))
+        patch.setattr("ns_abstract.execution.starting.started", lambda *_: nullcontext(FaultyWorker()))
         report = command()
     assert report["guarantee"] == "sampled"
     assert any("self-check" in limit and "exp(" in limit for limit in report["limits"])

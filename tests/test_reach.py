@@ -446,6 +446,8 @@ HOSTILE: dict[str, tuple[str, Any]] = {
     "camera.camera_to_world": ("camera.camera_to_world", [[1, 0], [0, 1]]),
     "camera.camera_to_world ": ("camera.camera_to_world", (2.0 * np.eye(4)).tolist()),
     "camera.fov": ("camera.fov", 180),
+    "camera.fy": ("camera.fy", -20.0),
+    "camera.cx": ("camera.cx", "half"),
     "camera.position.matrix": ("camera.position.matrix", [[1, 2, 3]]),
     "camera.yaw.row": ("camera.yaw.row", [1]),
     "network": ("network", "../net.onnx"),
@@ -460,6 +462,13 @@ HOSTILE: dict[str, tuple[str, Any]] = {
     "goal.when": ("goal.when", ["end"]),
     "goal.box": ("goal.box", {}),
 }
+
+
+def test_a_camera_states_its_intrinsics(tmp_path: Path) -> None:
+    value = json.loads(json.dumps(specification("affine")))
+    value["camera"] |= {"fx": 30.0, "fy": 31.0, "cy": 9.5}
+    camera = parse_loop(value, tmp_path).camera.poses((16, 24)).camera
+    assert camera.intrinsics == (30.0, 31.0, 12.0, 9.5, 24.0, 16.0)
 
 
 @pytest.mark.parametrize("field", HOSTILE)

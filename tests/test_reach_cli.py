@@ -219,6 +219,7 @@ def test_where_runs_go_wrong(edge: Course, finished: Path) -> None:
     """The edge of the funnel's reach lies in the box: both verdicts, and stored runs that leave the funnel again."""
     document = json.loads((finished / "report.json").read_text())
     assert document["verdict"] == "falsified" and document["state"] == "done"
+    assert document["intrinsics"] == edge.job.job.pose_sets[0].camera.intrinsics._asdict()
     shares = document["questions"]["safe"]
     assert shares["certified"] > 0.1 and shares["falsified"] > 0.1 and shares["unknown"] < 0.1
     # no more than runs show, of which there are 200

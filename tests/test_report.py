@@ -24,11 +24,12 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.folder import first_command, remove_parts
-from ns_abstract.refine.result import FrameResult, Leaves, TracePoint
+from ns_abstract.refine.result import FrameResult, Leaves, TracePoint, merged
 from ns_abstract.report import files, page, picture, record
 from ns_abstract.report.figures import interval, metrics, number
 from ns_abstract.report.files import IMAGES, LEAVES, check_frame, frame_name, load_frame, save_frame
-from ns_abstract.report.record import Report, RunRecord, differences, file_stamp, guarantee_text, merged, plain
+from ns_abstract.report.record import Report, RunRecord
+from ns_abstract.report.run import differences, file_stamp, guarantee_text, plain
 
 ROOT = Path(__file__).resolve().parents[1]
 EVIL = '<script>alert("x")</script>&$a_b$'
@@ -168,6 +169,7 @@ def test_killed_write(tmp_path):
     assert os.listdir(tmp_path) == ["report.json"]
 
 
+@pytest.mark.slow
 @settings(deadline=None, max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_damaged(tmp_path, data):
@@ -457,6 +459,7 @@ def test_curves_begin_where_something_is_known():
     assert [p["seconds"] for p in page._seen(entry_of(never_seen)["trace"])] == [3.0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("witness", "kind"), [(0.97, "good"), (0.3, "fair")])
 def test_only_tight_bounds_are_green(tmp_path, witness, kind):
     report = Report(tmp_path, run(frames=(0,)))

@@ -35,6 +35,7 @@ def exact(response: CameraResponse, x: Fraction, value: float) -> Any:
     return min(max(found, mpmath.mpf(0)), mpmath.mpf(1))
 
 
+@pytest.mark.slow_cases(every=14)
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("radius", [1e-9, 0.01, 0.3, 0.9])
 @pytest.mark.parametrize("width", [0.0, 1e-3, 0.3])

@@ -14,7 +14,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from ns_abstract.arithmetic.forms import FormArray
+from ns_abstract.arithmetic.form_array import FormArray
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.splat.activate import activate
@@ -276,6 +276,7 @@ def test_every_operation_is_covered() -> None:
         assert rule.continuous == (rule.name not in ("Ind", "Sort"))
 
 
+@pytest.mark.slow_cases(every=23)
 @pytest.mark.parametrize("face", ["interval", "affine", "quadratic"])
 @pytest.mark.parametrize("name", list(CASES))
 def test_rule_contains_exact_results(name: str, face: str) -> None:
@@ -318,6 +319,7 @@ def operands_of(draw, name: str):
     return boxes, at
 
 
+@pytest.mark.slow_cases(every=4)
 @pytest.mark.parametrize("name", list(CASES))
 @settings(max_examples=15, deadline=None)
 @given(data=st.data())
@@ -794,6 +796,7 @@ def test_linear_bounds_contain(seed: int, weight: float) -> None:
                         assert bool(v >= arb(line)) if sign > 0 else bool(v <= arb(line))
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 3), st.integers(0, 5), st.sampled_from(["frobenius", "spectral"]))
 def test_inverses_contain(seed: int, n: int, order: int, norm: str) -> None:
@@ -823,6 +826,7 @@ CELLS = {
 }
 
 
+@pytest.mark.slow_cases(every=6)
 @pytest.mark.parametrize("cell", list(CELLS))
 @pytest.mark.parametrize("inverse", ["matrixinv", "adjugate"])
 def test_paper_bound_contains_renders(cell: str, inverse: str) -> None:

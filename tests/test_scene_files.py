@@ -49,7 +49,7 @@ from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.methods.splat.write import write_splatfacto_run
 from ns_abstract.report import picture as pictures
 from ns_abstract.report.export import Results
-from ns_abstract.report.record import guarantee_text
+from ns_abstract.report.run import guarantee_text
 
 torch.set_num_threads(1)
 
@@ -86,6 +86,7 @@ def test_a_missing_step_names_those_that_are_there(run: Path) -> None:
     assert str(run) not in message
 
 
+@pytest.mark.slow_cases(every=4)
 @pytest.mark.parametrize("value", ["-1", "9999.0", "true", "text", "[9999]", "!!python/name:os.system ''"])
 def test_a_step_that_is_none_is_refused(run: Path, value: str) -> None:
     edit(run, ("load_step: null", f"load_step: {value}"))
@@ -321,6 +322,7 @@ def test_another_class_is_refused_unless_it_is_declared(
 MODULES = ("background_model.0.weight", "medium_mlp.bias", "gauss_params.features_medium", "exposure", "lpips_.x")
 
 
+@pytest.mark.slow_cases(every=3)
 @pytest.mark.parametrize("module", MODULES)
 def test_unknown_modules_are_refused_unless_they_are_declared(plain: Path, module: str) -> None:
     change(plain, lambda state: state.update({f"_model.{module}": torch.ones(3)}))
@@ -388,6 +390,7 @@ def test_the_report_says_of_the_gaussians_alone(
     assert Results(out).guarantees == {"float32-sound, of the Gaussians alone"}
 
 
+@pytest.mark.slow_cases(every=3)
 @pytest.mark.parametrize(
     ("changes", "edits", "mention"),
     [

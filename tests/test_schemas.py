@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import json
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -18,8 +19,6 @@ from ns_abstract.perturbation.specification import parse_perturbation
 from ns_abstract.reach.loop import parse_loop
 from ns_abstract.verify.picture_properties import PICTURE_TYPES, is_of_picture, parse_picture_property
 from ns_abstract.verify.properties import loading, parse_property, property_keys
-
-jsonschema = pytest.importorskip("jsonschema")
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTPUTS = 125 * 2 * 2
@@ -92,12 +91,18 @@ READERS: dict[str, Callable[[Any, Path], object]] = {
 }
 #: Properties of the picture are of the same file.
 SCHEMAS = {"picture": "property"}
-CHECKERS = {
-    name: jsonschema.Draft202012Validator(getattr(schemas, f"{SCHEMAS.get(name, name)}_schema")())
-    for name in EXAMPLES
-}  # fmt: skip
 #: How often the schema notices what the reader refuses, at least: the reader also knows scene, network and ranges.
 NOTICED = 0.85
+
+
+@functools.cache
+def checkers() -> dict[str, Any]:
+    """Validators by kind of file; importing their package takes seconds, so it waits for the first test."""
+    jsonschema = pytest.importorskip("jsonschema")
+    documents = {name: getattr(schemas, f"{SCHEMAS.get(name, name)}_schema")() for name in EXAMPLES}
+    for document in documents.values():
+        jsonschema.Draft202012Validator.check_schema(document)
+    return {name: jsonschema.Draft202012Validator(document) for name, document in documents.items()}
 
 
 def taken(kind: str, value: Any, folder: Path) -> bool:
@@ -134,15 +139,16 @@ def damaged(value: Any) -> Iterator[Any]:
     yield from walk(copy.deepcopy(value), lambda new: new)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", EXAMPLES)
 def test_what_the_reader_takes_the_schema_takes(kind: str, folder: Path) -> None:
     refused = noticed = 0
     for example in EXAMPLES[kind]:
-        assert taken(kind, example, folder) and CHECKERS[kind].is_valid(example), example
+        assert taken(kind, example, folder) and checkers()[kind].is_valid(example), example
         for value in damaged(example):
-            good = CHECKERS[kind].is_valid(value)
+            good = checkers()[kind].is_valid(value)
             if taken(kind, value, folder):
-                assert good, (value, next(CHECKERS[kind].iter_errors(value)).message)
+                assert good, (value, next(checkers()[kind].iter_errors(value)).message)
             else:
                 refused, noticed = refused + 1, noticed + (not good)
     assert noticed >= NOTICED * refused > 100, (noticed, refused)
@@ -170,16 +176,15 @@ def test_the_corpus_has_no_file_that_a_schema_refuses_alone(folder: Path) -> Non
                 if not file.is_file():
                     file.rmdir() if file.is_dir() else file.unlink(missing_ok=True)
             count += 1
-            assert CHECKERS[kind].is_valid(value) or not taken(kind, value, folder), case.name
+            assert checkers()[kind].is_valid(value) or not taken(kind, value, folder), case.name
     assert count > 50
 
 
 def test_every_key_of_the_readers_has_a_schema_of_its_own() -> None:
-    for kind, checker in CHECKERS.items():
-        jsonschema.Draft202012Validator.check_schema(checker.schema)
+    for kind, checker in checkers().items():
         text = json.dumps(checker.schema)
         assert text.count(": {}") == 0, kind
-    cases = CHECKERS["property"].schema["allOf"]
+    cases = checkers()["property"].schema["allOf"]
     pictures = {name: (*kind.keys, "preprocess", "partitions") for name, kind in PICTURE_TYPES.items()}
     for (name, keys), case in zip((property_keys() | pictures).items(), cases[:-1], strict=True):
         assert {*keys, "type", "$schema"} == case["then"]["properties"].keys(), name

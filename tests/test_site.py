@@ -38,6 +38,7 @@ def test_no_formula_stays_raw(site):
     assert formulas > 700
 
 
+@pytest.mark.slow
 def test_start_page_notebooks_and_commands(site):
     """The start page says how to install and what can be asked; notebooks and commands have pages."""
     start = (site / "index.html").read_text(encoding="utf-8")

@@ -68,6 +68,7 @@ def test_every_pose_has_slanted_parameters(name: str) -> None:
     assert all(holds(poses.box, values) for values in members(poses, plain, 100))
 
 
+@pytest.mark.slow_cases(every=3)
 @pytest.mark.parametrize("name", SHEARS)
 def test_feasible_loses_no_pose(name: str) -> None:
     poses = slanted(name)
@@ -135,6 +136,7 @@ def refined(job: PathJob, slant: bool, cells: int) -> tuple[PoseBox, FrameResult
     return poses, Refinement(frame, 0, RefinementGoal(1.0001, 300.0, cells)).run()
 
 
+@pytest.mark.slow
 def test_slanted_cells_enclose_and_are_tighter(job: PathJob) -> None:
     poses, result = refined(job, True, 150)
     frame = SplatFrame(*program_of(job), poses)

@@ -70,6 +70,13 @@ def refused(code: int, text: str, *fragments: str) -> None:
         assert fragment in text, text
 
 
+def record_of(fingerprint: dict[str, Any]) -> RunRecord:
+    return RunRecord(
+        guarantee="float32-sound", renderer={"name": "gsplat", "version": "1.4.0"}, scene={}, frames=(0,),
+        fingerprint=fingerprint, settings={"target_ratio": 1.05},
+    )  # fmt: skip
+
+
 def test_fingerprints_name_version_and_rules(blobs: Inputs, tmp_path: Path) -> None:
     net = classifier(tmp_path / "net.onnx")
     prop = write_json(
@@ -93,6 +100,7 @@ def test_fingerprint_of_images_and_numbers_of_rules(blobs: Inputs) -> None:
     assert certification._RULES > 4 and loop_job._RULES > 1
 
 
+@pytest.mark.slow
 @others
 def test_render_is_not_resumed(name: str, blobs: Inputs, tmp_path: Path, in_process: InProcess) -> None:
     write_results(blobs, tmp_path / "out", OTHERS[name])
@@ -108,7 +116,7 @@ def test_frame_of_another_version_is_not_kept(blobs: Inputs, tmp_path: Path) -> 
     # the report claims what its frame file does not
     document = json.loads((tmp_path / "report.json").read_text())
     (tmp_path / "report.json").write_text(json.dumps(document | {"fingerprint": now}))
-    run = RunRecord("float32-sound", {"name": "gsplat", "version": "1.4.0"}, {}, (0,), now, {"target_ratio": 1.05})
+    run = record_of(now)
     report = Report.resume(tmp_path, run)
     assert report.kept == [] and "ns-abstract 0.1.9" in report.ignored[0]
 
@@ -118,10 +126,11 @@ def test_same_version_is_resumed_and_exported(blobs: Inputs, tmp_path: Path, in_
     export = ["npz", "--input-dir", str(tmp_path / "out"), "--output-filename", str(tmp_path / "all.npz")]
     assert in_process(export_command.main, export)[0] == 0
     now = open_job(Settings(blobs.config, blobs.path, blobs.spec)).fingerprint
-    run = RunRecord("float32-sound", {"name": "gsplat", "version": "1.4.0"}, {}, (0,), now, {"target_ratio": 1.05})
+    run = record_of(now)
     assert Report.resume(tmp_path / "out", run).kept == [0]
 
 
+@pytest.mark.slow_cases(every=5)
 @others
 @pytest.mark.parametrize("kind", ["npz", "png"])
 def test_results_are_not_exported(kind: str, name: str, blobs: Inputs, tmp_path: Path, in_process: InProcess) -> None:

@@ -15,8 +15,10 @@ import torch
 
 from ns_abstract.arithmetic.rounding import Arithmetic
 from ns_abstract.bench import stiff
-from ns_abstract.bench.stiff import ARITHMETICS, Case, WatchedFrame, all_cases, run_case
-from ns_abstract.cli.bench import Stiff, bench
+from ns_abstract.bench.stiff import ARITHMETICS, WatchedFrame, run_case
+from ns_abstract.bench.stiff_cases import Case, all_cases
+from ns_abstract.cli.bench import bench
+from ns_abstract.cli.bench_options import Stiff
 from ns_abstract.cli.common import DONE
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
@@ -34,7 +36,7 @@ def case_of(name: str) -> Case:
     return next(case for case in CASES if case.name == name)
 
 
-@pytest.mark.slow_cases(every=10)
+@pytest.mark.slow_cases(every=60)
 @pytest.mark.parametrize("arithmetic", ARITHMETICS)
 @pytest.mark.parametrize("case", CASES, ids=lambda case: case.name.replace(" ", "-"))
 def test_case(case: Case, arithmetic: str) -> None:
@@ -134,6 +136,7 @@ def test_low_bounds_fail(name: str, arithmetic: str) -> None:
     assert 0.8e-3 < outcome.row["worst"] < 1.01e-3
 
 
+@pytest.mark.slow_cases(every=3)
 @pytest.mark.parametrize("arithmetic", ARITHMETICS)
 @pytest.mark.parametrize("name", ["depth ties", "six parameters", "needles", "harmonics 1e3", "screen-filling"])
 def test_forgotten_gaussian_fails(name: str, arithmetic: str) -> None:

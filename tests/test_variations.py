@@ -113,6 +113,7 @@ def test_blobs(degree: int, dimensions: int) -> None:
     assert found.violations == 0 and found.pictures["gradient"] == 2 * 4 * 6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("dimensions", [0, 3])
 def test_float32_blobs(dimensions: int) -> None:
     """Float32 evaluations of members, whose values are rounded to float32, lie inside as well."""

@@ -17,6 +17,7 @@ from PIL import Image
 
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.report import certificate_page as page
+from ns_abstract.report.figures import ShownUnits
 from ns_abstract.report.regions import (
     MOST,
     FailureRegion,
@@ -228,18 +229,17 @@ def test_every_pair_has_a_map_on_the_page(d: int, pairs: int) -> None:
     assert width <= 800 and all(x + w <= width and y + h <= height for x, y, w, h in places)
     for (x, y, w, h), (a, b, *_) in itertools.combinations(places, 2):
         assert abs(x - a) >= w or abs(y - b) >= h
-    document = {"frames": [fixed]}
-    [(text, shown)], more = page._matrices(document, {0: rows})
+    [(text, shown)], more = page._matrices([fixed], {0: rows})
     assert shown is fixed and more == 0
     assert text.count("<image") == d * d and "<0>" not in text and "&lt;0&gt;" in text
-    assert page._matrices({"frames": [entry("x", "y")]}, {0: cells(2)}) == ([], 0)
+    assert page._matrices([entry("x", "y")], {0: cells(2)}) == ([], 0)
 
 
 def test_of_many_frames_those_certified_least_have_maps() -> None:
     frames = [entry("x", "y", "z", index=k) for k in range(6)]
     for k, one in enumerate(frames):
         one["coverage"] = one["coverage"] | {"certified": 0.9 - 0.1 * (k % 3)}
-    found, more = page._matrices({"frames": frames}, {k: cells(3) for k in range(6)})
+    found, more = page._matrices(frames, {k: cells(3) for k in range(6)})
     assert [shown["index"] for _, shown in found] == [1, 2, 4, 5] and more == 2
 
 
@@ -267,6 +267,26 @@ def test_counterexamples_are_marked_where_they_are() -> None:
     # a short arc would hardly be seen as a ring
     arc = drawn([entry("azimuth", high=0.4)], {0: cells(1, 0.4)})
     assert "Verdicts along azimuth" in arc and arc.count('class="broken"') == 2
+
+
+def test_axes_are_in_the_units_that_were_asked_for() -> None:
+    frame, rows = entry("yaw", "x", high=0.5), cells(2, 0.5)
+    frame["parameters"][1]["unit"] = "normalised units"
+    units = ShownUnits("dataset", "degrees", 0.25)
+    shown, leaves = units.drawn(frame, rows)
+    (strip,), (plain,) = ([svg for svg, *_ in page.verdict_drawings([e], {0: r}, {})[0]] for e, r in
+                          ((shown, leaves), (frame, rows)))  # fmt: skip
+    assert "yaw (degrees)" in strip and "x (units of the data set)" in strip and "yaw (rad)" in plain
+    # the same drawing but for what stands at the axes
+    assert re.findall(r"<(?:rect|path)[^>]*class=.(?:certified|falsified|broken)[^>]*>", strip) != []
+    np.testing.assert_allclose(shown["parameters"][0]["upper"], math.degrees(0.5))
+    np.testing.assert_allclose(leaves[1]["counterexample"], [math.degrees(0.1875), 4 * 0.5 / 3])
+    assert rows == cells(2, 0.5) and leaves[0]["counterexample"] is None
+    assert stops([frame], {0: rows}, units)[-1].at == "frame 0, yaw = 28.65 degrees"
+    assert units.value("yaw", "rad", 0.5) == "yaw = 0.5 (28.6479 degrees)"
+    # a ring stays one
+    ring = entry("azimuth")
+    assert units.drawn(ring, cells(1))[0] == ring
 
 
 def test_a_path_is_one_strip() -> None:
@@ -465,7 +485,7 @@ def test_every_beginning_is_spread(count: int) -> None:
 def test_the_slider_on_the_page() -> None:
     frame = entry("x")
     frame["parameters"][0]["name"] = "<x>"
-    found = [(s, shown(list(s.values), 0.5, [1.0])) for s in stops([frame], {0: cells(1)}, 8)]
+    found = [(s, shown(list(s.values), 0.5, [1.0])) for s in stops([frame], {0: cells(1)}, most=8)]
     text = walk_html(found)
     assert text.count("<figure") == 8 and "<x>" not in text and "&lt;x&gt; = 6 rad" in text
     marks = re.findall(r'<i class="(\w+)-back">', text)
@@ -487,7 +507,7 @@ def test_pictures_are_written_and_those_of_others_are_left(tmp_path: Path) -> No
     ]
     rows = {k: cells(max(1, k)) for k in range(4)} | {4: [{"lower": [], "upper": [], "verdict": "certified"}]}
     covered = frames[0]["coverage"]
-    names = write_pictures(tmp_path, {"frames": frames, "coverage": covered}, rows, None)
+    names = write_pictures(tmp_path, {"scene": {}, "frames": frames, "coverage": covered}, rows, None)
     assert names == [f"verdicts_{k:05d}.svg" for k in range(4)] == sorted(f.name for f in tmp_path.iterdir())
     for name in names:
         drawn = ElementTree.parse(tmp_path / name).getroot()
@@ -503,7 +523,7 @@ def test_pictures_are_written_and_those_of_others_are_left(tmp_path: Path) -> No
     way[2]["parameters"][0]["upper"] = 0.0
     rows = {0: cells(1, 1.0), 1: cells(1, 1.0), 2: [{"lower": [0.0], "upper": [0.0], "verdict": "unknown"}]}
     rows[2][0]["counterexample"] = None
-    names = write_pictures(tmp_path, {"frames": way, "coverage": covered}, rows, None)
+    names = write_pictures(tmp_path, {"scene": {}, "frames": way, "coverage": covered}, rows, None)
     assert names == ["verdicts_path.svg"]
     clear_pictures(tmp_path)
     assert sorted(f.name for f in tmp_path.iterdir()) == ["cameras.svg", "mine.png"]

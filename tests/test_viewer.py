@@ -428,6 +428,7 @@ def test_a_larger_picture_of_which_less_is_known_waits() -> None:
 # ---------------------------------------------------------------- the command
 
 
+@pytest.mark.slow
 def test_viewer_needs_nerfstudio(monkeypatch: pytest.MonkeyPatch, blobs: Inputs, call: Call) -> None:  # noqa: F811
     monkeypatch.delitem(sys.modules, "ns_abstract.nerfstudio.viewing", raising=False)
     monkeypatch.setitem(sys.modules, "nerfstudio.configs.base_config", None)

@@ -124,6 +124,7 @@ def test_training_learns(scripts: Any, certified: float, tmp_path: Path) -> None
     np.testing.assert_allclose(found, outputs[:2].numpy(), atol=1e-4)
 
 
+@pytest.mark.slow
 def test_rows_of_outputs_are_tighter_than_their_parts(scripts: Any) -> None:
     """Differences of outputs over random sets hold what the network gives, and depend on weights once."""
     torch.manual_seed(0)
@@ -304,6 +305,7 @@ def test_estimator_of_the_airfield(scripts: Any) -> None:
     assert scripts.train.within(torch.from_numpy(outputs), truth, 0.1) >= 0.9
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["car, orbit", "lawn, car"])
 def test_a_part_is_certified(scripts: Any, name: str, tmp_path: Path) -> None:
     """A narrow part of the row's set, and no attack breaks it."""

@@ -8,7 +8,8 @@ from numba import njit
 from oracle import escapes, random_forms, rational
 from test_forms import BINARY, POSITIVE, SIZES, layout
 
-from ns_abstract.arithmetic.forms import Basis, FormArray, clamp_below, logarithm, negate, set_norms
+from ns_abstract.arithmetic.form_array import FormArray
+from ns_abstract.arithmetic.forms import Basis, clamp_below, logarithm, negate, set_norms
 from ns_abstract.arithmetic.simd import wide_forms
 from ns_abstract.arithmetic.simd.intrinsics import pointer
 from ns_abstract.arithmetic.simd.lanes import load8, store
@@ -141,6 +142,7 @@ SINGLE = {
 }
 
 
+@pytest.mark.slow_cases(every=8)
 @pytest.mark.parametrize("basis", BASES, ids=str)
 @pytest.mark.parametrize("size", SIZES)
 @pytest.mark.parametrize("name", PAIRS)

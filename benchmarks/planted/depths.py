@@ -10,7 +10,7 @@ _DIM = "test_depths.py::test_dim_light_and_tightness"
 DEPTHS = (
     Fault(
         "depth: rounding of the sums is not charged",
-        _DEPTHS, "shade_layers", "(rounding * total_high + rounding) * all_of_it", "0.0 * all_of_it",
+        _DEPTHS, "_expected_depth", "(rounding * total_high + rounding) * magnitude", "0.0 * magnitude",
         "test_depths.py::test_sums_of_weights_are_rounded",
     ),
     Fault(
@@ -21,7 +21,7 @@ DEPTHS = (
     ),
     Fault(
         "depth: what all depths have in common is forgotten",
-        _DEPTHS, "shade_layers", "reference[k] + common[k]", "reference[k] + (common[k] if k == 0 else 0.0)",
+        _DEPTHS, "_expected_depth", "result[k] += common[k]", "result[k] += common[k] if k == 0 else 0.0",
         _ATTACK + "[z-classic-1.4.0]", compiled=True,
     ),
     Fault(

@@ -2,6 +2,10 @@
 
 from planted.fault import Fault
 
+_REACHED_PIXELS = "methods/splat/reached_pixels.py"
+_PIXEL_REGIONS = "methods/splat/pixel_regions.py"
+_DEPTH_PAIRS = "methods/splat/depth_pairs.py"
+_ALPHA_RANGES = "methods/splat/alpha_ranges.py"
 _RECORDS = "methods/splat/projection_errors.py"
 _GAUSSIANS = "methods/splat/gaussians.py"
 _FRAGMENTS = "methods/splat/fragments.py"
@@ -33,11 +37,35 @@ SPLATS = (
     ),
     Fault(
         "near plane is not uncertain",
-        _RECORDS,
+        _PIXEL_REGIONS,
         "_tile_ranges",
-        "(s[ZLOW + q] < near * (1.0 + charges.near)) | (z_high > far)",
+        "(s[row.ZLOW + q] < near * (1.0 + charges.near)) | (z_high > far)",
         "z_high > far",
         "test_bounds.py::test_what_passes_the_near_plane_is_projected[2-False]",
+    ),
+    Fault(
+        "tiles are asked for in the real-number picture",
+        _BOUNDS,
+        "SplatBounds.__init__",
+        "arithmetic == REAL",
+        "False",
+        "test_gsplat_kernels.py::test_real_pictures_have_no_tiles",
+    ),
+    Fault(
+        "nothing is known of a needle whose covariance rounds by a third",
+        "arithmetic/rounding.py",
+        "",
+        "COVARIANCE_ERROR = 0.39",
+        "COVARIANCE_ERROR = 0.25",
+        "test_gsplat_kernels.py::test_needle_of_a_covariance_that_rounds_by_a_third[classic-1.4.0]",
+    ),
+    Fault(
+        "exponents of needles do not round",
+        _PIXEL_REGIONS,
+        "_opacities",
+        "kappa = kappa * (1.0 + 2.0 * kappa)",
+        "kappa = 0.0",
+        "test_gsplat_kernels.py::test_needle_of_a_covariance_that_rounds_by_a_third[classic-1.4.0]",
     ),
     Fault(
         "near plane culls what crosses it",
@@ -57,7 +85,7 @@ SPLATS = (
     ),
     Fault(
         "tile cut-off by the smallest radius",
-        _RECORDS,
+        _PIXEL_REGIONS,
         "_tile_ranges",
         "mean_x_low - radius_high - snap_x, mean_x_high + radius_high + snap_x",
         "mean_x_low - radius_low + 1.0, mean_x_high + radius_low - 1.0",
@@ -137,7 +165,7 @@ SPLATS = (
     ),
     Fault(
         "compensated layers dropped too early",
-        _RECORDS,
+        _PIXEL_REGIONS,
         "_opacities",
         "all_of_it * (1.0 + charges.exponent_limit)",
         "0.9 * all_of_it * (1.0 + charges.exponent_limit)",
@@ -145,10 +173,10 @@ SPLATS = (
     ),
     Fault(
         "compensated layers are drawn on too few pixels",
-        _RECORDS,
+        _PIXEL_REGIONS,
         "_opacities",
-        "s[CTOPLOG + q]",
-        "1.5 * s[CTOPLOG + q]",
+        "s[row.CTOPLOG + q]",
+        "1.5 * s[row.CTOPLOG + q]",
         "test_antialiased.py::test_pictures[x]",
     ),
     Fault(
@@ -170,17 +198,17 @@ SPLATS = (
     Fault(
         "a ratio's slope has the wrong sign",
         _LINE_PROJECTION,
-        "project_line",
-        "n00 = _lowered(_rotated(r0, b0, b1, b2, still, 0.0, 0.0), u, deep)",
-        "n00 = _lowered(_rotated(r0, b0, b1, b2, still, 0.0, 0.0), u._replace(slope=-u.slope), deep)",
+        "_seen_axis",
+        "n0 = _lowered(_rotated(rows[0], x, y, z, still, 0.0, 0.0), u, deep)",
+        "n0 = _lowered(_rotated(rows[0], x, y, z, still, 0.0, 0.0), u._replace(slope=-u.slope), deep)",
         "test_bounds.py::test_needle[2]",
     ),
     Fault(
         "the vertical ratio's slope has the wrong sign",
         _LINE_PROJECTION,
-        "project_line",
-        "n10 = _lowered(_rotated(r1, b0, b1, b2, still, 0.0, 0.0), v, deep)",
-        "n10 = _lowered(_rotated(r1, b0, b1, b2, still, 0.0, 0.0), v._replace(slope=-v.slope), deep)",
+        "_seen_axis",
+        "n1 = _lowered(_rotated(rows[1], x, y, z, still, 0.0, 0.0), v, deep)",
+        "n1 = _lowered(_rotated(rows[1], x, y, z, still, 0.0, 0.0), v._replace(slope=-v.slope), deep)",
         "test_bounds.py::test_needle[2]",
     ),
     Fault(
@@ -201,15 +229,15 @@ SPLATS = (
     ),
     Fault(
         "region of pixels without the mean's range",
-        _RECORDS,
+        _PIXEL_REGIONS,
         "_pixel_boxes",
-        "s[MXHI + q] + extent_x",
-        "s[MXLO + q] + extent_x",
+        "s[row.MXHI + q] + extent_x",
+        "s[row.MXLO + q] + extent_x",
         "test_bounds.py::test_alpha_threshold_of_all[2]",
     ),
     Fault(
         "order swap is ignored",
-        _FRAGMENTS,
+        _DEPTH_PAIRS,
         "_uncertain",
         "not (abs(center) > (spread + radius) * UP + rounding + depth_error[i] + depth_error[j])",
         "False and not (abs(center) > (spread + radius) * UP + rounding + depth_error[i] + depth_error[j])",
@@ -217,7 +245,7 @@ SPLATS = (
     ),
     Fault(
         "depth order: room for rounding is a part of what is left of a turn",
-        _FRAGMENTS,
+        _DEPTH_PAIRS,
         "_steadiness",
         "1.0 - along - TURN_ROOM",
         "(1.0 - along) * (1.0 - TURN_ROOM)",
@@ -241,7 +269,7 @@ SPLATS = (
     ),
     Fault(
         "equal depths keep the list's order",
-        _FRAGMENTS,
+        _DEPTH_PAIRS,
         "_uncertain",
         "not (abs(center) > (spread + radius) * UP + rounding + depth_error[i] + depth_error[j])",
         "center != 0.0 and (not abs(center) > (spread + radius) * UP + rounding + depth_error[i] + depth_error[j])",
@@ -273,8 +301,8 @@ SPLATS = (
     ),
     Fault(
         "layers that share a pixel are taken for apart",
-        _FRAGMENTS,
-        "_find_pairs",
+        _DEPTH_PAIRS,
+        "find_pairs",
         "pixel_set & int(theirs)",
         "pixel_set & int(theirs) & 1",
         "test_bounds.py::test_depth_swap[2]",
@@ -393,32 +421,32 @@ SPLATS = (
     ),
     Fault(
         "1/255 is not a jump",
-        _ALPHAS,
-        "_thresholded",
+        _ALPHA_RANGES,
+        "thresholded",
         "where(skips, minimum(limits.alpha_min_high, a_high), 0.0)",
         "0.0 * a_high",
         "test_bounds.py::test_alpha_threshold[2]",
     ),
     Fault(
         "1/255 does not make 0 possible",
-        _ALPHAS,
-        "_thresholded",
+        _ALPHA_RANGES,
+        "thresholded",
         "where(skips, 0.0, limits.sure * a_low)",
         "limits.sure * a_low",
         "test_bounds.py::test_alpha_threshold[2]",
     ),
     Fault(
         "0.999 clamp missing from the interval",
-        _ALPHAS,
-        "_thresholded",
+        _ALPHA_RANGES,
+        "thresholded",
         "a_low = minimum(a_low, alpha_max * (1.0 - charges.threshold))",
         "pass",
         "test_bounds.py::test_alpha_clamp[2]",
     ),
     Fault(
         "0.999 clamp missing from the form",
-        _ALPHAS,
-        "_thresholded",
+        _ALPHA_RANGES,
+        "thresholded",
         "maximum(0.0, a_high - alpha_max)",
         "0.0 * a_high",
         "test_bounds.py::test_alpha_clamp_crossed[2]",
@@ -489,32 +517,32 @@ SPLATS = (
     ),
     Fault(
         "remainder of the exponential's fit is dropped",
-        _ALPHAS,
-        "_fitted_exponential",
+        _ALPHA_RANGES,
+        "fitted_exponential",
         "fma(SERIES_REST * x, (x * x) * (x * x), fit)",
         "0.0 * x",
         "test_pixel_forms.py::test_a_straight_exponent_is_fitted[2.0]",
     ),
     Fault(
         "remainder of the fit of degree 3 is dropped",
-        _ALPHAS,
-        "_cubic_exponential",
+        _ALPHA_RANGES,
+        "cubic_exponential",
         "fma(CUBIC_SERIES_REST * x, (x * x) * (x * x), fit)",
         "0.0 * x",
         "test_pixel_forms.py::test_the_fit_of_degree_three_holds_everywhere",
     ),
     Fault(
         "one parameter: third and fifth powers of alpha are dropped",
-        _ALPHAS,
-        "_cubic_exponential",
+        _ALPHA_RANGES,
+        "cubic_exponential",
         "abs(fma(0.25, p3, 0.3125 * p5))",
         "0.0 * p3",
         "test_pixel_forms.py::test_an_exponent_of_one_parameter_is_fitted[0.6-0.0]",
     ),
     Fault(
         "one parameter: the exponent's radius moves alpha as at the middle of the range only",
-        _ALPHAS,
-        "_cubic_exponential",
+        _ALPHA_RANGES,
+        "cubic_exponential",
         "fma(moved, fma(3.0 * k3, moved, 2.0 * abs(e2)), abs(e1))",
         "0.5 * abs(e1)",
         "test_pixel_forms.py::test_an_exponent_of_one_parameter_is_fitted[0.0-0.01]",
@@ -737,8 +765,8 @@ SPLATS = (
     ),
     Fault(
         "what the exponent's curvature is off half its turn is not charged",
-        _ALPHAS,
-        "_fitted_exponential",
+        _ALPHA_RANGES,
+        "fitted_exponential",
         "fma(l, 2.0 * b - turn, fma(0.125 * turn, turn, sr * fma(2.0, l + b, sr)))",
         "fma(0.125 * turn, turn, sr * fma(2.0, l + b, sr))",
         "test_pixel_forms.py::test_a_bent_exponent_is_fitted[1.0-1.0]",
@@ -809,7 +837,7 @@ SPLATS = (
     ),
     Fault(
         "columns that a Gaussian may cover without the forms' spread",
-        _FRAGMENTS,
+        _REACHED_PIXELS,
         "_pixels_within",
         "(root(maximum(rest, 0.0)) + spread1) * inverse * REGION",
         "root(maximum(rest, 0.0)) * inverse",
@@ -841,7 +869,7 @@ SPLATS = (
     ),
     Fault(
         "an exponent that is no number leaves the opacity",
-        _RECORDS,
+        _PIXEL_REGIONS,
         "_opacities",
         "max(1.0, upper)",
         "upper",

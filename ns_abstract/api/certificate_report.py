@@ -118,6 +118,7 @@ class CertificateReport:
         total = self.job.partitions(self.search.grids[tally.frame])
         return {
             "index": tally.frame,
+            "intrinsics": self.job.job.pose_sets[tally.frame].camera.intrinsics._asdict(),
             "parameters": [
                 {
                     "name": name,

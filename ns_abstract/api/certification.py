@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from ns_abstract.api.assumptions import choice
-from ns_abstract.api.files import Settings, path_sets, resized
+from ns_abstract.api.files import Settings, path_sets
 from ns_abstract.api.frame_pictures import FramePictures, PropertySource
 from ns_abstract.api.job import Job, require_sound_platform, warm_up
+from ns_abstract.api.network_question import Question
 from ns_abstract.api.picture_question import PictureQuestion
 from ns_abstract.arithmetic.forms import MAX_DIMENSIONS
 from ns_abstract.execution.cancellation import cancel_when
@@ -32,17 +32,15 @@ from ns_abstract.io.jsonio import show
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.perturbation.specification import Perturbation
-from ns_abstract.refine.protocol import Frame, Method, RayFrame
-from ns_abstract.report.record import file_stamp
+from ns_abstract.refine.protocol import RayFrame
 from ns_abstract.verify.camera_response import CameraResponse
 from ns_abstract.verify.cells import Cell, CellGrid, initial_divisions
 from ns_abstract.verify.eight_bit import Picture
 from ns_abstract.verify.model import NetworkModel, parametric
-from ns_abstract.verify.network import NetworkArithmetic, load_network
-from ns_abstract.verify.network.explain import check_cell
+from ns_abstract.verify.network import NetworkArithmetic
 from ns_abstract.verify.picture_properties import PICTURE_TYPES, MeasureModel, is_of_picture
 from ns_abstract.verify.pixel_costs import pixel_weights
-from ns_abstract.verify.properties import Claim, LinearClaim, Property, loading, parse_property
+from ns_abstract.verify.properties import Claim, LinearClaim, Property
 from ns_abstract.verify.protocol import FrameImages as SearchedScene
 from ns_abstract.verify.protocol import Model as SearchedModel
 from ns_abstract.verify.registration import RegisteredImages, RegisteredModel
@@ -69,118 +67,6 @@ _KEPT = 4
 _FORESEEN = 0.25
 #: Bytes for the bounds of one process, where nothing is said.
 MEMORY = 1 << 30
-
-
-class Question:
-    """A network and the property to prove of it.
-
-    Args:
-        model: Network, .onnx.
-        source: What is to hold.
-
-    Raises:
-        InputError: A file or a field cannot be used.
-    """
-
-    #: Pixels that the picture moves by over a first cell: with one parameter, and with more.
-    motion = (0.08, 0.5)
-
-    def __init__(self, model: Path, source: PropertySource) -> None:
-        self.model, self.source = model, source
-        try:
-            load_options = loading(source.value)
-        except InputError as error:
-            raise source.within(error) from None
-        self.network = load_network(model, **load_options)
-        shapes = self.network.input_shape, self.network.output_shape
-        try:
-            self.property: Property = parse_property(source.value, source.folder, *shapes)
-        except InputError as error:
-            raise source.within(error) from None
-        #: height and width of the network's pictures
-        self.size = self.property.preprocess.size(self.network.input_shape)
-
-    def drawn(self, poses: PoseBox) -> PoseBox:
-        """A set whose pictures have the size that the property asks for."""
-        return poses if self.property.preprocess.resize is None else resized(poses, *self.size)
-
-    def opened(self, job: Job) -> None:
-        """Check that the pictures of a scene with its sets are those of the network.
-
-        Raises:
-            InputError: They have another size.
-        """
-        camera, size = job.pose_sets[0].camera, self.size
-        if (camera.height, camera.width) != size:
-            raise InputError(
-                f"the camera path has {camera.width} x {camera.height} pixels, the network's input "
-                f"{size[1]} x {size[0]}",
-                file=self.source.file,
-                field="preprocess.resize",
-                fix=f"write [{size[0]}, {size[1]}]",
-            )
-
-    def searched(self, memory: int, arithmetic: NetworkArithmetic, picture: Picture) -> NetworkModel:
-        """The network, as the search bounds it with so many bytes; ``picture`` is any."""
-        return NetworkModel(self.network, self.property.preprocess, memory, arithmetic)
-
-    def pictures(
-        self,
-        method: Method,
-        poses: PoseBox,
-        picture: Picture,
-        response: CameraResponse | None = None,
-        sheared: bool = False,
-    ) -> FramePictures:
-        """The pictures of a set that are shown to the network."""
-        return FramePictures(method, poses, picture, response, sheared)
-
-    @property
-    def name(self) -> str:
-        """What the property is about."""
-        return self.network.source.name
-
-    @property
-    def numbers(self) -> int:
-        """How many numbers the network computes for one picture."""
-        return sum(math.prod(self.network.shape(k)) for k in range(len(self.network.nodes) + 1))
-
-    def guarantee(self, arithmetic: NetworkArithmetic) -> tuple[str, ...]:
-        """What holds of the network, one sentence each."""
-        return self.network.guarantee(arithmetic)
-
-    def check_memory(self, dimensions: int, memory: float) -> None:
-        """Refuse a network one cell of which, of so many parameters, takes more bytes than there are.
-
-        Raises:
-            InputError: It does, about.
-        """
-        check_cell(self.network, max(1, dimensions), memory)
-
-    def describe(self) -> dict[str, Any]:
-        """The network for reports."""
-        shapes = {"input": self.network.input_shape, "output": self.network.output_shape}
-        return {**file_stamp(self.model), **shapes}
-
-    def fingerprint(self, arithmetic: NetworkArithmetic) -> dict[str, Any]:
-        """What a stored search must agree with beside the property."""
-        return {"model": file_stamp(self.model)["sha256"], "network_arithmetic": arithmetic}
-
-    def choices(self, arithmetic: NetworkArithmetic, picture: Picture) -> tuple[Assumption, ...]:
-        """What verdicts about the network rest on, and where each choice came from."""
-        name, output = self.source.name, self.source.value.get("output")
-        return (
-            choice("network output", self.network.output or "the only one", output, f"{name}: output"),
-            choice(
-                "network_arithmetic", arithmetic, None if arithmetic == "float32" else arithmetic,
-                "--network-arithmetic",
-            ),
-            choice("picture", picture, None if picture == "float" else picture, "--picture"),
-        )  # fmt: skip
-
-    def absolute(self) -> partial[Question]:
-        """How a process with another working directory asks it."""
-        return partial(Question, self.model.absolute(), self.source.absolute())
 
 
 #: What a certification is about.
@@ -492,10 +378,6 @@ class Certification:
                 field="--time-budget",
                 fix="give more, a smaller network or picture, fewer --num-samples, or declare an --occupancy-grid",
             )
-
-    def search_frame(self, index: int) -> Frame:
-        """The frame whose bounds the search of ``index`` will use."""
-        return self.search(index, self.grid(index)).scene.frame  # pyright: ignore[reportAttributeAccessIssue]
 
     def write_vnnlib(
         self, index: int, box: ParameterBox, target: Path, form: Form, version: LibraryVersion = "1.0"

@@ -27,7 +27,7 @@ from ns_abstract.api.job import Job
 from ns_abstract.api.poses import PoseSet, pose_sets
 from ns_abstract.api.scenes import Scene, checked_scene
 from ns_abstract.execution.cancellation import Deadline
-from ns_abstract.execution.engines import EngineName, started
+from ns_abstract.execution.starting import EngineName, started
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.io.arguments import file_path

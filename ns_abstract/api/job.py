@@ -238,7 +238,7 @@ class Job:
             return stopped() or (self.rays and time.perf_counter() - begin >= goal.seconds)
 
         refinement = Refinement(
-            frame, index, goal, seed=self.seed, keep_leaves=keep_leaves, stopped=over, progress=progress,
+            frame, index, replace(goal, keep_leaves=keep_leaves), seed=self.seed, stopped=over, progress=progress,
             members=frame.scene_samples(self.seed), tiles=tiles, known=known,
         )  # fmt: skip
         return replace(refinement.run_part(), problems=platform_problems())

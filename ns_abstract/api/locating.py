@@ -24,7 +24,7 @@ from ns_abstract.api.job import Job
 from ns_abstract.api.location import Location, PhotoOptions
 from ns_abstract.api.poses import PoseSet, pose_sets
 from ns_abstract.api.scenes import Scene, checked_scene
-from ns_abstract.execution.engines import EngineName, started
+from ns_abstract.execution.starting import EngineName, started
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.io.errors import InputError
 from ns_abstract.report.figures import percent, short_guarantee

@@ -26,7 +26,7 @@ from ns_abstract.reach.learned import LearnedDynamics
 from ns_abstract.reach.loop import Loop, load_loop, parse_loop
 from ns_abstract.reach.search import QUESTIONS, LoopBlockResult, LoopSearch
 from ns_abstract.reach.tubes import ControlBounds, Dependence, Pictures, TubeBuilder
-from ns_abstract.report.record import file_stamp
+from ns_abstract.report.run import file_stamp
 from ns_abstract.verify.camera_response import CameraResponse
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.model import NetworkModel

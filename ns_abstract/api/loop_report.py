@@ -17,9 +17,9 @@ from ns_abstract.reach.learned import LearnedDynamics
 from ns_abstract.reach.page import loop_page
 from ns_abstract.reach.search import QUESTIONS, Question, SimulatedRun, sampled_disturbances, simulate
 from ns_abstract.reach.tubes import Dependence, Tube
-from ns_abstract.report.certificate import SCENE_MARGIN, now
+from ns_abstract.report.certificate import SCENE_MARGIN
 from ns_abstract.report.outside import SceneDrawing
-from ns_abstract.report.record import file_stamp, guarantee_text, plain, versions
+from ns_abstract.report.run import Run, file_stamp, plain
 from ns_abstract.verify.search import Verdict
 from ns_abstract.verify.store import Store, Tally, fractions
 
@@ -58,8 +58,17 @@ class LoopReport:
     """
 
     def __init__(self, job: LoopJob, settings: Mapping[str, Any], command: tuple[str, ...]) -> None:
-        self.job, self.settings, self.command = job, settings, command
-        self.started = now()
+        self.job = job
+        self.about = Run(
+            guarantee=job.job.method.guarantee,
+            renderer={name: job.job.method.program[name] for name in ("name", "version")},
+            scene=job.job.describe(),
+            assumptions=job.assumptions,
+            settings=settings,
+            fingerprint=job.fingerprint,
+            command=command,
+            plan=job.job.plan,
+        )
         self.simulated: list[SimulatedRun] = []
         self.tubes: list[dict[str, Any]] = []
         self.examples: list[dict[str, Any]] = []
@@ -143,23 +152,18 @@ class LoopReport:
     def _document(self, search: CellSearch[Any], rows: Mapping[int, list[Row]], state: str) -> dict[str, Any]:
         job, loop, store = self.job, self.job.loop, search.store
         entries = {QUESTIONS[tally.frame]: self._entry(tally, rows[tally.frame]) for tally in store.tallies()}
-        program, scene = job.job.method.program, job.job.describe()
         learned: dict[str, Any] = {}
         if isinstance(loop.dynamics, LearnedDynamics):
             law = loop.dynamics
             learned = {"dynamics_model": file_stamp(law.file), "dynamics_guarantee": law.network.guarantee()}
         return plain(
-            {
-                "version": 1,
+            self.about.head()
+            | {
                 "kind": "loop",
                 "verdict": verdict(entries),
                 "questions": entries,
-                "guarantee": job.job.method.guarantee,
-                "guarantee_text": guarantee_text(job.job.method.guarantee, program["name"], scene.get("bounded")),
                 "network_guarantee": job.network.guarantee(job.model.arithmetic),
-                "renderer": {name: program[name] for name in ("name", "version")},
-                "scene": scene,
-                "assumptions": [vars(entry) for entry in job.assumptions],
+                "intrinsics": job.job.pose_sets[0].camera.intrinsics._asdict(),
                 "model": file_stamp(loop.network),
                 "loop": loop.value,
                 "dynamics": loop.dynamics.about,
@@ -178,16 +182,8 @@ class LoopReport:
                 "effort": store.effort,
                 "unknown_because": store.reasons,
                 "cells_seal": {"rows": store.seal.rows, "sum": store.seal.text},
-                "plan": job.job.plan,
-                "state": state,
-                "metrics": METRICS,
-                "settings": self.settings,
-                "fingerprint": job.fingerprint,
-                "command": self.command,
-                "packages": versions(),
-                "started": self.started,
-                "updated": now(),
             }
+            | self.about.tail(state, METRICS)
         )
 
     def _entry(self, tally: Tally, rows: Sequence[Row]) -> dict[str, Any]:

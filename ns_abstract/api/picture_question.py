@@ -257,7 +257,7 @@ def depth_range(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.nd
 
 
 class PictureQuestion:
-    """A property of the picture itself; see `ns_abstract.api.certification.Question`, which has a network.
+    """A property of the picture itself; see `ns_abstract.api.network_question.Question`, which has a network.
 
     Args:
         source: What is to hold.

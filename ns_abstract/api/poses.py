@@ -18,8 +18,7 @@ from ns_abstract.geometry.camera_path import (
     checked_pose,
     checked_side,
     focal_length,
-    focal_pixels,
-    principal_place,
+    stated_intrinsics,
 )
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import show
@@ -71,10 +70,9 @@ class Camera(PinholeCamera):
             raise InputError(problem, field="camera_to_world", fix="give a 4x4 or 3x4 matrix of numbers")
         pose = checked_pose(matrix.tolist(), "camera_to_world")
         across, down = checked_side(width, "width"), checked_side(height, "height")
-        focal = focal_length(fov, down, "fov") if fx is None else focal_pixels(fx, "fx")
-        other = focal if fy is None else focal_pixels(fy, "fy")
-        middle = principal_place(cx, across, "cx"), principal_place(cy, down, "cy")
-        super().__init__(pose, focal, other, *middle, across, down)
+        own = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
+        lens = stated_intrinsics(own, lambda: focal_length(fov, down, "fov"), down, across)
+        super().__init__(pose, *lens[:4], across, down)
 
 
 def _plain(value: Any) -> Any:

@@ -24,7 +24,7 @@ from ns_abstract.api.loop_job import LoopJob, open_loop
 from ns_abstract.api.loop_report import LoopReport
 from ns_abstract.api.scenes import Scene, checked_scene
 from ns_abstract.execution.cancellation import Deadline
-from ns_abstract.execution.engines import EngineName, started
+from ns_abstract.execution.starting import EngineName, started
 from ns_abstract.io.arguments import file_path
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.reach.search import QUESTIONS

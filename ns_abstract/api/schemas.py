@@ -224,6 +224,10 @@ def loop_schema() -> Schema:
     camera = {
         "camera_to_world": pose,
         "fov": _POSITIVE,
+        "fx": _POSITIVE,
+        "fy": _POSITIVE,
+        "cx": _NUMBER,
+        "cy": _NUMBER,
         "position": _object({"offset": _numbers(3), "matrix": _list(_list(_NUMBER, 1), 3, 3)}, ["matrix"]),
         **dict.fromkeys(ROTATIONS, turn),
     }

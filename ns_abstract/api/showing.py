@@ -16,6 +16,7 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.report import regions as broken
 from ns_abstract.report import walk
 from ns_abstract.report.certificate_page import CertificateDetails
+from ns_abstract.report.figures import ShownUnits
 from ns_abstract.report.picture import preview
 from ns_abstract.report.regions import FailureRegion, PoseImage
 from ns_abstract.verify.properties import Claim
@@ -92,7 +93,7 @@ def look_closer(
     regions = broken.falsified_regions(entries, rows)
     sides = {entry["index"]: entry["parameters"] for entry in entries}
     pictures: list[tuple[PoseImage, PoseImage | None]] = []
-    stops = walk.stops(entries, rows)
+    stops = walk.stops(entries, rows, ShownUnits.of(job.job.describe()))
     pictures_by_frame: dict[int, PoseImage] = {}
     why = _OVER
     # a property that makes no sense for a frame is told by who searches

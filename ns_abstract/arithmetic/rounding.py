@@ -148,6 +148,9 @@ LINEAR_UP, LINEAR_ROUNDING = 1.0 + 2.0**-40, 2.0**-44
 DIFFERENCE_ROUNDING = 2.0**-44
 #: B8: alphas below are left out by the paper's rasteriser, which draws all; so much is added for each that is.
 NEGLIGIBLE_ALPHA = 2.0**-40
+#: G7: the covariance's relative error x below which the exponent's is at most x (1 + 2 x), below 0.695: an inverse by
+#: 1 - x, and 36 of the 80 charged units times ((1 + x) / (1 - x))^2.
+COVARIANCE_ERROR = 0.39
 #: G12: units of the program by which alpha may exceed its threshold where a tile is missed: 298 of a box (16 and 32 of
 #: its side, 178 + 78 + 34 + 8 in the exponent), 2^17 of an ellipse, twice.
 BOX_ROOM, ELLIPSE_ROOM = 2.0**9, 2.0**18

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ns_abstract.arithmetic.forms import Float64Array, FormArray
+from ns_abstract.arithmetic.form_array import FormArray
+from ns_abstract.arithmetic.forms import Float64Array
 from ns_abstract.arithmetic.rounding import ANGLE_ROUNDING, FUNCTION_ROUNDING
 
 

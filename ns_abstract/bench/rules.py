@@ -30,6 +30,9 @@ _SAMPLES = 33
 #: Gaussians fainter than this at a pixel are no part of its scene.
 _FAINT = 1e-3
 
+#: Bounds [3] of the only pixel that a scene's camera has.
+_Rule = Callable[[Splats, PinholeCamera], tuple[Float64Array, Float64Array]]
+
 #: The paper's rules, and what they are without one of their parts.
 PAPER_RULES: dict[str, dict[str, object]] = {
     "MATRIXINV, VR-IND": {},
@@ -75,6 +78,34 @@ def _own(
     return cell_bounds.lower[0, 0, 0], cell_bounds.upper[0, 0, 0]
 
 
+def _all_rules(poses: PoseBox, cell: ParameterBox) -> dict[str, _Rule]:
+    """Ours and the paper's rules, by name, for a cell of a set."""
+    forms = poses.enclosure(cell, 1)
+
+    def by_paper(options: dict[str, object]) -> _Rule:
+        def bounded(scene: Splats, view: PinholeCamera) -> tuple[Float64Array, Float64Array]:
+            enclosure: Enclosure = paper.bound(scene, view, forms, **options)  # pyright: ignore[reportArgumentType]
+            low, high = enclosure.bounds()
+            return np.clip(low[0], 0.0, 1.0), np.clip(high[0], 0.0, 1.0)
+
+        return bounded
+
+    rules: dict[str, _Rule] = {"ours": lambda scene, view: _own(scene, view, poses, cell)}
+    return rules | {rule: by_paper(options) for rule, options in PAPER_RULES.items()}
+
+
+def _scene_of_pixel(splats: Splats, weights: Float64Array, most: int) -> Splats | None:
+    """At most ``most`` Gaussians of the largest weights [N]; None where they take less than half of the light."""
+    chosen = np.sort(np.argsort(-weights, kind="stable")[:most])
+    chosen = chosen[weights[chosen] >= _FAINT]
+    if weights[chosen].sum() < 0.5:
+        return None
+    return replace(
+        splats, means=splats.means[chosen], axes=splats.axes[chosen], opacity=splats.opacity[chosen],
+        sh=splats.sh[chosen],
+    )  # fmt: skip
+
+
 def compare(
     job: PathJob, name: str, frame: int, parts: int, pixels: int, most: int, seed: int = 0
 ) -> list[dict[str, object]]:
@@ -100,18 +131,7 @@ def compare(
         cell = cell.split(axis, parts)[parts // 2]
     camera, random = poses.camera, np.random.default_rng(seed)
     places = random.permutation(camera.width * camera.height)
-    rules: dict[str, Callable[[Splats, PinholeCamera], tuple[Float64Array, Float64Array]]] = {
-        "ours": lambda scene, view: _own(scene, view, poses, cell)
-    }
-    forms = poses.enclosure(cell, 1)
-    for rule, options in PAPER_RULES.items():
-
-        def by_rule(scene: Splats, view: PinholeCamera, options: dict = options) -> tuple[Float64Array, Float64Array]:
-            enclosure: Enclosure = paper.bound(scene, view, forms, **options)
-            low, high = enclosure.bounds()
-            return np.clip(low[0], 0.0, 1.0), np.clip(high[0], 0.0, 1.0)
-
-        rules[rule] = by_rule
+    rules = _all_rules(poses, cell)
     gaps: dict[str, list[float]] = {rule: [] for rule in ("renders", *rules)}
     seconds = dict.fromkeys(rules, 0.0)
     outside = dict.fromkeys(rules, 0)
@@ -120,20 +140,15 @@ def compare(
         row, column = divmod(place, camera.width)
         view = _pixel_camera(camera, column, row)
         weights = weights_at(splats, view, *poses.world_to_camera(cell.middle), np.array([0.5, 0.5]))
-        chosen = np.sort(np.argsort(-weights, kind="stable")[:most])
-        chosen = chosen[weights[chosen] >= _FAINT]
-        if weights[chosen].sum() < 0.5:
+        scene = _scene_of_pixel(splats, weights, most)
+        if scene is None:
             continue
-        scene = replace(
-            splats, means=splats.means[chosen], axes=splats.axes[chosen], opacity=splats.opacity[chosen],
-            sh=splats.sh[chosen],
-        )  # fmt: skip
         draws = [*cell.corners(), *cell.sample(_SAMPLES, random)]
         renders = np.stack([paper.render(scene, view, *poses.world_to_camera(values))[0] for values in draws])
         renders = np.clip(renders, 0.0, 1.0)
         least, greatest = renders.min(axis=0), renders.max(axis=0)
         gaps["renders"].append(float(np.linalg.norm(greatest - least)))
-        counts.append(chosen.size)
+        counts.append(scene.count)
         for rule, bounded in rules.items():
             started = time.process_time()
             low, high = bounded(scene, view)

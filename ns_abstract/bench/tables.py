@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -33,3 +34,25 @@ def write(rows: Sequence[dict[str, Any]], folder: Path, name: str, title: str) -
         writer.writeheader()
         writer.writerows(rows)
     (folder / f"{name}.md").write_text(f"# {title}\n\n{markdown(rows)}")
+
+
+@dataclass
+class Table:
+    """A table that grows: every row is on the terminal and in the files once it is there.
+
+    Attributes:
+        folder, name, title: See `write`.
+        rows: All so far.
+    """
+
+    folder: Path
+    name: str
+    title: str
+    rows: list[dict[str, Any]] = field(default_factory=list)
+
+    def add(self, *rows: dict[str, Any]) -> None:
+        """Print and write more rows."""
+        lines = markdown(rows).splitlines()
+        print("\n".join(lines[2 if self.rows else 0 :]), flush=True)
+        self.rows += rows
+        write(self.rows, self.folder, self.name, self.title)

@@ -34,6 +34,7 @@ def run_record(
         command=(program, *sys.argv[1:]),
         limits=tuple(map(failed_self_check, problems)),
         size=(camera.height, camera.width),
+        intrinsics={frame: job.pose_sets[frame].camera.intrinsics._asdict() for frame in frames},
     )
 
 

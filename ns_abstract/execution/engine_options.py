@@ -59,7 +59,8 @@ class EngineOptions:
         Raises:
             InputError: A file of the connection is missing, or no scheduler answers.
         """
-        from ns_abstract.execution.engines import Tls, started
+        from ns_abstract.execution.cluster import Tls
+        from ns_abstract.execution.starting import started
 
         tls = Tls.of(self.tls_ca_file, self.tls_cert, self.tls_key, self.scheduler_address)
         return started(self.engine, self.scheduler_address, processes, tls)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -224,6 +225,32 @@ def principal_place(value: Any, side: int, field: str) -> float:
     return side / 2 if value is None else float(value)
 
 
+def stated_intrinsics(
+    own: Mapping[str, Any], focal: Callable[[], float], height: int, width: int, prefix: str = ""
+) -> Intrinsics:
+    """Intrinsics in pixels as a file or a caller states them.
+
+    Args:
+        own: ``fx``, ``fy``, ``cx``, ``cy``; what is None or missing follows from ``focal`` and from the middle.
+        focal: The focal length where ``fx`` is not stated.
+        height, width: Size of the pictures, pixels.
+        prefix: Of the names in errors.
+
+    Raises:
+        InputError: One of them is no moderate number, or a focal length is not above 0.
+    """
+    fx, fy = own.get("fx"), own.get("fy")
+    across = focal() if fx is None else focal_pixels(fx, f"{prefix}fx")
+    return Intrinsics(
+        across,
+        across if fy is None else focal_pixels(fy, f"{prefix}fy"),
+        principal_place(own.get("cx"), width, f"{prefix}cx"),
+        principal_place(own.get("cy"), height, f"{prefix}cy"),
+        width,
+        height,
+    )
+
+
 def _parse(root: dict[str, Any], source: str, downscale_factor: float) -> CameraPath:
     unknown = PATH.unknown(root)
     height = checked_side(root.get("render_height"), "render_height")
@@ -232,16 +259,10 @@ def _parse(root: dict[str, Any], source: str, downscale_factor: float) -> Camera
     overrides = []
     for field, entry in _entries(root, unknown):
         own = {key: entry.get(key, root.get(key)) for key in ("fx", "fy", "cx", "cy")}
-        focal = _focal(entry, root, field, height) if own["fx"] is None else focal_pixels(own["fx"], f"{field}.fx")
-        camera = PinholeCamera(
-            camera_to_world=checked_pose(entry.get("camera_to_world"), f"{field}.camera_to_world"),
-            fx=focal,
-            fy=focal if own["fy"] is None else focal_pixels(own["fy"], f"{field}.fy"),
-            cx=principal_place(own["cx"], width, f"{field}.cx"),
-            cy=principal_place(own["cy"], height, f"{field}.cy"),
-            width=width,
-            height=height,
-        )
+        focal = partial(_focal, entry, root, field, height)
+        lens = stated_intrinsics(own, focal, height, width, f"{field}.")
+        pose = checked_pose(entry.get("camera_to_world"), f"{field}.camera_to_world")
+        camera = PinholeCamera(pose, *lens[:4], width=width, height=height)
         cameras.append(camera.rescaled(downscale_factor))
         overrides.append(_perturbation(entry, f"{field}.perturbation"))
     fps = root.get("fps")

@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from ns_abstract.arithmetic.forms import Basis, Float64Array, FormArray
+from ns_abstract.arithmetic.form_array import FormArray
+from ns_abstract.arithmetic.forms import Basis, Float64Array
 from ns_abstract.arithmetic.rounding import HALF_UP, POSE_ROUNDING, STILL_ROOM, TURNED_POSITION, TURNED_ROTATION
 from ns_abstract.arithmetic.taylor import TaylorArray, TaylorBasis, taylor_cos_sin
 from ns_abstract.arithmetic.trigonometry import cos_sin

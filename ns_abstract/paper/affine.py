@@ -12,7 +12,8 @@ from typing import Any, overload
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ns_abstract.arithmetic.forms import Basis, Float64Array, FormArray, set_norms
+from ns_abstract.arithmetic.form_array import FormArray
+from ns_abstract.arithmetic.forms import Basis, Float64Array, set_norms
 from ns_abstract.arithmetic.rounding import LARGEST_CUBED, SMALLEST_CUBED
 from ns_abstract.paper import lines
 from ns_abstract.paper.interval import BoolArray, Interval

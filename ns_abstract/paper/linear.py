@@ -17,7 +17,8 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ns_abstract.arithmetic.forms import Basis, Float64Array, FormArray
+from ns_abstract.arithmetic.form_array import FormArray
+from ns_abstract.arithmetic.forms import Basis, Float64Array
 from ns_abstract.paper import lines
 from ns_abstract.paper.affine import Enclosure
 from ns_abstract.paper.interval import BoolArray, Interval

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ns_abstract.arithmetic.forms import FormArray
+from ns_abstract.arithmetic.form_array import FormArray
 from ns_abstract.paper.affine import Enclosure
 from ns_abstract.paper.depth_order import permute, sort_by
 from ns_abstract.paper.interval import Float64Array, Interval

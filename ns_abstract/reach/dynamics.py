@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from ns_abstract.arithmetic.forms import MAX_DIMENSIONS, Basis, FormArray
+from ns_abstract.arithmetic.form_array import FormArray
+from ns_abstract.arithmetic.forms import MAX_DIMENSIONS, Basis
 from ns_abstract.arithmetic.rounding import HALF_UP, STEP_ROUNDINGS, STEP_UP, UNDERFLOW64, gamma
 from ns_abstract.arithmetic.trigonometry import cos_sin
 from ns_abstract.io.errors import InputError

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal
 
@@ -12,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.camera_path import PinholeCamera, checked_pose, focal_length
+from ns_abstract.geometry.camera_path import PinholeCamera, checked_pose, focal_length, stated_intrinsics
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.fields import Fail, interval, known
@@ -74,6 +75,10 @@ class GoalBox:
     when: Literal["end", "any"]
 
 
+#: Intrinsics in pixels that a file may state.
+LENS = ("fx", "fy", "cx", "cy")
+
+
 @dataclass(frozen=True)
 class CameraMount:
     """A camera whose pose is an affine function of the state.
@@ -81,6 +86,7 @@ class CameraMount:
     Attributes:
         rotation: [3, 3] camera to world (OpenGL axes: x right, y up, z back) where all angles are 0.
         fov: Vertical, degrees.
+        lens: Those of ``fx``, ``fy``, ``cx``, ``cy`` that the file states, pixels of the network's picture.
         names: Parameters that move: of x, y, z (world axes, normalised units) and yaw, pitch, roll (radians, about the
             camera's own axes, in this order).
         offset: [d] their values at state 0.
@@ -90,6 +96,7 @@ class CameraMount:
 
     rotation: Float64
     fov: float
+    lens: Mapping[str, float]
     names: tuple[str, ...]
     offset: Float64
     factors: Float64
@@ -99,10 +106,11 @@ class CameraMount:
         """All poses that may be looked at, in pictures of ``size`` (height, width)."""
         ranges = {name: (-FARTHEST, FARTHEST) if name in TRANSLATIONS else (-_TURN, _TURN) for name in self.names}
         ranges |= {name: (value, value) for name, value in self.fixed.items()}
-        focal = focal_length(self.fov, size[0], "camera.fov")
         height, width = size
+        focal = partial(focal_length, self.fov, height, "camera.fov")
+        lens = stated_intrinsics(self.lens, focal, height, width, "camera.")
         pose = np.concatenate([self.rotation, np.zeros((3, 1))], axis=1)
-        camera = PinholeCamera(pose, focal, focal, 0.5 * width, 0.5 * height, width, height)
+        camera = PinholeCamera(pose, *lens[:4], width=width, height=height)
         chosen = [{n: ranges[n] for n in group if n in ranges} for group in (TRANSLATIONS, ROTATIONS)]
         return PoseBox.around(camera, Perturbation(frame="world", translation=chosen[0], rotation=chosen[1]))
 
@@ -315,10 +323,12 @@ def _ranges(
 def _camera(value: Any, n: int, fail: Fail) -> CameraMount:
     if not isinstance(value, Mapping):
         raise fail("camera", f"found {show(value)}", "write an object")
-    known(value, ("camera_to_world", "fov", "position", *ROTATIONS), "camera.", fail)
+    known(value, ("camera_to_world", "fov", *LENS, "position", *ROTATIONS), "camera.", fail)
     pose = checked_pose(value.get("camera_to_world"), "camera.camera_to_world")
     fov = value.get("fov", 45.0)
     focal_length(fov, 1, "camera.fov")
+    lens = {name: value[name] for name in LENS if value.get(name) is not None}
+    stated_intrinsics(lens, lambda: 1.0, 1, 1, "camera.")
     names: list[str] = []
     rows: list[Float64] = []
     offsets: list[float] = []
@@ -353,7 +363,7 @@ def _camera(value: Any, n: int, fail: Fail) -> CameraMount:
         take(name, offset, numbers(entry.get("row", [0.0] * n), f"camera.{name}.row", n, fail))
     if not names:
         raise fail("camera", "the pose does not depend on the state", "give it a matrix or a row that is not 0")
-    return CameraMount(pose[:, :3].copy(), float(fov), tuple(names), np.array(offsets), np.stack(rows), fixed)
+    return CameraMount(pose[:, :3].copy(), float(fov), lens, tuple(names), np.array(offsets), np.stack(rows), fixed)
 
 
 def _control(value: Any, controls: int, fail: Fail) -> Control:

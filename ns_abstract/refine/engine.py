@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 
@@ -43,16 +43,15 @@ class Refinement:
     Args:
         frame: Bounds and renders.
         index: The frame's number.
-        goal: When to stop.
+        goal: When to stop, and whether leaves are kept.
         seed: Of the random poses that are rendered.
-        keep_leaves: Whether the result carries the leaves' linear sets.
         stopped: Asked between cells; true ends the work with what is known.
         progress: Called with (trace point, covered part of the set) after every initial cell and after every round.
         members: Where the scene varies too: other scenes of the set, each as a function like the frame's
             ``render``. They widen the inner bound; only poses are split.
         tiles: Numbers of the tiles that are looked at, ascending; None: all. Measures are those of its pixels (R6).
         known: What was found of the same set before, with bounds: results are no looser, and work goes where it
-            leaves most open. Not for ``keep_leaves``: leaves are to be as tight as the result.
+            leaves most open. Not where leaves are kept: these are to be as tight as the result.
         initial: Takes the cells of the initial partition with their bounds in these tiles; where it holds some, they
             are the initial partition.
         tuning: How time and memory are divided.
@@ -71,7 +70,6 @@ class Refinement:
         goal: RefinementGoal,
         *,
         seed: int = 0,
-        keep_leaves: bool = False,
         stopped: Callable[[], bool] = lambda: False,
         progress: Callable[[TracePoint, float], None] = lambda point, share: None,
         members: Iterator[Render] | None = None,
@@ -82,7 +80,7 @@ class Refinement:
     ) -> None:
         self.frame, self.index, self.goal, self.tuning = frame, index, goal, tuning
         self.stopped, self.progress = stopped, progress
-        self.tiles = FrameTiles(frame, tiles, keep_leaves)
+        self.tiles = FrameTiles(frame, tiles, goal.keep_leaves)
         scenes = iter(()) if members is None else members
         self.inner = InnerBound(self.tiles, np.random.default_rng([seed, index]), scenes, tuning)
         bounds: tuple[np.ndarray, np.ndarray] | None = None
@@ -238,11 +236,14 @@ class Refinement:
             self.initial.extend(leaves)
         return self._begin_leaves(leaves)
 
-    def _begin_leaves(self, leaves: Sequence[BoundedCell]) -> bool:
-        """Take cells that cover the set; returns True."""
-        self.leaves.begin(leaves)
+    def _begin_leaves(self, leaves: list[BoundedCell]) -> bool:
+        """Take cells that cover the set, out of ``leaves`` where nobody keeps them; returns True."""
+        cells = [cell for cell, _, _ in leaves]
+        leaves = list(leaves) if self.initial is not None else leaves
+        leaves.reverse()
+        self.leaves.begin(cells, (leaves.pop()[1:] for _ in cells))
         self.covered = True
-        elements = [None if cell.context is None else cell.context.shown for cell, _, _ in leaves]
+        elements = [None if cell.context is None else cell.context.shown for cell in cells]
         numbered = [numbers for numbers in elements if numbers is not None]
         if len(numbered) == len(elements):
             self.shown = np.unique(np.concatenate(numbered))

@@ -100,16 +100,23 @@ class InitialPartition:
         # odd: the middle of the set, which is rendered, is that of a part
         count, before = 2 * int(min(motion / tuning.first_motion, tuning.most_initial_cells) / 2.0) + 1, np.inf
         goal = replace(self.goal, ratio=max(self.goal.ratio, tuning.aim_ratio))
+        finer: int | None = None
         while True:
             part = self.splitter.cut(whole, 0, count)[count // 2]
             probe, affordable = self._probe(part)
             excess = self._beyond(Partition([], part, probe))
             aim = tuning.aim_share * goal.excess(self.inner.mean_gap)
+            most = int(min(affordable, tuning.most_initial_cells))
+            helped = self._helped(excess, before, tuning.helpful_share)
             # it falls with the square of the width, and of wider cells faster, where intervals take the place of forms
             share = min(excess / aim, 1e6) if aim > 0.0 < excess else 1.0
             wanted = math.ceil(count * (math.sqrt(share) if share > 1.0 else share**0.25))
-            most = int(min(affordable, tuning.most_initial_cells))
-            helped = self._helped(excess, before, tuning.helpful_share)
+            if finer is not None:
+                # known to be fine enough
+                wanted = min(wanted, finer)
+            elif wanted < tuning.coarser_share * count:
+                finer, count = count, wanted | 1
+                continue
             if wanted < 2 * count or 2 * count > most or not helped:
                 parts = self.splitter.cut(whole, 0, max(1, min(wanted if helped else count, most)))
                 return Partition(parts, part, probe)

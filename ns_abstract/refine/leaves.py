@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -114,11 +114,15 @@ class LeafBounds:
         """MPG of the outer bound."""
         return self.tiles.mean_gap(self.lower, self.upper)
 
-    def begin(self, leaves: Sequence[BoundedCell]) -> None:
-        """Take cells that cover the set."""
-        for t in self.tiles.all:
-            cells, lowers, uppers = zip(*((cell, lower[t], upper[t]) for cell, lower, upper in leaves), strict=True)
-            self.by_tile[t].replace(Change([], list(cells), list(lowers), list(uppers)))
+    def begin(self, cells: Sequence[LeafCell], bounds: Iterator[tuple[np.ndarray, np.ndarray]]) -> None:
+        """Take ``cells`` that cover the set, with bounds of each in all tiles, which are not kept as they come."""
+        rows = len(cells), *self.tiles.shape
+        for number, (lower, upper) in enumerate(bounds):
+            for tile, low, high in zip(self.by_tile, lower, upper, strict=True):
+                if tile.lower is None or tile.upper is None:
+                    tile.cells = list(cells)
+                    tile.lower, tile.upper = np.empty(rows, lower.dtype), np.empty(rows, upper.dtype)
+                tile.lower[number], tile.upper[number] = low, high
         self.update(self.tiles.all)
 
     def update(self, places: np.ndarray, changes: dict[int, Change] | None = None) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import bisect
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -340,3 +340,52 @@ def mean_pixel_gap(lower: NDArray[np.floating], upper: NDArray[np.floating]) -> 
 def max_pixel_gap(lower: NDArray[np.floating], upper: NDArray[np.floating]) -> float:
     """XPG: the maximum of `gap` over the pixels."""
     return float(gap(lower, upper).max())
+
+
+def merged(older: FrameResult, newer: FrameResult) -> FrameResult:
+    """Return the intersection of two results for one frame; both enclose the set, so it does.
+
+    Times and cells add up; the trace of ``newer`` follows that of ``older`` and never gets worse.
+
+    Raises:
+        ValueError: The two are of different frames, boxes or sizes.
+    """
+    same = [(r.index, r.box, r.lower.shape, sorted(r.layers)) for r in (older, newer)]
+    if same[0] != same[1]:
+        raise ValueError(f"frame {newer.index}: the stored result is of another set of images")
+    outer = min((point.mpg for point in older.trace), default=math.inf)
+    inner = max((point.mpg_witness for point in older.trace), default=0.0)
+    covered = max((point.covered for point in older.trace), default=0.0)
+    later = tuple(
+        TracePoint(
+            older.seconds + point.seconds,
+            older.cells + point.cells,
+            min(outer, point.mpg),
+            max(inner, point.mpg_witness),
+            max(covered, point.covered),
+        )
+        for point in newer.trace
+    )
+    return replace(
+        newer,
+        lower=np.maximum(older.lower, newer.lower),
+        upper=np.minimum(older.upper, newer.upper),
+        witness_lower=np.minimum(older.witness_lower, newer.witness_lower),
+        witness_upper=np.maximum(older.witness_upper, newer.witness_upper),
+        seconds=older.seconds + newer.seconds,
+        cells=older.cells + newer.cells,
+        trace=older.trace + later,
+        bounded=older.bounded or newer.bounded,
+        layers={name: _merged_layer(older.layers[name], layer) for name, layer in newer.layers.items()},
+        largest=greater(older.largest, newer.largest),
+    )
+
+
+def _merged_layer(older: ExtraOutput, newer: ExtraOutput) -> ExtraOutput:
+    return ExtraOutput(
+        np.maximum(older.lower, newer.lower),
+        np.minimum(older.upper, newer.upper),
+        np.minimum(older.witness_lower, newer.witness_lower),
+        np.maximum(older.witness_upper, newer.witness_upper),
+        newer.image,
+    )

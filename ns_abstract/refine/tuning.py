@@ -13,6 +13,7 @@ class Tuning:
         first_motion: Largest image motion (pixels) of a median Gaussian across one initial cell of one parameter.
         first_motions: The same along each of several parameters.
         aim_share: The initial partition of one parameter aims at this part of the excess that the goal allows.
+        coarser_share: Where so small a part of the cells that were tried seems enough, a coarser one is tried.
         aim_ratio: It aims at a goal of at least this ratio.
         helpful_share: Halving an initial cell of one parameter helps if it leaves at most this part of the excess.
         clipped_share: Part of the largest possible excess from which on [0, 1] may clip it, so that it does not fall.
@@ -41,6 +42,7 @@ class Tuning:
     first_motion: float = 0.5
     first_motions: float = 0.6
     aim_share: float = 0.6
+    coarser_share: float = 0.75
     aim_ratio: float = 1.05
     helpful_share: float = 0.5
     clipped_share: float = 0.25

@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 import json
-import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.folder import unwritable
-from ns_abstract.report.record import guarantee_text, plain, versions
-
-VERSION = 1
+from ns_abstract.report.run import Run, plain
 
 #: What the key ``scene_margin`` of report.json tells.
 SCENE_MARGIN = (
@@ -44,47 +40,23 @@ METRICS = {
 }
 
 
-def now() -> str:
-    """UTC time as ISO 8601."""
-    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
-
-
-@dataclass(frozen=True)
-class CertifiedRun:
-    """What a command certifies; all mappings must have a JSON form.
+@dataclass(frozen=True, kw_only=True)
+class CertifiedRun(Run):
+    """What a command certifies.
 
     Attributes:
-        guarantee: "float32-sound" or "real-sound", of the images.
         network_guarantee: What holds of the network, one sentence each.
-        renderer: ``name`` and ``version`` of the bounded program.
-        scene: ``name``, and whatever describes the scene.
         model: The network: ``name``, ``sha256``, shapes.
         property: Content of PROP.json.
         sentence: The property in words, as the end of "on every image ...".
-        settings: The command's options.
-        fingerprint: What results of a resumed run must agree in.
-        command: The command line.
-        plan: What was left out and why, one sentence each.
-        limits: Conditions on the guarantee, one sentence each.
         picture: "float" or "8-bit": what the network is shown.
-        assumptions: What the verdicts rest on, and where each choice came from.
     """
 
-    guarantee: str
     network_guarantee: tuple[str, ...]
-    renderer: Mapping[str, str]
-    scene: Mapping[str, Any]
     model: Mapping[str, Any]
     property: Mapping[str, Any]
     sentence: str
-    settings: Mapping[str, Any]
-    fingerprint: Mapping[str, Any]
-    command: tuple[str, ...]
-    plan: tuple[str, ...] = ()
-    limits: tuple[str, ...] = ()
     picture: str = "float"
-    assumptions: tuple[Assumption, ...] = ()
-    started: str = field(default_factory=now)
 
 
 def coverage(frames: Sequence[Mapping[str, Any]]) -> dict[str, float]:
@@ -136,18 +108,13 @@ def certificate_document(
     parts = [entry["partition"] for entry in frames if entry["partition"] is not None]
     total = sum(part["partitions"] for part in parts)
     return plain(
-        {
-            "version": VERSION,
+        run.head()
+        | {
             "verdict": verdict(frames),
             "property": run.property,
             "property_text": run.sentence,
-            "guarantee": run.guarantee,
-            "guarantee_text": guarantee_text(run.guarantee, run.renderer["name"], run.scene.get("bounded")),
             "network_guarantee": run.network_guarantee,
             "picture": run.picture,
-            "renderer": run.renderer,
-            "scene": run.scene,
-            "assumptions": [vars(entry) for entry in run.assumptions],
             "model": run.model,
             "coverage": covered,
             "sampled": {"poses": poses, "right": right, "sampled_right": right / poses if poses else None},
@@ -168,17 +135,9 @@ def certificate_document(
             "cells_seal": cells_seal,
             "scene_margin": scene_margin,
             "cameras": cameras or {"cells": [], "left_out": 0},
-            "plan": run.plan,
             "limits": run.limits,
-            "state": state,
-            "metrics": METRICS,
-            "settings": run.settings,
-            "fingerprint": run.fingerprint,
-            "command": run.command,
-            "packages": versions(),
-            "started": run.started,
-            "updated": now(),
         }
+        | run.tail(state, METRICS)
     )
 
 

@@ -11,10 +11,10 @@ from typing import Any
 from markupsafe import Markup, escape
 
 from ns_abstract.report.cameras import CameraDrawings
-from ns_abstract.report.figures import ShownUnits, number, percent, unit_of_axis
+from ns_abstract.report.figures import ShownUnits, is_ring, number, percent, unit_of_axis
 from ns_abstract.report.html import set_of, uri, whole_page
-from ns_abstract.report.record import plain
 from ns_abstract.report.regions import FailureRegion, PoseImage, regions_html
+from ns_abstract.report.run import plain
 from ns_abstract.report.svg import PlotAxis, draw_line, draw_plot, draw_svg
 from ns_abstract.report.verdict_maps import free_parameters, maps_of, matrix_svg, mixed, pixels
 from ns_abstract.report.walk import WalkPose, walk_html
@@ -32,8 +32,6 @@ _MOST_POINTS = 400
 _MOST_CELLS = 4000
 #: Places along a parameter where cells are drawn together; counterexamples marked, and frames with maps of all pairs.
 _FINE, _MOST_MARKS, _MOST_MATRICES = 160, 400, 4
-#: An orbit is drawn as a ring from so many radians on.
-_RING = 1.0
 
 
 @dataclass(frozen=True)
@@ -83,8 +81,10 @@ def certificate_page(
         "falsified": ("bad", f"Falsified; certified on {covered} of the poses"),
         "unknown": ("fair", f"Unknown; certified on {covered} of the poses"),
     }[document["verdict"]]
-    maps, drawn = verdict_drawings(document["frames"][:_MOST_ROWS], cells, numbers)
-    matrices, more_matrices = _matrices(document, cells)
+    asked = [units.drawn(entry, cells.get(entry["index"], ())) for entry in document["frames"]]
+    shown, rows = [entry for entry, _ in asked], {entry["index"]: leaves for entry, leaves in asked}
+    maps, drawn = verdict_drawings(shown[:_MOST_ROWS], rows, numbers)
+    matrices, more_matrices = _matrices(shown, rows)
     scripts = ["cells.js"] if numbers else []
     scripts += ["sliders.js", "walk.js"] if len(closer.stops) > 1 else []
     return whole_page(
@@ -113,6 +113,9 @@ def certificate_page(
         pictures=pictures,
         falsified=sum(entry["cells"]["falsified"] for entry in document["frames"]),
         time=_time(document["trace"]),
+        example_text=lambda entry, values: ", ".join(
+            units.value(p["name"], p["unit"], values[p["name"]]) for p in entry["parameters"]
+        ),
         set_of=lambda entry: set_of({"parameters": [p for p in entry["parameters"] if p["lower"] < p["upper"]]}, units),
     )
 
@@ -207,11 +210,6 @@ def verdict_drawings(
         else:
             bars.append(entry)
     return maps, [(_bars(bars, numbers, cells), "parts of each frame's set, by frame")] if bars else []
-
-
-def is_ring(parameter: Mapping[str, Any]) -> bool:
-    """Whether a parameter is drawn as a ring."""
-    return parameter["name"] == "azimuth" and parameter["upper"] - parameter["lower"] >= _RING
 
 
 def along_path(frames: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
@@ -358,18 +356,14 @@ def _plane(
 
 
 def _matrices(
-    document: Mapping[str, Any], cells: Mapping[int, Sequence[Mapping[str, Any]]]
+    frames: Sequence[Mapping[str, Any]], cells: Mapping[int, Sequence[Mapping[str, Any]]]
 ) -> tuple[list[tuple[Markup, Mapping[str, Any]]], int]:
     """Maps of all pairs of parameters, for sets of more than two; those that are certified least if there are many.
 
     Returns:
         The maps with their frames, and the number of frames that are left out.
     """
-    several = [
-        entry
-        for entry in document["frames"]
-        if cells.get(entry["index"]) and len(free_parameters(entry["parameters"])) > 2
-    ]
+    several = [entry for entry in frames if cells.get(entry["index"]) and len(free_parameters(entry["parameters"])) > 2]
     chosen = sorted(several, key=lambda entry: entry["coverage"]["certified"])[:_MOST_MATRICES]
     drawings = [
         (

@@ -22,7 +22,8 @@ from ns_abstract.refine.result import FrameResult, gap
 from ns_abstract.report.figures import metrics, number, short_guarantee
 from ns_abstract.report.files import IMAGES, frame_index, load_frame
 from ns_abstract.report.picture import heat, to_bytes
-from ns_abstract.report.record import file_stamp, frame_digests
+from ns_abstract.report.record import frame_digests
+from ns_abstract.report.run import file_stamp
 
 PICTURES = ("lower", "upper", "gap", "witness", "image")
 _LABELS = {

@@ -88,6 +88,17 @@ def unit_of_axis(unit: str) -> str:
     return "units" if unit == "normalised units" else unit
 
 
+#: A cell as a report has it: lower, upper, verdict, counterexample.
+Row = Mapping[str, Any]
+#: An orbit is drawn as a ring from so many radians on.
+_RING = 1.0
+
+
+def is_ring(parameter: Mapping[str, Any]) -> bool:
+    """Whether a parameter is drawn as a ring."""
+    return parameter["name"] == "azimuth" and parameter["upper"] - parameter["lower"] >= _RING
+
+
 @dataclass(frozen=True)
 class ShownUnits:
     """Units that a set of poses was stated in: people read ranges in these, with the other unit beside them.
@@ -106,6 +117,43 @@ class ShownUnits:
     def of(cls, scene: Mapping[str, Any]) -> ShownUnits:
         """Those that a report's ``scene`` names, or the normalised frame's."""
         return cls(**scene.get("units", {}))
+
+    def axis(self, unit: str) -> tuple[str, float]:
+        """The unit that values in ``unit`` are drawn in, and what they are multiplied by."""
+        if unit == "rad" and self.angle == "degrees":
+            return "degrees", math.degrees(1.0)
+        if unit == "normalised units" and self.translation == "dataset":
+            return "units of the data set", 1.0 / self.dataset_scale
+        return unit, 1.0
+
+    def value(self, name: str, unit: str, value: float) -> str:
+        """A parameter's value for people: as it is stored, behind it in the unit that was asked for."""
+        asked, factor = self.axis(unit)
+        beside = "" if factor == 1.0 else f" ({number(value * factor, 6)} {asked})"
+        return f"{name} = {value!r}{beside}"
+
+    def drawn(self, entry: Mapping[str, Any], rows: Sequence[Row]) -> tuple[dict[str, Any], list[Row]]:
+        """A frame's entry of report.json and its cells as they are drawn: in the units that were asked for.
+
+        A full turn stays in radians: it is drawn as a ring.
+        """
+        parameters = entry["parameters"]
+        axes = [(p["unit"], 1.0) if is_ring(p) else self.axis(p["unit"]) for p in parameters]
+        factors = [factor for _, factor in axes]
+        if all(factor == 1.0 for factor in factors):
+            return dict(entry), list(rows)
+
+        def scaled(values: Sequence[float] | None) -> list[float] | None:
+            return None if values is None else [v * f for v, f in zip(values, factors, strict=True)]
+
+        sides = [
+            {**p, "unit": unit, "lower": p["lower"] * factor, "upper": p["upper"] * factor}
+            for p, (unit, factor) in zip(parameters, axes, strict=True)
+        ]
+        places = ("lower", "upper", "counterexample")
+        return {**entry, "parameters": sides}, [
+            {**row, **{key: scaled(row[key]) for key in places if key in row}} for row in rows
+        ]
 
     def interval(self, name: str, unit: str, low: float, high: float) -> str:
         """One side of a box for people, in the unit that was asked and in the other one."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from html import escape
 from typing import Any
 
@@ -12,15 +12,13 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from ns_abstract.geometry.poses import PoseBox
-from ns_abstract.io.assumptions import Assumption
 from ns_abstract.refine.protocol import SceneElements
 from ns_abstract.report.cameras import CameraDrawings, cell_cameras, standing
-from ns_abstract.report.certificate import VERSION, now
 from ns_abstract.report.figures import number, unit_of_axis
 from ns_abstract.report.html import uri, whole_page
 from ns_abstract.report.outside import SceneDrawing
 from ns_abstract.report.picture import heat, preview, to_bytes
-from ns_abstract.report.record import guarantee_text, plain, versions
+from ns_abstract.report.run import Run, plain
 from ns_abstract.report.svg import draw_svg
 from ns_abstract.report.verdict_maps import NONE, OPEN, pixels
 
@@ -49,41 +47,24 @@ _HEADINGS = {
 }
 
 
-@dataclass(frozen=True)
-class LocatedRun:
-    """What a command looked for; all mappings must have a JSON form.
+@dataclass(frozen=True, kw_only=True)
+class LocatedRun(Run):
+    """What a command looked for.
 
     Attributes:
-        guarantee: "float32-sound" or "real-sound", of the pictures.
-        renderer: The bounded program.
-        scene: ``name``, and whatever describes the scene.
-        assumptions: What the answer rests on.
         photo: Its file, or None.
         levels: [H, W, 3] uint8 the photo.
         noise, outliers: What a picture may miss.
         counted: Number of pixels that count.
         allowed: Number of them that may show anything.
-        settings: The command's options.
-        fingerprint: What results of a resumed run must agree in.
-        command: The command line.
-        plan: What was left out and why.
     """
 
-    guarantee: str
-    renderer: Mapping[str, Any]
-    scene: Mapping[str, Any]
-    assumptions: tuple[Assumption, ...]
     photo: str | None
     levels: NDArray[np.uint8]
     noise: float
     outliers: float
     counted: int
     allowed: int
-    settings: Mapping[str, Any]
-    fingerprint: Mapping[str, Any]
-    command: tuple[str, ...]
-    plan: tuple[str, ...] = ()
-    started: str = field(default_factory=now)
 
 
 def location_document(
@@ -126,8 +107,8 @@ def location_document(
     else:
         answer = "possible" if best is not None and best["outliers"] <= run.allowed else "unknown"
     return plain(
-        {
-            "version": VERSION,
+        run.head()
+        | {
             "answer": answer,
             "possible_volume": sum(entry["possible_volume"] for entry in frames) / max(1, len(frames)),
             "hull": hull,
@@ -139,25 +120,12 @@ def location_document(
                 "counted": run.counted,
                 "allowed": run.allowed,
             },
-            "guarantee": run.guarantee,
-            "guarantee_text": guarantee_text(run.guarantee, run.renderer["name"], run.scene.get("bounded")),
-            "renderer": run.renderer,
-            "scene": run.scene,
-            "assumptions": [vars(entry) for entry in run.assumptions],
             "frames": frames,
             "trace": [{"seconds": p["seconds"], "searched_left": 1.0 - p["certified"]} for p in trace],
             "seconds": seconds,
             "effort": effort,
-            "plan": run.plan,
-            "state": state,
-            "metrics": METRICS,
-            "settings": run.settings,
-            "fingerprint": run.fingerprint,
-            "command": run.command,
-            "packages": versions(),
-            "started": run.started,
-            "updated": now(),
         }
+        | run.tail(state, METRICS)
     )
 
 
@@ -193,6 +161,7 @@ def _frame(
         best = {"pose": pose, "outliers": found[0].outliers, "camera_to_world": matrix}
     return {
         "index": index,
+        "intrinsics": poses.camera.intrinsics._asdict(),
         "parameters": [
             {"name": name, "unit": unit, "lower": known[name][0], "upper": known[name][1]} for name, unit in parameters
         ],

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,6 +62,47 @@ def _box_items(box: ParameterBox, units: ShownUnits) -> list[str]:
     return [units.interval(*side) for side in sides] or ["one camera pose"]
 
 
+class _Sheet(NamedTuple):
+    """Sizes of a picture of four panels, in its own pixels.
+
+    Attributes:
+        dpi: Pixels by inch.
+        panel: Width and height of a panel.
+        width: Of the whole picture.
+        characters: Of a line of text.
+    """
+
+    dpi: float
+    panel: tuple[int, int]
+    width: int
+    characters: int
+
+    @classmethod
+    def of(cls, height: int, width: int) -> _Sheet:
+        """For images of ``height`` x ``width`` pixels."""
+        panel_w = int(_PANEL_PIXELS_MAX if width > _PANEL_PIXELS_MAX else width * max(1, round(_PANEL_PIXELS / width)))
+        panel_h = max(1, round(panel_w * height / width))
+        if panel_h > 1.5 * panel_w:
+            # tall images: the height sets the scale
+            panel_h = int(min(1.5 * _PANEL_PIXELS_MAX, height * max(1, round(1.5 * _PANEL_PIXELS / height))))
+            panel_w = max(1, round(panel_h * width / height))
+        dpi = panel_w / min(_PANEL_INCHES, 1.5 * _PANEL_INCHES * panel_w / panel_h)
+        # labels and the colour bar need room beside narrow and flat images, which keep their shape
+        panel = max(panel_w, round(_LEAST_WIDTH * dpi)), max(panel_h, round(_LEAST_HEIGHT * dpi))
+        sheet = cls(dpi, panel, 0, 0)
+        total = 2 * sheet.px(_MARGIN) + 4 * panel[0] + 3 * sheet.px(_GUTTER) + sheet.bar
+        return sheet._replace(width=total, characters=max(40, int(total / dpi / (_TEXT_POINTS * 0.0087))))
+
+    def px(self, length: float) -> int:
+        """Inches in pixels."""
+        return round(length * self.dpi)
+
+    @property
+    def bar(self) -> int:
+        """What the colour bar takes."""
+        return self.px(_GUTTER / 2 + _BAR + _BAR_TEXT)
+
+
 def frame_figure(
     result: FrameResult, *, guarantee: str = "", about: str = "", units: ShownUnits | None = None
 ) -> Figure:
@@ -77,27 +118,36 @@ def frame_figure(
     """
     from matplotlib.figure import Figure
 
-    height, width = result.lower.shape[:2]
-    panel_w = int(_PANEL_PIXELS_MAX if width > _PANEL_PIXELS_MAX else width * max(1, round(_PANEL_PIXELS / width)))
-    panel_h = max(1, round(panel_w * height / width))
-    if panel_h > 1.5 * panel_w:
-        # tall images: the height sets the scale
-        panel_h = int(min(1.5 * _PANEL_PIXELS_MAX, height * max(1, round(1.5 * _PANEL_PIXELS / height))))
-        panel_w = max(1, round(panel_h * width / height))
-    inches = min(_PANEL_INCHES, 1.5 * _PANEL_INCHES * panel_w / panel_h)
-    dpi = panel_w / inches
-    # labels and the colour bar need room beside narrow and flat images, which keep their shape
-    panel_w, panel_h = max(panel_w, round(_LEAST_WIDTH * dpi)), max(panel_h, round(_LEAST_HEIGHT * dpi))
+    sheet = _Sheet.of(*result.lower.shape[:2])
+    px = sheet.px
+    ranges = _wrapped(_box_items(result.box, units or ShownUnits()), sheet.characters)
+    measured = _wrapped(_metric_items(result), sheet.characters)
+    head = px(_LINE) * (1 + len(ranges) + len(measured)) + px(_LINE) // 2
+    total_h = px(_MARGIN) + head + px(_LABEL) + sheet.panel[1] + px(_MARGIN)
+    figure = Figure(figsize=(sheet.width / sheet.dpi, total_h / sheet.dpi), dpi=sheet.dpi, facecolor="white")
 
-    def px(length: float) -> int:
-        return round(length * dpi)
+    def write(x: float, y: float, content: str, points: float, **style: Any) -> None:
+        figure.text(
+            x / sheet.width, 1.0 - y / total_h, content, fontsize=points, va="baseline", parse_math=False, **style
+        )  # fmt: skip
 
-    bar = px(_GUTTER / 2 + _BAR + _BAR_TEXT)
-    total_w = 2 * px(_MARGIN) + 4 * panel_w + 3 * px(_GUTTER) + bar
-    characters = max(40, int(total_w / dpi / (_TEXT_POINTS * 0.0087)))
-    lines = _wrapped(_box_items(result.box, units or ShownUnits()), characters)
+    title = "  ·  ".join(part for part in (f"Frame {result.index}", about, guarantee) if part)
+    title_room = max(20, int(sheet.characters * _TEXT_POINTS / _TITLE_POINTS * 0.85))
+    title = title if len(title) <= title_room else f"{title[: title_room - 1]}…"
+    y = px(_MARGIN) + px(_LINE) * 0.7
+    write(px(_MARGIN), y, title, _TITLE_POINTS, weight="bold", color=_INK)
+    if not result.bounded:
+        measured = ["no bound but [0, 1] is known: the time ended before this frame was done", *measured[1:]]
+    for k, line in enumerate([*ranges, *measured]):
+        warned = not result.bounded and k == len(ranges)
+        write(px(_MARGIN), y + (k + 1) * px(_LINE), line, _TEXT_POINTS, color=_WARN if warned else _SOFT)
+    _draw_panels(figure, result, sheet, total_h, write)
+    return figure
+
+
+def _metric_items(result: FrameResult) -> list[str]:
     figures = metrics(result)
-    text = [
+    return [
         f"MPG {number(figures['mpg'])}",
         f"XPG {number(figures['xpg'])}",
         f"witness MPG {number(figures['mpg_witness'])}",
@@ -105,30 +155,11 @@ def frame_figure(
         f"{result.cells} cells",
         f"{number(result.seconds, 3)} s",
     ]
-    measured = _wrapped(text, characters)
-    head = px(_LINE) * (1 + len(lines) + len(measured)) + px(_LINE) // 2
-    total_h = px(_MARGIN) + head + px(_LABEL) + panel_h + px(_MARGIN)
 
-    figure = Figure(figsize=(total_w / dpi, total_h / dpi), dpi=dpi, facecolor="white")
 
-    def write(x: float, y: float, content: str, points: float, **style: Any) -> None:
-        figure.text(
-            x / total_w, 1.0 - y / total_h, content, fontsize=points, va="baseline", parse_math=False, **style
-        )  # fmt: skip
-
-    title = f"Frame {result.index}"
-    for part in (about, guarantee):
-        title += f"  ·  {part}" if part else ""
-    title_room = max(20, int(characters * _TEXT_POINTS / _TITLE_POINTS * 0.85))
-    title = title if len(title) <= title_room else f"{title[: title_room - 1]}…"
-    y = px(_MARGIN) + px(_LINE) * 0.7
-    write(px(_MARGIN), y, title, _TITLE_POINTS, weight="bold", color=_INK)
-    if not result.bounded:
-        measured = ["no bound but [0, 1] is known: the time ended before this frame was done", *measured[1:]]
-    for k, line in enumerate([*lines, *measured]):
-        warned = not result.bounded and k == len(lines)
-        write(px(_MARGIN), y + (k + 1) * px(_LINE), line, _TEXT_POINTS, color=_WARN if warned else _SOFT)
-
+def _draw_panels(figure: Figure, result: FrameResult, sheet: _Sheet, total_h: int, write: Callable[..., None]) -> None:
+    """Draw the four images with labels, and the gap's colour bar, at the foot of a picture ``total_h`` pixels high."""
+    px, (panel_w, panel_h) = sheet.px, sheet.panel
     length = gap(result.lower, result.upper)
     top = float(length.max())
     panels: list[tuple[str, Any]] = [
@@ -139,7 +170,7 @@ def frame_figure(
     ]
     x, base = px(_MARGIN), px(_MARGIN)
     for k, (label, image) in enumerate(panels):
-        axes = figure.add_axes((x / total_w, base / total_h, panel_w / total_w, panel_h / total_h))
+        axes = figure.add_axes((x / sheet.width, base / total_h, panel_w / sheet.width, panel_h / total_h))
         heat_map = axes.imshow(
             image, cmap=GAP_COLORS if k == 2 else None, vmin=0.0, vmax=top if top > 0.0 else 1.0,
             interpolation="antialiased",
@@ -149,10 +180,9 @@ def frame_figure(
         x += panel_w + px(_GUTTER)
         if k == 2:
             left = x - px(_GUTTER) + px(_GUTTER / 2)
-            side = figure.add_axes((left / total_w, base / total_h, px(_BAR) / total_w, panel_h / total_h))
-            _color_bar(figure, heat_map, side, panel_h / dpi)
-            x += bar
-    return figure
+            side = figure.add_axes((left / sheet.width, base / total_h, px(_BAR) / sheet.width, panel_h / total_h))
+            _color_bar(figure, heat_map, side, panel_h / sheet.dpi)
+            x += sheet.bar
 
 
 def layer_figure(result: FrameResult, name: str) -> Figure:

@@ -2,28 +2,20 @@
 
 from __future__ import annotations
 
-import hashlib
-import importlib.metadata
 import json
-import math
 import os
-import platform
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
-from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.folder import first_command, remove_parts, unwritable
-from ns_abstract.io.jsonio import file_size, is_number, load_json
+from ns_abstract.io.jsonio import is_number, load_json
 from ns_abstract.io.version import ADVISORY, stale
-from ns_abstract.io.version import VERSION as PACKAGE
-from ns_abstract.refine.result import ExtraOutput, FrameResult, TracePoint, greater
+from ns_abstract.refine.result import FrameResult, TracePoint, merged
 from ns_abstract.report.figures import ShownUnits, layer_metrics, metrics, seconds_to, short_guarantee
 from ns_abstract.report.files import (
     StoredFrame,
@@ -34,8 +26,7 @@ from ns_abstract.report.files import (
     load_frame,
     save_frame,
 )
-
-VERSION = 1
+from ns_abstract.report.run import Run, differences, file_stamp, guarantee_text, plain
 
 Status = Literal["done", "partial", "missing"]
 Outcome = Literal["done", "budget", "interrupted"]
@@ -49,7 +40,6 @@ PAGE_FRAMES = 60
 #: Characters of the page that its numbers may take, all frames together, and most bytes of a frame file that is read
 #: again for them.
 _PLAY_CHARACTERS, _PLAY_FILE = 10_000_000, 512 << 20
-_CHUNK = 2**20
 
 METRICS = {
     "mpg": "mean over the pixels of the Euclidean norm over RGB of upper - lower",
@@ -65,79 +55,12 @@ METRICS = {
     "images": "RGB in [0, 1], so gaps lie in [0, sqrt(3)]",
 }
 
-_PROGRAMS = {"gsplat": "gsplat's formulas give", "paper": "the paper's Algorithm 1 gives"}
 _LIMITS = {
     "gsplat": "Weakest link: the bounds hold as far as the device follows gsplat's formulas within CUDA's documented "
     "errors, which were compared with exact results on one GPU (an H100). CUDA gsplat was run there, and nothing that "
     "it rendered was outside.",
     "paper": "Weakest link: Algorithm 1 is the paper's, not what Nerfstudio shows; use the gsplat renderer for that.",
 }
-
-
-def guarantee_text(guarantee: str, renderer: str = "gsplat", bounded: str | None = None) -> str:
-    """Return the text of a guarantee, as the end of a sentence about an abstract image.
-
-    Args:
-        guarantee: "float32-sound", "real-sound" or "sampled".
-        renderer: Name of the bounded renderer.
-        bounded: What of the scene is bounded, such as "of the Gaussians alone"; None: all of it.
-
-    Raises:
-        ValueError: The guarantee is not one of the three.
-    """
-    program = _PROGRAMS.get(renderer, f"{renderer} gives")
-    texts = {
-        "float32-sound": f"encloses the image that {program} in real numbers and in every float32 evaluation "
-        "with CUDA fast-math error constants",
-        "real-sound": "encloses the real-number renderer and this package's float64 evaluation",
-        "sampled": "is not a guarantee: it holds only the images that were rendered",
-    }
-    if guarantee not in texts:
-        raise ValueError(f"guarantee {guarantee!r} is not one of {', '.join(texts)}")
-    if bounded is None or guarantee == "sampled":
-        return texts[guarantee]
-    return f"{texts[guarantee]}, {bounded}: the run's model may draw more, of which nothing is said"
-
-
-def plain(value: Any) -> Any:
-    """``value`` as strict JSON: tuples and arrays as lists, paths as text, no NaN or infinity (null).
-
-    Raises:
-        TypeError: A value has no JSON form.
-    """
-    if value is None or isinstance(value, (bool, str)):
-        return value
-    if isinstance(value, (np.generic, np.ndarray)):
-        return plain(value.tolist())
-    if isinstance(value, int):
-        return int(value)
-    if isinstance(value, float):
-        return float(value) if math.isfinite(value) else None
-    if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [plain(item) for item in value]
-    if isinstance(value, os.PathLike):
-        return os.fspath(value)
-    raise TypeError(f"{type(value).__name__} has no JSON form")
-
-
-def file_stamp(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Identity of a file by content: ``name``, ``bytes`` and ``sha256``; a moved file keeps it.
-
-    Raises:
-        InputError: The file is absent or cannot be read.
-    """
-    path = Path(path)
-    size = file_size(path, "file")
-    digest = hashlib.sha256()
-    try:
-        with path.open("rb") as stream:
-            while chunk := stream.read(_CHUNK):
-                digest.update(chunk)
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", file=path, fix="check the permissions") from None
-    return {"name": path.name, "bytes": size, "sha256": digest.hexdigest()}
 
 
 def frame_digests(document: Any) -> dict[str, str]:
@@ -158,121 +81,26 @@ def explanations(document: Any) -> dict[int, tuple[str, ...]]:
     return texts
 
 
-def versions() -> dict[str, str | None]:
-    """Versions of what computed the bounds; None where a package has no metadata."""
-    versions_found: dict[str, str | None] = {"python": platform.python_version(), "machine": platform.machine()}
-    versions_found["ns-abstract"] = PACKAGE
-    for name in ("numpy", "numba"):
-        try:
-            versions_found[name] = importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            versions_found[name] = None
-    return versions_found
-
-
 def failed_self_check(problem: str) -> str:
     """The condition on the guarantee that a problem of a platform's arithmetic makes."""
     return f"The platform's arithmetic failed the self-check, so nothing is guaranteed: {problem}"
 
 
-@dataclass(frozen=True)
-class RunRecord:
-    """The record of a command's run; all mappings must have a JSON form (see `plain`).
+@dataclass(frozen=True, kw_only=True)
+class RunRecord(Run):
+    """A command's run.
 
     Attributes:
-        guarantee: "float32-sound", "real-sound" or "sampled".
-        renderer: ``name`` and ``version`` of the bounded program.
-        scene: ``name``, and whatever describes the scene (source, number of Gaussians, ...).
         frames: Numbers of the camera path's entries that were asked for.
-        fingerprint: Whatever changes the set of images: scene file (`file_stamp`), camera path,
-            perturbation, renderer, arithmetic, downscale factor. Results are mixed only where it is
-            the same. Effort (time budget, target ratio, seed) does not belong here.
         settings: The command's options; ``target_ratio`` decides when a frame is done, and with a true
             ``save_cells`` stored frames without leaf cells are computed again.
-        plan: What was left out for this scene and why, one sentence each.
-        command: The command line.
-        limits: Further conditions on the guarantee, one sentence each.
         size: Height and width of the pictures; None: any that stored frames have.
-        assumptions: What the bounds rest on, and where each choice came from.
+        intrinsics: By frame the pictures' `Intrinsics`.
     """
 
-    guarantee: str
-    renderer: Mapping[str, str]
-    scene: Mapping[str, Any]
     frames: tuple[int, ...]
-    fingerprint: Mapping[str, Any]
-    settings: Mapping[str, Any]
-    plan: tuple[str, ...] = ()
-    command: tuple[str, ...] = ()
-    limits: tuple[str, ...] = ()
     size: tuple[int, int] | None = None
-    assumptions: tuple[Assumption, ...] = ()
-
-
-def _leaves_of(value: Any, path: str = "") -> dict[str, Any]:
-    """Dotted paths and values of a JSON tree."""
-    if isinstance(value, dict) and (value or not path):
-        leaves: dict[str, Any] = {}
-        for key, item in value.items():
-            leaves |= _leaves_of(item, f"{path}.{key}" if path else str(key))
-        return leaves
-    return {path: value}
-
-
-def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """Dotted paths where two JSON trees differ."""
-    first, second = _leaves_of(plain(old)), _leaves_of(plain(new))
-    absent = object()
-    return [key for key in {**first, **second} if first.get(key, absent) != second.get(key, absent)]
-
-
-def merged(older: FrameResult, newer: FrameResult) -> FrameResult:
-    """Return the intersection of two results for one frame; both enclose the set, so it does.
-
-    Times and cells add up; the trace of ``newer`` follows that of ``older`` and never gets worse.
-
-    Raises:
-        ValueError: The two are of different frames, boxes or sizes.
-    """
-    same = [(r.index, r.box, r.lower.shape, sorted(r.layers)) for r in (older, newer)]
-    if same[0] != same[1]:
-        raise ValueError(f"frame {newer.index}: the stored result is of another set of images")
-    outer = min((point.mpg for point in older.trace), default=math.inf)
-    inner = max((point.mpg_witness for point in older.trace), default=0.0)
-    covered = max((point.covered for point in older.trace), default=0.0)
-    later = tuple(
-        TracePoint(
-            older.seconds + point.seconds,
-            older.cells + point.cells,
-            min(outer, point.mpg),
-            max(inner, point.mpg_witness),
-            max(covered, point.covered),
-        )
-        for point in newer.trace
-    )
-    return replace(
-        newer,
-        lower=np.maximum(older.lower, newer.lower),
-        upper=np.minimum(older.upper, newer.upper),
-        witness_lower=np.minimum(older.witness_lower, newer.witness_lower),
-        witness_upper=np.maximum(older.witness_upper, newer.witness_upper),
-        seconds=older.seconds + newer.seconds,
-        cells=older.cells + newer.cells,
-        trace=older.trace + later,
-        bounded=older.bounded or newer.bounded,
-        layers={name: _merged_layer(older.layers[name], layer) for name, layer in newer.layers.items()},
-        largest=greater(older.largest, newer.largest),
-    )
-
-
-def _merged_layer(older: ExtraOutput, newer: ExtraOutput) -> ExtraOutput:
-    return ExtraOutput(
-        np.maximum(older.lower, newer.lower),
-        np.minimum(older.upper, newer.upper),
-        np.minimum(older.witness_lower, newer.witness_lower),
-        np.maximum(older.witness_upper, newer.witness_upper),
-        newer.image,
-    )
+    intrinsics: Mapping[int, Mapping[str, float]] = field(default_factory=dict)
 
 
 class Report:
@@ -324,15 +152,13 @@ class Report:
         self._undrawn: set[int] = set()
         self._explained: dict[int, tuple[str, ...]] = {}
         self._state = "running"
-        self._started = _now()
         self._page_due = 0.0
-        self._packages = versions()
         self._describe(run)
         guarantee_text(run.guarantee)
         try:
             folder.mkdir(parents=True, exist_ok=True)
             remove_parts(folder)
-            self._found = sorted(path.name for kind in ("npz", "png") for path in folder.glob(f"frame_*.{kind}"))
+            self._present = sorted(path.name for kind in ("npz", "png") for path in folder.glob(f"frame_*.{kind}"))
         except OSError as error:
             raise unwritable(folder, error) from None
 
@@ -384,7 +210,7 @@ class Report:
                         field="fingerprint",
                         fix="give another --output-dir, or leave out --resume to start again",
                     )
-        stored_before = (frame_index(self.folder / file) for file in self._found)
+        stored_before = (frame_index(self.folder / file) for file in self._present)
         for index in sorted({index for index in stored_before if index is not None}):
             path = self.folder / frame_name(index, "npz")
             try:
@@ -594,38 +420,28 @@ class Report:
         """The content of report.json (contract, version 1)."""
         run = self.run
         name = str(run.renderer.get("name", ""))
+        beside = {"intrinsics": run.intrinsics, "explanation": self._explained}
         written = {file for entry in self._entries.values() for file in entry["files"].values()}
         return plain(
-            {
-                "version": VERSION,
-                "guarantee": run.guarantee,
-                "guarantee_text": guarantee_text(run.guarantee, name, run.scene.get("bounded")),
+            run.head()
+            | {
                 "limits": [*([_LIMITS[name]] if name in _LIMITS else []), *run.limits],
-                "renderer": run.renderer,
-                "scene": run.scene,
-                "assumptions": [vars(entry) for entry in run.assumptions],
-                "plan": run.plan,
                 "frames": [
-                    self._entries[k] | ({"explanation": why} if (why := self._explained.get(k)) else {})
+                    self._entries[k] | {name: value for name, about in beside.items() if (value := about.get(k))}
                     for k in sorted(self._entries)
                 ],
                 "frames_asked": run.frames,
                 "missing": self.missing,
                 # a run that was killed never gets to say so
                 "interrupted": self._state in ("running", "interrupted"),
-                "state": self._state,
-                "metrics": METRICS,
-                "settings": run.settings,
-                "fingerprint": run.fingerprint,
-                "command": run.command,
+            }
+            | run.tail(self._state, METRICS)
+            | {
                 **({"first_command": first} if (first := self._first_command) else {}),
                 "sha256": self._digests,
-                "packages": self._packages,
-                "started": self._started,
-                "updated": _now(),
                 "kept": self.kept,
                 "ignored": self.ignored,
-                "other_files": [file for file in self._found if file not in written],
+                "other_files": [file for file in self._present if file not in written],
             }
         )
 
@@ -673,7 +489,3 @@ class Report:
             result = load_frame(self.folder / frame_name(index, "npz"), leaves=False).result
             self._previews[index] = previews(result, _PREVIEW_PIXELS)
         return self._previews[index]
-
-
-def _now() -> str:
-    return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())

@@ -14,7 +14,7 @@ from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.folder import unwritable
 from ns_abstract.report.cameras import CameraDrawings
 from ns_abstract.report.certificate_page import along_path, verdict_drawings
-from ns_abstract.report.figures import percent
+from ns_abstract.report.figures import ShownUnits, percent
 from ns_abstract.report.verdict_maps import BAD, GOOD, OPEN, free_parameters, maps_of, matrix_svg
 
 CellRows = Sequence[Mapping[str, Any]]
@@ -101,8 +101,10 @@ def write_pictures(
         _, ((plot, _),) = verdict_drawings(way, rows, {})
         files["verdicts_path"] = standalone([plot], "from keyframe to keyframe", covered)
     else:
+        units = ShownUnits.of(document["scene"])
         for entry in entries[:MOST]:
-            files[f"verdicts_{entry['index']:05d}"] = _frame(entry, rows.get(entry["index"], ()))
+            name = f"verdicts_{entry['index']:05d}"
+            files[name] = _frame(*units.drawn(entry, rows.get(entry["index"], ())))
     if cameras is not None and cameras.cells:
         files["cameras"] = standalone([plot for plot, *_ in cameras.plots({})], "cameras of cells", covered)
     written = []

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
-from ns_abstract.report.figures import number, unit_of_axis
+from ns_abstract.report.figures import ShownUnits, number, unit_of_axis
 from ns_abstract.report.html import fill
 from ns_abstract.report.regions import PoseImage
 
@@ -45,25 +45,29 @@ def direction(parameters: Sequence[Mapping[str, Any]]) -> int | None:
 
 
 def stops(
-    entries: Sequence[Mapping[str, Any]], rows: Mapping[int, Sequence[Mapping[str, Any]]], most: int = MOST
+    entries: Sequence[Mapping[str, Any]],
+    rows: Mapping[int, Sequence[Mapping[str, Any]]],
+    units: ShownUnits | None = None,
+    most: int = MOST,
 ) -> list[WalkPose]:
     """Poses along every frame's set in turn, evenly spread, the other parameters in the middle.
 
     Args:
         entries: Frames of report.json: index and parameters (name, unit, lower, upper).
         rows: By frame, its cells.
+        units: Those that places are written in.
         most: Most poses; of more frames some, evenly spread.
     """
     if len(entries) > most:
         entries = [entries[k * (len(entries) - 1) // (most - 1)] for k in range(most)]
-    each = most // max(1, len(entries))
+    each, units = most // max(1, len(entries)), units or ShownUnits()
     poses = []
     for position, entry in enumerate(entries):
         parameters = entry["parameters"]
         axis = direction(parameters)
         middle = [0.5 * (p["lower"] + p["upper"]) for p in parameters]
         if axis is None or each < 2:
-            poses.append(_stop(entry, rows, middle, None))
+            poses.append(_stop(entry, rows, units, middle, None))
             continue
         low, high = parameters[axis]["lower"], parameters[axis]["upper"]
         name = parameters[axis]["name"]
@@ -71,18 +75,23 @@ def stops(
         follows = position + 1 < len(entries) and name == "segment"
         closed = name == "azimuth" and high - low >= _FULL_TURN * (1.0 - 1e-9)
         for value in np.linspace(low, high, each, endpoint=not (follows or closed)).tolist():
-            poses.append(_stop(entry, rows, [*middle[:axis], value, *middle[axis + 1 :]], axis))
+            poses.append(_stop(entry, rows, units, [*middle[:axis], value, *middle[axis + 1 :]], axis))
     return poses
 
 
 def _stop(
-    entry: Mapping[str, Any], rows: Mapping[int, Sequence[Mapping[str, Any]]], values: list[float], axis: int | None
+    entry: Mapping[str, Any],
+    rows: Mapping[int, Sequence[Mapping[str, Any]]],
+    units: ShownUnits,
+    values: list[float],
+    axis: int | None,
 ) -> WalkPose:
     row = cell_at(rows.get(entry["index"], ()), values)
     at = f"frame {entry['index']}"
     if axis is not None:
         p = entry["parameters"][axis]
-        at += f", {p['name']} = {number(values[axis], 4)} {unit_of_axis(p['unit'])}"
+        unit, factor = units.axis(p["unit"])
+        at += f", {p['name']} = {number(values[axis] * factor, 4)} {unit_of_axis(unit)}"
     verdict = "unknown" if row is None else row["verdict"]
     return WalkPose(
         entry["index"], tuple(values), verdict, row["margin"] if row and verdict == "certified" else None, at

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import torch
 
-from ns_abstract.arithmetic.forms import FormArray
+from ns_abstract.arithmetic.form_array import FormArray
 from ns_abstract.arithmetic.network_charges import OWN_MARGIN
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.differentiable_pose import differentiable_pose

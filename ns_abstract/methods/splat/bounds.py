@@ -14,6 +14,7 @@ from ns_abstract.arithmetic.rounding import (
     FRAGMENT_ROUNDING,
     GRAM_ROOM,
     GRAM_UP,
+    REAL,
     REGION,
     SHIFTED_ROUNDING,
     STILL_POSITION,
@@ -31,8 +32,9 @@ from ns_abstract.methods.splat.colors import color_magnitudes, fixed_colors, gat
 from ns_abstract.methods.splat.constants import Rasteriser, RasterRules, raster_rules
 from ns_abstract.methods.splat.gaussians import covariance_noise, gaussian_stage
 from ns_abstract.methods.splat.lists import TileLists, depth_order, pixel_sets, tile_lists, tile_mask, visible_again
+from ns_abstract.methods.splat.pixel_regions import exponent_limits
 from ns_abstract.methods.splat.pixels import pixel_stage
-from ns_abstract.methods.splat.projection_errors import columns, exponent_limits
+from ns_abstract.methods.splat.projection_errors import columns
 from ns_abstract.methods.splat.stage_data import (
     CellPoses,
     Colors,
@@ -183,7 +185,9 @@ class SplatBounds:
         self.varied = VariedSplats.fixed(splats) if varied is None else varied
         self.rasteriser = rasteriser
         self.arithmetic = arithmetic
-        self.rules = raster_rules(rasteriser, splats.antialiased)
+        rules = raster_rules(rasteriser, splats.antialiased)
+        # G12: tiles from 1.5 on change no picture in real numbers, and our renderer has none
+        self.rules = rules._replace(tile_room=0.0) if arithmetic == REAL else rules
         self.side = rasteriser.work_tile
         self.charges = charges(arithmetic)
         self._buffers: dict[tuple[int, str], np.ndarray] = {}

@@ -24,15 +24,7 @@ from ns_abstract.arithmetic.simd.intrinsics import advanced, lowest_bit, signed
 from ns_abstract.arithmetic.simd.lanes import maximum, minimum, store
 from ns_abstract.methods.splat.blend import blend_quadratic, blend_several, flattened, form_range
 from ns_abstract.methods.splat.lists import BLOCK
-from ns_abstract.methods.splat.pixel_block import (
-    ALPHA_HIGH,
-    FORM,
-    OPEN,
-    RHO,
-    color_ends,
-    color_size,
-    listed_fragment,
-)
+from ns_abstract.methods.splat.pixel_block import ALPHA_HIGH, FORM, OPEN, RHO, color_ends, color_size, listed_fragment
 
 #: Lanes of accumulation and depth.
 _SUM, DEPTH = 0, 3
@@ -148,16 +140,66 @@ def _weighted_mean(t, radius, low, high, total_low, total_high, order, m):
     return max(first_low, other_low - off), min(first_high, other_high + off)
 
 
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _blend_depths(begin, end, block, t, by_lane, order, m):
+    """Blend a pixel's shifted depths and accumulation: polynomials in ``t``, then ends and radii by lane."""
+    fragments, moves = block.fragments, block.reordering.moves
+    if order == 2:
+        blended = blend_quadratic(begin, end, fragments, block.shifted, moves, t, block.jumps, False)
+        r = blended.radius
+    else:
+        blended = blend_several(begin, end, fragments, block.shifted, moves, t, m, block.jumps, False)
+        r = flattened(t, blended.radius, advanced(t, 4 * (m + fragments.bends)), m)
+    ends = blended.ends
+    r = r * (UP + LAYER_ROUNDING * (end - begin))
+    bottom, top = form_range(t, r, order, m)
+    store(by_lane, 0, maximum(ends.low, bottom))
+    store(by_lane, 4, minimum(ends.high, top))
+    store(by_lane, 8, r)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _write(layers, total_low, total_high, low, high):
+    layers[ACCUMULATION_LOW], layers[ACCUMULATION_HIGH] = total_low, total_high
+    layers[DEPTH_LOW], layers[DEPTH_HIGH] = low, high
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _expected_depth(result, radius, span, low, high, total_low, total_high, rounding, common, charges, order, m):
+    """Bounds of the expected depth where something is drawn, infinite above where they are not finite (D3, D4).
+
+    ``result`` holds the reference and behind it the polynomial of the sum of weights times depths against it, of
+    ``radius`` beside its own; that sum lies between ``low`` and ``high``. Overwrites ``result``.
+    """
+    magnitude = 0.0
+    for k in range(m):
+        result[k] += common[k]
+        magnitude += abs(common[k])
+    magnitude = (magnitude + common[m]) * UP + span.largest
+    # of the sums of weights times depths, and of the accumulation
+    error = (rounding * total_high + rounding) * magnitude
+    shift_low, shift_high = _range(result, order, m)
+    low, high = _weighted_mean(result, radius + error, low - error, high + error, total_low, total_high, order, m)
+    # a mean lies among what it is made of
+    off = error / total_low * UP
+    low, high = max(low, shift_low + span.nearest - off), min(high, shift_high + span.farthest + off)
+    size = max(abs(low), abs(high))
+    off = common[m] + charges.expected_depth * size + DEPTH_ROUNDING * (magnitude + size)
+    low, high = low - off, high + off
+    is_bounded = low <= high and math.isfinite(high - low)
+    return max(low if is_bounded else 0.0, 0.0), high if is_bounded else np.inf
+
+
 @njit(cache=True, error_model="numpy")
 def shade_layers(pixels, left, above, block, inputs, bounds):
     """Write `PixelBounds.layers` of those ``pixels`` of a block that `shade` has shaded (design.md, D1-D4).
 
     Reads the depths in lane `DEPTH` of the palette, and changes rows of moves, which are of no use afterwards.
     """
-    fragments, moves, t = block.fragments, block.reordering.moves, block.sums
+    fragments, t = block.fragments, block.sums
     per_pixel, charges, cutoffs = fragments.per_pixel, inputs.charges, inputs.cutoffs
     order, m = inputs.shape.order, inputs.shape.monomials
-    common, unseen = inputs.colors.common, block.palette.unseen
+    unseen = block.palette.unseen
     # behind what blending takes: ends and radii by lane, the reference, two polynomials of the result
     by_lane = advanced(t, 4 * (2 * m + fragments.bends))
     reference = advanced(by_lane, 16)
@@ -171,25 +213,14 @@ def shade_layers(pixels, left, above, block, inputs, bounds):
         end = begin + n
         _set_reference(begin, end, fragments, block.palette, reference, m)
         span = _shift_depths(begin, end, block, reference, m)
-        if order == 2:
-            blended = blend_quadratic(begin, end, fragments, block.shifted, moves, t, block.jumps, False)
-            r = blended.radius
-        else:
-            blended = blend_several(begin, end, fragments, block.shifted, moves, t, m, block.jumps, False)
-            r = flattened(t, blended.radius, advanced(t, 4 * (m + fragments.bends)), m)
-        ends = blended.ends
-        r = r * (UP + LAYER_ROUNDING * n)
-        bottom, top = form_range(t, r, order, m)
-        store(by_lane, 0, maximum(ends.low, bottom))
-        store(by_lane, 4, minimum(ends.high, top))
-        store(by_lane, 8, r)
+        _blend_depths(begin, end, block, t, by_lane, order, m)
         rounding = SECOND_ORDER * (charges.blend_fragment * n + charges.blend_pixel)
         # light that is lost to a stop that was ignored, and that comes to what is missing (B6)
         lost = per_pixel[RHO + q] * (1.0 + charges.lost_light)
         passed = per_pixel[OPEN + q] * (1.0 + charges.lost_light)
         nearest, farthest, largest = span.nearest, span.farthest, span.largest
-        shift_low, shift_high = _range(reference, order, m)
         if passed > 0.0:
+            shift_low, shift_high = _range(reference, order, m)
             nearest = min(nearest, unseen[DEPTH] - shift_high)
             farthest = max(farthest, unseen[4 + DEPTH] - shift_low)
             largest = max(largest, abs(unseen[DEPTH]), abs(unseen[4 + DEPTH]))
@@ -200,44 +231,25 @@ def shade_layers(pixels, left, above, block, inputs, bounds):
         sum_low, sum_high = by_lane[DEPTH] - fall, by_lane[4 + DEPTH] + rise
         total_low = max(by_lane[_SUM] - lost - rounding, 0.0)
         total_high = min(by_lane[4 + _SUM] + passed + rounding, 1.0)
-        layers = bounds.layers[0, above + q // BLOCK, left + q % BLOCK]
-        if not total_low <= total_high or not math.isfinite(farthest - nearest + sum_high - sum_low):
-            # nothing can be drawn, or nothing is known
-            nothing = n == 0 and passed == 0.0
-            layers[ACCUMULATION_LOW], layers[ACCUMULATION_HIGH] = 0.0, 0.0 if nothing else 1.0
-            layers[DEPTH_LOW], layers[DEPTH_HIGH] = (np.inf, -np.inf) if nothing else (0.0, np.inf)
-            continue
         some = least - rounding
-        if not some > 0.0:
+        layers = bounds.layers[0, above + q // BLOCK, left + q % BLOCK]
+        is_bounded = total_low <= total_high and math.isfinite(farthest - nearest + sum_high - sum_low)
+        if (not is_bounded and n == 0 and passed == 0.0) or (is_bounded and some > 0.0 and total_high < some):
+            # nothing can be drawn
+            _write(layers, 0.0, 0.0, np.inf, -np.inf)
+        elif not is_bounded:
+            _write(layers, 0.0, 1.0, 0.0, np.inf)
+        elif not some > 0.0:
             # so many that rounding may hide one
-            layers[ACCUMULATION_LOW], layers[ACCUMULATION_HIGH] = total_low, total_high
-            layers[DEPTH_LOW], layers[DEPTH_HIGH] = 0.0, np.inf
-            continue
-        if total_high < some:
-            layers[ACCUMULATION_LOW], layers[ACCUMULATION_HIGH] = 0.0, 0.0
-            layers[DEPTH_LOW], layers[DEPTH_HIGH] = np.inf, -np.inf
-            continue
-        if total_low > 0.0:
-            total_low = max(total_low, some)
-        layers[ACCUMULATION_LOW], layers[ACCUMULATION_HIGH] = total_low, total_high
-        # the depth where something is drawn
-        total_low = max(total_low, some)
-        all_of_it = 0.0
-        for k in range(m):
-            result[k] = reference[k] + common[k]
-            result[m + k] = t[4 * k + DEPTH]
-            all_of_it += abs(common[k])
-        all_of_it = (all_of_it + common[m]) * UP + largest
-        # of the sums of weights times depths, and of the accumulation
-        error = (rounding * total_high + rounding) * all_of_it
-        radius = by_lane[8 + DEPTH] + max(fall, rise) + error
-        shift_low, shift_high = _range(result, order, m)
-        low, high = _weighted_mean(result, radius, sum_low - error, sum_high + error, total_low, total_high, order, m)
-        # a mean lies among what it is made of
-        off = error / total_low * UP
-        low, high = max(low, shift_low + nearest - off), min(high, shift_high + farthest + off)
-        size = max(abs(low), abs(high))
-        off = common[m] + charges.expected_depth * size + DEPTH_ROUNDING * (all_of_it + size)
-        low, high = low - off, high + off
-        is_bounded = low <= high and math.isfinite(high - low)
-        layers[DEPTH_LOW], layers[DEPTH_HIGH] = max(low if is_bounded else 0.0, 0.0), high if is_bounded else np.inf
+            _write(layers, total_low, total_high, 0.0, np.inf)
+        else:
+            for k in range(m):
+                result[k], result[m + k] = reference[k], t[4 * k + DEPTH]
+            drawn = max(total_low, some)
+            total_low = drawn if total_low > 0.0 else total_low
+            radius, span = by_lane[8 + DEPTH] + max(fall, rise), _Span(nearest, farthest, largest)
+            low, high = _expected_depth(
+                result, radius, span, sum_low, sum_high, drawn, total_high, rounding, inputs.colors.common, charges,
+                order, m,
+            )  # fmt: skip
+            _write(layers, total_low, total_high, low, high)

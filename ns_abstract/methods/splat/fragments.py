@@ -6,17 +6,17 @@ contribute, and notes which Gaussians that share a pixel may change places (desi
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 from numba import njit
 
-from ns_abstract.arithmetic.rounding import ORDER_ROUNDING, REGION, TURN_ROOM, UP, WINDOW_ROUNDING
+from ns_abstract.arithmetic.rounding import UP
 from ns_abstract.arithmetic.simd.intrinsics import advanced, lowest_bit, pointer, prefetch, signed
-from ns_abstract.arithmetic.simd.lanes import load8, maximum, minimum, root, spans, store, where
+from ns_abstract.arithmetic.simd.lanes import load8, store
 from ns_abstract.methods.splat.alphas import alphas
-from ns_abstract.methods.splat.lists import AHEAD, BLOCK, PIXELS
+from ns_abstract.methods.splat.depth_pairs import BlockList, DepthWindow, depth_radii, find_pairs
+from ns_abstract.methods.splat.lists import BLOCK, PIXELS
 from ns_abstract.methods.splat.pixel_block import (
     ALPHA_HIGH,
     ALPHA_LOW,
@@ -38,57 +38,12 @@ from ns_abstract.methods.splat.pixel_block import (
     longest_list,
     set_unknown,
 )
-from ns_abstract.methods.splat.projection_errors import EXPONENT_LIMIT, FORMS, MEAN_X, MEAN_Y, SPREAD, UNBOUNDED
+from ns_abstract.methods.splat.projection_errors import MEAN_X, MEAN_Y
+from ns_abstract.methods.splat.reached_pixels import ROW_SHIFT, pixels_once
 
-#: Pixel q of a block lies in row q >> _ROW_SHIFT; sets of pixels are the bits of an int64.
-_ROW_SHIFT = BLOCK.bit_length() - 1
 # what a block may answer in place of a number of pairs
 GIVE_UP = -1
 GROW = -2
-
-
-class _BlockList(NamedTuple):
-    """A block's list of Gaussians, nearest first, with pointers to their `ProjectedGaussians`.
-
-    Attributes:
-        numbers: [length] the Gaussians' rows.
-        columns: Columns of ``record``.
-        slope: [rows, 3] see `ViewingAxes.depth`.
-        tied: See `ViewingAxes.tied`.
-        x0, y0: The block's first pixel.
-        m: Coefficients of a form.
-    """
-
-    numbers: np.ndarray
-    length: int
-    record: np.ndarray
-    columns: int
-    box: np.ndarray
-    tiles: np.ndarray
-    delta: np.ndarray
-    depth_error: np.ndarray
-    slope: np.ndarray
-    tied: bool
-    x0: int
-    y0: int
-    m: int
-
-
-class _DepthWindow(NamedTuple):
-    """How far apart in depth list positions may change places (O1).
-
-    Attributes:
-        room: Positions i, j keep their order where ``room |depth_i - depth_j| > radius_i + radius_j``; if not positive,
-            nothing is known.
-        largest: Largest `ListEntries.depth_radius` of all but the few positions in ``far``.
-        far: How many these are.
-        farthest: Their largest one.
-    """
-
-    room: float
-    largest: float
-    far: int
-    farthest: float
 
 
 class _EarlyTermination(NamedTuple):
@@ -102,86 +57,8 @@ class _EarlyTermination(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _uncertain(i, j, listed):
-    """Whether the depth order of Gaussians i and j, listed in this order, may be another in the cell (design.md, O1).
-
-    Depths differ by the third row of the rotation times ``delta_i - delta_j``.
-    """
-    delta, slope, depth_error, m = listed.delta, listed.slope, listed.depth_error, listed.m
-    x = delta[3 * i] - delta[3 * j]
-    y = delta[3 * i + 1] - delta[3 * j + 1]
-    z = delta[3 * i + 2] - delta[3 * j + 2]
-    if listed.tied and x == 0.0 and y == 0.0 and z == 0.0:
-        return i > j
-    center = slope[0] * x + slope[1] * y + slope[2] * z
-    spread = 0.0
-    for k in range(1, m):
-        spread += abs(slope[3 * k] * x + slope[3 * k + 1] * y + slope[3 * k + 2] * z)
-    size = abs(delta[3 * i]) + abs(delta[3 * j]) + abs(delta[3 * i + 1]) + abs(delta[3 * j + 1])
-    size += abs(delta[3 * i + 2]) + abs(delta[3 * j + 2])
-    rounding = ORDER_ROUNDING * size
-    radius = slope[3 * m] * abs(x) + slope[3 * m + 1] * abs(y) + slope[3 * m + 2] * abs(z)
-    return not (abs(center) > (spread + radius) * UP + rounding + depth_error[i] + depth_error[j])
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
-def _turn(slope, ray, m):
-    """By how much the depth of a point of unit depth on ``ray`` [3] changes over the cell, at most (design.md, O1)."""
-    along = 0.0
-    for k in range(1, m):
-        along += abs(slope[k, 0] * ray[0] + slope[k, 1] * ray[1] + slope[k, 2] * ray[2])
-    return along + (slope[m, 0] * abs(ray[0]) + slope[m, 1] * abs(ray[1]) + slope[m, 2] * abs(ray[2]))
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
-def _steadiness(along):
-    """Lower bound of one less the exact `_turn` (design.md, O1), of which a small one may be nothing but rounding."""
-    return 1.0 - along - TURN_ROOM
-
-
-@njit(cache=True, error_model="numpy")
-def _depth_radii(numbers, gaussians, slope, ray, m, entries):
-    """How far in depth each entry may move against the block's central ray (design.md, O1).
-
-    Fills ``entries.depth_radius`` and ``entries.depth``; returns `_DepthWindow.room` and `_DepthWindow.largest`.
-    """
-    depth, delta, depth_error = gaussians.depth, gaussians.delta, gaussians.depth_error
-    radii, deep = entries.depth_radius, entries.depth
-    count = numbers.size
-    along = _turn(slope, ray, m)
-    total = 0.0
-    for k in range(count):
-        ahead = numbers[min(k + AHEAD, count - 1)]
-        prefetch(delta, ahead, 0)
-        prefetch(depth, ahead, 0)
-        prefetch(depth_error, ahead, 0)
-        i = numbers[k]
-        deep[k] = depth[i]
-        # offset from the central ray: what a rotation moves in depth relative to the ray
-        x = delta[i, 0] - depth[i] * ray[0]
-        y = delta[i, 1] - depth[i] * ray[1]
-        z = delta[i, 2] - depth[i] * ray[2]
-        e = slope[m, 0] * abs(x) + slope[m, 1] * abs(y) + slope[m, 2] * abs(z)
-        for row in range(1, m):
-            e += abs(slope[row, 0] * x + slope[row, 1] * y + slope[row, 2] * z)
-        size = abs(delta[i, 0]) + abs(delta[i, 1]) + abs(delta[i, 2]) + abs(depth[i]) * (1.0 + along)
-        radii[k] = e * UP + WINDOW_ROUNDING * size + depth_error[i]
-        total += radii[k]
-    room = _steadiness(along)
-    if not total < np.inf:
-        room = -1.0
-    # few entries reach far: they are compared with all, the others within a window
-    typical = 4.0 * total / max(count, 1)
-    largest = 0.0
-    for k in range(count):
-        if radii[k] <= typical:
-            largest = max(largest, radii[k])
-    return room, largest
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
 def _start(numbers, inputs, block):
-    """Reset a block's pixels and list positions; returns the `_DepthWindow`."""
+    """Reset a block's pixels and list positions; returns the `DepthWindow`."""
     entries, per_pixel, lengths = block.entries, block.fragments.per_pixel, block.fragments.lengths
     for q in range(PIXELS):
         per_pixel[TLO + q] = 1.0
@@ -191,7 +68,7 @@ def _start(numbers, inputs, block):
         per_pixel[LOST + q] = 0.0
         per_pixel[OPEN + q] = 0.0
         lengths[q] = 0
-    room, largest = _depth_radii(
+    room, largest = depth_radii(
         numbers, inputs.gaussians, inputs.axes.depth, block.ray, inputs.shape.monomials, entries
     )
     far = 0
@@ -208,130 +85,7 @@ def _start(numbers, inputs, block):
     # row 0 is for fragments that do not move
     for r in range(MOVES):
         block.reordering.moves[r] = 0.0
-    return _DepthWindow(room, largest, far, farthest)
-
-
-@njit(cache=True, error_model="numpy")
-def _pixels_within(record, ox, oy, left, right, top, bottom, m, per_pixel):
-    """The set of pixels of a range where the exponent may stay low enough for the threshold.
-
-    Row by row, sigma >= (near1^2 + near2^2)/2 bounds the columns, where near1 and near2 are what the forms' spread
-    leaves of |y1| and |y2| (design.md, B2). (ox, oy) is the offset of the block's first pixel from the mean.
-    """
-    inside = ((2 << (bottom * BLOCK + BLOCK - 1)) - 1) & ~((1 << (top * BLOCK)) - 1)
-    unbounded = record[UNBOUNDED] != 0.0
-    p, c, g, w1, w2 = 0.0, 0.0, 0.0, 0.0, 0.0
-    spread1, spread2 = np.inf, np.inf
-    if not unbounded:
-        stride = m + 1
-        p = record[FORMS]
-        c = record[FORMS + stride]
-        g = record[FORMS + 2 * stride]
-        w1 = record[FORMS + 3 * stride]
-        w2 = record[FORMS + 4 * stride]
-        x = max(abs(ox + left), abs(ox + right))
-        y = max(abs(oy + top), abs(oy + bottom))
-        spread1 = (record[SPREAD] * x + record[SPREAD + 1] * y + record[SPREAD + 3]) * REGION
-        spread2 = (record[SPREAD + 2] * y + record[SPREAD + 4]) * REGION
-    # without a bound on the columns the whole rows are taken
-    numbers = load8(per_pixel, NUMBERS)
-    start = float(left) + 0.0 * numbers
-    stop = float(right) + 0.0 * numbers
-    if p > 0.0 and spread1 < np.inf and spread2 < np.inf:
-        inverse = 1.0 / p
-        ay = oy + numbers
-        near = maximum(0.0, abs(g * ay - w2) - spread2)
-        rest = 2.0 * record[EXPONENT_LIMIT] * REGION - near * near * (2.0 - REGION)
-        half = (root(maximum(rest, 0.0)) + spread1) * inverse * REGION
-        center = (c * ay + w1) * inverse - ox
-        slack = (REGION - 1.0) * (abs(center) + abs(ox) + half)
-        start = maximum(start, center - half - slack)
-        stop = where(rest >= 0.0, minimum(stop, center + half + slack), -1.0)
-    return spans(minimum(float(BLOCK), start), maximum(-1.0, stop)) & inside
-
-
-@njit(cache=True, error_model="numpy")
-def _pixels_of(record, box, x0, y0, m, per_pixel):
-    """The set of a block's pixels on which a Gaussian may reach the threshold."""
-    left = int(math.ceil(min(max(box[0] - 0.5 - x0, 0.0), float(BLOCK))))
-    right = int(math.floor(min(max(box[1] - 0.5 - x0, -1.0), BLOCK - 1.0)))
-    top = int(math.ceil(min(max(box[2] - 0.5 - y0, 0.0), float(BLOCK))))
-    bottom = int(math.floor(min(max(box[3] - 0.5 - y0, -1.0), BLOCK - 1.0)))
-    if top > bottom or left > right:
-        return 0
-    ox, oy = x0 + 0.5 - record[MEAN_X], y0 + 0.5 - record[MEAN_Y]
-    return signed(_pixels_within(record, ox, oy, left, right, top, bottom, m, per_pixel))
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
-def _pixels_once(k, listed, entries, per_pixel):
-    """`_pixels_of` list position k, found when first asked for."""
-    if entries.asked[k] == 0:
-        entries.asked[k] = 1
-        i = listed.numbers[k]
-        entries.pixels[k] = _pixels_of(
-            advanced(listed.record, i * listed.columns), advanced(listed.box, 4 * i), listed.x0, listed.y0, listed.m,
-            per_pixel,
-        )  # fmt: skip
-    return entries.pixels[k]
-
-
-@njit(cache=True, error_model="numpy")
-def _pixels_at(lanes, pixels):
-    """The set of the pixels that stand in the lanes ``found``."""
-    at = 0
-    while lanes != 0:
-        at |= 1 << int(pixels[lowest_bit(lanes)])
-        lanes &= lanes - 1
-    return signed(at)
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
-def _find_pairs(k, found, pixels, listed, entries, per_pixel, window, reordering, count):
-    """Append the pairs (k, later entry) that share a pixel and are of uncertain order; widen ``first``, ``last``.
-
-    ``pixels`` in the lanes ``found`` are k's. Returns the number of pairs, or -1 where there is no room for them.
-    """
-    radii, deep, far, pairs = entries.depth_radius, entries.depth, entries.far, reordering.pairs
-    i = listed.numbers[k]
-    pixel_set = 0
-    beyond = listed.length
-    near = radii[k] + window.largest
-    # those within the window, then those that reach far
-    other = k
-    f = 0
-    within = True
-    while True:
-        if within:
-            other += 1
-            if other >= listed.length or (deep[other] - deep[k]) * window.room > near:
-                within = False
-                beyond = other
-                continue
-        else:
-            while f < window.far and far[f] < beyond:
-                f += 1
-            if f >= window.far:
-                break
-            other = far[f]
-            f += 1
-            if (deep[other] - deep[k]) * window.room > radii[k] + window.farthest:
-                break
-        if (deep[other] - deep[k]) * window.room > radii[k] + radii[other]:
-            continue
-        if pixel_set == 0:
-            pixel_set = _pixels_at(found, pixels)
-        theirs = _pixels_once(other, listed, entries, per_pixel)
-        if pixel_set & int(theirs) == 0 or not _uncertain(i, listed.numbers[other], listed):
-            continue
-        if count >= reordering.pair_limit:
-            return -1
-        pairs[2 * count] = k
-        pairs[2 * count + 1] = other
-        entries.last[k] = max(entries.last[k], other)
-        entries.first[other] = min(entries.first[other], k)
-        count += 1
-    return count
+    return DepthWindow(room, largest, far, farthest)
 
 
 @njit(cache=True, error_model="numpy")
@@ -514,7 +268,7 @@ def _place_batch(start, some, live, listed, inputs, block):
         prefetch(gaussians.record, ahead, 8 * listed.columns - 8)
         for byte in range(0, 8 * colors.shape[1], 64):
             prefetch(colors, ahead, byte)
-        _pixels_once(start + b, listed, block.entries, block.fragments.per_pixel)
+        pixels_once(start + b, listed, block.entries, block.fragments.per_pixel)
     end = 0
     for b in range(some):
         row = advanced(listed.record, listed.numbers[start + b] * listed.columns)
@@ -526,7 +280,7 @@ def _place_batch(start, some, live, listed, inputs, block):
             pixels &= pixels - 1
             batch.pixels[end] = q
             batch.offset_x[end] = ox + (q & (BLOCK - 1))
-            batch.offset_y[end] = oy + (q >> _ROW_SHIFT)
+            batch.offset_y[end] = oy + (q >> ROW_SHIFT)
             end += 1
     batch.begins[some] = end
     return end
@@ -588,7 +342,7 @@ def collect_fragments(numbers, place, inputs, block, marks_):
     fragments, entries, reordering, batch = block.fragments, block.entries, block.reordering, block.batch
     gaussians, charges, m = inputs.gaussians, inputs.charges, inputs.shape.monomials
     colors, channels, marks = inputs.colors.values, inputs.colors.channels, pointer(marks_)
-    listed = _BlockList(
+    listed = BlockList(
         pointer(numbers), numbers.size, pointer(gaussians.record), gaussians.record.shape[1], pointer(gaussians.box),
         pointer(gaussians.tiles), pointer(gaussians.delta), pointer(gaussians.depth_error),
         pointer(inputs.axes.depth), inputs.axes.tied, place.x0, place.y0, m,
@@ -624,7 +378,7 @@ def collect_fragments(numbers, place, inputs, block, marks_):
                 continue
             k = start + b
             i = listed.numbers[k]
-            pairs = _find_pairs(k, lanes, pixels, listed, entries, fragments.per_pixel, window, reordering, pairs)
+            pairs = find_pairs(k, lanes, pixels, listed, entries, fragments.per_pixel, window, reordering, pairs)
             if pairs < 0:
                 return GIVE_UP, 0
             # threads share these bytes: written no more than once each

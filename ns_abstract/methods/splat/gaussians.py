@@ -21,6 +21,7 @@ from ns_abstract.methods.splat import projection_errors as row
 from ns_abstract.methods.splat.constants import RasterRules
 from ns_abstract.methods.splat.form_projection import WORKSPACE, project_forms, rotate
 from ns_abstract.methods.splat.line_projection import compensate_line, project_line
+from ns_abstract.methods.splat.pixel_regions import projected_stretch, regions
 from ns_abstract.methods.splat.projection_errors import (
     LANES,
     REGION,
@@ -29,8 +30,6 @@ from ns_abstract.methods.splat.projection_errors import (
     float_errors,
     gather,
     gather_means,
-    projected_stretch,
-    regions,
 )
 from ns_abstract.methods.splat.stage_data import (
     CellPoses,

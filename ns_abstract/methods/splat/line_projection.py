@@ -113,6 +113,31 @@ def _crossed(a, b, c, d):
     return multiplied(cross, cross)
 
 
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _seen_axis(rows, x, y, z, u, v):
+    """Of ``w = R b``, ``b = (x, y, z)`` a scaled axis: ``w0 - u w2``, ``w1 - v w2`` and the magnitude of ``w2``."""
+    still = LineForm(0.0, 0.0, 0.0, 0.0)
+    deep = _rotated(rows[2], x, y, z, still, 0.0, 0.0)
+    n0 = _lowered(_rotated(rows[0], x, y, z, still, 0.0, 0.0), u, deep)
+    n1 = _lowered(_rotated(rows[1], x, y, z, still, 0.0, 0.0), v, deep)
+    return n0, n1, magnitude(deep) + deep.radius
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _store_whitening(s, q, z, dx, dy, b, c, det):
+    """Fill FP .. FW2 of lane ``q`` from the covariance times z^2 and pixel offsets times z (design.md, G7)."""
+    # S' = 1/sqrt(c'), P' = sqrt(c'/det'), Q' = P' b'/c'
+    root = inverse_root(c)
+    along = multiplied(multiplied(c, root), inverse_root(det))
+    across = multiplied(along, multiplied(multiplied(b, root), root))
+    # P = P' z, Q = Q' z, S = S' z, W1 = P' X^ - Q' Y^, W2 = S' Y^
+    store(multiplied(along, z), s, row.FP, LANES, q)
+    store(multiplied(across, z), s, row.FQ, LANES, q)
+    store(multiplied(root, z), s, row.FS, LANES, q)
+    store(combined(multiplied(along, dx), 1.0, multiplied(across, dy), -1.0), s, row.FW1, LANES, q)
+    store(multiplied(root, dy), s, row.FW2, LANES, q)
+
+
 @njit(cache=True, error_model="numpy")
 def project_line(s, n, rotation, offset, camera, rules):
     """Bounds and forms of ``n`` Gaussians from the rows that `projection_errors.gather` filled (design.md, G4-G9).
@@ -124,19 +149,18 @@ def project_line(s, n, rotation, offset, camera, rules):
     """
     eps2d, margin = rules.eps2d, rules.view_margin
     fx, fy, cx, cy, width, height = camera
-    r0, r1, r2 = _rotation_row(rotation, 0), _rotation_row(rotation, 1), _rotation_row(rotation, 2)
+    rows = _rotation_row(rotation, 0), _rotation_row(rotation, 1), _rotation_row(rotation, 2)
     offset_x, offset_y, offset_z = _column(offset, 0), _column(offset, 1), _column(offset, 2)
     size_x, size_y, size_z = magnitude(offset_x), magnitude(offset_y), magnitude(offset_z)
-    still = LineForm(0.0, 0.0, 0.0, 0.0)
     left, right, top, bottom = np.inf, np.inf, np.inf, np.inf
     if margin >= 0.0:
         left, right = cx / fx + margin * 0.5 * width / fx, (width - cx) / fx + margin * 0.5 * width / fx
         top, bottom = cy / fy + margin * 0.5 * height / fy, (height - cy) / fy + margin * 0.5 * height / fy
     for q in range(n):
         v0, v1, v2 = s[row.V0 + q], s[row.V1 + q], s[row.V2 + q]
-        x = _rotated(r0, v0, v1, v2, offset_x, size_x, s[row.SX + q])
-        y = _rotated(r1, v0, v1, v2, offset_y, size_y, s[row.SY + q])
-        z = _rotated(r2, v0, v1, v2, offset_z, size_z, s[row.SZ + q])
+        x = _rotated(rows[0], v0, v1, v2, offset_x, size_x, s[row.SX + q])
+        y = _rotated(rows[1], v0, v1, v2, offset_y, size_y, s[row.SY + q])
+        z = _rotated(rows[2], v0, v1, v2, offset_z, size_z, s[row.SZ + q])
         s[row.ZLO + q], s[row.ZHI + q] = ends(z)
         s[row.Z0 + q] = z.center
         inverse_z = inverse(z)
@@ -150,22 +174,9 @@ def project_line(s, n, rotation, offset, camera, rules):
         # the Jacobian's clamped ratios
         u = _clamped(u, u_low, u_high, left, right)
         v = _clamped(v, v_low, v_high, top, bottom)
-        # w = R B, then n0 = w0 - u w2, n1 = w1 - v w2
-        b0, b1, b2 = s[row.B00 + q], s[row.B10 + q], s[row.B20 + q]
-        deep = _rotated(r2, b0, b1, b2, still, 0.0, 0.0)
-        s[row.DEEP0 + q] = magnitude(deep) + deep.radius
-        n00 = _lowered(_rotated(r0, b0, b1, b2, still, 0.0, 0.0), u, deep)
-        n10 = _lowered(_rotated(r1, b0, b1, b2, still, 0.0, 0.0), v, deep)
-        b0, b1, b2 = s[row.B01 + q], s[row.B11 + q], s[row.B21 + q]
-        deep = _rotated(r2, b0, b1, b2, still, 0.0, 0.0)
-        s[row.DEEP1 + q] = magnitude(deep) + deep.radius
-        n01 = _lowered(_rotated(r0, b0, b1, b2, still, 0.0, 0.0), u, deep)
-        n11 = _lowered(_rotated(r1, b0, b1, b2, still, 0.0, 0.0), v, deep)
-        b0, b1, b2 = s[row.B02 + q], s[row.B12 + q], s[row.B22 + q]
-        deep = _rotated(r2, b0, b1, b2, still, 0.0, 0.0)
-        s[row.DEEP2 + q] = magnitude(deep) + deep.radius
-        n02 = _lowered(_rotated(r0, b0, b1, b2, still, 0.0, 0.0), u, deep)
-        n12 = _lowered(_rotated(r1, b0, b1, b2, still, 0.0, 0.0), v, deep)
+        n00, n10, s[row.DEEP0 + q] = _seen_axis(rows, s[row.B00 + q], s[row.B10 + q], s[row.B20 + q], u, v)
+        n01, n11, s[row.DEEP1 + q] = _seen_axis(rows, s[row.B01 + q], s[row.B11 + q], s[row.B21 + q], u, v)
+        n02, n12, s[row.DEEP2 + q] = _seen_axis(rows, s[row.B02 + q], s[row.B12 + q], s[row.B22 + q], u, v)
         # a' = fx^2 |n0|^2 + eps z^2, c' = fy^2 |n1|^2 + eps z^2, b' = fx fy n0.n1 (covariance times z^2)
         z2 = multiplied(z, z)
         n0 = _sum_of_products(n00, n00, n01, n01, n02, n02)
@@ -184,16 +195,7 @@ def project_line(s, n, rotation, offset, camera, rules):
         s[row.DLO + q], s[row.DHI + q] = ends(det)
         # (a' - c')/2, for the radius
         s[row.LO + q], s[row.HI + q] = ends(combined(a, 0.5, c, -0.5))
-        # S' = 1/sqrt(c'), P' = sqrt(c'/det'), Q' = P' b'/c'
-        root = inverse_root(c)
-        along = multiplied(multiplied(c, root), inverse_root(det))
-        across = multiplied(along, multiplied(multiplied(b, root), root))
-        # P = P' z, Q = Q' z, S = S' z, W1 = P' X^ - Q' Y^, W2 = S' Y^
-        store(multiplied(along, z), s, row.FP, LANES, q)
-        store(multiplied(across, z), s, row.FQ, LANES, q)
-        store(multiplied(root, z), s, row.FS, LANES, q)
-        store(combined(multiplied(along, dx), 1.0, multiplied(across, dy), -1.0), s, row.FW1, LANES, q)
-        store(multiplied(root, dy), s, row.FW2, LANES, q)
+        _store_whitening(s, q, z, dx, dy, b, c, det)
         store(k, s, row.FK, LANES, q)
         store(det, s, row.FD, LANES, q)
 

@@ -13,10 +13,11 @@ from numba import njit
 
 from ns_abstract.arithmetic.simd.intrinsics import borrowed, lowest_bit, pointer, signed, taken
 from ns_abstract.methods.splat.blend import shade
+from ns_abstract.methods.splat.block_buffers import block_of, new_buffers, resized
 from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW, DEPTH_HIGH, DEPTH_LOW, shade_layers
 from ns_abstract.methods.splat.fragments import GIVE_UP, GROW, apply_stops, collect_fragments, number_groups
 from ns_abstract.methods.splat.lists import BLOCK, TileLists, block_lists, longest_first
-from ns_abstract.methods.splat.pixel_block import BlockPlace, block_of, longest_list, new_buffers, resized
+from ns_abstract.methods.splat.pixel_block import BlockPlace, longest_list
 from ns_abstract.methods.splat.reordering import swap_bounds
 from ns_abstract.methods.splat.stage_data import (
     Colors,

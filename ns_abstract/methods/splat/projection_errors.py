@@ -25,16 +25,11 @@ from numba import njit
 
 from ns_abstract.arithmetic.rounding import (
     COMPENSATION_ROUNDING,
-    ELLIPSE_ERROR,
-    ELLIPSE_SHARPNESS,
-    ELLIPSE_SPAN,
-    ELLIPSE_TIPS,
-    LOGARITHM_ROOM,
+    COVARIANCE_ERROR,
     REGION,
     ROOT_ROUNDING,
     SECOND_ORDER,
     UP,
-    Charges,
 )
 
 #: Lanes of one block of the compiled stage.
@@ -55,7 +50,7 @@ class RecordTuning:
 
 
 _LEAST_SQUARE = RecordTuning.least_square
-_IN_FRONT = RecordTuning.in_front
+IN_FRONT = RecordTuning.in_front
 _FACTORS_MATTER = RecordTuning.factors_matter
 
 
@@ -431,6 +426,8 @@ def compensations(s, n, rules, charges):
         a, c = (a + move_x) * (a + move_x), (c + move_y) * (c + move_y)
         error = c * error_a + a * error_c + 2.0 * np.sqrt(a * c) * error_b + error_a * error_c + error_b * error_b
         error = SECOND_ORDER * (error + charges.determinant * (a + error_a) * (c + error_c) + flush) / det
+        # the least factor of the determinant; G7's where that is known
+        remains = max(1.0 - spread, (1.0 - s[ETA + q]) ** 2) if s[ETA + q] < COVARIANCE_ERROR else 1.0 - spread
         # the square of the compensation lies in [0, 1]; bounds that are no numbers say nothing
         low = s[SQLO + q] if s[SQLO + q] > 0.0 else 0.0
         high = s[SQHI + q] if s[SQHI + q] < 1.0 else 1.0
@@ -438,10 +435,10 @@ def compensations(s, n, rules, charges):
         bottom = max(0.0, low_root * (1.0 - ROOT_ROUNDING) - moved)
         bottom = np.sqrt(max(0.0, bottom * bottom - error) / (1.0 + spread)) * shrink
         top = high_root * (1.0 + ROOT_ROUNDING) + moved
-        top = np.sqrt((top * top + error) / (1.0 - spread)) * grow
+        top = np.sqrt((top * top + error) / remains) * grow
         change = (moved * (2.0 * low_root + moved) + error) / low
         # 1.6.0 has a least factor
-        formed = (low > _LEAST_SQUARE) & (change < 0.25) & (0.45 * low > least * least)
+        formed = (low > _LEAST_SQUARE) & (change < 0.25) & (spread < 0.5) & (0.45 * low > least * least)
         bottom = max(bottom, least * (1.0 - charges.compensation))
         top = max(top, least * (1.0 + charges.compensation))
         s[CTOP + q] = top if top < np.inf else np.inf
@@ -452,193 +449,3 @@ def compensations(s, n, rules, charges):
     for q in range(n):
         s[CTOPLOG + q] = np.log(s[CTOP + q] * REGION)
         s[CHIGHLOG + q] = np.log(s[CHIGH + q] * REGION)
-
-
-def exponent_limits(opacity_high: np.ndarray, alpha_min: float, charges: Charges) -> np.ndarray:
-    """Exponents [N] from which on opacities [N] leave less than ``alpha_min``, however they are evaluated (B4)."""
-    with np.errstate(divide="ignore"):
-        exponent = np.log(opacity_high * (1.0 + charges.opacity) * (1.0 + charges.exponent_limit) / alpha_min)
-    # room for the rounding of the exponential, which grows more slowly than the exponent's own error
-    return exponent * REGION + LOGARITHM_ROOM
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
-def _within(x, most):
-    return min(max(x, 0.0), most)
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
-def ellipse_is_met(sharpness, widest, thinnest, eta, span, charges):
-    """Whether a Gaussian shows hardly anything in tiles that rounding may miss (design.md, G12), by its covariance.
-
-    ``sharpness`` is det / (a c), ``widest`` and ``thinnest`` bound a and c, ``span`` the coordinates in pixels.
-    """
-    unit = 0.125 * charges.tile
-    steep = 16.0 * unit * span * np.sqrt(widest / thinnest) < 0.25
-    tips = (sharpness * sharpness > ELLIPSE_SHARPNESS * unit) & (
-        sharpness * np.sqrt(thinnest) > ELLIPSE_TIPS * unit * span
-    )
-    return steep & tips & (eta < ELLIPSE_ERROR) & (span < ELLIPSE_SPAN)
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
-def largest_extent(s, q):
-    """Upper bound of the largest standard deviation of one lane's Gaussian, up to rounding."""
-    total = 0.0
-    for k in range(9):
-        entry = s[B00 + k * LANES + q]
-        total += entry * entry
-    return np.sqrt(total)
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
-def projected_stretch(rules, camera):
-    """Upper bound of the norm of z J, up to rounding; 0 where no float32 program is modelled (the paper's rules)."""
-    if rules.view_margin < 0.0:
-        return 0.0
-    fx, fy, _, _, _, _ = camera
-    limit_x, limit_y = view_limits(rules, camera)
-    return np.sqrt(fx * fx * (1.0 + limit_x * limit_x) + fy * fy * (1.0 + limit_y * limit_y)) * REGION
-
-
-@njit(cache=True, error_model="numpy")
-def regions(s, n, rules, camera, charges):
-    """Compute regions and tile ranges from the rows of `float_errors` (design.md, G5-G12): rows GONE .. T7.
-
-    GONE is 1 where no pose shows it, KNOWN where its forms may be relied on. The others may cover every pixel. Of a
-    record: the opacities, kappa and the exponent from which on alpha is below the threshold.
-    """
-    _tile_ranges(s, n, rules, camera, charges)
-    _opacities(s, n, rules, charges)
-    _pixel_boxes(s, n, rules, camera)
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
-def _tile_side(rules):
-    """Side of a tile, pixels: the program's, or that of the work's division where it has none."""
-    return rules.tile_size if rules.tile_size > 0.0 else float(rules.work_tile)
-
-
-@njit(cache=True, error_model="numpy")
-def _tile_ranges(s, n, rules, camera, charges):
-    """Tiles of the program (design.md, G8, G9, G12): rows T0 .. T7, GONE, FINITE, FRONT, PLACED."""
-    near, far, room, ellipse = rules.near, rules.far, rules.tile_room, rules.ellipse_tiles
-    width, height = camera.width, camera.height
-    cut = rules.tile_size > 0.0
-    side = _tile_side(rules)
-    across, down = np.ceil(width / side), np.ceil(height / side)
-    # below it no product of entries of a covariance overflows (G9)
-    safe = near * np.sqrt(np.sqrt(charges.overflow)) * 0.5
-    stretch = projected_stretch(rules, camera)
-    for q in range(n):
-        a, c = s[A + q], s[C + q]
-        mean_x_low, mean_x_high, mean_y_low, mean_y_high = s[MXLO + q], s[MXHI + q], s[MYLO + q], s[MYHI + q]
-        z_high = s[ZHIGH + q]
-        # well in front of the camera; products of covariances that may overflow leave nothing known
-        front = (s[ZLOW + q] >= near * _IN_FRONT) & (z_high < np.inf)
-        # at some pose the near or the far plane hides it
-        cut_off = (s[ZLOW + q] < near * (1.0 + charges.near)) | (z_high > far)
-        front = front & (a * c < charges.overflow) & (s[TAME + q] < np.inf)
-        largest = largest_extent(s, q)
-        finite = (front | (largest * stretch < safe)) & (
-            largest * largest * max(1.0, stretch / near) < charges.overflow
-        )
-        front = front & finite
-        radius_high, radius_low = s[RHIGH + q], s[RLOW + q]
-        snap_x = charges.tile * (abs(mean_x_low) + abs(mean_x_high) + radius_high)
-        snap_y = charges.tile * (abs(mean_y_low) + abs(mean_y_high) + radius_high)
-        left, right = mean_x_low - radius_high - snap_x, mean_x_high + radius_high + snap_x
-        top, bottom = mean_y_low - radius_high - snap_y, mean_y_high + radius_high + snap_y
-        # a place that is not finite is no number in some of these
-        placed = front & (right - left < np.inf) & (bottom - top < np.inf)
-        bounded = placed & (cut | (room > 0.0))
-        # image-border culls of fully_fused_projection_fwd.cu:171-180
-        gone = bounded & ((right <= 0.0) | (left >= width) | (bottom <= 0.0) | (top >= height))
-        # the tiles of an ellipse come from the conic, which may be wrong by any amount
-        boxed = bounded & (not ellipse)
-        s[T0 + q] = np.floor(_within(left / side, across)) if boxed else 0.0
-        s[T1 + q] = np.ceil(_within(right / side, across)) if boxed else across
-        s[T2 + q] = np.floor(_within(top / side, down)) if boxed else 0.0
-        s[T3 + q] = np.ceil(_within(bottom / side, down)) if boxed else down
-        # surely hit: the tile range of every mean and radius contains it
-        left, right = mean_x_high - radius_low + snap_x, mean_x_low + radius_low - snap_x
-        top, bottom = mean_y_high - radius_low + snap_y, mean_y_low + radius_low - snap_y
-        sure = placed & cut & (left < width) & (top < height) & (right > 0.0) & (bottom > 0.0)
-        whole = front & (not cut)
-        if room > 0.0:
-            # G12: where rounding moves a box or an ellipse by less than half a pixel
-            span = radius_high + max(abs(mean_x_low), abs(mean_x_high)) + max(abs(mean_y_low), abs(mean_y_high))
-            whole = whole & (s[ETA + q] * (1.0 + 4.0 * s[ETA + q]) < 0.05) & (8.0 * charges.tile * span < 1.0)
-            if ellipse:
-                thinnest = max(min(s[ALO + q], s[CLO + q]), 0.0) / (z_high * z_high)
-                sharpness = s[DET + q] / (a * c)
-                whole = whole & ellipse_is_met(sharpness, max(a, c), thinnest, s[ETA + q], span, charges)
-        s[T4 + q] = np.floor(_within(left / side, across)) if sure else 0.0
-        last = np.ceil(_within(right / side, across)) if sure else (across if whole else 0.0)
-        s[T5 + q] = s[T4 + q] if cut_off else last
-        s[T6 + q] = np.floor(_within(top / side, down)) if sure else 0.0
-        s[T7 + q] = np.ceil(_within(bottom / side, down)) if sure else (down if whole else 0.0)
-        s[GONE + q], s[FINITE + q] = 1.0 if gone else 0.0, 1.0 if finite else 0.0
-        s[FRONT + q], s[PLACED + q] = 1.0 if front else 0.0, 1.0 if placed else 0.0
-
-
-@njit(cache=True, error_model="numpy")
-def _opacities(s, n, rules, charges):
-    """Opacities, kappa and exponents (design.md, G7, G9, G11): KNOWN, GONE, columns of the record, REGIONLIMIT."""
-    alpha_min, antialiased = rules.alpha_min, rules.antialiased
-    for q in range(n):
-        det = s[DET + q]
-        finite = s[FINITE + q] != 0.0
-        # G7: relative error of the exponent
-        sharp_enough = (s[FRONT + q] != 0.0) & (det > 0.0) & (s[EDET + q] < 0.5 * det)
-        kappa = s[ETA + q]
-        region_is_known = (s[PLACED + q] != 0.0) & sharp_enough & (kappa < 0.25)
-        kappa = kappa * (1.0 + 4.0 * kappa)
-        lower = s[OPLOW + q] * (1.0 - charges.opacity)
-        upper = s[OPHIGH + q] * (1.0 + charges.opacity)
-        limit = s[OPLIMIT + q]
-        region_limit = limit
-        gone = s[GONE + q] != 0.0
-        if antialiased:
-            # G11; where the determinant may vanish, nothing is known of the compensation
-            region_is_known = region_is_known & (s[CTOP + q] < np.inf)
-            region_limit = limit + s[CTOPLOG + q]
-            limit = limit + s[CHIGHLOG + q]
-            all_of_it = min(1.0, upper * s[CTOP + q]) if sharp_enough & (s[CTOP + q] < np.inf) else 1.0
-            gone = gone | (all_of_it * (1.0 + charges.exponent_limit) < alpha_min)
-            lower = lower * s[CLOW + q] if region_is_known else lower
-            upper = upper * s[CHIGH + q] if region_is_known else all_of_it
-        # a minimum with a number is a number: an exponent that is none leaves the largest alpha
-        upper = upper if finite else max(1.0, upper)
-        gone = (gone & finite) | (region_is_known & (region_limit < 0.0))
-        s[R_OPACITY_LOW + q] = lower
-        s[R_OPACITY_HIGH + q] = upper
-        s[R_KAPPA + q] = kappa if region_is_known else 0.0
-        s[R_EXPONENT_LIMIT + q] = limit / (1.0 - kappa) if region_is_known else -1.0
-        s[REGIONLIMIT + q] = region_limit / (1.0 - kappa)
-        s[GONE + q], s[KNOWN + q] = 1.0 if gone else 0.0, 1.0 if region_is_known else 0.0
-
-
-@njit(cache=True, error_model="numpy")
-def _pixel_boxes(s, n, rules, camera):
-    """Pixels where alpha may reach the threshold (design.md, G9): rows BOX0 .. BOX3, GONE, and fewer tiles."""
-    width, height = camera.width, camera.height
-    side = _tile_side(rules)
-    for q in range(n):
-        region_is_known = s[KNOWN + q] != 0.0
-        extent_x = np.sqrt(2.0 * s[REGIONLIMIT + q] * s[A + q]) * REGION
-        extent_y = np.sqrt(2.0 * s[REGIONLIMIT + q] * s[C + q]) * REGION
-        left, right = s[MXLO + q] - extent_x, s[MXHI + q] + extent_x
-        top, bottom = s[MYLO + q] - extent_y, s[MYHI + q] + extent_y
-        # no pixel centre inside
-        outside = region_is_known & ((right < 0.5) | (left > width - 0.5) | (bottom < 0.5) | (top > height - 0.5))
-        s[GONE + q] = 1.0 if outside else s[GONE + q]
-        s[BOX0 + q] = left if region_is_known else -np.inf
-        s[BOX1 + q] = right if region_is_known else np.inf
-        s[BOX2 + q] = top if region_is_known else -np.inf
-        s[BOX3 + q] = bottom if region_is_known else np.inf
-        # tiles without such pixels need not look at it
-        s[T0 + q] = max(s[T0 + q], np.floor(max(left - 0.5, 0.0) / side)) if region_is_known else s[T0 + q]
-        s[T1 + q] = min(s[T1 + q], np.floor(min(right - 0.5, width) / side) + 1.0) if region_is_known else s[T1 + q]
-        s[T2 + q] = max(s[T2 + q], np.floor(max(top - 0.5, 0.0) / side)) if region_is_known else s[T2 + q]
-        s[T3 + q] = min(s[T3 + q], np.floor(min(bottom - 0.5, height) / side) + 1.0) if region_is_known else s[T3 + q]

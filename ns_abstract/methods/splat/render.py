@@ -150,6 +150,18 @@ def _set_color(sh, shift, degree, most, i, direction, basis, color):
             color[channel] = min(most, max(0.0, color[channel] + shift[i, channel]))
 
 
+@njit(cache=True, error_model="numpy", inline="always")
+def _ratio_limits(camera, margin):
+    """Sizes of x/z and y/z, to the left, right, top and bottom, that the Jacobian is clamped to."""
+    left = right = top = bottom = np.inf
+    if margin >= 0.0:
+        left = camera.cx / camera.fx + margin * 0.5 * camera.width / camera.fx
+        right = (camera.width - camera.cx) / camera.fx + margin * 0.5 * camera.width / camera.fx
+        top = camera.cy / camera.fy + margin * 0.5 * camera.height / camera.fy
+        bottom = (camera.height - camera.cy) / camera.fy + margin * 0.5 * camera.height / camera.fy
+    return left, right, top, bottom
+
+
 @njit(cache=True, error_model="numpy", nogil=True)
 def _project_worker(counter_, scene, rotation, position, eye, camera, rules, out):
     """One thread's Gaussians; see `ns_abstract.methods.splat.constants` for the rules' sources.
@@ -170,15 +182,10 @@ def _project_worker(counter_, scene, rotation, position, eye, camera, rules, out
     records, box, tiles = borrowed(out.record), borrowed(out.box), borrowed(out.tiles)
     depth, visible = borrowed(out.depth), borrowed(out.visible)
     fx, fy, cx, cy = camera.fx, camera.fy, camera.cx, camera.cy
-    tile, margin, alpha_min, eps2d = rules.work_tile, rules.view_margin, rules.alpha_min, rules.eps2d
+    tile, alpha_min, eps2d = rules.work_tile, rules.alpha_min, rules.eps2d
     tiles_x = int(math.ceil(camera.width / tile))
     tiles_y = int(math.ceil(camera.height / tile))
-    right = left = bottom = top = np.inf
-    if margin >= 0.0:
-        right = (camera.width - cx) / fx + margin * 0.5 * camera.width / fx
-        left = cx / fx + margin * 0.5 * camera.width / fx
-        bottom = (camera.height - cy) / fy + margin * 0.5 * camera.height / fy
-        top = cy / fy + margin * 0.5 * camera.height / fy
+    left, right, top, bottom = _ratio_limits(camera, rules.view_margin)
     r0 = rotation[0, 0], rotation[0, 1], rotation[0, 2]
     r1 = rotation[1, 0], rotation[1, 1], rotation[1, 2]
     r2 = rotation[2, 0], rotation[2, 1], rotation[2, 2]

@@ -1,0 +1,34 @@
+"""Starts the engine that options ask for."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Literal
+
+from ns_abstract.execution.cluster import Cluster, Tls, connected
+from ns_abstract.execution.engines import Engine, Processes, SerialEngine
+
+EngineName = Literal["local", "dask"]
+
+
+@contextmanager
+def started(name: EngineName, address: str | None, workers: int, tls: Tls | None = None) -> Iterator[Engine]:
+    """An engine, closed at the end of the block.
+
+    Args:
+        name: "dask", or "local": this process if there is one worker, otherwise processes.
+        address: HOST:PORT of a Dask scheduler; None: a cluster on this machine.
+        workers: Processes on this machine.
+        tls: As for `connected`.
+
+    Raises:
+        InputError: As `connected`.
+    """
+    with ExitStack() as stack:
+        if name == "dask":
+            engine: Engine = Cluster(stack.enter_context(connected(address, workers, tls)))
+        else:
+            engine = SerialEngine() if workers == 1 else Processes(workers)
+        stack.callback(engine.close)
+        yield engine
