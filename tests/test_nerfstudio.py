@@ -154,8 +154,8 @@ def test_other_methods_are_refused(nerfstudio: SimpleNamespace, folder: Path, tm
     shutil.copytree(folder / "blobs", tmp_path / "blobs")
     file = tmp_path / "blobs" / "splatfacto" / STAMP / "config.yml"
     text = file.read_text()
-    file.write_text(text.replace("models.splatfacto.SplatfactoModel", "models.nerfacto.NerfactoModel"))
-    with pytest.raises(InputError, match=r"names the model class 'nerfstudio.models.nerfacto.NerfactoModel'"):
+    file.write_text(text.replace("models.splatfacto.SplatfactoModel", "models.tensorf.TensoRFModel"))
+    with pytest.raises(InputError, match=r"names the model class 'nerfstudio.models.tensorf.TensoRFModel'"):
         nerfstudio.viewing.open_run(file)
     file.write_text(text.replace("engine.trainer.TrainerConfig", "engine.trainer.NoSuchConfig"))
     with pytest.raises(InputError, match="nerfstudio cannot open it"):

@@ -156,7 +156,7 @@ def _prepared(config: TrainerConfig, file: Path) -> TrainerConfig:
         config.pipeline.model = AbstractNerfModelConfig.of(model)
     elif not isinstance(model, (AbstractSplatfactoModelConfig, AbstractNerfModelConfig)):
         raise InputError(
-            f"the viewer does not bound the method {config.method_name}",
+            f"the method {config.method_name} is not bounded in the viewer",
             file=file,
             field="pipeline.model",
             fix="give a run of splatfacto, vanilla-nerf, abstract-splatfacto or abstract-nerf",

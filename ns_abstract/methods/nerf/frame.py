@@ -262,8 +262,12 @@ class FieldFrame(RayPictures):
         return parts
 
     def _tried(self, calls: Sequence[Sequence[Any]]) -> list[RayBounds | None]:
-        """See `_run`; None: there was no time for a call."""
-        raise NotImplementedError
+        """See `_run`; None: there was no time for a call. One after another."""
+        parts: list[RayBounds | None] = []
+        with suppress(WorkCancelledError):
+            for call in calls:
+                parts.append(self.bounds.rays(*call))
+        return parts + [None] * (len(calls) - len(parts))
 
     @cached_property
     def _strips(self) -> PoseStrips:
@@ -412,13 +416,9 @@ class NerfFrame(FieldFrame):
         self.renderer: NerfRenderer
 
     def _tried(self, calls: Sequence[Sequence[Any]]) -> list[RayBounds | None]:
-        """See `_run`; None: there was no time for a call."""
+        """See `_run`; None: there was no time for a call. In processes."""
         if len(calls) == 1 or self.workers == 1:
-            parts: list[RayBounds | None] = []
-            with suppress(WorkCancelledError):
-                for call in calls:
-                    parts.append(self.bounds.rays(*call))
-            return parts + [None] * (len(calls) - len(parts))
+            return super()._tried(calls)
         engine = _processes(self.workers)
         for number, call in enumerate(calls):
             engine.submit(number, _bound_share, self._token, self._recipe, self.bounds.displacement, call)
