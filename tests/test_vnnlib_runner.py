@@ -140,7 +140,7 @@ def test_unsafe_instances_are_never_proved(tmp_path: Path, monkeypatch: pytest.M
     assert shown >= 4
 
 
-def proved(file: Path, condition: str, asks: int = 1500) -> str:
+def proved(file: Path, condition: str, asks: int = 400) -> str:
     """What proofs alone say, since no output that the program computes is finite, until time has been asked for."""
     times = itertools.count()
     regions = load_regions(file.parent / "a", 2, 2, text(condition))
