@@ -395,7 +395,10 @@ def _bin(light, k, line, out):
     # 1 - exp(-x), up to a few units
     low = light.left[k, 0] * max(1.0 - exp_above(-light.least[k]), 0.0) - 8.0 * UNIT64
     high = light.left[k, 1] * (1.0 - exp_below(-light.most[k])) + 8.0 * UNIT64
-    low, high = max(low, 0.0) + HISTOGRAM_PADDING * (1.0 - 4.0 * UNIT64), high + HISTOGRAM_PADDING * (1.0 + 4.0 * UNIT64)
+    low, high = (
+        max(low, 0.0) + HISTOGRAM_PADDING * (1.0 - 4.0 * UNIT64),
+        high + HISTOGRAM_PADDING * (1.0 + 4.0 * UNIT64),
+    )
     pose_low, pose_high = pose_range(out, line, n)
     if rest < np.inf:
         low, high = max(low, out[0] + pose_low - rest), min(high, out[0] + pose_high + rest)
