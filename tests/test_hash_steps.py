@@ -33,8 +33,10 @@ def symbols(p: np.ndarray, line: bool) -> list[Fraction]:
 def value(one: np.ndarray, pose: list[Fraction], place: float = 0.0) -> Fraction:
     """A form without its radius, exactly."""
     terms = zip(one[1 : 1 + POSES], pose, strict=True)
-    return Fraction(float(one[0])) + sum(Fraction(float(g)) * s for g, s in terms) + Fraction(float(one[3])) * Fraction(
-        place
+    return (
+        Fraction(float(one[0]))
+        + sum(Fraction(float(g)) * s for g, s in terms)
+        + Fraction(float(one[3])) * Fraction(place)
     )
 
 

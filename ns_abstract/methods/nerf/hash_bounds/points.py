@@ -223,6 +223,21 @@ def _at_kinks(x, low, high, out):
 
 
 @njit(cache=True, error_model="numpy")
+def _largest(x, axis, positive, room, line, difference):
+    """Whether the coordinate ``axis`` surely is the largest of the forms ``x`` [3, n + 3] in size, by ``room``."""
+    sign = 1.0 if positive else -1.0
+    for i in range(3):
+        if i != axis:
+            for other in (-1.0, 1.0):
+                # as forms: coordinates that are far away grow together
+                scale_add(x[axis], sign * other, x[i], 0.0, difference)
+                low, high = form_range(difference, line)
+                if (low if other > 0.0 else -high) < room:
+                    return False
+    return True
+
+
+@njit(cache=True, error_model="numpy")
 def point(ray, distance, line, out, work):
     """Contracted point at ``distance`` as forms of ``(v + 2) / 4`` in [0, 1]^3 (design.md, H2).
 
@@ -251,14 +266,11 @@ def point(ray, distance, line, out, work):
     if not radius < np.inf:
         return False
     axis, nearest = -1, 0.0
-    for j in range(3):
-        near = max(low[j], -high[j])
-        others = 0.0
-        for i in range(3):
-            if i != j:
-                others = max(others, high[i], -low[i])
-        if near >= 1.0 and near >= others:
-            axis, nearest = j, near
+    if radius >= 1.0:
+        for j in range(3):
+            near = max(low[j], -high[j])
+            if near >= 1.0 and near > nearest and _largest(x, j, low[j] > 0.0, POINT_PLACE_ROUNDING * size, line, t):
+                axis, nearest = j, near
     if radius < 1.0:
         out[:] = x
         nearest = 1.0

@@ -1,0 +1,38 @@
+"""Frames of nerfacto: bounds over sets of poses hold every render, at tolerance zero (design.md, H8, F12)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from nerfactos import tiny_nerfacto
+from nerfs import poses
+
+from ns_abstract.methods.nerf.hash_bounds.frame import NerfactoFrame
+
+SETS = {
+    "yaw": {"rotation": {"yaw": 1e-3}},
+    "narrow": {"rotation": {"yaw": 1e-9}},
+    "orbit": {"orbit": {"target": [0, 0, 0], "axis": [0, 0.1, 1], "azimuth": [0.3, 0.302]}},
+    "two": {"rotation": {"yaw": 1e-4}, "translation": {"x": 1e-4}},
+}
+
+
+@pytest.mark.slow_cases
+@pytest.mark.parametrize("name", SETS)
+def test_sets_of_poses_are_enclosed(name: str) -> None:
+    """Bounds of rays, and planes of certificates, of half a set."""
+    pose_set = poses(SETS[name])
+    frame = NerfactoFrame(tiny_nerfacto(1), pose_set)
+    tiles, rng = np.arange(4), np.random.default_rng(0)
+    box = pose_set.box.split(0, 2)[0]
+    found, planes = frame.bound(box, tiles), frame.sets(box)
+    assert float((found.upper - found.lower).mean()) < 0.3
+    values = [box.middle, *box.corners(), *box.sample(12, rng)]
+    low, high, half = np.array(box.lower), np.array(box.upper), 0.5
+    assert planes.linear is not None
+    a_low, b_low, a_high, b_high = (part.astype(np.float64) for part in planes.linear)
+    for v in values:
+        exact = frame.precise(v)
+        assert np.all(found.lower <= exact[tiles]) and np.all(exact[tiles] <= found.upper)
+        p = (v - half * (low + high)) / (half * (high - low))
+        assert np.all(a_low @ p + b_low <= exact) and np.all(exact <= a_high @ p + b_high)
