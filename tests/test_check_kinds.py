@@ -24,6 +24,7 @@ from splat_files import glb_parts, write_checkpoints, write_compressed, write_gl
 
 import ns_abstract as nsa
 from ns_abstract.api.checking import check
+from ns_abstract.check import inputs
 from ns_abstract.check.fields import CheckedField
 from ns_abstract.check.forms import Affine
 from ns_abstract.check.inputs import BadInput, read_poses, read_scene
@@ -46,6 +47,7 @@ from ns_abstract.cli import certify as certify_command
 from ns_abstract.cli import check as check_command
 from ns_abstract.demo.writing import write_loop_demo
 from ns_abstract.geometry.camera_path import PinholeCamera as PathCamera
+from ns_abstract.geometry.camera_path import load_camera_path
 from ns_abstract.io.atomic import write_json
 from ns_abstract.methods.nerf.render import NerfRenderer
 from ns_abstract.methods.nerf.scene import NerfScene
@@ -529,3 +531,15 @@ def test_the_last_leg_of_a_cycle_is_swept(cycle: bool, blobs: Inputs, tmp_path: 
         end = np.array([[0.0, 1.0]])
         first = np.array(path["camera_path"][0]["camera_to_world"]).reshape(4, 4)[:3, 3]
         assert np.abs(poses.view(end, end).origin[0] - first).max() < 1e-12
+
+
+@pytest.mark.parametrize("down", [1.0, 1.7])
+def test_stated_intrinsics_are_those_of_the_picture(tmp_path: Path, down: float) -> None:
+    entry = {"camera_to_world": np.eye(4).reshape(-1).tolist(), "fx": 40.0, "cy": 11.25}
+    root = {"render_height": 24, "render_width": 32, "fy": 41.0, "cx": 15.5, "camera_path": [entry]}
+    path = tmp_path / "path.json"
+    path.write_text(json.dumps(root))
+    ours = load_camera_path(path, down).cameras[0].intrinsics
+    checked = inputs._camera(root, entry, down)
+    assert (checked.fx, checked.fy, checked.cx, checked.cy, checked.width, checked.height) == ours
+    assert inputs.lens({}, 90.0, 32, 24)[:2] == pytest.approx((12.0, 12.0))

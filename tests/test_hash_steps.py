@@ -66,7 +66,7 @@ def random_form(rng: np.random.Generator, center: float, size: float) -> np.ndar
 def test_products_and_quotients_of_forms_are_enclosed() -> None:
     rng = np.random.default_rng(0)
     for _ in range(DRAWS):
-        line, pose, place = draw(rng)
+        _, pose, place = draw(rng)
         a, b = (random_form(rng, rng.normal(), 0.3) for _ in range(2))
         out, scratch = np.zeros(5), np.zeros((2, 5))
         x, y = (member(rng, one, pose, place) for one in (a, b))
@@ -98,7 +98,7 @@ def test_bands_enclose_their_function(band: Callable, exact: Callable) -> None:
                 t = mpmath.mpf(x) - mpmath.mpf(center)
                 found = mpmath.mpf(v) + mpmath.mpf(slope) * t + mpmath.mpf(curvature) * t * t
                 assert abs(exact(mpmath.mpf(x)) - found) <= rest
-            line, pose, place = draw(rng)
+            _, pose, place = draw(rng)
             one, out = random_form(rng, center, min(reach, 3.0)), np.zeros(5)
             x = member(rng, one, pose, place)
             ends = forms.form_range(one, line)
@@ -121,7 +121,7 @@ def test_contracted_points_are_enclosed() -> None:
     rng = np.random.default_rng(2)
     inside = 0
     for k in range(3 * DRAWS):
-        line, pose, place = draw(rng)
+        _, pose, place = draw(rng)
         far = (0.3, 1.0, 3.0, 300.0)[k % 4]
         direction = rng.normal(size=3)
         if k % 3 == 0:
@@ -178,7 +178,7 @@ def test_features_are_enclosed_across_faces() -> None:
     table = rng.normal(size=(64, 2))
     ranges = np.stack([table.min(axis=0), table.max(axis=0)])
     for k in range(3 * DRAWS):
-        line, pose, place = draw(rng)
+        _, pose, place = draw(rng)
         resolution = int(rng.integers(4, 600))
         # on a face, near one, anywhere; within a cell, over some, over many
         center = rng.integers(1, resolution, 3) / resolution + (k % 3) * rng.uniform(0.0, 0.3, 3) / resolution
@@ -194,7 +194,7 @@ def test_networks_are_enclosed() -> None:
     rng = np.random.default_rng(5)
     rest = np.zeros((6, 16))
     for k in range(DRAWS // 2):
-        line, pose, place = draw(rng)
+        _, pose, place = draw(rng)
         net, head = random_net(rng, 6, 8, 4), random_net(rng, 16 + 3, 8, 8, 3)
         weights, head_weights = network.net_weights(net), network.head_weights(head, 16)
         size = (1e-8, 1e-3, 0.1, 1.0)[k % 4]

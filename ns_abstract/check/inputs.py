@@ -289,12 +289,24 @@ def given_set(settings: dict[str, Any], moved: Path | None) -> dict[str, Any] | 
 def _camera(root: dict[str, Any], entry: dict[str, Any], down: float) -> CheckedCamera:
     pose = np.array(entry["camera_to_world"], np.float64).reshape(4, 4)[:3]
     width, height = int(root["render_width"]), int(root["render_height"])
-    fov = root["default_fov"] if entry.get("fov") is None else entry["fov"]
-    focal = float(height / 2.0 / np.tan(float(fov) * (np.pi / 180.0) / 2.0))
+    own = {key: root.get(key) if entry.get(key) is None else entry[key] for key in ("fx", "fy", "cx", "cy")}
+    fov = root.get("default_fov") if entry.get("fov") is None else entry["fov"]
+    fx, fy, cx, cy = lens(own, fov, width, height)
     if down == 1.0:
-        return CheckedCamera(pose, focal, focal, width / 2.0, height / 2.0, width, height)
+        return CheckedCamera(pose, fx, fy, cx, cy, width, height)
     # nerfstudio holds the factor and the centre in float32
     scale = np.float32(1.0 / down)
-    cx, cy = (float(np.float32(side / 2.0) * scale) for side in (width, height))
+    cx, cy = (float(np.float32(place) * scale) for place in (cx, cy))
     wide, tall = (int(np.float32(side) * scale) for side in (width, height))
-    return CheckedCamera(pose, focal * float(scale), focal * float(scale), cx, cy, wide, tall)
+    return CheckedCamera(pose, fx * float(scale), fy * float(scale), cx, cy, wide, tall)
+
+
+def lens(own: dict[str, Any], fov: Any, width: float, height: float) -> tuple[float, float, float, float]:
+    """fx, fy, cx and cy in pixels: those of ``own`` that are stated, else by the vertical angle and the middle."""
+    if own.get("fx") is None:
+        fx = float(height / 2.0 / np.tan(float(fov) * (np.pi / 180.0) / 2.0))
+    else:
+        fx = float(own["fx"])
+    fy = fx if own.get("fy") is None else float(own["fy"])
+    cx, cy = (float(side / 2.0 if own.get(n) is None else own[n]) for n, side in (("cx", width), ("cy", height)))
+    return fx, fy, cx, cy

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from ns_abstract.check.forms import Affine, Array, U, fixed, parameters, product, rotation, total
-from ns_abstract.check.inputs import BadInput
+from ns_abstract.check.inputs import BadInput, lens
 from ns_abstract.check.networks import CheckedNetwork
 from ns_abstract.check.pictures import FIRST, Verdict, divided, units
 from ns_abstract.check.poses import TURNS, CameraForms, CheckedCamera, Poses
@@ -174,9 +174,9 @@ class CheckedLoop(_OfNetwork):
             problem = "has dynamics that this program does not follow"
             raise BadInput(problem, "report.json", "loop.dynamics.type", "audit an affine loop")
         height, width = self.shape["resize"]
-        focal = float(height / 2.0 / np.tan(float(loop["camera"]["fov"]) * (np.pi / 180.0) / 2.0))
+        stated = lens(loop["camera"], loop["camera"].get("fov", 45.0), width, height)
         pose = np.array(loop["camera"]["camera_to_world"], np.float64)[:3]
-        self.camera = CheckedCamera(pose, focal, focal, width / 2.0, height / 2.0, int(width), int(height))
+        self.camera = CheckedCamera(pose, *stated, int(width), int(height))
         self.steps, self.names = int(loop["steps"]), list(loop["state"])
         empty = {"offset": [0.0] * 3, "matrix": [[0.0] * len(self.names)] * 3}
         self.position = loop["camera"].get("position") or empty
