@@ -66,7 +66,7 @@ def random_form(rng: np.random.Generator, center: float, size: float) -> np.ndar
 def test_products_and_quotients_of_forms_are_enclosed() -> None:
     rng = np.random.default_rng(0)
     for _ in range(DRAWS):
-        _, pose, place = draw(rng)
+        line, pose, place = draw(rng)
         a, b = (random_form(rng, rng.normal(), 0.3) for _ in range(2))
         out, scratch = np.zeros(5), np.zeros((2, 5))
         x, y = (member(rng, one, pose, place) for one in (a, b))
@@ -121,7 +121,7 @@ def test_contracted_points_are_enclosed() -> None:
     rng = np.random.default_rng(2)
     inside = 0
     for k in range(3 * DRAWS):
-        _, pose, place = draw(rng)
+        line, pose, place = draw(rng)
         far = (0.3, 1.0, 3.0, 300.0)[k % 4]
         direction = rng.normal(size=3)
         if k % 3 == 0:
