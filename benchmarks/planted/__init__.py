@@ -8,6 +8,7 @@ from planted.fault import Fault, apply
 from planted.fields import FIELDS
 from planted.files import FILES
 from planted.forms import FORMS
+from planted.hash_fields import HASH_FIELDS
 from planted.inputs import INPUTS
 from planted.location import LOCATION
 from planted.loops import LOOPS
@@ -25,7 +26,7 @@ from planted.verdicts import VERDICTS
 FAULTS = (
     *FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS, *DEPTHS, *LOOPS, *CHECKS,
     *INPUTS, *NETWORKS, *NETWORK_ROWS, *PROCESSES, *RESULTS, *SCENES, *MAPS, *DIFFERENCES,
-    *PICTURES, *LOCATION, *FILES,
+    *PICTURES, *LOCATION, *FILES, *HASH_FIELDS,
 )  # fmt: skip
 
 __all__ = ["FAULTS", "Fault", "apply"]
