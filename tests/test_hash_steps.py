@@ -98,7 +98,7 @@ def test_bands_enclose_their_function(band: Callable, exact: Callable) -> None:
                 t = mpmath.mpf(x) - mpmath.mpf(center)
                 found = mpmath.mpf(v) + mpmath.mpf(slope) * t + mpmath.mpf(curvature) * t * t
                 assert abs(exact(mpmath.mpf(x)) - found) <= rest
-            _, pose, place = draw(rng)
+            line, pose, place = draw(rng)
             one, out = random_form(rng, center, min(reach, 3.0)), np.zeros(5)
             x = member(rng, one, pose, place)
             ends = forms.form_range(one, line)
@@ -230,7 +230,8 @@ class Ray:
         size = 10.0 ** rng.uniform(-7.0, -2.0)
         self.edges = distribution.edges_of(count, POSES)
         work = np.zeros((4, 5))
-        middles = np.sort(rng.uniform(0.0, 1.0, count + 1)) if seed % 3 else np.linspace(0.0, 1.0, count + 1)
+        # apart, and inside of the ray: edges of a member are in order
+        middles = np.linspace(0.01, 0.99, count + 1) + (seed % 3) * rng.uniform(-0.1, 0.1, count + 1) / count
         for j, middle in enumerate(middles):
             self.edges.place[j] = form(rng, middle, 0.2 * size / count, 0.2 * size / count)
             reach = forms.spread_of(self.edges.place[j])
@@ -265,7 +266,6 @@ class Ray:
             pose = [Fraction(0)] * 2
         signs = rng.choice([-1.0, 1.0], self.count + 1) if rng.integers(2) else rng.uniform(-1.0, 1.0, self.count + 1)
         places = np.array([float(value(one, pose, s)) for one, s in zip(self.edges.place, signs, strict=True)])
-        places = np.maximum.accumulate(places)
         distances = np.array([concrete.distance_at(s, 0.0, 0.99, True) for s in places])
         densities = np.zeros(self.count)
         for i in range(self.count):

@@ -8,6 +8,7 @@ from planted.fault import Fault, apply
 from planted.fields import FIELDS
 from planted.files import FILES
 from planted.forms import FORMS
+from planted.hash_bounds import HASH_BOUNDS
 from planted.hash_fields import HASH_FIELDS
 from planted.inputs import INPUTS
 from planted.location import LOCATION
@@ -26,7 +27,7 @@ from planted.verdicts import VERDICTS
 FAULTS = (
     *FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS, *DEPTHS, *LOOPS, *CHECKS,
     *INPUTS, *NETWORKS, *NETWORK_ROWS, *PROCESSES, *RESULTS, *SCENES, *MAPS, *DIFFERENCES,
-    *PICTURES, *LOCATION, *FILES, *HASH_FIELDS,
+    *PICTURES, *LOCATION, *FILES, *HASH_FIELDS, *HASH_BOUNDS,
 )  # fmt: skip
 
 __all__ = ["FAULTS", "Fault", "apply"]
