@@ -147,6 +147,21 @@ def test_contracted_points_are_enclosed() -> None:
     assert inside > DRAWS
 
 
+def test_kinks_of_the_contraction_are_enclosed() -> None:
+    """The largest coordinate changes in the middle of the piece, and nothing else has a radius."""
+    o = np.zeros((3, 5))
+    d = np.array([[0.7, 0.0, 0.0, 0.0, 0.0], [0.7, 0.02, 0.0, 0.0, 0.0], [0.1, 0.0, 0.0, 0.0, 0.0]])
+    t = np.array([3.0, 0.0, 0.0, 0.0, 0.0])
+    ratios, shifts, along = np.zeros((3, 3, 5)), np.zeros((3, 3, 5)), np.zeros(3, np.bool_)
+    work, out = np.zeros((24, 5)), np.zeros((3, 5))
+    points.quotients(o, d, LINE, ratios, shifts, along, work)
+    assert points.point((o, d, ratios, shifts, along), t, LINE, out, work)
+    for p in (-1.0, -0.5, 0.0, 0.5, 1.0):
+        pose = symbols(np.array([p, 0.0]), LINE)
+        exact = contracted([3 * value(d[a], pose) for a in range(3)])
+        assert all(holds(out[a], pose, 0.0, exact[a]) for a in range(3))
+
+
 def test_far_points_lose_no_more_than_their_depth_tells() -> None:
     """The rest of a far point's place is of second order in its relative depth, not of its distance."""
     rng = np.random.default_rng(3)
@@ -178,7 +193,11 @@ def test_features_are_enclosed_across_faces() -> None:
     table = rng.normal(size=(64, 2))
     ranges = np.stack([table.min(axis=0), table.max(axis=0)])
     for k in range(3 * DRAWS):
+<<<<<<< HEAD
         _, pose, place = draw(rng)
+=======
+        _line, pose, place = draw(rng)
+>>>>>>> h53b
         resolution = int(rng.integers(4, 600))
         # on a face, near one, anywhere; within a cell, over some, over many
         center = rng.integers(1, resolution, 3) / resolution + (k % 3) * rng.uniform(0.0, 0.3, 3) / resolution
@@ -194,7 +213,11 @@ def test_networks_are_enclosed() -> None:
     rng = np.random.default_rng(5)
     rest = np.zeros((6, 16))
     for k in range(DRAWS // 2):
+<<<<<<< HEAD
         _, pose, place = draw(rng)
+=======
+        _line, pose, place = draw(rng)
+>>>>>>> h53b
         net, head = random_net(rng, 6, 8, 4), random_net(rng, 16 + 3, 8, 8, 3)
         weights, head_weights = network.net_weights(net), network.head_weights(head, 16)
         size = (1e-8, 1e-3, 0.1, 1.0)[k % 4]

@@ -13,7 +13,7 @@ HASH_BOUNDS = (
     Fault(
         "hash fields: kinks of the contraction have one slope", _FOLDER + "points.py", "_at_kinks",
         "0.5 * (jacobian[1, i, k] - jacobian[0, i, k]) * HASH_UP", "0.0",
-        _STEPS + "test_contracted_points_are_enclosed",
+        _STEPS + "test_kinks_of_the_contraction_are_enclosed",
     ),
     Fault(
         "hash fields: slopes of features beyond a face are left out", _FOLDER + "features.py", "level_features",
