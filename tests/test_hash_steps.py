@@ -193,11 +193,7 @@ def test_features_are_enclosed_across_faces() -> None:
     table = rng.normal(size=(64, 2))
     ranges = np.stack([table.min(axis=0), table.max(axis=0)])
     for k in range(3 * DRAWS):
-<<<<<<< HEAD
-        _, pose, place = draw(rng)
-=======
         _line, pose, place = draw(rng)
->>>>>>> h53b
         resolution = int(rng.integers(4, 600))
         # on a face, near one, anywhere; within a cell, over some, over many
         center = rng.integers(1, resolution, 3) / resolution + (k % 3) * rng.uniform(0.0, 0.3, 3) / resolution
@@ -213,11 +209,7 @@ def test_networks_are_enclosed() -> None:
     rng = np.random.default_rng(5)
     rest = np.zeros((6, 16))
     for k in range(DRAWS // 2):
-<<<<<<< HEAD
-        _, pose, place = draw(rng)
-=======
         _line, pose, place = draw(rng)
->>>>>>> h53b
         net, head = random_net(rng, 6, 8, 4), random_net(rng, 16 + 3, 8, 8, 3)
         weights, head_weights = network.net_weights(net), network.head_weights(head, 16)
         size = (1e-8, 1e-3, 0.1, 1.0)[k % 4]

@@ -1,14 +1,8 @@
 """Affine forms over a piece of a pose set and one place, for the kernels of hash-grid fields (design.md, H1).
 
-<<<<<<< HEAD
-A form is an array [n + 3]: centre, coefficients of the n pose symbols, that of the place symbol, and a radius. Over
-one parameter ``p`` the pose symbols are two, ``p`` and ``2 p^2 - 1`` ("line"), so that curvature is followed; over
-more they are the parameters themselves.
-=======
 A form is an array [n + 3]: centre, coefficients of the n pose symbols, that of the place symbol, and a radius.
 Over one parameter ``p`` the pose symbols are two, ``p`` and ``2 p^2 - 1`` ("line"), so that curvature is followed;
 over more they are the parameters themselves.
->>>>>>> h53b
 """
 
 from __future__ import annotations
