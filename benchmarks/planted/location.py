@@ -58,11 +58,12 @@ LOCATION = (
     ),
     Fault(
         "location: sub-boxes whose bounds cross are excluded",
-        _PHOTO, "TiledPhoto.excluded", "(lower <= upper).all(axis=1) & ", "", _NUMBERS,
+        _PHOTO, "TiledPhoto.excluded", "(lower <= upper).all(axis=1)", "np.ones(lower.shape[::2], bool)", _NUMBERS,
     ),
     Fault(
         "location: a sub-box that is left is called empty",
-        _CELLS, "divided", "yield from divided(replace(inner, past=", "yield from divided(replace(cell, past=", _EMPTY,
+        _CELLS, "divided", "replace(inner, past=(*inner.past[:axis], line, *inner.past[axis + 1 :]))",
+        "replace(inner, past=(*cell.past[:axis], line, *cell.past[axis + 1 :]))", _EMPTY,
     ),
     Fault(
         "location: rounding of lines may exceed the overlap of sub-boxes",

@@ -616,7 +616,7 @@ SPLATS = (
         _INTERVALS,
         "blend_parts",
         "load8(out, at + part)",
-        "ends",
+        "load8(out, at)",
         "test_intervals.py::test_blends_over_parts_hold_every_exact_blend[2.0-counts3]",
     ),
     Fault(
