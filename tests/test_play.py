@@ -391,8 +391,9 @@ def certificate(folder: Path) -> Path:
         ]  # fmt: skip
 
     about = CertifiedRun(
-        "float32-sound", ("sound",), {"name": "gsplat", "version": "1.4.0"}, {"name": "a <script>"}, {"name": "net"},
-        {}, "it holds", {}, {}, ("run",),
+        guarantee="float32-sound", renderer={"name": "gsplat", "version": "1.4.0"}, scene={"name": "a <script>"},
+        fingerprint={}, settings={}, command=("run",), network_guarantee=("sound",), model={"name": "net"}, property={},
+        sentence="it holds",
     )  # fmt: skip
     document = certificate_document(
         about, [entry(0, ("azimuth",)), entry(1, ("azimuth", "<b>"))], state="done", trace=[], seconds=1.0,
@@ -401,7 +402,9 @@ def certificate(folder: Path) -> Path:
     )  # fmt: skip
     red = preview(np.full((4, 4, 3), (200, 10, 10), np.uint8), 64)
     cells = {0: rows(0.0), 1: rows(4.0)}
-    found = [(stop, PoseImage(stop.at, stop.values, red, [1.0], 0.5)) for stop in stops(document["frames"], cells, 8)]
+    found = [
+        (stop, PoseImage(stop.at, stop.values, red, [1.0], 0.5)) for stop in stops(document["frames"], cells, most=8)
+    ]
     seen = {(0, 1): {"png": red, "text": "broken </script>"}}
     page = certificate_page(document, cells, [], seen, closer=CertificateDetails(stops=found))
     (folder / "certificate.html").write_text(page)

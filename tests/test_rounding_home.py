@@ -31,6 +31,7 @@ KNOWN = {
     "methods/nerf/render.py": {"1e-05"},  # Nerfstudio's least sum of weights
     "methods/splat/constants.py": {"1e-10"},  # gsplat's least accumulation
     "methods/splat/drawable.py": {"np.spacing"},  # a note on how coarse coordinates are
+    "methods/nerf/nerfacto_load.py": {"np.spacing"},  # a note on resolutions near an integer
     # an optimiser's settings, which no picture sees
     "methods/nerf/write.py": {"1e-08"},
     "methods/splat/write.py": {"1e-15"},
@@ -87,6 +88,9 @@ def bare(text: str) -> list[str]:
             if value is not None and 0.0 < value < 1e-4:
                 found.append(ast.unparse(node))
         elif isinstance(node, ast.Attribute) and node.attr in _EXACTNESS:
+            # a field's spacing is no number's
+            if node.attr == "spacing" and ast.unparse(node.value) != "np":
+                continue
             # a table of exact values is read as such
             if node.attr != "fromhex" or "_TABLES" not in text:
                 found.append(ast.unparse(node))

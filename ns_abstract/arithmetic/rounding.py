@@ -279,6 +279,24 @@ SHARE_BINS = 16
 #: H8: the middle of a piece of a box, half its width and the ends of its parts: quotients, products and sums, 8; as
 #: many to spare; by the number of pieces where they are told in half-widths of a piece.
 PIECE_END_ROUNDING = 16.0 * UNIT64
+#: H6: middles, halves, what is left of shares, and a place of an edge at one pose: at most 3 roundings of numbers as
+#: large as those beside; 1 to spare.
+HASH_SUM_ROUNDING = 4.0 * UNIT64
+#: H6, H7: light, weights and quotients of them, of numbers of at most 1: exponentials bounded by themselves, and at
+#: most 5 differences, products and quotients; ends of a colour's form, a sum of few numbers; 3 to spare.
+HASH_LIGHT_ROUNDING = 8.0 * UNIT64
+#: H6: a place within one bin, by its form or its ends: at most 10 roundings of numbers of at most 1; 6 to spare.
+HASH_PLACE_ROUNDING = 16.0 * UNIT64
+#: H6: a place over several bins; H8: a form's ends over part of a box: at most 22; 10 to spare.
+HASH_PLACES_ROUNDING = 32.0 * UNIT64
+#: H6: a distance as a function of its place, with slope and bend: four times a distance's.
+SPACING_BAND_ROUNDING = 4.0 * SPACING_ROUNDING
+#: H1: a product of forms: twice a form's rule.
+HASH_PRODUCT_ROUNDING = 2.0 * FORM_ROUNDING
+#: H8: an end of a part in half-widths: twice a piece's.
+PIECE_PART_ROUNDING = 2.0 * PIECE_END_ROUNDING
+#: H6: no charge: what stands for a quotient's 0.
+HASH_LEAST = 1e-300
 #: H7: compositing in both evaluations, absolute, by sample: at most 12 operations on numbers of at most 1; 4 to spare.
 HASH_SAMPLE_ROUNDING = 16.0 * UNIT64
 

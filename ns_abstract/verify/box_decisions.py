@@ -56,6 +56,8 @@ class BoxTuning:
     #: with plain ones.
     lines: float = 0.3
     dear: float = 2.0
+    #: What a step is taken to need at least.
+    least_seconds: float = 1e-6
 
 
 _TUNING = BoxTuning()
@@ -214,7 +216,9 @@ class _BoxSearch:
         start = self.deadline.left
         tree, left = self._tree(family, which, images, 0, family.unsafe.groups)
         allowed = _TUNING.lines * self.deadline.left
-        steps = min(_STEPS, int(min(1e6, allowed / max(1e-6, _TUNING.dear * (start - self.deadline.left)))))
+        steps = min(
+            _STEPS, int(min(1e6, allowed / max(_TUNING.least_seconds, _TUNING.dear * (start - self.deadline.left))))
+        )
         if left and self._attack(family, np.array([which]), *_TUNING.later, left):
             return True
         if left and steps:

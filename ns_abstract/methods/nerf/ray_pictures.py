@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -18,9 +19,18 @@ from ns_abstract.methods.nerf.render import Shift
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.refine.protocol import Frame, SceneSample
 
-#: Step of the difference quotient that tells how far the picture moves, as a part of the parameter's range; and
-#: pixels that a turn of the whole circle of hues counts for. Both are preferences.
-_MOTION_STEP, _SHIFT_MOTION = 2.0**-10, 6.0
+
+@dataclass(frozen=True)
+class MotionTuning:
+    """How motion of pictures is told. None of them decides whether a bound holds."""
+
+    #: Step of the difference quotient that tells how far the picture moves, as a part of the parameter's range.
+    step: float = 2.0**-10
+    #: Pixels that a turn of the whole circle of hues counts for.
+    shift: float = 6.0
+
+
+_MOTION_STEP, _SHIFT_MOTION = MotionTuning.step, MotionTuning.shift
 
 
 class PixelRenderer(Protocol):

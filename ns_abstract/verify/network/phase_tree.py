@@ -32,7 +32,7 @@ class TreeTuning:
             of one without unstable neurons.
         first: The first step's size.
         tried: Neurons of which both halves are bounded before one is chosen.
-        easier: What the better half counts beside the worse one.
+        better_half: What the better half counts beside the worse one.
         waiting: Most branches that wait.
     """
 
@@ -42,7 +42,7 @@ class TreeTuning:
     last_steps: int = 60
     first: float = 0.2
     tried: int = 10
-    easier: float = 1.0
+    better_half: float = 1.0
     waiting: int = 1 << 14
 
 
@@ -236,7 +236,7 @@ class PhaseTree:
             bounds.append(rows.lower(found).reshape(-1, 2, g).max(2))
         # what is proved cannot become better
         ends = np.minimum(np.concatenate(bounds), 0.0)
-        score = ends.min(1) + self.tuning.easier * ends.max(1)
+        score = ends.min(1) + self.tuning.better_half * ends.max(1)
         chosen: dict[int, int] = {}
         for k, number in enumerate(owner):
             if number not in chosen or score[k] > score[chosen[number]]:

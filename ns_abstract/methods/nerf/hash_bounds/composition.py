@@ -5,7 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from ns_abstract.arithmetic.rounding import HASH_SAMPLE_ROUNDING, HASH_UP, UNIT64
+from ns_abstract.arithmetic.rounding import (
+    HASH_LIGHT_ROUNDING,
+    HASH_SAMPLE_ROUNDING,
+    HASH_UP,
+)
 from ns_abstract.methods.nerf.hash_bounds.distribution import _functional, times
 from ns_abstract.methods.nerf.hash_bounds.forms import exp_above, exp_below, pose_range
 
@@ -44,7 +48,7 @@ def weight_bounds(light, i, last):
         return light.left[i, 0], light.left[i, 1]
     low = light.left[i, 0] * max(1.0 - exp_above(-light.least[i]), 0.0)
     high = light.left[i, 1] * (1.0 - exp_below(-light.most[i]))
-    return max(low - 8.0 * UNIT64, 0.0), high + 8.0 * UNIT64
+    return max(low - HASH_LIGHT_ROUNDING, 0.0), high + HASH_LIGHT_ROUNDING
 
 
 @njit(cache=True, error_model="numpy")
@@ -132,7 +136,7 @@ def form_bounds(form, line):
     """Bounds of what `form_color` makes; all numbers where it is not finite."""
     n = form.shape[0] - 3
     low, high = pose_range(form, line, n)
-    rest = form[n + 2] + 8.0 * UNIT64 * (abs(low) + abs(high) + abs(form[0]))
+    rest = form[n + 2] + HASH_LIGHT_ROUNDING * (abs(low) + abs(high) + abs(form[0]))
     if not rest < np.inf:
         return -np.inf, np.inf
     return form[0] + low - rest, form[0] + high + rest

@@ -10,11 +10,16 @@ from numba import njit
 from ns_abstract.arithmetic.rounding import (
     DEPTH_PRODUCT_ROUNDING,
     DEPTH_SUM_ROUNDING,
+    HASH_LEAST,
+    HASH_LIGHT_ROUNDING,
+    HASH_PLACE_ROUNDING,
+    HASH_PLACES_ROUNDING,
+    HASH_SUM_ROUNDING,
     HASH_UP,
     SHARE_BINS,
     SHARE_ROUNDING,
+    SPACING_BAND_ROUNDING,
     SPACING_ROUNDING,
-    UNIT64,
 )
 from ns_abstract.methods.nerf.hash_bounds.forms import (
     exp_above,
@@ -124,11 +129,11 @@ def space(edges, j, spacing, line, work):
         out[n + 2] += room
         edges.near[j], edges.far[j] = at_low, at_high
         return
-    near = 2.0 * at_low if at_low < 0.5 else 1.0 / max(2.0 - 2.0 * at_low, 1e-300)
+    near = 2.0 * at_low if at_low < 0.5 else 1.0 / max(2.0 - 2.0 * at_low, HASH_LEAST)
     far = 2.0 * at_high if at_high < 0.5 else 1.0 / (2.0 - 2.0 * at_high)
     if not at_high < 1.0:
         far = np.inf
-    edges.near[j], edges.far[j] = max(near * (1.0 - 4.0 * SPACING_ROUNDING), 0.0), far * (1.0 + 4.0 * SPACING_ROUNDING)
+    edges.near[j], edges.far[j] = max(near * (1.0 - SPACING_BAND_ROUNDING), 0.0), far * (1.0 + SPACING_BAND_ROUNDING)
     y[n + 2] += room
     form_low, form_high = form_range(y, line)
     if form_high <= 0.5:
@@ -147,7 +152,7 @@ def space(edges, j, spacing, line, work):
         bend = 4.0 / (end * end * end) * reach * reach * HASH_UP
         y[0] = 0.0
         scale_add(y, slope, nothing, value + 0.5 * bend, out)
-        out[n + 2] += 0.5 * bend * HASH_UP + 4.0 * SPACING_ROUNDING * (1.0 + abs(value))
+        out[n + 2] += 0.5 * bend * HASH_UP + SPACING_BAND_ROUNDING * (1.0 + abs(value))
     else:
         out[:] = 0.0
         out[n + 2] = np.inf
@@ -162,7 +167,7 @@ def _keep_finite(form, low, high):
     if not abs(form[n + 1]) + form[n + 2] <= half:
         form[:] = 0.0
         form[0] = low + half if half < np.inf else low
-        form[n + 1] = (half + 4.0 * UNIT64 * abs(form[0])) * HASH_UP
+        form[n + 1] = (half + HASH_SUM_ROUNDING * abs(form[0])) * HASH_UP
         form[n + 2] = 0.0
 
 
@@ -178,7 +183,7 @@ def middle_of(edges, i, out):
     for s in range(n + 1):
         out[s] = 0.5 * (a[s] + b[s])
     start, stop = 0.5 * a[n + 1], 0.5 * b[n + 1]
-    total = start + stop + 0.5 * (a[n + 2] + b[n + 2]) + 4.0 * UNIT64 * (abs(a[0]) + abs(b[0]))
+    total = start + stop + 0.5 * (a[n + 2] + b[n + 2]) + HASH_SUM_ROUNDING * (abs(a[0]) + abs(b[0]))
     out[n + 1], out[n + 2] = total * HASH_UP, 0.0
     if total > 0.0:
         return start / out[n + 1], stop / out[n + 1]
@@ -210,7 +215,7 @@ def add_depth(edges, i, density, bounds, shares, line, light, work):
     length[n + 1], length[n + 2] = -a[n + 1], b[n + 1]
     length[n + 3] = (a[n + 2] + b[n + 2] + SPACING_ROUNDING * (abs(a[0]) + abs(b[0]))) * HASH_UP
     value[n + 1], value[n + 2] = density[n + 1] * shares[0], density[n + 1] * shares[1]
-    left = max(1.0 - shares[0] - shares[1], 0.0) + 4.0 * UNIT64
+    left = max(1.0 - shares[0] - shares[1], 0.0) + HASH_SUM_ROUNDING
     value[n + 3] = (density[n + 2] + abs(density[n + 1]) * left) * HASH_UP
     multiply(length, value, line, out)
     out[n + 3] += DEPTH_PRODUCT_ROUNDING * (abs(out[0]) + spread_of(out))
@@ -301,10 +306,10 @@ def _add_up(light, i, line, n):
                 value += 0.5 * curvature * reach * reach
                 rest += 0.5 * curvature * reach * reach
         if rest < half:
-            out[0], out[1], out[2], out[3] = value, slope, bend, (rest + 8.0 * UNIT64 * abs(value)) * HASH_UP
+            out[0], out[1], out[2], out[3] = value, slope, bend, (rest + HASH_LIGHT_ROUNDING * abs(value)) * HASH_UP
             return
     out[0], out[1], out[2] = light.left[k, 0] + half, 0.0, 0.0
-    out[3] = (half + 4.0 * UNIT64) * HASH_UP
+    out[3] = (half + HASH_SUM_ROUNDING) * HASH_UP
 
 
 @njit(cache=True, error_model="numpy")
@@ -390,14 +395,14 @@ def _bin(light, k, line, out):
         out[s] = there[1] * light.total[k + 1, s] - here[1] * light.total[k, s]
     if line:
         out[2] += here[2] - there[2]
-    rest = here[3] + there[3] + 8.0 * UNIT64
+    rest = here[3] + there[3] + HASH_LIGHT_ROUNDING
     rest = (rest + _functional(light, k + 1, k, 0.0, -here[1], there[1], (0.0, 0.0), 1.0)) * HASH_UP
     # 1 - exp(-x), up to a few units
-    low = light.left[k, 0] * max(1.0 - exp_above(-light.least[k]), 0.0) - 8.0 * UNIT64
-    high = light.left[k, 1] * (1.0 - exp_below(-light.most[k])) + 8.0 * UNIT64
+    low = light.left[k, 0] * max(1.0 - exp_above(-light.least[k]), 0.0) - HASH_LIGHT_ROUNDING
+    high = light.left[k, 1] * (1.0 - exp_below(-light.most[k])) + HASH_LIGHT_ROUNDING
     low, high = (
-        max(low, 0.0) + HISTOGRAM_PADDING * (1.0 - 4.0 * UNIT64),
-        high + HISTOGRAM_PADDING * (1.0 + 4.0 * UNIT64),
+        max(low, 0.0) + HISTOGRAM_PADDING * (1.0 - HASH_SUM_ROUNDING),
+        high + HISTOGRAM_PADDING * (1.0 + HASH_SUM_ROUNDING),
     )
     pose_low, pose_high = pose_range(out, line, n)
     if rest < np.inf:
@@ -423,7 +428,7 @@ def _one_bin(light, count, edges, k, share, line, out, work):
     for s in range(n + 1):
         value[s] -= part * weight[s]
     rest = share * end[3] + (1.0 - part) * here[3] + part * there[3]
-    rest += SHARE_ROUNDING * (count + SHARE_BINS) * (1.0 + HISTOGRAM_PADDING * count) + 8.0 * UNIT64
+    rest += SHARE_ROUNDING * (count + SHARE_BINS) * (1.0 + HISTOGRAM_PADDING * count) + HASH_LIGHT_ROUNDING
     length, spread_length = behind[0] - before[0], 0.0
     for s in range(1, n + 1):
         spread_length += abs(behind[s] - before[s])
@@ -462,7 +467,7 @@ def _one_bin(light, count, edges, k, share, line, out, work):
     if line:
         out[2] += 0.5 * bent
     rest = abs(scale) * rest + abs(length) * products + own_rest
-    return (followed + rest) * HASH_UP + 16.0 * UNIT64 * (1.0 + abs(scale) * reach)
+    return (followed + rest) * HASH_UP + HASH_PLACE_ROUNDING * (1.0 + abs(scale) * reach)
 
 
 @njit(cache=True, error_model="numpy")
@@ -474,7 +479,7 @@ def _slopes_of_bins(light, edges, first, past, line, work):
         longest = edges.high[k + 1] - edges.low[k]
         shortest = max(edges.low[k + 1] - edges.high[k], 0.0)
         least, most = min(least, shortest / high), max(most, longest / low)
-    return least * (1.0 - 8.0 * UNIT64), most * (1.0 + 8.0 * UNIT64)
+    return least * (1.0 - HASH_LIGHT_ROUNDING), most * (1.0 + HASH_LIGHT_ROUNDING)
 
 
 @njit(cache=True, error_model="numpy")
@@ -502,7 +507,7 @@ def _several_bins(light, count, edges, first, past, share, line, out, work):
     for s in range(n + 1):
         out[s] = edges.place[k, s] + slope * value[s]
     out[0] += 0.5 * corner
-    return (symbols + abs(slope) * rest + max(wide[0], wide[1]) + 0.5 * abs(corner)) * HASH_UP + 32.0 * UNIT64
+    return (symbols + abs(slope) * rest + max(wide[0], wide[1]) + 0.5 * abs(corner)) * HASH_UP + HASH_PLACES_ROUNDING
 
 
 @njit(cache=True, error_model="numpy")
@@ -546,7 +551,7 @@ def follow(light, count, edges, wanted, line, out, work):
             return False
         if not rest < half:
             place[:] = 0.0
-            place[0], place[n + 1] = low + half, (half + 4.0 * UNIT64) * HASH_UP
+            place[0], place[n + 1] = low + half, (half + HASH_SUM_ROUNDING) * HASH_UP
         out.low[j], out.high[j] = low, high
     return True
 
@@ -562,4 +567,4 @@ def _within(light, count, edges, first, past, share, line, work):
     _, low_weight, _ = _bin(light, past - 1, line, work[1])
     part = min(max(high / low_weight, 0.0), 1.0)
     most = edges.high[past - 1] + part * (edges.high[past] - edges.high[past - 1])
-    return least - 16.0 * UNIT64, most + 16.0 * UNIT64
+    return least - HASH_PLACE_ROUNDING, most + HASH_PLACE_ROUNDING

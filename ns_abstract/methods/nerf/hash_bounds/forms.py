@@ -8,6 +8,7 @@ over more they are the parameters themselves.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numba import njit
@@ -18,6 +19,7 @@ from ns_abstract.arithmetic.rounding import (
     EXP_UP,
     FORM_ROUNDING,
     HASH_BAND_ROUNDING,
+    HASH_PRODUCT_ROUNDING,
     HASH_UP,
     UNDERFLOW64,
 )
@@ -26,8 +28,19 @@ from ns_abstract.arithmetic.rounding import (
 _LEAST, _MOST = -700.0, 700.0
 #: Ranges up to this half-width are followed by Taylor's formula, wider ones by a chord.
 _TAYLOR_RANGE = 0.5
-#: Chords with a lesser slope are replaced by the interval.
-_FLAT = 1e-280
+
+
+@dataclass(frozen=True)
+class BandTuning:
+    """From where on chords are replaced by an interval. None of them decides whether a bound holds."""
+
+    #: Least slope of a chord of the exponential.
+    flat: float = 1e-280
+    #: Least distance of a logistic function's value from 0 and 1 at which its place is looked for.
+    margin: float = 1e-12
+
+
+_FLAT, _MARGIN = BandTuning.flat, BandTuning.margin
 
 
 @njit(cache=True, error_model="numpy")
@@ -102,7 +115,7 @@ def multiply(a, b, line, out):
     out[0] = a[0] * b[0] + shift
     size_a, size_b = abs(a[0]) + spread_a, abs(b[0]) + spread_b
     rest = max(rest, 0.0) + size_a * b[k] + size_b * a[k] + a[k] * b[k]
-    out[k] = (rest + 2.0 * FORM_ROUNDING * size_a * size_b) * HASH_UP + UNDERFLOW64
+    out[k] = (rest + HASH_PRODUCT_ROUNDING * size_a * size_b) * HASH_UP + UNDERFLOW64
 
 
 @njit(cache=True, error_model="numpy")
@@ -141,7 +154,7 @@ def compose(a, derivatives, line, out, scratch):
     out[0] += f0
     size = abs(f0) + abs(f1) * reach + abs(f2) * reach * reach
     rest = abs(f1) * step[k] + abs(f2) * square[k] + f3 * reach * reach * reach
-    out[k] = (rest + 2.0 * FORM_ROUNDING * size) * HASH_UP + UNDERFLOW64
+    out[k] = (rest + HASH_PRODUCT_ROUNDING * size) * HASH_UP + UNDERFLOW64
 
 
 @njit(cache=True, error_model="numpy")
@@ -220,7 +233,7 @@ def sigmoid_band(center, low, high):
     if slope < 0.25:
         root = math.sqrt(0.25 - slope)
         for s in (0.5 - root, 0.5 + root):
-            if s > 1e-12 and s < 1.0 - 1e-12:
+            if s > _MARGIN and s < 1.0 - _MARGIN:
                 place = math.log(s / (1.0 - s))
                 if low < place < high:
                     there = s - slope * (place - center)

@@ -7,7 +7,14 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from ns_abstract.arithmetic.rounding import HASH_BAND_ROUNDING, HASH_UP, PIECE_END_ROUNDING, UNIT64
+from ns_abstract.arithmetic.rounding import (
+    HASH_BAND_ROUNDING,
+    HASH_PLACES_ROUNDING,
+    HASH_SUM_ROUNDING,
+    HASH_UP,
+    PIECE_END_ROUNDING,
+    PIECE_PART_ROUNDING,
+)
 from ns_abstract.methods.nerf.hash_bounds.composition import (
     form_bounds,
     form_color,
@@ -212,7 +219,7 @@ def _color(field, edges, i, count, line, rooms, room):
         for s in range(n + 1):
             form[s] = out[s]
         form[n + 1], form[n + 2] = out[n + 1] * start, out[n + 1] * stop
-        left = max(1.0 - start - stop, 0.0) + 4.0 * UNIT64
+        left = max(1.0 - start - stop, 0.0) + HASH_SUM_ROUNDING
         form[n + 3] = (out[n + 2] + abs(out[n + 1]) * left) * HASH_UP
         ends = sigmoid_band(low, low, low)[0], sigmoid_band(high, high, high)[0]
         bounds[0, i, c] = max(ends[0] - HASH_BAND_ROUNDING, 0.0)
@@ -251,8 +258,8 @@ def _start(rays, ray, middle, half, field, line, room):
     for j in range(count + 1):
         edges.place[j] = 0.0
         edges.place[j, 0] = j / count
-        edges.place[j, -2] = 4.0 * UNIT64
-        edges.low[j], edges.high[j] = j / count - 4.0 * UNIT64, j / count + 4.0 * UNIT64
+        edges.place[j, -2] = HASH_SUM_ROUNDING
+        edges.low[j], edges.high[j] = j / count - HASH_SUM_ROUNDING, j / count + HASH_SUM_ROUNDING
         space(edges, j, field.spacing, line, work)
 
 
@@ -352,7 +359,7 @@ def _on_part(form, line, low, high):
             ends = form[1 + k] * low[k], form[1 + k] * high[k]
             least, most = least + min(ends[0], ends[1]), most + max(ends[0], ends[1])
             size += abs(form[1 + k])
-    rest += 32.0 * UNIT64 * size
+    rest += HASH_PLACES_ROUNDING * size
     return least - rest, most + rest
 
 
@@ -379,8 +386,8 @@ def _keep(out, counts, place, cells, found, shown, line, low, high):
             part = part * counts[k] + at[k]
             # where the part begins and ends in the piece, with room for rounding
             scale = 2.0 * cells[k] / counts[k]
-            low[k] = max(at[k] * scale - 2.0 * place[k] - 1.0 - 2.0 * PIECE_END_ROUNDING * cells[k], -1.0)
-            high[k] = min((at[k] + 1) * scale - 2.0 * place[k] - 1.0 + 2.0 * PIECE_END_ROUNDING * cells[k], 1.0)
+            low[k] = max(at[k] * scale - 2.0 * place[k] - 1.0 - PIECE_PART_ROUNDING * cells[k], -1.0)
+            high[k] = min((at[k] + 1) * scale - 2.0 * place[k] - 1.0 + PIECE_PART_ROUNDING * cells[k], 1.0)
         for c in range(3):
             least, most = _on_part(shown[c], line, low, high)
             least, most = max(least, found[0, c]), min(most, found[1, c])
