@@ -26,7 +26,8 @@ HASH_BOUNDS = (
     ),
     Fault(
         "hash fields: the places of samples forget the rests of light", _FOLDER + "distribution.py", "_one_bin",
-        "return (followed + rest) * HASH_UP + HASH_PLACE_ROUNDING * (1.0 + abs(scale) * reach)", "return 0.5 * followed",
+        "return (followed + rest) * HASH_UP + HASH_PLACE_ROUNDING * (1.0 + abs(scale) * reach)",
+        "return 0.5 * followed",
         _STEPS + "test_light_and_places_of_samples_are_enclosed", True,
     ),
     Fault(
