@@ -199,7 +199,7 @@ def test_on_progress_ends_the_work(wall: nsa.Scene) -> None:
     assert all(p.frame == 0 and p.budget <= 600.0 and p.mpg >= p.mpg_witness for p in seen)
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize("how", ["signal", "raised"])
 def test_interrupt_keeps_what_is_known(how: str, wall: nsa.Scene, request: pytest.FixtureRequest) -> None:
     if how == "signal":

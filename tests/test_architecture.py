@@ -194,6 +194,7 @@ def test_modules_import_one_way() -> None:
     assert len(texts) > 200 and circle(texts) == []
 
 
+@pytest.mark.slow
 def test_only_the_plug_in_imports_nerfstudio() -> None:
     plug_in = {"nerfstudio", "viser", "torchmetrics", "gsplat"}
     for file in sources():

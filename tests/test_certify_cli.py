@@ -196,6 +196,7 @@ def attack(case: Case, folder: Path, frame: int = 0, poses: int = 6) -> tuple[in
 # ---------------------------------------------------------------- verdicts
 
 
+@pytest.mark.slow
 def test_given_set_is_that_of_a_file(
     blobs: Inputs, net: Path, tmp_path: Path, in_process: InProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -433,6 +433,7 @@ def test_bad_input_is_one_line(name: str, copy: Path, in_process: InProcess) -> 
     assert not (copy / "check.json").exists()
 
 
+@pytest.mark.slow
 def test_a_pickle_in_a_frame_file_is_not_run(copy: Path, in_process: InProcess, tmp_path: Path) -> None:
     class Evil:
         def __reduce__(self) -> Any:

@@ -266,6 +266,7 @@ BAD: dict[str, tuple[str, int, str]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", BAD)
 def test_a_forged_table_is_found(name: str, copy: Path, in_process: InProcess) -> None:
     change, expected, words = BAD[name]

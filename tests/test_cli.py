@@ -729,6 +729,7 @@ def test_worker_with_other_files_is_refused(blobs: Inputs, tmp_path: Path) -> No
         bound_part(other, TileTask(0, None), goal, False)
 
 
+@pytest.mark.slow
 @needs_dask
 def test_no_scheduler_at_the_address(
     blobs: Inputs, tmp_path: Path, call: Callable[..., tuple[int, str]], monkeypatch: pytest.MonkeyPatch

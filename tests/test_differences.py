@@ -211,6 +211,7 @@ def test_linear_bounds_hold_exact_differences() -> None:
             assert most <= Fraction(float(found[n])) <= most + Fraction(1, 10**9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("d", "order"), [(1, 2), (1, 1), (2, 2), (3, 1)])
 def test_polynomials_hold_exact_values(d: int, order: int) -> None:
     random = np.random.default_rng(d)

@@ -163,7 +163,7 @@ def test_numbers_are_those_of_the_description(name: str, degree: int, tmp_path: 
     assert np.abs(found.opacity_logits - scene.opacity_logits).max() < 0.05
 
 
-@pytest.mark.slow_cases(every=3)
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FORMATS)
 def test_bounds_hold_the_picture_of_another_decoder(name: str, tmp_path: Path) -> None:
     file, expected = FORMATS[name](tmp_path, source())

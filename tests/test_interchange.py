@@ -40,6 +40,7 @@ def run(call: Call, *options: object) -> tuple[int, str]:  # noqa: F811
     return call([str(option) for option in options], export_command.main)
 
 
+@pytest.mark.slow
 def test_exr_holds_the_bounds_bit_for_bit(call: Call, bounded: Path, tmp_path: Path) -> None:  # noqa: F811
     exr: Any = pytest.importorskip("OpenEXR", reason="OpenEXR is not installed (extra exr)")
     assert run(call, "exr", "--input-dir", bounded, "--output-dir", tmp_path / "new") == (0, "")
@@ -191,6 +192,7 @@ def test_a_statement_does_not_name_files_that_have_changed(
     assert "no such run" in error and error.count("\n") == 1
 
 
+@pytest.mark.slow
 def test_cells_that_are_not_those_of_the_report_are_not_stated(
     call: Call, certificate: Path, tmp_path: Path, bounded: Path,  # noqa: F811
 ) -> None:  # fmt: skip

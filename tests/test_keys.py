@@ -181,6 +181,7 @@ def pictures_that_differ(config: Any, names: list[str], picture: Any) -> set[str
     return found
 
 
+@pytest.mark.slow
 @needs_nerfstudio
 @pytest.mark.usefixtures("no_metric")
 def test_nerfstudio_nerf_pictures_depend_on_what_is_used_or_refused(nerfstudio: SimpleNamespace) -> None:

@@ -65,6 +65,7 @@ def test_a_run_is_read_as_it_was_written(run: Path) -> None:
 TABLE, PROPOSAL = "_model.field.mlp_base.model.0.hash_table", "_model.proposal_networks.0."
 
 
+@pytest.mark.slow_cases(every=3)
 @pytest.mark.parametrize(
     ("edit", "fragment"),
     [

@@ -99,6 +99,7 @@ def exact_least(layers: list[tuple[np.ndarray, np.ndarray]], b: np.ndarray, a: n
     return min(value(p) for p in pieces([Fraction(-1), Fraction(1)]))
 
 
+@pytest.mark.slow_cases(every=4)
 @pytest.mark.parametrize("radius", [0.0, 1e-6, 0.1, 1.0, 30.0])
 def test_bounds_lie_below_the_exact_minimum(radius: float, tmp_path: Path) -> None:
     gaps, spans = 0.0, 0.0
@@ -313,6 +314,7 @@ def test_rows_that_end_by_plan_lie_below_the_exact_minimum(
     assert gaps <= 7.0 * spans
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("which", [0, 1, 2, None])
 @pytest.mark.parametrize("net", ["residual", "gate"])
 def test_rows_that_rest_on_several_nodes(
@@ -608,6 +610,7 @@ def test_chains_of_maxima_beside_their_input(tmp_path: Path) -> None:
         assert (lower[cell] <= least).all() and np.isfinite(lower[cell]).all()
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("deep", [False, True])
 def test_curves_are_bounded_by_what_rows_leave(deep: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Lines that are close beside the width of a form may be far apart beside the true one: rows find out."""

@@ -74,6 +74,7 @@ def losing(depth: int, terms: int) -> Layers:
     return [(weight, np.zeros(terms + 1))] * depth
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("depth", [1, 2, 3])
 def test_sums_that_lose_as_much_as_they_can(depth: int, tmp_path: Path) -> None:
     layers = losing(depth, 120)

@@ -37,6 +37,7 @@ def box(lower: np.ndarray, upper: np.ndarray) -> ImageSets:
     return ImageSets(none, lower[None], none, upper[None], lower[None], upper[None])
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("arithmetic", ["float32", "real"])
 def test_claims_next_to_the_exact_minimum(arithmetic: NetworkArithmetic, tmp_path: Path) -> None:
     """What some image breaks exactly is never proved; a little below it is, where slopes alone prove less."""

@@ -412,6 +412,7 @@ def test_curvatures_of_two_layers(straight):
             assert low - 1e-15 <= value <= high + 1e-15
 
 
+@pytest.mark.slow
 def test_an_interval_replaces_a_form_that_says_less():
     """Bounds of alpha that are narrower than its form's radius: the pixel's radius is that of the interval (B7)."""
     alpha = np.array([0.5, 0.01, 0.02, 0.0, 0.0, 0.0])

@@ -194,6 +194,7 @@ def test_enclosure(name, order):
     assert escapes(poses, poses.box, order) == []
 
 
+@pytest.mark.slow_cases(every=3)
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize(("names", "radius"), [(SCENE_SHIFTS, 0.03), (SCENE_TURNS, 0.2), (SCENE_TURNS, 1e-9)])
 @pytest.mark.parametrize("name", ["nothing", "world", "orbit", "rotation"])
@@ -266,7 +267,7 @@ def thin_escapes(poses: PoseBox, order: int = 1) -> list:
     ]
 
 
-@pytest.mark.slow_cases(every=9)
+@pytest.mark.slow
 @pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("angle", [0.01, 0.3, 1.0, 2.0, 3.0])
 def test_segment(angle, order):
@@ -292,7 +293,7 @@ def test_segment_nearly_equal(angle):
     assert escapes(poses, poses.box, 1) == [] and thin_escapes(poses) == []
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize("gap", [1e-1, 1e-2, 1e-4, 1e-6, 4e-7, 1e-9])
 def test_segment_nearly_opposite(gap):
     for seed in range(3):

@@ -97,7 +97,6 @@ def law_file(file: Path, kind: str, n: int = 3, m: int = 2) -> Path:
     return f.write(file)
 
 
-@pytest.mark.slow_cases
 @pytest.mark.parametrize("kind", ["tanh", "relu", "vector", "selection"])
 def test_a_step_of_a_file_is_enclosed(tmp_path: Path, kind: str) -> None:
     """More than 2500 steps by kind as onnxruntime computes them, of states and controls in a set, exactly."""

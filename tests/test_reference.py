@@ -95,6 +95,7 @@ def apart(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.abs(a - b).max())
 
 
+@pytest.mark.slow_cases(every=3)
 @pytest.mark.parametrize("kind", KINDS)
 def test_same_image(kind: str) -> None:
     # these seeds have no decision within rounding of its threshold, so that no pixel is excused

@@ -154,6 +154,7 @@ def test_what_the_reader_takes_the_schema_takes(kind: str, folder: Path) -> None
     assert noticed >= NOTICED * refused > 100, (noticed, refused)
 
 
+@pytest.mark.slow
 def test_the_corpus_has_no_file_that_a_schema_refuses_alone(folder: Path) -> None:
     kinds = {"spec": ("perturbation", SET), "prop": ("property", EXAMPLES["property"][0]), "loop": ("loop", LOOP)}
     count = 0

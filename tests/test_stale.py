@@ -130,7 +130,7 @@ def test_same_version_is_resumed_and_exported(blobs: Inputs, tmp_path: Path, in_
     assert Report.resume(tmp_path / "out", run).kept == [0]
 
 
-@pytest.mark.slow_cases(every=5)
+@pytest.mark.slow_cases
 @others
 @pytest.mark.parametrize("kind", ["npz", "png"])
 def test_results_are_not_exported(kind: str, name: str, blobs: Inputs, tmp_path: Path, in_process: InProcess) -> None:

@@ -409,7 +409,7 @@ def render(options: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
     return leave.value.code
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize("poses", [{}, SHIFT])
 def test_command(poses: dict, make_blobs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Alone and with poses: the command's result contains members of the set, and the report counts them."""

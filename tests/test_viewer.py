@@ -436,6 +436,7 @@ def test_viewer_needs_nerfstudio(monkeypatch: pytest.MonkeyPatch, blobs: Inputs,
     one_line(*found, "nerfstudio", "pip install")
 
 
+@pytest.mark.slow
 def test_viewer_refuses_what_is_no_run(blobs: Inputs, call: Call) -> None:  # noqa: F811
     pytest.importorskip("viser", reason="nerfstudio is not installed (extra nerfstudio)")
     for file in (blobs.config.parent / "none.yml", blobs.path):
