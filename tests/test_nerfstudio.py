@@ -150,6 +150,7 @@ def test_a_run_that_was_moved_opens(nerfstudio: SimpleNamespace, folder: Path, t
         nerfstudio.viewing.open_run(file)
 
 
+@pytest.mark.slow
 def test_other_methods_are_refused(nerfstudio: SimpleNamespace, folder: Path, tmp_path: Path) -> None:
     shutil.copytree(folder / "blobs", tmp_path / "blobs")
     file = tmp_path / "blobs" / "splatfacto" / STAMP / "config.yml"
