@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from ns_abstract.refine.result import FrameResult, TracePoint, max_pixel_gap, mean_pixel_gap
 
@@ -99,6 +99,14 @@ def is_ring(parameter: Mapping[str, Any]) -> bool:
     return parameter["name"] == "azimuth" and parameter["upper"] - parameter["lower"] >= _RING
 
 
+class _OtherUnit(NamedTuple):
+    """A unit beside that of files, what values are multiplied by, and whether it is the one that was requested."""
+
+    unit: str
+    factor: float
+    is_requested: bool
+
+
 @dataclass(frozen=True)
 class ShownUnits:
     """Units that a set of poses was stated in: people read ranges in these, with the other unit beside them.
@@ -120,11 +128,16 @@ class ShownUnits:
 
     def axis(self, unit: str) -> tuple[str, float]:
         """The unit that values in ``unit`` are drawn in, and what they are multiplied by."""
-        if unit == "rad" and self.angle == "degrees":
-            return "degrees", math.degrees(1.0)
-        if unit == "normalised units" and self.translation == "dataset":
-            return "units of the data set", 1.0 / self.dataset_scale
-        return unit, 1.0
+        other = self._other(unit)
+        return (other.unit, other.factor) if other is not None and other.is_requested else (unit, 1.0)
+
+    def _other(self, unit: str) -> _OtherUnit | None:
+        """The second unit of values in ``unit``, where there is one to tell of."""
+        if unit == "rad":
+            return _OtherUnit("degrees", math.degrees(1.0), self.angle == "degrees")
+        if unit == "normalised units" and (self.translation == "dataset" or self.dataset_scale != 1.0):
+            return _OtherUnit("units of the data set", 1.0 / self.dataset_scale, self.translation == "dataset")
+        return None
 
     def value(self, name: str, unit: str, value: float) -> str:
         """A parameter's value for people: as it is stored, behind it in the unit that was asked for."""
@@ -157,16 +170,11 @@ class ShownUnits:
 
     def interval(self, name: str, unit: str, low: float, high: float) -> str:
         """One side of a box for people, in the unit that was requested and in the other one."""
-        text, ends = interval(name, unit, low, high), (low, high)
-        if unit == "rad":
-            other, is_requested, ends = "degrees", self.angle == "degrees", [math.degrees(end) for end in ends]
-        elif unit == "normalised units" and (self.translation == "dataset" or self.dataset_scale != 1.0):
-            other, is_requested = "units of the data set", self.translation == "dataset"
-            ends = [end / self.dataset_scale for end in ends]
-        else:
+        text, other = interval(name, unit, low, high), self._other(unit)
+        if other is None:
             return text
-        beside = interval(name, other, *ends)
-        first, second = (beside, text) if is_requested else (text, beside)
+        beside = interval(name, other.unit, low * other.factor, high * other.factor)
+        first, second = (beside, text) if other.is_requested else (text, beside)
         return f"{first} ({second.removeprefix(name).strip().removeprefix('∈ ')})"
 
 

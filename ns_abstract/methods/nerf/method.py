@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +14,13 @@ from ns_abstract.methods.nerf.bounds import basis_of, device_bytes
 from ns_abstract.methods.nerf.device import check_device, processes_that_fit
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.occupancy import VOXEL_BYTES, OccupancyGrid
-from ns_abstract.methods.nerf.ray_pictures import FieldMethod, check_arithmetic
+from ns_abstract.methods.nerf.ray_pictures import (
+    FieldMethod,
+    arrays_digest,
+    check_arithmetic,
+    picture_of_parameters,
+    refuse_layers,
+)
 from ns_abstract.methods.nerf.render import Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.nerf.weights import NerfWeightFrame
@@ -117,8 +122,7 @@ class NerfMethod(FieldMethod):
         Raises:
             InputError: Layers are asked for: a NeRF's depth is a median.
         """
-        if layers:
-            raise InputError("depth and accumulation of a NeRF are not bounded", field="--outputs", fix="leave it out")
+        refuse_layers(layers)
         return NerfFrame(self.scene, self.sampling, poses, self.device, self._processes(poses.geometry.box.dimensions))
 
     def weight_frame(self, poses: PoseBox, planes: Sequence[WeightPlane], pixels: np.ndarray) -> NerfWeightFrame:
@@ -136,10 +140,6 @@ class NerfMethod(FieldMethod):
             return self.workers
         field, swept = self.scene.fine, self.sampling.kind == "hierarchical"
         return processes_that_fit(device_bytes(field, basis_of(dimensions + swept, field)), self.workers)
-
-    def ablations(self, poses: PoseBox) -> Iterator[tuple[str, NerfFrame]]:
-        """None are known."""
-        return iter(())
 
     def memory(self, pixels: int, threads: int) -> int:
         """See `Method.memory`; rays are bounded one after another."""
@@ -172,11 +172,8 @@ class NerfMethod(FieldMethod):
     @property
     def fingerprint(self) -> dict[str, Any]:
         """Scene and program, for results that are continued."""
-        digest = hashlib.sha256()
         fields = [self.scene.fine] + [self.scene.coarse] * (self.sampling.kind == "hierarchical")
-        for array in (array for field in fields for array in field.arrays()):
-            digest.update(repr(array.shape).encode())
-            digest.update(np.ascontiguousarray(array).tobytes())
+        digest = arrays_digest(array for field in fields for array in field.arrays())
         if self.scene.occupancy is not None:
             digest.update(self.scene.occupancy.digest)
         digest.update(repr((self.scene.fine.position, self.scene.fine.direction, self.sampling)).encode())
@@ -199,10 +196,6 @@ class NerfMethod(FieldMethod):
 
     def differentiable(self, poses: PoseBox) -> Callable[[torch.Tensor], torch.Tensor]:
         """Parameter values [d] to the picture [H, W, 3], by the concrete renderer."""
-        from ns_abstract.geometry.differentiable_pose import differentiable_pose
-        from ns_abstract.methods.nerf.hsv import color_shift
         from ns_abstract.methods.nerf.render import NerfRenderer
 
-        renderer, pose = NerfRenderer(self.scene, self.sampling), differentiable_pose(poses.geometry)
-        count, camera = poses.geometry.box.dimensions, poses.camera
-        return lambda values: renderer.picture(camera, pose(values[:count]), color_shift(poses, values.unbind()))
+        return picture_of_parameters(poses, NerfRenderer(self.scene, self.sampling).picture)

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.device import check_device
 from ns_abstract.methods.nerf.hash_bounds.frame import NerfactoFrame
 from ns_abstract.methods.nerf.hash_field import NerfactoScene
-from ns_abstract.methods.nerf.ray_pictures import FieldMethod, check_arithmetic
+from ns_abstract.methods.nerf.ray_pictures import (
+    FieldMethod,
+    arrays_digest,
+    check_arithmetic,
+    picture_of_parameters,
+    refuse_layers,
+)
 from ns_abstract.methods.program_options import ProgramOptions
 
 if TYPE_CHECKING:
@@ -88,13 +92,8 @@ class NerfactoMethod(FieldMethod):
         Raises:
             InputError: Layers are asked for: a NeRF's depth is a median.
         """
-        if layers:
-            raise InputError("depth and accumulation of a NeRF are not bounded", field="--outputs", fix="leave it out")
+        refuse_layers(layers)
         return NerfactoFrame(self.scene, poses, self.workers)
-
-    def ablations(self, poses: PoseBox) -> Iterator[tuple[str, NerfactoFrame]]:
-        """None are known."""
-        return iter(())
 
     def memory(self, pixels: int, threads: int) -> int:
         """See `Method.memory`; rays are bounded one after another."""
@@ -114,10 +113,8 @@ class NerfactoMethod(FieldMethod):
     @property
     def fingerprint(self) -> dict[str, Any]:
         """Scene and program, for results that are continued."""
-        f, digest = self.scene.field, hashlib.sha256()
-        for array in f.arrays():
-            digest.update(repr(array.shape).encode())
-            digest.update(np.ascontiguousarray(array).tobytes())
+        f = self.scene.field
+        digest = arrays_digest(f.arrays())
         behind = f.background if isinstance(f.background, str) else f.background.tolist()
         factors = f.average_init_density, *(one.average_init_density for one in f.proposals)
         digest.update(repr((f.samples, f.near, f.far, f.spacing, behind, factors, f.contraction)).encode())
@@ -141,13 +138,7 @@ class NerfactoMethod(FieldMethod):
 
     def differentiable(self, poses: PoseBox) -> Callable[[torch.Tensor], torch.Tensor]:
         """Parameter values [d] to the picture [H, W, 3], in torch."""
-        from ns_abstract.geometry.differentiable_pose import differentiable_pose
-        from ns_abstract.methods.nerf.hsv import color_shift
         from ns_abstract.methods.nerf.nerfacto_torch import DifferentiableNerfacto
         from ns_abstract.methods.nerf.render import differentiable_picture
 
-        field, pose = DifferentiableNerfacto(self.scene.field), differentiable_pose(poses.geometry)
-        count, camera = poses.geometry.box.dimensions, poses.camera
-        return lambda values: differentiable_picture(
-            field, camera, pose(values[:count]), color_shift(poses, values.unbind())
-        )
+        return picture_of_parameters(poses, partial(differentiable_picture, DifferentiableNerfacto(self.scene.field)))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import hashlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
@@ -18,6 +19,9 @@ from ns_abstract.methods.nerf.hsv import color_shift
 from ns_abstract.methods.nerf.render import Shift
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.refine.protocol import Frame, SceneSample
+
+if TYPE_CHECKING:
+    import torch
 
 
 @dataclass(frozen=True)
@@ -166,6 +170,10 @@ class FieldMethod:
     def elements(self) -> None:
         """A field has none."""
 
+    def ablations(self, poses: PoseBox) -> Iterator[tuple[str, Frame]]:
+        """None are known."""
+        return iter(())
+
     def prepare(self, perturbations: Sequence[Perturbation]) -> None:
         """Refuse what needs Gaussians.
 
@@ -182,3 +190,29 @@ def check_arithmetic(arithmetic: str | None) -> None:
         raise InputError(
             "float32 evaluations of a NeRF's networks cannot be enclosed tightly", field="--arithmetic", fix="use real"
         )
+
+
+def refuse_layers(layers: bool) -> None:
+    """Raise InputError where depth or accumulation are asked for: a NeRF's depth is a median."""
+    if layers:
+        raise InputError("depth and accumulation of a NeRF are not bounded", field="--outputs", fix="leave it out")
+
+
+def arrays_digest(arrays: Iterable[np.ndarray]) -> hashlib._Hash:
+    """SHA-256 of the arrays' shapes and contents, one after another."""
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(repr(array.shape).encode())
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest
+
+
+def picture_of_parameters(
+    poses: PoseBox, picture: Callable[[PinholeCamera, torch.Tensor, Any], torch.Tensor]
+) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Parameter values [d] to the picture [H, W, 3]; ``picture`` draws that of a camera, a pose and a colour shift."""
+    from ns_abstract.geometry.differentiable_pose import differentiable_pose
+
+    pose, camera = differentiable_pose(poses.geometry), poses.camera
+    count = poses.geometry.box.dimensions
+    return lambda values: picture(camera, pose(values[:count]), color_shift(poses, values.unbind()))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -154,9 +153,3 @@ class HashBounds:
             return displacement
         factor = _TUNING.wider * (first / max(kept, 1)) ** (1.0 / self.dimensions)
         return max(_TUNING.least_displacement, displacement * min(max(factor, 0.25), 2.0))
-
-
-def weights_of(field: NerfactoField) -> int:
-    """Numbers that a sample of the picture is computed from, about."""
-    nets = (field.density_net, field.color_net)
-    return sum(w.size for net in nets for w in net.weights) + math.prod(field.encoding.table.shape[::2])

@@ -9,8 +9,8 @@ from numba import njit
 
 from ns_abstract.arithmetic.rounding import CELL_ROUNDING, HASH_UP, TRILINEAR_ROUNDING
 from ns_abstract.methods.nerf.hash_bounds.forms import spread_of
+from ns_abstract.methods.nerf.nerfacto_kernel import hash_row
 
-_PRIME_Y, _PRIME_Z = 2654435761, 805459861
 #: Most nodes of a level whose slopes are looked at, and of which the hull of values is taken.
 FORM_NODES, HULL_NODES = 216, 4096
 
@@ -18,13 +18,10 @@ FORM_NODES, HULL_NODES = 216, 4096
 @njit(cache=True, error_model="numpy")
 def _gather(table, first, counts, nodes):
     """Values ``nodes`` [counts, F] of a level's ``table`` [2^T, F] from the corner ``first`` [3] on."""
-    mask = table.shape[0] - 1
     for i in range(counts[0]):
-        x = first[0] + i
         for j in range(counts[1]):
-            y = (first[1] + j) * _PRIME_Y
             for k in range(counts[2]):
-                row = (x ^ y ^ ((first[2] + k) * _PRIME_Z)) & mask
+                row = hash_row(first[0] + i, first[1] + j, first[2] + k, table.shape[0])
                 for f in range(table.shape[1]):
                     nodes[i, j, k, f] = table[row, f]
 
@@ -32,14 +29,11 @@ def _gather(table, first, counts, nodes):
 @njit(cache=True, error_model="numpy")
 def _hull(table, first, counts, low, high):
     """Least and largest value [F] of the nodes from ``first`` on."""
-    mask = table.shape[0] - 1
     low[:], high[:] = np.inf, -np.inf
     for i in range(counts[0]):
-        x = first[0] + i
         for j in range(counts[1]):
-            y = (first[1] + j) * _PRIME_Y
             for k in range(counts[2]):
-                row = (x ^ y ^ ((first[2] + k) * _PRIME_Z)) & mask
+                row = hash_row(first[0] + i, first[1] + j, first[2] + k, table.shape[0])
                 for f in range(table.shape[1]):
                     low[f] = min(low[f], table[row, f])
                     high[f] = max(high[f], table[row, f])
