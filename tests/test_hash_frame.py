@@ -13,6 +13,8 @@ SETS = {
     "yaw": {"rotation": {"yaw": 1e-3}},
     "narrow": {"rotation": {"yaw": 1e-9}},
     "orbit": {"orbit": {"target": [0, 0, 0], "axis": [0, 0.1, 1], "azimuth": [0.3, 0.302]}},
+    "hue": {"rotation": {"yaw": 1e-4}, "hue": 0.05, "saturation": [-0.2, 0.1]},
+    "fixed": {"rotation": {"yaw": 1e-4}, "hue": [0.3, 0.3]},
     "two": {"rotation": {"yaw": 1e-4}, "translation": {"x": 1e-4}},
 }
 

@@ -6,7 +6,8 @@ import numpy as np
 
 from ns_abstract.arithmetic.simd.lanes import LINE
 from ns_abstract.arithmetic.simd.products import ROWS
-from ns_abstract.methods.nerf.hash_bounds.distribution import edges_of, light_of
+from ns_abstract.methods.nerf.hash_bounds.edges import edges_of
+from ns_abstract.methods.nerf.hash_bounds.light import light_of
 from ns_abstract.methods.nerf.hash_bounds.network import (
     HeadWeights,
     NetWeights,
@@ -65,7 +66,7 @@ def piece_room(field: NerfactoField, arrays: FieldArrays, dimensions: int) -> Pi
     head: HeadWeights = arrays.head
     neurons = int(head.net.sizes[1])
     most = max(int(net.sizes.max()) for net in (head.net, *(one.net for one in densities)))
-    forms = np.zeros((3, n + 3))
+    forms, count = np.zeros((3, n + 3)), field.samples[-1]
     return PieceRoom(
         (np.zeros((24, n + 3)), np.zeros((2, n + 4))),
         (forms, forms.copy(), np.zeros((3, 3, n + 3)), np.zeros((3, 3, n + 3)), np.zeros(3, np.bool_)),
@@ -75,7 +76,7 @@ def piece_room(field: NerfactoField, arrays: FieldArrays, dimensions: int) -> Pi
         tuple(light_of(count, n) for count in field.samples),
         rooms,
         _rooms(head.net, rooms[-1][-1].rows.shape[0]),
-        (np.zeros((field.samples[-1], 3, n + 4)), np.zeros((2, field.samples[-1], 3))),
+        (np.zeros((count, 3, n + 4)), np.zeros((2, count, 3)), np.zeros((2, count, 3))),
         np.zeros(most, np.int64),
         np.zeros((ROWS, 2 * LINE // 8)),
     )  # fmt: skip
