@@ -310,8 +310,8 @@ def main() -> None:
         if seed % 20 == 0:
             print(f"{attack.compared:,} after {time.perf_counter() - start:.0f} s", flush=True)
     print(
-        f"{attack.compared:,} channels compared in {seed - options.seed} cases, {attack.special:,} of them next to faces "
-        f"and kinks, {attack.known:,} of bounds narrower than 0.9: {attack.outside} outside, by {attack.worst:.3g}"
+        f"{attack.compared:,} channels compared in {seed - options.seed} cases, {attack.special:,} next to faces and "
+        f"kinks, {attack.known:,} of bounds narrower than 0.9: {attack.outside} outside, by {attack.worst:.3g}"
     )
     print(", ".join(f"{kind} {n:,}" for kind, n in attack.by_kind.items()))
 

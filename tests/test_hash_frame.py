@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
-from nerfactos import tiny_nerfacto
+from nerfactos import random_net, tiny_nerfacto
 from nerfs import poses
 
 from ns_abstract.methods.nerf.hash_bounds.frame import NerfactoFrame
@@ -20,11 +22,16 @@ SETS = {
 
 
 @pytest.mark.slow_cases
-@pytest.mark.parametrize("name", SETS)
+@pytest.mark.parametrize("name", [*SETS, "depths"])
 def test_sets_of_poses_are_enclosed(name: str) -> None:
-    """Bounds of rays, and planes of certificates, of half a set."""
-    pose_set = poses(SETS[name])
-    frame = NerfactoFrame(tiny_nerfacto(1), pose_set)
+    """Bounds of rays, and planes of certificates, of half a set; ``depths``: proposals of unequal depth."""
+    pose_set, scene = poses(SETS.get(name, SETS["yaw"])), tiny_nerfacto(1)
+    if name == "depths":
+        rng, (first, second) = np.random.default_rng(0), scene.field.proposals
+        first = replace(first, net=random_net(rng, first.encoding.size, 8, 8, 1, bias=4.0))
+        second = replace(second, net=random_net(rng, second.encoding.size, 1, bias=4.0))
+        scene = replace(scene, field=replace(scene.field, proposals=(first, second)))
+    frame = NerfactoFrame(scene, pose_set)
     tiles, rng = np.arange(4), np.random.default_rng(0)
     box = pose_set.box.split(0, 2)[0]
     found, planes = frame.bound(box, tiles), frame.sets(box)

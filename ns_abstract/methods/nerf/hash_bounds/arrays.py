@@ -17,7 +17,7 @@ from ns_abstract.methods.nerf.hash_bounds.network import (
     zonotope,
 )
 from ns_abstract.methods.nerf.hash_bounds.pieces import DensityArrays, FieldArrays, PieceRoom, form_width
-from ns_abstract.methods.nerf.hash_field import DenseNet, HashEncoding, NerfactoField
+from ns_abstract.methods.nerf.hash_field import LAYERS_LIMIT, DenseNet, HashEncoding, NerfactoField
 
 #: Harmonics of a direction.
 HARMONICS = 16
@@ -51,10 +51,11 @@ def field_arrays(field: NerfactoField) -> FieldArrays:
     )
 
 
-def _rooms(net: NetWeights, symbols: int) -> tuple[Zonotope, ...]:
-    """Neurons of every layer; ``symbols`` rows before its first ReLU."""
+def _rooms(net: NetWeights, symbols: int, layers: int = 0) -> tuple[Zonotope, ...]:
+    """Neurons of every layer, at least ``layers``; ``symbols`` rows before its first ReLU."""
     rows = symbols + int(net.sizes[1:-1].sum())
-    return tuple(zonotope(rows, int(n)) for n in net.sizes[1:])
+    found = tuple(zonotope(rows, int(n)) for n in net.sizes[1:])
+    return found + (zonotope(1, 1),) * (layers - len(found))
 
 
 def piece_room(field: NerfactoField, arrays: FieldArrays, dimensions: int) -> PieceRoom:
@@ -62,7 +63,8 @@ def piece_room(field: NerfactoField, arrays: FieldArrays, dimensions: int) -> Pi
     n = form_width(dimensions)
     densities = (*arrays.proposals, arrays.density)
     features = [one.table.shape[0] * one.table.shape[2] for one in densities]
-    rooms = tuple(_rooms(one.net, n + 2 + count) for one, count in zip(densities, features, strict=True))
+    pairs = zip(densities, features, strict=True)
+    rooms = tuple(_rooms(one.net, n + 2 + count, LAYERS_LIMIT) for one, count in pairs)
     head: HeadWeights = arrays.head
     neurons = int(head.net.sizes[1])
     most = max(int(net.sizes.max()) for net in (head.net, *(one.net for one in densities)))
@@ -75,7 +77,7 @@ def piece_room(field: NerfactoField, arrays: FieldArrays, dimensions: int) -> Pi
         tuple(edges_of(count, n) for count in field.samples),
         tuple(light_of(count, n) for count in field.samples),
         rooms,
-        _rooms(head.net, rooms[-1][-1].rows.shape[0]),
+        _rooms(head.net, rooms[-1][0].rows.shape[0]),
         (np.zeros((count, 3, n + 4)), np.zeros((2, count, 3)), np.zeros((2, count, 3))),
         np.zeros(most, np.int64),
         np.zeros((ROWS, 2 * LINE // 8)),

@@ -94,7 +94,7 @@ class PieceRoom(NamedTuple):
         directions: [16, n + 3] harmonics, and what the first layer makes of them.
         features: [features, n + 3] of the widest encoding.
         edges, light: Of every round.
-        rooms: Networks' neurons by round, then those of colours.
+        rooms: Neurons of density networks by round, of as many layers for each; ``head``: of the network of colours.
         colors: [N, 3, n + 4] forms, [2, N, 3] bounds, and as many numbers of scratch.
         live, rest: Scratch of layers.
     """
@@ -160,7 +160,7 @@ def density_of(field, place, line, rooms, room, out):
         )  # fmt: skip
     count = from_features(room.features[: levels * features], field.net, rooms[0])
     count = finish(rooms, count, field.net, room.live, room.rest)
-    output_form(rooms[len(rooms) - 1], count, 0, out.shape[0] - 1, out)
+    output_form(rooms[field.net.sizes.shape[0] - 2], count, 0, out.shape[0] - 1, out)
     return count
 
 
@@ -196,7 +196,7 @@ def _color(field, edges, i, count, line, rooms, room):
     n = out.shape[0] - 3
     start, stop = middle_of(edges, i, distance)
     rows = colors(
-        rooms[len(rooms) - 1], count, (room.directions[1], room.directions[2]), field.head, room.head, room.live,
+        rooms[field.density.net.sizes.shape[0] - 2], count, (room.directions[1], room.directions[2]), field.head, room.head, room.live,
         room.rest,
     )  # fmt: skip
     for c in range(3):
