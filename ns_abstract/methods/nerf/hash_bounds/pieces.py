@@ -196,8 +196,8 @@ def _color(field, edges, i, count, line, rooms, room):
     n = out.shape[0] - 3
     start, stop = middle_of(edges, i, distance)
     rows = colors(
-        rooms[field.density.net.sizes.shape[0] - 2], count, (room.directions[1], room.directions[2]), field.head, room.head, room.live,
-        room.rest,
+        rooms[field.density.net.sizes.shape[0] - 2], count, (room.directions[1], room.directions[2]), field.head,
+        room.head, room.live, room.rest,
     )  # fmt: skip
     for c in range(3):
         output_form(room.head[len(room.head) - 1], rows, c, n + 2, value)
