@@ -6,10 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from benchmark_scripts import script
 from nerfactos import random_net, tiny_nerfacto
 from nerfs import poses
 
 from ns_abstract.methods.nerf.hash_bounds.frame import NerfactoFrame
+
+attack_nerfacto = script("attack_nerfacto")
 
 SETS = {
     "yaw": {"rotation": {"yaw": 1e-3}},
@@ -45,3 +48,14 @@ def test_sets_of_poses_are_enclosed(name: str) -> None:
         assert np.all(found.lower <= exact[tiles]) and np.all(exact[tiles] <= found.upper)
         p = (v - half * (low + high)) / (half * (high - low))
         assert np.all(a_low @ p + b_low <= exact) and np.all(exact <= a_high @ p + b_high)
+
+
+@pytest.mark.slow
+def test_fields_and_cameras_that_are_hard_are_enclosed() -> None:
+    """Densities that overflow, empty and contradicting fields; poses beside faces and kinks, cameras far outside."""
+    attack = attack_nerfacto.Attack()
+    for seed in range(2 * len(attack_nerfacto.FIELDS)):
+        attack_nerfacto.attack_once(seed, attack, side=3, poses=6, own=True)
+    assert not attack.cases
+    # most bounds say something, and poses were found where the field has kinks
+    assert attack.known > attack.compared // 3 and attack.special > attack.compared // 8
