@@ -34,13 +34,14 @@ def main() -> None:
     parser.add_argument("--ratio", type=float, default=1.1)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--sets", nargs="+", choices=list(SETS), default=list(SETS))
     options = parser.parse_args()
     scene, n = load_any(options.config), options.size
     pose = look_at((1.3, -1.0, 0.8), (0.0, 0.0, 0.1))[:3]
     camera = PinholeCamera(pose, 1.4 * n, 1.4 * n, 0.5 * n, 0.5 * n, n, n)
     print(f"{scene.field.text}, {n}x{n}")
-    for name, spec in SETS.items():
-        frame = NerfactoFrame(scene, PoseBox.around(camera, parse_perturbation(spec)), options.workers)
+    for name in options.sets:
+        frame = NerfactoFrame(scene, PoseBox.around(camera, parse_perturbation(SETS[name])), options.workers)
         frame.warm_up()
         wall, cpu = time.perf_counter(), time.process_time()
         goal = RefinementGoal(ratio=options.ratio, seconds=options.seconds)
