@@ -162,6 +162,7 @@ def main() -> None:
     parser.add_argument("--ratio", type=float, default=1.05)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--workers", type=int, default=2)
+    parser.add_argument("--sets", nargs="+", choices=list(SETS), default=list(SETS))
     parser.add_argument("--losses", action="store_true")
     parser.add_argument("--without", help=argparse.SUPPRESS)
     options = parser.parse_args()
@@ -178,7 +179,7 @@ def main() -> None:
     print(f"{scene.field.text}, {n}x{n}\n")
     print("| set | renders' gap | ratio | s | CPU s | " + " | ".join(f"s to {m:g}" for m in MARKS) + " |")
     print("|---|" + "---|" * (4 + len(MARKS)), flush=True)
-    for name in SETS:
+    for name in options.sets:
         frame = frame_of(scene, n, name, options.workers)
         frame.warm_up()
         wall, cpu = time.perf_counter(), time.process_time()
