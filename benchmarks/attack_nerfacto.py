@@ -79,7 +79,7 @@ def random_field(rng: np.random.Generator, kind: str) -> NerfactoField:
     """A field of one of `FIELDS`, with any background, spacing and far end."""
     own, other = FIELDS[kind]
     samples = (24, 16, 12)[-int(rng.integers(2, 4)) :]
-    grid = random_grid(rng, 4, 9, 100)
+    grid = random_grid(rng, 4, 9, int(rng.choice([100, 2000])))
     if rng.random() < 0.1:
         grid = HashEncoding(np.zeros_like(grid.table), grid.resolutions)
     rounds = []
@@ -149,36 +149,35 @@ def rays_of(pose_set: PoseBox, values: np.ndarray) -> np.ndarray:
     return np.stack([np.broadcast_to(pose[:, 3], world.shape), world], axis=1)
 
 
+def labels_of(renderer: NerfactoRenderer, rays: np.ndarray, kinks: bool) -> np.ndarray:
+    """[rays, samples, 3] cells of the finest level, or regions of the contraction [rays, samples, 1]."""
+    finest, found = int(renderer.field.encoding.resolutions[-1]), []
+    for ray in rays:
+        edges = renderer.edges(ray)
+        x = ray[0] + ray[1] * ((edges[1:] + edges[:-1]) / 2.0)[:, None]
+        size = np.abs(x).max(axis=1)[:, None]
+        if kinks:
+            found.append(np.where(size < 1.0, -1, np.abs(x).argmax(axis=1)[:, None]))
+        else:
+            contracted = np.where(size < 1.0, x, (2.0 - 1.0 / np.maximum(size, 1.0)) * (x / np.maximum(size, 1.0)))
+            found.append(np.floor((contracted + 2.0) / 4.0 * finest))
+    return np.stack(found)
+
+
 def crossings(rng: np.random.Generator, renderer: NerfactoRenderer, pose_set: PoseBox, count: int) -> list[np.ndarray]:
     """Parameter values on both sides of faces of the finest level and of kinks that samples cross."""
     low, high = np.array(pose_set.box.lower), np.array(pose_set.box.upper)
-    finest = int(renderer.field.encoding.resolutions[-1])
     found = []
-    for _ in range(count):
-        a, b = rng.uniform(low, high), rng.uniform(low, high)
-        pixel, kind = int(rng.integers(pose_set.camera.height * pose_set.camera.width)), int(rng.integers(2))
-
-        def labels(values: np.ndarray, pixel: int = pixel, kind: int = kind) -> np.ndarray:
-            """Cells of all samples, or the regions of the contraction that they are in."""
-            ray = rays_of(pose_set, values)[pixel]
-            edges = renderer.edges(ray)
-            x = ray[0] + ray[1] * ((edges[1:] + edges[:-1]) / 2.0)[:, None]
-            size = np.abs(x).max(axis=1)
-            if kind:
-                return np.where(size < 1.0, -1, np.abs(x).argmax(axis=1))[:, None]
-            with np.errstate(divide="ignore", invalid="ignore"):
-                far = (2.0 - 1.0 / size[:, None]) * (x / size[:, None])
-            return np.floor((np.where(size[:, None] < 1.0, x, far) + 2.0) / 4.0 * finest)
-
-        apart = np.argwhere(labels(a) != labels(b))
-        if not len(apart):
-            continue
-        sample, axis = apart[rng.integers(len(apart))]
-        there = labels(b)[sample, axis]
-        for _ in range(60):
-            middle = 0.5 * (a + b)
-            a, b = (a, middle) if labels(middle)[sample, axis] == there else (middle, b)
-        found += [a, b]
+    for kinks in (False, True):
+        ends = low + rng.uniform(0.0, 0.1, low.size) * (high - low), high - rng.uniform(0.0, 0.1) * (high - low)
+        start, end = (labels_of(renderer, rays_of(pose_set, v), kinks) for v in ends)
+        for pixel, sample, axis in rng.permutation(np.argwhere(start != end))[:count]:
+            a, b = ends
+            for _ in range(60):
+                middle = 0.5 * (a + b)
+                there = labels_of(renderer, rays_of(pose_set, middle)[pixel : pixel + 1], kinks)[0, sample, axis]
+                a, b = (a, middle) if there == end[pixel, sample, axis] else (middle, b)
+            found += [a, b]
     return found
 
 
@@ -284,7 +283,7 @@ def attack_once(seed: int, attack: Attack, side: int = 5, poses: int = 40, own: 
     found = frame.bound(box, np.arange(side * side))
     lower, upper = (one.reshape(-1, 3).astype(np.float64) for one in (found.lower, found.upper))
     renderer = NerfactoRenderer(field)
-    special = crossings(rng, renderer, part, poses // 2)
+    special = crossings(rng, renderer, part, poses // 4)
     values = [box.middle, *box.corners(), *box.sample(poses, rng), *special]
     draw = renderer.rays if own else nerfstudio_draw(field)
     shown = draw(np.concatenate([rays_of(pose_set, v) for v in values])).reshape(len(values), -1, 3)

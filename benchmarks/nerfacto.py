@@ -43,7 +43,7 @@ MARKS = (3.0, 2.0, 1.5, 1.2, 1.1, 1.05)
 #: Folders of kernels that are no bounds.
 _OWN = "losses-"
 #: Rays, renders, and equal pieces of the table of losses, and its set.
-RAYS, RENDERS, PIECES, LOSS_SET = 24, 65, (4, 8, 16), "yaw 0.0001"
+RAYS, RENDERS, PIECES, LOSS_SET = 24, 65, (8, 16, 64), "yaw 0.001"
 
 
 def camera_of(size: int) -> PinholeCamera:
