@@ -33,8 +33,8 @@ from ns_abstract.io import memory
 from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.variations import SceneVariation, Selection
 from ns_abstract.reach.film import along
+from ns_abstract.reach.pictures import Pictures
 from ns_abstract.reach.search import SimulatedRun, first_outside, sampled_disturbances, simulate
-from ns_abstract.reach.tubes import Pictures
 from ns_abstract.verify.camera_response import CameraResponse
 from ns_abstract.verify.scene_margin import CAMERA_KINDS
 
