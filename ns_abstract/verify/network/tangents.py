@@ -29,6 +29,11 @@ class Curve(Protocol):
         """Curvature before, between and behind the breaks."""
         ...
 
+    @property
+    def slope_scale(self) -> float:
+        """What the error of a computed slope is relative to, beside the slope."""
+        ...
+
     def function(self, z: Tensor) -> Tensor:
         """The value."""
         ...
@@ -125,5 +130,5 @@ class Tangents:
         for corner, height in zip(self.corners, self.values, strict=True):
             touch = torch.maximum(touch, self.side * (height - slope * corner))
         far = torch.maximum(self.lower.abs(), self.upper.abs())
-        size = self.values.abs().amax(0) + value.abs() + (slope.abs() + 1.0) * width + OWN_FUNCTION
+        size = self.values.abs().amax(0) + value.abs() + (slope.abs() + self.curve.slope_scale) * width + OWN_FUNCTION
         return slope, self.side * (touch + OWN_FUNCTION * (size + slope.abs() * far))
