@@ -64,7 +64,9 @@ class UnstableNeurons:
                 found.append(TangentPoints(units[at.numpy()], tangents[at]))
         return found
 
-    def shifted(self, slope: Float64, low: Float64, high: Float64, size: Float64 | float = 0.0) -> tuple[Floats, Floats]:
+    def shifted(
+        self, slope: Float64, low: Float64, high: Float64, size: Float64 | float = 0.0
+    ) -> tuple[Floats, Floats]:
         """Offsets below and above, relative to the references, of lines with stored ``slope`` [R, U] (N4).
 
         ``size``: [U] of the numbers that ``low`` and ``high`` are sums of, where these are not charged for it.

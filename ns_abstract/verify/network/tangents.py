@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor
@@ -29,10 +29,8 @@ class Curve(Protocol):
         """Curvature before, between and behind the breaks."""
         ...
 
-    @property
-    def slope_scale(self) -> float:
-        """What the error of a computed slope is relative to, beside the slope."""
-        ...
+    #: What the error of a computed slope is relative to, beside the slope.
+    slope_scale: ClassVar[float]
 
     def function(self, z: Tensor) -> Tensor:
         """The value."""
