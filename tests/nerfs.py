@@ -12,8 +12,8 @@ from torch.nn import functional
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.keyframe_cameras import look_at
 from ns_abstract.geometry.poses import PoseBox
-from ns_abstract.methods.nerf.bounds import RayBounds
 from ns_abstract.methods.nerf.field import Field, encode
+from ns_abstract.methods.nerf.ray_field import RayBounds
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
 from ns_abstract.methods.nerf.scene import FieldWeights, Layer, NerfScene
 from ns_abstract.perturbation.specification import parse_perturbation

@@ -13,10 +13,11 @@ from ns_abstract.arithmetic.rounding import UNIT64
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf import device as device_module
 from ns_abstract.methods.nerf import zonotope
-from ns_abstract.methods.nerf.bounds import NerfBounds, RayBounds, basis_of, cells_at_once, device_bytes
+from ns_abstract.methods.nerf.bounds import NerfBounds
 from ns_abstract.methods.nerf.device import check_device, processes_that_fit
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.method import NerfMethod
+from ns_abstract.methods.nerf.ray_field import RayBounds, basis_of, cells_at_once, device_bytes
 from ns_abstract.methods.nerf.render import Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
 

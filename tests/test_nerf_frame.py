@@ -13,12 +13,13 @@ from nerfs import BINS, UNIFORM, images, pixels_of, poses, tiny_scene
 
 from ns_abstract.arithmetic.rounding import UNIT32
 from ns_abstract.geometry.poses import PoseBox
-from ns_abstract.methods.nerf import bounds as bounds_module
 from ns_abstract.methods.nerf import frame as frame_module
-from ns_abstract.methods.nerf.bounds import NerfBounds, RayBounds
+from ns_abstract.methods.nerf import sample_cells
+from ns_abstract.methods.nerf.bounds import NerfBounds
 from ns_abstract.methods.nerf.division import Division
 from ns_abstract.methods.nerf.field import Field
 from ns_abstract.methods.nerf.frame import NerfFrame
+from ns_abstract.methods.nerf.ray_field import RayBounds
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.refine.engine import Refinement, RefinementGoal, groups
@@ -253,7 +254,7 @@ def composite_without_ends(self) -> tuple[np.ndarray, np.ndarray]:
     return original_composite(self)
 
 
-original_composite = bounds_module._BundleWork._composite
+original_composite = sample_cells.SampleCellBounds._composite
 
 
 def stop_too_early(self) -> float:
@@ -265,7 +266,7 @@ def wrong_parts(value, bernstein):
     return low[:, :1].expand_as(low), high[:, :1].expand_as(high), error
 
 
-original_parts = bounds_module.bounds_by_part
+original_parts = sample_cells.bounds_by_part
 
 
 def narrow_pencil(self, *arguments) -> None:
@@ -274,16 +275,16 @@ def narrow_pencil(self, *arguments) -> None:
     self.direction[:, 1:] *= 0.9
 
 
-original_pencil = bounds_module.RayBundle.__init__
+original_pencil = sample_cells.RayBundle.__init__
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("target", "name", "fault"),
     [
-        (bounds_module._BundleWork, "_composite", composite_without_ends),
-        (bounds_module, "bounds_by_part", wrong_parts),
-        (bounds_module.RayBundle, "__init__", narrow_pencil),
+        (sample_cells.SampleCellBounds, "_composite", composite_without_ends),
+        (sample_cells, "bounds_by_part", wrong_parts),
+        (sample_cells.RayBundle, "__init__", narrow_pencil),
     ],
 )
 def test_planted_faults_are_found(monkeypatch: pytest.MonkeyPatch, target, name: str, fault) -> None:
@@ -299,7 +300,7 @@ def test_bounds_that_are_no_numbers_are_not_kept(monkeypatch: pytest.MonkeyPatch
         return low * float("nan"), high, error * float("nan")
 
     scene, pose_set = tiny_scene(3), poses(SETS["yaw"])
-    monkeypatch.setattr(bounds_module, "bounds_by_part", broken)
+    monkeypatch.setattr(sample_cells, "bounds_by_part", broken)
     found = bounded(scene, pose_set)
     assert np.isfinite(found.lower).all() and np.isfinite(found.upper).all()
     assert attack(scene, pose_set, found)[1] == 0
@@ -311,7 +312,7 @@ def test_what_is_known_is_only_replaced_by_bounds() -> None:
     low = np.array([0.3, np.nan, 0.3, -np.inf, 0.6, 0.3, 0.9])
     high = np.array([0.7, 0.7, np.nan, 0.7, 0.4, np.inf, 0.95])
     lower, upper = np.full(7, 0.2), np.full(7, 0.8)
-    bounds_module._BundleWork._keep(lower, upper, (np.arange(7),), low, high)
+    sample_cells.SampleCellBounds._keep(lower, upper, (np.arange(7),), low, high)
     assert lower.tolist() == [0.3] + 6 * [0.2] and upper.tolist() == [0.7] + 6 * [0.8]
 
 
@@ -328,7 +329,7 @@ def test_pieces_that_are_given_up_say_nothing() -> None:
 def test_rays_of_wide_sets_lie_in_their_polynomials() -> None:
     """The Taylor models' own error counts where sets are wide and the degree is 1."""
     pose_set = poses({"rotation": {"yaw": 0.2, "roll": 0.1}, "translation": {"x": 0.1}})
-    pencil = bounds_module.RayBundle(pose_set, pose_set.box, pixels_of(pose_set.camera), 1)
+    pencil = sample_cells.RayBundle(pose_set, pose_set.box, pixels_of(pose_set.camera), 1)
     ray, distance = np.repeat(np.arange(12), 2), np.tile([0.3, 3.9], 12)
     lines, radius = pencil.points(ray, distance, 0.0 * distance)
     directions = np.array([[(x + 0.5 - 2.0) / 5.0, -(y + 0.5 - 1.5) / 5.0, -1.0] for y in range(3) for x in range(4)])

@@ -13,9 +13,11 @@ from ns_abstract.arithmetic.rounding import COMPOSITE_ROUNDING
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf import bounds as bounds_module
-from ns_abstract.methods.nerf.bounds import NerfBounds, RayBounds
+from ns_abstract.methods.nerf import sample_cells
+from ns_abstract.methods.nerf.bounds import NerfBounds
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.method import NerfMethod
+from ns_abstract.methods.nerf.ray_field import RayBounds, RayRequest
 from ns_abstract.methods.nerf.render import NerfRenderer
 from ns_abstract.methods.nerf.samples import composite, edge_bounds, field_hulls
 from ns_abstract.methods.nerf.scene import NerfScene
@@ -29,8 +31,8 @@ SETS = {
 
 def by_bins(scene: NerfScene, pose_set: PoseBox) -> RayBounds:
     """Without samples that are followed."""
-    bounds, tolerance = NerfBounds(scene, BINS, pose_set.box.dimensions), 0.05 / bounds_module._SWEPT
-    asked = bounds_module._RayRequest(pose_set, pose_set.box, pixels_of(pose_set.camera)[:6], tolerance, None, None, [])
+    bounds, tolerance = NerfBounds(scene, BINS, pose_set.box.dimensions), 0.05 / sample_cells._SWEPT
+    asked = RayRequest(pose_set, pose_set.box, pixels_of(pose_set.camera)[:6], tolerance, None, None, [])
     return bounds._apart(asked, None, False, bounds_module._DISPLACEMENT)
 
 
@@ -56,7 +58,7 @@ def test_a_smooth_field_is_tight() -> None:
 def test_where_samples_lie_makes_opaque_fields_tight(monkeypatch: pytest.MonkeyPatch) -> None:
     scene, pose_set = tiny_scene(1, density=1e3), poses({"rotation": {"yaw": 1e-4}})
     found = by_bins(scene, pose_set)
-    monkeypatch.setattr(bounds_module._BundleWork, "_sampled", lambda self, low, high: (np.zeros(1), np.ones(1)))
+    monkeypatch.setattr(sample_cells.SampleCellBounds, "_sampled", lambda self, low, high: (np.zeros(1), np.ones(1)))
     wide = by_bins(scene, pose_set)
     assert (wide.lower <= found.lower).all() and (found.upper <= wide.upper).all()
     assert (found.upper - found.lower).mean() < 0.3 * (wide.upper - wide.lower).mean()
@@ -136,7 +138,7 @@ def only_middles(self, values, end, axis=-1):
 
 @pytest.mark.slow
 def test_planted_faults_are_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(bounds_module._BundleWork, "_anywhere", only_middles)
+    monkeypatch.setattr(sample_cells.SampleCellBounds, "_anywhere", only_middles)
     scene, pose_set = tiny_scene(3, density=30.0), poses(SETS["yaw"])
     assert attack_first_rays(scene, pose_set, by_bins(scene, pose_set))[1] > 0
 

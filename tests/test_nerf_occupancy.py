@@ -19,9 +19,10 @@ from ns_abstract.cli import render as render_command
 from ns_abstract.geometry.keyframe_cameras import KeyframeCamera, path_json
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
-from ns_abstract.methods.nerf.bounds import NerfBounds, RayBounds
+from ns_abstract.methods.nerf.bounds import NerfBounds
 from ns_abstract.methods.nerf.occupancy import OccupancyGrid, load_grid
 from ns_abstract.methods.nerf.ray_bundle import RayBundle
+from ns_abstract.methods.nerf.ray_field import RayBounds
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.verify.attack.falsify import falsify

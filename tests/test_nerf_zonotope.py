@@ -13,10 +13,10 @@ from nerfs import raw_outputs, tiny_weights
 from ns_abstract.arithmetic.rounding import UNIT64
 from ns_abstract.arithmetic.simd.lanes import LINE
 from ns_abstract.methods.nerf import relu_kernel, zonotope
-from ns_abstract.methods.nerf.bounds import basis_of
 from ns_abstract.methods.nerf.field_kernel import CHUNK
 from ns_abstract.methods.nerf.layer_kernel import BLOCK, LayerInput, LayerOutput, LayerWeights, linear
 from ns_abstract.methods.nerf.outputs import greatest, opacity
+from ns_abstract.methods.nerf.ray_field import basis_of
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer
 from ns_abstract.methods.nerf.zonotope import FieldBounds, PreActivation
 

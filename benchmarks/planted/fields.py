@@ -2,7 +2,7 @@
 
 from planted.fault import Fault
 
-_ZONOTOPE, _BOUNDS = "methods/nerf/zonotope.py", "methods/nerf/bounds.py"
+_ZONOTOPE, _CELLS = "methods/nerf/zonotope.py", "methods/nerf/sample_cells.py"
 _HSV, _OCCUPANCY, _RELU = "methods/nerf/hsv.py", "methods/nerf/occupancy.py", "methods/nerf/relu_kernel.py"
 _LAYER = "methods/nerf/layer_kernel.py"
 _PLANES, _STRIPS = "methods/nerf/planes.py", "methods/nerf/strips.py"
@@ -217,16 +217,17 @@ FIELDS = (
     ),
     Fault(
         "compositing: brighter colours take the lower opacity",
-        _BOUNDS, "_BundleWork._composited", "np.where(rise > 0.0, most, least)", "np.where(rise > 0.0, least, least)",
+        _CELLS, "SampleCellBounds._composited",
+        "np.where(rise > 0.0, most, least)", "np.where(rise > 0.0, least, least)",
         _STIFF + "[rough]", True,
     ),
     Fault(
         "compositing: darker colours take the lower opacity",
-        _BOUNDS, "_BundleWork._composited", "np.where(fall < 0.0, most, least)", "least", _STIFF + "[rough]", True,
+        _CELLS, "SampleCellBounds._composited", "np.where(fall < 0.0, most, least)", "least", _STIFF + "[rough]", True,
     ),
     Fault(
         "colours: a batch that was given up keeps its numbers",
-        _BOUNDS, "_BundleWork._bound_field", "density.failed[:, None]", "density.failed[:, None] & False",
+        _CELLS, "SampleCellBounds._bound_field", "density.failed[:, None]", "density.failed[:, None] & False",
         "test_nerf_frame.py::test_pieces_that_are_given_up_say_nothing", True,
     ),
     Fault(
@@ -235,7 +236,7 @@ FIELDS = (
     ),
     Fault(
         "known bounds: what is no number replaces what is known",
-        _BOUNDS, "_BundleWork._keep", "(low <= high) & np.isfinite(low) & np.isfinite(high)", "low == low",
+        _CELLS, "SampleCellBounds._keep", "(low <= high) & np.isfinite(low) & np.isfinite(high)", "low == low",
         "test_nerf_frame.py::test_what_is_known_is_only_replaced_by_bounds",
     ),
     Fault(

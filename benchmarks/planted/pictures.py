@@ -2,7 +2,7 @@
 
 from planted.fault import Fault
 
-_WEIGHTS, _WHITE, _BOUNDS = "methods/splat/weights.py", "methods/nerf/white.py", "methods/nerf/bounds.py"
+_WEIGHTS, _WHITE = "methods/splat/weights.py", "methods/nerf/white.py"
 _MEASURES, _PROPERTIES, _QUESTION = (
     "verify/picture_measures.py", "verify/picture_properties.py", "api/picture_question.py",
 )  # fmt: skip

@@ -1,48 +1,33 @@
-"""Bounds of rays over a box of poses: cells by sample, densities and colours, compositing (design.md, F6-F8, F10, F14).
-
-Every sample of a ray gets cells of its own width: where the field is rough over the sample's path, the box is cut
-finer. The polynomials that come out of the network are then cut into parts at no cost, and compositing is done
-part by part, where it is exact for independent samples.
-"""
+"""Bounds of rays over a box of poses, by cells of every sample or by samples that are followed (design.md, F6-F16)."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
-from torch import Tensor
 
-from ns_abstract.arithmetic.chebyshev import ChebyshevBasis
 from ns_abstract.arithmetic.outward import outward
-from ns_abstract.arithmetic.rounding import DENSITY_ROUNDING, DIRECTION_ROUNDING, KEPT_LIGHT_UP, SAMPLE_ROUNDING
-from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.nerf.division import ENDS, Division, division_for, regroup_parts
-from ns_abstract.methods.nerf.hsv import Range, shifted_bounds
-from ns_abstract.methods.nerf.outputs import bounds_by_part, brightness, greatest, opacity
 from ns_abstract.methods.nerf.ray_bundle import TAYLOR, RayBundle
+from ns_abstract.methods.nerf.ray_field import (
+    RAY_TUNING,
+    RayBounds,
+    RayField,
+    RayRequest,
+    Shifts,
+    basis_of,
+    typical_displacement,
+)
 from ns_abstract.methods.nerf.render import Sampling
+from ns_abstract.methods.nerf.sample_cells import SampleCellBounds
 from ns_abstract.methods.nerf.sample_paths import BundleBounds, SamplePaths
-from ns_abstract.methods.nerf.samples import composite, field_hulls
-from ns_abstract.methods.nerf.scene import FieldWeights, NerfScene
+from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.nerf.white import WhiteSamples
-from ns_abstract.methods.nerf.zonotope import ERROR_TERMS, FieldBounds, PostActivation, PreActivation
+from ns_abstract.methods.nerf.zonotope import FieldBounds
 
-#: (degree, grid) of the polynomials by number of parameters.
-_DEGREES = {0: (1, 2), 1: (28, 112), 2: (6, 20), 3: (4, 10), 4: (2, 5)}
-#: The same of one parameter for a field whose base has at most so many layers: it bears cells as wide as its waves are
-#: followed, while deeper ones bend more.
-_SHALLOW, _SHALLOW_DEGREE = 4, (35, 126)
-#: Cells bounded at once by compiled kernels, whose numbers stay in a core's cache.
-_BATCH = 128
-#: Elsewhere: values of a layer's neurons on the grid, and how many arrays as large there may be at a time, about.
-_VALUES, _ARRAYS = 1 << 25, 12
-#: Samples of a ray that are bounded before the light that is left is looked at.
-_BLOCK = 8
 #: Halvings below cells of the starting width, by number of parameters (one level may concern any axis).
 _DEEPER = {0: 0, 1: 2}
 _DEEPER_MORE = 6
@@ -52,132 +37,18 @@ _FINER = {2: 1}
 _PARTS = 4096
 
 
-@dataclass(frozen=True)
-class RayTuning:
-    """Light and ways from which on samples are worked on. None of them decides whether a bound holds."""
-
-    #: Light (in [0, 1]) that a skipped sample may add, as a share of the tolerance.
-    quiet: float = 0.02
-    #: Opacities of at most this share of the tolerance are not told apart by parts of a cell.
-    alike: float = 2.0**-9
-    #: Light that a sample may leave open before compositing has shown where it matters.
-    coarse: float = 0.1
-    #: Half the way of one that is followed, whose place the coarse pass moves, too.
-    followed: float = 5e-4
-    least_followed: float = 2e-6
-    #: Light from a sample whose colour's shift is not looked at.
-    unseen: float = 1e-5
-
-
-_TUNING = RayTuning()
-#: A cell on which an opacity is open by this much everywhere was far too wide.
-_LOST = 0.5
-#: Shares of the first cells that were far too wide and factors by which later ones begin narrower: the first share that
-#: is exceeded counts. Work on wide cells is lost and there is more of it, as their error terms are more.
-_LOST_SHARES = ((0.25, 0.6), (0.04, 0.87))
-#: The share below which they begin wider, and the factor: this costs little, as the shares rise steeply with the width.
-_FEW_LOST, _WIDER = 0.01, 1.08
-#: A sample is worth halving if it can take away this share of what a part has too much.
-_SHARE = 0.125
-#: Rounds of halving where the colours' bounds are too wide.
-_ROUNDS = 32
 #: Half the way of a sample over a cell to begin with.
 _DISPLACEMENT = 0.02
 #: Where samples are followed: halvings below first cells by axis, of the deepest cells into parts, and the least way.
 _FOLLOWED_DEEPER = 3
 _FOLLOWED_FINER, _FOLLOWED_FINER_MORE = {1: 2, 2: 2}, 1
-#: Rays that one cell leaves so open are bounded by bins, too, with a tolerance so many times as large: these bounds are
-#: loose anyhow.
-_LOOSE, _SWEPT = 0.5, 8.0
+#: Rays that one cell leaves so open are bounded by bins, too.
+_LOOSE = 0.5
 #: Numbers (rays, samples, parts) that are worked on together.
 _NUMBERS = 1 << 21
 
 
-#: Intervals of hue and saturation.
-Shifts = tuple[Range, Range]
-
-
-def basis_of(dimensions: int, field: FieldWeights) -> ChebyshevBasis:
-    """The polynomials that are used for ``dimensions`` parameters of a ``field``."""
-    degree, grid = _DEGREES.get(dimensions, (1, 2))
-    if dimensions == 1 and len(field.base) <= _SHALLOW:
-        degree, grid = _SHALLOW_DEGREE
-    return ChebyshevBasis(dimensions, degree, grid)
-
-
-def cells_at_once(field: FieldWeights, basis: ChebyshevBasis) -> int:
-    """Cells of a batch where kernels are not compiled."""
-    return max(1, _VALUES // (len(basis.evaluation) * field.width))
-
-
-def device_bytes(field: FieldWeights, basis: ChebyshevBasis) -> int:
-    """Memory that such a batch may take, about."""
-    # error terms before and after a layer, and their product with slopes
-    columns = 3 * ERROR_TERMS * cells_at_once(field, basis) * field.width
-    return 8 * (_ARRAYS * _VALUES + columns) + (1 << 29)
-
-
-@dataclass
-class RayBounds:
-    """Bounds of n rays over a box.
-
-    Attributes:
-        lower, upper: [n, 3] float64 bounds of the colours.
-        alpha: [n, samples] float32 upper bounds of the opacity of every sample over the box.
-        cells: Cells of the network that were bounded.
-        displacement: Half the way of a sample over a cell that the network's bounds bear, as far as these rays tell.
-        parts: [2, n, shifts, *parts, 3] float32 lower and upper bounds, rounded outward, by part of the box, if a
-            division was given; one row of ``shifts`` where none were.
-    """
-
-    lower: np.ndarray
-    upper: np.ndarray
-    alpha: np.ndarray
-    cells: int
-    displacement: float
-    parts: np.ndarray | None = None
-
-
-@dataclass(frozen=True)
-class _RayRequest:
-    """The arguments of `NerfBounds.rays`."""
-
-    pose_set: PoseBox
-    box: ParameterBox
-    pixels: np.ndarray
-    tolerance: float
-    known: np.ndarray | None
-    aim: tuple[np.ndarray, np.ndarray] | None
-    shifts: list[Shifts]
-
-    def take(self, which: np.ndarray) -> _RayRequest:
-        """Some of the rays."""
-        known_alpha = None if self.known is None else self.known[which]
-        aim = None if self.aim is None else (self.aim[0][which], self.aim[1][which])
-        return replace(self, pixels=self.pixels[which], known=known_alpha, aim=aim)
-
-
-@dataclass
-class _SampleCells:
-    """Cells of samples: ray, sample, cell, [k] each, all of one level."""
-
-    ray: np.ndarray
-    sample: np.ndarray
-    cell: np.ndarray
-
-    def __len__(self) -> int:
-        return self.ray.size
-
-    def take(self, which: np.ndarray | slice) -> _SampleCells:
-        return _SampleCells(self.ray[which], self.sample[which], self.cell[which])
-
-
-def join_sample_cells(parts: list[_SampleCells]) -> _SampleCells:
-    """All items of ``parts``."""
-    return _SampleCells(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("ray", "sample", "cell")))
-
-
-class NerfBounds:
+class NerfBounds(RayField):
     """Bounds of a scene's rays.
 
     Args:
@@ -200,23 +71,15 @@ class NerfBounds:
         compiled: bool | None = None,
         white: WhiteSamples | None = None,
     ) -> None:
-        self.white = white
-        self.sampling, self.device = sampling, torch.device(device)
-        self.swept = sampling.kind == "hierarchical"
-        self.basis = basis_of(dimensions + self.swept, scene.fine)
-        self.field = FieldBounds(scene.fine, self.basis, device=device, compiled=compiled)
-        #: Cells bounded at once.
-        self.batch = _BATCH if self.field.compiled else cells_at_once(scene.fine, self.basis)
-        self.occupancy = scene.occupancy
+        super().__init__(scene, sampling, dimensions, device, compiled, white)
         #: Samples that the coarse pass places.
         self.paths = None
         if self.swept:
             coarse = FieldBounds(scene.coarse, basis_of(dimensions, scene.coarse), device=device, compiled=compiled)
             self.paths = SamplePaths(coarse, self.field, sampling, scene.occupancy, self.batch)
-        self.distances, self.lengths = sampling.bins
         self.taylor = min(TAYLOR, max(1, self.basis.degree))
         #: Where to begin to look for `RayBounds.displacement`.
-        self.displacement = _DISPLACEMENT if self.paths is None else _TUNING.followed
+        self.displacement = _DISPLACEMENT if self.paths is None else RAY_TUNING.followed
 
     def rays(
         self,
@@ -240,7 +103,7 @@ class NerfBounds:
             shifts: Intervals of hue and saturation that are added to all colours; bounds hold over all of them.
             division: The cells, in place of those that suit the rays; bounds are then kept by part.
         """
-        request = _RayRequest(pose_set, box, pixels, tolerance, known, aim, shifts or [])
+        request = RayRequest(pose_set, box, pixels, tolerance, known, aim, shifts or [])
         if self.paths is None:
             return self._apart(request, division, division is not None, self.displacement)
         ray_bounds, alone = self._followed(self.paths, request, division)
@@ -261,7 +124,7 @@ class NerfBounds:
         ray_bounds.cells += bins.cells
         return ray_bounds
 
-    def _nothing(self, request: _RayRequest, parts: tuple[int, ...] | None) -> RayBounds:
+    def _nothing(self, request: RayRequest, parts: tuple[int, ...] | None) -> RayBounds:
         """What holds of any rays; also by ``parts``, if there are any."""
         n = len(request.pixels)
         trivial = np.zeros((n, 3)), np.ones((n, 3)), np.ones((n, self.distances.size), np.float32), 0, self.displacement
@@ -271,7 +134,7 @@ class NerfBounds:
         return RayBounds(*trivial, np.stack([low, np.ones_like(low)]))
 
     def _followed(
-        self, paths: SamplePaths, request: _RayRequest, given: Division | None
+        self, paths: SamplePaths, request: RayRequest, given: Division | None
     ) -> tuple[RayBounds, np.ndarray]:
         """Bounds from samples that are followed; [0, 1] where the box is too wide for that.
 
@@ -291,12 +154,12 @@ class NerfBounds:
         low, high = (np.moveaxis(end, 2, 1).reshape(n, shifts, *division.parts, 3) for end in (work.lower, work.upper))
         rays = RayBounds(
             work.lower.min(axis=(1, 2)), work.upper.max(axis=(1, 2)), np.ones((n, self.distances.size), np.float32),
-            work.cells, max(_TUNING.least_followed, self.displacement * work.factor),
+            work.cells, max(RAY_TUNING.least_followed, self.displacement * work.factor),
             None if given is None else np.stack(outward(low, high)),
         )  # fmt: skip
         return rays, start == 0
 
-    def _apart(self, request: _RayRequest, given: Division | None, by_part: bool, displacement: float) -> RayBounds:
+    def _apart(self, request: RayRequest, given: Division | None, by_part: bool, displacement: float) -> RayBounds:
         """Bounds from cells of every sample, or of the bins that samples lie in."""
         n, samples, box = len(request.pixels), self.distances.size, request.box
         pencil = RayBundle(request.pose_set, box, request.pixels, self.taylor, self.swept)
@@ -326,7 +189,7 @@ class NerfBounds:
         edges = None
         if self.paths is not None:
             edges = self._edges(self.paths, RayBundle(request.pose_set, box, request.pixels, self.taylor), division)
-        work = _BundleWork(self, pencil, division, moves, request, displacement, edges)
+        work = SampleCellBounds(self, pencil, division, moves, request, displacement, edges)
         return work.run(request.shifts, by_part)
 
     def _edges(self, paths: SamplePaths, pencil: RayBundle, division: Division) -> tuple[np.ndarray, np.ndarray]:
@@ -338,11 +201,6 @@ class NerfBounds:
         )
         return low.reshape(-1, low.shape[2]), high.reshape(-1, high.shape[2])
 
-    @property
-    def compiled(self) -> bool:
-        """Whether kernels for a processor bound the field."""
-        return self.field.compiled
-
     def division(self, moves: np.ndarray, most: int = _PARTS, deeper: int | None = None) -> Division | None:
         """`division_for` for samples that move by ``moves`` [n, samples, d], as wide as the network's bounds bear."""
         d = moves.shape[2]
@@ -351,443 +209,3 @@ class NerfBounds:
         else:
             usual, finer = _FOLLOWED_DEEPER * d, _FOLLOWED_FINER.get(d, _FOLLOWED_FINER_MORE)
         return division_for(moves, self.displacement, most, usual if deeper is None else deeper, finer)
-
-
-def typical_displacement(parts: Sequence[RayBounds]) -> float:
-    """Return the geometric mean of the displacements of ``parts``, whatever their order."""
-    return math.exp(sum(math.log(part.displacement) for part in parts) / len(parts))
-
-
-class _BundleWork:
-    """The bounds of one pencil of rays; see `NerfBounds.rays`."""
-
-    def __init__(
-        self,
-        owner: NerfBounds,
-        pencil: RayBundle,
-        division: Division,
-        moves: np.ndarray,
-        request: _RayRequest,
-        displacement: float,
-        edges: tuple[np.ndarray, np.ndarray] | None = None,
-    ) -> None:
-        self.edges, known = edges, request.known
-        self.owner, self.pencil, self.division = owner, pencil, division
-        self.tolerance, self.aim = request.tolerance * (_SWEPT if owner.swept else 1.0), request.aim
-        self.basis, self.field = owner.basis, owner.field
-        n, samples = moves.shape[:2]
-        parts = math.prod(division.parts)
-        self.alpha_low, self.alpha_high = np.zeros((samples, n, parts)), np.ones((samples, n, parts))
-        self.color_low, self.color_high = np.zeros((samples, n, parts, 3)), np.ones((samples, n, parts, 3))
-        # what the network itself leaves open of opacities and colours, and the level of the cells that showed it
-        self.open, self.vague = (np.ones((samples, n, parts), np.float32) for _ in range(2))
-        self.level = np.full((samples, n, parts), -1, np.int8)
-        # light that reaches a sample, and what all samples so far let through
-        self.before, self.light = np.ones((samples, n, parts), np.float32), np.ones((n, parts))
-        self.cells, self.displacement = 0, displacement
-        # cells of samples that were the first, those of them that were too wide, and whether the box is not narrow
-        self.tried, self.lost, self.wide = 0, 0, False
-        # the first level whose cells are narrow enough for the sample
-        self.start = division.first(moves, displacement)
-        self.quiet = np.zeros((n, samples), bool)
-        if known is not None:
-            self.quiet = known <= _TUNING.quiet * self.tolerance
-            for i, k in np.argwhere(self.quiet):
-                self.alpha_high[k, i] = known[i, k]
-        self._levels: dict[int, tuple[Tensor, Tensor, np.ndarray]] = {}
-
-    def run(self, shifts: list[Shifts], by_part: bool = False) -> RayBounds:
-        """Bound block after block of samples, nearest first, then halve cells where colours are too wide.
-
-        ``by_part``: keep the bounds of every part.
-        """
-        samples = self.owner.distances.size
-        for first in range(0, samples, _BLOCK):
-            block = np.arange(first, min(samples, first + _BLOCK))
-            if not (self.light > self._dark).any():
-                break
-            self.before[block] = self.light
-            self._bound_block(block)
-            self.light *= np.prod(1.0 - self._anywhere(self.alpha_low[block], np.minimum), axis=0)
-        self._learn()
-        self._improve()
-        color, bounded = (self.color_low, self.color_high), []
-        for shift in shifts:
-            check_cancelled()
-            self.color_low, self.color_high = self._shifted(color, shift)
-            bounded.append(self._composite())
-        low, high = (np.stack(ends, axis=1) for ends in zip(*(bounded or [self._composite()]), strict=True))
-        alpha = self.alpha_high.max(axis=2).T.astype(np.float32)
-        return RayBounds(
-            low.min(axis=(1, 2)), high.max(axis=(1, 2)), np.nextafter(alpha, np.float32(2.0)), self.cells,
-            self.displacement,
-            np.stack(outward(self._poses(low, np.min), self._poses(high, np.max))) if by_part else None,
-        )  # fmt: skip
-
-    def _poses(self, values: np.ndarray, end: Callable[..., np.ndarray]) -> np.ndarray:
-        """[n, shifts, *parts, 3] of [n, shifts, parts, 3]: by part of the poses alone."""
-        apart = values.reshape(*values.shape[:2], *self.division.parts, 3)
-        return end(apart, axis=-2) if self.owner.swept else apart
-
-    @property
-    def _dark(self) -> float:
-        """Light that does not matter any more."""
-        return 0.1 * self.tolerance
-
-    @property
-    def _negligible(self) -> float:
-        """Light from a sample, at most, whose colour does not matter."""
-        return (0.1 if self.owner.swept else 0.5) * self.tolerance
-
-    def _level(self, level: int) -> tuple[Tensor, Tensor, np.ndarray]:
-        """Monomials at the nodes of every cell [cells, nodes, M], Bernstein matrix [parts, b, m], members."""
-        if level not in self._levels:
-            low, high = self.division.boxes(level)
-            nodes = 0.5 * (low + high)[:, None] + 0.5 * (high - low)[:, None] * self.basis.nodes
-            monomials = np.prod(nodes[:, :, None, :] ** self.pencil.exponents, axis=-1)
-            self._levels[level] = (
-                torch.from_numpy(monomials).to(self.owner.device),
-                self.field.bernstein(self.division.inner(level)),
-                self.division.members(level),
-            )
-        return self._levels[level]
-
-    def _rows(self, level: int, items: _SampleCells) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Where the parts [k, parts of a cell] of ``items`` stand in the arrays by sample, ray and part."""
-        return items.sample[:, None], items.ray[:, None], self._level(level)[2][items.cell]
-
-    def _bound_block(self, block: np.ndarray) -> None:
-        """Bound the samples ``block`` of all rays."""
-        waiting: dict[int, list[_SampleCells]] = {}
-        for level in range(self.division.levels + 1):
-            ray, place = np.nonzero((self.start[:, block] == level) & ~self.quiet[:, block])
-            if not ray.size:
-                continue
-            members = self._level(level)[2]
-            bright = self.light[:, members].max(axis=2) > self._dark  # [n, cells]
-            item, cell = np.nonzero(bright[ray])
-            if not item.size:
-                continue
-            waiting[level] = [_SampleCells(ray[item], block[place[item]], cell)]
-        self.wide |= any(level > 0 for level in waiting)
-        for level in range(self.division.levels + 1):
-            if level not in waiting:
-                continue
-            items = join_sample_cells(waiting.pop(level))
-            again = []
-            for start in range(0, len(items), self.owner.batch):
-                batch = items.take(slice(start, start + self.owner.batch))
-                halve, lost, visible = self._bound_batch(level, batch, _TUNING.coarse)
-                again.append(batch.take(halve))
-                first = self.start[batch.ray, batch.sample] == level
-                self.lost += int((lost & first).sum())
-                self.tried += int((visible & first).sum())
-            coarse = join_sample_cells(again)
-            below = self.division.below[level]
-            if below < 0 or not len(coarse):
-                continue
-            children = self.division.children(level, coarse.cell)
-            finer = _SampleCells(np.tile(coarse.ray, 2), np.tile(coarse.sample, 2), children)
-            waiting.setdefault(below, []).append(finer)
-
-    def _learn(self) -> None:
-        """Cells should have started narrower if many of them were too wide, wider if few were."""
-        if self.tried < 32:
-            return
-        for share, narrower in _LOST_SHARES:
-            if self.lost > share * self.tried:
-                self.displacement *= narrower
-                return
-        # cells that the box itself makes narrow do not show what wider ones would bear
-        if self.wide and self.lost < _FEW_LOST * self.tried:
-            self.displacement *= _WIDER
-
-    def _improve(self) -> None:
-        """Halve cells that leave colours open beyond the aim, round after round, on the parts where they do."""
-        rays = np.arange(self.light.shape[0])
-        below = np.array([*self.division.below, -1])
-        for _ in range(_ROUNDS):
-            low, high, impact = self._impact(rays)
-            # cells of level -1 were never bounded
-            able = below[self.level[:, rays]] >= 0
-            threshold = np.full(impact.shape[1:], self.tolerance)
-            if self.aim is not None:
-                excess = np.maximum(high - self.aim[1][rays, None], self.aim[0][rays, None] - low).max(axis=2)
-                able &= excess > 0.0
-                threshold = np.minimum(_SHARE * excess, np.where(able, impact, 0.0).max(axis=0))
-                threshold = np.maximum(threshold, _SHARE * 0.5 * self.tolerance)
-            sample, ray, part = np.nonzero(able & (impact >= threshold))
-            if not sample.size:
-                return
-            ray = rays[ray]
-            level = below[self.level[sample, ray, part]]
-            for deeper in np.unique(level):
-                which = level == deeper
-                cell = self._cell_of(deeper)[part[which]]
-                unique_cells = np.unique(np.stack([ray[which], sample[which], cell]), axis=1)
-                for start in range(0, unique_cells.shape[1], self.owner.batch):
-                    items = _SampleCells(*unique_cells[:, start : start + self.owner.batch])
-                    self._bound_batch(int(deeper), items, math.inf)
-            rays = np.unique(ray)
-
-    def _cell_of(self, level: int) -> np.ndarray:
-        """[parts] the cell of ``level`` that every part lies in."""
-        members = self._level(level)[2]
-        return np.argsort(members, axis=None) // members.shape[1]
-
-    def _impact(self, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Bounds [r, parts, 3] of ``rays``, and [samples, r, parts] what each sample leaves open of them (about)."""
-        alpha_low, alpha_high = self._anywhere(self.alpha_low[:, rays], np.minimum), self.alpha_high[:, rays]
-        top = self._anywhere(alpha_high, np.maximum)
-        light = np.ones_like(alpha_low)
-        np.cumprod(1.0 - alpha_low[:-1], axis=0, out=light[1:])
-        self.before[:, rays] = light
-        color_low, color_high, rest = self._mixtures(rays, True)
-        span = np.empty_like(alpha_low)
-        low, high = self._background(len(rays)), self._background(len(rays))
-        for k in range(len(span) - 1, -1, -1):
-            rise, fall = color_high[k] - high, color_low[k] - low
-            span[k] = np.maximum(color_high[k] - low, high - color_low[k]).max(axis=-1)
-            high += np.where(rise > 0.0, top[k][..., None], alpha_low[k][..., None]) * rise
-            low += np.where(fall < 0.0, top[k][..., None], alpha_low[k][..., None]) * fall
-        return low - rest, high + rest, light * (self.open[:, rays] * span + alpha_high * self.vague[:, rays])
-
-    def _anywhere(self, values: np.ndarray, end: np.ufunc, axis: int = -1) -> np.ndarray:
-        """Where samples lie anywhere in their bins: the ``end`` of ``values`` by parts over the parts of the bin."""
-        if not self.owner.swept:
-            return values
-        inner = self.division.parts[-1]
-        axis %= values.ndim
-        shape = (*values.shape[:axis], values.shape[axis] // inner, inner, *values.shape[axis + 1 :])
-        return np.repeat(end.reduce(values.reshape(shape), axis=axis + 1), inner, axis=axis)
-
-    def _mixtures(self, rays: np.ndarray | slice, apart: bool) -> tuple[np.ndarray, np.ndarray, np.ndarray | float]:
-        """Bounds of the colours that samples or bins contribute, and what must be added to the result's (F10).
-
-        ``apart``: what is negligible in a bin is added instead of mixed in.
-        """
-        low, high = self.color_low[:, rays], self.color_high[:, rays]
-        if not self.owner.swept:
-            return low, high, 0.0
-        weight = self.before[:, rays] * self.alpha_high[:, rays]
-        dim = (weight <= self._negligible) & apart
-        alone = self._anywhere(dim, np.logical_and)[..., None]
-        low = self._anywhere(np.where(dim[..., None], np.inf, low), np.minimum, -2)
-        high = self._anywhere(np.where(dim[..., None], -np.inf, high), np.maximum, -2)
-        rest = self._anywhere(np.where(dim & ~alone[..., 0], weight, 0.0), np.maximum).sum(axis=0)
-        # the light before a sample is kept in float32
-        return np.where(alone, 0.0, low), np.where(alone, 1.0, high), (rest * KEPT_LIGHT_UP)[..., None]
-
-    def _background(self, count: int) -> np.ndarray:
-        """[count, parts, 3] the colour behind the last sample."""
-        return np.tile(np.array(self.owner.sampling.background, np.float64), (count, self.light.shape[1], 1))
-
-    def _bound_batch(self, level: int, items: _SampleCells, coarse: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Bound some cells of one level.
-
-        Returns [k] which leave more light open than ``coarse``, which leave all of it, and which needed the network.
-        """
-        check_cancelled()
-        halve, lost, tried = (np.zeros(len(items), bool) for _ in range(3))
-        lines, radius = self.pencil.points(
-            items.ray, self.owner.distances[items.sample], 0.5 * self.owner.lengths[items.sample]
-        )
-        which, sure = self._occupied(level, items, lines, radius)
-        if which.size:
-            items, lines, radius, sure = items.take(which), lines[which], radius[which], sure[which]
-            halve[which], lost[which] = self._bound_field(level, items, lines, radius, sure, coarse)
-            tried[which] = True
-        return halve, lost, tried
-
-    def _occupied(
-        self, level: int, items: _SampleCells, lines: np.ndarray, radius: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Which items may see occupied voxels, and [k] whether an item surely does; the others are made empty (F11)."""
-        everything = np.arange(len(items))
-        if self.owner.occupancy is None:
-            return everything, np.ones(len(items), bool)
-        low, high = self.division.boxes(level)
-        ends = self.pencil.ranges(lines, radius, low[items.cell], high[items.cell])
-        empty, sure = self.owner.occupancy.look(*ends)
-        gone = items.take(empty)
-        if len(gone):
-            rows = self._rows(level, gone)
-            self.alpha_low[rows] = self.alpha_high[rows] = 0.0
-            self.open[rows] = self.vague[rows] = 0.0
-            self.level[rows] = self.division.levels
-        return everything[~empty], sure
-
-    def _bound_field(
-        self,
-        level: int,
-        items: _SampleCells,
-        lines: np.ndarray,
-        radius: np.ndarray,
-        sure: np.ndarray,
-        coarse: float,
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """`_bound_batch` by the network; where it is not ``sure`` [k], density may also be 0."""
-        device, field = self.owner.device, self.field
-        monomials, bernstein, _ = self._level(level)
-        self.cells += len(items)
-        there = monomials[torch.from_numpy(items.cell).to(device)]
-        nodes = there @ torch.from_numpy(lines).to(device)
-        encoded = field.encode(nodes, torch.from_numpy(radius).to(device), field.position)
-        pieces, density = field.base(*encoded)
-        halve, lost = np.zeros((2, len(items)), bool)
-        differing = np.flatnonzero(~self._leave_alike(level, items, density))
-        if not differing.size:
-            return halve, lost
-        items, sure, density = (
-            items.take(differing),
-            sure[differing],
-            density.without_columns(torch.from_numpy(differing).to(device)),
-        )
-        low, high, error = bounds_by_part(density, bernstein)
-        length = torch.from_numpy(self.owner.lengths[items.sample]).to(device)[:, None]
-        alpha_low, alpha_high = opacity(low[..., 0], length, up=False), opacity(high[..., 0], length, up=True)
-        bad = density.failed[:, None]
-        alpha_low, alpha_high = torch.where(bad, 0.0, alpha_low), torch.where(bad, 1.0, alpha_high)
-        # what the network's own error leaves open, apart from the cell's width
-        middle = 0.5 * (low[..., 0] + high[..., 0])
-        open_ = opacity(middle + error[:, :1], length, up=True) - opacity(middle - error[:, :1], length, up=False)
-        open_ = torch.where(bad, 1.0, open_).cpu().numpy()
-        low_a, high_a = alpha_low.cpu().numpy(), alpha_high.cpu().numpy()
-        if not sure.all():
-            low_a = np.where(sure[:, None], low_a, 0.0)
-            open_ = np.where(sure[:, None], open_, high_a)
-        rows = self._rows(level, items)
-        light = self.before[rows]
-        self._keep(self.alpha_low, self.alpha_high, rows, low_a, high_a)
-        self.open[rows] = np.minimum(self.open[rows], open_)
-        self.level[rows] = level
-        halved = (open_ * light).max(axis=1) > coarse
-        halve[differing], lost[differing] = halved, halved & (open_.min(axis=1) > _LOST)
-        shines = (high_a * light).max(axis=1) > self._negligible
-        # what is halved gets its colours from the halves, if there are any
-        final = ~halved | (self.division.below[level] < 0)
-        coloured = np.flatnonzero(shines & final & ~density.failed.cpu().numpy())
-        if coloured.size:
-            which = torch.from_numpy(differing[coloured]).to(device)
-            self._color(level, items.take(coloured), pieces.select(which), there[which])
-        return halve, lost
-
-    def _leave_alike(self, level: int, items: _SampleCells, density: PreActivation) -> np.ndarray:
-        """[k] whether next to nothing is seen of an item: that is all that is found out about it then."""
-        length = torch.from_numpy(self.owner.lengths[items.sample]).to(density.poly.device)
-        most = opacity(greatest(density)[:, 0], length, up=True)
-        alike = ((most <= _TUNING.alike * self.tolerance) & ~density.failed).cpu().numpy()
-        gone, high = items.take(alike), most.cpu().numpy()[alike, None]
-        rows = self._rows(level, gone)
-        self.alpha_high[rows] = np.minimum(self.alpha_high[rows], high)
-        self.open[rows] = np.minimum(self.open[rows], high)
-        self.level[rows] = level
-        return alike
-
-    def _color(self, level: int, items: _SampleCells, pieces: PostActivation, there: Tensor) -> None:
-        """Bound the colours of ``pieces``, those of ``items``; ``there``: monomials at their nodes."""
-        if self.owner.white is not None:
-            self._whiten(self.owner.white, level, items)
-            return
-        device, field = self.owner.device, self.field
-        bernstein = self._level(level)[1]
-        direction = there @ torch.from_numpy(self.pencil.direction[items.ray]).to(device)
-        radius = self.pencil.direction_radius[items.ray] + DIRECTION_ROUNDING
-        encoded = field.encode(direction, torch.from_numpy(radius).to(device), field.direction)
-        color = field.color(pieces, *encoded)
-        low, high, error = brightness(color, bernstein)
-        where = self._rows(level, items)
-        self._keep(self.color_low, self.color_high, where, low.cpu().numpy(), high.cpu().numpy())
-        slack = 2.0 * torch.tanh(0.25 * error.amax(dim=1))
-        slack = torch.where(color.failed, 1.0, slack).cpu().numpy()
-        self.vague[where] = np.minimum(self.vague[where], slack[:, None])
-
-    def _whiten(self, white: WhiteSamples, level: int, items: _SampleCells) -> None:
-        """Bound the colours of samples ``items`` that are white where they are chosen (Q3)."""
-        distance = self.owner.distances[items.sample]
-        lines, radius = self.pencil.points(items.ray, distance, 0.5 * self.owner.lengths[items.sample])
-        low, high = self.division.boxes(level)
-        ends = self.pencil.ranges(lines, radius, low[items.cell], high[items.cell])
-        least, most = white.between(*ends, distance)
-        where = self._rows(level, items)
-        self._keep(self.color_low, self.color_high, where, least[:, None], most[:, None])
-        self.vague[where] = np.minimum(self.vague[where], (most - least).max(axis=1)[:, None])
-
-    @staticmethod
-    def _keep(lower: np.ndarray, upper: np.ndarray, rows: tuple, low: np.ndarray, high: np.ndarray) -> None:
-        """Intersect what is known with new bounds; what is not a number or crosses says nothing."""
-        old_low, old_high = lower[rows], upper[rows]
-        good = (low <= high) & np.isfinite(low) & np.isfinite(high)
-        low = np.where(good, np.maximum(low, old_low), old_low)
-        high = np.where(good, np.minimum(high, old_high), old_high)
-        crossed = ~(low <= high)
-        lower[rows] = np.where(crossed, old_low, low)
-        upper[rows] = np.where(crossed, old_high, high)
-
-    def _shifted(self, color: tuple[np.ndarray, np.ndarray], shift: Shifts) -> tuple[np.ndarray, np.ndarray]:
-        """Bounds of ``color`` (lower, upper) after ``shift``; [0, 1] where next to nothing is seen of it."""
-        visible = self.before * self.alpha_high > _TUNING.unseen
-        low, high = np.zeros_like(color[0]), np.ones_like(color[1])
-        low[visible], high[visible] = shifted_bounds(color[0][visible], color[1][visible], *shift)
-        return low, high
-
-    def _composite(self) -> tuple[np.ndarray, np.ndarray]:
-        """[n, parts, 3] bounds by part (design.md, F8)."""
-        low, high = self._composited(False)
-        if self.owner.swept:
-            other_low, other_high = self._composited(True)
-            low, high = np.maximum(low, other_low), np.minimum(high, other_high)
-        if self.edges is not None:
-            other_low, other_high = self._sampled(*self.edges)
-            low, high = np.maximum(low, other_low), np.minimum(high, other_high)
-        return low, high
-
-    def _sampled(self, edges_low: np.ndarray, edges_high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """[n, parts, 3] bounds by parts, from where the fine field is sampled (design.md, F14)."""
-        owner, inner = self.owner, self.division.parts[-1]
-        rows, samples, n = len(edges_low), self.alpha_low.shape[0], self.alpha_low.shape[1]
-
-        def along(values: np.ndarray) -> np.ndarray:
-            """[samples, n, parts, ...] as [n parts of the poses, parts of the ray, ...]."""
-            apart = values.reshape(samples, n, rows // n, inner, *values.shape[3:])
-            return np.ascontiguousarray(np.moveaxis(apart, 0, 2)).reshape(rows, samples * inner, *values.shape[3:])
-
-        with np.errstate(divide="ignore"):
-            density_low = -np.log1p(-self.alpha_low) / owner.lengths[:, None, None] * (1.0 - DENSITY_ROUNDING)
-            density_high = -np.log1p(-self.alpha_high) / owner.lengths[:, None, None] * (1.0 + DENSITY_ROUNDING)
-        weight = self.before * self.alpha_high
-        dim = weight <= self._negligible
-        # what is negligible takes the colour of what is not, at the price of its weight
-        price = along(np.where(dim, weight, 0.0)).reshape(rows, samples, inner).max(axis=2).sum(axis=1)
-        colors = np.stack([
-            along(np.where(dim[..., None], np.inf, self.color_low)),
-            along(np.where(dim[..., None], -np.inf, self.color_high)),
-        ])  # fmt: skip
-        count = edges_low.shape[1] - 1
-        density, color = np.empty((2, rows, count)), np.empty((2, rows, count, 3))
-        near, far = owner.sampling.near, owner.sampling.far
-        field_hulls(
-            edges_low, edges_high, near, (far - near) / (samples * inner),
-            np.stack([along(density_low), along(density_high)]), colors, density, color,
-        )  # fmt: skip
-        low = np.tile(np.array(owner.sampling.background, np.float64), (rows, 1))
-        high = low.copy()
-        composite(edges_low, edges_high, density, color, low, high)
-        slack = SAMPLE_ROUNDING * (2 * count + 7) + (price * KEPT_LIGHT_UP)[:, None]
-        ends = np.clip(low - slack, 0.0, 1.0), np.clip(high + slack, 0.0, 1.0)
-        low, high = (np.repeat(end.reshape(n, rows // n, 3), inner, axis=1) for end in ends)
-        return low, high
-
-    def _composited(self, apart: bool) -> tuple[np.ndarray, np.ndarray]:
-        """[n, parts, 3] bounds by parts; ``apart``: see `_mixtures`."""
-        low, high = self._background(len(self.light)), self._background(len(self.light))
-        color_low, color_high, rest = self._mixtures(slice(None), apart)
-        for k in range(self.alpha_low.shape[0] - 1, -1, -1):
-            least = self._anywhere(self.alpha_low[k], np.minimum)[..., None]
-            most = self._anywhere(self.alpha_high[k], np.maximum)[..., None]
-            rise, fall = color_high[k] - high, color_low[k] - low
-            high += np.where(rise > 0.0, most, least) * rise
-            low += np.where(fall < 0.0, most, least) * fall
-        slack = SAMPLE_ROUNDING * (self.alpha_low.shape[0] + self.owner.sampling.importance + 5)
-        low, high = low - rest - slack, high + rest + slack
-        return np.clip(low, 0.0, 1.0), np.clip(high, 0.0, 1.0)

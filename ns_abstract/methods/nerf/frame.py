@@ -19,7 +19,8 @@ from ns_abstract.execution.cancellation import WorkCancelledError, check_cancell
 from ns_abstract.execution.engines import Processes
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseBox
-from ns_abstract.methods.nerf.bounds import NerfBounds, RayBounds, Shifts, typical_displacement
+from ns_abstract.methods.nerf.bounds import NerfBounds
+from ns_abstract.methods.nerf.ray_field import RayBounds, Shifts, typical_displacement
 from ns_abstract.methods.nerf.ray_pictures import PixelRenderer, RayPictures
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
 from ns_abstract.methods.nerf.scene import NerfScene

@@ -10,10 +10,10 @@ import numpy as np
 
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
-from ns_abstract.methods.nerf.bounds import basis_of, device_bytes
 from ns_abstract.methods.nerf.device import check_device, processes_that_fit
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.occupancy import VOXEL_BYTES, OccupancyGrid
+from ns_abstract.methods.nerf.ray_field import basis_of, device_bytes
 from ns_abstract.methods.nerf.ray_pictures import (
     FieldMethod,
     arrays_digest,

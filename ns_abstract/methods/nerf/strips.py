@@ -20,10 +20,10 @@ import numpy as np
 from ns_abstract.arithmetic.rounding import PART_END_ROUNDING
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseBox
-from ns_abstract.methods.nerf.bounds import RayBounds, Shifts
 from ns_abstract.methods.nerf.division import Division
 from ns_abstract.methods.nerf.planes import fit_planes
 from ns_abstract.methods.nerf.ray_bundle import RayBundle
+from ns_abstract.methods.nerf.ray_field import RayBounds, Shifts
 
 #: Rays that are bounded together by compiled kernels, and by torch alone, which wants many cells at a time.
 _GROUP, _GROUP_ON_DEVICE = 8, 64

@@ -10,12 +10,12 @@ from ns_abstract.arithmetic.outward import outward
 from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseBox
-from ns_abstract.methods.nerf.bounds import RayBounds, Shifts
 from ns_abstract.methods.nerf.division import Division, division_for
 from ns_abstract.methods.nerf.hash_bounds import pieces
 from ns_abstract.methods.nerf.hash_bounds.arrays import field_arrays, piece_room
 from ns_abstract.methods.nerf.hash_field import NerfactoField
 from ns_abstract.methods.nerf.ray_bundle import TAYLOR, RayBundle
+from ns_abstract.methods.nerf.ray_field import RayBounds, Shifts
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,11 @@ from typing import Any
 from ns_abstract.execution.cancellation import WorkCancelledError
 from ns_abstract.execution.threads import each
 from ns_abstract.geometry.poses import PoseBox
-from ns_abstract.methods.nerf.bounds import RayBounds
 from ns_abstract.methods.nerf.frame import FieldFrame
 from ns_abstract.methods.nerf.hash_bounds.bounds import HashBounds
 from ns_abstract.methods.nerf.hash_field import NerfactoScene
 from ns_abstract.methods.nerf.nerfacto_render import NerfactoRenderer
+from ns_abstract.methods.nerf.ray_field import RayBounds
 
 #: Rays that are bounded together, and shares of a worker between two looks at the goal. Preferences.
 _SHARE, _SHARES = 4, 4

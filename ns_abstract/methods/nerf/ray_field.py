@@ -1,0 +1,155 @@
+"""Records of bounds of rays, and the field of a scene along the rays of a sampling (design.md, F6-F8)."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from ns_abstract.arithmetic.chebyshev import ChebyshevBasis
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.poses import PoseBox
+from ns_abstract.methods.nerf.hsv import Range
+from ns_abstract.methods.nerf.render import Sampling
+from ns_abstract.methods.nerf.scene import FieldWeights, NerfScene
+from ns_abstract.methods.nerf.white import WhiteSamples
+from ns_abstract.methods.nerf.zonotope import ERROR_TERMS, FieldBounds
+
+#: (degree, grid) of the polynomials by number of parameters.
+_DEGREES = {0: (1, 2), 1: (28, 112), 2: (6, 20), 3: (4, 10), 4: (2, 5)}
+#: The same of one parameter for a field whose base has at most so many layers: it bears cells as wide as its waves are
+#: followed, while deeper ones bend more.
+_SHALLOW, _SHALLOW_DEGREE = 4, (35, 126)
+#: Cells bounded at once by compiled kernels, whose numbers stay in a core's cache.
+_BATCH = 128
+#: Elsewhere: values of a layer's neurons on the grid, and how many arrays as large there may be at a time, about.
+_VALUES, _ARRAYS = 1 << 25, 12
+
+
+@dataclass(frozen=True)
+class RayTuning:
+    """Light and ways from which on samples are worked on. None of them decides whether a bound holds."""
+
+    #: Light (in [0, 1]) that a skipped sample may add, as a share of the tolerance.
+    quiet: float = 0.02
+    #: Opacities of at most this share of the tolerance are not told apart by parts of a cell.
+    alike: float = 2.0**-9
+    #: Light that a sample may leave open before compositing has shown where it matters.
+    coarse: float = 0.1
+    #: Half the way of one that is followed, whose place the coarse pass moves, too.
+    followed: float = 5e-4
+    least_followed: float = 2e-6
+    #: Light from a sample whose colour's shift is not looked at.
+    unseen: float = 1e-5
+
+
+RAY_TUNING = RayTuning()
+
+#: Intervals of hue and saturation.
+Shifts = tuple[Range, Range]
+
+
+def basis_of(dimensions: int, field: FieldWeights) -> ChebyshevBasis:
+    """The polynomials that are used for ``dimensions`` parameters of a ``field``."""
+    degree, grid = _DEGREES.get(dimensions, (1, 2))
+    if dimensions == 1 and len(field.base) <= _SHALLOW:
+        degree, grid = _SHALLOW_DEGREE
+    return ChebyshevBasis(dimensions, degree, grid)
+
+
+def cells_at_once(field: FieldWeights, basis: ChebyshevBasis) -> int:
+    """Cells of a batch where kernels are not compiled."""
+    return max(1, _VALUES // (len(basis.evaluation) * field.width))
+
+
+def device_bytes(field: FieldWeights, basis: ChebyshevBasis) -> int:
+    """Memory that such a batch may take, about."""
+    # error terms before and after a layer, and their product with slopes
+    columns = 3 * ERROR_TERMS * cells_at_once(field, basis) * field.width
+    return 8 * (_ARRAYS * _VALUES + columns) + (1 << 29)
+
+
+@dataclass
+class RayBounds:
+    """Bounds of n rays over a box.
+
+    Attributes:
+        lower, upper: [n, 3] float64 bounds of the colours.
+        alpha: [n, samples] float32 upper bounds of the opacity of every sample over the box.
+        cells: Cells of the network that were bounded.
+        displacement: Half the way of a sample over a cell that the network's bounds bear, as far as these rays tell.
+        parts: [2, n, shifts, *parts, 3] float32 lower and upper bounds, rounded outward, by part of the box, if a
+            division was given; one row of ``shifts`` where none were.
+    """
+
+    lower: np.ndarray
+    upper: np.ndarray
+    alpha: np.ndarray
+    cells: int
+    displacement: float
+    parts: np.ndarray | None = None
+
+
+def typical_displacement(parts: Sequence[RayBounds]) -> float:
+    """Return the geometric mean of the displacements of ``parts``, whatever their order."""
+    return math.exp(sum(math.log(part.displacement) for part in parts) / len(parts))
+
+
+@dataclass(frozen=True)
+class RayRequest:
+    """The arguments of `NerfBounds.rays`."""
+
+    pose_set: PoseBox
+    box: ParameterBox
+    pixels: np.ndarray
+    tolerance: float
+    known: np.ndarray | None
+    aim: tuple[np.ndarray, np.ndarray] | None
+    shifts: list[Shifts]
+
+    def take(self, which: np.ndarray) -> RayRequest:
+        """Some of the rays."""
+        known_alpha = None if self.known is None else self.known[which]
+        aim = None if self.aim is None else (self.aim[0][which], self.aim[1][which])
+        return replace(self, pixels=self.pixels[which], known=known_alpha, aim=aim)
+
+
+class RayField:
+    """A scene's field along the rays of a sampling, and what bounds it.
+
+    Args:
+        scene: The scene.
+        sampling: Uniform or hierarchical.
+        dimensions: Number of parameters.
+        device: Where the network is bounded.
+        compiled: Whether by kernels compiled for a processor; None: where ``device`` is one.
+        white: Which samples are white, the others black, in place of the field's colours; None: these. Of uniform
+            samples alone.
+    """
+
+    def __init__(
+        self,
+        scene: NerfScene,
+        sampling: Sampling,
+        dimensions: int,
+        device: torch.device | str = "cpu",
+        compiled: bool | None = None,
+        white: WhiteSamples | None = None,
+    ) -> None:
+        self.white = white
+        self.sampling, self.device = sampling, torch.device(device)
+        self.swept = sampling.kind == "hierarchical"
+        self.basis = basis_of(dimensions + self.swept, scene.fine)
+        self.field = FieldBounds(scene.fine, self.basis, device=device, compiled=compiled)
+        #: Cells bounded at once.
+        self.batch = _BATCH if self.field.compiled else cells_at_once(scene.fine, self.basis)
+        self.occupancy = scene.occupancy
+        self.distances, self.lengths = sampling.bins
+
+    @property
+    def compiled(self) -> bool:
+        """Whether kernels for a processor bound the field."""
+        return self.field.compiled
