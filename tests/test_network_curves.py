@@ -13,6 +13,7 @@ from flint import arb, fmpq
 from oracle import at_most, rational
 
 from ns_abstract.verify.network import activations, composite_activations
+from ns_abstract.verify.network.layers import LinearRelaxation
 from ns_abstract.verify.network.scalar_function import ScalarFunction
 
 ZERO = fmpq(0)
@@ -108,7 +109,7 @@ def broken(curve: ScalarFunction, exact: Exact, range_: tuple[float, float]) -> 
     flat = torch.zeros_like(lower)
     least, most = curve.range(lower, upper)
     found = 0
-    lines = [curve.lines(lower, upper), curve.band(lower, upper), activations.LinearRelaxation(flat, least, flat, most)]
+    lines = [curve.lines(lower, upper), curve.band(lower, upper), LinearRelaxation(flat, least, flat, most)]
     for k in range(len(lower)):
         for z in points(float(lower[k]), float(upper[k]), curve.breaks):
             for line in lines:

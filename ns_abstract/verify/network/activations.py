@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -141,6 +142,8 @@ class Power(ScalarFunction):
 class Reciprocal(ScalarFunction):
     """``1 / z``; known where an interval holds no 0, with ``floor`` a bound that the input is known to obey."""
 
+    # two operations that keep all digits, however small the slope is
+    slope_scale: ClassVar[float] = 0.0
     floor: float = -math.inf
 
     @property
