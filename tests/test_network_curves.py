@@ -12,8 +12,9 @@ import torch
 from flint import arb, fmpq
 from oracle import at_most, rational
 
-from ns_abstract.verify.network import activations
-from ns_abstract.verify.network.activations import ScalarFunction
+from ns_abstract.verify.network import activations, composite_activations
+from ns_abstract.verify.network.layers import LinearRelaxation
+from ns_abstract.verify.network.scalar_function import ScalarFunction
 
 ZERO = fmpq(0)
 Exact = Callable[[arb], arb]
@@ -48,7 +49,11 @@ CURVES: dict[str, tuple[ScalarFunction, Exact, tuple[float, float]]] = {
     "root": (activations.Root((1,)), lambda z: z.sqrt(), (1e-6, 50)),
     "inverse root": (activations.Root((1,), inverse=True), lambda z: z.rsqrt(), (1e-5, 50)),
     "exp": (activations.Exp((1,)), lambda z: z.exp(), (-30, 30)),
-    "capped exp": (activations.CappedExp((1,)), lambda z: z.min(arb(activations.CAP)).exp(), (-30, 40)),
+    "capped exp": (
+        composite_activations.CappedExp((1,)),
+        lambda z: z.min(arb(composite_activations.CAP)).exp(),
+        (-30, 40),
+    ),
     "log": (activations.Log((1,)), lambda z: z.log(), (1e-4, 50)),
     "softplus": (activations.Softplus((1,)), lambda z: (1 + z.exp()).log(), (-40, 40)),
     "elu": (activations.Elu((1,), alpha=1.5), lambda z: _elu(z, 1.5, 1, 1), (-20, 20)),
@@ -104,7 +109,7 @@ def broken(curve: ScalarFunction, exact: Exact, range_: tuple[float, float]) -> 
     flat = torch.zeros_like(lower)
     least, most = curve.range(lower, upper)
     found = 0
-    lines = [curve.lines(lower, upper), curve.band(lower, upper), activations.LinearRelaxation(flat, least, flat, most)]
+    lines = [curve.lines(lower, upper), curve.band(lower, upper), LinearRelaxation(flat, least, flat, most)]
     for k in range(len(lower)):
         for z in points(float(lower[k]), float(upper[k]), curve.breaks):
             for line in lines:

@@ -13,10 +13,10 @@ from flint import arb
 from onnx import helper
 from onnx_files import OnnxFile, attack, image_sets, session
 
-from ns_abstract.verify.network import ImageSets, bound_outputs, load_network
-from ns_abstract.verify.network import activations as curve_module
+from ns_abstract.verify.network import ImageSets, bound_outputs, composite_activations, load_network
 from ns_abstract.verify.network.bilinear import Product, ProductPlanes
 from ns_abstract.verify.network.coefficients import Coefficients, grid
+from ns_abstract.verify.network.scalar_function import ScalarFunction
 from ns_abstract.verify.network.sparse_layers import PairwiseDifferences, SparseMatrix, TransposedConvolution
 
 SHAPE = (3, 6, 6)
@@ -366,7 +366,7 @@ def _touching_line(monkeypatch: pytest.MonkeyPatch) -> None:
         height = cuts.value - line * cuts.z
         return height[len(height) // 2]
 
-    monkeypatch.setattr(curve_module.ScalarFunction, "_extreme", staticmethod(extreme))
+    monkeypatch.setattr(ScalarFunction, "_extreme", staticmethod(extreme))
 
 
 def _sparse_not_passed_back(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -461,9 +461,9 @@ def test_shares_past_the_cap_are_charged(gap: float, tmp_path: Path) -> None:
         assert arb(found[k]) <= share and arb(found[3 + k]) <= -share
         assert float((share - arb(found[k])).upper()) < 2e-12 and float((-share - arb(found[3 + k])).upper()) < 2e-12
     # what the layers compute without their roundings, from the side of the smallest number
-    cap, gaps = curve_module.CAP, torch.tensor([gap, 0.0, 1.0], dtype=torch.float64)
-    total = curve_module.CappedExp((1,)).function(gaps).sum().clamp(max=float(np.exp(cap)))
-    layer = curve_module.SoftmaxReciprocal((1,))
+    cap, gaps = composite_activations.CAP, torch.tensor([gap, 0.0, 1.0], dtype=torch.float64)
+    total = composite_activations.CappedExp((1,)).function(gaps).sum().clamp(max=float(np.exp(cap)))
+    layer = composite_activations.SoftmaxReciprocal((1,))
     off = abs(arb(float(layer.function(total))) - shares[1])
     assert off <= float(torch.as_tensor(layer.missing(total, total))) + 2.0**-50 * float(layer.function(total))
 

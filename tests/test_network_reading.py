@@ -17,7 +17,7 @@ from onnx_files import OnnxFile
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import ImageSets, bound_outputs, load_network
-from ns_abstract.verify.network.composite_layers import nearest_pixels
+from ns_abstract.verify.network.interpolation import nearest_pixels
 from ns_abstract.verify.network.load import onnx_runner
 from ns_abstract.verify.vnnlib import load_regions, load_vnnlib
 

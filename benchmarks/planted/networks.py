@@ -97,8 +97,8 @@ NETWORKS = (
     ),
     Fault(
         "clip: limits of 2^100 are taken for none",
-        _NETWORK + "composite_layers.py",
-        "CompositeBuilder.clip",
+        _NETWORK + "elementwise_layers.py",
+        "ElementwiseBuilder.clip",
         "least <= -OVERFLOW, most >= OVERFLOW",
         "least <= -(2.0**100), most >= 2.0**100",
         _TESTS + "test_limits_of_clips_count_however_large",

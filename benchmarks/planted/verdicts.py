@@ -294,7 +294,7 @@ VERDICTS = (
     ),
     Fault(
         "network: sums of a softmax that are cut off are exact",
-        "verify/network/activations.py",
+        "verify/network/composite_activations.py",
         "SoftmaxReciprocal.missing",
         "LOST_SHARE",
         "0.0",

@@ -10,12 +10,12 @@ import torch
 from torch import Tensor
 
 from ns_abstract.io.errors import InputError
-from ns_abstract.verify.network.activations import ScalarFunction
 from ns_abstract.verify.network.bounds import bound_outputs
 from ns_abstract.verify.network.composite_activations import Quantised
 from ns_abstract.verify.network.graph import Network
 from ns_abstract.verify.network.image_sets import ImageSets
 from ns_abstract.verify.network.layers import Activation
+from ns_abstract.verify.network.scalar_function import ScalarFunction
 from ns_abstract.verify.network.sparse_layers import Variance
 
 #: One output, flattened, for one image [1, ...].

@@ -1,4 +1,4 @@
-"""Activations that a graph writes out with constants of its own, bounded with these constants.
+"""Activations that stand inside composites: parts of a softmax, and curves with constants of the file.
 
 A file's 0.70710677 is not ``1 / sqrt(2)``. In exact arithmetic the difference may decide a verdict, so that the
 curves here take the file's numbers (docs/dev/design.md, N24).
@@ -9,12 +9,20 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor
 
-from ns_abstract.arithmetic.network_charges import OWN_QUOTIENTS, STEPS, SWITCH
-from ns_abstract.verify.network import activations
+from ns_abstract.arithmetic.network_charges import (
+    ATTENTION,
+    ATTENTION_BLOCKS,
+    LOST_SHARE,
+    OWN_QUOTIENTS,
+    STEPS,
+    SWITCH,
+)
+from ns_abstract.verify.network.activations import FLUSHED, Clip, Exp, Gelu, HardSwish, Reciprocal, Softplus
 
 
 def _far(lower: Tensor, upper: Tensor) -> Tensor:
@@ -22,7 +30,7 @@ def _far(lower: Tensor, upper: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True, eq=False)
-class ScaledGelu(activations.Gelu):
+class ScaledGelu(Gelu):
     """``z (1 + erf(rate z / sqrt(2))) / 2``: GELU of ``rate z``, divided by ``rate``."""
 
     rate: float = 1.0
@@ -42,7 +50,7 @@ class ScaledGelu(activations.Gelu):
 
 
 @dataclass(frozen=True, eq=False)
-class GatedClip(activations.HardSwish):
+class GatedClip(HardSwish):
     """``z min(max(factor z + offset, 0), 1)``."""
 
     factor: float = 1.0 / 6.0
@@ -63,7 +71,7 @@ class GatedClip(activations.HardSwish):
 
 
 @dataclass(frozen=True, eq=False)
-class SwitchedSoftplus(activations.Softplus):
+class SwitchedSoftplus(Softplus):
     """``log(1 + exp(z))`` up to ``limit``, and above it a straight line that is ``excess`` off z, relatively."""
 
     limit: float = math.inf
@@ -76,7 +84,7 @@ class SwitchedSoftplus(activations.Softplus):
 
 
 @dataclass(frozen=True, eq=False)
-class Quantised(activations.Clip):
+class Quantised(Clip):
     """``step * min(max(round(z / step), low), high)``, enclosed by the clipped z and half a step (N25).
 
     `function` is the clipped z; a call gives the steps, whose gradient is that of the clipped z.
@@ -95,3 +103,47 @@ class Quantised(activations.Clip):
         plain = self.function(z)
         stepped = (torch.round(z / self.step) * self.step).clamp(self.least, self.most)
         return plain + (stepped - plain).detach()
+
+
+#: A softmax's terms, relative to one of them, and their sum are cut off at exp(this).
+CAP = 30.0
+
+
+class SoftmaxReciprocal(Reciprocal):
+    """The reciprocal in a softmax: of a sum of capped exponentials (N11)."""
+
+    def missing(self, lower: Tensor, upper: Tensor) -> Tensor | float:
+        # the share and this are both less than exp(-CAP) and its roundings there; sums keep half their size
+        return torch.where(upper > 0.5 * math.exp(CAP), LOST_SHARE, 0.0)
+
+
+@dataclass(frozen=True, eq=False)
+class CappedExp(Exp):
+    """``min(exp(z), exp(cap))``: of terms of a softmax, whose sums are as good as infinite past that (N11).
+
+    Attributes:
+        count: Terms of a sum.
+    """
+
+    count: int = 1
+    cap: ClassVar[float] = CAP
+
+    @property
+    def breaks(self) -> tuple[float, ...]:
+        return (self.cap,)
+
+    @property
+    def bends(self) -> tuple[int, ...]:
+        return 1, 0
+
+    def function(self, z: Tensor) -> Tensor:
+        return z.clamp(max=self.cap).exp()
+
+    def slope(self, z: Tensor) -> Tensor:
+        return z.clamp(max=self.cap).exp()
+
+    def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
+        # the smaller of a number and the cap is the cap where any evaluation is past it
+        capped = lower > self.cap + 1.0
+        relative = ATTENTION + ATTENTION_BLOCKS * self.count
+        return torch.where(capped, 0.0, relative * upper.clamp(max=self.cap).exp() + FLUSHED)

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
@@ -16,30 +15,21 @@ from ns_abstract.arithmetic.network_charges import (
     ATTENTION_BLOCKS,
     FOLDING,
     LEAST_DIVISOR,
-    NEAR,
-    OVERFLOW,
-    POLYNOMIAL,
-    POSITION,
     gamma,
 )
 from ns_abstract.io.errors import InputError
-from ns_abstract.verify.network import activations
-from ns_abstract.verify.network.bilinear import Product
-from ns_abstract.verify.network.build import NetworkBuilder
-from ns_abstract.verify.network.composite_activations import GatedClip, ScaledGelu, SwitchedSoftplus
+from ns_abstract.verify.network import activations, composite_activations
+from ns_abstract.verify.network.elementwise_layers import ElementwiseBuilder
 from ns_abstract.verify.network.graph import as_double, item
-from ns_abstract.verify.network.inexact_constants import ConstantIntervals, InexactLayer, with_inexact_constants
+from ns_abstract.verify.network.interpolation import ResizeAxis
 from ns_abstract.verify.network.layers import (
-    Activation,
     Convolution,
     Gather,
-    LeakyRelu,
     LinearLayer,
     ScaleLayer,
     Shape,
     Sum,
 )
-from ns_abstract.verify.network.max_pooling import MaxPool
 from ns_abstract.verify.network.sparse_layers import (
     PairwiseDifferences,
     Resize,
@@ -48,264 +38,13 @@ from ns_abstract.verify.network.sparse_layers import (
     Variance,
 )
 
-#: The same for curves that take the file's own numbers.
-_ALIKE = 2.0**-10
 _ONES = (1, 1)
-#: A preference: limits of one side up to this are those of a ReLU, whose slopes are chosen (N14).
-_NEAR_ZERO = 2.0**16
 #: Entries of a matrix that takes means away; where it would have more, the mean is a layer of its own.
 _CENTRED_AT_ONCE = 1 << 16
 
 
-class CompositeBuilder(NetworkBuilder):
+class CompositeBuilder(ElementwiseBuilder):
     """Builds operators such as softmax, normalisation and resizing from basic layers."""
-
-    # ------------------------------------------------------------ what is known of nodes
-
-    def _node(self, index: int) -> Any:
-        return self.nodes[index - 1] if index else None
-
-    def _affine(self, index: int) -> tuple[int, float, float]:
-        """(root, factor, offset): node ``index`` is ``factor * root + offset`` with plain numbers."""
-        factor, offset = 1.0, 0.0
-        # constants that are known within bounds alone are no plain numbers
-        while index and type(self._node(index).layer) is ScaleLayer:
-            layer = self._node(index).layer
-            f = layer.factor.reshape(-1)
-            o = torch.zeros(1, dtype=torch.float64) if layer.offset is None else layer.offset.reshape(-1)
-            if not (bool((f == f[0]).all()) and bool((o == o[0]).all())):
-                break
-            factor, offset = factor * float(f[0]), offset + factor * float(o[0])
-            index = self._node(index).inputs[0]
-        return index, factor, offset
-
-    def floor(self, index: int, depth: int = 12) -> float:
-        """A number that node ``index`` never is below, by what computes it, rounding included."""
-        if not index or not depth:
-            return -math.inf
-        node = self._node(index)
-        layer = node.layer
-        if isinstance(layer, (activations.Exp, activations.Softplus, activations.Abs, activations.Sigmoid)):
-            return 0.0
-        if isinstance(layer, LeakyRelu) and layer.alpha == 0.0:
-            return 0.0
-        if isinstance(layer, activations.Power) and layer.exponent % 2 == 0:
-            return 0.0
-        if isinstance(layer, activations.Clip):
-            return layer.least
-        least = [self.floor(k, depth - 1) for k in node.inputs]
-        if isinstance(layer, Product):
-            return 0.0 if min(least) >= 0.0 else -math.inf
-        if isinstance(layer, Variance):
-            # one pass may end below zero (N11)
-            return -math.inf
-        if min(least) == -math.inf or isinstance(layer, Activation):
-            return -math.inf
-        if type(layer) is ScaleLayer and bool((layer.factor >= 0.0).all()):
-            low = layer.factor * least[0] + (0.0 if layer.offset is None else layer.offset)
-            positive = layer.offset is None or bool((layer.offset >= 0.0).all())
-            return self._rounded(float(low.min()), positive, layer.terms)
-        if type(layer) is LinearLayer or isinstance(layer, MaxPool):
-            return least[0]
-        positive = (
-            (isinstance(layer, Sum) and min(layer.signs) > 0)
-            or (
-                isinstance(layer, (SparseMatrix, Convolution))
-                and not isinstance(layer, InexactLayer)
-                and bool((layer.weight >= 0.0).all())
-            )
-            or isinstance(layer, Gather)
-        )
-        return 0.0 if positive and min(least) >= 0.0 and layer.bias is None else -math.inf
-
-    @staticmethod
-    def _rounded(value: float, positive: bool, terms: int) -> float:
-        """A sum of numbers that are not negative keeps its size, but for ``terms`` roundings and folding."""
-        return value * (1.0 - gamma(terms + FOLDING)) if positive and value >= 0.0 else -math.inf
-
-    # ------------------------------------------------------------ functions of one number
-
-    def curve(self, x: int, make: Callable[..., activations.ScalarFunction], **settings: Any) -> int:
-        """A layer of `ns_abstract.verify.network.activations`."""
-        return self._add(make(self.shape(x), **settings), x)
-
-    def doubt(self, index: int, weight: ConstantIntervals | None, offset: ConstantIntervals | None) -> int:
-        """The last layer again, whose constants are known within bounds alone (N23)."""
-        if weight is None and offset is None:
-            return index
-        node = self.nodes[index - 1]
-        assert isinstance(node.layer, LinearLayer)
-        self.nodes[index - 1] = replace(node, layer=with_inexact_constants(node.layer, weight, offset))
-        return index
-
-    def clip(self, x: int, least: float, most: float) -> int:
-        """``min(max(x, least), most)``, with infinite limits, too."""
-        if not least <= most:
-            raise InputError(f"clips to [{least}, {most}]", fix="the limits must not cross")
-        if least >= OVERFLOW or most <= -OVERFLOW:
-            raise InputError(f"clips to [{least}, {most}]", fix="float32 cannot compute with such numbers")
-        # numbers that are bounded at all never reach limits past that (N22)
-        open_below, open_above = least <= -OVERFLOW, most >= OVERFLOW
-        if open_below and open_above:
-            return x
-        if least == most:
-            return self.scale(x, np.zeros(()), np.asarray(least))
-        limit = least if open_above else most
-        if (open_below or open_above) and abs(limit) <= _NEAR_ZERO:
-            sign = 1.0 if open_above else -1.0
-            moved = x if limit == 0.0 and sign > 0.0 else self.scale(x, np.asarray(sign), np.asarray(-sign * limit))
-            if limit == 0.0 and sign > 0.0:
-                return self.leaky_relu(moved, 0.0)
-            return self.scale(self.leaky_relu(moved, 0.0), np.asarray(sign), np.asarray(limit))
-        bounds = -math.inf if open_below else least, math.inf if open_above else most
-        return self.curve(x, activations.Clip, least=bounds[0], most=bounds[1])
-
-    def prelu(self, x: int, slope: np.ndarray) -> int:
-        """``max(x, 0) + slope min(x, 0)`` as ``slope x + (1 - slope) relu(x)``."""
-        slope = np.asarray(slope, np.float64)
-        if slope.size == 1 and 0.0 <= float(slope.reshape(-1)[0]) <= 1.0:
-            return self.leaky_relu(x, float(slope.reshape(-1)[0]))
-        straight = self.scale(x, slope, None)
-        return self.sum((straight, self.scale(self.leaky_relu(x, 0.0), 1.0 - slope, None)), (1, 1))
-
-    def power(self, x: int, exponent: float) -> int:
-        """``x^exponent`` for whole exponents and half ones."""
-        if exponent == 1.0:
-            return x
-        if exponent == int(exponent) and 2.0 <= exponent <= 8.0:
-            return self.curve(x, activations.Power, exponent=int(exponent))
-        if exponent in (0.5, -0.5):
-            return self.curve(x, activations.Root, floor=self._above(x), inverse=exponent < 0.0)
-        if exponent == -1.0:
-            return self.reciprocal(x)
-        raise InputError(f"exponent {exponent} is not supported", fix="use 2 to 8, 0.5, -0.5 or -1")
-
-    def _above(self, x: int) -> float:
-        floor = self.floor(x)
-        # a smaller one may be flushed to zero
-        return floor if floor > LEAST_DIVISOR else -math.inf
-
-    def reciprocal(self, x: int) -> int:
-        """``1 / x``; 1 / sqrt is one function."""
-        node = self._node(x)
-        if node is not None and isinstance(node.layer, activations.Root) and not node.layer.inverse:
-            return self.curve(node.inputs[0], activations.Root, floor=node.layer.floor, inverse=True)
-        return self.curve(x, activations.Reciprocal, floor=self._above(x))
-
-    def softsign(self, x: int) -> int:
-        """``x / (1 + |x|)``."""
-        size = self.scale(self.curve(x, activations.Abs), np.ones(()), np.ones(()))
-        return self.product(x, self.reciprocal(size))
-
-    def logarithm(self, x: int) -> int:
-        """The natural logarithm."""
-        return self.curve(x, activations.Log, floor=self._above(x))
-
-    def switched_softplus(self, compared: int, limit: float, straight: int, curved: int) -> int:
-        """``straight`` where ``compared`` is above the limit, else the softplus ``curved``; 0 if it is none."""
-        (root, s, o), (behind, t, p) = self._affine(straight), self._affine(curved)
-        node = self._node(behind)
-        if node is None or type(node.layer) is not activations.Softplus or limit < 16.0 or o != 0.0 or p != 0.0:
-            return 0
-        argument, other = self._affine(node.inputs[0]), self._affine(compared)
-        same = argument[0] == other[0] == root and argument[2] == other[2] == 0.0 and argument[1] == other[1]
-        if not same or not abs(t * argument[1] - s) <= NEAR * abs(s):
-            return 0
-        # of the argument a x: the line is s x = s / (t a) of it, times t
-        excess = abs(1.0 - s / (t * argument[1]))
-        return self._times(self.curve(node.inputs[0], SwitchedSoftplus, limit=limit, excess=excess), t)
-
-    # ------------------------------------------------------------ two values that depend on the image
-
-    def spread(self, x: int, shape: Shape) -> int:
-        """The item repeated along axes of length 1, as arrays are."""
-        before = self.shape(x)
-        if before == tuple(shape):
-            return x
-        self._check_size(shape)
-        self.reserve(float(np.prod(shape)))
-        try:
-            index = np.broadcast_to(np.arange(int(np.prod(before))).reshape(1, *before), (1, *shape))[0]
-        except ValueError:
-            raise InputError(f"shapes {item(before)} and {item(shape)} do not fit") from None
-        if int(np.prod(before)) == int(np.prod(shape)):
-            return self.reshape(x, tuple(shape))
-        return self._gather(x, index, 0.0)
-
-    def common(self, *inputs: int) -> tuple[int, ...]:
-        """The inputs, spread to one shape."""
-        try:
-            shape = np.broadcast_shapes(*[(1, *self.shape(k)) for k in inputs])
-        except ValueError:
-            raise InputError(f"shapes {[item(self.shape(k)) for k in inputs]} do not fit") from None
-        if shape[0] != 1:
-            raise InputError(f"shapes {[item(self.shape(k)) for k in inputs]} mix the batch", fix="unsqueeze before")
-        return tuple(self.spread(k, shape[1:]) for k in inputs)
-
-    def plus(self, inputs: Sequence[int], signs: Sequence[int]) -> int:
-        """A sum of values whose shapes may differ."""
-        return self.sum(self.common(*inputs), tuple(signs))
-
-    def product(self, a: int, b: int) -> int:
-        """``a b``; a value times a known function of it is one function (N10)."""
-        gated = self._gated(a, b) or self._gated(b, a)
-        if gated:
-            return gated
-        (root, s, o), (other, t, p) = self._affine(a), self._affine(b)
-        if root == other and o == p == 0.0:
-            return self._times(self.curve(root, activations.Power, exponent=2), s * t)
-        a, b = self.common(a, b)
-        return self._add(Product(self.shape(a)), a, b)
-
-    def _times(self, x: int, factor: float) -> int:
-        return x if factor == 1.0 else self.scale(x, np.asarray(factor), None)
-
-    def _gated(self, value: int, gate: int) -> int:
-        """``value gate`` as one curve; 0 if it is none that is known."""
-        root, s, o = self._affine(value)
-        inner, factor, shift = self._affine(gate)
-        node = self._node(inner)
-        if o != 0.0 or node is None or not isinstance(node.layer, Activation) or s == 0.0 or factor == 0.0:
-            return 0
-        argument, t, c = self._affine(node.inputs[0])
-        layer = node.layer
-        if isinstance(layer, activations.Tanh) and c == 0.0 and t == 1.0 and shift == 0.0:
-            behind = self._node(argument)
-            if behind is not None and isinstance(behind.layer, activations.Softplus) and behind.inputs[0] == root:
-                return self._times(self.curve(root, activations.Mish), s * factor)
-        if argument != root:
-            return 0
-        if isinstance(layer, activations.Sigmoid) and c == 0.0 and shift == 0.0 and t != 0.0:
-            return self._times(self.curve(self._times(root, t), activations.Silu), s * factor / t)
-        if (
-            isinstance(layer, activations.Erf)
-            and c == 0.0
-            and abs(t * math.sqrt(2.0) - 1.0) < _ALIKE
-            and shift == factor
-        ):
-            return self._times(self.curve(root, ScaledGelu, rate=t * math.sqrt(2.0)), 2.0 * s * factor)
-        if isinstance(layer, activations.Clip) and shift == 0.0 and layer.least == 0.0 and 0.0 in (c, layer.offset):
-            # clip(a x + b, 0, m) of the root
-            a, b = layer.factor * t / layer.most, (layer.factor * c + layer.offset) / layer.most
-            if abs(6.0 * a - 1.0) < _ALIKE and abs(2.0 * b - 1.0) < _ALIKE:
-                gate = self.curve(root, GatedClip, factor=a, offset=b)
-                return self._times(gate, s * factor * layer.most)
-        return 0
-
-    def extreme(self, inputs: Sequence[int], most: bool) -> int:
-        """Greatest or least of several values."""
-        parts = list(self.common(*inputs))
-        while len(parts) > 1:
-            pairs = [self._either(a, b, most) for a, b in zip(parts[::2], parts[1::2], strict=False)]
-            parts = pairs + parts[len(pairs) * 2 :]
-        return parts[0]
-
-    def _either(self, a: int, b: int, most: bool) -> int:
-        if most:
-            return self._maximum(a, b)
-        # min(a, b) = a - relu(a - b)
-        less = self.sum((a, b), (1, -1), exact=True)
-        return self.sum((a, self.leaky_relu(less, 0.0)), (1, -1), exact=True)
 
     # ------------------------------------------------------------ sparse maps
 
@@ -593,7 +332,7 @@ class CompositeBuilder(NetworkBuilder):
         if logarithm:
             total = self.reduce(self.curve(apart, activations.Exp), [len(shape)], False, False)
             return self.scale(self.curve(total, activations.Log, floor=least), -np.ones(()), None)
-        powers = self.curve(apart, activations.CappedExp, count=count)
+        powers = self.curve(apart, composite_activations.CappedExp, count=count)
         if dropped is not None:
             if bool(dropped.all(axis).any()):
                 raise InputError("a mask takes out all numbers of a row", fix="leave one, at least")
@@ -602,8 +341,8 @@ class CompositeBuilder(NetworkBuilder):
             # its own term keeps the sum of a number that is taken out away from zero
             powers = self._selected(powers, np.moveaxis(~others | np.eye(count, dtype=bool), -2, axis))
         total = self.reduce(powers, [len(shape)], False, False)
-        total = self.curve(total, activations.Clip, least=0.0, most=math.exp(activations.CAP))
-        shares = self.curve(total, activations.SoftmaxReciprocal, floor=least)
+        total = self.curve(total, activations.Clip, least=0.0, most=math.exp(composite_activations.CAP))
+        shares = self.curve(total, composite_activations.SoftmaxReciprocal, floor=least)
         return shares if dropped is None else self._selected(shares, ~dropped)
 
     def _selected(self, x: int, kept: np.ndarray) -> int:
@@ -631,96 +370,3 @@ class CompositeBuilder(NetworkBuilder):
         """``weight x`` along the last axis but one."""
         order = [*range(len(self.shape(x)) - 2), len(self.shape(x)) - 1, len(self.shape(x)) - 2]
         return self.transpose(self.matrix(self.transpose(x, order), weight, None), order)
-
-
-class ResizeAxis(NamedTuple):
-    """The interpolation matrix along one axis, and its error.
-
-    Attributes:
-        weight: [out, size].
-        doubt: [out, size] what a weight may be off in float32, for positions are computed in it, too.
-    """
-
-    weight: np.ndarray
-    doubt: np.ndarray
-
-
-def nearest_pixels(size: int, out: int, coordinates: str, nearest: str, ratio: float) -> np.ndarray:
-    """Return [out] the input pixels that onnxruntime picks along one axis; it computes positions in float32.
-
-    Exact places differ from these by up to a pixel where they lie half way or on a number.
-    """
-    half = np.float32(0.5)
-    k, scale = np.arange(out, dtype=np.float32), np.float32(ratio)
-    if coordinates == "align_corners":
-        place = k * np.float32(size - 1) / np.float32(out - 1) if out > 1 else 0.0 * k
-    elif coordinates == "asymmetric":
-        place = k / scale
-    elif coordinates == "pytorch_half_pixel" and out == 1:
-        place = 0.0 * k
-    else:
-        place = (k + half) / scale - half
-    # half way from zero, as C rounds
-    rounded = np.trunc(place) + np.sign(place) * (np.abs(place - np.trunc(place)) >= half)
-    places = {
-        "floor": np.floor(place),
-        "ceil": np.ceil(place),
-        "round_prefer_floor": np.where(place == np.trunc(place) + half, np.floor(place), rounded),
-        "round_prefer_ceil": rounded,
-    }
-    if nearest not in places:
-        raise InputError(f"attribute nearest_mode = {nearest} is not supported", fix="use floor")
-    return np.clip(places[nearest], 0, size - 1).astype(np.int64)
-
-
-def interpolation(
-    size: int, out: int, mode: str, coordinates: str, nearest: str, scale: float | None, bend: float = -0.75
-) -> ResizeAxis:
-    """ONNX's Resize along one axis; ``bend`` is `cubic_coeff_a`."""
-    k = np.arange(out, dtype=np.float64)
-    ratio = out / size if scale is None else scale
-    if coordinates == "align_corners":
-        step = (size - 1) / (out - 1) if out > 1 else 0.0
-        place = k * step
-    elif coordinates == "asymmetric":
-        step, place = ratio, k / ratio
-    elif coordinates == "pytorch_half_pixel" and out == 1:
-        step, place = 0.0, 0.0 * k
-    elif coordinates in ("half_pixel", "pytorch_half_pixel"):
-        step, place = ratio, (k + 0.5) / ratio - 0.5
-    else:
-        raise InputError(
-            f"attribute coordinate_transformation_mode = {coordinates} is not supported",
-            fix="use half_pixel, asymmetric or align_corners",
-        )
-    matrix, doubt = np.zeros((out, size)), np.zeros((out, size))
-    rows = np.arange(out)
-    if mode == "nearest":
-        matrix[rows, nearest_pixels(size, out, coordinates, nearest, ratio)] = 1.0
-        return ResizeAxis(matrix, doubt)
-    cubic = mode == "cubic"
-    if cubic and not abs(bend) <= 1.0:
-        raise InputError(f"attribute cubic_coeff_a = {bend} is not supported", fix="between -1 and 1")
-    if not cubic:
-        place = np.clip(place, 0.0, size - 1.0)
-    low = np.floor(place).astype(np.int64)
-    part = place - low
-    taps, weights = (0, 1), (1.0 - part, part)
-    if cubic:
-        far, near, across, beyond = (np.abs(part - tap) for tap in (-1, 0, 1, 2))
-        inner = [(bend + 2.0) * t**3 - (bend + 3.0) * t**2 + 1.0 for t in (near, across)]
-        outer = [bend * (t**3 - 5.0 * t**2 + 8.0 * t - 4.0) for t in (far, beyond)]
-        taps, weights = (-1, 0, 1, 2), (outer[0], *inner, outer[1])
-    for tap, weight in zip(taps, weights, strict=True):
-        np.add.at(matrix, (rows, np.clip(low + tap, 0, size - 1)), weight)
-    # scale, quotient or product of a reciprocal, difference; exact where the scale is a power of two
-    moved = np.zeros(out) if np.frexp(step)[0] in (0.0, 0.5) else POSITION * (np.abs(place) + 1.0)
-    steepest = 2.0 if cubic else 1.0
-    # weights of a known place are exact but for the polynomials'
-    own = POLYNOMIAL if cubic else 0.0
-    for tap in range(min(taps) - 1, max(taps) + 2):
-        # one beside those of a place counts where the place may be past a number
-        inside = min(taps) <= tap <= max(taps)
-        weighted = inside | (part <= moved if tap < 0 else 1.0 - part <= moved)
-        np.add.at(doubt, (rows, np.clip(low + tap, 0, size - 1)), np.where(weighted, steepest * moved + own, 0.0))
-    return ResizeAxis(matrix, doubt)

@@ -13,10 +13,11 @@ import torch
 from torch import Tensor
 
 from ns_abstract.execution.cancellation import check_cancelled
-from ns_abstract.verify.network.activations import LibraryFunction, Sigmoid, Tanh
+from ns_abstract.verify.network.activations import Sigmoid, Tanh
 from ns_abstract.verify.network.bilinear import Product
 from ns_abstract.verify.network.layers import Activation, LinearLayer, ScaleLayer, Shape
 from ns_abstract.verify.network.max_pooling import MaxPool
+from ns_abstract.verify.network.scalar_function import LibraryFunction
 
 Layer = LinearLayer | Activation | Product | MaxPool
 

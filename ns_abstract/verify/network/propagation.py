@@ -22,7 +22,6 @@ from ns_abstract.arithmetic.network_charges import (
     UP,
     gamma,
 )
-from ns_abstract.verify.network.activations import ScalarFunction
 from ns_abstract.verify.network.bilinear import Product
 from ns_abstract.verify.network.coefficient_source import CoefficientSource
 from ns_abstract.verify.network.coefficients import grid
@@ -31,6 +30,7 @@ from ns_abstract.verify.network.intermediate_bounds import IntermediateBounds
 from ns_abstract.verify.network.layers import Activation, LeakyRelu, LinearLayer, ScaleLayer, Sum
 from ns_abstract.verify.network.relaxations import Relaxations, ReusedRelaxation
 from ns_abstract.verify.network.rounding import Rounding
+from ns_abstract.verify.network.scalar_function import ScalarFunction
 from ns_abstract.verify.network.slope_choices import UnstableNeurons
 from ns_abstract.verify.network.sparse_layers import Variance
 

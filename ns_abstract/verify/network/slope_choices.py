@@ -11,10 +11,10 @@ import torch
 from numpy.typing import NDArray
 
 from ns_abstract.arithmetic.network_charges import OWN_SUMS
-from ns_abstract.verify.network.activations import ScalarFunction
 from ns_abstract.verify.network.coefficients import Floats
 from ns_abstract.verify.network.layers import Activation, LeakyRelu
 from ns_abstract.verify.network.relaxations import Relaxations
+from ns_abstract.verify.network.scalar_function import ScalarFunction
 from ns_abstract.verify.network.tangents import Tangents
 
 Float64 = NDArray[np.float64]
