@@ -20,8 +20,9 @@ from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import Float64Array, ParameterBox
 from ns_abstract.geometry.tiles import assemble, in_tiles
 from ns_abstract.refine.protocol import Bounds, Frame, LinearSets, PartsFrame, SubBoxFrame
-from ns_abstract.verify.cell_boxes import aligned, divided, inner_cell, resolved, slabs, sub_box_counts
+from ns_abstract.verify.cell_boxes import aligned, divided, inner_cell, slabs, sub_box_counts
 from ns_abstract.verify.cells import Cell, CellGrid
+from ns_abstract.verify.image_motion import ImageMotion
 from ns_abstract.verify.photo import Photo
 from ns_abstract.verify.search import BlockResult, FinishedCell
 
@@ -37,17 +38,19 @@ class LocationTuning:
 
     #: Image motion over a cell, pixels: beyond it, cells are cut without bounds; up to it, they are contracted.
     coarse: float = 4.5
-    #: Sub-boxes that are excluded one by one, at most, in cells over which the image moves by no more than so many
-    #: pixels; and the part of a box of them that has to be left for it to become one cell.
-    sub_boxes: tuple[tuple[float, int], ...] = ((2.0, 512), (3.5, 128), (math.inf, 32))
+    #: Sub-boxes that are excluded one by one, at most; and the part of a box of them that has to be left for it to
+    #: become one cell.
+    sub_boxes: int = 4096
     filled: float = 0.5
+    #: Image motion over the parts of a block's parameters, as a part of that over a sub-box; and a power of two,
+    #: negative: how far it is brought down.
+    part: float = 1.5
+    deepest: int = 4
     #: Grid lines that cells begin and end at, as a power of two of their width.
     aligned: int = 5
     contracted: float = 0.3
     #: Pixels that are bounded to exclude a cell: so many times those that may show anything.
     surplus: float = 4.0
-    #: How much wider a cell of as loose bounds is than a sub-box, about.
-    wider: float = 1.8
     #: Image motion over the cell whose bounds tell how loose they are; pixels that must be likely to be excluded, as a
     #: part of those that exclude a cell, for it to be bounded.
     reference: float = 2.4
@@ -125,6 +128,14 @@ class LocationSearch:
         return self._pace * (np.array(box.upper) - np.array(box.lower))
 
     @cached_property
+    def image_motion(self) -> ImageMotion | None:
+        """Tables of what pixels rule out; None: the frame has none, or nothing is contracted."""
+        if not self.contract or not isinstance(self.frame, SubBoxFrame):
+            return None
+        tables = ImageMotion(self.frame, self.plain, self.tiled)
+        return tables if tables.blocks else None
+
+    @cached_property
     def looseness(self) -> tuple[np.ndarray, np.ndarray]:
         """By how much bounds of a typical cell go below and above what is rendered nearby: [T, side, side, 3] each.
 
@@ -198,14 +209,14 @@ class _Examination:
             self._shrink(feasible)
             box = search.grid.box_of(self.cell)
             moved = float(np.linalg.norm(search.moved(box)))
-            if box.dimensions and moved > tuning.coarse:
+            if search.image_motion is None and box.dimensions and moved > tuning.coarse:
                 break
             picture, number = self._look(box.middle)
             if moved > tuning.contracted:
-                some = self._sub_boxes(box, picture)
+                some = self._sub_boxes(box)
                 if some:
                     return None
-                if some is False:
+                if some is False or moved > tuning.coarse:
                     break
             bounds = self._bounds(box, picture)
             if bounds is None or self._settled(bounds):
@@ -224,24 +235,18 @@ class _Examination:
         """Whether what is left of the cell has a verdict."""
         return bool(self.leaves) and self.leaves[-1].cell == self.cell
 
-    def _sub_boxes(self, box: ParameterBox, picture: np.ndarray) -> bool | None:
-        """Exclude sub-boxes of the cell; returns whether some were, or None: the frame has no bounds of sub-boxes."""
+    def _sub_boxes(self, box: ParameterBox) -> bool | None:
+        """Exclude sub-boxes of the cell; returns whether some were, or None: they are too narrow, or there are none."""
         search, tuning = self.search, self.search.tuning
         moved = search.moved(box)
-        total = float(np.linalg.norm(moved))
-        counts = sub_box_counts(self.cell, moved, next(most for width, most in tuning.sub_boxes if total <= width))
-        if not isinstance(search.frame, SubBoxFrame) or not search.contract or not resolved(box, counts):
+        counts = sub_box_counts(self.cell, moved, tuning.sub_boxes)
+        level = round(-math.log2(tuning.part * float((moved / counts).max(initial=tuning.still)) + tuning.still))
+        if search.image_motion is None or level > tuning.deepest:
             return None
-        chosen = self._promising(picture, total, float(np.linalg.norm(moved / counts)))
-        if chosen.sum() <= search.tiled.allowed:
-            return False
-        tiles = np.flatnonzero(chosen.any(axis=(1, 2)))
-        self.bounded += 1
-        ends = search.frame.sub_box_ends(box, counts, tiles, chosen[tiles])
-        if ends is None:
-            return None
-        number = search.tiled.excluded(*ends, chosen)
-        left = (number <= search.tiled.allowed).reshape(counts)
+        before = search.image_motion.bounded
+        number = search.image_motion.outliers(box, counts, level)
+        self.bounded += search.image_motion.bounded - before
+        left = number <= search.tiled.allowed
         self.share = float(np.median(number)) / (search.tiled.allowed + 1)
         if left.all():
             return False
@@ -308,16 +313,15 @@ class _Examination:
             self._exclude(float(number - allowed))
         return self.done
 
-    def _promising(self, picture: np.ndarray, moved: float, loose: float | None = None) -> np.ndarray:
+    def _promising(self, picture: np.ndarray, moved: float) -> np.ndarray:
         """[T, side, side] counted pixels that bounds are most likely to exclude: a guess of work.
 
-        None are chosen where too few are likely to be. The picture moves by ``moved`` pixels over the cell, and by
-        ``loose`` over the cells whose bounds count; None: by as much.
+        None are chosen where too few are likely to be. The picture moves by ``moved`` pixels over the cell.
         """
         search, tiled, side = self.search, self.search.tiled, self.search.frame.side
         least, most = nearby(assemble(picture, search.frame.camera), max(1, round(0.5 * moved)))
         low, high = in_tiles(least, side), in_tiles(most, side)
-        scale = (moved if loose is None else search.tuning.wider * loose) / search.tuning.reference
+        scale = moved / search.tuning.reference
         below, above = (part * scale for part in search.looseness)
         gaps = np.maximum(low - tiled.high, tiled.low - high).max(axis=-1)
         likely = np.maximum(low - below - tiled.high, tiled.low - high - above).max(axis=-1)
