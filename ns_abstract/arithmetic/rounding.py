@@ -125,9 +125,6 @@ JUMP_ROUNDING, SWAP_ROUNDING = UNIT64, 2.0 * UNIT64
 #: B12: by how much of a cell's half-width sub-boxes reach beyond their ends, so that they hold what lies between the
 #: grid's lines however these are rounded; and the most, of that, that the lines' rounding may come to.
 SUB_BOX_OVERLAP, SUB_BOX_LINES = 2.0**-24, 2.0**-26
-#: U6: part of a part's width that boxes may reach beyond it; it, the roundings of the boxes' ends and those of the
-#: parts' lines (each at most as much) stay below `SUB_BOX_OVERLAP` of half of a part's width.
-PART_OVERLAP = 2.0**-27
 #: B12: a grid's line and the middle and half-width of a cell, relative to the sizes of its ends: 6; 10 to spare.
 SUB_BOX_LINE_ROUNDING = 16.0 * UNIT64
 #: B12: a part's share of a swap bound: a quotient and two products, 3; 5 to spare.

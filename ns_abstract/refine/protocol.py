@@ -259,28 +259,20 @@ class PartsFrame(Protocol):
 
 
 @runtime_checkable
-class SubBoxFrame(Frame, Protocol):
+class SubBoxFrame(Protocol):
     """An optional interface of a `Frame`: bounds over each of many equal sub-boxes of a wide cell."""
 
-    def local(self, rectangle: tuple[float, float, float, float]) -> SubBoxFrame | None:
-        """The same poses in parameters that are sheared for a rectangle of pixels, x0, x1, y0, y1.
-
-        Few of them move what typically lies there; `motion` tells by how much. None: there are no sub-boxes.
-        """
-        ...
-
     def sub_box_ends(
-        self, box: ParameterBox, counts: np.ndarray, tiles: np.ndarray, pixels: np.ndarray, within: Any = None
-    ) -> tuple[np.ndarray, np.ndarray, CellContext]:
-        """Lower and upper bounds [n, 3, k] of ``n`` pixels over ``k`` sub-boxes, and the context of these pixels.
+        self, box: ParameterBox, counts: np.ndarray, tiles: np.ndarray, pixels: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """Lower and upper bounds [n, 3, k] of ``n`` pixels over ``k`` sub-boxes; None: there are none for this set.
 
         Args:
-            box: The cell, of two or more parameters.
+            box: The cell.
             counts: [d] sub-boxes along its axes, powers of two, at least 8 together; they are numbered like the
                 entries of an array of this shape. Each is widened by `SUB_BOX_OVERLAP` of the cell's half-widths.
             tiles: [t] numbers.
             pixels: [t, side, side] the ``n`` pixels.
-            within: Context of a box around the cell and of these pixels and perhaps more, or None.
         """
         ...
 

@@ -20,9 +20,8 @@ from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import Float64Array, ParameterBox
 from ns_abstract.geometry.tiles import assemble, in_tiles
 from ns_abstract.refine.protocol import Bounds, Frame, LinearSets, PartsFrame, SubBoxFrame
-from ns_abstract.verify.cell_boxes import aligned, divided, inner_cell, slabs, sub_box_counts
+from ns_abstract.verify.cell_boxes import aligned, divided, inner_cell, resolved, slabs, sub_box_counts
 from ns_abstract.verify.cells import Cell, CellGrid
-from ns_abstract.verify.image_motion import ImageMotion
 from ns_abstract.verify.photo import Photo
 from ns_abstract.verify.search import BlockResult, FinishedCell
 
@@ -36,16 +35,13 @@ _SMOOTH = 4
 class LocationTuning:
     """Preferences of the search. None of them decides whether an excluded cell holds no pose of the photo."""
 
-    #: Image motion over a cell, pixels: beyond it, cells are cut without bounds; up to it, they are contracted.
-    coarse: float = 4.5
-    #: Sub-boxes that are excluded one by one, at most; and the part of a box of them that has to be left for it to
-    #: become one cell.
-    sub_boxes: int = 4096
+    #: Image motion over a sub-box, pixels, beyond which cells are cut without bounds.
+    coarse: float = 4.0
+    #: Sub-boxes along each of the two parameters that move the picture most; others are not divided, since what is
+    #: shared by the sub-boxes of a cell, above all its depth order, loses by every parameter that is wide.
+    along: int = 8
+    #: The part of a box of sub-boxes that has to be left for it to become one cell.
     filled: float = 0.5
-    #: Image motion over the parts of a block's parameters, as a part of that over a sub-box; and a power of two,
-    #: negative: how far it is brought down.
-    part: float = 1.5
-    deepest: int = 4
     #: Grid lines that cells begin and end at, as a power of two of their width.
     aligned: int = 5
     contracted: float = 0.3
@@ -123,17 +119,17 @@ class LocationSearch:
         motion = np.maximum(motion, 1e-3 * max(1.0, float(motion.max(initial=0.0))))
         self._pace = motion / width
 
+    @cached_property
+    def along(self) -> np.ndarray:
+        """[d] sub-boxes along the parameters of a cell."""
+        counts = np.ones(self.frame.box.dimensions, np.int64)
+        if isinstance(self.frame, SubBoxFrame) and self.contract:
+            counts[np.argsort(-self.moved(self.frame.box), kind="stable")[:2]] = self.tuning.along
+        return counts
+
     def moved(self, box: ParameterBox) -> Float64Array:
         """[d] pixels that typical scene elements move by over a cell (an estimate)."""
         return self._pace * (np.array(box.upper) - np.array(box.lower))
-
-    @cached_property
-    def image_motion(self) -> ImageMotion | None:
-        """Tables of what pixels rule out; None: the frame has none, or nothing is contracted."""
-        if not self.contract or not isinstance(self.frame, SubBoxFrame):
-            return None
-        tables = ImageMotion(self.frame, self.plain, self.tiled)
-        return tables if tables.blocks else None
 
     @cached_property
     def looseness(self) -> tuple[np.ndarray, np.ndarray]:
@@ -208,15 +204,15 @@ class _Examination:
                 return self._exclude(1.0)
             self._shrink(feasible)
             box = search.grid.box_of(self.cell)
-            moved = float(np.linalg.norm(search.moved(box)))
-            if search.image_motion is None and box.dimensions and moved > tuning.coarse:
+            moved = float(np.linalg.norm(search.moved(box) / search.along))
+            if box.dimensions and moved > tuning.coarse:
                 break
             picture, number = self._look(box.middle)
             if moved > tuning.contracted:
-                some = self._sub_boxes(box)
+                some = self._sub_boxes(box, picture)
                 if some:
                     return None
-                if some is False or moved > tuning.coarse:
+                if some is False:
                     break
             bounds = self._bounds(box, picture)
             if bounds is None or self._settled(bounds):
@@ -235,18 +231,23 @@ class _Examination:
         """Whether what is left of the cell has a verdict."""
         return bool(self.leaves) and self.leaves[-1].cell == self.cell
 
-    def _sub_boxes(self, box: ParameterBox) -> bool | None:
-        """Exclude sub-boxes of the cell; returns whether some were, or None: they are too narrow, or there are none."""
+    def _sub_boxes(self, box: ParameterBox, picture: np.ndarray) -> bool | None:
+        """Exclude sub-boxes of the cell; returns whether some were, or None: the frame has no bounds of sub-boxes."""
         search, tuning = self.search, self.search.tuning
-        moved = search.moved(box)
-        counts = sub_box_counts(self.cell, moved, tuning.sub_boxes)
-        level = round(-math.log2(tuning.part * float((moved / counts).max(initial=tuning.still)) + tuning.still))
-        if search.image_motion is None or level > tuning.deepest:
+        counts = sub_box_counts(self.cell, search.along)
+        if not isinstance(search.frame, SubBoxFrame) or not search.contract or not resolved(box, counts):
             return None
-        before = search.image_motion.bounded
-        number = search.image_motion.outliers(box, counts, level)
-        self.bounded += search.image_motion.bounded - before
-        left = number <= search.tiled.allowed
+        chosen = self._telling(picture)
+        if chosen.sum() <= search.tiled.allowed:
+            self.share = 0.0
+            return False
+        tiles = np.flatnonzero(chosen.any(axis=(1, 2)))
+        self.bounded += 1
+        ends = search.frame.sub_box_ends(box, counts, tiles, chosen[tiles])
+        if ends is None:
+            return None
+        number = search.tiled.excluded(*ends, chosen)
+        left = (number <= search.tiled.allowed).reshape(counts)
         self.share = float(np.median(number)) / (search.tiled.allowed + 1)
         if left.all():
             return False
@@ -312,6 +313,14 @@ class _Examination:
         if number > allowed:
             self._exclude(float(number - allowed))
         return self.done
+
+    def _telling(self, picture: np.ndarray) -> np.ndarray:
+        """[T, side, side] counted pixels near which the picture explains the photo's least: a guess of work."""
+        search, tiled, side = self.search, self.search.tiled, self.search.frame.side
+        least, most = (in_tiles(end, side) for end in nearby(assemble(picture, search.frame.camera), 1))
+        gaps = np.where(tiled.counted, np.maximum(least - tiled.high, tiled.low - most).max(axis=-1), -np.inf)
+        count = min(gaps.size, round(search.tuning.surplus * (tiled.allowed + 1)))
+        return (gaps > 0.0) & (gaps >= np.partition(gaps, gaps.size - count, axis=None)[gaps.size - count])
 
     def _promising(self, picture: np.ndarray, moved: float) -> np.ndarray:
         """[T, side, side] counted pixels that bounds are most likely to exclude: a guess of work.
@@ -399,7 +408,8 @@ class _Examination:
         search, tuning = self.search, self.search.tuning
         if self.cell.volume <= max(1.0, tuning.finest ** len(self.cell.first) * search.grid.volume):
             return self._finish()
-        moved = search.moved(search.grid.box_of(self.cell))
+        # of a sub-box
+        moved = search.moved(search.grid.box_of(self.cell)) / search.along
         total = float(np.linalg.norm(moved))
         aim = tuning.coarse
         if total <= tuning.coarse:

@@ -90,14 +90,14 @@ class TiledPhoto:
         return sane & self.counted[tiles] & ((lower > self.high[tiles]) | (upper < self.low[tiles])).any(axis=-1)
 
     def excluded(self, lower: np.ndarray, upper: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-        """[n, k] whether bounds of a pixel over each of ``k`` sub-boxes lie beyond what explains it (U2, U5).
+        """[k] how many pixels each of ``k`` sub-boxes excludes: its bounds lie beyond what explains them (U2, U5).
 
         Args:
             lower, upper: [n, 3, k] bounds of the pictures of each sub-box.
             pixels: [T, side, side] the ``n`` pixels, all of them counted.
         """
         high, low = self.high[pixels][:, :, None], self.low[pixels][:, :, None]
-        return (lower <= upper).all(axis=1) & ((lower > high) | (upper < low)).any(axis=1)
+        return ((lower <= upper).all(axis=1) & ((lower > high) | (upper < low)).any(axis=1)).sum(axis=0)
 
     def explained(self, lower: np.ndarray, upper: np.ndarray, tiles: np.ndarray) -> int:
         """How many counted pixels of ``tiles`` every picture between the bounds explains."""

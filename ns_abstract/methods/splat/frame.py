@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -54,9 +53,6 @@ class FrameTuning:
     parts: int = 32
     #: A context that is larger than this part of the one around it is not kept beside it.
     worth_keeping: float = 0.8
-    #: A rectangle's parameters follow what lies within so many pixels of it, where so many Gaussians do.
-    local_margin: float = 4.0
-    local_gaussians: int = 8
 
 
 _TUNING = FrameTuning()
@@ -198,7 +194,6 @@ class SplatFrame:
         self._stop = rasteriser.transmittance_min
         self._floor = -1.0
         self.across, self.down = tile_grid(self.camera, self.side)
-        self._plain_set, self._rectangle = pose_set, (0.0, float(self.camera.width), 0.0, float(self.camera.height))
         if sheared and (shear := self._shear()):
             self.pose_set = pose_set.sheared(shear)
             self.box = self.pose_set.box
@@ -300,41 +295,23 @@ class SplatFrame:
         candidates = self.candidates(tiles, within, pixels)
         return each(lambda box: self._bound(box, tiles, within, candidates, keep_linear, pixels), boxes)
 
-    def local(self, rectangle: tuple[float, float, float, float]) -> SplatFrame | None:
-        """See `ns_abstract.refine.protocol.SubBoxFrame` (design.md, U6)."""
-        if self.box.dimensions < 2:
-            return None
-        x0, x1, y0, y1 = rectangle
-        margin = _TUNING.local_margin
-        frame = copy.copy(self)
-        frame.__dict__.pop("_pace", None)
-        frame.pose_set, frame.box = self._plain_set, self._plain_set.box
-        frame._rectangle = x0 - margin, x1 + margin, y0 - margin, y1 + margin
-        if frame._seen(frame.box.middle, frame._typical_means())[1].sum() < _TUNING.local_gaussians:
-            frame.pose_set, frame.box, frame._rectangle = self.pose_set, self.box, self._rectangle
-        elif shear := frame._shear(local=True):
-            frame.pose_set = self._plain_set.sheared(shear)
-            frame.box = frame.pose_set.box
-        return frame
-
     def sub_box_ends(
-        self, box: ParameterBox, counts: np.ndarray, tiles: np.ndarray, pixels: np.ndarray,
-        within: VisibleContext | None = None,
-    ) -> tuple[np.ndarray, np.ndarray, VisibleContext]:  # fmt: skip
+        self, box: ParameterBox, counts: np.ndarray, tiles: np.ndarray, pixels: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray] | None:
         """See `ns_abstract.refine.protocol.SubBoxFrame` (design.md, U5)."""
+        if box.dimensions < 2:
+            return None
         check_cancelled()
         forms = self.pose_set.enclosure(box, self.order)
         cell = self.bounds.cell(
-            self.camera, forms, tiles, self.candidates(tiles, within, pixels), floor=self._floor, pixels=pixels,
-            parts=counts, keep_parts=True,
-        )  # fmt: skip
+            self.camera, forms, tiles, floor=self._floor, pixels=pixels, parts=counts, keep_parts=True
+        )
         assert cell.parts is not None
         ends = cell.parts[pixels]
         lower, upper = ends[:, :COLORS], ends[:, COLORS:]
         # crossed or not a number: nothing is known
         sane = lower <= upper
-        lower, upper = np.where(sane, lower, 0.0).clip(0.0, 1.0), np.where(sane, upper, 1.0).clip(0.0, 1.0)
-        return lower, upper, VisibleContext(cell.visible, cell.reach)
+        return np.where(sane, lower, 0.0).clip(0.0, 1.0), np.where(sane, upper, 1.0).clip(0.0, 1.0)
 
     def _bound(
         self, box: ParameterBox, tiles: np.ndarray, within: VisibleContext | None, candidates: np.ndarray | None,
@@ -403,15 +380,11 @@ class SplatFrame:
         table = summed_area(laid_out(chosen, self.across))
         return within.visible[touching(np.arange(within.visible.size), within.reach, table)]
 
-    def _shear(self, local: bool = False) -> dict[str, dict[str, float]]:
-        """For each rotation, how much of it undoes what one unit of another parameter moves typical Gaussians by.
-
-        A roll is undone, too, where the rectangle is ``local``.
-        """
+    def _shear(self) -> dict[str, dict[str, float]]:
+        """For each rotation, how much of it undoes what one unit of another parameter moves typical Gaussians by."""
         box, middle = self.box, self.box.middle
         names = [name for name in ROTATIONS if name in box.names]
-        names = [name for name in names if name != "roll" or not local] or names
-        others = [name for name in box.names if name not in names]
+        others = [name for name in box.names if name not in ROTATIONS]
         means, width = self._typical_means(), np.array(box.upper) - np.array(box.lower)
         here, visible = self._seen(middle, means)
         if not names or not others or not visible.any():
@@ -446,10 +419,10 @@ class SplatFrame:
         return means
 
     def _seen(self, values: np.ndarray, means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels [n, 2] of ``means`` and which of them [n] lie in the picture, or in the rectangle of `local`."""
+        """Pixels [n, 2] of ``means`` and which of them [n] lie in the picture."""
         here, z = self._project(values, means)
-        x0, x1, y0, y1 = self._rectangle
-        return here, (z > 0.01) & (here > (x0, y0)).all(axis=1) & (here < (x1, y1)).all(axis=1)
+        size = self.camera.width, self.camera.height
+        return here, (z > 0.01) & (here > 0).all(axis=1) & (here < size).all(axis=1)
 
     def motion(self, box: ParameterBox) -> np.ndarray:
         """[d] pixels that typical Gaussians move by over each parameter's range (an estimate)."""
