@@ -8,8 +8,8 @@
 Photos are rendered at hidden poses, 64 x 64 pixels, with noise uniform within 2/255 and 2 % of the pixels at random.
 ``--follow`` examines the cells that hold a hidden pose alone, until ``--depth`` of them or none is left, and exits with
 1 where one of them is excluded. ``--elsewhere`` takes photos from outside of the set, whose answer has to be "none".
-``--sample`` follows the cells that hold random poses of the set until these are excluded, and estimates from them what a
-whole search takes: a cell that a random pose lies in with probability v stands for 1 / v cells.
+``--sample`` follows the cells that hold random poses of the set until these are excluded, and estimates from them what
+a whole search takes: a cell that a random pose lies in with probability v stands for 1 / v cells.
 """
 
 from __future__ import annotations
