@@ -3,10 +3,13 @@
     python benchmarks/locate.py CONFIG PATH [--set six|three] [--seconds 60] [--photos 5] [--no-contraction]
     python benchmarks/locate.py CONFIG PATH --follow 1000
     python benchmarks/locate.py CONFIG PATH --elsewhere
+    python benchmarks/locate.py CONFIG PATH --sample 20
 
 Photos are rendered at hidden poses, 64 x 64 pixels, with noise uniform within 2/255 and 2 % of the pixels at random.
 ``--follow`` examines the cells that hold a hidden pose alone, until ``--depth`` of them or none is left, and exits with
 1 where one of them is excluded. ``--elsewhere`` takes photos from outside of the set, whose answer has to be "none".
+``--sample`` follows the cells that hold random poses of the set until these are excluded, and estimates from them what
+a whole search takes: a cell that a random pose lies in with probability v stands for 1 / v cells.
 """
 
 from __future__ import annotations
@@ -32,6 +35,8 @@ SETS = {
     "two": {"translation": {"x": 0.05}, "rotation": {"yaw": 0.05}},
 }
 SIZE, NOISE, OUTLIERS = 64, 2.0 / 255.0, 0.02
+#: Cells that are not followed further by ``--sample``, as a part of the set.
+FINEST = 3e-5
 
 
 def photo(picture: np.ndarray, generator: np.random.Generator) -> np.ndarray:
@@ -113,6 +118,46 @@ def followed(scene: nsa.Scene, poses: nsa.PoseSet, seed: int, depth: int, contra
     return True, count, sum(cell.volume for cell in cells) / search.grid.volume
 
 
+def sampled(scene: nsa.Scene, poses: nsa.PoseSet, count: int) -> None:
+    """Print the processor time of a search down to cells of a size, and what it leaves, estimated at random poses."""
+    _, levels = hidden(scene, poses, 0, False)
+    location = Location(Job(scene, [poses.of(scene)]), levels, None, PhotoOptions(NOISE, OUTLIERS, True))
+    search, generator = location.search(0), np.random.default_rng(1)
+    many = in_units(search, search.plain.box.sample(200_000, generator))
+    examined: dict[Any, Any] = {}
+    chains = []
+    for place in in_units(search, search.plain.box.sample(count, generator)):
+        cell, chain, left = search.grid.roots()[0], [], True
+        while cell is not None and (not chain or chain[-1][0] > FINEST):
+            if cell not in examined:
+                begin = time.process_time()
+                findings = search.examine([cell])
+                share = float(((many >= cell.first) & (many < cell.past)).all(axis=1).mean())
+                examined[cell] = findings, time.process_time() - begin, max(share, 1.0 / len(many))
+            findings, seconds, share = examined[cell]
+            chain.append((share, seconds))
+            inside = [c for b in findings.blocks for c in b if ((place >= c.first) & (place < c.past)).all()]
+            kept = [leaf.cell for leaf in findings.leaves if leaf.verdict != "certified"]
+            left = bool(inside) or any(((place >= c.first) & (place < c.past)).all() for c in kept)
+            cell = inside[0] if inside else None
+        chains.append((left, chain))
+    print("smallest cell (part of the set),processor seconds,left")
+    for least in (0.1, 0.03, 0.01, 0.003, 0.001, 3e-4, 1e-4, FINEST):
+        cost = np.mean([sum(seconds / share for share, seconds in chain if share >= least) for _, chain in chains])
+        rest = np.mean([left or chain[-1][0] < least for left, chain in chains])
+        print(f"{least:g},{cost:.0f},{rest:.3f}", flush=True)
+
+
+def in_units(search: Any, values: np.ndarray) -> np.ndarray:
+    """Poses [n, d] of a set in units of the grid that is searched."""
+    box, names = search.grid.box, search.frame.box.names
+    places = values.copy()
+    for name, factors in search.frame.pose_set.shear.items():
+        for other, factor in factors.items():
+            places[:, names.index(name)] -= factor * values[:, names.index(other)]
+    return (places - box.lower) / (np.array(box.upper) - box.lower) * np.array(search.grid.units)
+
+
 def main() -> None:
     """Measure, and exit with 1 where a true pose was excluded, or a photo from elsewhere not."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -127,11 +172,15 @@ def main() -> None:
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--depth", type=int, default=40)
     parser.add_argument("--elsewhere", action="store_true")
+    parser.add_argument("--sample", type=int, default=0)
     options = parser.parse_args()
     scene = nsa.load_scene(options.config)
     source = nsa.load_camera_path(options.path).cameras[0]
     given = nsa.PoseSet(source, **SETS[options.set])
     poses = nsa.PoseSet(resized(given.of(scene), SIZE, SIZE).camera, **SETS[options.set])
+    if options.sample:
+        use_threads(1)
+        return sampled(scene, poses, options.sample)
     if not options.follow:
         sys.exit(0 if located(scene, poses, options) else 1)
     use_threads(options.workers)

@@ -165,8 +165,8 @@ def test_sub_boxes_that_are_left_are_kept() -> None:
 
 def test_numbers_of_sub_boxes_divide_the_units() -> None:
     cell = Cell((0, 3, 7), (1 << 10, 3 + 12, 7 + 5))
-    counts = sub_box_counts(cell, np.array([1.0, 1.0, 9.0]), 64)
-    assert counts.tolist() == [16, 4, 1]
+    assert sub_box_counts(cell, np.array([8, 8, 8])).tolist() == [8, 4, 1]
+    assert sub_box_counts(cell, np.array([8, 2, 1])).tolist() == [8, 2, 1]
     grid = CellGrid(box_of([1.0, 1.0], [1.0 + 1e-3, 2.0]), (1 << 20,) * 2, (1, 1))
     assert resolved(grid.box_of(Cell((0, 0), (1 << 20, 1 << 20))), np.array([4, 4]))
     # lines of so small a cell are rounded by more than sub-boxes overlap, and two of them are too few

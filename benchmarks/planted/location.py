@@ -70,6 +70,10 @@ LOCATION = (
         _CELLS, "resolved", "SUB_BOX_LINES * 0.5 * (high - low)", "(high - low)", _LINES,
     ),
     Fault(
+        "location: sub-boxes do not divide a cell's units",
+        _CELLS, "sub_box_counts", "np.minimum(sizes & -sizes, most)", "np.minimum(sizes, most)", _LINES,
+    ),
+    Fault(
         "location: a shear moves the ends of boxes one way",
         _COVER, "ShearedBoxes.within", "least + np.minimum(a, b)", "least + np.maximum(a, b)", _BOXES,
     ),

@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 
 from ns_abstract.arithmetic.rounding import SUB_BOX_LINE_ROUNDING, SUB_BOX_LINES
-from ns_abstract.geometry.box import Float64Array, ParameterBox
+from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.verify.cells import Cell, CellGrid
 
 
@@ -49,20 +49,11 @@ def aligned(cell: Cell, inner: Cell, bits: int) -> Cell:
     return Cell(tuple(first), tuple(past))
 
 
-def sub_box_counts(cell: Cell, moved: Float64Array, most: int) -> np.ndarray:
-    """Numbers of sub-boxes [d] along a cell's axes, powers of two that divide its units, at most ``most`` together.
-
-    They move the picture about as much along every axis; ``moved`` [d] pixels are what the cell does.
-    """
+def sub_box_counts(cell: Cell, most: np.ndarray) -> np.ndarray:
+    """Numbers of sub-boxes [d] along a cell's axes, powers of two that divide its units, at most ``most`` [d]."""
     sizes = np.array(cell.past, np.int64) - np.array(cell.first, np.int64)
-    counts = np.ones(sizes.size, np.int64)
-    while 2 * counts.prod() <= most:
-        free = np.where(sizes % (2 * counts) == 0, moved / counts, -1.0)
-        axis = int(np.argmax(free)) if free.size else 0
-        if not free.size or free[axis] < 0.0:
-            break
-        counts[axis] *= 2
-    return counts
+    # the largest power of two that divides
+    return np.minimum(sizes & -sizes, most)
 
 
 def resolved(box: ParameterBox, counts: np.ndarray) -> bool:

@@ -35,19 +35,18 @@ _SMOOTH = 4
 class LocationTuning:
     """Preferences of the search. None of them decides whether an excluded cell holds no pose of the photo."""
 
-    #: Image motion over a cell, pixels: beyond it, cells are cut without bounds; up to it, they are contracted.
-    coarse: float = 4.5
-    #: Sub-boxes that are excluded one by one, at most, in cells over which the image moves by no more than so many
-    #: pixels; and the part of a box of them that has to be left for it to become one cell.
-    sub_boxes: tuple[tuple[float, int], ...] = ((2.0, 512), (3.5, 128), (math.inf, 32))
+    #: Image motion over a sub-box, pixels, beyond which cells are cut without bounds.
+    coarse: float = 4.0
+    #: Sub-boxes along each of the two parameters that move the picture most; others are not divided, since what is
+    #: shared by the sub-boxes of a cell, above all its depth order, loses by every parameter that is wide.
+    along: int = 8
+    #: The part of a box of sub-boxes that has to be left for it to become one cell.
     filled: float = 0.5
     #: Grid lines that cells begin and end at, as a power of two of their width.
     aligned: int = 5
     contracted: float = 0.3
     #: Pixels that are bounded to exclude a cell: so many times those that may show anything.
     surplus: float = 4.0
-    #: How much wider a cell of as loose bounds is than a sub-box, about.
-    wider: float = 1.8
     #: Image motion over the cell whose bounds tell how loose they are; pixels that must be likely to be excluded, as a
     #: part of those that exclude a cell, for it to be bounded.
     reference: float = 2.4
@@ -119,6 +118,14 @@ class LocationSearch:
         # what moves nothing is cut for the bounds' sake now and then
         motion = np.maximum(motion, 1e-3 * max(1.0, float(motion.max(initial=0.0))))
         self._pace = motion / width
+
+    @cached_property
+    def along(self) -> np.ndarray:
+        """[d] sub-boxes along the parameters of a cell."""
+        counts = np.ones(self.frame.box.dimensions, np.int64)
+        if isinstance(self.frame, SubBoxFrame) and self.contract:
+            counts[np.argsort(-self.moved(self.frame.box), kind="stable")[:2]] = self.tuning.along
+        return counts
 
     def moved(self, box: ParameterBox) -> Float64Array:
         """[d] pixels that typical scene elements move by over a cell (an estimate)."""
@@ -197,7 +204,7 @@ class _Examination:
                 return self._exclude(1.0)
             self._shrink(feasible)
             box = search.grid.box_of(self.cell)
-            moved = float(np.linalg.norm(search.moved(box)))
+            moved = float(np.linalg.norm(search.moved(box) / search.along))
             if box.dimensions and moved > tuning.coarse:
                 break
             picture, number = self._look(box.middle)
@@ -227,13 +234,12 @@ class _Examination:
     def _sub_boxes(self, box: ParameterBox, picture: np.ndarray) -> bool | None:
         """Exclude sub-boxes of the cell; returns whether some were, or None: the frame has no bounds of sub-boxes."""
         search, tuning = self.search, self.search.tuning
-        moved = search.moved(box)
-        total = float(np.linalg.norm(moved))
-        counts = sub_box_counts(self.cell, moved, next(most for width, most in tuning.sub_boxes if total <= width))
+        counts = sub_box_counts(self.cell, search.along)
         if not isinstance(search.frame, SubBoxFrame) or not search.contract or not resolved(box, counts):
             return None
-        chosen = self._promising(picture, total, float(np.linalg.norm(moved / counts)))
+        chosen = self._telling(picture)
         if chosen.sum() <= search.tiled.allowed:
+            self.share = 0.0
             return False
         tiles = np.flatnonzero(chosen.any(axis=(1, 2)))
         self.bounded += 1
@@ -308,16 +314,23 @@ class _Examination:
             self._exclude(float(number - allowed))
         return self.done
 
-    def _promising(self, picture: np.ndarray, moved: float, loose: float | None = None) -> np.ndarray:
+    def _telling(self, picture: np.ndarray) -> np.ndarray:
+        """[T, side, side] counted pixels near which the picture explains the photo's least: a guess of work."""
+        search, tiled, side = self.search, self.search.tiled, self.search.frame.side
+        least, most = (in_tiles(end, side) for end in nearby(assemble(picture, search.frame.camera), 1))
+        gaps = np.where(tiled.counted, np.maximum(least - tiled.high, tiled.low - most).max(axis=-1), -np.inf)
+        count = min(gaps.size, round(search.tuning.surplus * (tiled.allowed + 1)))
+        return (gaps > 0.0) & (gaps >= np.partition(gaps, gaps.size - count, axis=None)[gaps.size - count])
+
+    def _promising(self, picture: np.ndarray, moved: float) -> np.ndarray:
         """[T, side, side] counted pixels that bounds are most likely to exclude: a guess of work.
 
-        None are chosen where too few are likely to be. The picture moves by ``moved`` pixels over the cell, and by
-        ``loose`` over the cells whose bounds count; None: by as much.
+        None are chosen where too few are likely to be. The picture moves by ``moved`` pixels over the cell.
         """
         search, tiled, side = self.search, self.search.tiled, self.search.frame.side
         least, most = nearby(assemble(picture, search.frame.camera), max(1, round(0.5 * moved)))
         low, high = in_tiles(least, side), in_tiles(most, side)
-        scale = (moved if loose is None else search.tuning.wider * loose) / search.tuning.reference
+        scale = moved / search.tuning.reference
         below, above = (part * scale for part in search.looseness)
         gaps = np.maximum(low - tiled.high, tiled.low - high).max(axis=-1)
         likely = np.maximum(low - below - tiled.high, tiled.low - high - above).max(axis=-1)
@@ -395,7 +408,8 @@ class _Examination:
         search, tuning = self.search, self.search.tuning
         if self.cell.volume <= max(1.0, tuning.finest ** len(self.cell.first) * search.grid.volume):
             return self._finish()
-        moved = search.moved(search.grid.box_of(self.cell))
+        # of a sub-box
+        moved = search.moved(search.grid.box_of(self.cell)) / search.along
         total = float(np.linalg.norm(moved))
         aim = tuning.coarse
         if total <= tuning.coarse:

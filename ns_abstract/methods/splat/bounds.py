@@ -55,6 +55,8 @@ from ns_abstract.methods.splat.variations import VariedSplats
 
 #: Most pairs of fragments whose depth order is examined in one block of pixels.
 PAIR_LIMIT = 30_000
+#: The same where bounds over many sub-boxes come of it.
+PART_PAIR_LIMIT = 100_000
 
 
 class Stages(NamedTuple):
@@ -274,7 +276,7 @@ class SplatBounds:
             Colors(colors, self.splats.background, self._sums.color_radius, 4 if layers else 3, common),
             self.rules,
             self.charges,
-            self._cutoffs(floor),
+            self._cutoffs(floor, PART_PAIR_LIMIT if keep_parts else PAIR_LIMIT),
             shape,
             cell_parts(np.ones(shape.dimensions, np.int64) if parts is None else parts, SUB_BOX_OVERLAP * keep_parts),
         )
@@ -361,7 +363,7 @@ class SplatBounds:
         forms[:, m] = error * REGION
         return forms
 
-    def _cutoffs(self, floor: float) -> Cutoffs:
+    def _cutoffs(self, floor: float, pairs: int) -> Cutoffs:
         """What need not be followed where no more light than ``floor`` comes (design.md, B6, B8)."""
         stop, fade = self.rules.transmittance_min, 0.0
         if stop > 0.0 < floor:
@@ -370,7 +372,7 @@ class SplatBounds:
             fade = (1.1 + 4.0 * floor) * most * self.charges.left_out
         else:
             floor = -1.0
-        return Cutoffs(floor, fade, self.rasteriser.alpha_negligible * self.splats.count, PAIR_LIMIT)
+        return Cutoffs(floor, fade, self.rasteriser.alpha_negligible * self.splats.count, pairs)
 
     def _colors(
         self, forms: PoseForms, camera_magnitude: np.ndarray, candidates: np.ndarray, alive: np.ndarray, n: int
