@@ -133,7 +133,9 @@ def opened(folder: Path, report: dict[str, Any], moved: dict[str, Path | None]) 
     if report.get("kind") == "loop":
         parts = read_verdicts(folder, report)
         model = moved.get("model") or file("loop").parent / report["loop"]["network"]
-        return parts, [CheckedLoop(c, scene, report, model) for c in parts if CheckedLoop.claims(c)]
+        return parts, [
+            CheckedLoop(c, scene, report, model, dataset_scale(config)) for c in parts if CheckedLoop.claims(c)
+        ]
     path, given = file("camera_path_filename"), given_set(settings, moved.get("perturbation_filename"))
     without = "sha256" not in report.get("model", {})
     if (folder / "cells.sqlite").exists():
