@@ -72,13 +72,14 @@ FIELDS: dict[str, tuple[tuple[float, float], tuple[float, float]]] = {
     "proposals overflow": ((4.0, 1.0), (900.0, 300.0)),
     "proposals see nothing": ((6.0, 3.0), (-900.0, 0.0)),
     "the field overflows": ((0.0, 1000.0), (3.0, 1.0)),
+    "huge weights": ((0.0, 1e30), (0.0, 1e30)),
 }
 
 
 def random_field(rng: np.random.Generator, kind: str) -> NerfactoField:
     """A field of one of `FIELDS`, with any background, spacing and far end."""
     own, other = FIELDS[kind]
-    samples = (24, 16, 12)[-int(rng.integers(2, 4)) :]
+    samples = ((24, 16, 12), (16, 12), (1, 1), (3, 2, 1))[rng.integers(4)]
     grid = random_grid(rng, 4, 9, int(rng.choice([100, 2000])))
     if rng.random() < 0.1:
         grid = HashEncoding(np.zeros_like(grid.table), grid.resolutions)
@@ -96,7 +97,7 @@ def random_field(rng: np.random.Generator, kind: str) -> NerfactoField:
         0.01,
         tuple(rounds),
         samples,
-        far=float(rng.choice([6.0, 1000.0])),
+        far=float(rng.choice([6.0, 1000.0, 1e5])),
         spacing="uniform" if rng.random() < 0.2 else "piecewise",
         background=backgrounds[rng.integers(3)],
     )

@@ -8,6 +8,7 @@ from fractions import Fraction
 import mpmath
 import numpy as np
 import pytest
+import torch
 from nerfactos import random_net
 
 from ns_abstract.methods.nerf import nerfacto_kernel as concrete
@@ -21,6 +22,7 @@ from ns_abstract.methods.nerf.hash_bounds import (
     network,
     points,
 )
+from ns_abstract.methods.nerf.hsv import shifted
 from ns_abstract.methods.nerf.render import HISTOGRAM_PADDING
 
 #: Draws of each step; interpreted kernels are slow.
@@ -219,26 +221,29 @@ def test_networks_are_enclosed() -> None:
     rest = np.zeros((6, 16))
     for k in range(DRAWS // 2):
         _line, pose, place = draw(rng)
-        net, head = random_net(rng, 6, 8, 4), random_net(rng, 16 + 3, 8, 8, 3)
+        net, head = random_net(rng, 6, 8, 8, 4), random_net(rng, 16 + 3, 8, 8, 3)
         weights, head_weights = network.net_weights(net), network.head_weights(head, 16)
         size = (1e-8, 1e-3, 0.1, 1.0)[k % 4]
         inputs = np.stack([random_form(rng, rng.normal(), size) for _ in range(6)])
         seen = np.stack([random_form(rng, rng.normal(), size) for _ in range(16)])
         seen[:, 3] = 0.0
-        rooms = tuple(network.zonotope(10 + 8, n) for n in (8, 4))
-        color_rooms = tuple(network.zonotope(18 + 16, n) for n in (8, 8, 3))
+        # room for a layer that this network does not have
+        rooms = tuple(network.zonotope(10 + 16, n) for n in (8, 8, 4, 1))
+        color_rooms = tuple(network.zonotope(26 + 16, n) for n in (8, 8, 3))
         live = np.zeros(16, np.int64)
         count = network.finish(rooms, network.from_features(inputs, weights, rooms[0]), weights, live, rest)
         rows, radius = np.zeros((4, 8)), np.zeros(8)
         network.look_at_direction(seen, head_weights, rows, radius)
-        total = network.colors(rooms[-1], count, (rows, radius), head_weights, color_rooms, live, rest)
+        total = network.colors(rooms[2], count, (rows, radius), head_weights, color_rooms, live, rest)
         x = np.array([float(member(rng, one, pose, place)) for one in inputs])
-        h = net.weights[1] @ np.maximum(net.weights[0] @ x + net.biases[0], 0.0) + net.biases[1]
+        h = x
+        for i, (w, b) in enumerate(zip(net.weights, net.biases, strict=True)):
+            h = w @ h + b if i == 2 else np.maximum(w @ h + b, 0.0)
         c = np.concatenate([[float(member(rng, one, pose, 0.0)) for one in seen], h[1:]])
         for i, (w, b) in enumerate(zip(head.weights, head.biases, strict=True)):
             c = w @ c + b if i == 2 else np.maximum(w @ c + b, 0.0)
         out = np.zeros(5)
-        for room, many, exact in ((rooms[-1], count, h), (color_rooms[-1], total, c)):
+        for room, many, exact in ((rooms[2], count, h), (color_rooms[-1], total, c)):
             for j, v in enumerate(exact):
                 network.output_form(room, many, j, 4, out)
                 assert holds(out, pose, place, Fraction(float(v)))
@@ -350,6 +355,11 @@ def test_colours_of_rays_are_enclosed() -> None:
         three = [np.repeat(side[:, None], 3, axis=1) for side in (low, high)]
         composition.interval_colors(ray.light, count, *three, np.full(3, behind), last, ends)
         bounds = composition.form_bounds(out, ray.line)
+        shifts, moved = np.array([[0.1, 0.2], [-0.1, 0.3]]), np.zeros((2, 3))
+        room = np.zeros((2, count, 3))
+        composition.shifted_interval_colors(
+            ray.light, count, np.stack(three), shifts, np.full(3, behind), last, room, moved
+        )
         for _ in range(6):
             pose, _, distances, densities = ray.draw()
             weights = np.zeros(count)
@@ -370,6 +380,10 @@ def test_colours_of_rays_are_enclosed() -> None:
             picked = np.clip(picked, low, high)
             shown = (weights * picked).sum() + (picked[-1] if last else behind) * (1.0 - weights.sum())
             assert ends[0, 0] <= shown <= ends[1, 0] and bounds[0] <= shown <= bounds[1]
+            grey = torch.from_numpy(np.repeat(picked[:, None], 3, axis=1))
+            colors_moved = shifted(grey, *(float(rng.uniform(*one)) for one in shifts)).numpy()
+            total = weights @ colors_moved + (colors_moved[-1] if last else behind) * (1.0 - weights.sum())
+            assert np.all(moved[0] <= total) and np.all(total <= moved[1])
             if np.isfinite(out[-1]):
                 assert abs(Fraction(float(shown)) - value(np.append(out[:3], [0.0, 0.0]), pose)) <= Fraction(
                     float(out[-1])
