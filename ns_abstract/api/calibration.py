@@ -92,7 +92,9 @@ def calibrate(
         levels = _photo(file, frames[k], k)
         camera = path.cameras[k]
         if levels.shape[:2] != (camera.height, camera.width):
-            problem = f"frames[{k}] has {levels.shape[1]} x {levels.shape[0]} pixels, not {camera.width} x {camera.height}"
+            problem = (
+                f"frames[{k}] has {levels.shape[1]} x {levels.shape[0]} pixels, not {camera.width} x {camera.height}"
+            )
             raise InputError(problem, file=file, field=_OPTION, fix="give the photos that w and h tell")
         if camera.height > height:
             camera = camera.resized(height, max(1, round(camera.width * height / camera.height)))

@@ -296,7 +296,8 @@ class Locate(GivenSet):
         photo = PhotoOptions(
             self.noise, self.outliers, not self.no_contraction, self.brightness_gain, self.brightness_offset
         )
-        image = self.image or sequence_photos(self.image_sequence or Path())[0]
+        # the photos of a sequence are read one by one
+        image = self.image or Path()
         return LocateSettings(_files(self), image, self.mask, photo, self.calibrate)
 
 

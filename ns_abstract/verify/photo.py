@@ -52,9 +52,7 @@ class Brightness:
             ends.append(found + sign * BRIGHTNESS_ROUNDING * size)
         return np.where(low <= 0.0, -np.inf, ends[0]), np.where(high >= 1.0, np.inf, ends[1])
 
-    def outside(
-        self, picture: np.ndarray, low: Float64Array, high: Float64Array, counted: np.ndarray
-    ) -> np.ndarray:
+    def outside(self, picture: np.ndarray, low: Float64Array, high: Float64Array, counted: np.ndarray) -> np.ndarray:
         """Which counted pixels of a picture [..., 3] one gain and offset for all of them do not take into [low, high].
 
         They are fitted: others may do better.
