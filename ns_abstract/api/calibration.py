@@ -108,7 +108,7 @@ def calibrate(
         residuals.append(np.sort(np.maximum(gaps.max(axis=-1).ravel() - 0.5 / 255.0, 0.0))[::-1])
         size = camera.height, camera.width
     parts = sorted({outliers, *(part for part in tuning.parts if part > outliers)})
-    needed = {part: max(noise, max(map(lambda r, p=part: _noise(r, p), residuals))) for part in parts}
+    needed = {part: max(noise, *(_noise(residual, part) for residual in residuals)) for part in parts}
     best = min(parts, key=lambda part: needed[part] * (1.0 + tuning.price * part))
     psnr = -10.0 * math.log10(max(float(np.mean(errors)), 1e-12))
     by_part = {f"{part:g}": value for part, value in needed.items()}

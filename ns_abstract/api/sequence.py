@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.api.files import PathJob
+from ns_abstract.api.job import check_frames
 from ns_abstract.api.location import LocateSettings, Location, open_location
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.atomic import write_json
@@ -96,7 +97,7 @@ class PhotoSequence:
         job = self.first.job
         assert isinstance(job, PathJob)
         self.job = job
-        self.sets = {k: job.pose_sets[k] for k in self.frames or range(job.frame_count)}
+        self.sets = {k: job.pose_sets[k] for k in check_frames(self.frames, job.frame_count)}
         self.ranges = load_motion(self.motion, self.sets, job.method.dataset_scale)
         text = json.dumps([self.first.fingerprint, self.ranges, sorted(self.sets)], sort_keys=True)
         self.fingerprint = hashlib.sha256(text.encode()).hexdigest()

@@ -45,9 +45,10 @@ def locate_photos(options: Locate, stop: SignalStop) -> None:
         _search(options, stop, console, location, frames, options.output_dir)
         return
     with stop.at_once():
+        settings = options.settings
         assert options.motion is not None
         photos = open_sequence(
-            options.settings, options.image_sequence, options.motion, options.output_dir, options.frames, options.resume
+            settings, options.image_sequence, options.motion, options.output_dir, options.frames, options.resume
         )
     _tell(console, photos.first)
 
