@@ -79,11 +79,11 @@ def test_locate_allows_another_brightness(blobs: Inputs) -> None:
     frame = scene.method().frame(poses.of(scene))
     pose = frame.box.sample(1, rng)[0]
     levels = taken(exposed(assemble(frame.render(pose), frame.camera), 1.1, 0.01), 0.004, 10, rng)
-    given: dict[str, Any] = {"noise": 0.004, "outliers": 10 / 1024, "time_budget": 20.0}
+    given: dict[str, Any] = {"noise": 0.006, "outliers": 40 / 1024, "time_budget": 20.0}
     assert nsa.locate(scene, poses, levels, **given).possible_volume == 0.0
     place = nsa.locate(scene, poses, levels, brightness={"gain": (0.9, 1.15), "offset": (-0.02, 0.02)}, **given)
     assert place.hull is not None and place.hull[0][0] <= pose[0] <= place.hull[1][0]
-    assert place.possible_volume < 0.6 and place.answer == "possible"
+    assert place.possible_volume < 0.1 and place.answer == "possible"
     assert place.report["photo"]["brightness"] == {"gain": [0.9, 1.15], "offset": [-0.02, 0.02]}
     with pytest.raises(nsa.InputError, match="--brightness-gain: found"):
         nsa.locate(scene, poses, levels, brightness={"gain": (1.1, 0.9)})
