@@ -66,7 +66,7 @@ LOOPS = (
     Fault(
         "loops: places of the scene that the view tells are not charged",
         _TUBES,
-        "TubeBuilder._advanced",
+        "TubeBuilder._pose_box",
         "AffineSet(np.zeros(place.size), none, place, pose.first)",
         "AffineSet(np.zeros(place.size), none, 0.0 * place, pose.first)",
         "test_reach.py::test_tubes_hold_runs_in_a_scene_whose_place_the_view_tells",

@@ -134,8 +134,9 @@ def training_data(scene: Scene) -> Path:
         raise InputError("the scene is no run with photos", file=file, field=_OPTION, fix="give --noise and --outliers")
     run = read_config(file)
     value = run.root.get("data")
-    parts = value.value if isinstance(value, Tagged) else [value]
-    if not (isinstance(parts, list) and parts and all(isinstance(part, str) and part for part in parts)):
+    stated = value.value if isinstance(value, Tagged) else [value]
+    parts = [part for part in stated if isinstance(part, str) and part] if isinstance(stated, list) else []
+    if not parts or len(parts) != len(stated):
         raise InputError("names no data set", file=run.file, field="data", fix="give --noise and --outliers")
     recorded = Path(*parts)
     places = [recorded, *(
