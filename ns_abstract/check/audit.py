@@ -118,7 +118,7 @@ def opened(folder: Path, report: dict[str, Any], moved: dict[str, Path | None]) 
     settings, renderer, name = report["settings"], report["renderer"], folder / "report.json"
     if not (renderer["name"] == "gsplat" and renderer["version"] in RULES) and renderer["name"] != "nerf-uniform":
         problem = f"found {renderer['name']} {renderer.get('version')}, and this program checks gsplat and nerf-uniform"
-        raise BadInput(problem, name, "renderer")
+        raise BadInput(problem, name, "renderer", "give a result of a splat, or of vanilla-nerf at uniform samples")
     if report.get("guarantee") not in ("float32-sound", "real-sound"):
         raise BadInput(f"found {report.get('guarantee')!r}: nothing is claimed", name, "guarantee")
 
