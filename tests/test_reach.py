@@ -430,6 +430,7 @@ def test_tubes_hold_margins_of_the_pictures_of_every_run(tmp_path: Path) -> None
     loop, box, rng = found.loop, found.loop.box, np.random.default_rng(7)
     tube = found.tube(box)
     assert not tube.reason and tube.views.shape == (7, 2) and (tube.views > 0.0).all()
+    assert tube.safe(loop) == tube.views[:, 0].min()
     for number, start in enumerate([*box.corners(), *box.sample(58, rng)]):
         push = sampled_disturbances(loop, rng, "ends" if number % 2 else "random")
         run = simulate(found, loop.state(box, start), push)

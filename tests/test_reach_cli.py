@@ -245,7 +245,7 @@ def test_a_planted_bad_controller_is_falsified(course: Course, tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_pictures_along_a_loop(course: Course, tmp_path: Path, run: InProcess) -> None:
+def test_pictures_along_a_loop(course: Course, tmp_path: Path, in_process: InProcess) -> None:
     """Nothing near is certified; a limit that pictures break is falsified by runs whose pictures are rendered again."""
     clear = {"type": "clear", "distance": 0.3, "weight": 0.5}
     bright = {"type": "picture", "statistic": "mean", "channel": "r", "max": 0.1, "when": "end"}
@@ -261,12 +261,14 @@ def test_pictures_along_a_loop(course: Course, tmp_path: Path, run: InProcess) -
         assert (again.views == stored["views"]).all() and again.margin(job.loop, "reaches") <= 0.0
         image = Pictures(job.job.method, job.job.pose_sets[0]).image(job.loop.camera.values(stored["states"][-1]))
         assert image[..., 0].mean() > 0.1
-    for key, wrong, told in (
+    wrong_values: tuple[tuple[str, Any, str], ...] = (
         ("unsafe", [clear | {"region": [0, 0, 9, 9]}], r"seen.json: unsafe\[0\].region: .* reaches beyond"),
         ("goal", {"type": "visible", "select": {"box": [[90, 90, 90], [91, 91, 91]]}}, r"seen.json: goal.*select"),
-    ):
-        course.changed("seen.json", initial=SMALL, **{key: wrong})
-        code, _, said = run(reach_command, seen.options(tmp_path / "no"))
+    )
+    for key, wrong, told in wrong_values:
+        changes: dict[str, Any] = {key: wrong, "initial": SMALL}
+        course.changed("seen.json", "", **changes)
+        code, _, said = in_process(reach_command.main, seen.options(tmp_path / "no"))
         assert code == 2 and re.search(told, said) and said.count("\n") == 1, said
 
 

@@ -5,6 +5,7 @@ from planted.fault import Fault
 _PHOTO, _SEARCH, _COVER = "verify/photo.py", "verify/location.py", "verify/location_cover.py"
 _CELLS = "verify/cell_boxes.py"
 _ENDS = "test_locate.py::test_a_photo_allows_its_noise_and_every_rounding"
+_BRIGHT = "test_locate_sequence.py::test_values_before_any_brightness_are_held"
 _REACH = "test_locate.py::test_contraction_keeps_every_pose_that_explains_the_photo"
 _NUMBERS = "test_locate.py::test_what_is_no_number_explains_and_excludes_nothing"
 _SLABS = "test_locate.py::test_slabs_and_the_inner_cell_tile_a_cell"
@@ -14,12 +15,29 @@ _BOXES = "test_locate.py::test_a_cover_holds_every_pose_of_sheared_boxes"
 
 LOCATION = (
     Fault(
+        "location: gains above 1 alone are looked at",
+        _PHOTO, "Brightness.before", "[moved / gain for gain in self.gain]", "[moved / self.gain[1]]", _BRIGHT,
+    ),
+    Fault(
+        "location: what a camera clips is taken for what it shows",
+        _PHOTO, "Brightness.before", "np.where(high >= 1.0, np.inf, ends[1])", "ends[1]", _BRIGHT,
+    ),
+    Fault(
+        "location: the offset brightens one end and darkens the other",
+        _PHOTO, "Brightness.before", "(low, -1.0, self.offset[1])", "(low, -1.0, self.offset[0])", _BRIGHT,
+    ),
+    Fault(
+        "location: a set grows to one side alone",
+        "api/sequence.py", "grown", "hull[name][0] + low", "hull[name][0]",
+        "test_locate_sequence.py::test_a_grown_set_holds_every_pose_that_a_motion_leads_to",
+    ),
+    Fault(
         "location: rounding to 8 bits is left out of the noise",
-        _PHOTO, "Photo.ends", "(0.5 + STEP) / _STEPS", "STEP / _STEPS", _ENDS,
+        _PHOTO, "Photo.shown", "(0.5 + STEP) / _STEPS", "STEP / _STEPS", _ENDS,
     ),
     Fault(
         "location: the photo's own rounding is not charged",
-        _PHOTO, "Photo.ends", "self.noise + (0.5 + STEP) / _STEPS + QUOTIENT + PHOTO_ROOM",
+        _PHOTO, "Photo.shown", "self.noise + (0.5 + STEP) / _STEPS + QUOTIENT + PHOTO_ROOM",
         "self.noise + 0.5 / _STEPS", _ENDS,
     ),
     Fault(

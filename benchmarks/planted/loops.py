@@ -44,7 +44,7 @@ LOOPS = (
         "Tube.safe",
         "[*clearances, *self.views[:, : len(loop.required)].ravel()]",
         "clearances",
-        f"{_VIEWS}_properties_of_the_picture_are_certified_and_falsified",
+        f"{_VIEWS}_tubes_hold_margins_of_the_pictures_of_every_run",
     ),
     Fault(
         "scene margin: tubes of a tenth of the radius",

@@ -70,11 +70,12 @@ class PathJob(Job):
 
     Attributes:
         path: The camera path.
+        scene: The scene.
         settings: The files and options.
     """
 
     def __init__(self, settings: Settings, scene: Scene, path: CameraPath, pose_sets: tuple[PoseBox, ...]) -> None:
-        self.settings, self.path = settings, path
+        self.settings, self.scene, self.path = settings, scene, path
         try:
             super().__init__(
                 scene,

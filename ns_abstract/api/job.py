@@ -101,6 +101,11 @@ class Job:
         self._check_memory()
 
     @property
+    def arithmetic(self) -> str | None:
+        """The arithmetic that was asked for; None: the strongest that the scene has."""
+        return self._arithmetic
+
+    @property
     def frame_count(self) -> int:
         """Number of sets."""
         return len(self.pose_sets)

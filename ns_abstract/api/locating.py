@@ -21,7 +21,7 @@ from ns_abstract.api.cell_search import (
     check_arguments,
 )
 from ns_abstract.api.job import Job
-from ns_abstract.api.location import Location, PhotoOptions
+from ns_abstract.api.location import Location, PhotoOptions, calibrated
 from ns_abstract.api.poses import PoseSet, pose_sets
 from ns_abstract.api.scenes import Scene, checked_scene
 from ns_abstract.execution.starting import EngineName, started
@@ -89,6 +89,7 @@ class LocationQuestion(CellQuestion[LocateProgress]):
             outliers=job.photo.outliers,
             counted=int(job.photo.counted.sum()),
             allowed=job.photo.allowed,
+            more=_more(job),
             settings=settings,
             fingerprint=job.fingerprint,
             command=command,
@@ -136,6 +137,13 @@ class LocationQuestion(CellQuestion[LocateProgress]):
             page = partial(location_page, document, rows, sets, pictures, self.job.job.method.elements())
             search.last.write(document, page)
         return document
+
+
+def _more(job: Location) -> dict[str, Any]:
+    """What report.json says of brightness and calibration, where they were asked for."""
+    brightness = job.photo.brightness
+    more: dict[str, Any] = {} if brightness.still else {"brightness": vars(brightness)}
+    return more if job.calibration is None else {**more, "calibration": job.calibration.describe()}
 
 
 @dataclass(frozen=True)
@@ -201,6 +209,8 @@ def locate(
     noise: float = 0.02,
     outliers: float = 0.05,
     mask: ArrayLike | None = None,
+    calibrate: bool = False,
+    brightness: Mapping[str, Sequence[float]] | None = None,
     contract: bool = True,
     time_budget: float = 600.0,
     output_dir: str | os.PathLike[str] | None = None,
@@ -223,6 +233,8 @@ def locate(
         noise: By how much a value of the photo may differ from the picture's before it is rounded to 8 bits.
         outliers: Part of the pixels that may show anything.
         mask: [H, W] which pixels count; None: all.
+        calibrate: Whether noise and outliers are raised to what explains the run's training photos.
+        brightness: ``{"gain": [low, high], "offset": [low, high]}``: the camera may show gain * picture + offset.
         contract: Whether cells are contracted by their pixels' linear bounds before they are cut.
         time_budget: Seconds for all sets together.
         output_dir: Folder for cells.sqlite and the report, as ns-abstract-locate writes them; None: nothing is kept.
@@ -241,7 +253,9 @@ def locate(
     request = Request(time_budget, resume, output_dir is not None)
     check_arguments(request, workers, output_dir)
     sets = pose_sets(poses)
-    options = PhotoOptions(noise, outliers, contract)
+    if unknown := set(brightness or {}) - {"gain", "offset"}:
+        raise InputError(f"found {sorted(unknown)[0]!r}", field="brightness", fix="give gain, offset or both")
+    options = PhotoOptions(noise, outliers, contract, **{k: tuple(v) for k, v in (brightness or {}).items()})  # pyright: ignore[reportArgumentType]
     job = Job(
         checked_scene(scene),
         [entry.of(scene) for entry in sets],
@@ -249,7 +263,9 @@ def locate(
         workers=workers,
         memory_limit=memory_limit,
     )
-    location = Location(job, photo_levels(photo), None if mask is None else _checked_mask(mask, job), options)
+    options, calibration = calibrated(scene, job, options) if calibrate else (options, None)
+    counted = None if mask is None else _checked_mask(mask, job)
+    location = Location(job, photo_levels(photo), counted, options, calibration=calibration)
     settings = {"time_budget": time_budget, "arithmetic": arithmetic, "workers": workers, "engine": engine}
     rows, document = answered(
         LocationQuestion(location, range(len(sets)), {**settings, **vars(options)}, ("ns_abstract.locate",)),

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ns_abstract.api.calibration import Calibration, calibrate
 from ns_abstract.api.files import Settings, open_job
 from ns_abstract.api.job import Job, require_sound_platform
+from ns_abstract.api.scenes import Scene
 from ns_abstract.execution.worker_cache import Recipe
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.io.errors import InputError
@@ -21,7 +23,7 @@ from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.location import LocationResult, LocationSearch
 from ns_abstract.verify.location_cover import PoseCover, ShearedBoxes, cover
-from ns_abstract.verify.photo import Photo
+from ns_abstract.verify.photo import Brightness, Photo
 
 #: Of the search's rules: results of different ones are not mixed.
 _RULES = 2
@@ -35,6 +37,7 @@ class PhotoOptions:
         noise: By how much values may differ, of 1.
         outliers: Part of the pixels that may be anything.
         contract: Whether cells are contracted by their pixels' linear bounds before they are cut.
+        gain, offset: Ends of what the camera may do to all values of the picture alike: ``gain * value + offset``.
 
     Raises:
         InputError: A value cannot be used.
@@ -43,8 +46,19 @@ class PhotoOptions:
     noise: float = 0.02
     outliers: float = 0.05
     contract: bool = True
+    gain: tuple[float, float] = (1.0, 1.0)
+    offset: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def brightness(self) -> Brightness:
+        """What the camera may do to the picture."""
+        return Brightness(self.gain, self.offset)
 
     def __post_init__(self) -> None:
+        for name, ends, least, most in (("gain", self.gain, 0.1, 10.0), ("offset", self.offset, -1.0, 1.0)):
+            if not (len(ends) == 2 and least <= ends[0] <= ends[1] <= most):
+                fix = f"give two numbers from {least:g} to {most:g}, the smaller one first"
+                raise InputError(f"found {list(ends)}", field=f"--brightness-{name}", fix=fix)
         if not 0.0 <= self.noise < 1.0:
             raise InputError(f"found {self.noise}", field="--noise", fix="give a number from 0 to below 1")
         if not 0.0 <= self.outliers < 1.0:
@@ -60,15 +74,22 @@ class Location:
         mask: [H, W] which pixels count; None: all.
         options: What a picture may miss.
         file: Of the photo, for errors.
+        calibration: Where noise and outliers come from, if they were calibrated.
 
     Raises:
         InputError: The photo does not fit the cameras, or the platform's arithmetic is not sound.
     """
 
     def __init__(
-        self, job: Job, levels: np.ndarray, mask: np.ndarray | None, options: PhotoOptions, file: Path | None = None
+        self,
+        job: Job,
+        levels: np.ndarray,
+        mask: np.ndarray | None,
+        options: PhotoOptions,
+        file: Path | None = None,
+        calibration: Calibration | None = None,
     ) -> None:
-        self.job, self.options, self.file = job, options, file
+        self.job, self.options, self.file, self.calibration = job, options, file, calibration
         camera = job.pose_sets[0].camera
         size = camera.height, camera.width
         if levels.shape[:2] != size:
@@ -83,7 +104,7 @@ class Location:
         counted = np.ones(size, bool) if mask is None else mask
         if not counted.any():
             raise InputError("counts no pixel", field="--mask", fix="write white where pixels count")
-        self.photo = Photo(levels, options.noise, options.outliers, counted)
+        self.photo = Photo(levels, options.noise, options.outliers, counted, options.brightness)
         require_sound_platform()
         self._searches: dict[int, LocationSearch] = {}
 
@@ -125,7 +146,9 @@ class Location:
     def _fingerprint(self) -> dict[str, Any]:
         photo = self.photo
         digest = hashlib.sha256(photo.levels.tobytes() + np.packbits(photo.counted).tobytes()).hexdigest()
-        options = vars(self.options)
+        options = {key: list(v) if isinstance(v, tuple) else v for key, v in vars(self.options).items()}
+        if self.options.brightness.still:
+            del options["gain"], options["offset"]
         return {**self.job.fingerprint, "photo": digest, **options, "rules": _RULES}
 
     @property
@@ -149,12 +172,14 @@ class LocateSettings:
         image: The photo.
         mask: Which of its pixels count, or None.
         photo: What a picture may miss.
+        calibrate: Whether the run's training photos may raise that.
     """
 
     files: Settings
     image: Path
     mask: Path | None = None
     photo: PhotoOptions = field(default_factory=PhotoOptions)
+    calibrate: bool = False
 
 
 def open_location(settings: LocateSettings) -> Location:
@@ -166,4 +191,23 @@ def open_location(settings: LocateSettings) -> Location:
     levels = read_photo(settings.image)
     mask = None if settings.mask is None else read_mask(settings.mask, levels.shape[:2])
     job = open_job(settings.files, default=Perturbation())
-    return Location(job, levels, mask, settings.photo, settings.image)
+    options, calibration = settings.photo, None
+    if settings.calibrate:
+        options, calibration = calibrated(job.scene, job, options)
+    return Location(job, levels, mask, options, settings.image, calibration)
+
+
+def calibrated(scene: Scene, job: Job, options: PhotoOptions) -> tuple[PhotoOptions, Calibration]:
+    """What explains the run's training photos, but no less than ``options``.
+
+    Raises:
+        InputError: There are no photos.
+    """
+    found = calibrate(
+        scene,
+        job.pose_sets[0].camera.height,
+        noise=options.noise,
+        outliers=options.outliers,
+        arithmetic=job.arithmetic,
+    )
+    return replace(options, noise=found.noise, outliers=found.outliers), found

@@ -319,6 +319,8 @@ RESPONSE_ROUNDING = 8.0 * UNIT32
 RESPONSE_ROUNDINGS = 2.0 * RESPONSE_ROUNDING
 #: U1: a photo's value, the noise and the sums with them, absolute: 6 roundings of numbers below 4; up to 2^11.
 PHOTO_ROOM = 2.0**-40
+#: U6: two sums and a quotient, of the sum of all sizes over the least gain: 3 roundings; up to 2^4.
+BRIGHTNESS_ROUNDING = 2.0**-49
 #: U3: a constraint's room and its slopes' sum, of sums of at most d + 3 <= 11 terms: 16; up to 2^9 of their size.
 REACH_ROUNDING = 2.0**-44
 #: U3: a reach in [-1, 1], the cell's middle and half its width, and their sum, in half-widths: 2^4; up to 2^13. Whether

@@ -239,22 +239,32 @@ class Locate(GivenSet):
 
     load_config: Path
     """config.yml of a Splatfacto, vanilla-nerf or nerfacto run, or a file (.ply, .sog, .spz, .splat, .glb, .pt)."""
-    image: Path
-    """The photo: RGB of 8 bits, of the size of the camera path's pictures."""
     camera_path_filename: Path
     """Camera path as Nerfstudio's viewer writes it; the set is around its entries."""
     output_dir: Path
     """Folder for the results; made if missing."""
+    image: Path | None = None
+    """The photo: RGB of 8 bits, of the size of the camera path's pictures."""
+    image_sequence: Path | None = None
+    """In place of --image: folder of photos, followed in the order of their names. Needs --motion."""
+    motion: Path | None = None
+    """Perturbation file: by how much the set's parameters may change from one photo to the next."""
     noise: float = 0.02
     """By how much a value of the photo, from 0 to 1, may differ from the scene's picture before it is rounded."""
     outliers: float = 0.05
     """Part of the pixels that may show anything: people, reflections."""
     mask: Path | None = None
     """Black and white picture of the photo's size: white pixels count. Default: all."""
+    calibrate: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
+    """Raise --noise and --outliers to what explains the run's own training photos."""
+    brightness_gain: tuple[float, float] = (1.0, 1.0)
+    """The camera may show gain * picture + offset, the same for all pixels: ends of the gain."""
+    brightness_offset: tuple[float, float] = (0.0, 0.0)
+    """Ends of the offset."""
     no_contraction: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Only halve cells; for comparisons."""
     time_budget: float | None = None
-    """Seconds for all frames together. Default: 600."""
+    """Seconds for all frames together, of every photo. Default: 600."""
     frames: tuple[int, ...] | None = None
     """Entries of the camera path, counted from 0. Default: all."""
     downscale_factor: float = 1.0
@@ -279,8 +289,16 @@ class Locate(GivenSet):
         """
         from ns_abstract.api.location import LocateSettings, PhotoOptions
 
-        photo = PhotoOptions(self.noise, self.outliers, not self.no_contraction)
-        return LocateSettings(_files(self), self.image, self.mask, photo)
+        if (self.image is None) == (self.image_sequence is None):
+            raise InputError("found both or neither", field="--image", fix="give it, or --image-sequence")
+        if (self.image_sequence is None) != (self.motion is None):
+            raise InputError("given without the other", field="--motion", fix="give it beside --image-sequence")
+        photo = PhotoOptions(
+            self.noise, self.outliers, not self.no_contraction, self.brightness_gain, self.brightness_offset
+        )
+        # the photos of a sequence are read one by one
+        image = self.image or Path()
+        return LocateSettings(_files(self), image, self.mask, photo, self.calibrate)
 
 
 def _files(options: Render | Compare | Locate, **more: Any) -> Settings:

@@ -21,8 +21,8 @@ def locate(options: Locate) -> int:
     stop = SignalStop()
     with stop.installed():
         with stop.at_once():
-            from ns_abstract.cli.locating import locate_photo
-        locate_photo(options, stop)
+            from ns_abstract.cli.locating import locate_photos
+        locate_photos(options, stop)
     return INTERRUPTED if stop() else DONE
 
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from ns_abstract.api.cell_search import CellSearch, Request
 from ns_abstract.api.compiling import compile_beside
 from ns_abstract.api.job import check_frames
 from ns_abstract.api.locating import LocationQuestion
-from ns_abstract.api.location import open_location
+from ns_abstract.api.location import Location, open_location
+from ns_abstract.api.sequence import open_sequence
 from ns_abstract.cli.common import SignalStop, plain_console
 from ns_abstract.cli.options import stated
 from ns_abstract.report.figures import percent
@@ -28,24 +30,60 @@ _ANSWERS = {
 }
 
 
-def locate_photo(options: Locate, stop: SignalStop) -> None:
-    """Search the frames and write the results.
+def locate_photos(options: Locate, stop: SignalStop) -> None:
+    """Search the frames for one photo or for a sequence of them, and write the results.
 
     Raises:
         InputError: A file, a field or an option cannot be used.
     """
     console = plain_console()
+    if options.image_sequence is None:
+        with stop.at_once():
+            location = open_location(options.settings)
+            frames = check_frames(options.frames, location.job.frame_count)
+        _tell(console, location)
+        _search(options, stop, console, location, frames, options.output_dir)
+        return
     with stop.at_once():
-        location = open_location(options.settings)
-        frames = check_frames(options.frames, location.job.frame_count)
-        question = LocationQuestion(location, frames, stated(options), ("ns-abstract-locate", *sys.argv[1:]))
-    method, photo = location.job.method, location.photo
+        settings = options.settings
+        assert options.motion is not None
+        photos = open_sequence(
+            settings, options.image_sequence, options.motion, options.output_dir, options.frames, options.resume
+        )
+    _tell(console, photos.first)
+
+    def search(location: Location, frames: tuple[int, ...], folder: Path) -> dict[str, Any]:
+        console.print(f"{location.file}", markup=False, soft_wrap=True)
+        return _search(options, stop, console, location, frames, folder)
+
+    document = photos.follow(search)
+    if document["not_examined"] and document["state"] == "done":
+        text = f"none: no pose explains {document['images'][-1]['image']['name']}, {document['not_examined']} after it"
+        console.print(f"{text} not examined", markup=False, soft_wrap=True)
+    console.print(f"report: {options.output_dir / 'report.json'}", markup=False, soft_wrap=True)
+
+
+def _tell(console: Any, location: Location) -> None:
+    """Print what is looked for."""
+    method, photo, found = location.job.method, location.photo, location.calibration
+    if found is not None:
+        text = f"calibrated on {found.photos} training photos ({found.psnr:.1f} dB): noise {found.noise:.4f}, outliers"
+        console.print(f"{text} {found.outliers:g}", markup=False, soft_wrap=True)
     console.print(
         f"{method.name}: {method.content}; {photo.allowed} of {int(photo.counted.sum())} pixels may show anything",
         markup=False,
     )
     for warning in location.job.warnings:
         console.print(f"warning: {warning}", markup=False, soft_wrap=True)
+
+
+def _search(
+    options: Locate, stop: SignalStop, console: Any, location: Location, frames: tuple[int, ...], folder: Path
+) -> dict[str, Any]:
+    """Locate one photo; returns the content of its report.json."""
+    # a photo of a sequence that was not begun has no folder yet
+    resume = options.resume and (options.image_sequence is None or (folder / "cells.sqlite").exists())
+    question = LocationQuestion(location, frames, stated(options), ("ns-abstract-locate", *sys.argv[1:]))
     for note in question.about.plan:
         console.print(f"  {note}", markup=False, soft_wrap=True)
 
@@ -58,12 +96,12 @@ def locate_photo(options: Locate, stop: SignalStop) -> None:
                 compile_beside(location.job, frames[0])
 
     with ProgressBar(console) as progress:
-        document = CellSearch(question, options.output_dir).run(
+        document = CellSearch(question, folder).run(
             lambda stack: stack.enter_context(
                 options.where.started(1 if location.job.rays else options.where.processes)
             ),
             stop,
-            Request(options.time_budget or _SECONDS, options.resume, on_open=opened, on_progress=progress),
+            Request(options.time_budget or _SECONDS, resume, on_open=opened, on_progress=progress),
         )
     left = percent(document["possible_volume"])
     console.print(f"{_ANSWERS[document['answer']]}; {left} of the set left", markup=False)
@@ -71,4 +109,5 @@ def locate_photo(options: Locate, stop: SignalStop) -> None:
         missed = document["best"]["outliers"]
         text = f"  best pose misses {missed} pixels: --noise and --outliers must allow the scene's own error"
         console.print(text, markup=False, soft_wrap=True)
-    console.print(f"report: {options.output_dir / 'report.html'}", markup=False, soft_wrap=True)
+    console.print(f"report: {folder / 'report.html'}", markup=False, soft_wrap=True)
+    return document

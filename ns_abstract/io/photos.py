@@ -16,6 +16,7 @@ _MOST_PIXELS, _MOST_MASK_BYTES = 1 << 26, 64 << 20
 #: Grey level of 255 from which on a pixel of such a mask is white.
 _WHITE = 128
 #: Formats that hold values without loss of meaning: a .jpg's compression is noise like others.
+_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm")
 _FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "PPM")
 
 
@@ -35,6 +36,21 @@ def read_photo(file: Path, field: str = "--image") -> np.ndarray:
             f"holds pixels of kind {image.mode}", file=file, field=field, fix="save it as RGB with 8 bits by channel"
         )
     return np.array(image.convert("RGB"), np.uint8)
+
+
+def sequence_photos(folder: Path, field: str = "--image-sequence") -> list[Path]:
+    """The pictures of a folder, in the order of their names.
+
+    Raises:
+        InputError: There is no such folder, or it holds none.
+    """
+    if not folder.is_dir():
+        raise InputError("no such folder", file=folder, field=field, fix="give a folder of photos")
+    found = sorted(file for file in folder.iterdir() if file.suffix.lower() in _ENDINGS and file.is_file())
+    if not found:
+        fix = f"give a folder with files that end in {', '.join(_ENDINGS)}"
+        raise InputError("holds no photos", file=folder, field=field, fix=fix)
+    return found
 
 
 def read_mask(file: Path, size: tuple[int, int], field: str = "--mask") -> np.ndarray:

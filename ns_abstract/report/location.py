@@ -57,6 +57,7 @@ class LocatedRun(Run):
         noise, outliers: What a picture may miss.
         counted: Number of pixels that count.
         allowed: Number of them that may show anything.
+        more: What else report.json says of the photo: "brightness", "calibration".
     """
 
     photo: str | None
@@ -65,6 +66,7 @@ class LocatedRun(Run):
     outliers: float
     counted: int
     allowed: int
+    more: Mapping[str, Any]
 
 
 def location_document(
@@ -119,6 +121,7 @@ def location_document(
                 "outliers": run.outliers,
                 "counted": run.counted,
                 "allowed": run.allowed,
+                **run.more,
             },
             "frames": frames,
             "trace": [{"seconds": p["seconds"], "searched_left": 1.0 - p["certified"]} for p in trace],

@@ -12,12 +12,68 @@ from functools import cached_property
 import numpy as np
 
 from ns_abstract.arithmetic.network_charges import QUOTIENT, STEP
-from ns_abstract.arithmetic.rounding import CUT_ROOM, PHOTO_ROOM, REACH_ROUNDING
+from ns_abstract.arithmetic.rounding import BRIGHTNESS_ROUNDING, CUT_ROOM, PHOTO_ROOM, REACH_ROUNDING
 from ns_abstract.geometry.box import Float64Array
 from ns_abstract.geometry.tiles import in_tiles
 from ns_abstract.refine.protocol import LinearSets
 
 _STEPS = 255.0
+#: Rounds in which gain and offset of a picture are fitted.
+_FITS = 8
+
+
+@dataclass(frozen=True)
+class Brightness:
+    """What a camera may do to all values of a picture alike: it shows ``gain * value + offset``, clipped to [0, 1].
+
+    Attributes:
+        gain, offset: Ends of their intervals; gains are above 0.
+    """
+
+    gain: tuple[float, float] = (1.0, 1.0)
+    offset: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def still(self) -> bool:
+        """Whether the camera shows the picture itself."""
+        return (*self.gain, *self.offset) == (1.0, 1.0, 0.0, 0.0)
+
+    def before(self, low: Float64Array, high: Float64Array) -> tuple[Float64Array, Float64Array]:
+        """Ends of the values that some gain and offset take into [low, high], rounded outward (U6).
+
+        What is clipped to an end that lies within may have been anything beyond it.
+        """
+        ends = []
+        for side, sign, offset in ((low, -1.0, self.offset[1]), (high, 1.0, self.offset[0])):
+            moved = side - offset
+            size = (np.abs(side) + abs(offset)) / self.gain[0]
+            found = np.stack([moved / gain for gain in self.gain])
+            found = found.min(axis=0) if sign < 0.0 else found.max(axis=0)
+            ends.append(found + sign * BRIGHTNESS_ROUNDING * size)
+        return np.where(low <= 0.0, -np.inf, ends[0]), np.where(high >= 1.0, np.inf, ends[1])
+
+    def outside(self, picture: np.ndarray, low: Float64Array, high: Float64Array, counted: np.ndarray) -> np.ndarray:
+        """Which counted pixels of a picture [..., 3] one gain and offset for all of them do not take into [low, high].
+
+        They are fitted: others may do better.
+        """
+        middle, values = 0.5 * (low + high)[counted].ravel(), picture[counted].astype(np.float64).ravel()
+        room = 0.5 * (high - low)[counted].ravel()
+        gain, offset = (min(max(value, ends[0]), ends[1]) for value, ends in ((1.0, self.gain), (0.0, self.offset)))
+        best: np.ndarray | None = None
+        for _ in range(_FITS):
+            shown = np.clip(gain * picture.astype(np.float64) + offset, 0.0, 1.0)
+            missed = counted & ~((shown >= low) & (shown <= high)).all(axis=-1)
+            best = missed if best is None or missed.sum() < best.sum() else best
+            weight = 1.0 / np.maximum(np.abs(gain * values + offset - middle), room)
+            rows = np.stack([values, np.ones_like(values)], axis=1) * weight[:, None]
+            if not np.isfinite(rows).all():
+                break
+            found = np.linalg.lstsq(rows, middle * weight, rcond=None)[0]
+            gain = float(np.clip(found[0], *self.gain))
+            offset = float(np.clip(np.average(middle - gain * values, weights=weight**2), *self.offset))
+        assert best is not None
+        return best
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,12 +85,14 @@ class Photo:
         noise: By how much a value of the photo, in [0, 1], may differ from the picture's before it is rounded.
         outliers: Part of the counted pixels that may show anything.
         counted: [H, W] which pixels count.
+        brightness: What the camera may do to all values alike.
     """
 
     levels: np.ndarray
     noise: float
     outliers: float
     counted: np.ndarray
+    brightness: Brightness = Brightness()
 
     @property
     def allowed(self) -> int:
@@ -42,21 +100,30 @@ class Photo:
         return math.floor(self.outliers * int(self.counted.sum()))
 
     @cached_property
-    def ends(self) -> tuple[Float64Array, Float64Array]:
-        """Least and greatest values [H, W, 3] of a picture that explains a pixel (U1)."""
+    def shown(self) -> tuple[Float64Array, Float64Array]:
+        """Least and greatest values [H, W, 3] that the camera shows where they explain a pixel (U1)."""
         value = self.levels.astype(np.float64) / _STEPS
         room = self.noise + (0.5 + STEP) / _STEPS + QUOTIENT + PHOTO_ROOM
         return value - room, value + room
 
+    @cached_property
+    def ends(self) -> tuple[Float64Array, Float64Array]:
+        """Least and greatest values [H, W, 3] of a picture that explains a pixel, at any brightness (U1, U6)."""
+        return self.shown if self.brightness.still else self.brightness.before(*self.shown)
+
     def outside(self, picture: np.ndarray) -> np.ndarray:
         """[H, W] which counted pixels of a picture [H, W, 3] do not explain the photo; NaN explains nothing."""
+        if not self.brightness.still:
+            return self.brightness.outside(picture, *self.shown, self.counted)
         low, high = self.ends
         return self.counted & ~((picture >= low) & (picture <= high)).all(axis=-1)
 
     def tiled(self, side: int) -> TiledPhoto:
         """The photo in tiles of ``side`` pixels."""
         low, high = self.ends
-        return TiledPhoto(in_tiles(low, side), in_tiles(high, side), in_tiles(self.counted, side), self.allowed)
+        shown = None if self.brightness.still else tuple(in_tiles(end, side) for end in self.shown)
+        parts = in_tiles(low, side), in_tiles(high, side), in_tiles(self.counted, side)
+        return TiledPhoto(*parts, self.allowed, self.brightness, shown)
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,15 +134,21 @@ class TiledPhoto:
         low, high: [T, side, side, 3] values of a picture that explains a pixel.
         counted: [T, side, side] which pixels count; false beyond the photo's edges.
         allowed: Pixels of the whole photo that may show anything.
+        brightness: What the camera may do to all values alike.
+        shown: `Photo.shown` in tiles, where that is anything.
     """
 
     low: Float64Array
     high: Float64Array
     counted: np.ndarray
     allowed: int
+    brightness: Brightness = Brightness()
+    shown: tuple[Float64Array, ...] | None = None
 
     def outside(self, picture: np.ndarray) -> np.ndarray:
         """[T, side, side] which counted pixels of a picture in tiles do not explain the photo."""
+        if self.shown is not None:
+            return self.brightness.outside(picture, self.shown[0], self.shown[1], self.counted)
         return self.counted & ~((picture >= self.low) & (picture <= self.high)).all(axis=-1)
 
     def beyond(self, lower: np.ndarray, upper: np.ndarray, tiles: np.ndarray) -> np.ndarray:

@@ -1,0 +1,191 @@
+"""Where a camera went that took a sequence of photos: what is left of one photo's set, grown, is the next one's set."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ns_abstract.api.files import PathJob
+from ns_abstract.api.job import check_frames
+from ns_abstract.api.location import LocateSettings, Location, open_location
+from ns_abstract.geometry.poses import PoseBox
+from ns_abstract.io.atomic import write_json
+from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import load_json
+from ns_abstract.io.photos import read_mask, read_photo, sequence_photos
+from ns_abstract.perturbation.specification import ROTATIONS, TRANSLATIONS, load_perturbation
+from ns_abstract.report.run import file_stamp, plain
+
+Range = tuple[float, float]
+_REPORT = "report.json"
+
+
+def load_motion(file: Path, sets: Mapping[int, PoseBox], dataset_scale: float) -> dict[str, Range]:
+    """By how much parameters may change from one photo to the next, by name.
+
+    Raises:
+        InputError: The file states what is no motion, or one that a set has no parameter for.
+    """
+    motion = load_perturbation(file, dataset_scale=dataset_scale)
+    others = {
+        "sweep": motion.sweep != "keyframes", "orbit": motion.orbit is not None, "scene": bool(motion.scene),
+        "hue": motion.hue is not None, "saturation": motion.saturation is not None,
+    }  # fmt: skip
+    for name, given in others.items():
+        if given:
+            raise InputError("is no motion", file=file, field=name, fix="state translation and rotation alone")
+    ranges = {name: ends for name, ends in {**motion.translation, **motion.rotation}.items() if ends != (0.0, 0.0)}
+    for poses in sets.values():
+        if set(ranges) & set(TRANSLATIONS) and poses.perturbation.frame != motion.frame:
+            fix = f'write "frame": "{poses.perturbation.frame}", as the set has'
+            raise InputError(f"found {motion.frame}", file=file, field="frame", fix=fix)
+        if missing := [name for name in ranges if name not in poses.box.names]:
+            fix = "give the first photo's set a range of it, or remove it here"
+            raise InputError("does not vary in the set", file=file, field=missing[0], fix=fix)
+    return ranges
+
+
+def grown(poses: PoseBox, hull: Mapping[str, Range], motion: Mapping[str, Range]) -> PoseBox:
+    """All poses that a motion takes poses of ``hull`` to (U7).
+
+    Args:
+        poses: A set around the same camera.
+        hull: Ends by parameter of what is left of it.
+        motion: Ends of the changes; none where a translation or a rotation is not named. Other parameters, which no
+            motion names, keep the whole range of ``poses``.
+    """
+    box = poses.box
+    for axis, name in enumerate(box.names):
+        if name in (*TRANSLATIONS, *ROTATIONS):
+            low, high = motion.get(name, (0.0, 0.0))
+            ends = np.nextafter(hull[name][0] + low, -np.inf), np.nextafter(hull[name][1] + high, np.inf)
+            box = box.replace(axis, float(ends[0]), float(ends[1]))
+    return poses.within(box)
+
+
+@dataclass
+class PhotoSequence:
+    """A sequence of photos that is followed, and its report.
+
+    Args:
+        settings: What is located; the photo is the first one.
+        images: The photos, in order.
+        motion: File of the motion between two of them.
+        folder: For the results: a folder by photo, and report.json.
+        frames: Numbers of the sets that the first photo may come from.
+        resume: Whether to go on with what ``folder`` holds.
+
+    Raises:
+        InputError: A file or a field cannot be used, or the folder holds another sequence.
+    """
+
+    settings: LocateSettings
+    images: list[Path]
+    motion: Path
+    folder: Path
+    frames: tuple[int, ...] | None = None
+    resume: bool = False
+
+    def __post_init__(self) -> None:
+        self.first = open_location(self.settings)
+        job = self.first.job
+        assert isinstance(job, PathJob)
+        self.job = job
+        self.sets = {k: job.pose_sets[k] for k in check_frames(self.frames, job.frame_count)}
+        self.ranges = load_motion(self.motion, self.sets, job.method.dataset_scale)
+        text = json.dumps([self.first.fingerprint, self.ranges, sorted(self.sets)], sort_keys=True)
+        self.fingerprint = hashlib.sha256(text.encode()).hexdigest()
+        self.entries: list[dict[str, Any]] = self._stored() if self.resume else []
+
+    def _stored(self) -> list[dict[str, Any]]:
+        file = self.folder / _REPORT
+        if not file.is_file():
+            return []
+        document = load_json(file, "report of a sequence")
+        if not isinstance(document, dict) or document.get("fingerprint") != self.fingerprint:
+            raise InputError(
+                "is of other inputs", file=file, field="--resume", fix="give the same ones, or another --output-dir"
+            )
+        entries = [entry for entry in document["images"] if entry["state"] != "interrupted"]
+        for entry, image in zip(entries, self.images, strict=False):
+            if entry["image"] != file_stamp(image):
+                problem = f"{entry['image']['name']} was another photo then"
+                raise InputError(problem, file=image, field="--resume", fix="give the same photos")
+        return entries
+
+    def follow(self, search: Callable[[Location, tuple[int, ...], Path], dict[str, Any]]) -> dict[str, Any]:
+        """Locate one photo after the other until one is excluded everywhere; returns the content of report.json.
+
+        Args:
+            search: Locates a photo in sets of some numbers, into a folder; returns its report.
+        """
+        for k in range(len(self.entries), len(self.images)):
+            alive = self._sets(k)
+            if not alive:
+                break
+            folder = f"{k:05d}_{self.images[k].stem}"
+            numbers, poses = tuple(alive), tuple(alive.values())
+            document = search(self._location(k, poses), tuple(range(len(poses))), self.folder / folder)
+            frames = [{**frame, "index": numbers[frame["index"]]} for frame in document["frames"]]
+            kept = ("answer", "possible_volume", "hull", "best", "seconds", "state")
+            self.entries.append(
+                {"image": file_stamp(self.images[k]), "folder": folder, **{name: document[name] for name in kept}}
+                | {"frames": frames}
+            )
+            self._write()
+            if document["state"] == "interrupted":
+                break
+        return self._write()
+
+    def _sets(self, k: int) -> dict[int, PoseBox]:
+        """By number, the set of photo ``k``."""
+        if k == 0:
+            return self.sets
+        alive = {}
+        for frame in self.entries[k - 1]["frames"]:
+            if frame["hull"] is not None:
+                names = [entry["name"] for entry in frame["parameters"]]
+                hull = dict(zip(names, zip(frame["hull"]["lower"], frame["hull"]["upper"], strict=True), strict=True))
+                alive[frame["index"]] = grown(self.sets[frame["index"]], hull, self.ranges)
+        return alive
+
+    def _location(self, k: int, poses: tuple[PoseBox, ...]) -> Location:
+        image, first = self.images[k], self.first
+        levels = read_photo(image)
+        mask = None if self.settings.mask is None else read_mask(self.settings.mask, levels.shape[:2])
+        job = PathJob(self.job.settings, self.job.scene, self.job.path, poses)
+        return Location(job, levels, mask, first.options, image, first.calibration)
+
+    def _write(self) -> dict[str, Any]:
+        entries = self.entries
+        left = len(self.images) - len(entries)
+        state = entries[-1]["state"] if entries and entries[-1]["state"] == "interrupted" else "done"
+        document = plain(
+            {
+                "version": 1,
+                "kind": "sequence",
+                "answer": "none" if any(entry["answer"] == "none" for entry in entries) else entries[-1]["answer"],
+                "motion": self.ranges,
+                "images": entries,
+                "not_examined": left,
+                "state": state,
+                "fingerprint": self.fingerprint,
+            }
+        )
+        self.folder.mkdir(parents=True, exist_ok=True)
+        write_json(self.folder / _REPORT, document)
+        return document
+
+
+def open_sequence(
+    settings: LocateSettings, images: Path, motion: Path, folder: Path, frames: tuple[int, ...] | None, resume: bool
+) -> PhotoSequence:
+    """Open the photos of a folder, in the order of their names; arguments and errors as for `PhotoSequence`."""
+    photos = sequence_photos(images)
+    return PhotoSequence(replace(settings, image=photos[0]), photos, motion, folder, frames, resume)

@@ -1,0 +1,243 @@
+"""Photos of other brightness, calibrated noise, and sequences of photos: what is excluded never made the photo."""
+
+import json
+import sqlite3
+from collections.abc import Callable
+from fractions import Fraction
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import InProcess, Inputs
+from PIL import Image
+from test_locate import taken
+
+import ns_abstract as nsa
+from ns_abstract.api.calibration import calibrate, training_data
+from ns_abstract.api.sequence import grown
+from ns_abstract.cli.locate import main
+from ns_abstract.geometry.camera_path import load_camera_path
+from ns_abstract.geometry.poses import PoseBox
+from ns_abstract.geometry.tiles import assemble
+from ns_abstract.perturbation.specification import Perturbation
+from ns_abstract.verify.photo import Brightness, Photo
+
+RNG = np.random.default_rng
+
+
+def exposed(picture: np.ndarray, gain: float, offset: float) -> np.ndarray:
+    return np.clip(gain * picture.astype(np.float64) + offset, 0.0, 1.0)
+
+
+# ---------------------------------------------------------------- brightness
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_values_before_any_brightness_are_held(seed: int) -> None:
+    """Every value that some gain and offset take to within the noise and a rounding of a level, exactly."""
+    rng, noise = RNG(seed), [0.0, 0.02, 0.3, 0.004][seed]
+    levels = np.arange(256, dtype=np.uint8).repeat(3).reshape(16, 16, 3)
+    brightness = Brightness((0.5, 2.0) if seed % 2 else (0.9, 1.1), (-0.1, 0.05))
+    photo = Photo(levels, noise, 0.0, np.ones((16, 16), bool), brightness)
+    low, high = photo.ends
+    for level, a, b in zip(levels.ravel().tolist(), low.ravel().tolist(), high.ravel().tolist(), strict=True):
+        for _ in range(3):
+            gain, offset = (Fraction(rng.choice([*ends, rng.uniform(*ends)])) for ends in vars(brightness).values())
+            # what the camera shows: a value at an end of the noise and of the step, or anything that is clipped
+            shown = Fraction(level, 255) + int(rng.choice([-1, 0, 1])) * (Fraction(noise) + Fraction(1, 510))
+            beyond = Fraction(int(rng.integers(0, 5))) if shown >= 1 else Fraction()
+            below = Fraction(int(rng.integers(0, 5))) if shown <= 0 else Fraction()
+            value = (shown + beyond - below - offset) / gain
+            assert (a == -np.inf or Fraction(a) <= value) and (b == np.inf or value <= Fraction(b))
+    # and not everything: levels in the middle leave values out on both sides
+    assert np.isfinite(low[8]).all() or noise > 0.2
+    still = Photo(levels, noise, 0.0, np.ones((16, 16), bool))
+    assert (still.ends[0] == still.shown[0]).all() and (low <= still.ends[0]).all() and (high >= still.ends[1]).all()
+
+
+def test_one_brightness_for_all_pixels_explains_a_photo() -> None:
+    """The fit finds it beside outliers; pixels that would need one each are no explanation; NaN is none."""
+    rng = RNG(1)
+    picture = rng.uniform(0.1, 0.8, (16, 16, 3))
+    levels = taken(exposed(picture, 1.15, -0.04), 0.0, 20, rng)
+    photo = Photo(levels, 0.004, 0.1, np.ones((16, 16), bool), Brightness((0.8, 1.25), (-0.05, 0.05)))
+    assert photo.outside(picture).sum() <= 20
+    assert photo.tiled(4).outside(np.full((16, 4, 4, 3), np.nan)).all()
+    each = taken(picture * rng.choice([0.85, 1.2], (16, 16, 1)), 0.0, 0, rng)
+    mixed = Photo(each, 0.004, 0.1, np.ones((16, 16), bool), photo.brightness)
+    assert mixed.outside(picture).sum() > 60
+    # bounds that hold the picture exclude none of them
+    tiled, whole = photo.tiled(16), picture[None].astype(np.float32)
+    assert tiled.beyond(whole, whole, np.arange(1)).sum() <= 20
+
+
+@pytest.mark.slow
+def test_locate_allows_another_brightness(blobs: Inputs) -> None:
+    rng, scene = RNG(2), nsa.load_scene(blobs.config)
+    poses = nsa.PoseSet(nsa.load_camera_path(blobs.path).cameras[0], translation={"x": 0.3})
+    frame = scene.method().frame(poses.of(scene))
+    pose = frame.box.sample(1, rng)[0]
+    levels = taken(exposed(assemble(frame.render(pose), frame.camera), 1.1, 0.01), 0.004, 10, rng)
+    given: dict[str, Any] = {"noise": 0.006, "outliers": 40 / 1024, "time_budget": 20.0}
+    assert nsa.locate(scene, poses, levels, **given).possible_volume == 0.0
+    place = nsa.locate(scene, poses, levels, brightness={"gain": (0.9, 1.15), "offset": (-0.02, 0.02)}, **given)
+    assert place.hull is not None and place.hull[0][0] <= pose[0] <= place.hull[1][0]
+    assert place.possible_volume < 0.1 and place.answer == "possible"
+    assert place.report["photo"]["brightness"] == {"gain": [0.9, 1.15], "offset": [-0.02, 0.02]}
+    with pytest.raises(nsa.InputError, match="--brightness-gain: found"):
+        nsa.locate(scene, poses, levels, brightness={"gain": (1.1, 0.9)})
+
+
+# ---------------------------------------------------------------- calibration
+
+
+def with_photos(inputs: Inputs, error: float) -> tuple[nsa.Scene, Path]:
+    """The run with training photos that differ from its renders by up to ``error``, and 2 % of the pixels by more."""
+    scene, rng = nsa.load_scene(inputs.config), RNG(3)
+    data = training_data(scene)
+    cameras = load_camera_path(data, run_frame=scene.run_frame).cameras
+    for k, entry in enumerate(json.loads(data.read_text())["frames"]):
+        picture = nsa.render(scene, cameras[k])
+        count = picture[..., 0].size // 50
+        Image.fromarray(taken(picture, error, count, rng)).save(data.parent / entry["file_path"])
+    return scene, data
+
+
+def test_noise_and_outliers_explain_all_training_photos(make_blobs: Callable[..., Inputs]) -> None:
+    scene, data = with_photos(make_blobs(), 0.06)
+    found = calibrate(scene, 10_000, noise=0.02, outliers=0.01)
+    assert 0.05 < found.noise <= 0.0601 and found.outliers == 0.02
+    cameras = load_camera_path(data, run_frame=scene.run_frame).cameras
+    for camera, entry in zip(cameras, json.loads(data.read_text())["frames"], strict=True):
+        frame = scene.method().frame(PoseBox.around(camera, Perturbation()))
+        levels = np.array(Image.open(data.parent / entry["file_path"]))
+        photo = Photo(levels, found.noise, found.outliers, np.ones(levels.shape[:2], bool))
+        assert photo.outside(assemble(frame.render(frame.box.middle), frame.camera)).sum() <= photo.allowed
+    # what is given is the least
+    assert calibrate(scene, 10_000, noise=0.2, outliers=0.3).noise == 0.2
+    assert calibrate(scene, 8, noise=0.0, outliers=0.0).size[0] == 8
+
+
+def test_calibration_needs_the_photos(make_blobs: Callable[..., Inputs], tmp_path: Path, in_process: InProcess) -> None:
+    inputs = make_blobs()
+    data = training_data(nsa.load_scene(inputs.config))
+    image = tmp_path / "photo.png"
+    Image.new("RGB", (32, 32), 0).save(image)
+    (data.parent / json.loads(data.read_text())["frames"][0]["file_path"]).unlink()
+    for damage, words in ((lambda: None, "--calibrate: no such file"), (data.unlink, "no transforms.json in")):
+        damage()
+        code, _, err = in_process(
+            main, inputs.options(tmp_path / "out", image=image, frames=0, workers=1, calibrate=True)
+        )
+        assert code == 2 and words in err and err.count("\n") == 1, err
+        assert not (tmp_path / "out").exists()
+
+
+# ---------------------------------------------------------------- sequences
+
+
+def test_a_grown_set_holds_every_pose_that_a_motion_leads_to() -> None:
+    rng = RNG(4)
+    camera = nsa.Camera(np.eye(4), fov=45.0, width=8, height=8)
+    ranges = {"x": (-0.1, 0.1), "y": (-0.05, 0.2)}
+    poses = PoseBox.around(camera, Perturbation(translation=ranges, rotation={"yaw": (-0.3, 0.1)}))
+    for _ in range(50):
+        hull = {name: tuple(np.sort(rng.uniform(-0.3, 0.3, 2)).tolist()) for name in poses.box.names}
+        motion = {"x": (-0.01, 0.03), "yaw": (0.1, 0.2)}
+        box = grown(poses, hull, motion).box
+        for k, name in enumerate(box.names):
+            low, high = motion.get(name, (0.0, 0.0))
+            assert Fraction(box.lower[k]) <= Fraction(hull[name][0]) + Fraction(low)
+            assert Fraction(box.upper[k]) >= Fraction(hull[name][1]) + Fraction(high)
+            assert box.upper[k] - box.lower[k] <= hull[name][1] - hull[name][0] + high - low + 1e-12
+
+
+@pytest.fixture
+def travelled(blobs: Inputs, tmp_path: Path) -> tuple[list[str], np.ndarray, Path]:
+    """Options of a sequence of three photos and one that no pose made, the poses, and the folder of results."""
+    rng, scene = RNG(6), nsa.load_scene(blobs.config)
+    camera = nsa.load_camera_path(blobs.path).cameras[0]
+    wide = scene.method().frame(nsa.PoseSet(camera, translation={"x": 1.0}).of(scene))
+    # out of the first photo's set by far
+    places = np.array([0.02, 0.035, 0.05])
+    (tmp_path / "photos").mkdir()
+    for k, x in enumerate(places):
+        levels = taken(assemble(wide.render(np.array([x])), wide.camera), 0.004, 5, rng)
+        Image.fromarray(levels).save(tmp_path / "photos" / f"{k}.png")
+    Image.fromarray(rng.integers(0, 256, (32, 32, 3), np.uint8)).save(tmp_path / "photos" / "3.png")
+    Image.new("RGB", (32, 32)).save(tmp_path / "photos" / "4.png")
+    (tmp_path / "motion.json").write_text('{"version": 1, "translation": {"x": [0.0, 0.02]}}')
+    folder = tmp_path / "out"
+    options = blobs.options(
+        folder, image_sequence=tmp_path / "photos", motion=tmp_path / "motion.json", noise=0.004, outliers=0.01,
+        frames=0, workers=1, time_budget=20,
+    )  # fmt: skip
+    return options, places, folder
+
+
+@pytest.mark.slow
+def test_a_sequence_is_followed_and_resumed(
+    travelled: tuple[list[str], np.ndarray, Path], in_process: InProcess
+) -> None:
+    options, places, folder = travelled
+    code, _, err = in_process(main, options)
+    assert code == 0 and "none: no pose explains 3.png, 1 after it not examined" in err
+    report = json.loads((folder / "report.json").read_text())
+    assert [entry["answer"] for entry in report["images"]] == ["possible"] * 3 + ["none"]
+    assert report["answer"] == "none" and report["not_examined"] == 1
+    for entry, x in zip(report["images"], places, strict=False):
+        assert entry["hull"]["lower"][0] <= x <= entry["hull"]["upper"][0] <= x + 0.01
+        with sqlite3.connect(folder / entry["folder"] / "cells.sqlite") as base:
+            kinds = {row[0] for row in base.execute("SELECT verdict FROM cells")}
+        assert "possible" in kinds
+    # the sets are the last results, grown
+    for before, after in zip(report["images"][:3], report["images"][1:], strict=True):
+        (entry,) = after["frames"][0]["parameters"]
+        assert entry["lower"] == pytest.approx(before["hull"]["lower"][0], abs=1e-12)
+        assert entry["upper"] == pytest.approx(before["hull"]["upper"][0] + 0.02, abs=1e-12)
+    # cut off after the second photo: its results are read, the same comes out
+    cut = {**report, "images": report["images"][:2]}
+    (folder / "report.json").write_text(json.dumps(cut))
+    stamps = [(folder / entry["folder"] / "report.json").stat().st_mtime_ns for entry in report["images"][:2]]
+    assert in_process(main, [*options, "--resume"])[0] == 0
+    again = json.loads((folder / "report.json").read_text())
+    assert [(e["answer"], e["hull"]) for e in again["images"]] == [(e["answer"], e["hull"]) for e in report["images"]]
+    assert stamps == [(folder / entry["folder"] / "report.json").stat().st_mtime_ns for entry in report["images"][:2]]
+    for more, words in ((["--noise", "0.01"], "is of other inputs"), (["--outliers", "0.2"], "is of other inputs")):
+        code, _, err = in_process(main, [*options, *more, "--resume"])
+        assert code == 2 and words in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "motion, words",
+    [
+        ({"translation": {"y": 0.1}}, "motion.json: y: does not vary in the set"),
+        ({"translation": {"x": 0.1}, "frame": "world"}, "motion.json: frame: found world"),
+        ({"translation": {"x": 0.1}, "sweep": "segments"}, "motion.json: sweep: is no motion"),
+        ({"translation": {"x": [1, 0]}}, "motion.json: translation.x"),
+        (None, "--motion"),
+    ],
+)
+def test_bad_motions_are_one_line(
+    motion: Any, words: str, travelled: tuple[list[str], np.ndarray, Path], tmp_path: Path, in_process: InProcess
+) -> None:
+    options, _, folder = travelled
+    if motion is None:
+        place = options.index("--motion")
+        options = options[:place] + options[place + 2 :]
+    else:
+        (tmp_path / "motion.json").write_text(json.dumps({"version": 1, **motion}))
+    code, _, err = in_process(main, options)
+    assert code == 2 and words in err and err.count("\n") == 1, err
+    assert not folder.exists()
+
+
+def test_a_folder_without_photos_is_one_line(blobs: Inputs, tmp_path: Path, in_process: InProcess) -> None:
+    for folder, words in ((tmp_path, "holds no photos"), (tmp_path / "none", "no such folder")):
+        code, _, err = in_process(
+            main, blobs.options(tmp_path / "out", image_sequence=folder, motion=blobs.spec, workers=1)
+        )
+        assert code == 2 and words in err and err.count("\n") == 1
+    code, _, err = in_process(main, blobs.options(tmp_path / "out", workers=1))
+    assert code == 2 and "--image: found both or neither" in err
