@@ -115,7 +115,8 @@ class InitialPartition:
                 # known to be fine enough
                 wanted = min(wanted, finer)
             elif wanted < tuning.coarser_share * count:
-                finer, count = count, wanted | 1
+                # it is tried, so it may be as coarse as the square says
+                finer, count = count, math.ceil(count * math.sqrt(share)) | 1
                 continue
             if wanted < 2 * count or 2 * count > most or not helped:
                 parts = self.splitter.cut(whole, 0, max(1, min(wanted if helped else count, most)))
