@@ -499,7 +499,7 @@ def test_stop_during_the_cover_leaves_nothing_known() -> None:
     check(frame, result)
 
 
-def test_a_cover_that_was_stopped_is_not_kept_for_others() -> None:
+def test_a_cover_is_kept_for_others_whole_or_not_at_all() -> None:
     frame, kept = Waves(1, pace=20.0), []
     refinement = Refinement(
         frame, 0, RefinementGoal(1.05, FOREVER), stopped=lambda: len(frame.calls) >= 3, initial=kept
@@ -507,6 +507,9 @@ def test_a_cover_that_was_stopped_is_not_kept_for_others() -> None:
     assert not refinement.run().bounded and kept == []
     refinement = Refinement(Waves(1, pace=20.0), 0, RefinementGoal(1.05, FOREVER), initial=kept)
     assert refinement.run().bounded and len(kept) > 3
+    ends = sorted((cell.box.lower, cell.box.upper) for cell, _, _ in kept)
+    assert (ends[0][0], ends[-1][1]) == (refinement.frame.box.lower, refinement.frame.box.upper)
+    assert all(upper == lower for (_, upper), (lower, _) in itertools.pairwise(ends))
     assert all(lower.shape == upper.shape == refinement.leaves.lower.shape for _, lower, upper in kept)
 
 
