@@ -254,8 +254,10 @@ class Refinement:
     def _initial_cell(self, part: SubBox, partition: Partition | None) -> BoundedCell:
         """Take a cell of the initial partition and its bounds, which are computed unless ``partition`` tried them."""
         cell, everything = self._cell(part), self.tiles.all
-        tried = partition is not None and part.box == partition.tried.box
-        lower, upper, bounds = self._take(cell, partition.bounds) if tried else self._bound([cell], None, everything)[0]
+        if partition is not None and part.box == partition.tried.box:
+            lower, upper, bounds = self._take(cell, partition.bounds)
+        else:
+            [(lower, upper, bounds)] = self._bound([cell], None, everything)
         self.leaves.take(cell, lower, upper)
         self.leaf_sets.keep(cell, bounds, everything)
         return (cell, lower, upper) if self.initial is not None else (cell, _NO_BOUNDS, _NO_BOUNDS)
