@@ -18,6 +18,7 @@ from ns_abstract.verify.network.bounds import NetworkBounds
 from ns_abstract.verify.network.branching import branch
 from ns_abstract.verify.network.phase_tree import PhaseTree
 from ns_abstract.verify.network.subnormals import subnormals_kept
+from ns_abstract.verify.network.weighted_means import centred
 from ns_abstract.verify.vnnlib import InputRegion, UnsafeSet
 
 #: The competitions' words: an unsafe output was found; there is none; not decided; not decided in time.
@@ -167,6 +168,8 @@ class _BoxSearch:
         arithmetic: NetworkArithmetic,
     ) -> None:
         self.network, self.run, self.deadline, self.memory = network, run, deadline, memory
+        # what is bounded; equal to the network in the arithmetic that is asked for
+        self.bounded = network
         self.arithmetic: NetworkArithmetic = arithmetic
         self.boxes = 0
         total = sum(int(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1))
@@ -183,6 +186,9 @@ class _BoxSearch:
             # any output is unsafe, and no input could be shown to have one
             self.undecided = True
             return False
+        if self.arithmetic == "real":
+            middle = torch.from_numpy(0.5 * (family.lower[0] + family.upper[0]))
+            self.bounded = centred(self.network, middle.reshape(1, *self.network.input_shape))
         if int((family.upper > family.lower).sum(1).max()) <= _TUNING.cut:
             return self._bisect(family)
         return any(self._assume(family, which) for which in range(len(family.regions)))
@@ -241,7 +247,7 @@ class _BoxSearch:
     ) -> tuple[PhaseTree, list[tuple[int, ...]]]:
         """A tree over bounds with so many steps for intermediate ones, and the groups that its root leaves open."""
         cells = NetworkBounds(
-            self.network, images, "everywhere", self.memory, self.arithmetic, 1, intermediate_steps=steps
+            self.bounded, images, "everywhere", self.memory, self.arithmetic, 1, intermediate_steps=steps
         )
         tree, left = PhaseTree(cells, family.unsafe.rows, family.offset[which]), []
         for group in groups:
@@ -254,7 +260,7 @@ class _BoxSearch:
     def _anew(self, family: _Family, which: int, images: ImageSets, group: Sequence[int]) -> bool:
         """Whether a group is proved by branches with intermediate bounds of their own."""
         branching = branch(
-            self.network,
+            self.bounded,
             images,
             family.unsafe.rows,
             family.offset[which],
@@ -288,7 +294,7 @@ class _BoxSearch:
         """Bounds of boxes, with slopes by all inputs."""
         which, lower, upper = (np.stack(ends) for ends in zip(*boxes, strict=True))
         bounds = bound_outputs(
-            self.network,
+            self.bounded,
             self._images(lower, upper),
             family.unsafe.rows,
             family.offset[which],

@@ -26,13 +26,15 @@ from ns_abstract.io.jsonio import read_text
 from ns_abstract.io.packed import unpacked
 from ns_abstract.verify.vnnlib2 import Vnnlib2Query, is_version_2, joined, parse_query
 
-_LIMIT = 64 << 20
+_LIMIT = 256 << 20
 _TOKEN = re.compile(r'\s+|;[^\n]*|(?P<text>[()]|"[^"]*"|[^\s();"]+)|(?P<bad>.)', re.DOTALL)
+#: Bounds of single inputs next to each other, as files of many boxes hold them by the million.
+_RUN = re.compile(r"(?:\([<>]= X_\d{1,9} [-+.\deE]{1,40}\)\s*){8,}", re.ASCII)
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?", re.ASCII)
 _VARIABLE = re.compile(r"([XY])_(\d{1,9})", re.ASCII)
 _OTHER = "use the network's file"
 #: Most conjunctions that a file's assertions may multiply out to.
-_CONJUNCTIONS = 10_000
+_CONJUNCTIONS = 50_000
 _DEPTH = 200
 #: Exponents of two that the largest factor of a constraint may have before the constraint is rescaled, that any
 #: factor may have below the largest, and that the constant may have above it.
@@ -47,8 +49,39 @@ _ASKED = 1 << 12
 _BOXES = 1 << 25
 #: Coefficients of outputs by number (of input i by -1 - i), and a constant.
 _Linear = tuple[dict[int, float], float]
+
+
+@dataclass(frozen=True)
+class _Run:
+    """Bounds of single inputs, all of which hold.
+
+    Attributes:
+        texts: One of them each, without the closing bracket.
+        known: Shared by all runs: the side (0 below, 1 above), the input and the limit of a text.
+    """
+
+    texts: list[str]
+    known: dict[str, tuple[int, int, float]]
+
+    def read(self, declared: set[str], size: _VariableCounts) -> None:
+        """Learn what the texts say."""
+        for text in set(self.texts).difference(self.known):
+            ((constraint,),) = _ways(_expressions(text + ")")[0], declared, size)
+            assert not isinstance(constraint, _Run)
+            ends = np.array([[-np.inf], [np.inf]]) * np.ones(size.inputs or 0)
+            _bound(constraint, ends)
+            ((side, index),) = np.argwhere(np.isfinite(ends))
+            self.known[text] = int(side), int(index), float(ends[side, index])
+
+    def limit(self, ends: np.ndarray) -> None:
+        """Make ``ends`` [2, n] obey them."""
+        side, index, value = (np.array(v) for v in zip(*map(self.known.__getitem__, self.texts), strict=True))
+        np.maximum.at(ends[0], index[side == 0], value[side == 0])
+        np.minimum.at(ends[1], index[side == 1], value[side == 1])
+
+
 #: ``rows @ y + offset <= 0`` for all rows of a list: one way to be unsafe.
-_Conjunction = list[_Linear]
+_Conjunction = list[_Linear | _Run]
 
 
 @dataclass(frozen=True)
@@ -122,10 +155,15 @@ def load_vnnlib(path: Path, output_shape: Shape, input_shape: Shape | None = Non
         raise error.within(path) from None
 
 
-def _read(text: str, input_shape: Shape | None, output_shape: Shape) -> tuple[list[Any], Vnnlib2Query | None]:
-    """The expressions of version 1 that a file means, and the query that a file of version 2 is."""
+def _read(
+    text: str, input_shape: Shape | None, output_shape: Shape, runs: bool = False
+) -> tuple[list[Any], Vnnlib2Query | None]:
+    """The expressions of version 1 that a file means, and the query that a file of version 2 is.
+
+    ``runs``: whether bounds of single inputs may be a `_Run`.
+    """
     if not is_version_2(text):
-        return _expressions(text), None
+        return _expressions(text, runs), None
     expressions = _expressions(joined(text))
     query = parse_query(expressions, input_shape, output_shape)
     return query.expressions, query
@@ -175,7 +213,7 @@ def load_query(
     """`load_regions` with the query that a file of version 2 is; None for version 1."""
     text = _text(path) if text is None else text
     try:
-        expressions, query = _read(text, input_shape, output_shape)
+        expressions, query = _read(text, input_shape, output_shape, True)
         return _regions(expressions, _VariableCounts(_size(input_shape), _size(output_shape))), query
     except InputError as error:
         raise error.within(path) from None
@@ -217,12 +255,15 @@ def _regions(expressions: list[Any], sizes: _VariableCounts) -> tuple[InputRegio
     return tuple(regions)
 
 
-def _bound(constraint: _Linear, ends: np.ndarray) -> bool:
+def _bound(constraint: _Linear | _Run, ends: np.ndarray) -> bool:
     """Whether ``constraint`` is one on an input; if it is, ``ends`` [2, n] obey it afterwards.
 
     Raises:
         InputError: It is on several inputs, or on inputs and outputs.
     """
+    if isinstance(constraint, _Run):
+        constraint.limit(ends)
+        return True
     coefficients, constant = constraint
     used = [(key, value) for key, value in coefficients.items() if value]
     if all(key >= 0 for key, _ in used):
@@ -258,13 +299,24 @@ def _declares(expression: Any, declared: set[str]) -> bool:
     raise _fail(expression, "use declare-const and assert of VNN-LIB version 1")
 
 
-def _expressions(text: str) -> list[Any]:
-    """Nested lists of tokens."""
+def _expressions(text: str, runs: bool = False) -> list[Any]:
+    """Nested lists of tokens; ``runs``: and of `_Run` inside of conjunctions."""
     stack: list[list[Any]] = [[]]
-    for number, match in enumerate(_TOKEN.finditer(text)):
+    known: dict[str, tuple[int, int, float]] = {}
+    at, number = 0, 0
+    while at < len(text):
         if number % _ASKED == 0:
             check_cancelled()
-        token = match["text"]
+        number += 1
+        run = _RUN.match(text, at) if runs and stack[-1][:1] == ["and"] else None
+        if run:
+            check_cancelled()
+            stack[-1].append(_Run([part.strip() for part in run[0].split(")")[:-1]], known))
+            at = run.end()
+            continue
+        match = _TOKEN.match(text, at)
+        assert match is not None
+        at, token = match.end(), match["text"]
         if match["bad"]:
             line = text.count("\n", 0, match.start()) + 1
             raise InputError(f"unexpected {match['bad']!r} in line {line}", fix="close the string or remove the sign")
@@ -286,6 +338,8 @@ def _expressions(text: str) -> list[Any]:
 
 
 def _show(expression: Any) -> str:
+    if isinstance(expression, _Run):
+        expression = " ".join(f"{text})" for text in expression.texts)
     text = f"({' '.join(map(_show, expression))})" if isinstance(expression, list) else str(expression)
     return text if len(text) <= 60 else f"{text[:57]}..."
 
@@ -324,7 +378,9 @@ def _unsafe(conjunctions: list[_Conjunction], output_size: int, inputs: int) -> 
     groups = []
     for conjunction in conjunctions:
         group = []
-        for coefficients, constant in conjunction:
+        for constraint in conjunction:
+            assert not isinstance(constraint, _Run)
+            coefficients, constant = constraint
             key = (tuple(sorted(coefficients.items())), constant)
             if key not in group_numbers:
                 group_numbers[key] = len(rows)
@@ -378,7 +434,9 @@ def _ways(expression: Any, declared: set[str], size: _VariableCounts) -> list[_C
         check_cancelled()
         ways: list[_Conjunction] = [[]]
         for part in expression[1:]:
-            more = _ways(part, declared, size)
+            if isinstance(part, _Run):
+                part.read(declared, size)
+            more: list[_Conjunction] = [[part]] if isinstance(part, _Run) else _ways(part, declared, size)
             if len(more) == 1:
                 for way in ways:
                     way += more[0]

@@ -82,6 +82,8 @@ class ScalarFunction(Activation):
 
     #: Values of the input that are known to be impossible lie below.
     least_input: ClassVar[float] = -math.inf
+    #: What the error of a computed slope is relative to, beside the slope.
+    slope_scale: ClassVar[float] = 1.0
 
     def slope(self, z: Tensor) -> Tensor:
         """The derivative on curved parts."""
@@ -101,7 +103,7 @@ class ScalarFunction(Activation):
         bend = bends[torch.bucketize((0.5 * (z[1:] + z[:-1])).contiguous(), breaks)]
         value = self.function(z)
         slope = self.slope(z) if any(self.bends) else torch.zeros_like(z)
-        size = value.abs().amax(0) + (slope.abs().amax(0) + 1.0) * width + OWN_FUNCTION
+        size = value.abs().amax(0) + (slope.abs().amax(0) + self.slope_scale) * width + OWN_FUNCTION
         return _SampledFunction(z, value, slope, bend, size)
 
     @staticmethod
@@ -359,6 +361,8 @@ class Power(ScalarFunction):
 class Reciprocal(ScalarFunction):
     """``1 / z``; known where an interval holds no 0, with ``floor`` a bound that the input is known to obey."""
 
+    # two operations that keep all digits, however small the slope is
+    slope_scale: ClassVar[float] = 0.0
     floor: float = -math.inf
 
     @property

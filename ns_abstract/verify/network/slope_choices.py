@@ -64,12 +64,17 @@ class UnstableNeurons:
                 found.append(TangentPoints(units[at.numpy()], tangents[at]))
         return found
 
-    def shifted(self, slope: Float64, low: Float64, high: Float64) -> tuple[Floats, Floats]:
-        """Offsets below and above, relative to the references, of lines with stored ``slope`` [R, U] (N4)."""
+    def shifted(
+        self, slope: Float64, low: Float64, high: Float64, size: Float64 | float = 0.0
+    ) -> tuple[Floats, Floats]:
+        """Offsets below and above, relative to the references, of lines with stored ``slope`` [R, U] (N4).
+
+        ``size``: [U] of the numbers that ``low`` and ``high`` are sums of, where these are not charged for it.
+        """
         base = slope * self.reference - self.image
-        size = np.abs(self.reference) + np.abs(self.image) + np.abs(self.lower) + np.abs(self.upper)
-        give = np.abs(slope) * self.loose + self.room + OWN_SUMS * (size + np.abs(low) + np.abs(high))
-        give = give + OWN_SUMS * np.abs(slope) * size
+        own = np.abs(self.reference) + np.abs(self.lower) + np.abs(self.upper)
+        give = np.abs(slope) * self.loose + self.room + OWN_SUMS * (np.abs(self.image) + np.abs(low) + np.abs(high))
+        give = give + OWN_SUMS * (size + np.abs(slope) * own)
         ends = ((low + base - give, -1.0), (high + base + give, 1.0))
         below, above = (self.relaxations.outward(torch.from_numpy(v), side).numpy() for v, side in ends)
         return below, above
@@ -125,7 +130,7 @@ class ReluSlopes:
         lower, upper, flat = self.units.lower, self.units.upper, self.units.flat
         # the function is convex: above a line by most at an end, below it at the kink or, past the limits, at an end
         ends = self.alpha * lower - slope * lower, upper - slope * upper
-        below, above = self.units.shifted(slope, np.minimum(np.minimum(*ends), 0.0), np.maximum(*ends))
+        below, above = self.units.shifted(slope, np.minimum(np.minimum(*ends), 0.0), np.maximum(*ends), upper - lower)
         lines[0][:, flat], lines[1][:, flat], lines[2][:, flat] = slope, below, above
 
     def fix(self, phases: NDArray[np.int8], lines: Floats) -> None:
@@ -136,7 +141,8 @@ class ReluSlopes:
             slope = np.full(len(row), exact).astype(units.relaxations.number).astype(np.float64)
             # between 0 and the end on that side
             end = (exact - slope) * (units.upper if side > 0 else units.lower)
-            below, above = units.shifted(slope, np.minimum(end, 0.0), np.maximum(end, 0.0))
+            size = units.upper - units.lower
+            below, above = units.shifted(slope, np.minimum(end, 0.0), np.maximum(end, 0.0), size)
             for first, low, high in ((0, below, above), (3, above, below)):
                 for place, value in enumerate((slope, low, high), first):
                     lines[place][row, units.flat] = value

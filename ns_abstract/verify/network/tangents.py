@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import torch
 from torch import Tensor
@@ -28,6 +28,9 @@ class Curve(Protocol):
     def bends(self) -> Sequence[int]:
         """Curvature before, between and behind the breaks."""
         ...
+
+    #: What the error of a computed slope is relative to, beside the slope.
+    slope_scale: ClassVar[float]
 
     def function(self, z: Tensor) -> Tensor:
         """The value."""
@@ -125,5 +128,5 @@ class Tangents:
         for corner, height in zip(self.corners, self.values, strict=True):
             touch = torch.maximum(touch, self.side * (height - slope * corner))
         far = torch.maximum(self.lower.abs(), self.upper.abs())
-        size = self.values.abs().amax(0) + value.abs() + (slope.abs() + 1.0) * width + OWN_FUNCTION
+        size = self.values.abs().amax(0) + value.abs() + (slope.abs() + self.curve.slope_scale) * width + OWN_FUNCTION
         return slope, self.side * (touch + OWN_FUNCTION * (size + slope.abs() * far))
