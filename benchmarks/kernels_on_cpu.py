@@ -12,6 +12,9 @@ What is executed: gsplat's kernels for projection, spherical harmonics, tile int
 float32, with and without fused multiply-adds, and with division, roots, exponential and logarithm erring by what
 CUDA's programming guide allows, in random and in adverse directions (``tests/gsplat_kernels``). Not executed: a GPU.
 
+"spread" is the mean gap between the least and the greatest of a cell's renders: at width zero, of one pose, it is what
+float32 alone makes of the picture, and no bounds of every evaluation can be narrower.
+
 ``--planted`` bounds another rasteriser (alpha at most 0.98); violations are then expected, and none is a failure.
 """
 
@@ -73,13 +76,14 @@ def attack(
         build.pop("kind", None)
     programs = [Kernels(scene, version, **build) for build in builds]
     compared = violations = 0
-    worst, gaps = 0.0, []
+    worst, gaps, spreads = 0.0, [], []
     for cell in cells:
         found, lower, upper = bounded_both_ways(bounds, poses, cell, layers)
         gaps.append(float(np.linalg.norm(upper.astype(np.float64) - lower, axis=-1).mean()))
         corners = np.asarray(cell.corners())
         picked = corners[rng.permutation(len(corners))[: max(1, renders // 2)]]
         values = [cell.middle, *picked, *cell.sample(max(0, renders - 1 - len(picked)), rng)][:renders]
+        least, most = np.float32(np.inf), np.float32(-np.inf)
         for k, point in enumerate(values):
             program = programs[k % len(programs)]
             program.noise = (int(rng.integers(2**62)), program.noise[1])
@@ -89,6 +93,7 @@ def attack(
             beyond = np.maximum(lower - image, image - upper)
             worst = max(worst, float(np.nan_to_num(beyond, nan=np.inf).max()))
             compared += image.size
+            least, most = np.minimum(least, image), np.maximum(most, image)
             if found.layers is not None:
                 # depth where anything is drawn
                 values_there = program.layers(poses.camera, poses.pose(np.asarray(point))).astype(np.float64)
@@ -97,9 +102,10 @@ def attack(
                 inside = (of_layers[..., ::2] <= values_there) & (values_there <= of_layers[..., 1::2])
                 violations += int((drawn & ~inside).sum())
                 compared += int(drawn.sum())
+        spreads.append(float(np.linalg.norm(most - np.asarray(least, np.float64), axis=-1).mean()))
     return {
         "cells": len(cells), "renders": renders * len(cells), "comparisons": compared, "violations": violations,
-        "worst": worst, "gap": float(np.mean(gaps)),
+        "worst": worst, "gap": float(np.mean(gaps)), "spread": float(np.mean(spreads)),
     }  # fmt: skip
 
 

@@ -499,6 +499,36 @@ def test_stop_during_the_cover_leaves_nothing_known() -> None:
     check(frame, result)
 
 
+def test_a_cover_is_kept_for_others_whole_or_not_at_all() -> None:
+    frame, kept = Waves(1, pace=20.0), []
+    refinement = Refinement(
+        frame, 0, RefinementGoal(1.05, FOREVER), stopped=lambda: len(frame.calls) >= 3, initial=kept
+    )  # fmt: skip
+    assert not refinement.run().bounded and kept == []
+    refinement = Refinement(Waves(1, pace=20.0), 0, RefinementGoal(1.05, FOREVER), initial=kept)
+    assert refinement.run().bounded and len(kept) > 3
+    ends = sorted((cell.box.lower, cell.box.upper) for cell, _, _ in kept)
+    assert (ends[0][0], ends[-1][1]) == (refinement.frame.box.lower, refinement.frame.box.upper)
+    assert all(upper == lower for (_, upper), (lower, _) in itertools.pairwise(ends))
+    assert all(lower.shape == upper.shape == refinement.leaves.lower.shape for _, lower, upper in kept)
+
+
+@pytest.mark.parametrize("dimensions", [1, 2])
+def test_gaps_that_are_reported_are_those_of_the_bounds_at_that_time(dimensions: int) -> None:
+    reported: list[tuple[float, float]] = []
+
+    def compare(point: TracePoint, share: float) -> None:
+        tiles, leaves, inner = refinement.tiles, refinement.leaves, refinement.inner
+        assert point.mpg == tiles.mean_gap(leaves.lower, leaves.upper)
+        assert point.mpg_witness == tiles.mean_gap(inner.lower, inner.upper)
+        reported.append((point.mpg, point.mpg_witness))
+
+    refinement = Refinement(Waves(dimensions, pace=4.0), 0, RefinementGoal(1.0, FOREVER, 60), progress=compare)
+    refinement.run()
+    # both change on the way
+    assert all(len(set(values)) > 2 for values in zip(*reported, strict=True))
+
+
 def test_stop_after_the_cover_keeps_it() -> None:
     frame = Waves(1, pace=2.0)
     result = refine(frame, RefinementGoal(1.0, FOREVER), stopped=lambda: len(frame.calls) >= 12)

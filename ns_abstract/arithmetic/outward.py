@@ -5,6 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
+from ns_abstract.execution.threads import side_by_side, threads
+
+#: Numbers of a picture from which on threads share them.
+_SHARED = 1 << 18
+
 
 def outward(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Float32 neighbours of ``lower`` from below and ``upper`` from above."""
@@ -15,11 +20,14 @@ def _beside(values: np.ndarray, sign: float) -> np.ndarray:
     """The nearest float32 numbers that are not above ``values``; not below for ``sign`` -1."""
     values = np.ascontiguousarray(values, np.float64)
     neighbours = np.empty(values.shape, np.float32)
-    _round_towards(values.reshape(-1), sign, neighbours.reshape(-1))
+    flat, out = values.reshape(-1), neighbours.reshape(-1)
+    count = threads() if flat.size >= _SHARED else 1
+    ends = [flat.size * k // count for k in range(count + 1)]
+    side_by_side(lambda k: _round_towards(flat[ends[k] : ends[k + 1]], sign, out[ends[k] : ends[k + 1]]), count)
     return neighbours
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", nogil=True)
 def _round_towards(values, sign, out):
     """``sign * out <= sign * values`` [n], as large as float32 allows; ``sign`` is 1 or -1."""
     for q in range(values.size):

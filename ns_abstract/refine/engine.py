@@ -35,6 +35,8 @@ from ns_abstract.refine.tuning import TUNING, Tuning
 _SLACK_SHARE = 0.1
 #: Cells that may still be bounded where their number is not limited.
 _UNLIMITED = 1 << 60
+#: In place of bounds that the leaves have and nobody else keeps.
+_NO_BOUNDS = np.empty((0, 0, 0, 0), np.float32)
 
 
 class Refinement:
@@ -207,10 +209,14 @@ class Refinement:
     def _cover(self) -> bool:
         """Bound an initial partition of the set; False if the work was stopped first."""
         if self.initial:
-            return self._begin_leaves(self.initial)
-        everything = self.tiles.all
+            self.leaves.begin(len(self.initial))
+            for leaf in self.initial:
+                self.leaves.take(*leaf)
+            return self._covered([cell for cell, _, _ in self.initial])
         partition = InitialPartition(self.tiles, self.splitter, self.inner, self.goal, self.tuning).choose()
         parts = partition.parts
+        self.leaves.begin(len(parts))
+        # bounds of all cells only where somebody keeps them
         leaves: list[BoundedCell] = []
         for number, part in enumerate(parts):
             if number and self._over():
@@ -218,10 +224,8 @@ class Refinement:
                     return False
                 # slower than expected: one cell for the whole set is better than no bounds
                 self.leaf_sets.clear()
-                cell = self._cell(self.splitter.whole)
-                [(lower, upper, bounds)] = self._bound([cell], None, everything)
-                leaves = [(cell, lower, upper)]
-                self.leaf_sets.keep(cell, bounds, everything)
+                self.leaves.begin(1)
+                leaves = [self._initial_cell(self.splitter.whole, None)]
                 break
             leaves.append(self._initial_cell(part, partition))
             if number % 2:
@@ -234,14 +238,11 @@ class Refinement:
                 self._record(share, keep=number < self.tuning.first_points or due)
         if self.initial is not None:
             self.initial.extend(leaves)
-        return self._begin_leaves(leaves)
+        return self._covered([cell for cell, _, _ in leaves])
 
-    def _begin_leaves(self, leaves: list[BoundedCell]) -> bool:
-        """Take cells that cover the set, out of ``leaves`` where nobody keeps them; returns True."""
-        cells = [cell for cell, _, _ in leaves]
-        leaves = list(leaves) if self.initial is not None else leaves
-        leaves.reverse()
-        self.leaves.begin(cells, (leaves.pop()[1:] for _ in cells))
+    def _covered(self, cells: list[LeafCell]) -> bool:
+        """Go on with ``cells`` that cover the set and whose bounds the leaves have; returns True."""
+        self.leaves.update(self.tiles.all)
         self.covered = True
         elements = [None if cell.context is None else cell.context.shown for cell in cells]
         numbered = [numbers for numbers in elements if numbers is not None]
@@ -250,13 +251,16 @@ class Refinement:
         self._record(1.0)
         return True
 
-    def _initial_cell(self, part: SubBox, partition: Partition) -> BoundedCell:
-        """A cell of the initial partition with its bounds, which are computed unless they were tried before."""
+    def _initial_cell(self, part: SubBox, partition: Partition | None) -> BoundedCell:
+        """Take a cell of the initial partition and its bounds, which are computed unless ``partition`` tried them."""
         cell, everything = self._cell(part), self.tiles.all
-        tried = part.box == partition.tried.box
-        lower, upper, bounds = self._take(cell, partition.bounds) if tried else self._bound([cell], None, everything)[0]
+        if partition is not None and part.box == partition.tried.box:
+            lower, upper, bounds = self._take(cell, partition.bounds)
+        else:
+            [(lower, upper, bounds)] = self._bound([cell], None, everything)
+        self.leaves.take(cell, lower, upper)
         self.leaf_sets.keep(cell, bounds, everything)
-        return cell, lower, upper
+        return (cell, lower, upper) if self.initial is not None else (cell, _NO_BOUNDS, _NO_BOUNDS)
 
     def _refine(self) -> None:
         self.frame.set_tolerance(0.0)

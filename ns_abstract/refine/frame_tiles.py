@@ -107,6 +107,8 @@ def usable(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
     Depths are at least 0, and may be unknown above or nowhere (see `Frame`).
     """
+    if lower.shape[-1] <= DEPTH and bool((lower >= 0.0).all() and (lower <= upper).all() and (upper <= 1.0).all()):
+        return lower, upper
     good = np.isfinite(lower) & np.isfinite(upper) & (lower <= upper) & (lower <= 1.0) & (upper >= 0.0)
     low, high = np.clip(lower, 0.0, 1.0), np.clip(upper, 0.0, 1.0)
     low, high = np.where(good, low, np.zeros_like(low)), np.where(good, high, np.ones_like(high))

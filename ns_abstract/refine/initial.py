@@ -115,7 +115,8 @@ class InitialPartition:
                 # known to be fine enough
                 wanted = min(wanted, finer)
             elif wanted < tuning.coarser_share * count:
-                finer, count = count, wanted | 1
+                # it is tried, so it may be as coarse as the square says
+                finer, count = count, math.ceil(count * math.sqrt(share)) | 1
                 continue
             if wanted < 2 * count or 2 * count > most or not helped:
                 parts = self.splitter.cut(whole, 0, max(1, min(wanted if helped else count, most)))
@@ -124,8 +125,10 @@ class InitialPartition:
 
     def _helped(self, excess: float, before: float, share: float) -> bool:
         """Whether smaller cells left at most ``share`` of the excess ``before``, or that may have been cut off."""
+        if excess <= share * before or before == math.inf:
+            return True
         most = self.tiles.mean_gap(np.zeros_like(self.inner.image), np.ones_like(self.inner.image))
-        return excess <= share * before or before >= self.tuning.clipped_share * most
+        return before >= self.tuning.clipped_share * most
 
     def _beyond(self, found: Partition) -> float:
         """MPG of what was tried beyond that of pictures of it."""
@@ -141,5 +144,5 @@ class InitialPartition:
         if self.goal.cells is not None:
             allowed = self.goal.cells / 2
         size = probe.lower.nbytes + probe.upper.nbytes + context_bytes(probe.context) + linear_bytes(probe)
-        # half: the leaves are copied once when they are sorted by tile
+        # half: cells that are split need room, too
         return probe, max(1.0, min(allowed, 0.5 * self.goal.leaf_bytes / size))

@@ -35,15 +35,19 @@ class InnerBound:
         self.tiles, self.random, self.scenes, self.tuning = tiles, random, scenes, tuning
         self.lower, self.upper = tiles.filled(np.inf), tiles.filled(-np.inf)
         self.image = tiles.filled(0.0)
+        self._mean_gap: float | None = None
         self._views: list[tuple[np.ndarray, np.ndarray]] = []
 
     @property
     def mean_gap(self) -> float:
         """MPG of the inner bound."""
-        return self.tiles.mean_gap(self.lower, self.upper)
+        if self._mean_gap is None:
+            self._mean_gap = self.tiles.mean_gap(self.lower, self.upper)
+        return self._mean_gap
 
     def observed(self) -> None:
-        """Report the bound to the frame."""
+        """Report a change of the bound to the frame."""
+        self._mean_gap = None
         self.tiles.frame.observe(self.tiles.numbers(None), self.lower, self.upper)
 
     def render(self, values: np.ndarray, places: np.ndarray | None = None) -> np.ndarray:

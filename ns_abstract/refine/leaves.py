@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -105,6 +104,7 @@ class LeafBounds:
         self._intersect(tiles.all)
         self.lower[~tiles.inside] = 0.0
         self.upper[~tiles.inside] = 0.0
+        self._mean_gap: float | None = None
         self.bytes = 0
         #: what a leaf may leave open at a pixel that it is not bounded at any more; never falls
         self._closed_excess = 0.0
@@ -112,18 +112,23 @@ class LeafBounds:
     @property
     def mean_gap(self) -> float:
         """MPG of the outer bound."""
-        return self.tiles.mean_gap(self.lower, self.upper)
+        if self._mean_gap is None:
+            self._mean_gap = self.tiles.mean_gap(self.lower, self.upper)
+        return self._mean_gap
 
-    def begin(self, cells: Sequence[LeafCell], bounds: Iterator[tuple[np.ndarray, np.ndarray]]) -> None:
-        """Take ``cells`` that cover the set, with bounds of each in all tiles, which are not kept as they come."""
-        rows = len(cells), *self.tiles.shape
-        for number, (lower, upper) in enumerate(bounds):
-            for tile, low, high in zip(self.by_tile, lower, upper, strict=True):
-                if tile.lower is None or tile.upper is None:
-                    tile.cells = list(cells)
-                    tile.lower, tile.upper = np.empty(rows, lower.dtype), np.empty(rows, upper.dtype)
-                tile.lower[number], tile.upper[number] = low, high
-        self.update(self.tiles.all)
+    def begin(self, count: int) -> None:
+        """Make room for ``count`` cells that cover the set; what was taken before is dropped."""
+        for tile in self.by_tile:
+            tile.cells = []
+            # memory is taken where it is written
+            tile.lower, tile.upper = (np.empty((count, *self.tiles.shape), np.float32) for _ in range(2))
+
+    def take(self, cell: LeafCell, lower: np.ndarray, upper: np.ndarray) -> None:
+        """Copy the bounds of a cell in all tiles; `update` follows when all cells are there."""
+        for tile, low, high in zip(self.by_tile, lower, upper, strict=True):
+            assert tile.lower is not None and tile.upper is not None
+            tile.lower[len(tile.cells)], tile.upper[len(tile.cells)] = low, high
+            tile.cells.append(cell)
 
     def update(self, places: np.ndarray, changes: dict[int, Change] | None = None) -> None:
         """Update the outer bound of the tiles at ``places``, given what has changed since the round began."""
@@ -131,6 +136,7 @@ class LeafBounds:
             self.lower[t], self.upper[t] = self.by_tile[t].outer(None if changes is None else changes[t])
         self._intersect(places)
         self.lower[places], self.upper[places] = usable(self.lower[places], self.upper[places])
+        self._mean_gap = None
 
     def apply(self, changes: dict[int, Change]) -> None:
         """End a round with what has changed in it."""

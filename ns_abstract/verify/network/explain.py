@@ -42,17 +42,23 @@ def multiplications(network: Network, index: int) -> float:
     return size
 
 
+def least_seconds(network: Network, dimensions: int) -> float:
+    """Return the seconds (roughly) that a cell takes one core where no rows are passed back for units."""
+    count = len(network.nodes)
+    forwards = 2.0 * sum(multiplications(network, k) for k in range(1, count + 1)) * (1 + dimensions)
+    return forwards / _FORMS_SPEED + _LAYER_EACH * count
+
+
 def estimate(network: Network, dimensions: int) -> tuple[float, float, bool]:
     """Return a cell's bytes, seconds on one core (roughly), and whether backward passes are skipped."""
     count = len(network.nodes)
     sizes = [float(np.prod(network.shape(k))) for k in range(count + 1)]
-    forwards = 2.0 * sum(multiplications(network, k) for k in range(1, count + 1)) * (1 + dimensions)
     costs = cost_model_of(network)
     rows = costs.foreseen(_OPEN, _DEEP_OPEN)
     many = costs.deep and not rows.given_up
     memory = sum(sizes) * 8 * (3 * dimensions + _NUMBERS) + (_MANY_ROWS if many else _FEW_ROWS)
     speed = _PLANNED_SPEED if costs.planned else _MANY_SPEED if costs.deep else _FEW_SPEED
-    seconds = forwards / _FORMS_SPEED + rows.products / speed + _PLANNED_EACH * rows.numbers + _LAYER_EACH * count
+    seconds = least_seconds(network, dimensions) + rows.products / speed + _PLANNED_EACH * rows.numbers
     return memory, seconds, rows.given_up
 
 
@@ -90,8 +96,9 @@ def explain(network: Network, dimensions: int = 2) -> Sequence[str]:
     memory, seconds, given_up = estimate(network, dimensions)
     lines.append(f"{len(network.nodes)} layers, {total:,.0f} numbers, {work:,.0f} products an evaluation")
     lines.append(
-        f"one cell in {dimensions} parameters: about {memory / 2**30:.2f} GiB, and {seconds:.2g} s of one core "
-        f"for the network, if one unit of {1 / _OPEN:.0f} is unstable"
+        f"one cell in {dimensions} parameters: about {memory / 2**30:.2f} GiB, and for the network, of one core, "
+        f"{least_seconds(network, dimensions):.2g} s where hardly a unit is unstable, {seconds:.2g} s where one of "
+        f"{1 / _OPEN:.0f} is"
     )
     if given_up:
         lines.append("deep: rows for its units cost more than they may, so they are given up and bounds are wide")
