@@ -247,8 +247,9 @@ class _BoxSearch:
     ) -> tuple[PhaseTree, list[tuple[int, ...]]]:
         """A tree over bounds with so many steps for intermediate ones, and the groups that its root leaves open."""
         cells = NetworkBounds(
-            self.bounded, images, "everywhere", self.memory, self.arithmetic, 1, intermediate_steps=steps
-        )
+            self.bounded, images, "everywhere", self.memory, self.arithmetic, 1, intermediate_steps=steps,
+            asked=family.unsafe.rows,
+        )  # fmt: skip
         tree, left = PhaseTree(cells, family.unsafe.rows, family.offset[which]), []
         for group in groups:
             result = tree.prove(group, 1)
