@@ -1,6 +1,6 @@
 """A certificate of a small NeRF: which side of the object is shown, over an arc of an orbit, attacked afterwards.
 
-    python benchmarks/nerf_certificate.py RUN/config.yml CAMERA_PATH.json OUTPUT_DIR [--arc 0.5] [--side 16]
+    python benchmarks/nerf_certificate.py RUN/config.yml OUTPUT_DIR [--path CAMERA_PATH.json] [--arc 0.5] [--side 16]
 
 Trains a small classifier of the side (four sectors of the path's orbit) on renders of the NeRF, asks
 `ns-abstract-certify` whether it names the right one everywhere on an arc in the middle of a sector, and then renders
@@ -14,7 +14,7 @@ import json
 import math
 import time
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import torch
@@ -24,6 +24,7 @@ from views import HELD, export, fit, pictures
 
 import ns_abstract as nsa
 from ns_abstract.geometry.camera_path import load_camera_path
+from ns_abstract.geometry.keyframe_cameras import look_at
 from ns_abstract.io.jsonio import load_json
 from ns_abstract.refine.protocol import RayFrame
 from ns_abstract.verify.model import NetworkModel
@@ -41,15 +42,25 @@ def network(side: int) -> nn.Sequential:
     )  # fmt: skip
 
 
+def vertical_orbit() -> dict[str, Any]:
+    """A camera path of one view of the normalised frame's origin, with an orbit about the vertical axis."""
+    pose = np.eye(4)
+    pose[:3] = look_at((1.3, -1.0, 0.8), (0.0, 0.0, 0.1))[:3]
+    view = {"camera_to_world": pose.ravel().tolist(), "fov": math.degrees(2.0 * math.atan(0.5 / 1.4)), "aspect": 1}
+    orbit = {"target": [0.0, 0.0, 0.1], "axis": [0.0, 0.0, 1.0], "azimuth": [0.0, 2.0 * math.pi]}
+    perturbation = {"version": 1, "sweep": "keyframes", "orbit": orbit}
+    return {"camera_type": "perspective", "camera_path": [view], "fps": 1, "seconds": 1, "perturbation": perturbation}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("run", type=Path)
-    parser.add_argument("path", type=Path)
     parser.add_argument("output_dir", type=Path)
+    parser.add_argument("--path", type=Path, help="with an orbit; without it, one about the vertical axis")
     parser.add_argument("--side", type=int, default=16)
     parser.add_argument("--arc", type=float, default=0.5, help="radians")
-    parser.add_argument("--num-samples", type=int, default=48)
-    parser.add_argument("--near-plane", type=float, default=0.4)
+    parser.add_argument("--num-samples", type=int, help="of a vanilla-nerf's rays")
+    parser.add_argument("--near-plane", type=float, help="of a vanilla-nerf's rays")
     parser.add_argument("--pictures", type=int, default=600)
     parser.add_argument("--steps", type=int, default=800)
     parser.add_argument("--minutes", type=float, default=20.0, help="of the certificate")
@@ -59,7 +70,8 @@ def main() -> None:
     options = parser.parse_args()
     torch.manual_seed(0)
     options.output_dir.mkdir(parents=True, exist_ok=True)
-    value, side = load_json(options.path, "camera path"), options.side
+    side = options.side
+    value = vertical_orbit() if options.path is None else load_json(options.path, "camera path")
     value["render_height"] = value["render_width"] = side
     orbit = value["perturbation"]["orbit"]
     (options.output_dir / "path.json").write_text(json.dumps(value))
@@ -104,7 +116,7 @@ def main() -> None:
         for a in np.linspace(arc[0], arc[1], 200)
     ])  # fmt: skip
     print(
-        f"{scene.method().content}, {side} x {side}, {options.num_samples} samples, {options.arc} rad: certified "
+        f"{scene.method().content}, {side} x {side}, {options.arc} rad: certified "
         f"{found.certified:.3f}, falsified {found.falsified:.3f}, unknown {found.unknown:.3f}; right on {right:.3f} of "
         f"200 samples; {minutes:.1f} minutes, {options.workers} processes, {found.state}",
         flush=True,

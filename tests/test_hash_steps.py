@@ -8,10 +8,19 @@ from fractions import Fraction
 import mpmath
 import numpy as np
 import pytest
-from nerfactos import random_grid, random_net
+from nerfactos import random_net
 
 from ns_abstract.methods.nerf import nerfacto_kernel as concrete
-from ns_abstract.methods.nerf.hash_bounds import composition, distribution, features, forms, network, points
+from ns_abstract.methods.nerf.hash_bounds import (
+    composition,
+    distribution,
+    edges,
+    features,
+    forms,
+    light,
+    network,
+    points,
+)
 from ns_abstract.methods.nerf.render import HISTOGRAM_PADDING
 
 #: Draws of each step; interpreted kernels are slow.
@@ -243,7 +252,7 @@ class Ray:
         self.count, self.spacing = count, (True, 0.0, 0.99)
         self.line = bool(seed % 2)
         size = 10.0 ** rng.uniform(-7.0, -2.0)
-        self.edges = distribution.edges_of(count, POSES)
+        self.edges = edges.edges_of(count, POSES)
         work = np.zeros((4, 5))
         # apart, and inside of the ray: edges of a member are in order
         middles = np.linspace(0.01, 0.99, count + 1) + (seed % 3) * rng.uniform(-0.1, 0.1, count + 1) / count
@@ -251,22 +260,22 @@ class Ray:
             self.edges.place[j] = form(rng, middle, 0.2 * size / count, 0.2 * size / count)
             reach = forms.spread_of(self.edges.place[j])
             self.edges.low[j], self.edges.high[j] = middle - reach, middle + reach
-            distribution.space(self.edges, j, self.spacing, self.line, work)
+            edges.space(self.edges, j, self.spacing, self.line, work)
         density = 10.0 ** rng.uniform(-3.0, 3.0 if seed % 4 else 1.0, count) * rng.integers(0, 2, count)
         self.density = np.stack([random_form(rng, v, v * size) for v in density])
-        self.light = distribution.light_of(count, POSES)
-        distribution.begin(self.light)
+        self.light = light.light_of(count, POSES)
+        light.begin(self.light)
         self.shares = []
         self.known = True
         for i in range(count):
             middle = np.zeros(5)
-            self.shares.append(distribution.middle_of(self.edges, i, middle))
+            self.shares.append(edges.middle_of(self.edges, i, middle))
             low, high = forms.form_range(self.density[i], self.line)
             bounds = max(low, 0.0), high
             if seed % 5 == 0 and i == count // 2:
                 # nothing is known of this density
                 self.density[i], bounds = np.array([0.0, 0.0, 0.0, 0.0, np.inf]), (0.0, 1e300)
-            self.known &= distribution.add_depth(
+            self.known &= light.add_depth(
                 self.edges, i, self.density[i], bounds, self.shares[i], self.line, self.light, np.zeros((2, 6))
             )
 
@@ -285,7 +294,7 @@ class Ray:
         densities = np.zeros(self.count)
         for i in range(self.count):
             middle = np.zeros(5)
-            distribution.middle_of(self.edges, i, middle)
+            edges.middle_of(self.edges, i, middle)
             apart = 0.5 * (distances[i] + distances[i + 1]) - float(value(middle, pose, 0.0))
             place = min(max(apart / middle[3], -1.0), 1.0) if middle[3] > 0.0 else 0.0
             if np.isfinite(self.density[i, -1]):
@@ -302,7 +311,7 @@ def test_light_and_places_of_samples_are_enclosed() -> None:
         if not ray.known:
             continue
         wanted = 9
-        following = distribution.edges_of(wanted - 1, POSES)
+        following = edges.edges_of(wanted - 1, POSES)
         if not distribution.follow(ray.light, ray.count, ray.edges, wanted, ray.line, following, np.zeros((3, 5))):
             continue
         quantiles = (np.arange(wanted) + 0.5) / wanted
@@ -365,7 +374,3 @@ def test_colours_of_rays_are_enclosed() -> None:
                 assert abs(Fraction(float(shown)) - value(np.append(out[:3], [0.0, 0.0]), pose)) <= Fraction(
                     float(out[-1])
                 )
-
-
-def test_grids_hold_what_the_tests_draw() -> None:
-    assert random_grid(np.random.default_rng(0), 2, 4, 20).table.shape == (2, 16, 2)

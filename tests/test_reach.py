@@ -16,11 +16,13 @@ from benchmark_scripts import script
 from onnx_files import OnnxFile
 from waves import Waves
 
+from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import SCENE_TURNS
 from ns_abstract.io.errors import InputError
 from ns_abstract.reach.dynamics import Dynamics, Floats, affine, double_integrator, fixed_wing, quadrotor, unicycle
 from ns_abstract.reach.learned import LearnedDynamics
 from ns_abstract.reach.loop import HalfSpace, Loop, parse_loop
+from ns_abstract.reach.pictures import PropertyView
 from ns_abstract.reach.search import LoopSearch, first_outside, sampled_disturbances, simulate
 from ns_abstract.reach.tubes import AffineBounds, AffineSet, ControlBounds, Dependence, TubeBuilder, between, clipped
 from ns_abstract.verify.cells import CellGrid
@@ -402,6 +404,83 @@ def test_what_is_not_finite_is_never_safe(tmp_path: Path) -> None:
     assert not any(leaf.verdict == "certified" for leaf in leaves)
 
 
+# ---------------------------------------------------------------- properties of the picture along a loop
+
+MEAN = {"type": "picture", "statistic": "mean", "channel": "r", "region": [0, 0, 2, 1]}
+
+
+def viewing(folder: Path, value: dict[str, Any]) -> TubeBuilder:
+    """The loop whose properties are read off the wall."""
+    base = reacher(folder, value)
+    assert isinstance(base.view, Wall)
+    views = [PropertyView(prop, base.view, prop.model(SIDE, SIDE)) for prop in base.loop.views.values()]
+    return replace(base, views=tuple(views))
+
+
+def seen_loop(limit: float, goal: dict[str, Any] | None = None) -> dict[str, Any]:
+    value = specification("affine") | {"initial": {"p": [-0.02, 0.02], "q": 0.0, "r": 0.0}, "steps": 6}
+    value["unsafe"] = [{"all": [MEAN | {"max": limit}, MEAN | {"statistic": "least", "min": 0.05}]}]
+    value |= {"goal": MEAN | {"min": 0.1, "when": "any"} if goal is None else goal}
+    return value
+
+
+def test_tubes_hold_margins_of_the_pictures_of_every_run(tmp_path: Path) -> None:
+    """Margins of 60 runs' pictures are never below those that are proved, and 1000 poses of a box agree."""
+    found = viewing(tmp_path, seen_loop(0.9))
+    loop, box, rng = found.loop, found.loop.box, np.random.default_rng(7)
+    tube = found.tube(box)
+    assert not tube.reason and tube.views.shape == (7, 2) and (tube.views > 0.0).all()
+    for number, start in enumerate([*box.corners(), *box.sample(58, rng)]):
+        push = sampled_disturbances(loop, rng, "ends" if number % 2 else "random")
+        run = simulate(found, loop.state(box, start), push)
+        assert first_outside(tube, run) is None and (run.views >= tube.views).all()
+    worse = replace(run, views=np.where(np.arange(7)[:, None] == 3, tube.views - 1e-9, run.views))
+    assert "step 3" in str(first_outside(tube, worse))
+    view, whole = found.views[0], found.view.pose_set.box
+    poses = ParameterBox(whole.names, whole.units, (-0.3,) * whole.dimensions, (0.4,) * whole.dimensions)
+    least = view.bound(poses)[0]
+    margins = [view.margin(values) for values in [*poses.corners(), *poses.sample(1000, rng)]]
+    assert least <= min(margins) < least + 0.2
+
+
+def test_properties_of_the_picture_are_certified_and_falsified(tmp_path: Path) -> None:
+    for number in (0, 1):
+        good = examined(LoopSearch(viewing(tmp_path, seen_loop(0.9))), number)
+        assert good and {leaf.verdict for leaf in good} == {"certified"}
+    wrong = viewing(tmp_path, seen_loop(0.3))
+    bad = examined(LoopSearch(wrong), 0)
+    assert bad and {leaf.verdict for leaf in bad} == {"falsified"}
+    # the pictures of the stored start break the property, by the definition
+    image = wrong.view.image(wrong.loop.camera.values(wrong.loop.state(wrong.loop.box, bad[0].counterexample)))
+    assert image[0, :, 0].mean() > 0.3
+    # a goal that holds at the start alone is one of "any", not one of the end
+    start = viewing(tmp_path, seen_loop(0.9))
+    run = simulate(start, start.loop.state(start.loop.box, start.loop.box.middle), np.zeros((6, 3)))
+    drop = float(run.views[0, 1] - run.views[-1, 1])
+    assert abs(drop) > 1e-3
+    side = {"min" if drop > 0.0 else "max": 0.1 + float(run.views[[0, -1], 1].mean())}
+    for when, wanted in (("any", "certified"), ("end", "falsified")):
+        value = seen_loop(0.9, MEAN | side | {"when": when})
+        value |= {"initial": {"p": [-1e-4, 1e-4], "q": 0.0, "r": 0.0}}
+        leaves = examined(LoopSearch(viewing(tmp_path, value)), 1)
+        assert {leaf.verdict for leaf in leaves} == {wanted}, when
+
+
+def test_pictures_that_are_no_numbers_prove_nothing(tmp_path: Path) -> None:
+    base = viewing(tmp_path, seen_loop(0.9))
+    hole = Wall(base.loop)
+    hole.slopes = np.where(np.arange(SIDE)[:, None, None, None] == 0, np.nan, hole.slopes)
+    broken = replace(base, views=tuple(replace(view, pictures=hole) for view in base.views))
+    for number in (0, 1):
+        assert {leaf.verdict for leaf in examined(LoopSearch(broken), number, 3)} <= {"unknown"}
+    run = simulate(broken, base.loop.state(base.loop.box, base.loop.box.middle), np.zeros((6, 3)))
+    assert np.isnan(run.views).all() and np.isnan(run.margin(base.loop, "safe"))
+    # one number that is none is enough, also where others are worse
+    views = np.full((7, 2), -1.0)
+    views[2, 0] = np.nan
+    assert np.isnan(replace(run, views=views).margin(base.loop, "safe"))
+
+
 def test_a_face_is_exact() -> None:
     assert HalfSpace((1.0, -1.0), 0.1).exact([0.3, 0.2]) == Fraction(0.3) - Fraction(0.2) - Fraction(0.1)
     assert HalfSpace((1.0,), 0.1).exact([0.1]) == 0
@@ -458,6 +537,13 @@ HOSTILE: dict[str, tuple[str, Any]] = {
     "unsafe[0]": ("unsafe.0", {"box": {}, "half_space": {}}),
     "unsafe[0].box.p": ("unsafe.0.box.p", [None, None]),
     "unsafe[1].half_space.normal": ("unsafe.1.half_space.normal", [0, 0, 0]),
+    "unsafe[0].type": ("unsafe.0", {"type": "clever"}),
+    "unsafe[0].distance": ("unsafe.0", {"type": "clear"}),
+    "unsafe[1].all[0].select": ("unsafe.1", {"all": [{"type": "visible", "weight": 0.5}]}),
+    "unsafe[0].partitions": ("unsafe.0", {"type": "clear", "distance": 1, "partitions": [2]}),
+    "goal.min": ("goal", {"type": "picture", "when": "end"}),
+    "goal.when ": ("goal", {"type": "picture", "min": 0.1, "when": "now"}),
+    "goal.bogus": ("goal", {"type": "picture", "min": 0.1, "bogus": 1}),
     "goal.when": ("goal.when", ["end"]),
     "goal.box": ("goal.box", {}),
 }

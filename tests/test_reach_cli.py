@@ -33,8 +33,8 @@ from ns_abstract.io import memory
 from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.variations import SceneVariation, Selection
 from ns_abstract.reach.film import along
+from ns_abstract.reach.pictures import Pictures
 from ns_abstract.reach.search import SimulatedRun, first_outside, sampled_disturbances, simulate
-from ns_abstract.reach.tubes import Pictures
 from ns_abstract.verify.camera_response import CameraResponse
 from ns_abstract.verify.scene_margin import CAMERA_KINDS
 
@@ -245,6 +245,32 @@ def test_a_planted_bad_controller_is_falsified(course: Course, tmp_path: Path) -
 
 
 @pytest.mark.slow
+def test_pictures_along_a_loop(course: Course, tmp_path: Path, run: InProcess) -> None:
+    """Nothing near is certified; a limit that pictures break is falsified by runs whose pictures are rendered again."""
+    clear = {"type": "clear", "distance": 0.3, "weight": 0.5}
+    bright = {"type": "picture", "statistic": "mean", "channel": "r", "max": 0.1, "when": "end"}
+    seen = course.changed("seen.json", unsafe=[clear], goal=bright, initial=SMALL, steps=4)
+    document = seen.run(tmp_path / "out")
+    assert document["questions"]["safe"]["certified"] == 1.0 == document["questions"]["reaches"]["falsified"]
+    assert "nearer than 0.3" in document["questions"]["safe"]["text"]
+    job, files = seen.job, list((tmp_path / "out" / "counterexamples").glob("reaches_*.npz"))
+    assert files
+    for file in files:
+        stored = np.load(file)
+        again = simulate(job.reacher(), stored["states"][0], stored["disturbances"])
+        assert (again.views == stored["views"]).all() and again.margin(job.loop, "reaches") <= 0.0
+        image = Pictures(job.job.method, job.job.pose_sets[0]).image(job.loop.camera.values(stored["states"][-1]))
+        assert image[..., 0].mean() > 0.1
+    for key, wrong, told in (
+        ("unsafe", [clear | {"region": [0, 0, 9, 9]}], r"seen.json: unsafe\[0\].region: .* reaches beyond"),
+        ("goal", {"type": "visible", "select": {"box": [[90, 90, 90], [91, 91, 91]]}}, r"seen.json: goal.*select"),
+    ):
+        course.changed("seen.json", initial=SMALL, **{key: wrong})
+        code, _, said = run(reach_command, seen.options(tmp_path / "no"))
+        assert code == 2 and re.search(told, said) and said.count("\n") == 1, said
+
+
+@pytest.mark.slow
 def test_scene_margin(course: Course, tmp_path: Path) -> None:
     """Runs in scenes at the ends of the certified radius stay in the tubes and go well; stored ones fail."""
     part = course.changed("margin.json", "goal", initial=SMALL, steps=10)
@@ -293,7 +319,7 @@ def test_scene_margin(course: Course, tmp_path: Path) -> None:
         assert bool(files) == bool(broken)
         for file in files:
             with np.load(file) as stored:
-                run = SimulatedRun(stored["states"], stored["controls"], stored["disturbances"])
+                run = SimulatedRun(stored["states"], stored["controls"], stored["disturbances"], np.zeros((11, 0)))
                 assert (
                     run.margin(loop, "safe") <= 0.0
                     and broken is not None

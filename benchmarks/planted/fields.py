@@ -255,24 +255,29 @@ FIELDS = (
     ),
     Fault(
         "hue: all of the circle is missed where the order of channels is open",
-        _HSV, "_hues", "np.full(len(low), 6.0)", "np.full(len(low), 3.0)", _COLORS + "[0.3-0.4]",
+        _HSV, "_hues", "first, last = 0.0, 6.0", "first, last = 0.0, 3.0", _COLORS + "[0.3-0.4]",
+    ),
+    Fault(
+        "hue: a range of hues is its middle",
+        _HSV, "_hues", "return first - HUE_ROOM, last + HUE_ROOM", "return 0.5 * (first + last), 0.5 * (first + last)",
+        _COLORS + "[0.3-0.4]",
     ),
     Fault(
         "hue: the wrap at half a turn is forgotten",
-        _HSV, "shifted_bounds", "np.where(end >= 3.0, end - 6.0, end)", "end", _COLORS,
+        _HSV, "shift_box", "end - 6.0 if end >= 3.0 else end", "end", _COLORS,
     ),
     Fault(
         "hue: the range's end is forgotten",
-        _HSV, "shifted_bounds", "np.maximum(np.abs(start), np.abs(end))", "np.abs(start)", _COLORS,
+        _HSV, "shift_box", "max(abs(start), abs(end))", "abs(start)", _COLORS,
     ),
     Fault(
         "saturation: the least channel takes the other end of the shift",
-        _HSV, "shifted_bounds", "low.min(axis=1)[:, None] - np.maximum(*taken)",
-        "low.min(axis=1)[:, None] - np.minimum(*taken)", _COLORS,
+        _HSV, "shift_box", "max(saturation[1] * value_low, saturation[1] * value_high)",
+        "min(saturation[1] * value_low, saturation[1] * value_high)", _COLORS,
     ),
     Fault(
         "hue: rounding is not charged",
-        _HSV, "shifted_bounds", "least + (value_low - least) * share_low - HUE_ROUNDING",
+        _HSV, "shift_box", "least + (value_low - least) * share_low - HUE_ROUNDING",
         "least + (value_low - least) * share_low + 0.0", _COLORS,
     ),
     Fault(

@@ -35,4 +35,21 @@ HASH_BOUNDS = (
         "rest += times(abs(gain), light.depth[i, n + 3]) + abs(weight) * colors[i, n + 3]", "pass",
         _STEPS + "test_colours_of_rays_are_enclosed", True,
     ),
+    Fault(
+        "hash fields: a density that overflows is none", _FOLDER + "pieces.py", "_sample",
+        "exp_below(low) * field.scale, exp_above(high) * field.scale",
+        "exp_below(low) * field.scale, min(exp_above(high), 1e300) * field.scale * (high < 700.0)",
+        "test_hash_frame.py::test_fields_and_cameras_that_are_hard_are_enclosed", True,
+    ),
+    Fault(
+        "hash fields: shifted colours keep the bounds of those that are not", _FOLDER + "composition.py",
+        "shifted_interval_colors", "interval_colors(light, count, room[0], room[1], background, last, out)",
+        "interval_colors(light, count, colors[0], colors[1], background, last, out)",
+        "test_hash_frame.py::test_sets_of_poses_are_enclosed[hue]", True,
+    ),
+    Fault(
+        "hash fields: networks end at the second layer", _FOLDER + "network.py", "finish",
+        "weights.sizes.shape[0] - 1", "min(weights.sizes.shape[0] - 1, 2)",
+        "test_hash_frame.py::test_sets_of_poses_are_enclosed[depths]", True,
+    ),
 )  # fmt: skip

@@ -10,9 +10,42 @@ _SETS = "test_reach.py::test_affine_sets_hold_their_images"
 _CLIP = "test_reach.py::test_a_clip_is_enclosed"
 _RUNS = "test_reach.py::test_tubes_hold_every_run"
 _VERDICTS = "test_reach.py::test_a_good_controller_is_certified_and_a_bad_one_falsified"
+_VIEWS = "test_reach.py::test"
 _MARGIN = "test_reach_cli.py::test_scene_margin"
 
 LOOPS = (
+    Fault(
+        "loops: pictures of a step are those of its middle pose",
+        "reach/pictures.py",
+        "PropertyView.bound",
+        "self.pictures.sets(box)",
+        "self.pictures.sets(ParameterBox(box.names, box.units, tuple(box.middle), tuple(box.middle)))",
+        f"{_VIEWS}_tubes_hold_margins_of_the_pictures_of_every_run",
+    ),
+    Fault(
+        "loops: a margin that is no number takes no part",
+        _SEARCH,
+        "SimulatedRun.margin",
+        "any(map(_is_nan, clearances))",
+        "all(map(_is_nan, clearances))",
+        f"{_VIEWS}_pictures_that_are_no_numbers_prove_nothing",
+    ),
+    Fault(
+        "loops: a goal of the end counts at every step",
+        _LOOP,
+        "Goal.steps",
+        'last if self.when == "end" else 0',
+        "0",
+        f"{_VIEWS}_properties_of_the_picture_are_certified_and_falsified",
+    ),
+    Fault(
+        "loops: required properties are left out of proofs",
+        _TUBES,
+        "Tube.safe",
+        "[*clearances, *self.views[:, : len(loop.required)].ravel()]",
+        "clearances",
+        f"{_VIEWS}_properties_of_the_picture_are_certified_and_falsified",
+    ),
     Fault(
         "scene margin: tubes of a tenth of the radius",
         "api/loop_job.py",

@@ -14,18 +14,23 @@ import numpy as np
 
 from ns_abstract.api.assumptions import choice, set_choices
 from ns_abstract.api.certification import MEMORY
+from ns_abstract.api.files import resized
+from ns_abstract.api.frame_pictures import PropertySource
 from ns_abstract.api.job import Job, require_sound_platform
+from ns_abstract.api.picture_question import PlanePictures
 from ns_abstract.api.scenes import Scene
 from ns_abstract.arithmetic.forms import MAX_DIMENSIONS
 from ns_abstract.execution.worker_cache import Recipe
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.specification import TRANSLATIONS
 from ns_abstract.reach.learned import LearnedDynamics
-from ns_abstract.reach.loop import Loop, load_loop, parse_loop
+from ns_abstract.reach.loop import Loop, load_loop, parse_loop, within_field
+from ns_abstract.reach.pictures import Pictures, PropertyView
 from ns_abstract.reach.search import QUESTIONS, LoopBlockResult, LoopSearch
-from ns_abstract.reach.tubes import ControlBounds, Dependence, Pictures, TubeBuilder
+from ns_abstract.reach.tubes import ControlBounds, Dependence, TubeBuilder
 from ns_abstract.report.run import file_stamp
 from ns_abstract.verify.camera_response import CameraResponse
 from ns_abstract.verify.cells import Cell, CellGrid
@@ -52,7 +57,11 @@ class LoopJob:
 
     def __init__(self, job: Job, loop: Loop, network_arithmetic: NetworkArithmetic = "float32") -> None:
         require_sound_platform()
+        if loop.views:
+            loop = parse_loop(dict(loop.value), loop.network.absolute().parent, job.method.dataset_scale)
         self.job, self.loop = job, loop
+        # selections and regions are checked before anything is computed
+        self._seen = self._views(job.pose_sets[0])
         self.network = load_network(loop.network, **loop.loading)
         self.model = NetworkModel(self.network, loop.preprocess, MEMORY, network_arithmetic)
         outputs = loop.control.gain.shape[1]
@@ -66,7 +75,23 @@ class LoopJob:
     def reacher(self, dependence: Dependence = "kept") -> TubeBuilder:
         """Computes tubes of the loop."""
         view = Pictures(self.job.method, self.job.pose_sets[0])
-        return TubeBuilder(self.loop, view, ControlBounds(self.model, self.loop.control), dependence)
+        return TubeBuilder(self.loop, view, ControlBounds(self.model, self.loop.control), dependence, views=self._seen)
+
+    def _views(self, poses: PoseBox) -> tuple[PropertyView, ...]:
+        """What the properties of the picture are read off, from the poses of a set.
+
+        Raises:
+            InputError: A selection picks nothing, or a region reaches beyond the picture.
+        """
+        views = []
+        for key, prop in self.loop.views.items():
+            size = prop.preprocess.resize or (poses.camera.height, poses.camera.width)
+            try:
+                model, pictures = prop.model(*size), PlanePictures(self.job.method, resized(poses, *size), prop)
+            except InputError as error:
+                raise within_field(error, key) from None
+            views.append(PropertyView(prop, pictures, model))
+        return tuple(views)
 
     @cached_property
     def search(self) -> LoopSearch:
@@ -93,8 +118,9 @@ class LoopJob:
         if kind is REGISTRATION and self._moves:
             return replace(self.reacher(), registration=radius)
         if kind.place:
-            view = Pictures(method, poses.registered(kind.place, radius))
-        elif kind.response is not None:
+            placed = poses.registered(kind.place, radius)
+            return replace(self.reacher(), view=Pictures(method, placed), views=self._views(placed))
+        if kind.response is not None:
             view = Pictures(method, poses, CameraResponse(kind.response, radius))
         else:
             view = Pictures(method, self.job.varied(0, kind.variation(radius)))
@@ -119,7 +145,8 @@ class LoopJob:
     @property
     def questions(self) -> list[int]:
         """Numbers of the questions that are asked."""
-        return [k for k, name in enumerate(QUESTIONS) if (self.loop.goal if name == "reaches" else self.loop.unsafe)]
+        asked = self.loop.unsafe or self.loop.required, self.loop.goal
+        return [number for number, name in enumerate(QUESTIONS) if asked[name == "reaches"]]
 
     @property
     def recipe(self) -> Recipe[LoopJob]:
@@ -152,6 +179,10 @@ class LoopJob:
         text = json.dumps(self.loop.value, sort_keys=True)
         law = self.loop.dynamics
         learned = {"dynamics": file_stamp(law.file)["sha256"]} if isinstance(law, LearnedDynamics) else {}
+        if self.loop.views:
+            # masks and lists of Gaussians are files of their own
+            stated = [self.loop.value.get(key) for key in ("unsafe", "goal")]
+            learned["views"] = PropertySource(stated, self.loop.network.absolute()).stamped
         return {
             **self.job.fingerprint,
             **learned,

@@ -186,13 +186,23 @@ class LoopReport:
             | self.about.tail(state, METRICS)
         )
 
+    def _text(self, question: Question) -> str:
+        loop = self.job.loop
+        text = SENTENCES[question]
+        if question == "safe" and loop.required:
+            text += "".join(f"; on the picture from every such state, {prop.sentence()}" for prop in loop.required)
+        if question == "reaches" and loop.goal is not None and loop.goal.view is not None:
+            text += f"; inside the goal: {loop.goal.view.sentence()}"
+        notes = dict.fromkeys(note for prop in loop.views.values() for note in prop.notes)
+        return "; ".join([text, *notes])
+
     def _entry(self, tally: Tally, rows: Sequence[Row]) -> dict[str, Any]:
         question, shares = QUESTIONS[tally.frame], fractions(tally)
         kinds = ("certified", "falsified", "unknown")
         went_well = sum(run.margin(self.job.loop, question) > 0.0 for run in self.simulated)
         count = len(self.simulated)
         return {
-            "text": SENTENCES[question],
+            "text": self._text(question),
             "certified": shares["certified"],
             "falsified": shares["falsified"],
             "unknown": shares["unknown"] + shares["open"],

@@ -94,6 +94,7 @@ class LoopQuestion(CellQuestion[ReachProgress]):
         question, names = QUESTIONS[number], np.array(self.job.loop.names, str)
         for cell, run in findings.runs:
             arrays = {"states": run.states, "controls": run.controls, "disturbances": run.disturbances, "names": names}
+            arrays |= {"views": run.views} if self.job.loop.views else {}
             yield f"{question}_{cell_place(cell, 'state')}", arrays
             self.reports.add_example(question, run)
 
@@ -116,7 +117,9 @@ class LoopQuestion(CellQuestion[ReachProgress]):
             self.reports.make_film(search.store, deadline)
 
     def varied_scenes(self) -> tuple[Sequence[VariationKind], Callable[[VariationKind], ProveCell]]:
-        return bounded_kinds(self.job.places), self.job.settle
+        kinds = bounded_kinds(self.job.places)
+        # scenes of a set are rendered for the network alone
+        return tuple(kind for kind in kinds if kind.place or not self.job.loop.views), self.job.settle
 
     def margin_rows(self, rows: dict[int, list[Row]]) -> tuple[dict[int, list[Row]], dict[str, Any]]:
         # the strongest question of which anything is certified

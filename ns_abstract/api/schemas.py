@@ -152,18 +152,14 @@ def property_schema() -> Schema:
         }
         for name, (keys, required) in kinds.items()
     ]
-    parts = _list({"$ref": "#/$defs/statement"}, 1)
-    joined = [{name: parts} for name in ("all", "any")]
+    joined, parts = _joined_statements()
     several = {"anyOf": [_object({**one, **beside}, list(one)) for one in joined]}
     cases.append({"if": {"not": {"required": ["type"]}}, "then": several})
-    single = [
-        _object({**keys, "type": {"const": n}}, ["type", *required]) for n, (keys, required) in statements.items()
-    ]
     root: Schema = {
         "type": "object",
         "properties": {"type": {"enum": list(kinds)}},
         "allOf": cases,
-        "$defs": {"statement": {"anyOf": [*single, *(_object(one, list(one)) for one in joined)]}},
+        "$defs": parts,
     }
     return _whole("property", "What is to hold on every picture", root)
 
@@ -190,6 +186,26 @@ def _statements() -> dict[str, tuple[dict[str, Schema], list[str]]]:
     }
     needed = {"visible": ["select"], "clear": ["distance"]}
     return {name: (_fields(kind.keys, schemas), needed.get(name, [])) for name, kind in PICTURE_TYPES.items()}
+
+
+def _joined_statements() -> tuple[list[Schema], Schema]:
+    """Statements that are joined by all or any, and their parts under "$defs"."""
+    parts = _list({"$ref": "#/$defs/statement"}, 1)
+    joined: list[Schema] = [{name: parts} for name in ("all", "any")]
+    single = [
+        _object({**keys, "type": {"const": n}}, ["type", *required]) for n, (keys, required) in _statements().items()
+    ]
+    return joined, {"statement": {"anyOf": [*single, *(_object(one, list(one)) for one in joined)]}}
+
+
+def _views(beside: Mapping[str, Schema]) -> list[Schema]:
+    """Properties of the picture along a loop, with keys ``beside`` their own."""
+    beside = {"preprocess": _object({"resize": _preprocess()["properties"]["resize"]}), **beside}
+    single = [
+        _object({**keys, **beside, "type": {"const": n}}, ["type", *required])
+        for n, (keys, required) in _statements().items()
+    ]
+    return [*single, *(_object({**one, **beside}, list(one)) for one in _joined_statements()[0])]
 
 
 def _motion() -> Schema:
@@ -231,7 +247,7 @@ def loop_schema() -> Schema:
         "position": _object({"offset": _numbers(3), "matrix": _list(_list(_NUMBER, 1), 3, 3)}, ["matrix"]),
         **dict.fromkeys(ROTATIONS, turn),
     }
-    names = {"type": "string", "minLength": 1, "maxLength": 40}
+    names, when = {"type": "string", "minLength": 1, "maxLength": 40}, {"when": {"enum": ["end", "any"]}}
     schemas: dict[str, Schema] = {
         "version": {"const": 1},
         "state": _list(names, 1, dynamics.MOST - 1, uniqueItems=True),
@@ -245,12 +261,13 @@ def loop_schema() -> Schema:
         "network": _TEXT,
         "preprocess": _preprocess(),
         "control": _object({"gain": _MATRIX, "goal": _list(_NUMBER, 1), "clip": clip}),
-        "unsafe": _list({"anyOf": [_object({"box": box}, ["box"]), outside]}),
-        "goal": _object({"box": box, "when": {"enum": ["end", "any"]}}, ["box"]),
+        "unsafe": _list({"anyOf": [_object({"box": box}, ["box"]), outside, *_views({})]}),
+        "goal": {"anyOf": [_object({"box": box, **when}, ["box"]), *_views(when)]},
         "output": _TEXT,
     }  # fmt: skip
     required = ["version", "state", "initial", "steps", "sampling_time", "dynamics", "camera", "network", "control"]
     root = _object(_fields(loop.KEYS, schemas), required, anyOf=[{"required": ["unsafe"]}, {"required": ["goal"]}])
+    root["$defs"] = _joined_statements()[1]
     return _whole("loop", "A camera, a network and a law of motion in a closed loop", root)
 
 

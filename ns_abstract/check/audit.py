@@ -118,7 +118,7 @@ def opened(folder: Path, report: dict[str, Any], moved: dict[str, Path | None]) 
     settings, renderer, name = report["settings"], report["renderer"], folder / "report.json"
     if not (renderer["name"] == "gsplat" and renderer["version"] in RULES) and renderer["name"] != "nerf-uniform":
         problem = f"found {renderer['name']} {renderer.get('version')}, and this program checks gsplat and nerf-uniform"
-        raise BadInput(problem, name, "renderer")
+        raise BadInput(problem, name, "renderer", "give a result of a splat, or of vanilla-nerf at uniform samples")
     if report.get("guarantee") not in ("float32-sound", "real-sound"):
         raise BadInput(f"found {report.get('guarantee')!r}: nothing is claimed", name, "guarantee")
 
@@ -133,7 +133,9 @@ def opened(folder: Path, report: dict[str, Any], moved: dict[str, Path | None]) 
     if report.get("kind") == "loop":
         parts = read_verdicts(folder, report)
         model = moved.get("model") or file("loop").parent / report["loop"]["network"]
-        return parts, [CheckedLoop(c, scene, report, model) for c in parts if CheckedLoop.claims(c)]
+        return parts, [
+            CheckedLoop(c, scene, report, model, dataset_scale(config)) for c in parts if CheckedLoop.claims(c)
+        ]
     path, given = file("camera_path_filename"), given_set(settings, moved.get("perturbation_filename"))
     without = "sha256" not in report.get("model", {})
     if (folder / "cells.sqlite").exists():

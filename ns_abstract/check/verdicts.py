@@ -167,7 +167,7 @@ class CheckedLoop(_OfNetwork):
 
     kinds = ("certified",)
 
-    def __init__(self, cells: StoredCells, scene: Any, report: dict[str, Any], model: Path) -> None:
+    def __init__(self, cells: StoredCells, scene: Any, report: dict[str, Any], model: Path, scale: float) -> None:
         self.loop = loop = report["loop"]
         super().__init__(cells, scene, report, model, loop)
         if loop["dynamics"].get("type") != "affine":
@@ -183,6 +183,13 @@ class CheckedLoop(_OfNetwork):
         self.turns = {name: loop["camera"][name] for name in TURNS if loop["camera"].get(name)}
         rows = [*self.position["matrix"], *(about["row"] for about in self.turns.values())]
         self.seen = [k for k in range(len(self.names)) if any(row[k] for row in rows)]
+        stated = [*(loop.get("unsafe") or []), loop.get("goal") or {}]
+        self.areas, self.statements = [a for a in stated[:-1] if "box" in a or "half_space" in a], []
+        for about in stated:
+            if about and "box" not in about and "half_space" not in about:
+                camera = resized(self.camera, about.get("preprocess") or {})
+                self.statements.append((camera, parsed(about, (camera.height, camera.width), scale)))
+        self.goal_stated = bool(stated[-1]) and "box" not in stated[-1]
 
     def _state(self, low: Array, high: Array) -> list[Affine]:
         given = Poses(self.camera, self.cells.names).given(low, high)
@@ -196,17 +203,33 @@ class CheckedLoop(_OfNetwork):
             turn = product(turn, rotation(np.array(TURNS[name]), _affine(about["row"], x, about["offset"])))
         return CameraForms(turn, place, self.camera.pose)
 
+    def _local(self, x: list[Affine]) -> tuple[list[Affine], Array, Array]:
+        """The states that the camera sees as forms in symbols of their own, middles and half widths of their box."""
+        low, high = (np.stack([e.range()[k] for e in x], axis=-1) for k in (0, 1))
+        middle = 0.5 * (low + high)
+        half = np.maximum(high - middle, middle - low) * (1.0 + 4.0 * U)
+        own = parameters(middle[:, self.seen], half[:, self.seen])
+        local = [own[self.seen.index(k)] if k in self.seen else own[0] * 0.0 + middle[:, k] for k in range(len(x))]
+        return local, middle, half
+
+    def _stated(self, x: list[Affine], unit: float) -> list[Array]:
+        """Lower bounds [B] of the margins of the statements about pictures, the goal's last."""
+        if not self.statements:
+            return []
+        view = self._view(self._local(x)[0])
+
+        def least(camera: CheckedCamera, statement: Any) -> Array:
+            return statement.margin(lambda paint: pictures(self.scene.painted(paint), camera, view, unit))[0]
+
+        return [least(*entry) for entry in self.statements]
+
     def _outputs(self, x: list[Affine], unit: float) -> list[Affine]:
         """The network's outputs in the symbols of the state.
 
         They are bounded by forms in the states that the camera sees, over their box, whose symbols are these states
         themselves, scaled.
         """
-        low, high = (np.stack([e.range()[k] for e in x], axis=-1) for k in (0, 1))
-        middle = 0.5 * (low + high)
-        half = np.maximum(high - middle, middle - low) * (1.0 + 4.0 * U)
-        own = parameters(middle[:, self.seen], half[:, self.seen])
-        local = [own[self.seen.index(k)] if k in self.seen else own[0] * 0.0 + middle[:, k] for k in range(len(x))]
+        local, middle, half = self._local(x)
         y, outputs = self.network.outputs(self.inputs(self.camera, self._view(local), unit)), []
         inverse = np.where(half > 1e-150, 1.0 / np.maximum(half, 1e-150), 0.0)
         scaled = [(x[k] + -middle[:, k]) * inverse[:, k] for k in self.seen]
@@ -239,14 +262,16 @@ class CheckedLoop(_OfNetwork):
         x, goal, found, inside = self._state(low, high), self.loop.get("goal"), [], []
         for step in range(self.steps + 1):
             x = self._next(x, unit) if step else x
-            found += [_outside(area, x, self.names) for area in self.loop.get("unsafe") or []]
+            margins = self._stated(x, unit)
+            found += [_outside(area, x, self.names) for area in self.areas]
+            found += margins[:-1] if self.goal_stated else margins
             if self.cells.index and goal:
-                inside.append(-_outside(goal, x, self.names, inner=True))
+                inside.append(margins[-1] if self.goal_stated else -_outside(goal, x, self.names, inner=True))
             lost = ~np.isfinite(np.stack([e.width for e in x])).all(axis=0)
             if (lost | (np.min(found, axis=0, initial=np.inf) <= 0.0)).all():
                 return np.full(len(low), -np.inf)
         if inside:
-            found.append(inside[-1] if goal["when"] == "end" else np.max(inside, axis=0))
+            found.append(inside[-1] if goal.get("when", "end") == "end" else np.max(inside, axis=0))
         least = np.min(found, axis=0) if found else np.full(len(low), np.inf)
         return np.where(np.isnan(least) | lost, -np.inf, least)
 

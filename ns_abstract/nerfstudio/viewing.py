@@ -159,7 +159,8 @@ def _prepared(config: TrainerConfig, file: Path) -> TrainerConfig:
             f"the method {config.method_name} is not bounded in the viewer",
             file=file,
             field="pipeline.model",
-            fix="give a run of splatfacto, vanilla-nerf, abstract-splatfacto or abstract-nerf",
+            fix="bound it with ns-abstract-render; the viewer takes splatfacto, vanilla-nerf, abstract-splatfacto "
+            "and abstract-nerf",
         )
     config.pipeline._target = AbstractPipeline
     if isinstance(config.pipeline.model, AbstractNerfModelConfig) and not torch.cuda.is_available():

@@ -11,7 +11,8 @@ import numpy as np
 
 from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.reach.tubes import Pictures, Tube, TubeBuilder
+from ns_abstract.reach.pictures import Pictures
+from ns_abstract.reach.tubes import Tube, TubeBuilder
 from ns_abstract.refine.protocol import Method
 from ns_abstract.refine.result import FrameResult
 from ns_abstract.report.export import encoded, panels, picture

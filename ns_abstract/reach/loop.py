@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
 from functools import partial
@@ -30,6 +30,7 @@ from ns_abstract.reach.dynamics import (
     unusable,
 )
 from ns_abstract.reach.learned import LearnedDynamics
+from ns_abstract.verify.picture_properties import PictureProperty, is_of_picture, parse_picture_property
 from ns_abstract.verify.preprocess import Preprocess, parse_preprocess
 
 Float64 = NDArray[np.float64]
@@ -63,18 +64,26 @@ class HalfSpace:
 
 
 @dataclass(frozen=True)
-class GoalBox:
-    """The goal: the open box that the state has to be in.
+class Goal:
+    """The goal: the open box that the state has to be in, or the property that its picture has to have.
 
     Attributes:
-        faces: All above 0 inside.
+        faces: All above 0 inside; none where a property is asked for.
         when: "end", after the last step; "any", after at least one.
+        view: The property, or None.
     """
 
     faces: tuple[HalfSpace, ...]
     when: Literal["end", "any"]
+    view: PictureProperty | None = None
+
+    def steps(self, last: int) -> range:
+        """The steps at which the goal counts."""
+        return range(last if self.when == "end" else 0, last + 1)
 
 
+#: A property of the picture, for errors.
+_VIEW = 'a property of the picture {"type": "clear", ..}'
 #: Intrinsics in pixels that a file may state.
 LENS = ("fx", "fy", "cx", "cy")
 
@@ -167,6 +176,7 @@ class Loop:
         preprocess: What comes before it.
         control: What comes behind it; None until the network's outputs are known.
         unsafe: Closed sets, each given by faces: outside where any of them is above 0.
+        required: Properties of the picture: a state is unsafe where its picture lacks one of them.
         goal: Or None.
         value: The file's content.
     """
@@ -184,8 +194,16 @@ class Loop:
     preprocess: Preprocess
     control: Control
     unsafe: tuple[tuple[HalfSpace, ...], ...]
-    goal: GoalBox | None
+    required: tuple[PictureProperty, ...]
+    goal: Goal | None
     value: Mapping[str, Any]
+
+    @property
+    def views(self) -> dict[str, PictureProperty]:
+        """All properties of the picture by the key that states them, the goal's last."""
+        keys = [f"unsafe[{k}]" for k, entry in enumerate(self.value.get("unsafe", [])) if is_of_picture(entry)]
+        named = dict(zip(keys, self.required, strict=True))
+        return named if self.goal is None or self.goal.view is None else {**named, "goal": self.goal.view}
 
     @property
     def loading(self) -> dict[str, Any]:
@@ -232,12 +250,13 @@ def load_loop(path: str | Path) -> Loop:
         raise error.within(path) from None
 
 
-def parse_loop(value: Any, folder: Path) -> Loop:
+def parse_loop(value: Any, folder: Path, dataset_scale: float = 1.0) -> Loop:
     """Check the content of LOOP.json.
 
     Args:
         value: The content.
         folder: Where the files that it names lie.
+        dataset_scale: Normalised units per unit of the data set, for distances in pictures.
 
     Raises:
         InputError: A key is unknown, or a value cannot be used.
@@ -269,7 +288,9 @@ def parse_loop(value: Any, folder: Path) -> Loop:
     unsafe = value.get("unsafe", [])
     if not isinstance(unsafe, list) or len(unsafe) > _MOST_SETS:
         raise fail("unsafe", f"found {show(unsafe)}", f"write a list of at most {_MOST_SETS} sets")
-    goal = None if "goal" not in value else _goal(value["goal"], names, fail)
+    view = partial(_view, folder=folder, dataset_scale=dataset_scale)
+    required = tuple(view(entry, f"unsafe[{k}]") for k, entry in enumerate(unsafe) if is_of_picture(entry))
+    goal = None if "goal" not in value else _goal(value["goal"], names, fail, view)
     if not unsafe and goal is None:
         raise fail("unsafe", "missing", "give unsafe sets, or a goal, or both")
     return Loop(
@@ -285,7 +306,10 @@ def parse_loop(value: Any, folder: Path) -> Loop:
         network,
         parse_preprocess(value.get("preprocess", {})),
         _control(value.get("control"), dynamics.controls, fail),
-        tuple(_unsafe(entry, f"unsafe[{k}]", names, fail) for k, entry in enumerate(unsafe)),
+        tuple(
+            _unsafe(entry, f"unsafe[{k}]", names, fail) for k, entry in enumerate(unsafe) if not is_of_picture(entry)
+        ),
+        required,
         goal,
         value,
     )
@@ -404,7 +428,7 @@ def _box_faces(value: Any, field: str, names: tuple[str, ...], fail: Fail, *, in
 
 def _unsafe(value: Any, field: str, names: tuple[str, ...], fail: Fail) -> tuple[HalfSpace, ...]:
     if not isinstance(value, Mapping) or len(value) != 1:
-        raise fail(field, f"found {show(value)}", 'write {"box": ..} or {"half_space": ..}')
+        raise fail(field, f"found {show(value)}", f'write {{"box": ..}}, {{"half_space": ..}} or {_VIEW}')
     known(value, ("box", "half_space"), f"{field}.", fail)
     if "box" in value:
         return _box_faces(value["box"], f"{field}.box", names, fail, inside=False)
@@ -419,11 +443,28 @@ def _unsafe(value: Any, field: str, names: tuple[str, ...], fail: Fail) -> tuple
     return (HalfSpace(tuple((-normal).tolist()), -end),)
 
 
-def _goal(value: Any, names: tuple[str, ...], fail: Fail) -> GoalBox:
+def _view(value: Mapping[str, Any], field: str, folder: Path, dataset_scale: float) -> PictureProperty:
+    """The property of the picture under a key."""
+    try:
+        if "partitions" in value:
+            raise unusable("is for certificates", "partitions", "remove it")
+        return parse_picture_property(dict(value), folder, dataset_scale)
+    except InputError as error:
+        raise within_field(error, field) from None
+
+
+def within_field(error: InputError, field: str) -> InputError:
+    """The error of a key of a property, with the key that states the property before it."""
+    return InputError(error.problem, file=error.file, field=f"{field}.{error.field}", fix=error.fix)
+
+
+def _goal(value: Any, names: tuple[str, ...], fail: Fail, view: Callable[[Any, str], PictureProperty]) -> Goal:
     if not isinstance(value, Mapping):
-        raise fail("goal", f"found {show(value)}", "write an object with box and when")
-    known(value, ("box", "when"), "goal.", fail)
+        raise fail("goal", f"found {show(value)}", f"write an object with box and when, or {_VIEW}")
     when = value.get("when", "end")
     if when not in ("end", "any") or not isinstance(when, str):
         raise fail("goal.when", f"found {show(when)}", "write end or any")
-    return GoalBox(_box_faces(value.get("box"), "goal.box", names, fail, inside=True), when)  # pyright: ignore[reportArgumentType]
+    if is_of_picture(value):
+        return Goal((), when, view({key: v for key, v in value.items() if key != "when"}, "goal"))
+    known(value, ("box", "when"), "goal.", fail)
+    return Goal(_box_faces(value.get("box"), "goal.box", names, fail, inside=True), when)  # pyright: ignore[reportArgumentType]

@@ -137,7 +137,7 @@ def _seen(
     window, marks = view.window, ""
     x, y = plane_axes(window)
     sets = [("unsafe", faces, -1.0) for faces in loop.unsafe]
-    sets += [] if loop.goal is None else [("goal", loop.goal.faces, 1.0)]
+    sets += [] if loop.goal is None or not loop.goal.faces else [("goal", loop.goal.faces, 1.0)]
     legend = set()
     for kind, faces, sign in sets:
         corners = region(faces, loop, view.axes, window, sign)

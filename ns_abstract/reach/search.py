@@ -12,7 +12,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -55,22 +55,32 @@ class SimulatedRun:
         states: [steps + 1, n] float64.
         controls: [steps, m].
         disturbances: [steps, n] what was added.
+        views: [steps + 1, properties] margins of the pictures at these states; see `Loop.views`.
     """
 
     states: Float64
     controls: Float64
     disturbances: Float64
+    views: Float64
 
     def margin(self, loop: Loop, question: Question) -> float:
         """How far the run is from going wrong: it does where this is not above 0. Its sign is exact; NaN: no number."""
         if not np.isfinite(self.states).all():
             return math.nan
         states = self.states.tolist()
-        clearances = [max(face.exact(x) for face in faces) for x in states for faces in loop.unsafe]
+        clearances: list[Any] = [max(face.exact(x) for face in faces) for x in states for faces in loop.unsafe]
+        clearances += self.views[:, : len(loop.required)].ravel().tolist()
         if question == "reaches":
             assert loop.goal is not None
-            depths = [min(face.exact(x) for face in loop.goal.faces) for x in states]
-            clearances.append(depths[-1] if loop.goal.when == "end" else max(depths))
+            steps = loop.goal.steps(loop.steps)
+            if loop.goal.view is None:
+                depths = [min(face.exact(states[k]) for face in loop.goal.faces) for k in steps]
+            else:
+                depths = self.views[steps, -1].tolist()
+            # a picture that is no number says nothing, whatever else the run shows
+            clearances += [math.nan] if any(map(_is_nan, depths)) else [max(depths)]
+        if any(map(_is_nan, clearances)):
+            return math.nan
         return float(min(clearances)) if clearances else math.inf
 
 
@@ -93,6 +103,7 @@ def simulate(
     loop = reacher.loop
     more = () if member is None else (member,)
     states, controls = [np.asarray(start, np.float64)], []
+    margins = np.full((loop.steps + 1, len(reacher.views)), np.nan)
     with np.errstate(all="ignore"):
         for push in disturbances:
             x = states[-1]
@@ -102,6 +113,9 @@ def simulate(
             u = reacher.pilot.concrete(reacher.view.image(pose, *more))
             controls.append(u)
             states.append(loop.dynamics.step(x, u) + push)
+    for k, x in enumerate(states):
+        if reacher.views and np.isfinite(x).all():
+            margins[k] = [view.margin(reacher.seen_from(x, off)) for view in reacher.views]
     missing = loop.steps + 1 - len(states)
     lost = np.full((missing, len(start)), np.nan)
     empty = np.full((loop.steps - len(controls), loop.dynamics.controls), np.nan)
@@ -109,7 +123,12 @@ def simulate(
         np.concatenate([np.stack(states), lost]),
         np.concatenate([np.array(controls).reshape(-1, loop.dynamics.controls), empty]),
         np.asarray(disturbances, np.float64),
+        margins,
     )
+
+
+def _is_nan(value: Any) -> bool:
+    return isinstance(value, float) and math.isnan(value)
 
 
 def sampled_disturbances(
@@ -190,13 +209,14 @@ class LoopSearch:
         """Lower bound of the margin of all runs in a tube; minus infinity where nothing is known (L5)."""
         if tube.reason or len(tube.sets) != self.loop.steps + 1 or not all(step.finite for step in tube.sets):
             return -math.inf
-        clearance = tube.safe(self.loop.unsafe)
+        clearance = tube.safe(self.loop)
         if question == "reaches":
             goal = self.loop.goal
             assert goal is not None
-            steps = [self.loop.steps] if goal.when == "end" else range(self.loop.steps + 1)
+            steps = goal.steps(self.loop.steps)
             # some one step is in the goal for all runs
-            clearance = min(clearance, max(tube.inside(k, goal.faces) for k in steps))
+            depths = [tube.inside(k, goal.faces) if goal.view is None else float(tube.views[k, -1]) for k in steps]
+            clearance = min(clearance, max(depths))
         return clearance if math.isfinite(clearance) or clearance == math.inf else -math.inf
 
     def _scenes(self, generator: np.random.Generator) -> Iterator[tuple[SceneSample | None, Float64 | None]]:
@@ -398,6 +418,9 @@ def first_outside(tube: Tube, run: SimulatedRun) -> str | None:
         state = run.states[step]
         if not ((low <= state) & (state <= high)).all():
             return f"step {step}: {state.tolist()} not in {low.tolist()} to {high.tolist()}"
+    for step, least in enumerate(tube.views):
+        if (run.views[step] < least).any():
+            return f"step {step}: margins of pictures {run.views[step].tolist()} below {least.tolist()}"
     for step, (low, high) in enumerate(tube.controls):
         if not ((low <= run.controls[step]) & (run.controls[step] <= high)).all():
             return f"the control of step {step}"

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,14 +21,11 @@ from ns_abstract.arithmetic.rounding import (
 )
 from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.poses import PoseBox
-from ns_abstract.geometry.tiles import assemble
 from ns_abstract.perturbation.specification import TRANSLATIONS
 from ns_abstract.reach.dynamics import middle_half
 from ns_abstract.reach.learned import LearnedDynamics
 from ns_abstract.reach.loop import Control, HalfSpace, Loop
-from ns_abstract.refine.protocol import Frame, Method, SceneSample
-from ns_abstract.verify.camera_response import CameraResponse, response_sets
+from ns_abstract.reach.pictures import LoopPictures, PropertyView
 from ns_abstract.verify.model import NetworkModel
 from ns_abstract.verify.network import OutputBounds
 from ns_abstract.verify.properties import Query
@@ -146,56 +143,7 @@ def _scaled(values: AffineSet, middle: Float64, half: Float64) -> AffineSet:
     return shifted.mapped(np.diag(inverse), np.zeros(len(middle)), np.where(usable | (half == 0.0), 0.0, 1.0))
 
 
-# ---------------------------------------------------------------- pictures and the network
-
-
-class LoopPictures(Protocol):
-    """The interface of the pictures that the camera may take."""
-
-    pose_set: PoseBox
-
-    def image(self, values: Float64, member: SceneSample | None = None) -> np.ndarray:
-        """[H, W, 3] float32 at pose parameters [d], of another scene of the set if one is named."""
-        ...
-
-    def scene_samples(self, seed: int) -> Iterator[SceneSample]:
-        """Other scenes of the set, without end; none where only poses vary."""
-        ...
-
-    def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
-        """Return linear sets, bounds and slopes over a box of poses; see `ns_abstract.verify.protocol.FrameImages`."""
-        ...
-
-
-class Pictures:
-    """A scene's pictures.
-
-    Args:
-        method: The scene and its program.
-        poses: All poses that may be looked at; boxes of them are bounded.
-        response: The cameras that may show them; None: one that shows what is rendered.
-    """
-
-    def __init__(self, method: Method, poses: PoseBox, response: CameraResponse | None = None) -> None:
-        self.frame: Frame = method.frame(poses)
-        self._response = response
-        self.pose_set = self.frame.pose_set
-        self._tiles = np.arange(self.frame.tile_count)
-
-    def image(self, values: Float64, member: SceneSample | None = None) -> np.ndarray:
-        check_cancelled()
-        render = self.frame.render if member is None else member
-        return assemble(render(np.asarray(values, np.float64)), self.frame.camera)
-
-    def scene_samples(self, seed: int) -> Iterator[SceneSample]:
-        return (
-            self.frame.scene_samples(seed) if self._response is None else self._response.scene_samples(self.frame, seed)
-        )
-
-    def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
-        tile_bounds = self.frame.bound(box, self._tiles, keep_linear=True)
-        linear, lower, upper = response_sets(tile_bounds, self.frame.camera, self._response)
-        return linear, lower, upper, tile_bounds.slopes
+# ---------------------------------------------------------------- the network
 
 
 @dataclass(frozen=True)
@@ -337,17 +285,20 @@ class Tube:
         sets: By step, from 0; as many as were found before the end or a reason to stop.
         controls: [steps, 2, m] least and most control of every step.
         slopes: [m] how much pictures moved by initial parameter, summed over the steps: what a cut may gain.
+        views: [sets, properties] lower bounds of the margins of `Loop.views` (L7); minus infinity: nothing is known.
         reason: Why it ends early, or "".
     """
 
     sets: tuple[AffineSet, ...]
     controls: Float64
     slopes: Float64
+    views: Float64
     reason: str = ""
 
-    def safe(self, unsafe: Sequence[Sequence[HalfSpace]]) -> float:
-        """Lower bound, over all steps and unsafe sets, of the distance to them along the best face (L4)."""
-        return min((clearance(step, unsafe) for step in self.sets), default=np.inf)
+    def safe(self, loop: Loop) -> float:
+        """Lower bound, over all steps, of the distance to unsafe sets along the best face, and of required margins."""
+        clearances = [clearance(step, loop.unsafe) for step in self.sets]
+        return float(min([*clearances, *self.views[:, : len(loop.required)].ravel()], default=np.inf))
 
     def inside(self, step: int, faces: Sequence[HalfSpace]) -> float:
         """Lower bound of how deep all states of a step lie inside a box."""
@@ -366,6 +317,7 @@ class TubeBuilder:
         registration: How far the scene may stand from its place along every world axis, all of a run through; needs a
             camera that moves along all of them. Otherwise the view's set may tell where the scene stands
             (`PoseBox.registered`).
+        views: What the properties of `Loop.views` are read off, in their order.
     """
 
     loop: Loop
@@ -373,6 +325,7 @@ class TubeBuilder:
     pilot: ControlBounds
     dependence: Dependence = "kept"
     registration: float = 0.0
+    views: tuple[PropertyView, ...] = ()
     _limits: tuple[Float64, Float64] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -409,13 +362,20 @@ class TubeBuilder:
         free = [k for k in range(len(lower)) if upper[k] > lower[k]]
         places = [cell.names.index(self.loop.names[k]) for k in free]
         slopes = np.zeros(cell.dimensions)
-        sets, controls = [state], []
+        sets, controls, views = [state], [], []
         reason = ""
         for step in range(self.loop.steps + 1):
             if not state.finite:
                 reason = f"the states of step {step} are not finite"
             elif not whole and not clearance(state, self.loop.unsafe) > 0.0:
                 reason = f"unsafe states cannot be ruled out at step {step}"
+            elif not whole and self.views:
+                margins, moved = self._view_margins(state, step)
+                views.append(margins)
+                if self.dependence == "kept":
+                    slopes[places] += moved[: len(places)]
+                if not (margins[: len(self.loop.required)] > 0.0).all():
+                    reason = f"unsafe pictures cannot be ruled out at step {step}"
             if reason or step == self.loop.steps:
                 break
             check_cancelled()
@@ -432,7 +392,7 @@ class TubeBuilder:
             controls.append(control)
         if self.dependence != "kept":
             slopes[:] = np.array(cell.upper) - np.array(cell.lower)
-        return Tube(tuple(sets), np.array(controls), slopes, reason)
+        return Tube(tuple(sets), np.array(controls), slopes, np.reshape(views, (len(views), len(self.views))), reason)
 
     def poses(self, state: AffineSet) -> AffineSet:
         """Parameters [d] of the camera's poses at the states of a set, and their float64 evaluations."""
@@ -453,26 +413,47 @@ class TubeBuilder:
         ]
         return np.array(ends)[:, 0], np.array(ends)[:, 1]
 
-    def _advanced(self, state: AffineSet) -> tuple[AffineSet, Float64, Float64] | str:
-        """One step (L4): the next set, least and most controls [2, m], and how much the picture moves by symbol."""
+    def _pose_box(self, state: AffineSet) -> tuple[ParameterBox, AffineSet] | None:
+        """The smallest box around the view's parameters at the states of a set, and their positions [-1, 1]^d in it.
+
+        None where the camera may leave the range of poses.
+        """
         pose = self.poses(state)
         low, high = pose.hull()
         if not ((low >= self._limits[0][: len(low)]) & (high <= self._limits[1][: len(high)])).all():
-            return "the camera may leave the range of poses"
+            return None
         if (place := self.place).size:
             low, high = np.concatenate([low, -place]), np.concatenate([high, place])
             none = np.zeros((place.size, pose.generators.shape[1]))
             pose = pose.beside(AffineSet(np.zeros(place.size), none, place, pose.first))
         names, units = self.view.pose_set.box.names, self.view.pose_set.box.units
-        linear, lower, upper, slopes = self.view.sets(
-            ParameterBox(names, units, tuple(low.tolist()), tuple(high.tolist()))
-        )
+        box = ParameterBox(names, units, tuple(low.tolist()), tuple(high.tolist()))
+        return box, _scaled(pose, *middle_half(low, high))
+
+    def _view_margins(self, state: AffineSet, step: int) -> tuple[Float64, Float64]:
+        """[properties] lower bounds of their margins at a step (L7), and how much the pictures move by symbol."""
+        margins, moved = np.full(len(self.views), -np.inf), np.zeros(state.generators.shape[1])
+        poses, goal = self._pose_box(state), self.loop.goal
+        for k, view in enumerate(self.views):
+            counts = k < len(self.loop.required) or (goal is not None and step in goal.steps(self.loop.steps))
+            if poses is not None and counts:
+                check_cancelled()
+                margins[k], slopes = view.bound(poses[0])
+                moved += slopes @ np.abs(poses[1].generators)
+        return margins, moved
+
+    def _advanced(self, state: AffineSet) -> tuple[AffineSet, Float64, Float64] | str:
+        """One step (L4): the next set, least and most controls [2, m], and how much the picture moves by symbol."""
+        poses = self._pose_box(state)
+        if poses is None:
+            return "the camera may leave the range of poses"
+        box, scaled = poses
+        linear, lower, upper, slopes = self.view.sets(box)
         if not all(np.isfinite(part).all() for part in (*linear, lower, upper)) or (lower > upper).any():
             return "the picture's bounds are not finite"
         controls = self.pilot.bound(linear, lower, upper)
         if controls is None:
             return "the network's bounds are not finite"
-        scaled = _scaled(pose, *middle_half(low, high))
         moved = np.abs(np.asarray(slopes, np.float64)) @ np.abs(scaled.generators)
         control = scaled.mapped(controls.slopes, controls.center, controls.radius)
         ends = control.hull()

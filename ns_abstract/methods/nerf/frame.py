@@ -23,7 +23,7 @@ from ns_abstract.methods.nerf.bounds import NerfBounds, RayBounds, Shifts, typic
 from ns_abstract.methods.nerf.ray_pictures import PixelRenderer, RayPictures
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
-from ns_abstract.methods.nerf.strips import FieldBounds, PoseStrips
+from ns_abstract.methods.nerf.strips import PoseStrips, RayBounder
 from ns_abstract.refine.protocol import LinearSets
 
 
@@ -134,7 +134,7 @@ class FieldFrame(RayPictures):
     """
 
     def __init__(
-        self, pose_set: PoseBox, renderer: PixelRenderer, bounds: FieldBounds, share: int, at_once: int, workers: int
+        self, pose_set: PoseBox, renderer: PixelRenderer, bounds: RayBounder, share: int, at_once: int, workers: int
     ) -> None:
         super().__init__(pose_set, renderer)
         self._geometry = pose_set.geometry

@@ -17,6 +17,8 @@ from ns_abstract.geometry.transform import DataparserTransform
 from ns_abstract.io.assumptions import Assumption
 
 FloatArray = NDArray[np.float64]
+#: Most layers of a network of densities.
+LAYERS_LIMIT = 8
 
 
 @dataclass(frozen=True)

@@ -6,13 +6,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
+from numba import njit
 from torch import Tensor
 
 from ns_abstract.arithmetic.rounding import HUE_ROOM, HUE_ROUNDING
 from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseBox
 
-Float64Array = NDArray[np.float64]
 Range = tuple[float, float]
 
 
@@ -45,57 +44,59 @@ def shifted(rgb: Tensor, hue: Tensor | float, saturation: Tensor | float) -> Ten
     return low[..., None] + (value - low)[..., None] * (2.0 - distance).clamp(0.0, 1.0)
 
 
-def _hues(low: Float64Array, high: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """[n] bounds of the hue (sixths of a turn) of boxes of colours [n, 3]; six apart where it may be any.
+@njit(cache=True, error_model="numpy")
+def _hues(low, high):
+    """Bounds of the hue (sixths of a turn) of a box of colours [3]; six apart where it may be any.
 
     Where one channel is the largest (least) all over the box, the hue is monotone in each channel, so its ends are
     at corners.
     """
-    first, last = np.zeros(len(low)), np.full(len(low), 6.0)
-    for extreme in (False, True):
+    first, last = 0.0, 6.0
+    for largest in (False, True):
         for i in range(3):
             j, k = (i + 1) % 3, (i + 2) % 3
-            with np.errstate(divide="ignore", invalid="ignore"):
-                if extreme:
-                    sure = (low[:, i] > high[:, j]) & (low[:, i] > high[:, k])
-                    centre, up, down = 2.0 * i, j, k
-
-                    def part(c, a, b):
-                        return (a - b) / (c - np.minimum(a, b))
-                else:
-                    sure = (high[:, i] < low[:, j]) & (high[:, i] < low[:, k])
-                    centre, up, down = 2.0 * i + 3.0, k, j
-
-                    def part(c, a, b):
-                        return (a - b) / (np.maximum(a, b) - c)
-
-                ends = [part(c[:, i], high[:, up], low[:, down]) for c in (low, high)]
-                starts = [part(c[:, i], low[:, up], high[:, down]) for c in (low, high)]
-            first[sure] = centre + np.clip(np.minimum(*starts), -1.0, 1.0)[sure]
-            last[sure] = centre + np.clip(np.maximum(*ends), -1.0, 1.0)[sure]
+            if largest:
+                sure, centre, up, down = low[i] > high[j] and low[i] > high[k], 2.0 * i, j, k
+            else:
+                sure, centre, up, down = high[i] < low[j] and high[i] < low[k], 2.0 * i + 3.0, k, j
+            if not sure:
+                continue
+            start, end = np.inf, -np.inf
+            for c in (low[i], high[i]):
+                for a, b in ((low[up], high[down]), (high[up], low[down])):
+                    part = (a - b) / (c - min(a, b) if largest else max(a, b) - c)
+                    start, end = min(start, part), max(end, part)
+            first, last = centre + min(max(start, -1.0), 1.0), centre + min(max(end, -1.0), 1.0)
     return first - HUE_ROOM, last + HUE_ROOM
 
 
-def shifted_bounds(
-    low: Float64Array, high: Float64Array, hue: Range, saturation: Range
-) -> tuple[Float64Array, Float64Array]:
-    """Bounds [n, 3] of `shifted` over boxes of colours [n, 3] and intervals of both shifts (design.md, F9)."""
+@njit(cache=True, error_model="numpy")
+def shift_box(low, high, hue, saturation, down, up):
+    """Write bounds [3] of `shifted` over a box of colours [3] and intervals of both shifts (design.md, F9)."""
     first, last = _hues(low, high)
-    value_low, value_high = low.max(axis=1)[:, None], high.max(axis=1)[:, None]
-    taken = [saturation[1] * v for v in (value_low, value_high)]
-    scaled = [saturation[0] * v for v in (value_low, value_high)]
-    least = np.clip(low.min(axis=1)[:, None] - np.maximum(*taken), 0.0, value_low)
-    most = np.clip(high.min(axis=1)[:, None] - np.minimum(*scaled), 0.0, value_high)
-    centre = np.array([0.0, 2.0, 4.0])
-    start = (first + 6.0 * hue[0])[:, None] - centre
-    width = (last - first + 6.0 * (hue[1] - hue[0]) + 2.0 * HUE_ROOM)[:, None]
-    start = np.mod(start - HUE_ROOM + 3.0, 6.0) - 3.0
-    end = start + width
-    # where a range goes on beyond half a turn, so does its end, and the share is 0
-    far = np.maximum(np.abs(start), np.abs(end))
-    near = np.minimum(np.abs(start), np.abs(np.where(end >= 3.0, end - 6.0, end)))
-    near = np.where(((start <= 0.0) & (end >= 0.0)) | (end >= 6.0), 0.0, near)
-    share_low, share_high = np.clip(2.0 - far, 0.0, 1.0), np.clip(2.0 - near, 0.0, 1.0)
-    down = least + (value_low - least) * share_low - HUE_ROUNDING
-    up = most + (value_high - most) * share_high + HUE_ROUNDING
-    return np.clip(down, 0.0, 1.0), np.clip(up, 0.0, 1.0)
+    value_low, value_high = max(low[0], low[1], low[2]), max(high[0], high[1], high[2])
+    taken = max(saturation[1] * value_low, saturation[1] * value_high)
+    scaled = min(saturation[0] * value_low, saturation[0] * value_high)
+    least = min(max(min(low[0], low[1], low[2]) - taken, 0.0), value_low)
+    most = min(max(min(high[0], high[1], high[2]) - scaled, 0.0), value_high)
+    width = last - first + 6.0 * (hue[1] - hue[0]) + 2.0 * HUE_ROOM
+    for c in range(3):
+        start = (first + 6.0 * hue[0] - 2.0 * c - HUE_ROOM + 3.0) % 6.0 - 3.0
+        end = start + width
+        # where a range goes on beyond half a turn, so does its end, and the share is 0
+        far = max(abs(start), abs(end))
+        near = min(abs(start), abs(end - 6.0 if end >= 3.0 else end))
+        if (start <= 0.0 and end >= 0.0) or end >= 6.0:
+            near = 0.0
+        share_low, share_high = min(max(2.0 - far, 0.0), 1.0), min(max(2.0 - near, 0.0), 1.0)
+        down[c] = min(max(least + (value_low - least) * share_low - HUE_ROUNDING, 0.0), 1.0)
+        up[c] = min(max(most + (value_high - most) * share_high + HUE_ROUNDING, 0.0), 1.0)
+
+
+@njit(cache=True, error_model="numpy")
+def shifted_bounds(low, high, hue, saturation):
+    """Bounds [n, 3] of `shifted` over boxes of colours [n, 3] and intervals of both shifts."""
+    down, up = np.empty_like(low), np.empty_like(high)
+    for i in range(low.shape[0]):
+        shift_box(low[i], high[i], hue, saturation, down[i], up[i])
+    return down, up

@@ -24,6 +24,7 @@ from ns_abstract.methods import config_keys, runs
 from ns_abstract.methods.checkpoint import StoredTensor, to_float32
 from ns_abstract.methods.nerf import model_state
 from ns_abstract.methods.nerf.hash_field import (
+    LAYERS_LIMIT,
     DenseNet,
     HashEncoding,
     NerfactoField,
@@ -45,7 +46,7 @@ _SAMPLES_LIMIT, _ROUNDS_LIMIT, _WIDTH_LIMIT, _FAR_LIMIT = 4096, 8, 4096, 1e6
 _BYTES = 12
 #: nerfstudio/fields/density_fields.py: defaults of a proposal field, and values that each may have.
 _PROPOSAL = {
-    "num_layers": (2, 1, 8),
+    "num_layers": (2, 1, LAYERS_LIMIT),
     "hidden_dim": (64, 1, _WIDTH_LIMIT),
     "num_levels": (8, 1, _LEVELS_LIMIT),
     "max_res": (1024, 1, _RESOLUTION_LIMIT),

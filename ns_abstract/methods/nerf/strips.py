@@ -79,7 +79,7 @@ class StripLayout:
     displacement: float
 
 
-class FieldBounds(Protocol):
+class RayBounder(Protocol):
     """Bounds of a field's rays over boxes of poses."""
 
     #: Half the way of a sample over a first cell, as learned from earlier rays.
@@ -118,7 +118,7 @@ class PoseStrips:
         run: Bounds groups of rays, here or in other processes.
     """
 
-    def __init__(self, bounds: FieldBounds, pose_set: PoseBox, pixels: np.ndarray, run: Run) -> None:
+    def __init__(self, bounds: RayBounder, pose_set: PoseBox, pixels: np.ndarray, run: Run) -> None:
         self.bounds, self.pose_set, self.geometry = bounds, pose_set, pose_set.geometry
         self.pixels, self.run = pixels, run
         self.poses = self.geometry.box

@@ -6,7 +6,8 @@ import numpy as np
 
 from ns_abstract.arithmetic.simd.lanes import LINE
 from ns_abstract.arithmetic.simd.products import ROWS
-from ns_abstract.methods.nerf.hash_bounds.distribution import edges_of, light_of
+from ns_abstract.methods.nerf.hash_bounds.edges import edges_of
+from ns_abstract.methods.nerf.hash_bounds.light import light_of
 from ns_abstract.methods.nerf.hash_bounds.network import (
     HeadWeights,
     NetWeights,
@@ -16,7 +17,7 @@ from ns_abstract.methods.nerf.hash_bounds.network import (
     zonotope,
 )
 from ns_abstract.methods.nerf.hash_bounds.pieces import DensityArrays, FieldArrays, PieceRoom, form_width
-from ns_abstract.methods.nerf.hash_field import DenseNet, HashEncoding, NerfactoField
+from ns_abstract.methods.nerf.hash_field import LAYERS_LIMIT, DenseNet, HashEncoding, NerfactoField
 
 #: Harmonics of a direction.
 HARMONICS = 16
@@ -50,10 +51,11 @@ def field_arrays(field: NerfactoField) -> FieldArrays:
     )
 
 
-def _rooms(net: NetWeights, symbols: int) -> tuple[Zonotope, ...]:
-    """Neurons of every layer; ``symbols`` rows before its first ReLU."""
+def _rooms(net: NetWeights, symbols: int, layers: int = 0) -> tuple[Zonotope, ...]:
+    """Neurons of every layer, at least ``layers``; ``symbols`` rows before its first ReLU."""
     rows = symbols + int(net.sizes[1:-1].sum())
-    return tuple(zonotope(rows, int(n)) for n in net.sizes[1:])
+    found = tuple(zonotope(rows, int(n)) for n in net.sizes[1:])
+    return found + (zonotope(1, 1),) * (layers - len(found))
 
 
 def piece_room(field: NerfactoField, arrays: FieldArrays, dimensions: int) -> PieceRoom:
@@ -61,11 +63,12 @@ def piece_room(field: NerfactoField, arrays: FieldArrays, dimensions: int) -> Pi
     n = form_width(dimensions)
     densities = (*arrays.proposals, arrays.density)
     features = [one.table.shape[0] * one.table.shape[2] for one in densities]
-    rooms = tuple(_rooms(one.net, n + 2 + count) for one, count in zip(densities, features, strict=True))
+    pairs = zip(densities, features, strict=True)
+    rooms = tuple(_rooms(one.net, n + 2 + count, LAYERS_LIMIT) for one, count in pairs)
     head: HeadWeights = arrays.head
     neurons = int(head.net.sizes[1])
     most = max(int(net.sizes.max()) for net in (head.net, *(one.net for one in densities)))
-    forms = np.zeros((3, n + 3))
+    forms, count = np.zeros((3, n + 3)), field.samples[-1]
     return PieceRoom(
         (np.zeros((24, n + 3)), np.zeros((2, n + 4))),
         (forms, forms.copy(), np.zeros((3, 3, n + 3)), np.zeros((3, 3, n + 3)), np.zeros(3, np.bool_)),
@@ -74,8 +77,8 @@ def piece_room(field: NerfactoField, arrays: FieldArrays, dimensions: int) -> Pi
         tuple(edges_of(count, n) for count in field.samples),
         tuple(light_of(count, n) for count in field.samples),
         rooms,
-        _rooms(head.net, rooms[-1][-1].rows.shape[0]),
-        (np.zeros((field.samples[-1], 3, n + 4)), np.zeros((2, field.samples[-1], 3))),
+        _rooms(head.net, rooms[-1][0].rows.shape[0]),
+        (np.zeros((count, 3, n + 4)), np.zeros((2, count, 3)), np.zeros((2, count, 3))),
         np.zeros(most, np.int64),
         np.zeros((ROWS, 2 * LINE // 8)),
     )  # fmt: skip

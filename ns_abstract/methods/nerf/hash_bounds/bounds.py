@@ -87,28 +87,28 @@ class HashBounds:
     ) -> RayBounds:
         """Bounds of the colours of ``pixels`` [n, 2] over every pose of ``box``; see `NerfBounds.rays`.
 
-        Opacities are not told, so those that are ``known`` are not looked at; there are no ``shifts``.
+        Opacities are not told, so those that are ``known`` are not looked at.
         """
-        assert not shifts
         n, d, displacement = len(pixels), box.dimensions, self.displacement
         bundle = RayBundle(pose_set, box, pixels, self.taylor)
         moves = bundle.displacement(self.distances, self.lengths)[:, 0]
         counts = np.ones(d, np.int64) if division is None else np.array(division.parts, np.int64)
         alpha = np.ones((n, 1), np.float32)
         cells = self._first_cells(moves, displacement)
-        bounds_by_part = np.zeros((n, max(1, int(counts.prod())), 2, 3))
-        bounds_by_part[:, :, 1] = 1.0
+        ranges = np.array(shifts or [], np.float64).reshape(-1, 2, 2)
+        bounds_by_part = np.zeros((n, max(1, len(ranges)), max(1, int(counts.prod())), 2, 3))
+        bounds_by_part[..., 1, :] = 1.0
         bounded = np.zeros((n, 3), np.int64)
         if cells is not None and bundle.finite:
             goal = np.stack([np.full((n, 3), np.inf), np.full((n, 3), -np.inf), np.full((n, 3), tolerance)], axis=1)
             if aim is not None:
                 goal[:, 0], goal[:, 1], goal[:, 2] = aim[0], aim[1], _TUNING.rest * tolerance
-            self._run(bundle, cells, goal, tolerance, counts, bounds_by_part, bounded)
+            self._run(bundle, cells, goal, tolerance, ranges, counts, bounds_by_part, bounded)
             displacement = self._learned(displacement, bounded)
-        low, high = bounds_by_part[:, :, 0], bounds_by_part[:, :, 1]
-        found = RayBounds(low.min(axis=1), high.max(axis=1), alpha, int(bounded[:, 1].sum()), displacement)
+        low, high = bounds_by_part[..., 0, :], bounds_by_part[..., 1, :]
+        found = RayBounds(low.min(axis=(1, 2)), high.max(axis=(1, 2)), alpha, int(bounded[:, 1].sum()), displacement)
         if division is not None:
-            shape = n, 1, *division.parts, 3
+            shape = n, low.shape[1], *division.parts, 3
             found.parts = np.stack(outward(low.reshape(shape), high.reshape(shape)))
         return found
 
@@ -123,8 +123,8 @@ class HashBounds:
         return cells.astype(np.int64)
 
     def _run(
-        self, bundle: RayBundle, cells: np.ndarray, goal: np.ndarray, tolerance: float, counts: np.ndarray,
-        bounds_by_part: np.ndarray, bounded: np.ndarray,
+        self, bundle: RayBundle, cells: np.ndarray, goal: np.ndarray, tolerance: float, shifts: np.ndarray,
+        counts: np.ndarray, bounds_by_part: np.ndarray, bounded: np.ndarray,
     ) -> None:  # fmt: skip
         d = cells.shape[1]
         origin_radius, direction_radius = bundle.rounded
@@ -138,8 +138,8 @@ class HashBounds:
             )
             most = _TUNING.most + 16 * int(cells[some].prod(axis=1).max())
             pieces.bound_rays(
-                self.arrays, rays, cells[some], _TUNING.deeper * d, most, goal[some], limits, room, counts,
-                bounds_by_part[some], bounded[some],
+                self.arrays, rays, cells[some], _TUNING.deeper * d, most, goal[some], limits, shifts, room,
+                counts, bounds_by_part[some], bounded[some],
             )  # fmt: skip
         self._rooms.append(room)
 

@@ -10,8 +10,9 @@ from ns_abstract.arithmetic.rounding import (
     HASH_SAMPLE_ROUNDING,
     HASH_UP,
 )
-from ns_abstract.methods.nerf.hash_bounds.distribution import _functional, times
 from ns_abstract.methods.nerf.hash_bounds.forms import exp_above, exp_below, pose_range
+from ns_abstract.methods.nerf.hash_bounds.light import depths_functional, times
+from ns_abstract.methods.nerf.hsv import shift_box
 
 
 @njit(cache=True, error_model="numpy")
@@ -39,6 +40,27 @@ def interval_colors(light, count, low, high, background, last, out):
     slack = HASH_SAMPLE_ROUNDING * (count + 4.0)
     out[0] -= slack
     out[1] += slack
+
+
+@njit(cache=True, error_model="numpy")
+def shifted_interval_colors(light, count, colors, shift, background, last, room, out):
+    """`interval_colors` [2, 3] where hue and saturation are added to all samples' colours (design.md, F9).
+
+    Args:
+        light, count: `Light` and N.
+        colors: [2, N, 3] bounds of colours before the shift.
+        shift: [2, 2] intervals of hue (turns) and saturation.
+        background, last: See `interval_colors`.
+        room: [2, N, 3] scratch.
+        out: [2, 3] in [0, 1]; overwritten.
+    """
+    for i in range(count):
+        shift_box(colors[0, i], colors[1, i], shift[0], shift[1], room[0, i], room[1, i])
+    interval_colors(light, count, room[0], room[1], background, last, out)
+    for c in range(3):
+        out[0, c], out[1, c] = min(max(out[0, c], 0.0), 1.0), min(max(out[1, c], 0.0), 1.0)
+        if not out[0, c] <= out[1, c]:
+            out[0, c], out[1, c] = 0.0, 1.0
 
 
 @njit(cache=True, error_model="numpy")
@@ -76,7 +98,7 @@ def _products(light, count, i, whole, color, line):
     moved = slope * light.total[i + 1, 1] - here[1] * light.total[i, 1]
     other = abs(slope * light.total[i + 1, 2] - here[1] * light.total[i, 2]) + here[3]
     other += abs(here[2]) if whole else there[3] + abs(there[2] - here[2])
-    other += _functional(light, i + 1, i, 0.0, -here[1], slope, (0.0, 0.0), 1.0)
+    other += depths_functional(light, i + 1, i, 0.0, -here[1], slope, (0.0, 0.0), 1.0)
     bend = moved * color[1]
     followed = abs(moved) * (reach - abs(color[1])) + other * reach
     if followed < apart:

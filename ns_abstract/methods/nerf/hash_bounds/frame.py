@@ -8,7 +8,6 @@ from typing import Any
 from ns_abstract.execution.cancellation import WorkCancelledError
 from ns_abstract.execution.threads import each
 from ns_abstract.geometry.poses import PoseBox
-from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.bounds import RayBounds
 from ns_abstract.methods.nerf.frame import FieldFrame
 from ns_abstract.methods.nerf.hash_bounds.bounds import HashBounds
@@ -34,15 +33,7 @@ class NerfactoFrame(FieldFrame):
         super().__init__(pose_set, NerfactoRenderer(scene.field), bounds, _SHARE, at_once, workers)
 
     def _tried(self, calls: Sequence[Sequence[Any]]) -> list[RayBounds | None]:
-        """See `FieldFrame`; in threads.
-
-        Raises:
-            InputError: The set shifts colours.
-        """
-        if any(call[6] for call in calls):
-            raise InputError(
-                "colours of nerfacto that are shifted are not bounded", field="hue", fix="leave out hue and saturation"
-            )
+        """See `FieldFrame`; in threads."""
 
         def bounded(call: Sequence[Any]) -> RayBounds | None:
             try:

@@ -189,13 +189,13 @@ def finish(rooms, count, weights, live, rest):
     """The layers behind the first one, whose neurons before their ReLU are in ``rooms[0]``; returns the rows.
 
     Args:
-        rooms: `Zonotope` of every layer.
+        rooms: `Zonotope` of every layer, and more.
         count: Rows of the first.
         weights: `NetWeights`.
         live: [most neurons] scratch.
         rest: [ROWS, two lines] scratch.
     """
-    for layer in range(1, len(rooms)):
+    for layer in range(1, weights.sizes.shape[0] - 1):
         z = rooms[layer - 1]
         n = weights.sizes[layer]
         count, alive = relu(z, count, n, live)

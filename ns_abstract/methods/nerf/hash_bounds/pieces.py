@@ -19,18 +19,11 @@ from ns_abstract.methods.nerf.hash_bounds.composition import (
     form_bounds,
     form_color,
     interval_colors,
+    shifted_interval_colors,
     weight_bounds,
 )
-from ns_abstract.methods.nerf.hash_bounds.distribution import (
-    Edges,
-    Light,
-    add_depth,
-    begin,
-    follow,
-    give_up,
-    middle_of,
-    space,
-)
+from ns_abstract.methods.nerf.hash_bounds.distribution import follow
+from ns_abstract.methods.nerf.hash_bounds.edges import Edges, middle_of, space
 from ns_abstract.methods.nerf.hash_bounds.features import level_features
 from ns_abstract.methods.nerf.hash_bounds.forms import (
     apply_band,
@@ -40,6 +33,7 @@ from ns_abstract.methods.nerf.hash_bounds.forms import (
     form_range,
     sigmoid_band,
 )
+from ns_abstract.methods.nerf.hash_bounds.light import Light, add_depth, begin, give_up
 from ns_abstract.methods.nerf.hash_bounds.network import (
     HeadWeights,
     NetWeights,
@@ -100,8 +94,8 @@ class PieceRoom(NamedTuple):
         directions: [16, n + 3] harmonics, and what the first layer makes of them.
         features: [features, n + 3] of the widest encoding.
         edges, light: Of every round.
-        rooms: Networks' neurons by round, then those of colours.
-        colors: [N, 3, n + 4] forms, and [2, N, 3] bounds.
+        rooms: Neurons of density networks by round, of as many layers for each; ``head``: of the network of colours.
+        colors: [N, 3, n + 4] forms, [2, N, 3] bounds, and as many numbers of scratch.
         live, rest: Scratch of layers.
     """
 
@@ -113,7 +107,7 @@ class PieceRoom(NamedTuple):
     light: tuple[Light, ...]
     rooms: tuple[tuple[Zonotope, ...], ...]
     head: tuple[Zonotope, ...]
-    colors: tuple[np.ndarray, np.ndarray]
+    colors: tuple[np.ndarray, np.ndarray, np.ndarray]
     live: np.ndarray
     rest: np.ndarray
 
@@ -166,7 +160,7 @@ def density_of(field, place, line, rooms, room, out):
         )  # fmt: skip
     count = from_features(room.features[: levels * features], field.net, rooms[0])
     count = finish(rooms, count, field.net, room.live, room.rest)
-    output_form(rooms[len(rooms) - 1], count, 0, out.shape[0] - 1, out)
+    output_form(rooms[field.net.sizes.shape[0] - 2], count, 0, out.shape[0] - 1, out)
     return count
 
 
@@ -196,14 +190,14 @@ def _sample(field, edges, light, i, line, rooms, room):
 @njit(cache=True, error_model="numpy", nogil=True)
 def _color(field, edges, i, count, line, rooms, room):
     """Fill in the colours of sample ``i`` from ``count`` rows of the density's network."""
-    forms, bounds = room.colors
+    forms, bounds, _ = room.colors
     work = room.work[0]
     distance, value, out = work[0], work[1], work[2]
     n = out.shape[0] - 3
     start, stop = middle_of(edges, i, distance)
     rows = colors(
-        rooms[len(rooms) - 1], count, (room.directions[1], room.directions[2]), field.head, room.head, room.live,
-        room.rest,
+        rooms[field.density.net.sizes.shape[0] - 2], count, (room.directions[1], room.directions[2]), field.head,
+        room.head, room.live, room.rest,
     )  # fmt: skip
     for c in range(3):
         output_form(room.head[len(room.head) - 1], rows, c, n + 2, value)
@@ -276,6 +270,9 @@ def bound_piece(field, rays, ray, middle, half, limits, room, out, shown):
         room: `PieceRoom`.
         out: [2, 3]; overwritten: [0, 1] where nothing is known.
         shown: [3, n + 3] forms of the colours (`composition.form_color`), of infinite radius where nothing is known.
+
+    Returns:
+        Whether something is known: the light and colours of the samples in ``room``.
     """
     out[0], out[1] = 0.0, 1.0
     shown[:] = 0.0
@@ -287,14 +284,14 @@ def bound_piece(field, rays, ray, middle, half, limits, room, out, shown):
         edges, light, following = room.edges[r], room.light[r], room.edges[r + 1]
         count = light.least.shape[0]
         if not _round(field.proposals[r], edges, light, count, limits.dark[0], line, room.rooms[r], room):
-            return
+            return False
         wanted = following.low.shape[0]
         if not follow(light, count, edges, wanted, line, following, work[:3]):
-            return
+            return False
         for j in range(wanted):
             space(following, j, field.spacing, line, work)
     edges, light, rooms = room.edges[rounds], room.light[rounds], room.rooms[rounds]
-    forms, bounds = room.colors
+    forms, bounds, _ = room.colors
     count, n = light.least.shape[0], work.shape[1] - 3
     forms[:] = 0.0
     forms[:, :, 0] = 0.5
@@ -304,7 +301,7 @@ def bound_piece(field, rays, ray, middle, half, limits, room, out, shown):
     for i in range(count):
         known, rows = _sample(field.density, edges, light, i, line, rooms, room)
         if not known:
-            return
+            return False
         whole = field.last and i == count - 1
         if rows > 0 and weight_bounds(light, i, whole)[1] > limits.dim:
             _color(field, edges, i, rows, line, rooms, room)
@@ -319,6 +316,7 @@ def bound_piece(field, rays, ray, middle, half, limits, room, out, shown):
         out[1, c] = min(max(min(out[1, c], high), 0.0), 1.0)
         if not out[0, c] <= out[1, c]:
             out[0, c], out[1, c] = 0.0, 1.0
+    return True
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
@@ -406,7 +404,7 @@ def _keep(out, counts, place, cells, found, shown, line, low, high):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def bound_ray(field, rays, ray, cells, deepest, most, goal, limits, room, counts, out):
+def bound_ray(field, rays, ray, cells, deepest, most, goal, limits, shifts, room, counts, out):
     """Bounds of a ray by part of the box, pieces halved until they are good or as small as allowed (design.md, H8).
 
     Args:
@@ -414,8 +412,9 @@ def bound_ray(field, rays, ray, cells, deepest, most, goal, limits, room, counts
         cells: [d] first pieces by axis.
         deepest, most: Halvings of these, and pieces in all.
         goal: [3, 3] bounds between which all is good, and a form's rest that is good wherever it lies.
+        shifts: [s, 2, 2] intervals of hue and saturation that are added to the samples' colours; none: they stay.
         counts: [d] parts by axis.
-        out: [parts, 2, 3]; overwritten.
+        out: [s or 1, parts, 2, 3] bounds by shift; overwritten.
 
     Returns:
         The number of first pieces, of pieces that were bounded, and of those that were kept.
@@ -436,7 +435,7 @@ def bound_ray(field, rays, ray, cells, deepest, most, goal, limits, room, counts
             stack[i, 0, k], stack[i, 1, k] = rest % cells[k], cells[k]
             rest //= cells[k]
         known[i, 0], known[i, 1] = 0.0, 1.0
-    out[:, 0], out[:, 1] = 1.0, 0.0
+    out[:, :, 0], out[:, :, 1] = 1.0, 0.0
     height, tried, kept = first, 0, 0
     while height:
         height -= 1
@@ -444,7 +443,7 @@ def bound_ray(field, rays, ray, cells, deepest, most, goal, limits, room, counts
             place, count = stack[height, 0, k], stack[height, 1, k]
             middle[k] = (2.0 * place + 1.0) / count - 1.0
             half[k] = 1.0 / count + PIECE_END_ROUNDING
-        bound_piece(field, rays, ray, middle, half, limits, room, found, shown)
+        sampled = bound_piece(field, rays, ray, middle, half, limits, room, found, shown)
         tried += 1
         good = True
         for c in range(3):
@@ -455,7 +454,17 @@ def bound_ray(field, rays, ray, cells, deepest, most, goal, limits, room, counts
             good &= inside or shown[c, -1] <= goal[2, c]
         if good or depth[height] >= deepest or tried + height >= most:
             kept += 1
-            _keep(out, counts, stack[height, 0], stack[height, 1], found, shown, d == 1, low, high)
+            if not shifts.shape[0]:
+                _keep(out[0], counts, stack[height, 0], stack[height, 1], found, shown, d == 1, low, high)
+            for s in range(shifts.shape[0]):
+                found[0], found[1] = 0.0, 1.0
+                shown[:, -1] = np.inf
+                if sampled:
+                    shifted_interval_colors(
+                        room.light[len(room.light) - 1], room.light[len(room.light) - 1].least.shape[0],
+                        room.colors[1], shifts[s], field.background, field.last, room.colors[2], found,
+                    )  # fmt: skip
+                _keep(out[s], counts, stack[height, 0], stack[height, 1], found, shown, d == 1, low, high)
             continue
         axis = _longest_axis(rays, ray, half)
         stack[height, 0, axis] *= 2
@@ -471,17 +480,17 @@ def bound_ray(field, rays, ray, cells, deepest, most, goal, limits, room, counts
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def bound_rays(field, rays, cells, deepest, most, goal, limits, room, counts, out, pieces):
+def bound_rays(field, rays, cells, deepest, most, goal, limits, shifts, room, counts, out, pieces):
     """`bound_ray` of all rays.
 
     Args:
         cells: [r, d].
         goal: [r, 3, 3].
-        out: [r, parts, 2, 3]; overwritten.
+        out: [r, s or 1, parts, 2, 3]; overwritten.
         pieces: [r, 3] what `bound_ray` returns; overwritten.
     """
     for k in range(cells.shape[0]):
-        pieces[k] = bound_ray(field, rays, k, cells[k], deepest, most, goal[k], limits, room, counts, out[k])
+        pieces[k] = bound_ray(field, rays, k, cells[k], deepest, most, goal[k], limits, shifts, room, counts, out[k])
 
 
 def form_width(dimensions: int) -> int:
