@@ -248,7 +248,7 @@ class _BoxSearch:
         """A tree over bounds with so many steps for intermediate ones, and the groups that its root leaves open."""
         cells = NetworkBounds(
             self.bounded, images, "everywhere", self.memory, self.arithmetic, 1, intermediate_steps=steps,
-            asked=family.unsafe.rows,
+            asked=family.unsafe.rows, coarse=True,
         )  # fmt: skip
         tree, left = PhaseTree(cells, family.unsafe.rows, family.offset[which]), []
         for group in groups:

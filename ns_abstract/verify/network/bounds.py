@@ -85,6 +85,7 @@ class NetworkBounds:
 
     Args:
         asked: [k, output_size] rows of which bounds will be asked; None: any.
+        coarse: See `IntermediateBounds`.
 
     Attributes:
         intermediate: What is known of the nodes.
@@ -104,13 +105,14 @@ class NetworkBounds:
         sharing: CoefficientSource | None = None,
         intermediate_steps: int = 0,
         asked: Float64 | None = None,
+        coarse: bool = False,
     ) -> None:
         sharing = CoefficientSource() if sharing is None else sharing
         fields, good = finite(images)
         middle = sharing.about(middle_of(fields))
         image = planes_of(fields, middle, network.input_shape, substitution)
         self.intermediate = intermediate = sharing.intermediate = IntermediateBounds(
-            network, image, middle, good, arithmetic, assumed
+            network, image, middle, good, arithmetic, assumed, coarse
         )
         schedule = WorkBudget(network)
         backward = BackwardPass(intermediate, memory, schedule.deep)
