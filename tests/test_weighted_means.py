@@ -1,4 +1,4 @@
-"""Weighted means written about their value at one input (design.md, N23)."""
+"""Weighted means written about their value at one input (design.md, N26)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which numbers of a network some rows on its outputs depend on: the others need no better bounds."""
+"""Which numbers of a network some rows on its outputs depend on: the others need no better bounds (design.md, V11)."""
 
 from __future__ import annotations
 
