@@ -103,6 +103,30 @@ def test_boxes_of_cases(tmp_path: Path) -> None:
     assert found == {"reached": "sat", "missed": "unsat"}
 
 
+def test_runs_of_bounds_mean_what_single_ones_mean(tmp_path: Path) -> None:
+    """Many bounds next to each other are read together; a second space keeps them apart."""
+    rng = np.random.default_rng(5)
+    names = [f"X_{k}" for k in range(12)]
+    declare = "".join(f"(declare-const {name} Real)\n" for name in [*names, "Y_0"])
+    ways = []
+    for way in range(3):
+        parts = [f"({sign} {name} {v!r})" for name in names for sign, v in ((">=", way - 9.0), ("<=", rng.normal()))]
+        # the same input again, a number with an exponent, and a bound of an output in between
+        parts += ["(<= X_3 -1.25)", "(>= X_3 -9.5e0)", f"(<= Y_0 {way}.5)", *parts[:9], "(<= X_4 -2)"]
+        ways.append(f"(and {' '.join(parts)})")
+    text = declare + f"(assert (or\n{chr(10).join(ways)}))"
+    found = [load_regions(tmp_path, 12, 1, one) for one in (text, text.replace("= X", "=  X"))]
+    assert len(found[0]) == 3
+    for one, other in zip(*found, strict=True):
+        np.testing.assert_array_equal(one.lower, other.lower)
+        np.testing.assert_array_equal(one.upper, other.upper)
+        np.testing.assert_array_equal(one.unsafe.offset, other.unsafe.offset)
+    assert found[0][0].upper[3] == -1.25 and found[0][1].upper[4] <= -2.0
+    for bad, said in (("(<= X_12 1.0)", "X_12"), ("(<= X_1 1e999)", "1e999"), ("(<= X_1 1.2.3)", "1.2.3")):
+        with pytest.raises(InputError, match=said):
+            load_regions(tmp_path, 12, 1, text.replace("(<= X_3 -1.25)", bad))
+
+
 @pytest.mark.slow
 def test_unsafe_instances_are_never_proved(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What one input reaches exactly is unsafe: found or unknown, never proved; counterexamples are re-run."""

@@ -1,17 +1,21 @@
-"""Weighted means written about their value at one input (design.md, N23)."""
+"""Weighted means written about their value at one input (design.md, N26)."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from ns_abstract.verify.network import ImageSets, Network, bound_outputs
+from ns_abstract.execution.cancellation import Deadline
+from ns_abstract.verify import box_decisions
+from ns_abstract.verify.network import ImageSets, Network, NetworkArithmetic, bound_outputs
 from ns_abstract.verify.network.activations import Power, Reciprocal
 from ns_abstract.verify.network.composite_layers import CompositeBuilder
 from ns_abstract.verify.network.weighted_means import centred
+from ns_abstract.verify.vnnlib import InputRegion, UnsafeSet
 
 WEIGHTS = np.array([[10.0, 20.0, 40.0, 80.0, 160.0, 320.0], [3.0, 1.0, 4.0, 1.0, 5.0, 9.0]])
 
@@ -64,3 +68,24 @@ def test_large_sums_have_tight_reciprocals(shift: float) -> None:
     least, most = Reciprocal((1,)).range(lower, upper)
     assert 0.999 / 1.2e8 < float(least) <= 1 / 1.2e8
     assert 1 / float(lower) <= float(most) < 1.001 / 1e8
+
+
+def test_float32_computes_something_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is equal in real arithmetic is bounded where that is asked for, and only there."""
+    network, seen = mean_network(), []
+
+    def noticed(*given: Any) -> Network:
+        seen.append(given)
+        return centred(*given)
+
+    def run(x: np.ndarray) -> np.ndarray:
+        with torch.no_grad():
+            return network(torch.from_numpy(x).double()).numpy()
+
+    monkeypatch.setattr(box_decisions, "centred", noticed)
+    unsafe = UnsafeSet(np.array([[1.0, 0.0]]), np.zeros(1), ((0,),), 0)
+    region = InputRegion(np.full(4, -0.1), np.full(4, 0.1), unsafe)
+    kinds: tuple[tuple[NetworkArithmetic, int], ...] = (("float32", 0), ("real", 1))
+    for arithmetic, count in kinds:
+        found = box_decisions.decide(network, run, [region], Deadline(60.0), arithmetic=arithmetic)
+        assert found.word == "unsat" and len(seen) == count

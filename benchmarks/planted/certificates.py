@@ -312,6 +312,33 @@ CERTIFICATES = (
         "test_phase_tree.py::test_claims_next_to_the_exact_minimum[real]",
     ),
     Fault(
+        "weighted means: any sum is a mean's",
+        "verify/network/weighted_means.py", "_mean", "bool((total.weight == 1.0).all())", "True",
+        "test_weighted_means.py::test_numbers_that_are_no_shares_stay",
+    ),
+    Fault(
+        "weighted means: differences of weights are rounded",
+        "verify/network/weighted_means.py", "_moved", "np.isfinite(moved).all() and all(exact)",
+        "np.isfinite(moved).all()", "test_weighted_means.py::test_numbers_that_are_no_shares_stay",
+    ),
+    Fault(
+        "weighted means: float32 computes the same",
+        "verify/box_decisions.py", "_BoxSearch.settle", 'self.arithmetic == "real"', "True",
+        "test_weighted_means.py::test_float32_computes_something_else",
+    ),
+    Fault(
+        "rows in float32 are charged as float64",
+        "verify/network/intermediate_bounds.py", "IntermediateBounds.__init__",
+        "Relaxations(torch.float32, UNIT, sums)", "Relaxations(torch.float32, DOUBLE_UNIT, sums)",
+        "test_dependence.py::test_rows_in_float32_are_charged",
+    ),
+    Fault(
+        "VNN-LIB: the last bound of an input counts",
+        _VNNLIB, "_Run.limit", "np.minimum.at(ends[1], index[side == 1], value[side == 1])",
+        "ends[1].__setitem__(index[side == 1], value[side == 1])",
+        "test_vnnlib_runner.py::test_runs_of_bounds_mean_what_single_ones_mean",
+    ),
+    Fault(
         "search: a bound below 0 is a proof",
         _SEARCH, "Search._verdicts", "bound is not None and bound > 0.0", "bound is not None and bound > -0.05",
         _VERDICTS + "[1-0.43]",

@@ -28,7 +28,7 @@ Verdict = Literal["sat", "unsat", "unknown", "timeout"]
 _PARAMETERS = 16
 #: Boxes bounded together: as many as have so many numbers of layers between them, and no more than the second number;
 #: and the most that wait beside those of the question.
-_TOGETHER, _MOST, _WAITING = 1 << 18, 256, 1 << 14
+_TOGETHER, _MOST, _WAITING = 1 << 21, 256, 1 << 14
 #: Numbers of layers of the inputs that are attacked at a time.
 _ATTACKED = 1 << 23
 #: Steps towards the best lines for intermediate bounds of a box that is not cut.
@@ -247,8 +247,9 @@ class _BoxSearch:
     ) -> tuple[PhaseTree, list[tuple[int, ...]]]:
         """A tree over bounds with so many steps for intermediate ones, and the groups that its root leaves open."""
         cells = NetworkBounds(
-            self.bounded, images, "everywhere", self.memory, self.arithmetic, 1, intermediate_steps=steps
-        )
+            self.bounded, images, "everywhere", self.memory, self.arithmetic, 1, intermediate_steps=steps,
+            asked=family.unsafe.rows, coarse=True,
+        )  # fmt: skip
         tree, left = PhaseTree(cells, family.unsafe.rows, family.offset[which]), []
         for group in groups:
             result = tree.prove(group, 1)

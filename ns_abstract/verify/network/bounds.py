@@ -11,6 +11,7 @@ from ns_abstract.verify.network.backward import BackwardPass
 from ns_abstract.verify.network.coefficient_source import CoefficientSource
 from ns_abstract.verify.network.coefficients import Float64
 from ns_abstract.verify.network.cost_model import WorkBudget
+from ns_abstract.verify.network.dependence import dependence
 from ns_abstract.verify.network.forward import ForwardPass
 from ns_abstract.verify.network.graph import Network, NetworkArithmetic
 from ns_abstract.verify.network.image_sets import ActivationPhases, ImageSets, OutputBounds, Substitution
@@ -82,6 +83,10 @@ def bound_outputs(
 class NetworkBounds:
     """Bounds of one network over several cells: builds the passes and runs them over all nodes.
 
+    Args:
+        asked: [k, output_size] rows of which bounds will be asked; None: any.
+        coarse: See `IntermediateBounds`.
+
     Attributes:
         intermediate: What is known of the nodes.
         last: The form of the last one.
@@ -99,19 +104,22 @@ class NetworkBounds:
         assumed: Sequence[Mapping[int, ActivationPhases]] | None = None,
         sharing: CoefficientSource | None = None,
         intermediate_steps: int = 0,
+        asked: Float64 | None = None,
+        coarse: bool = False,
     ) -> None:
         sharing = CoefficientSource() if sharing is None else sharing
         fields, good = finite(images)
         middle = sharing.about(middle_of(fields))
         image = planes_of(fields, middle, network.input_shape, substitution)
         self.intermediate = intermediate = sharing.intermediate = IntermediateBounds(
-            network, image, middle, good, arithmetic, assumed
+            network, image, middle, good, arithmetic, assumed, coarse
         )
         schedule = WorkBudget(network)
         backward = BackwardPass(intermediate, memory, schedule.deep)
         inner = RowAscent(intermediate, backward, 0 if schedule.deep else intermediate_steps)
         neuron_bounds = NeuronBounds(intermediate, backward, schedule, sharing, inner)
-        selection = NeuronSelection(intermediate, neuron_bounds, schedule, sharing)
+        used = None if asked is None else dependence(network, asked)
+        selection = NeuronSelection(intermediate, neuron_bounds, schedule, sharing, used)
         pooling = MaxPoolPropagation(intermediate, backward, schedule, sharing)
         propagation = ForwardPropagation(intermediate, sharing, bool(slope_steps or inner.steps))
         self.last = ForwardPass(intermediate, propagation, pooling, selection, schedule).run()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import torch
 from torch import Tensor
 
@@ -34,6 +36,7 @@ class NeuronSelection:
         intermediate: Bounds the numbers that are chosen.
         schedule: What rows cost, and how many of them a deep network is worth.
         sharing: What other cells say of a node before.
+        used: By node: [*shape] numbers that matter to anybody; None: all.
 
     Attributes:
         unsure: Part of the latest ReLU's inputs whose signs have not been found out.
@@ -45,7 +48,9 @@ class NeuronSelection:
         neuron_bounds: NeuronBounds,
         schedule: WorkBudget,
         sharing: CoefficientSource,
+        used: Mapping[int, Tensor] | None = None,
     ) -> None:
+        self.used = used
         self.intermediate, self.network, self.neuron_bounds = intermediate, intermediate.network, neuron_bounds
         self.schedule, self.sharing = schedule, sharing
         self.unsure = 0.0
@@ -60,6 +65,9 @@ class NeuronSelection:
         form, unstable, apart = self.sharing.refinable(index, form, unstable, apart, layer)
         if self.network.depth[index] < 2:
             return form
+        if self.used is not None:
+            matters = self.used.get(index, torch.zeros((), dtype=torch.bool))
+            unstable, apart = unstable & matters, None if apart is None else apart * matters
         if self.schedule.planned:
             return self._planned(index, form, unstable, layer)
         if apart is not None:

@@ -1,4 +1,4 @@
-"""Weighted means of positive numbers, written about their value at one input (docs/dev/design.md, N23)."""
+"""Weighted means of positive numbers, written about their value at one input (docs/dev/design.md, N26)."""
 
 from __future__ import annotations
 
