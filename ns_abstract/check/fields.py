@@ -102,9 +102,8 @@ class CheckedField:
         thick, thinned = (np.exp(-e * lengths) for e in ends)
         thin = thin.within(thinned * (1.0 - 1e-12), thick * (1.0 + 1e-12))
         f = 1.0 / (1.0 + np.exp(-color.c))
-        color = color.composed(f, f * (1.0 - f), -0.0482 + 0.0 * f, 0.0482 + 0.0 * f)
-        ends = zip(color.range(), (-1e-12, 1e-12), strict=True)
-        color = color.within(*(1.0 / (1.0 + np.exp(-e)) * (1.0 + room) for e, room in ends))
+        ends = [1.0 / (1.0 + np.exp(-e)) * (1.0 + room) for e, room in zip(color.range(), (-1e-12, 1e-12), strict=True)]
+        color = color.composed(f, f * (1.0 - f), -0.0482 + 0.0 * f, 0.0482 + 0.0 * f).within(*ends)
         alpha = -thin + 1.0
         return from_the_back(alpha, color, np.ones(alpha.c.shape, bool), np.array(self.background), 0.0)
 
