@@ -93,17 +93,18 @@ class Claims(ABC):
 
     def settle(self, claim: Any, deadline: float) -> tuple[bool | None, bool, dict[str, Any]]:
         """True: proved; False: refuted, with the pose; None: open when the time was over; and whether of float32."""
-        begin = time.monotonic()
+        begin, (low, high) = time.monotonic(), self.box(claim)
+        near = self.near(claim, low[None], high[None], self.units[0])
         for unit in self.units:
             end = begin + (deadline - begin) * (_FIRST if unit else 1.0)
-            verdict, detail = self._divide(claim, unit, end)
+            verdict, detail = self._divide(claim, near, unit, end)
             if verdict is not None:
                 return verdict, unit > 0.0 and self.in_float32, detail
         return None, False, {}
 
-    def _divide(self, claim: Any, unit: float, deadline: float) -> tuple[bool | None, dict[str, Any]]:
+    def _divide(self, claim: Any, near: Array, unit: float, deadline: float) -> tuple[bool | None, dict[str, Any]]:
         low, high = self.box(claim)
-        stack, fresh = [(low, high, self.near(claim, low[None], high[None], unit))], True
+        stack, fresh = [(low, high, near)], True
         while stack:
             if time.monotonic() > deadline:
                 return None, {}
@@ -112,7 +113,7 @@ class Claims(ABC):
             first, last = (np.stack([part[k] for part in parts]) for k in (0, 1))
             near = np.unique(np.concatenate([part[2] for part in parts]))
             found, middle = self.margins(claim, first, last, near, unit), 0.5 * (first + last)
-            open_ = np.flatnonzero(~(found.least > 0.0))
+            open_ = np.flatnonzero(~(found.least >= 0.0))
             some = open_[: 1 + self.together // 8]
             some = [0] if fresh and not len(some) and self.floor(claim) > 0.0 else some
             if len(some):
@@ -120,7 +121,7 @@ class Claims(ABC):
                 wrong = np.flatnonzero(at.most < self.floor(claim) * (1.0 - 1e-9))
                 if len(wrong):
                     return False, self.detail(claim, middle[some][wrong[:1]])
-                if len(open_) and not (at.least > 0.0).all():
+                if len(open_) and not (at.least >= 0.0).all():
                     # smaller boxes about this point are not proved either
                     return None, {}
             fresh = False

@@ -76,7 +76,7 @@ class CheckedNetwork:
         Tensors are bounded from the picture on; neurons that may bend are bounded again by rows that go back to it.
         """
         c, g, r = (torch.from_numpy(np.ascontiguousarray(a, np.float64)) for a in (picture.c, picture.g, picture.r))
-        known, lines = {self.input: _Known(c, g, r, c.abs() + g.abs().sum(0) + r)}, {}
+        known, lines, deep = {self.input: _Known(c, g, r, c.abs() + g.abs().sum(0) + r)}, {}, set()
         for layer in self.layers:
             (c, g, r, size), *others = (known[name] for name in layer.inputs)
             f, absolute = layer.map, layer.absolute
@@ -89,30 +89,36 @@ class CheckedNetwork:
                 c, g, r, size = (a + b for a, b in zip((c, g, r, size), others[0], strict=True))
             else:
                 low, high = known[layer.inputs[0]].ends()
-                bends = ((low < 0.0) & (high > 0.0)).flatten(1).any(0).nonzero()[:, 0]
-                if 0 < len(bends) <= _MOST_ROWS:
-                    chosen = functional.one_hot(bends, c[0].numel()).double()
-                    least, most = map(torch.from_numpy, self._back(known, lines, layer.inputs[0], chosen).range())
-                    low.flatten(1)[:, bends] = low.flatten(1)[:, bends].maximum(least)
-                    high.flatten(1)[:, bends] = high.flatten(1)[:, bends].minimum(most)
+                which, place = ((low < 0.0) & (high > 0.0)).flatten(1).nonzero().T
+                if layer.inputs[0] in deep and 0 < len(which) <= _MOST_ROWS * len(c):
+                    own = functional.one_hot(place, c[0].numel()).double()
+                    least, most = map(torch.from_numpy, self._back(known, lines, layer.inputs[0], own, which).range())
+                    low.flatten(1)[which, place] = low.flatten(1)[which, place].maximum(least)
+                    high.flatten(1)[which, place] = high.flatten(1)[which, place].minimum(most)
                 slope, half = lines[layer.output] = _line(low, high)
                 c, g, r, size = slope * c + half, slope * g, slope * r + half, torch.maximum(high, -low).clamp(min=0.0)
             r = (r + self._charge(layer, c.shape) * size) * (1.0 + 8.0 * U)
             known[layer.output] = _Known(c, g, r, size)
-        every = [torch.eye(known[n].c[0].numel(), dtype=torch.float64) if rows is None else rows for n in self.names]
-        return [self._back(known, lines, n, e) for n, e in zip(self.names, every, strict=True)]
+            # what lies behind a ReLU: before the first one rows say no more than this
+            deep |= {layer.output} if layer.output in lines or deep.intersection(layer.inputs) else set()
+        found, count = [], len(picture.c)
+        for name in self.names:
+            every = torch.eye(known[name].c[0].numel(), dtype=torch.float64) if rows is None else rows
+            which = torch.arange(count).repeat_interleave(len(every))
+            form = self._back(known, lines, name, every.repeat(count, 1), which)
+            found.append(form.of(lambda a: a.reshape(*a.shape[:-1], count, -1)))
+        return found
 
-    def _back(self, known: dict[str, _Known], lines: dict[str, Any], name: str, rows: Tensor) -> Affine:
-        """Forms [B, m] of ``rows`` [m, n] times a tensor: rows go back through the layers to the picture.
+    def _back(self, known: dict[str, _Known], lines: dict[str, Any], name: str, rows: Tensor, which: Tensor) -> Affine:
+        """Forms [W] of ``rows`` [W, n] times a tensor of the pictures ``which`` [W]: rows go back to the picture.
 
         A ReLU lies between two parallel lines.
         """
-        (count, *shape), m = known[name].c.shape, len(rows)
-        back = {name: rows.reshape(1, m, *shape).expand(count, m, *shape)}
-        c = r = torch.zeros(count, m, dtype=torch.float64)
+        back = {name: rows.reshape(-1, *known[name].c.shape[1:])}
+        c = r = torch.zeros(len(rows), dtype=torch.float64)
 
         def against(row: Tensor, values: Tensor) -> Tensor:
-            return (row * values[:, None]).flatten(2).sum(2)
+            return (row * values[which]).flatten(1).sum(1)
 
         for layer in reversed(self.layers):
             row = back.pop(layer.output, None)
@@ -121,21 +127,20 @@ class CheckedNetwork:
             size = known[layer.output].size
             r = r + self._charge(layer, size.shape) * against(row.abs(), size)
             if layer.map is not None:
-                c = c + (row * layer.bias).flatten(2).sum(2)
-                before = known[layer.inputs[0]].c.shape[1:]
-                place = torch.zeros(count * m, *before, dtype=torch.float64, requires_grad=True)
-                (row,) = torch.autograd.grad(layer.map(place), place, row.flatten(0, 1))
-                row = row.reshape(count, m, *before)
+                c = c + (row * layer.bias).flatten(1).sum(1)
+                shape = known[layer.inputs[0]].c.shape[1:]
+                place = torch.zeros(len(row), *shape, dtype=torch.float64, requires_grad=True)
+                (row,) = torch.autograd.grad(layer.map(place), place, row)
             elif len(layer.inputs) == 1:
                 slope, half = lines[layer.output]
-                c, r, row = c + against(row, half), r + against(row.abs(), half), row * slope[:, None]
+                c, r, row = c + against(row, half), r + against(row.abs(), half), row * slope[which]
             for source in layer.inputs:
                 back[source] = back[source] + row if source in back else row
         row, (pc, pg, pr, size) = back[self.input], known[self.input]
         c, g = c + against(row, pc), [against(row, part) for part in pg]
         rounding = 4.0 * U * (math.prod(size.shape[1:]) + len(pg) + 32.0)
         r = (r + against(row.abs(), pr + rounding * size)) * (1.0 + 1e-10) + 1e-30
-        return Affine(c.numpy(), torch.stack(g).numpy() if g else np.zeros((0, count, m)), r.numpy())
+        return Affine(c.numpy(), torch.stack(g).numpy() if g else np.zeros((0, len(rows))), r.numpy())
 
 
 def _line(low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:

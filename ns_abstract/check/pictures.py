@@ -43,7 +43,7 @@ class ClaimedBounds(NamedTuple):
             slope = plane[:, None] * (half / span).T
             middle = constant + ((centre - 0.5 * (self.low + self.high)) / span) @ plane
             tilt, reach = np.abs(slope - form.g).sum(axis=0) + form.r, np.abs(slope).sum(axis=0)
-            room = 1e-13 * (np.abs(plane).sum() + tilt + np.abs(middle - c) + 1.0)
+            room = 1e-13 * (np.abs(plane).sum() + tilt + np.abs(middle - c))
             # a bound beyond the end of [0, 1] holds, and one beyond the other end does not
             holds = side * (middle - end) + reach + 1e-13 * (np.abs(plane).sum() + 1.0) <= 0.0
             past = side * (middle - 1.0 + end) + reach - 1e-9

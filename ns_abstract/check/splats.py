@@ -518,8 +518,11 @@ def pixels(
         used = used if len(used) else np.zeros(1, int)
         some = picked([alpha, view.color, view.depth, shows], np.arange(len(index))[:, None], used[None])
         form, keep = blended(*some, splats.background, unit)
-        kept = np.zeros(shows.shape, bool)
+        kept, seen = np.zeros(shows.shape, bool), shows.any(axis=1)[:, None]
         kept[:, used] = keep
+        # where nothing shows the background is drawn, exactly
+        c, r = np.where(seen, form.c, splats.background), np.where(seen, form.r, 0.0)
+        form = Affine(c, np.where(seen, form.g, 0.0), r)
         return form, kept[:, :count], motion
 
 

@@ -67,7 +67,8 @@ class Verdicts(Claims):
 
     def margins(self, claim: int, low: Array, high: Array, near: Array, unit: float) -> Margins:
         """Over boxes [B, d]."""
-        return Margins(*self.bounds(low, high, unit))
+        least, most = self.bounds(low, high, unit)
+        return Margins(np.where(least > 0.0, least, -np.inf), most)
 
     @abstractmethod
     def bounds(self, low: Array, high: Array, unit: float) -> tuple[Array, Array]:
