@@ -28,6 +28,7 @@ from ns_abstract.check import inputs
 from ns_abstract.check.fields import CheckedField
 from ns_abstract.check.forms import Affine
 from ns_abstract.check.inputs import BadInput, read_poses, read_scene
+from ns_abstract.check.loops import _lifted
 from ns_abstract.check.networks import read_network
 from ns_abstract.check.poses import CheckedCamera, Poses
 from ns_abstract.check.splats import (
@@ -42,7 +43,6 @@ from ns_abstract.check.splats import (
     reaches,
 )
 from ns_abstract.check.statements import parsed
-from ns_abstract.check.loops import _lifted
 from ns_abstract.cli import certify as certify_command
 from ns_abstract.cli import check as check_command
 from ns_abstract.demo.writing import write_loop_demo
@@ -146,8 +146,8 @@ def test_networks_are_enclosed(radius: float, tmp_path: Path) -> None:
     form = Affine(c, g, np.full(c.shape, 0.1 * radius + 4e-7))
     network, exact = read_network(file, None, FLOAT), read_network(file, None, 0.0)
     rows = torch.tensor([[1.0, -1.0, 0.0], [0.0, 0.5, 2.0]], dtype=torch.float64)
-    (outputs,) = network.outputs(form)
-    (least, most), (inner, _) = (n.outputs(form, rows)[0].range() for n in (network, exact))
+    outputs = network.outputs(form)
+    (least, most), (inner, _) = (n.outputs(form, rows).range() for n in (network, exact))
     found = []
     for _ in range(50):
         s, e = rng.uniform(-1.0, 1.0, 2), 0.1 * radius * rng.uniform(-1.0, 1.0, c.shape)
@@ -169,7 +169,7 @@ def test_a_float32_network_leaves_the_exact_one(tmp_path: Path) -> None:
     y = np.asarray(session.run(None, {"image": c})[0], np.float64)
     form = Affine(c.astype(np.float64), np.zeros((0, *c.shape)), np.zeros(c.shape))
     for unit, holds in ((FLOAT, True), (0.0, False)):
-        low, high = read_network(file, None, unit).outputs(form)[0].range()
+        low, high = read_network(file, None, unit).outputs(form).range()
         assert bool(((low <= y) & (y <= high)).all()) == holds
 
 
@@ -451,24 +451,18 @@ def test_rays_contain_pictures_of_another_renderer(half: float) -> None:
     assert max(widths) < {0.0: 1e-9, 1e-5: 1e-4, 1e-3: np.inf}[half]
 
 
-def test_layers_of_a_field_see_their_columns() -> None:
-    """Density and colour of one encoding are those of the layers, computed one behind the other."""
-    scene, field = nerf()
-    code = np.random.default_rng(0).normal(size=(4, field.width))
-    split = scene.fine.base[0].weight.shape[1]
-    position, direction = code[:, :split], code[:, split:]
-    x = position
-    for layer in scene.fine.base:
-        x = np.concatenate([position, x], axis=1) if layer.weight.shape[1] > x.shape[1] else x
-        x = np.maximum(x @ layer.weight.T.astype(np.float64) + layer.bias, 0.0)
-    density = x @ scene.fine.density.weight.T + scene.fine.density.bias
-    x = np.concatenate([direction, x], axis=1)
-    for layer in scene.fine.head:
-        x = np.maximum(x @ layer.weight.T.astype(np.float64) + layer.bias, 0.0)
-    color = x @ scene.fine.color.weight.T + scene.fine.color.bias
-    found = field.network.outputs(Affine(code, np.zeros((0, *code.shape)), np.zeros(code.shape)))
-    for form, values in zip(found, (density, color), strict=True):
-        assert (np.abs(form.c - values) <= form.r).all() and form.r.max() < 1e-9
+def test_neurons_that_bend_are_enclosed() -> None:
+    from ns_abstract.check.fields import _Zonotope
+
+    rng = np.random.default_rng(0)
+    form = Affine(rng.normal(size=(1, 2, 5)), 0.3 * rng.normal(size=(2, 1, 2, 5)), 0.1 * rng.random((1, 2, 5)))
+    weight, bias = rng.normal(size=(6, 5)), rng.normal(size=6)
+    found = _Zonotope.of(form).layer(weight, bias).bent().layer(weight[:, :5].T @ np.eye(6)[:6, :6], bias[:5]).form(2)
+    for _ in range(200):
+        s, e = rng.uniform(-1.0, 1.0, 2), rng.choice([-1.0, 1.0], form.c.shape)
+        x = form.c + s[0] * form.g[0] + s[1] * form.g[1] + e * form.r
+        y = np.maximum(x @ weight.T + bias, 0.0) @ weight + bias[:5]
+        assert (np.abs(y - found.c - s[0] * found.g[0] - s[1] * found.g[1]) <= found.r + 1e-12).all()
 
 
 # ---------------------------------------------------------------- files

@@ -59,7 +59,7 @@ class Loop(OfNetwork):
         half = np.maximum(high - middle, middle - low) * (1.0 + 4.0 * U)
         own = parameters(middle[:, self.seen], half[:, self.seen])
         local = [own[self.seen.index(k)] if k in self.seen else own[0] * 0.0 + middle[:, k] for k in range(len(x))]
-        (y,), outputs = self.network.outputs(self.inputs(self.camera, self._view(local), unit)), []
+        y, outputs = self.network.outputs(self.inputs(self.camera, self._view(local), unit)), []
         inverse = np.where(half > 1e-150, 1.0 / np.maximum(half, 1e-150), 0.0)
         scaled = [(x[k] + -middle[:, k]) * inverse[:, k] for k in self.seen]
         for j in range(y.c.shape[-1]):

@@ -59,18 +59,18 @@ class CheckedNetwork:
     Args:
         layers: As they are computed.
         source: Name of the input.
-        outputs: Names of outputs.
+        output: Name of the output that counts.
         unit: Unit roundoff of the network's own evaluation; 0: the network of real numbers.
     """
 
-    def __init__(self, layers: list[CheckedLayer], source: str, outputs: list[str], unit: float) -> None:
-        self.layers, self.input, self.names, self.unit = layers, source, outputs, unit
+    def __init__(self, layers: list[CheckedLayer], source: str, output: str, unit: float) -> None:
+        self.layers, self.input, self.output, self.unit = layers, source, output, unit
 
     def _charge(self, layer: CheckedLayer, shape: Any) -> float:
         own = (layer.terms + 4.0) * self.unit if layer.terms else 0.0
         return own + 4.0 * U * (math.prod(shape[1:]) + 2.0 * layer.terms + 32.0)
 
-    def outputs(self, picture: Affine, rows: Tensor | None = None) -> list[Affine]:
+    def outputs(self, picture: Affine, rows: Tensor | None = None) -> Affine:
         """The outputs as forms [B, n] over pictures [B, ...]; or ``rows`` [m, n] times them, [B, m].
 
         Tensors are bounded from the picture on; neurons that may bend are bounded again by rows that go back to it.
@@ -101,13 +101,11 @@ class CheckedNetwork:
             known[layer.output] = _Known(c, g, r, size)
             # what lies behind a ReLU: before the first one rows say no more than this
             deep |= {layer.output} if layer.output in lines or deep.intersection(layer.inputs) else set()
-        found, count = [], len(picture.c)
-        for name in self.names:
-            every = torch.eye(known[name].c[0].numel(), dtype=torch.float64) if rows is None else rows
-            which = torch.arange(count).repeat_interleave(len(every))
-            form = self._back(known, lines, name, every.repeat(count, 1), which)
-            found.append(form.of(lambda a: a.reshape(*a.shape[:-1], count, -1)))
-        return found
+        count, size = len(picture.c), known[self.output].c[0].numel()
+        rows = torch.eye(size, dtype=torch.float64) if rows is None else rows
+        which, m = torch.arange(count).repeat_interleave(len(rows)), len(rows)
+        form = self._back(known, lines, self.output, rows.repeat(count, 1), which)
+        return form.of(lambda a: a.reshape(*a.shape[:-1], count, m))
 
     def _back(self, known: dict[str, _Known], lines: dict[str, Any], name: str, rows: Tensor, which: Tensor) -> Affine:
         """Forms [W] of ``rows`` [W, n] times a tensor of the pictures ``which`` [W]: rows go back to the picture.
@@ -183,7 +181,7 @@ def read_network(file: Path, output: str | None, unit: float) -> CheckedNetwork:
             raise ValueError(f"has {node.op_type} with {wrong or 'inputs'} that this program does not read")
         layers.append(CheckedLayer(inputs, node.output[0], *_layer(node.op_type, options, constants, len(inputs))))
         made.add(node.output[0])
-    return CheckedNetwork(layers, source, [output or names[0]], unit)
+    return CheckedNetwork(layers, source, output or names[0], unit)
 
 
 def _layer(kind: str, options: dict[str, Any], constants: list[Tensor], inputs: int) -> tuple[Any, ...]:
@@ -198,22 +196,18 @@ def _layer(kind: str, options: dict[str, Any], constants: list[Tensor], inputs: 
         return (lambda x: x), (lambda x: x), constants[0], 1
     if kind == "Conv" and inputs == 1 and constants[0].ndim == 4:
         weight, *rest = constants
-        more = {
-            k: options.get(name, 1)
-            for k, name in (("stride", "strides"), ("dilation", "dilations"), ("groups", "group"))
-        }
+        stride, dilation, groups = (options.get(name, 1) for name in ("strides", "dilations", "group"))
+        spare = (pads[1], pads[3], pads[0], pads[2])
         f, size = (
-            lambda x, w=w: functional.conv2d(functional.pad(x, (pads[1], pads[3], pads[0], pads[2])), w, **more)
+            lambda x, w=w: functional.conv2d(functional.pad(x, spare), w, None, stride, 0, dilation, groups)
             for w in (weight, weight.abs())
         )
         bias = rest[0].reshape(-1, 1, 1) if rest else _NONE
         return f, size, bias, weight[0].numel() + weight.numel() // weight.shape[1]
     if kind in ("Gemm", "MatMul") and inputs == 1 and constants[0].ndim == 2:
-        return (
-            *product(constants[0] if options.get("transB") else constants[0].T),
-            (constants[1:] or [_NONE])[0],
-            sum(constants[0].shape),
-        )
+        weight = constants[0] if options.get("transB") else constants[0].T
+        f, size = (lambda x, w=w: x @ w.T for w in (weight, weight.abs()))
+        return f, size, (constants[1:] or [_NONE])[0], sum(weight.shape)
     if kind == "AveragePool" and not any(pads) and "dilations" not in options:
         kernel, stride = options["kernel_shape"], options.get("strides", 1)
         f = lambda x: functional.avg_pool2d(x, kernel, stride)  # noqa: E731
@@ -221,8 +215,3 @@ def _layer(kind: str, options: dict[str, Any], constants: list[Tensor], inputs: 
     if kind == "Flatten":
         return (lambda x: x.flatten(1)), (lambda x: x.flatten(1)), _NONE, 0
     raise ValueError(f"has an operator {kind} that this program does not read")
-
-
-def product(weight: Tensor) -> tuple[Any, Any]:
-    """The map of a matrix [out, in], and that of its absolute values."""
-    return (lambda x: x @ weight.T), (lambda x: x @ weight.abs().T)

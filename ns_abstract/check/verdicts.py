@@ -117,7 +117,7 @@ class Certificate(OfNetwork):
 
     def bounds(self, low: Array, high: Array, unit: float) -> tuple[Array, Array]:
         """Of the class' output less the largest other one."""
-        (forms,) = self.network.outputs(self.inputs(self.camera, self.poses.view(low, high), unit), self.rivals)
+        forms = self.network.outputs(self.inputs(self.camera, self.poses.view(low, high), unit), self.rivals)
         least, most = (end.min(axis=1) for end in forms.range())
         return least, most
 
