@@ -112,7 +112,10 @@ def touched(package: Path, file: str, before: str) -> set[tuple[str, str]]:
     """
     root, uses = package / "ns_abstract", {}
     for path in root.rglob("*.py"):
-        tree, module = ast.parse(path.read_text()), path.relative_to(package).with_suffix("").as_posix().replace("/", ".")
+        tree, module = (
+            ast.parse(path.read_text()),
+            path.relative_to(package).with_suffix("").as_posix().replace("/", "."),
+        )
         imported = {}
         for n in ast.walk(tree):
             if isinstance(n, ast.ImportFrom):

@@ -286,7 +286,8 @@ def test_parts_of_a_box_are_the_box(motion: list[float]) -> None:
     for d in (1, 2):
         ends = low[:d], high[:d]
         parts = _divided(*ends, np.array(motion[:d]), high[:d] - low[:d])
-        assert len(parts) > 1 and partition(*(np.stack(e) for e in zip(*parts, strict=True)), *ends) == 1
+        bottom, top = (np.stack([part[k] for part in parts]) for k in (0, 1))
+        assert len(parts) > 1 and partition(bottom, top, *ends) == 1
     assert len(_divided(low, low, np.array(motion), high - low)) == 1
 
 

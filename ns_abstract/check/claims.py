@@ -45,6 +45,8 @@ class Claims(ABC):
 
     #: Boxes that are looked at together.
     together = 8
+    #: Number of claims that are drawn from.
+    count: int
     #: Whether what is behind the picture is proved of float32, too.
     in_float32 = True
 
@@ -78,6 +80,10 @@ class Claims(ABC):
         """Numbers of what has to be looked at over the box [1, d]."""
         return np.zeros(0, np.int64)
 
+    def hint(self, claim: Any) -> Array | None:
+        """A pose [1, d] that may refute the claim."""
+        return None
+
     def floor(self, claim: Any) -> float:
         """The margin that is claimed of every pose."""
         return 0.0
@@ -94,7 +100,9 @@ class Claims(ABC):
     def settle(self, claim: Any, deadline: float) -> tuple[bool | None, bool, dict[str, Any]]:
         """True: proved; False: refuted, with the pose; None: open when the time was over; and whether of float32."""
         begin, (low, high) = time.monotonic(), self.box(claim)
-        near = self.near(claim, low[None], high[None], self.units[0])
+        near, hint = self.near(claim, low[None], high[None], self.units[0]), self.hint(claim)
+        if hint is not None and self.margins(claim, hint, hint, near, 0.0).most[0] < 0.0:
+            return False, False, self.detail(claim, hint)
         for unit in self.units:
             end = begin + (deadline - begin) * (_FIRST if unit else 1.0)
             verdict, detail = self._divide(claim, near, unit, end)

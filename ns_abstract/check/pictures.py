@@ -10,16 +10,17 @@ from ns_abstract.check.claims import Claims, Margins
 from ns_abstract.check.forms import Affine, Array
 from ns_abstract.check.poses import Poses
 from ns_abstract.check.results import StoredCells
-from ns_abstract.check.splats import ActivatedScene, meeting, pixels, reaches
+from ns_abstract.check.splats import ActivatedScene, meeting, pixels, reaches, several
 
 
 class PixelClaim(NamedTuple):
-    """A pixel's channel over a cell."""
+    """A pixel's channel over a cell, and a pose [1, d] that may refute it."""
 
     cell: int
     row: int
     column: int
     channel: int
+    pose: Array | None = None
 
 
 class ClaimedBounds(NamedTuple):
@@ -80,6 +81,32 @@ class Picture(Claims):
         (_, b), (slope, c) = self.bounds(claim).planes
         return float((np.abs(slope).sum() + 1e-4) / max(c - b, 1e-7)) if np.any(slope) else 0.0
 
+    def draw(self, rng: Any, hunted: bool) -> PixelClaim:
+        """A claim that is uniform, or the most telling of eight, or one that a pose of its cell seems to break."""
+        claim = super().draw(rng, hunted)
+        if not hunted or not isinstance(self.scene, ActivatedScene):
+            return claim
+        (low, high), a, k, camera = self.box(claim), self.cells.arrays, claim.cell, self.poses.camera
+        # ends of ranges are likely
+        s = np.clip(rng.uniform(-1.5, 1.5, len(low)), -1.0, 1.0)
+        point = np.clip(0.5 * (low + high) + 0.5 * (high - low) * s, low, high)[None]
+        limits, side = (camera.height, camera.width), a["b_lower"].shape[1]
+        rows, columns = (np.arange(t, min(t + side, n)) for t, n in zip(a["tile"][k], limits, strict=True))
+        numbers = (rows[:, None] * camera.width + columns).ravel()
+        drawn = several(self.scene, camera, self.poses.view(point, point), numbers, 0.0).c
+        here = np.s_[: len(rows), : len(columns)]
+        planes = (a[f"A_{e}"][k][here] @ s + a[f"b_{e}"][k][here] for e in ("lower", "upper"))
+        low, high = (pick(p, a[e][rows][:, columns]) for p, pick, e in
+                     zip(planes, (np.maximum, np.minimum), ("lower", "upper"), strict=True))  # fmt: skip
+        room = np.minimum(drawn.reshape(low.shape) - low, high - drawn.reshape(low.shape))
+        row, column, channel = np.unravel_index(int(np.argmin(room)), room.shape)
+        broken = room[row, column, channel] < -1e-9
+        return PixelClaim(k, int(rows[row]), int(columns[column]), int(channel), point) if broken else claim
+
+    def hint(self, claim: PixelClaim) -> Array | None:
+        """A pose that may refute the claim."""
+        return claim.pose
+
     def place(self, claim: PixelClaim) -> dict[str, Any]:
         """The claim for check.json."""
         at = {"pixel": [claim.row, claim.column], "channel": claim.channel}
@@ -113,7 +140,8 @@ class Picture(Claims):
         return Margins(-worst.max(axis=0), none + 1.0)
 
     def _forms(self, claim: PixelClaim, low: Array, high: Array, near: Array, unit: float) -> Any:
-        view, pixel = self.poses.view(low, high), tuple(np.full(len(low), v) for v in claim[1:3])
+        view = self.poses.view(low, high)
+        pixel = np.full(len(low), claim.row), np.full(len(low), claim.column)
         kept = motion = None
         if isinstance(self.scene, ActivatedScene):
             at = np.broadcast_to(near, (len(low), len(near)))

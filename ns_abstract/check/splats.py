@@ -516,8 +516,10 @@ def pixels(
         used = np.flatnonzero(shows.any(axis=0))
         # one, so that there is one
         used = used if len(used) else np.zeros(1, int)
-        some = picked([alpha, view.color, view.depth, shows], np.arange(len(index))[:, None], used[None])
-        form, keep = blended(*some, splats.background, unit)
+        alpha, color, depth, some = picked(
+            [alpha, view.color, view.depth, shows], np.arange(len(index))[:, None], used[None]
+        )
+        form, keep = blended(alpha, color, depth, some, splats.background, unit)
         kept, seen = np.zeros(shows.shape, bool), shows.any(axis=1)[:, None]
         kept[:, used] = keep
         # where nothing shows the background is drawn, exactly
@@ -528,11 +530,17 @@ def pixels(
 
 def pictures(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit: float) -> Affine:
     """The pictures [B, H, W, 3] over B boxes of poses."""
-    count, size, lists = len(view.origin), cam.height * cam.width, []
+    form = several(splats, cam, view, np.arange(cam.height * cam.width), unit)
+    return form.of(lambda a: a.reshape(*a.shape[:-2], cam.height, cam.width, 3))
+
+
+def several(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, numbers: Array, unit: float) -> Affine:
+    """Colours [B, P, 3] of pixels over B boxes of poses, by their numbers [P] in the picture."""
+    count, size, lists = len(view.origin), len(numbers), []
     for ends in reaches(splats, cam, view, unit):
         inside = (ends[:, 0] <= cam.width) & (ends[:, 1] >= 0.0) & (ends[:, 2] <= cam.height) & (ends[:, 3] >= 0.0)
         some = np.flatnonzero(inside)
-        lists += [some[meeting(ends[some], *divmod(p, cam.width))] for p in range(size)]
+        lists += [some[meeting(ends[some], *divmod(p, cam.width))] for p in numbers]
     # one more, so that there is one
     every = np.unique(np.concatenate([*lists, [0]]).astype(np.int64))
     with np.errstate(all="ignore"):
@@ -542,9 +550,9 @@ def pictures(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit
     for start in range(0, len(lists), step):
         chosen = lists[start : start + step]
         index = np.full((len(chosen), longest), -1)
-        for place, numbers in zip(index, chosen, strict=True):
-            place[: len(numbers)] = np.searchsorted(every, numbers)
+        for place, found in zip(index, chosen, strict=True):
+            place[: len(found)] = np.searchsorted(every, found)
         box, place = np.divmod(np.arange(start, start + len(chosen)), size)
         part = picked(whole, box[:, None], index)
-        parts.append(pixels(splats, cam, part, index, np.divmod(place, cam.width), unit)[0].clamped(0.0, 1.0))
-    return Affine.joined(parts, -2).of(lambda a: a.reshape(*a.shape[:-2], count, cam.height, cam.width, 3))
+        parts.append(pixels(splats, cam, part, index, np.divmod(numbers[place], cam.width), unit)[0].clamped(0.0, 1.0))
+    return Affine.joined(parts, -2).of(lambda a: a.reshape(*a.shape[:-2], count, size, 3))
