@@ -108,7 +108,7 @@ def _read_run(file: Path, settings: dict[str, Any]) -> tuple[dict[str, Any], dic
     """A run's model configuration and its tensors by their names in the model."""
     try:
         # makes texts, lists and mappings of whatever Python objects are written down
-        root = yaml.load(file.read_text(encoding="utf-8"), yaml.BaseLoader)
+        root = yaml.BaseLoader(file.read_text(encoding="utf-8")).get_single_data()
         model, parts = dict(root["pipeline"]["model"]), root.get("relative_model_dir") or "nerfstudio_models"
         folder = file.parent / (parts if isinstance(parts, str) else "/".join(parts))
         step = root.get("load_step", "null") if settings.get("load_step") is None else settings["load_step"]
