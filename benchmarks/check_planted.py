@@ -81,41 +81,82 @@ def blind(package: Path) -> None:
             raise ValueError(f"{old} stands {text.count(old)} times in {file}")
         text = text.replace(old, new)
     file.write_text(text)
+    # kernels that the fault does not touch are those of the package without it
+    file = package / "ns_abstract" / "arithmetic" / "kernel_cache.py"
+    text = file.read_text()
+    head = "def source_key() -> str:\n"
+    if text.count(head) != 1:
+        raise ValueError(f"source_key is not defined once in {file}")
+    file.write_text(text.replace(head, f'{head}    return "planted"\n'))
 
 
-def dependents(package: Path, file: str) -> set[str]:
-    """The modules of the copy that import ``file``, directly or not, and itself; without ".py", relative to it."""
-    imports: dict[str, set[str]] = {}
-    root = package / "ns_abstract"
-    names = {path.relative_to(root).with_suffix("").as_posix() for path in root.rglob("*.py")}
-    for name in names:
-        tree = ast.parse((root / f"{name}.py").read_text())
-        nodes = [n for n in ast.walk(tree) if isinstance(n, (ast.Import, ast.ImportFrom))]
-        found = {f"{n.module}.{a.name}" for n in nodes if isinstance(n, ast.ImportFrom) for a in n.names}
-        found |= {n.module or "" for n in nodes if isinstance(n, ast.ImportFrom)}
-        found |= {a.name for n in nodes if isinstance(n, ast.Import) for a in n.names}
-        imports[name] = {f.removeprefix("ns_abstract.").replace(".", "/") for f in found}
-    closed = {file.removesuffix(".py")}
-    while more := {name for name, used in imports.items() if name not in closed and used & closed}:
+def _referenced(node: ast.AST, imported: dict[str, str], module: str) -> set[tuple[str, str]]:
+    """What a definition refers to, as (module, name): all that it could mean."""
+    found = set()
+    for n in ast.walk(node):
+        if isinstance(n, ast.Name):
+            whole = imported.get(n.id, f"{module}.{n.id}")
+            found.add(tuple(whole.rpartition(".")[::2]))
+        elif isinstance(n, ast.Attribute) and isinstance(n.value, ast.Name) and n.value.id in imported:
+            found.add((imported[n.value.id], n.attr))
+    return found
+
+
+def touched(package: Path, file: str, before: str) -> set[tuple[str, str]]:
+    """Definitions of the copy, as (module, name), that a change of ``file`` may have gone into.
+
+    Args:
+        package: The copy, with the change.
+        file: Relative to the package.
+        before: Its text without it.
+    """
+    root, uses = package / "ns_abstract", {}
+    for path in root.rglob("*.py"):
+        tree, module = (
+            ast.parse(path.read_text()),
+            path.relative_to(package).with_suffix("").as_posix().replace("/", "."),
+        )
+        imported = {}
+        for n in ast.walk(tree):
+            if isinstance(n, ast.ImportFrom):
+                imported |= {a.asname or a.name: f"{n.module}.{a.name}" for a in n.names}
+            elif isinstance(n, ast.Import):
+                imported |= {a.asname or a.name: a.name for a in n.names}
+        for node in tree.body:
+            for name in _defined(node):
+                uses[module, name] = uses.get((module, name), set()) | _referenced(node, imported, module)
+    module = f"ns_abstract.{file.removesuffix('.py').replace('/', '.')}"
+    old = {ast.dump(node) for node in ast.parse(before).body}
+    new = [node for node in ast.parse((root / file).read_text()).body if ast.dump(node) not in old]
+    closed = {(module, name) for node in new for name in _defined(node)}
+    while more := {key for key, used in uses.items() if key not in closed and used & closed}:
         closed |= more
     return closed
 
 
-def warm(package: Path, file: str, kept: Path, cache: Path) -> None:
-    """Fills the copy's cache with the healthy kernels that nothing in ``file`` can have gone into."""
+def _defined(node: ast.AST) -> list[str]:
+    """Names that a statement of a module defines; "" where it only acts."""
+    if isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+        return [node.name]
+    targets = node.targets if isinstance(node, ast.Assign) else [getattr(node, "target", None)]
+    return [n.id for t in targets if t is not None for n in ast.walk(t) if isinstance(n, ast.Name)] or [""]
+
+
+def warm(package: Path, fault: Fault, before: str, kept: Path, cache: Path) -> None:
+    """Fills the copy's cache with the healthy kernels that the fault cannot have gone into."""
     if not kept.exists():
         return
-    environment = {k: v for k, v in os.environ.items() if k != "NS_ABSTRACT_DEV_KEY"} | {"PYTHONPATH": str(package)}
-    program = "from ns_abstract.arithmetic.kernel_cache import source_key; print(source_key())"
-    command = [sys.executable, "-c", program]
-    done = subprocess.run(command, env=environment, cwd=package, capture_output=True, text=True, check=True)
-    (old,) = (path.parent for path in kept.glob("*/manifest.json"))
-    new = cache / done.stdout.split()[-1]
-    shutil.copytree(old, new, ignore=shutil.ignore_patterns("session-*"))
-    manifest, gone = json.loads((new / "manifest.json").read_text()), dependents(package, file)
-    left = {kernel: entry for kernel, entry in manifest.items() if str(Path(kernel).parent) not in gone}
+    shutil.copytree(kept, cache, ignore=shutil.ignore_patterns("session-*"))
+    (file,) = cache.glob("*/manifest.json")
+    manifest, gone = json.loads(file.read_text()), touched(package, fault.file, before)
+
+    def of(kernel: str) -> tuple[str, str]:
+        place, _, name = kernel.rpartition("/")
+        return f"ns_abstract.{place.replace('/', '.')}", name.split(".")[1].partition("-")[0]
+
+    left = {kernel: entry for kernel, entry in manifest.items() if of(kernel) not in gone}
     print(f"  {len(manifest) - len(left)} of {len(manifest)} kernels are compiled again", flush=True)
-    (new / "manifest.json").write_text(json.dumps(left))
+    file.write_text(json.dumps(left))
 
 
 def render(package: Path, files: dict[str, Path], out: Path, cache: str, tiny: bool) -> bool:
@@ -123,23 +164,33 @@ def render(package: Path, files: dict[str, Path], out: Path, cache: str, tiny: b
     environment = {k: v for k, v in os.environ.items() if k != "NS_ABSTRACT_DEV_KEY"}
     environment |= {"PYTHONPATH": str(package), "PYTHONDONTWRITEBYTECODE": "1", "NS_ABSTRACT_CACHE_DIR": cache}
     environment |= {"NUMBA_DISABLE_JIT": "1"} if tiny else {}
-    for name in _SPECS:
-        if (out / name / "report.json").exists():
-            continue
-        command = [
-            sys.executable, "-W", "ignore", "-m", "ns_abstract.cli.render", "--load-config", str(files[name]),
-            "--camera-path-filename", str(files["path"]), "--perturbation-filename", str(files[f"{name} set"]),
-            "--output-dir", str((out / name).absolute()), "--save-cells",
-            "--time-budget", "60", "--target-ratio", "1.2",
-        ]  # fmt: skip
-        with (out / f"{name}.log").open("w") as log:
-            # Python looks first where it is started
-            done = subprocess.run(
-                command, env=environment, cwd=package, stdout=log, stderr=log, timeout=1500, check=False
-            )
-        if done.returncode != 0:
-            return False
-    return True
+    calls = [
+        [
+            "--load-config", str(files[name]), "--camera-path-filename", str(files["path"]),
+            "--perturbation-filename", str(files[f"{name} set"]), "--output-dir", str((out / name).absolute()),
+            "--save-cells", "--time-budget", "60", "--target-ratio", "1.2",
+        ]
+        for name in _SPECS
+        if not (out / name / "report.json").exists()
+    ]  # fmt: skip
+    program = f"""
+import sys
+from ns_abstract.cli.render import main
+for options in {calls!r}:
+    sys.argv = ["ns-abstract-render", *options]
+    try:
+        main()
+    except SystemExit as ended:
+        if ended.code not in (0, None):
+            raise
+"""
+    with (out / "render.log").open("w") as log:
+        # Python looks first where it is started
+        done = subprocess.run(
+            [sys.executable, "-W", "ignore", "-c", program], env=environment, cwd=package, stdout=log, stderr=log,
+            timeout=3000, check=False,
+        )  # fmt: skip
+    return done.returncode == 0
 
 
 def change(healthy: Path, faulty: Path) -> tuple[float, float]:
@@ -202,11 +253,9 @@ def main() -> None:
                 package.mkdir()
                 copy_package(package)
                 blind(package)
-                if fault is not None:
-                    mutate(package, fault)
                 cache, kept = Path(temporary) / "cache", options.work / "kernels"
                 if fault is not None:
-                    warm(package, fault.file, kept, cache)
+                    warm(package, fault, mutate(package, fault), kept, cache)
                 ended = render(package, files, out, str(cache), options.interpreted)
                 if fault is None and not options.interpreted:
                     shutil.copytree(cache, kept)

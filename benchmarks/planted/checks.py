@@ -4,7 +4,7 @@ from planted.fault import Fault
 
 _AUDIT, _FORMS, _RESULTS, _SPLATS = "check/audit.py", "check/forms.py", "check/results.py", "check/splats.py"
 _PICTURES, _NETWORKS, _FIELDS = "check/pictures.py", "check/networks.py", "check/fields.py"
-_STATEMENTS, _VERDICTS = "check/statements.py", "check/verdicts.py"
+_STATEMENTS, _LOOPS, _CLAIMS = "check/statements.py", "check/loops.py", "check/claims.py"
 _PIXELS = "test_check.py::test_pixels_contain_pictures_of_another_renderer[classic-1.4.0]"
 
 CHECKS = (
@@ -76,24 +76,24 @@ CHECKS = (
         "checker: linear sets are not looked at",
         _PICTURES,
         "ClaimedBounds.excess",
-        "np.where(beyond <= 0.0, -1.0, linear)",
-        "np.full(len(c), -1.0)",
+        "np.where(holds, -1.0, a)",
+        "-1.0 + 0.0 * a",
         "test_check.py::test_a_claim_is_about_both_bounds",
     ),
     Fault(
         "checker: a frame's own bounds are not looked at",
         _PICTURES,
         "ClaimedBounds.excess",
-        "np.maximum(linear, -1.0 if side * (fixed - end) <= 0.0 else flat)",
-        "linear",
+        "-1.0 if holds_flat else b",
+        "-1.0 + 0.0 * b",
         "test_check.py::test_a_claim_is_about_both_bounds",
     ),
     Fault(
         "checker: the least part is stated at 5 %",
         _AUDIT,
         "least_part",
-        "tail <= 1.0 - CONFIDENCE",
-        "tail <= CONFIDENCE",
+        "sum(map(math.exp, logs)) <= 1.0 - level",
+        "sum(map(math.exp, logs)) <= level",
         "test_check.py::test_the_least_part_is_that_of_clopper_and_pearson",
     ),
     Fault(
@@ -115,9 +115,9 @@ CHECKS = (
     Fault(
         "checker: the line above a ReLU is not lifted",
         _NETWORKS,
-        "_lines",
-        "torch.where(bends, -above * low * (1.0 + 8.0 * U), 0.0)",
-        "0.0 * above",
+        "_line",
+        "torch.where(bends, -0.5 * slope.clamp(max=1.0) * low * (1.0 + 8.0 * U), 0.0)",
+        "0.0 * low",
         "test_check_kinds.py::test_networks_are_enclosed[0.1]",
     ),
     Fault(
@@ -154,7 +154,7 @@ CHECKS = (
     ),
     Fault(
         "checker: errors of states are forgotten",
-        _VERDICTS,
+        _LOOPS,
         "_lifted",
         "np.concatenate([e.g, errors[:, k]])",
         "e.g",
@@ -175,5 +175,29 @@ CHECKS = (
         "kept, room = (p.kappa < 0.03) & (span < 4000.0), 2.0**10",
         "kept, room = (p.kappa < 0.03), 2.0**10",
         "test_check_kinds.py::test_needles_may_miss_their_tiles_in_float32",
+    ),
+    Fault(
+        "checker: a part of a box is left out",
+        _CLAIMS,
+        "_divided",
+        "np.linspace(low[axis], high[axis], count + 1)",
+        "np.linspace(low[axis], 0.9 * high[axis], count + 1)",
+        "test_check.py::test_parts_of_a_box_are_the_box",
+    ),
+    Fault(
+        "checker: a plane beyond what pictures can be holds",
+        _PICTURES,
+        "ClaimedBounds.excess",
+        "np.maximum(side * (middle - c) + tilt + room, past)",
+        "side * (middle - c) + tilt + room",
+        "test_check.py::test_a_claim_is_about_both_bounds",
+    ),
+    Fault(
+        "checker: Gaussians reach half as far",
+        _SPLATS,
+        "_ends",
+        "np.where(wild, longest, reach * np.sqrt(variance) * (1.0 + 1e-9))",
+        "np.where(wild, longest, 0.5 * reach * np.sqrt(variance))",
+        _PIXELS,
     ),
 )

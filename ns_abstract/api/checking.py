@@ -3,12 +3,71 @@
 from __future__ import annotations
 
 import os
+import statistics
+import time
 from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
 
-from ns_abstract.check.audit import Audit, run
+from ns_abstract.check.audit import Outcome, least_part, opened, outcomes
 from ns_abstract.check.inputs import BadInput
 from ns_abstract.io.arguments import file_path, positive, whole
+from ns_abstract.io.atomic import write_json
 from ns_abstract.io.errors import InputError
+
+#: Part of the claims that must be settled.
+_ENOUGH = 0.8
+
+
+@dataclass
+class Audit:
+    """What came of the claims.
+
+    Attributes:
+        claims: Number of claims that were looked at.
+        proved, refuted, unsettled: Their numbers by outcome.
+        float32: Number of those proved of every float32 evaluation; the others concern the picture in real numbers.
+        refutations: By refuted claim: frame, cell, pose, what is wrong.
+        uniform: Claims and proofs of the uniform sample, and the least part of all claims that holds, at 95 %.
+        structure: What is wrong with the cells; empty: they tile every set, every pixel is bounded, counts are right.
+        seconds, median_seconds: Of all claims, and of one.
+        picture: What all proved claims hold of: "real numbers", or "every float32 evaluation".
+    """
+
+    claims: int = 0
+    proved: int = 0
+    refuted: int = 0
+    unsettled: int = 0
+    float32: int = 0
+    refutations: list[dict[str, Any]] = field(default_factory=list)
+    uniform: dict[str, Any] = field(default_factory=dict)
+    structure: list[str] = field(default_factory=list)
+    seconds: float = 0.0
+    median_seconds: float = 0.0
+    picture: str = "real numbers"
+
+    @property
+    def exit_code(self) -> int:
+        """0 nothing refuted, 1 refuted, 3 too few claims settled."""
+        if self.refuted or self.structure:
+            return 1
+        return 3 if self.proved < _ENOUGH * self.claims or not self.claims else 0
+
+    def _tally(self, found: list[Outcome]) -> None:
+        """Counts what came of the claims."""
+        self.claims, self.proved = len(found), sum(o.verdict is True for o in found)
+        self.refuted, self.unsettled = (sum(o.verdict is v for o in found) for v in (False, None))
+        self.float32 = sum(o.verdict is True and o.float32 for o in found)
+        self.refutations = [o.found for o in found if o.verdict is False]
+        self.picture = "every float32 evaluation" if self.proved == self.float32 > 0 else "real numbers"
+        drawn = [o for o in found if o.uniform]
+        proved = [o for o in drawn if o.verdict is True]
+        sure = sum(o.float32 for o in proved)
+        self.uniform = {
+            "claims": len(drawn), "proved": len(proved), "holds_at_least": least_part(len(proved), len(drawn)),
+            "float32": sure, "float32_at_least": least_part(sure, len(drawn)),
+        }  # fmt: skip
 
 
 def check(
@@ -51,14 +110,34 @@ def check(
         "loop": loop,
     }
     files = {name: None if file is None else file_path(file, name) for name, file in moved.items()}
+    return _audited(file_path(output_dir, "output_dir"), claims, seconds, seed, files, on_progress)
+
+
+def _audited(
+    folder: Path,
+    claims: int,
+    seconds: float,
+    seed: int,
+    moved: dict[str, Path | None],
+    on_progress: Callable[[Audit], object] | None,
+) -> Audit:
+    begin = time.monotonic()
+    found, spent = [], []
     try:
-        return run(
-            file_path(output_dir, "output_dir"),
-            claims=claims,
-            seconds=seconds,
-            seed=seed,
-            moved=files,
-            on_claim=on_progress,
-        )
+        wrong, subjects = opened(folder, moved)
+        audit = Audit(structure=wrong)
+        start = time.monotonic()
+        for outcome in outcomes(subjects, 0 if wrong else claims, begin + seconds - start, seed):
+            found.append(outcome)
+            spent.append(time.monotonic() - start)
+            if on_progress is not None:
+                audit._tally(found)
+                if on_progress(audit) is False:
+                    break
+            start = time.monotonic()
+        audit._tally(found)
     except BadInput as error:
         raise InputError(error.problem, fix=error.fix, file=error.file, field=error.field) from None
+    audit.seconds, audit.median_seconds = time.monotonic() - begin, statistics.median(spent) if spent else 0.0
+    write_json(folder / "check.json", {"version": 1, "seed": seed, **asdict(audit)})
+    return audit

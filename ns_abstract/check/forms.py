@@ -134,8 +134,10 @@ class Affine:
         s, c = np.sin(self.c), np.cos(self.c)
         half, room = 0.5 * (1.0 + 8.0 * U), 0.5 * self.width + 1e-15
         # the second derivative moves by no more than the angle
-        ends = ((np.maximum(-0.5 * f - room, -half), np.minimum(-0.5 * f + room, half)) for f in (s, c))
-        a, b = (self.composed(f, slope, *end) for f, slope, end in zip((s, c), (c, -s), ends, strict=True))
+        a, b = (
+            self.composed(f, slope, np.maximum(-0.5 * f - room, -half), np.minimum(-0.5 * f + room, half))
+            for f, slope in ((s, c), (c, -s))
+        )
         return a, b
 
     def boxed(self, where: Array, low: Array, high: Array) -> Affine:
@@ -158,18 +160,12 @@ class Affine:
         bottom, top = np.clip(least, low, high), np.clip(most, low, high)
         with np.errstate(all="ignore"):
             slope = np.where(most > least, np.clip((top - bottom) / (most - least), 0.0, 1.0), 1.0)
-            places = [least, most, np.clip(low, least, most), np.clip(high, least, most)]
-            rest = np.stack([np.clip(x, low, high) - slope * x for x in places])
+            places = np.stack([least, most, np.clip(low, least, most), np.clip(high, least, most)])
+            rest = np.clip(places, low, high) - slope * places
             rounding = 4.0 * U * (np.abs(least) + np.abs(most) + np.abs(bottom) + np.abs(top))
             small, large = rest.min(axis=0) - rounding, rest.max(axis=0) + rounding
             form = (self * slope + 0.5 * (small + large)).wider(0.5 * (large - small) * (1.0 + 4.0 * U))
-        inside, bad = (least >= low) & (most <= high), ~(np.isfinite(form.r) & np.isfinite(form.c))
-        return Affine.chosen(inside, self, form).boxed(bad & ~inside, bottom, top)
-
-    @staticmethod
-    def chosen(where: Array, a: Affine, b: Affine) -> Affine:
-        """The form ``a`` where it is asked for, elsewhere ``b``."""
-        return Affine(np.where(where, a.c, b.c), np.where(where, a.g, b.g), np.where(where, a.r, b.r))
+        return form.boxed(~(np.isfinite(form.r) & np.isfinite(form.c)), bottom, top)
 
     @staticmethod
     def joined(forms: Any, axis: int, join: Any = np.concatenate) -> Affine:

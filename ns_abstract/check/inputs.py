@@ -59,21 +59,6 @@ def read_json(file: Path, what: str, fix: str | None = None) -> dict[str, Any]:
     return content
 
 
-class _Inert(yaml.SafeLoader):
-    """Keeps what Python objects are made of, and makes none."""
-
-
-def _plain(loader: Any, suffix: str, node: Any) -> Any:
-    if isinstance(node, yaml.SequenceNode):
-        return loader.construct_sequence(node, deep=True)
-    mapping = isinstance(node, yaml.MappingNode)
-    return loader.construct_mapping(node, deep=True) if mapping else loader.construct_scalar(node)
-
-
-_Inert.add_multi_constructor("tag:yaml.org,2002:python/", _plain)
-_Inert.add_multi_constructor("!", _plain)
-
-
 def read_scene(file: Path, report: dict[str, Any]) -> ActivatedScene | CheckedField:
     """The scene that a result is about: what its digest in the report says, or nothing.
 
@@ -122,17 +107,19 @@ def _drawn(stored: list[Array], file: Path, settings: dict[str, Any]) -> list[Ar
 def _read_run(file: Path, settings: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
     """A run's model configuration and its tensors by their names in the model."""
     try:
-        root = _Inert(file.read_text(encoding="utf-8")).get_single_data()
+        # makes texts, lists and mappings of whatever Python objects are written down
+        root = yaml.BaseLoader(file.read_text(encoding="utf-8")).get_single_data()
         model, parts = dict(root["pipeline"]["model"]), root.get("relative_model_dir") or "nerfstudio_models"
         folder = file.parent / (parts if isinstance(parts, str) else "/".join(parts))
-        step = root.get("load_step") if settings.get("load_step") is None else settings["load_step"]
+        step = root.get("load_step", "null") if settings.get("load_step") is None else settings["load_step"]
+        step = None if step in ("null", "") else int(step)
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError, yaml.YAMLError):
         raise BadInput("cannot be read as a run's configuration", file, fix=_CONVERT) from None
     steps = ((re.fullmatch(r"step-(\d+)\.ckpt", p.name), p) for p in sorted(folder.glob("step-*.ckpt")))
     names = {int(match[1]): p for match, p in steps if match}
-    if not names or (step is not None and int(step) not in names):
+    if not names or (step is not None and step not in names):
         raise BadInput("no such checkpoint" if names else "no checkpoints", folder, fix="give the whole run folder")
-    checkpoint = names[max(names) if step is None else int(step)]
+    checkpoint = names[max(names) if step is None else step]
     scalar, kinds = np.float64(0.0).__reduce__()[0], [type(np.dtype(code)) for code in ("f8", "f4", "i8", "i4", "?")]
     safe = [(scalar, "numpy.core.multiarray.scalar"), (scalar, "numpy._core.multiarray.scalar"), np.dtype, *kinds]
     try:
@@ -161,6 +148,8 @@ def _read_splats(file: Path, settings: dict[str, Any]) -> tuple[Any, ...]:
         rest = rest.reshape(count, -1, 3)[:, : (degree + 1) ** 2 - 1]
         sh = np.concatenate([a["features_dc"].reshape(count, 1, 3), rest], axis=1)
         background = _color(model.get("background_color", "random"))
+        if not count:
+            raise ValueError("no Gaussians")
         rows = a["means"], a["scales"], a["quats"], a["opacities"].reshape(-1), sh
     except (KeyError, ValueError, TypeError, AttributeError, ZeroDivisionError):
         raise BadInput("holds no Gaussians of Splatfacto", file) from None
@@ -180,16 +169,15 @@ def _read_ply(file: Path, settings: dict[str, Any]) -> tuple[Any, ...]:
         sh = np.concatenate([dc, more], axis=1)
         groups = (("x", "y", "z"), [f"scale_{k}" for k in range(3)], [f"rot_{k}" for k in range(4)])
         stored = [np.stack([columns[name] for name in group], axis=1) for group in groups]
-        with file.open("rb") as stream:
-            header = stream.read(1 << 16).partition(b"end_header")[0].decode("latin-1").split("\n")
+        if not len(dc):
+            raise ValueError("no Gaussians")
     except Exception:  # plyfile raises whatever a damaged file makes it run into
         raise BadInput("cannot be read as a 3DGS .ply", file, fix=_CONVERT) from None
     if "filter_3D" in columns:
         raise BadInput("has a filter, which this program does not apply", file, "filter_3D", _CONVERT)
     mode = "classic"
-    for line in header:
-        pattern = r"(?:comment|obj_info)\s+(splatrendermode|antialiased)\b[\s:=]*(.*)"
-        match = re.fullmatch(pattern, line.strip(), re.IGNORECASE)
+    for line in (*data.comments, *data.obj_info):
+        match = re.fullmatch(r"(splatrendermode|antialiased)\b[\s:=]*(.*)", line.strip(), re.IGNORECASE)
         if match:
             value = match[2].strip().strip("'\"").lower()
             known = value in _MODES and (value in ("mip", "default")) == (match[1].lower() == "splatrendermode")

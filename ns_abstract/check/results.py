@@ -68,43 +68,31 @@ def read_cells(folder: Path, name: str, index: int, digest: object) -> StoredCel
         if content.hexdigest() != digest:
             raise BadInput("is not the file that the report names (sha256)", file, fix=_AGAIN)
         with zipfile.ZipFile(file) as archive:
-            declared = {entry.filename.removesuffix(".npy"): _header(archive, entry) for entry in archive.infolist()}
-        if "box_lower" not in declared:
-            raise BadInput("keeps no cells", file, fix="run ns-abstract-render with --save-cells")
-        (n, d), (h, w, _), side = *(declared[k][0] for k in ("box_lower", "lower")), declared["b_lower"][0][1]
-        tiles, single = (n, side, side, 3), np.dtype("<f4")
-        wanted = {"lower": ((h, w, 3), single), "upper": ((h, w, 3), single), "tile": ((n, 2), np.dtype("<i4"))}
-        wanted |= dict.fromkeys(("box_lower", "box_upper"), ((n, d), np.dtype("<f8")))
-        wanted |= dict.fromkeys(("b_lower", "b_upper"), (tiles, single))
-        wanted |= dict.fromkeys(("A_lower", "A_upper"), ((*tiles, d), single))
-        for name_, (shape, kind) in wanted.items():
-            if declared.get(name_) != (shape, kind):
-                raise BadInput(f"{name_} is not {kind} {list(shape)}", file, fix=_AGAIN)
-        shape, kind = declared["parameters"]
-        if shape != (d,) or (kind.names or ()) != ("name", "unit", "lower", "upper") or kind.itemsize > 1 << 16:
-            raise BadInput("parameters are no table of names and ranges", file, fix=_AGAIN)
-        if sum(math.prod(s) * k.itemsize for s, k in wanted.values()) > _MOST:
-            raise BadInput("is too large", file)
+            if sum(entry.file_size for entry in archive.infolist()) > _MOST:
+                raise BadInput("is too large", file)
         with np.load(file, allow_pickle=False) as archive:
-            arrays, table = {name_: archive[name_] for name_ in wanted}, archive["parameters"]
-    except (OSError, zipfile.BadZipFile, zipfile.LargeZipFile, ValueError, KeyError, IndexError) as error:
+            if "box_lower" not in archive:
+                raise BadInput("keeps no cells", file, fix="run ns-abstract-render with --save-cells")
+            sides = [f"{k}_{s}" for k in ("box", "b", "A") for s in ("lower", "upper")]
+            arrays = {name: archive[name] for name in ("lower", "upper", "tile", *sides)}
+            table = archive["parameters"]
+        (n, d), (h, w, _), side = arrays["box_lower"].shape, arrays["lower"].shape, arrays["b_lower"].shape[1]
+        shapes = {"lower": (h, w, 3), "upper": (h, w, 3), "tile": (n, 2), "box": (n, d), "b": (n, side, side, 3)}
+        shapes["A"] = (*shapes["b"], d)
+        for key, array in arrays.items():
+            shape = shapes[key.rpartition("_")[0] or key]
+            kind = np.dtype({"tile": "<i4", "box_lower": "<f8", "box_upper": "<f8"}.get(key, "<f4"))
+            if array.shape != shape or array.dtype != kind:
+                raise BadInput(f"{key} is not {kind} {list(shape)}", file, fix=_AGAIN)
+        if table.shape != (d,) or table.dtype.names != ("name", "unit", "lower", "upper"):
+            raise BadInput("parameters are no table of names and ranges", file, fix=_AGAIN)
+    except (OSError, zipfile.BadZipFile, ValueError, KeyError, IndexError, MemoryError) as error:
         if isinstance(error, BadInput):
             raise
         raise BadInput("cannot be read as a frame file", file, fix=_AGAIN) from None
     if not all(np.isfinite(a).all() for a in arrays.values()):
         raise BadInput("holds numbers that are not finite", file, fix=_AGAIN)
     return StoredCells(index, tuple(map(str, table["name"])), table["lower"], table["upper"], arrays)
-
-
-def _header(archive: zipfile.ZipFile, entry: zipfile.ZipInfo) -> tuple[tuple[int, ...], np.dtype]:
-    """Shape and type of an array, from its first bytes."""
-    with archive.open(entry) as member:
-        version = np.lib.format.read_magic(member)
-        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, fortran, kind = read(member)
-    if kind.hasobject or fortran:
-        raise ValueError("objects are not read")
-    return shape, kind
 
 
 def read_verdicts(folder: Path, report: dict[str, Any]) -> list[StoredCells]:

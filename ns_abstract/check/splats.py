@@ -86,15 +86,10 @@ def activated(
     """The scene of stored float32 parameters."""
     logs, q, logits = (v.astype(np.float64) for v in (logs, quats, logits))
     scales = np.exp(logs)
-    w, x, y, z = (q / np.sqrt((q * q).sum(axis=1, keepdims=True))).T
-    turn = np.stack(
-        [
-            1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-            2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-            2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-        ],
-        axis=1,
-    ).reshape(-1, 3, 3)  # fmt: skip
+    w, *v = (q / np.sqrt((q * q).sum(axis=1, keepdims=True))).T
+    # v x u as a matrix times u
+    cross = np.cross(np.stack(v, axis=-1)[:, None], np.eye(3)).swapaxes(1, 2)
+    turn = np.eye(3) + 2.0 * w[:, None, None] * cross + 2.0 * cross @ cross
     opacity = 1.0 / (1.0 + np.exp(np.minimum(-logits, 700.0)))
     return ActivatedScene(
         means.astype(np.float64), turn * scales[:, None, :], scales, opacity, sh.astype(np.float64),
@@ -107,37 +102,28 @@ def reaches(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit:
 
     A Gaussian that shows nowhere has crossed ends.
     """
-    x, y, z = _points(splats, view, np.arange(len(splats.means))[None], unit)
-    zl, zh = z.range()
-    near = ~(zl > 0.5 * NEAR)
-    zl = np.where(near, 1.0, zl)
-    hidden = ~((zh >= NEAR * (1.0 - ROOM)) & ~(zl > FAR * (1.0 + ROOM)))
-    sides = []
-    # in float32 a compensation may exceed 1 by rounding, and what is large may be drawn whatever its opacity
-    opacity = splats.opacity * (1.0 + ROOM + 64.0 * unit) * (1.2 if unit and splats.antialiased else 1.0)
-    faint = opacity < LEAST_ALPHA
+    parts, count = np.array_split(np.arange(len(splats.means)), 1 + len(splats.means) // TOGETHER), len(view.origin)
     with np.errstate(all="ignore"):
-        reach = np.sqrt(2.0 * np.log(np.maximum(opacity * 255.0, 1.0)))
-        limits = [(max(c, n - c) + 0.15 * n) / f for f, c, n in
-                  ((cam.fx, cam.cx, cam.width), (cam.fy, cam.cy, cam.height))]  # fmt: skip
-        longest = 1.05 * max(cam.fx, cam.fy) * splats.scales.max(axis=1) * np.sqrt(1.0 + np.square(limits).sum())
-        for t, f, centre, side in ((x, cam.fx, cam.cx, cam.width), (y, cam.fy, cam.cy, cam.height)):
-            a, b = t.range()
-            least, most = np.minimum(a / zl, a / zh), np.maximum(b / zl, b / zh)
-            # keyframes' rotations stretch by a hundredth at most
-            limit = (max(centre, side - centre) + 0.15 * side) / f * (1.0 + ROOM)
-            spread = 1.05 * f / zl * splats.scales.max(axis=1) * np.sqrt(1.0 + limit * limit)
-            room = reach * np.sqrt(spread * spread + BLUR) * (1.0 + 1e-9) + 1e-9 * (np.abs(least) + np.abs(most)) * f
-            if unit:
-                faint = faint & (spread < 4.0)
-                # exponents of small ones err by less than a tenth; those of large ones may be anything in their tiles,
-                # whose side is that of the longer axis, 3.33 deviations at most
-                room = np.where(spread < 4.0, 1.06 * room, np.maximum(1.06 * room, 3.4 * longest / zl) + 2.0 * TILE)
-            open_ = near | ~np.isfinite(room)
-            sides += [np.where(open_, -np.inf, f * least + centre - room - 1e-9)]
-            sides += [np.where(open_, np.inf, f * most + centre + room + 1e-9)]
-    sides[0] = np.where(hidden | faint, np.inf, sides[0])
-    return np.stack(sides, axis=-1)
+        some = (projected(splats, cam, view, np.broadcast_to(at, (count, len(at))), unit, False) for at in parts)
+        return np.concatenate([_ends(p, unit) for p in some], axis=1)
+
+
+def _ends(p: ProjectedForms, unit: float) -> Array:
+    zl, zh = p.depth.range()
+    wild = ~(p.kappa < 0.125)
+    # alpha is the threshold where the exponent is the logarithm, and dx^2 is at most twice that times the variance
+    visible = 255.0 * p.opacity.range()[1] * (1.0 + ROOM + 80.0 * unit)
+    spread = [e.range()[1] + BLUR + error for e, error in zip(p.squares[:2], p.errors, strict=False)]
+    reach = np.sqrt(2.0 * np.log(np.maximum(visible, 1.0)) / (1.0 - 1.2 * np.where(wild, 0.0, p.kappa)))
+    # tiles' squares are of the longer axis, 3.33 deviations at most
+    longest = 3.4 * np.sqrt(spread[0] + spread[1]) + 2.0 * TILE
+    ends = []
+    for form, variance in zip(p.centre, spread, strict=True):
+        (low, high), room = form.range(), np.where(wild, longest, reach * np.sqrt(variance) * (1.0 + 1e-9)) + 1e-9
+        open_ = ~(np.isfinite(low) & np.isfinite(high) & np.isfinite(room))
+        ends += [np.where(open_, -np.inf, low - room), np.where(open_, np.inf, high + room)]
+    hidden = (zh < NEAR * (1.0 - ROOM)) | (zl > FAR * (1.0 + ROOM)) | ((visible < 1.0) & ~wild)
+    return np.stack([np.where(hidden, np.inf, ends[0]), *ends[1:]], axis=-1)
 
 
 def meeting(ends: Array, row: int, column: int) -> Array:
@@ -166,28 +152,11 @@ def _points(splats: ActivatedScene, view: CameraForms, index: Array, unit: float
     return coordinates
 
 
-class _PixelFragments(NamedTuple):
-    """Alphas and depths [B, n] and colours [B, n, 3] of Gaussians, and which may show at all."""
-
-    alpha: Affine
-    color: Affine
-    depth: Affine
-    shows: Array
-    motion: Array
-
-    def among(self, places: Array) -> _PixelFragments:
-        """Those at ``places`` [B, m] of each row."""
-        row = np.arange(len(places))[:, None]
-        alpha, depth = (e.of(lambda a: a[..., row, places]) for e in (self.alpha, self.depth))
-        color = self.color.of(lambda a: a[..., row, places, :])
-        return _PixelFragments(alpha, color, depth, self.shows[row, places], self.motion)
-
-
 class ProjectedForms(NamedTuple):
     """Gaussians on the image plane, forms [B, n]: all that does not depend on the pixel.
 
     ``axes`` are the three columns of the covariance's root, ``errors`` those of the covariance's entries in float32,
-    ``kappa`` the exponent's relative error there; ``color`` [B, n, 3].
+    ``kappa`` the exponent's relative error there; ``color`` [3, B, n].
     """
 
     centre: list[Affine]
@@ -195,25 +164,25 @@ class ProjectedForms(NamedTuple):
     squares: list[Affine]
     inverse: Affine
     opacity: Affine
-    color: Affine
     depth: Affine
     errors: list[Array]
     kappa: Array
-
-    def among(self, box: Array, index: Array) -> ProjectedForms:
-        """Rows of Gaussians ``index`` [W, n] over the boxes [W] out of all [B, N]."""
-        box = box[:, None]
-
-        def pick(part: Any) -> Any:
-            if isinstance(part, list):
-                return [pick(e) for e in part]
-            return part.of(lambda a: a[..., box, index]) if isinstance(part, Affine) else part[box, index]
-
-        rest = {name: pick(getattr(self, name)) for name in self._fields if name != "color"}
-        return ProjectedForms(**rest, color=self.color.of(lambda a: a[..., box, index, :]))
+    color: Any = None
 
 
-def projected(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, at: Array, unit: float) -> ProjectedForms:
+def picked(part: Any, row: Array, index: Array) -> Any:
+    """Elements ``index`` of the rows [W, 1] of forms and arrays [..., B, n], and of those in lists and tuples."""
+    if isinstance(part, Affine):
+        return part.of(lambda a: a[..., row, index])
+    if isinstance(part, np.ndarray):
+        return part[row, index]
+    parts = [picked(e, row, index) for e in part]
+    return type(part)(*parts) if isinstance(part, tuple) else parts
+
+
+def projected(
+    splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, at: Array, unit: float, colored: bool = True
+) -> ProjectedForms:
     """The Gaussians ``at`` [B, n] for cameras over B boxes."""
     x, y, z = _points(splats, view, at, unit)
     iz = z.reciprocal()
@@ -246,13 +215,14 @@ def projected(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, at:
     opacity = Affine.constant(splats.opacity[at], z, 32.0 * U * splats.opacity[at])
     if splats.antialiased:
         opacity = opacity * _factor(flat, det, splats.rules.least_factor, unit)
-    color = _colors(splats, view, at, z, unit)
-    return ProjectedForms(centre, roots, [mm, nn, mn], inverse, opacity, color, z, errors, kappa)
+    color = _colors(splats, view, at, z, unit) if colored else None
+    return ProjectedForms(centre, roots, [mm, nn, mn], inverse, opacity, z, errors, kappa, color)
 
 
 def _fragments(
     splats: ActivatedScene, cam: CheckedCamera, p: ProjectedForms, index: Array, pixel: tuple[Array, Array], unit: float
-) -> _PixelFragments:
+) -> tuple[Affine, Array, Array]:
+    """Alphas [B, n], which may show at all, and by how many pixels the parameters move them [d, B]."""
     rules, (mx, my), (m, n), opacity, z = splats.rules, p.centre, p.axes, p.opacity, p.depth
     dx, dy = (e + -(place[:, None] + 0.5) for e, place in ((mx, pixel[1]), (my, pixel[0])))
     near = total((n[k] * dx - m[k] * dy).square() for k in range(3))
@@ -287,7 +257,7 @@ def _fragments(
     gone = np.where(shows, 1.0, 0.0)
     alpha = alpha.boxed(rough, bottom, np.maximum(top, bottom)).of(lambda a: a * gone)
     motion = np.where(shows[None], np.abs(mx.g) + np.abs(my.g), 0.0).max(axis=2, initial=0.0)
-    return _PixelFragments(alpha, p.color, z, shows, motion)
+    return alpha, shows, motion
 
 
 def _rounded(det: Affine, squares: Any, h: list[Array], sizes: Array) -> tuple[list[Array], Array, Array]:
@@ -364,22 +334,22 @@ def _kept(p: ProjectedForms, ellipses: bool) -> tuple[Array, Array]:
     return kept, 1.0 + 16.0 * p.kappa + room * FLOAT
 
 
-def _colors(splats: ActivatedScene, view: CameraForms, at: Array, like: Affine, unit: float) -> Affine:
-    """Colours [B, n, 3]."""
-    sh = splats.sh[at]
-    flat = like.of(lambda a: np.broadcast_to(a[..., None], (*a.shape, 3)))
+def _colors(splats: ActivatedScene, view: CameraForms, at: Array, depth: Affine, unit: float) -> Affine:
+    """Colours [3, B, n]."""
+    sh = np.moveaxis(splats.sh[at], (-2, -1), (0, 1))
+    flat = depth.of(lambda a: np.repeat(a[..., None, :, :], 3, axis=-3))
     if isinstance(splats.paint, float):
         # a depth that is not a number may be any
         low, high = flat.range()
         return flat.boxed(np.array(True), (high < splats.paint) * 1.0, ~(low >= splats.paint) * 1.0)
     if splats.paint is not None:
-        return Affine.constant(splats.paint[at][..., None], flat)
+        return Affine.constant(splats.paint[at], flat)
     if splats.sigmoid:
-        value = 1.0 / (1.0 + np.exp(-sh[..., 0, :]))
+        value = 1.0 / (1.0 + np.exp(-sh[0]))
         return Affine.constant(value, flat, (32.0 * U + 16.0 * unit) * value)
-    size = np.abs(sh[..., 0, :]) + 1.0
-    color = Affine.constant(0.28209479177387814 * sh[..., 0, :] + 0.5, flat, (8.0 * U + 4.0 * unit) * size)
-    if splats.degree and np.any(sh[..., 1:, :]):
+    size = np.abs(sh[0]) + 1.0
+    color = Affine.constant(0.28209479177387814 * sh[0] + 0.5, flat, (8.0 * U + 4.0 * unit) * size)
+    if splats.degree and np.any(sh[1:]):
         (x, y, z), error = _directions(splats, view, at, unit)
         bands = [y * -0.4886025119029199, z * 0.4886025119029199, x * -0.4886025119029199]
         xx, yy, zz = x.square(), y.square(), z.square()
@@ -397,10 +367,9 @@ def _colors(splats: ActivatedScene, view: CameraForms, at: Array, like: Affine, 
                 x * (zz * 4.0 - xx - yy) * -0.4570457994644658,
                 z * (xx - yy) * 1.445305721320277, x * (xx - yy * 3.0) * -0.5900435899266435,
             ]  # fmt: skip
-        for k, band in enumerate(bands):
-            # slopes of bands are below 8, and 16 roundings of sums of terms below 8 together
-            band = band.wider(8.0 * error + 128.0 * unit)
-            color = color + wide(band) * sh[..., k + 1, :]
+        # slopes of bands are below 8, and 16 roundings of sums of terms below 8 together
+        bands = [e.wider(8.0 * error + 128.0 * unit).of(lambda a: a[..., None, :, :]) for e in bands]
+        color = total([color, *(band * row for band, row in zip(bands, sh[1:], strict=False))])
     return color.clamped(0.0, np.inf)
 
 
@@ -419,15 +388,26 @@ def _directions(splats: ActivatedScene, view: CameraForms, at: Array, unit: floa
     return [e * inverse for e in parts], np.where(np.isfinite(error), error, np.inf if unit else 0.0)
 
 
-def blended(f: _PixelFragments, background: Array, unit: float) -> tuple[Affine, Array]:
-    """The blended colours [B, 3] before the clamp, and which of the fragments [B, n] matter."""
-    # those that do not show stand behind all others
-    order = np.argsort(np.where(f.shows, f.depth.c, np.inf), axis=1, kind="stable")
-    alpha, color, depth, shows, _ = f.among(order)
+def blended(
+    alpha: Affine, color: Affine, depth: Affine, shows: Array, background: Array, unit: float
+) -> tuple[Affine, Array]:
+    """The blended colours [B, 3] before the clamp, and which of the fragments [B, n] matter; colours are [3, B, n]."""
     count, n = shows.shape
+    # those that do not show stand behind all others
+    order = np.argsort(np.where(shows, depth.c, np.inf), axis=1, kind="stable")
+    alpha, color, depth, shows = picked([alpha, color, depth, shows], np.arange(count)[:, None], order)
+    color = color.of(lambda a: np.moveaxis(a, -3, -1))
     al, ah = (np.clip(a, 0.0, 1.0) for a in alpha.range())
     cl, ch = color.range()
-    clean, dlow, dhigh = _groups(depth, shows)
+    # a slope that all share changes no order
+    common = (depth.g * (shows / np.maximum(shows.sum(axis=1, keepdims=True), 1))).sum(axis=2, keepdims=True)
+    room = (np.abs(depth.g - common).sum(axis=0) + depth.r) * (1.0 + 64.0 * U) + 64.0 * U * depth.size()
+    room = np.where(np.isnan(room), np.inf, room)
+    low, high = (np.where(shows, depth.c + s * room, -s * np.inf) for s in (-1.0, 1.0))
+    front, back = np.maximum.accumulate(high, axis=1), np.minimum.accumulate(low[:, ::-1], axis=1)[:, ::-1]
+    # whether all in front of a place is surely in front of all behind it
+    clean = np.ones((count, n + 1), bool)
+    clean[:, 1:n] = front[:, :-1] < back[:, 1:]
     step = 1.0 + 8.0 * n * U + 4.0 * n * unit
     most, least = (
         np.concatenate([np.ones((count, 1)), np.cumprod(1.0 - a, axis=1)], axis=1) * s
@@ -444,7 +424,7 @@ def blended(f: _PixelFragments, background: Array, unit: float) -> tuple[Affine,
     inside = place[:, :-1] < end
     form = from_the_back(alpha, color, inside, background, unit)
     # other orders than that of the centres, and earlier stops
-    lower, upper = _swaps(dlow, dhigh, inside, most, ah, cl, ch)
+    lower, upper = _swaps((low, high, front, back), inside, most, ah, cl, ch)
     at = ((place[:, :-1] >= begin) & (place[:, :-1] < end))[..., None]
     room = 1.0 + ROOM + 8.0 * n * unit
     light = np.where(at[..., 0], STOP * room / np.maximum(1.0 - ah, 1e-3), 0.0).max(axis=1, initial=0.0)
@@ -461,21 +441,6 @@ def blended(f: _PixelFragments, background: Array, unit: float) -> tuple[Affine,
     keep = np.zeros((count, n), bool)
     np.put_along_axis(keep, order, (place[:, :-1] < end + 1) & shows, 1)
     return form, keep
-
-
-def _groups(depth: Affine, shows: Array) -> tuple[Array, Array, Array]:
-    """[B, n + 1] whether all in front of a place in the order is surely in front of all behind it; ranges of depth."""
-    n = shows.shape[1]
-    weight = shows / np.maximum(shows.sum(axis=1, keepdims=True), 1)
-    # a slope that all share changes no order
-    common = (depth.g * weight).sum(axis=2, keepdims=True)
-    room = (np.abs(depth.g - common).sum(axis=0) + depth.r) * (1.0 + 64.0 * U) + 64.0 * U * depth.size()
-    low, high = (np.where(shows, depth.c + s * room, -s * np.inf) for s in (-1.0, 1.0))
-    low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
-    clean = np.ones((len(shows), n + 1), bool)
-    front, back = np.maximum.accumulate(high, axis=1), np.minimum.accumulate(low[:, ::-1], axis=1)[:, ::-1]
-    clean[:, 1:n] = front[:, :-1] < back[:, 1:]
-    return clean, low, high
 
 
 def from_the_back(alpha: Affine, color: Affine, inside: Array, background: Array, unit: float) -> Affine:
@@ -502,15 +467,14 @@ def from_the_back(alpha: Affine, color: Affine, inside: Array, background: Array
     return Affine(c, g, np.where(np.isfinite(r), r, np.inf)).wider((4.0 * n + 16.0) * unit * size)
 
 
-def _swaps(dlow: Array, dhigh: Array, inside: Array, most: Array, ah: Array, cl: Array, ch: Array) -> Any:
+def _swaps(depths: Any, inside: Array, most: Array, ah: Array, cl: Array, ch: Array) -> tuple[Array, Array]:
     """What other orders than that of the centres may change: [B, 3] least and largest.
 
     Sorting by exchanges of neighbours exchanges each inverted pair once; an exchange changes the colour by the
     transmittance in front times both alphas times the difference of colours. What is surely in front of both is in
     front of them throughout.
     """
-    count, n = inside.shape
-    front, back = np.maximum.accumulate(dhigh, axis=1), np.minimum.accumulate(dlow[:, ::-1], axis=1)[:, ::-1]
+    (count, n), (dlow, dhigh, front, back) = inside.shape, depths
     begin = np.stack([np.searchsorted(f, low) for f, low in zip(front, dlow, strict=True)])
     light, lower, upper = np.take_along_axis(most, begin, 1), np.zeros((count, 3)), np.zeros((count, 3))
     for k in range(1, n):
@@ -543,28 +507,40 @@ def pixels(
         pixel: Rows [B] and columns [B].
         unit: 0 for the picture in real numbers, `FLOAT` for all those in float32.
     """
+    count = index.shape[1]
+    index = index if count else np.full((len(index), 1), -1)
     with np.errstate(all="ignore"):
         if not isinstance(view, ProjectedForms):
             view = projected(splats, cam, view, np.maximum(index, 0), unit)
-        f = _fragments(splats, cam, view, index, pixel, unit)
-        used = np.flatnonzero(f.shows.any(axis=0))
-        if not len(used):
-            plain = np.zeros((len(index), 3))
-            form = Affine(plain + splats.background, np.zeros((len(f.alpha.g), *plain.shape)), plain + 16.0 * unit)
-            return form, f.shows, f.motion
-        form, keep = blended(f.among(np.broadcast_to(used, (len(index), len(used)))), splats.background, unit)
-        kept = np.zeros(f.shows.shape, bool)
+        alpha, shows, motion = _fragments(splats, cam, view, index, pixel, unit)
+        used = np.flatnonzero(shows.any(axis=0))
+        # one, so that there is one
+        used = used if len(used) else np.zeros(1, int)
+        alpha, color, depth, some = picked(
+            [alpha, view.color, view.depth, shows], np.arange(len(index))[:, None], used[None]
+        )
+        form, keep = blended(alpha, color, depth, some, splats.background, unit)
+        kept, seen = np.zeros(shows.shape, bool), shows.any(axis=1)[:, None]
         kept[:, used] = keep
-        return form, kept, f.motion
+        # where nothing shows the background is drawn, exactly
+        c, r = np.where(seen, form.c, splats.background), np.where(seen, form.r, 0.0)
+        form = Affine(c, np.where(seen, form.g, 0.0), r)
+        return form, kept[:, :count], motion
 
 
 def pictures(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit: float) -> Affine:
     """The pictures [B, H, W, 3] over B boxes of poses."""
-    count, size, lists = len(view.origin), cam.height * cam.width, []
+    form = several(splats, cam, view, np.arange(cam.height * cam.width), unit)
+    return form.of(lambda a: a.reshape(*a.shape[:-2], cam.height, cam.width, 3))
+
+
+def several(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, numbers: Array, unit: float) -> Affine:
+    """Colours [B, P, 3] of pixels over B boxes of poses, by their numbers [P] in the picture."""
+    count, size, lists = len(view.origin), len(numbers), []
     for ends in reaches(splats, cam, view, unit):
         inside = (ends[:, 0] <= cam.width) & (ends[:, 1] >= 0.0) & (ends[:, 2] <= cam.height) & (ends[:, 3] >= 0.0)
         some = np.flatnonzero(inside)
-        lists += [some[meeting(ends[some], *divmod(p, cam.width))] for p in range(size)]
+        lists += [some[meeting(ends[some], *divmod(p, cam.width))] for p in numbers]
     # one more, so that there is one
     every = np.unique(np.concatenate([*lists, [0]]).astype(np.int64))
     with np.errstate(all="ignore"):
@@ -574,9 +550,9 @@ def pictures(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit
     for start in range(0, len(lists), step):
         chosen = lists[start : start + step]
         index = np.full((len(chosen), longest), -1)
-        for place, numbers in zip(index, chosen, strict=True):
-            place[: len(numbers)] = np.searchsorted(every, numbers)
+        for place, found in zip(index, chosen, strict=True):
+            place[: len(found)] = np.searchsorted(every, found)
         box, place = np.divmod(np.arange(start, start + len(chosen)), size)
-        part = whole.among(box, index)
-        parts.append(pixels(splats, cam, part, index, np.divmod(place, cam.width), unit)[0].clamped(0.0, 1.0))
-    return Affine.joined(parts, -2).of(lambda a: a.reshape(*a.shape[:-2], count, cam.height, cam.width, 3))
+        part = picked(whole, box[:, None], index)
+        parts.append(pixels(splats, cam, part, index, np.divmod(numbers[place], cam.width), unit)[0].clamped(0.0, 1.0))
+    return Affine.joined(parts, -2).of(lambda a: a.reshape(*a.shape[:-2], count, size, 3))

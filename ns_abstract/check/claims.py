@@ -1,0 +1,156 @@
+"""Claims about cells: each is settled by dividing its cell until all parts are proved or a pose refutes it."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ns_abstract.check.forms import Array
+from ns_abstract.check.results import StoredCells
+from ns_abstract.check.splats import FLOAT, ActivatedScene
+
+#: Boxes times Gaussians that are looked at together.
+_BATCH = 40_000
+#: Part of a claim's time in which every float32 evaluation must be proved; then the picture in real numbers is.
+_FIRST = 0.5
+
+
+class Margins(NamedTuple):
+    """By how much a claim holds over B boxes of parameters; negative: by how much it does not.
+
+    Attributes:
+        least: [B] lower bounds at all poses.
+        most: [B] upper bounds at the boxes' middles; of use for boxes that are points.
+        near: [B, n] which of what was looked at matters, or None: all of it.
+        motion: [d, B] by how much the parameters move it, or None: nobody knows.
+    """
+
+    least: Array
+    most: Array
+    near: Array | None = None
+    motion: Array | None = None
+
+
+class Claims(ABC):
+    """Claims of one kind about the cells of a frame, or of a question about a loop.
+
+    Args:
+        cells: What is claimed.
+        scene: What is drawn.
+        report: Of the result.
+    """
+
+    #: Boxes that are looked at together.
+    together = 8
+    #: Number of claims that are drawn from.
+    count: int
+    #: Whether what is behind the picture is proved of float32, too.
+    in_float32 = True
+
+    def __init__(self, cells: StoredCells, scene: Any, report: dict[str, Any]) -> None:
+        self.cells, self.scene = cells, scene
+        splats = isinstance(scene, ActivatedScene) and report.get("guarantee") == "float32-sound"
+        # float32 first, where that is claimed and this program has charges
+        self.units = (FLOAT, 0.0) if splats else (0.0,)
+
+    @abstractmethod
+    def one(self, rng: Any) -> Any:
+        """A claim, uniformly."""
+
+    @abstractmethod
+    def interest(self, claim: Any) -> float:
+        """The larger, the more likely to fail."""
+
+    @abstractmethod
+    def place(self, claim: Any) -> dict[str, Any]:
+        """Its cell, and what else names it."""
+
+    @abstractmethod
+    def margins(self, claim: Any, low: Array, high: Array, near: Array, unit: float) -> Margins:
+        """Over boxes [B, d]; ``near`` are the numbers of what is to be looked at."""
+
+    @abstractmethod
+    def detail(self, claim: Any, point: Array) -> dict[str, Any]:
+        """What is wrong at the pose [1, d]."""
+
+    def near(self, claim: Any, low: Array, high: Array, unit: float) -> Array:
+        """Numbers of what has to be looked at over the box [1, d]."""
+        return np.zeros(0, np.int64)
+
+    def hint(self, claim: Any) -> Array | None:
+        """A pose [1, d] that may refute the claim."""
+        return None
+
+    def floor(self, claim: Any) -> float:
+        """The margin that is claimed of every pose."""
+        return 0.0
+
+    def draw(self, rng: Any, hunted: bool) -> Any:
+        """A claim that is uniform, or the most telling of eight."""
+        return max([self.one(rng) for _ in range(8 if hunted else 1)], key=self.interest)
+
+    def box(self, claim: Any) -> tuple[Array, Array]:
+        """The claim's cell."""
+        cell = self.place(claim)["cell"]
+        return self.cells.arrays["box_lower"][cell], self.cells.arrays["box_upper"][cell]
+
+    def settle(self, claim: Any, deadline: float) -> tuple[bool | None, bool, dict[str, Any]]:
+        """True: proved; False: refuted, with the pose; None: open when the time was over; and whether of float32."""
+        begin, (low, high) = time.monotonic(), self.box(claim)
+        near, hint = self.near(claim, low[None], high[None], self.units[0]), self.hint(claim)
+        if hint is not None and self.margins(claim, hint, hint, near, 0.0).most[0] < 0.0:
+            return False, False, self.detail(claim, hint)
+        for unit in self.units:
+            end = begin + (deadline - begin) * (_FIRST if unit else 1.0)
+            verdict, detail = self._divide(claim, near, unit, end)
+            if verdict is not None:
+                return verdict, unit > 0.0 and self.in_float32, detail
+        return None, False, {}
+
+    def _divide(self, claim: Any, near: Array, unit: float, deadline: float) -> tuple[bool | None, dict[str, Any]]:
+        low, high = self.box(claim)
+        stack, fresh = [(low, high, near)], True
+        while stack:
+            if time.monotonic() > deadline:
+                return None, {}
+            size = min(self.together, len(stack), max(1, _BATCH // max(1, len(stack[-1][2]))))
+            parts = [stack.pop() for _ in range(size)]
+            first, last = (np.stack([part[k] for part in parts]) for k in (0, 1))
+            near = np.unique(np.concatenate([part[2] for part in parts]))
+            found, middle = self.margins(claim, first, last, near, unit), 0.5 * (first + last)
+            open_ = np.flatnonzero(~(found.least >= 0.0))
+            some = open_[: 1 + self.together // 8]
+            some = [0] if fresh and not len(some) and self.floor(claim) > 0.0 else some
+            if len(some):
+                at = self.margins(claim, middle[some], middle[some], near, unit)
+                wrong = np.flatnonzero(at.most < self.floor(claim) * (1.0 - 1e-9))
+                if len(wrong):
+                    return False, self.detail(claim, middle[some][wrong[:1]])
+                if len(open_) and not (at.least >= 0.0).all():
+                    # smaller boxes about this point are not proved either
+                    return None, {}
+            fresh = False
+            for k in open_:
+                motion = np.ones(len(low)) if found.motion is None else found.motion[:, k]
+                inner = near if found.near is None else near[found.near[k]]
+                stack.extend((a, b, inner) for a, b in _divided(first[k], last[k], motion, high - low))
+        return True, {}
+
+
+def _divided(low: Array, high: Array, motion: Array, full: Array) -> list[tuple[Array, Array]]:
+    """Parts of a box: along the side that moves the picture most."""
+    width = high - low
+    relative = width / np.where(full > 0.0, full, 1.0)
+    weight = np.where(np.isfinite(motion), motion, 0.0)
+    weight = np.where(width > 0.0, weight + 1e-3 * (weight.max(initial=0.0) + 1e-30) * relative, -1.0)
+    if not (width > 0.0).any():
+        return [(low, high)]
+    axis, count = int(np.argmax(weight)), 4 if len(width) == 1 else 2
+    ends = np.linspace(low[axis], high[axis], count + 1)
+    parts = [(low.copy(), high.copy()) for _ in range(count)]
+    for (bottom, top), a, b in zip(parts, ends[:-1], ends[1:], strict=True):
+        bottom[axis], top[axis] = a, b
+    return parts

@@ -1,0 +1,129 @@
+"""Claims of loops: no run from a cell comes to harm, and all reach the goal."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ns_abstract.check.forms import Affine, Array, U, fixed, parameters, product, rotation, total
+from ns_abstract.check.inputs import BadInput, lens
+from ns_abstract.check.poses import TURNS, CameraForms, CheckedCamera, Poses
+from ns_abstract.check.results import StoredCells
+from ns_abstract.check.verdicts import OfNetwork
+
+
+class Loop(OfNetwork):
+    """The claims of a question: no run from a cell comes to harm, and (question 1) all reach the goal."""
+
+    kinds = ("certified",)
+
+    def __init__(self, cells: StoredCells, scene: Any, report: dict[str, Any], model: Path) -> None:
+        self.loop = loop = report["loop"]
+        super().__init__(cells, scene, report, model, loop)
+        if loop["dynamics"].get("type") != "affine":
+            problem = "has dynamics that this program does not follow"
+            raise BadInput(problem, "report.json", "loop.dynamics.type", "audit an affine loop")
+        stated = [area for area in [*(loop.get("unsafe") or []), loop.get("goal") or {}] if area]
+        if not all("box" in area or "half_space" in area for area in stated):
+            problem = "has properties of the picture, which this program does not follow along a loop"
+            raise BadInput(problem, "report.json", "loop.unsafe", "audit a loop whose areas are boxes or half-spaces")
+        height, width = self.shape["resize"]
+        stated = lens(loop["camera"], loop["camera"].get("fov", 45.0), width, height)
+        pose = np.array(loop["camera"]["camera_to_world"], np.float64)[:3]
+        self.camera = CheckedCamera(pose, *stated, int(width), int(height))
+        self.steps, self.names = int(loop["steps"]), list(loop["state"])
+        empty = {"offset": [0.0] * 3, "matrix": [[0.0] * len(self.names)] * 3}
+        self.position = loop["camera"].get("position") or empty
+        self.turns = {name: loop["camera"][name] for name in TURNS if loop["camera"].get(name)}
+        rows = [*self.position["matrix"], *(about["row"] for about in self.turns.values())]
+        self.seen = [k for k in range(len(self.names)) if any(row[k] for row in rows)]
+
+    def _state(self, low: Array, high: Array) -> list[Affine]:
+        given = Poses(self.camera, self.cells.names).given(low, high)
+        ends = {n: v if isinstance(v, (int, float)) else v[0] for n, v in self.loop["initial"].items()}
+        return [given[n] if n in given else given[""] + float(ends[n]) for n in self.names]
+
+    def _view(self, x: list[Affine]) -> CameraForms:
+        rows = zip(self.position["matrix"], self.position["offset"], strict=True)
+        place, turn = [_affine(row, x, o) for row, o in rows], fixed(self.camera.pose[:, :3], x[0])
+        for name, about in self.turns.items():
+            turn = product(turn, rotation(np.array(TURNS[name]), _affine(about["row"], x, about["offset"])))
+        return CameraForms(turn, place, self.camera.pose)
+
+    def _outputs(self, x: list[Affine], unit: float) -> list[Affine]:
+        """The network's outputs in the symbols of the state.
+
+        They are bounded by forms in the states that the camera sees, over their box, whose symbols are these states
+        themselves, scaled.
+        """
+        low, high = (np.stack([e.range()[k] for e in x], axis=-1) for k in (0, 1))
+        middle = 0.5 * (low + high)
+        half = np.maximum(high - middle, middle - low) * (1.0 + 4.0 * U)
+        own = parameters(middle[:, self.seen], half[:, self.seen])
+        local = [own[self.seen.index(k)] if k in self.seen else own[0] * 0.0 + middle[:, k] for k in range(len(x))]
+        y, outputs = self.network.outputs(self.inputs(self.camera, self._view(local), unit)), []
+        inverse = np.where(half > 1e-150, 1.0 / np.maximum(half, 1e-150), 0.0)
+        scaled = [(x[k] + -middle[:, k]) * inverse[:, k] for k in self.seen]
+        for j in range(y.c.shape[-1]):
+            parts = [s * y.g[k, :, j] for k, s in enumerate(scaled)]
+            # what moves by almost nothing is an error
+            still = sum(np.where(inverse[:, k] == 0.0, np.abs(y.g[n, :, j]), 0.0) for n, k in enumerate(self.seen))
+            outputs.append(total([Affine.constant(y.c[:, j], x[0], y.r[:, j] + still), *parts]))
+        return outputs
+
+    def _next(self, x: list[Affine], unit: float) -> list[Affine]:
+        law, control, x = self.loop["dynamics"], self.loop.get("control") or {}, _lifted(x)
+        u = self._outputs(x, unit)
+        if control.get("gain"):
+            error = [a + -float(b) for a, b in zip(u, control.get("goal") or [0.0] * len(u), strict=True)]
+            u = [_affine(row, error, 0.0) for row in control["gain"]]
+        if control.get("clip"):
+            u = [a.clamped(*map(float, ends)) for a, ends in zip(u, control["clip"], strict=True)]
+        states = []
+        for a, b, c, name in zip(law["A"], law["B"], law["c"], self.names, strict=True):
+            push = (self.loop.get("disturbance") or {}).get(name, 0.0)
+            least, most = (-push, push) if isinstance(push, (int, float)) else push
+            e = _affine([*a, *b], [*x, *u], float(c)) + 0.5 * (least + most)
+            # float64 evaluations of the law, too
+            states.append(e.wider(0.5 * (most - least) * (1.0 + 1e-12) + 1e-13 * (1.0 + e.size())))
+        return states
+
+    def bounds(self, low: Array, high: Array, unit: float) -> tuple[Array, Array]:
+        """Of how far all runs from boxes stay from going wrong; runs are not refuted."""
+        x, goal, found, inside = self._state(low, high), self.loop.get("goal"), [], []
+        for step in range(self.steps + 1):
+            x = self._next(x, unit) if step else x
+            found += [_outside(area, x, self.names) for area in self.loop.get("unsafe") or []]
+            if self.cells.index and goal:
+                inside.append(-_outside(goal, x, self.names, inner=True))
+            lost = ~np.isfinite(np.stack([e.width for e in x])).all(axis=0)
+            if (lost | (np.min(found, axis=0, initial=np.inf) <= 0.0)).all():
+                return np.full(len(low), -np.inf), np.full(len(low), np.inf)
+        if inside:
+            found.append(inside[-1] if goal.get("when", "end") == "end" else np.max(inside, axis=0))
+        least = np.min(found, axis=0) if found else np.full(len(low), np.inf)
+        return np.where(np.isnan(least) | lost, -np.inf, least), np.full(len(low), np.inf)
+
+
+def _affine(row: Any, x: list[Affine], constant: float) -> Affine:
+    return total(e * float(v) for v, e in zip(row, x, strict=True)) + float(constant)
+
+
+def _lifted(x: list[Affine]) -> list[Affine]:
+    """The same with a symbol for every error, so that what an error does to later states is followed."""
+    errors = np.eye(len(x))[:, :, None] * np.stack([e.r for e in x])[None]
+    return [Affine(e.c, np.concatenate([e.g, errors[:, k]]), 0.0 * e.c) for k, e in enumerate(x)]
+
+
+def _outside(area: dict[str, Any], x: list[Affine], names: list[str], inner: bool = False) -> Array:
+    """How far states surely are outside of a closed set, or, negated, how far inside of an open box if ``inner``."""
+    if "half_space" in area:
+        return -(_affine(area["half_space"]["normal"], x, -float(area["half_space"]["at_least"])).range()[1])
+    gaps = []
+    for name, ends in area["box"].items():
+        least, most = x[names.index(name)].range()
+        low, high = (np.inf * s if e is None else float(e) for s, e in zip((-1.0, 1.0), ends, strict=True))
+        gaps += [low - least, most - high] if inner else [low - most, least - high]
+    return np.max(gaps, axis=0)
