@@ -25,7 +25,10 @@ Float64 = NDArray[np.float64]
 class LoopPictures(Protocol):
     """The interface of the pictures that the camera may take."""
 
-    pose_set: PoseBox
+    @property
+    def pose_set(self) -> PoseBox:
+        """The poses that may be looked at."""
+        ...
 
     def image(self, values: Float64, member: SceneSample | None = None) -> np.ndarray:
         """[H, W, 3] float32 at pose parameters [d], of another scene of the set if one is named."""
