@@ -20,7 +20,16 @@ from conftest import InProcess, Inputs, blob_scene, ring
 from nerfs import UNIFORM, tiny_weights, view
 from onnx import helper
 from scene_files import ply
-from splat_files import glb_parts, write_checkpoints, write_compressed, write_glb, write_splat, write_spz
+from splat_files import (
+    glb_parts,
+    sog_parts,
+    write_checkpoints,
+    write_compressed,
+    write_glb,
+    write_sog,
+    write_splat,
+    write_spz,
+)
 
 import ns_abstract as nsa
 from ns_abstract.api.checking import check
@@ -490,7 +499,7 @@ def test_comments_of_ply_files_choose_the_mode(comments: tuple[str, ...], mode: 
         read_scene(file, report)
 
 
-@pytest.mark.parametrize("name", ["splat", "glb", "spz", "compressed.ply", "pt"])
+@pytest.mark.parametrize("name", ["splat", "glb", "spz", "sog", "inria", "compressed.ply", "pt"])
 def test_decoded_formats_are_checked_as_ply_files(name: str, tmp_path: Path) -> None:
     """The digest of the exported .ply is that of the bounds' scene; the file itself is refused in one line."""
     scene, file = blob_scene(20, degree=0), tmp_path / f"scene.{name}"
@@ -498,6 +507,13 @@ def test_decoded_formats_are_checked_as_ply_files(name: str, tmp_path: Path) -> 
         file = write_checkpoints(scene, tmp_path)
     elif name == "glb":
         write_glb(file, *glb_parts(scene))
+    elif name == "sog":
+        write_sog(file, *sog_parts(scene))
+    elif name == "inria":
+        (tmp_path / "point_cloud/iteration_7").mkdir(parents=True)
+        write_ply(scene, tmp_path / "point_cloud/iteration_7/point_cloud.ply")
+        (tmp_path / "cfg_args").write_text("Namespace(sh_degree=0, white_background=False)")
+        file = tmp_path
     else:
         {"splat": write_splat, "spz": write_spz, "compressed.ply": write_compressed}[name](scene, file)
     method = nsa.load_scene(file).method()
