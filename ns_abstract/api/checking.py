@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ns_abstract.check.audit import Outcome, least_part, opened, outcomes
+from ns_abstract.check.audit import ClaimOutcome, least_part, opened, outcomes
 from ns_abstract.check.inputs import BadInput
 from ns_abstract.io.arguments import file_path, positive, whole
 from ns_abstract.io.atomic import write_json
@@ -54,7 +54,7 @@ class Audit:
             return 1
         return 3 if self.proved < _ENOUGH * self.claims or not self.claims else 0
 
-    def _tally(self, found: list[Outcome]) -> None:
+    def _tally(self, found: list[ClaimOutcome]) -> None:
         """Counts what came of the claims."""
         self.claims, self.proved = len(found), sum(o.verdict is True for o in found)
         self.refuted, self.unsettled = (sum(o.verdict is v for o in found) for v in (False, None))

@@ -12,14 +12,14 @@ import numpy as np
 
 from ns_abstract.check.claims import Claims
 from ns_abstract.check.inputs import BadInput, dataset_scale, given_set, read_poses, read_scene
-from ns_abstract.check.loops import Loop
+from ns_abstract.check.loops import LoopClaims
 from ns_abstract.check.pictures import Picture
 from ns_abstract.check.results import StoredCells, read_cells, read_report, read_verdicts, structure
 from ns_abstract.check.splats import RULES
-from ns_abstract.check.verdicts import Certificate, Statement
+from ns_abstract.check.verdicts import CertificateClaims, StatementClaims
 
 
-class Outcome(NamedTuple):
+class ClaimOutcome(NamedTuple):
     """What came of a claim.
 
     Attributes:
@@ -57,7 +57,7 @@ def opened(folder: Path, moved: dict[str, Path | None]) -> tuple[list[str], list
         raise BadInput("is not the report of a result", name, fix="make the result again") from None
 
 
-def outcomes(subjects: list[Claims], claims: int, seconds: float, seed: int) -> Iterator[Outcome]:
+def outcomes(subjects: list[Claims], claims: int, seconds: float, seed: int) -> Iterator[ClaimOutcome]:
     """Draws claims, every second one uniformly, and settles each; the others hunt for faults."""
     end, rng = time.monotonic() + seconds, np.random.default_rng(seed)
     sizes = np.array([s.count for s in subjects], np.float64)
@@ -68,7 +68,7 @@ def outcomes(subjects: list[Claims], claims: int, seconds: float, seed: int) -> 
         if start < end:
             verdict, float32, detail = subject.settle(claim, min(start + share, end))
         found = {"frame": subject.cells.index, **subject.place(claim), **detail} if verdict is False else {}
-        yield Outcome(verdict, float32, number % 2 == 0, found)
+        yield ClaimOutcome(verdict, float32, number % 2 == 0, found)
 
 
 def _opened(
@@ -92,7 +92,7 @@ def _opened(
     if report.get("kind") == "loop":
         parts = read_verdicts(folder, report)
         model = moved.get("model") or file("loop").parent / report["loop"]["network"]
-        return parts, [s for s in (Loop(c, scene, report, model) for c in parts) if s.count]
+        return parts, [s for s in (LoopClaims(c, scene, report, model) for c in parts) if s.count]
     path, given = file("camera_path_filename"), given_set(settings, moved.get("perturbation_filename"))
     certificate = (folder / "cells.sqlite").exists()
     parts, subjects = read_verdicts(folder, report) if certificate else _frames(folder, report), []
@@ -106,9 +106,9 @@ def _opened(
         if not certificate:
             subjects.append(Picture(cells, scene, poses, report))
         elif "sha256" in report.get("model", {}):
-            subjects.append(Certificate(cells, scene, poses, report, file("model")))
+            subjects.append(CertificateClaims(cells, scene, poses, report, file("model")))
         else:
-            subjects.append(Statement(cells, scene, poses, report, scale))
+            subjects.append(StatementClaims(cells, scene, poses, report, scale))
     return parts, [s for s in subjects if s.count]
 
 

@@ -18,7 +18,7 @@ _BATCH = 40_000
 _FIRST = 0.5
 
 
-class Margins(NamedTuple):
+class ClaimMargins(NamedTuple):
     """By how much a claim holds over B boxes of parameters; negative: by how much it does not.
 
     Attributes:
@@ -69,7 +69,7 @@ class Claims(ABC):
         """Its cell, and what else names it."""
 
     @abstractmethod
-    def margins(self, claim: Any, low: Array, high: Array, near: Array, unit: float) -> Margins:
+    def margins(self, claim: Any, low: Array, high: Array, near: Array, unit: float) -> ClaimMargins:
         """Over boxes [B, d]; ``near`` are the numbers of what is to be looked at."""
 
     @abstractmethod

@@ -14,7 +14,7 @@ from ns_abstract.check.results import StoredCells
 from ns_abstract.check.verdicts import OfNetwork
 
 
-class Loop(OfNetwork):
+class LoopClaims(OfNetwork):
     """The claims of a question: no run from a cell comes to harm, and (question 1) all reach the goal."""
 
     kinds = ("certified",)

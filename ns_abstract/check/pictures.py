@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ns_abstract.check.claims import Claims, Margins
+from ns_abstract.check.claims import ClaimMargins, Claims
 from ns_abstract.check.forms import Affine, Array
 from ns_abstract.check.poses import Poses
 from ns_abstract.check.results import StoredCells
@@ -126,7 +126,7 @@ class Picture(Claims):
             return super().near(claim, low, high, unit)
         return meeting(reaches(self.scene, self.poses.camera, self.poses.view(low, high), unit)[0], *claim[1:3])
 
-    def margins(self, claim: PixelClaim, low: Array, high: Array, near: Array, unit: float) -> Margins:
+    def margins(self, claim: PixelClaim, low: Array, high: Array, near: Array, unit: float) -> ClaimMargins:
         """Over boxes [B, d], of the Gaussians ``near``."""
         bounds, middle = self.bounds(claim), 0.5 * (low + high)
         half, none = np.maximum(high - middle, middle - low), np.zeros(len(low))
@@ -135,9 +135,9 @@ class Picture(Claims):
         if (worst := bounds.excess(middle, half, nothing)[0]).max() > 0.0:
             form, kept, motion = self._forms(claim, low, high, near, unit)
             worst, sure = bounds.excess(middle, half, form)
-            return Margins(-worst.max(axis=0), -sure.max(axis=0), kept, motion)
+            return ClaimMargins(-worst.max(axis=0), -sure.max(axis=0), kept, motion)
         # the bounds [0, 1] or wider hold whatever is drawn
-        return Margins(-worst.max(axis=0), none + 1.0)
+        return ClaimMargins(-worst.max(axis=0), none + 1.0)
 
     def _forms(self, claim: PixelClaim, low: Array, high: Array, near: Array, unit: float) -> Any:
         view = self.poses.view(low, high)

@@ -14,7 +14,7 @@ from ns_abstract.check.inputs import BadInput
 _CHANNELS = {"luminance": (0.2126, 0.7152, 0.0722), "r": (1.0, 0.0, 0.0), "g": (0.0, 1.0, 0.0), "b": (0.0, 0.0, 1.0)}
 
 
-class Combined(NamedTuple):
+class CombinedMargins(NamedTuple):
     """All or any of some statements hold: the least or the largest of their margins counts."""
 
     pick: Any
@@ -44,7 +44,7 @@ class Measured(NamedTuple):
     high: float
 
     def margin(self, picture: Callable[[Any], Affine]) -> tuple[Array, Array]:
-        """Lower and upper bounds [B] of the margin; see `Combined`."""
+        """Lower and upper bounds [B] of the margin; see `CombinedMargins`."""
         plane = picture(self.paint)
         single = total(plane.of(lambda a, k=k: a[..., k]) * w for k, w in enumerate(self.channels))
         parts = [single.of(lambda a, k=k: a.reshape(*a.shape[:-2], -1)[..., k]) for k in self.regions]
@@ -62,7 +62,7 @@ class Measured(NamedTuple):
         return np.where(np.isnan(lower), -np.inf, lower), np.where(np.isnan(upper), np.inf, upper)
 
 
-def parsed(root: dict[str, Any], size: tuple[int, int], scale: float) -> Combined | Measured:
+def parsed(root: dict[str, Any], size: tuple[int, int], scale: float) -> CombinedMargins | Measured:
     """The statement of a property file.
 
     Args:
@@ -75,7 +75,7 @@ def parsed(root: dict[str, Any], size: tuple[int, int], scale: float) -> Combine
     """
     for name, pick in (("all", np.min), ("any", np.max)):
         if name in root:
-            return Combined(pick, [parsed(part, size, scale) for part in root[name]])
+            return CombinedMargins(pick, [parsed(part, size, scale) for part in root[name]])
     kind, weight = root.get("type"), float(root.get("weight", 0.5))
     first = _region(root.get("region"), size)
     below, above = (lambda v: float(np.nextafter(v, -np.inf))), (lambda v: float(np.nextafter(v, np.inf)))

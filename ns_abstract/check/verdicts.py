@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ns_abstract.check.claims import Claims, Margins
+from ns_abstract.check.claims import ClaimMargins, Claims
 from ns_abstract.check.forms import Affine, Array, U
 from ns_abstract.check.inputs import BadInput
 from ns_abstract.check.networks import read_network
@@ -65,14 +65,14 @@ class Verdicts(Claims):
         most = float(self.bounds(point, point, 0.0)[1][0])
         return {"pose": point[0].tolist(), "margin": most, "excess": max(self.floor(claim) - most, 0.0)}
 
-    def margins(self, claim: int, low: Array, high: Array, near: Array, unit: float) -> Margins:
+    def margins(self, claim: int, low: Array, high: Array, near: Array, unit: float) -> ClaimMargins:
         """Over boxes [B, d]."""
         least, most = self.bounds(low, high, unit)
-        return Margins(np.where(least > 0.0, least, -np.inf), most)
+        return ClaimMargins(np.where(least > 0.0, least, -np.inf), most)
 
     @abstractmethod
     def bounds(self, low: Array, high: Array, unit: float) -> tuple[Array, Array]:
-        """`Margins.least` and `Margins.most`."""
+        """`ClaimMargins.least` and `ClaimMargins.most`."""
 
 
 class OfNetwork(Verdicts):
@@ -102,7 +102,7 @@ class OfNetwork(Verdicts):
         return ((image * (high - low) + (low - mean)) * (1.0 / std)).wider(16.0 * (self.network.unit + U) * size)
 
 
-class Certificate(OfNetwork):
+class CertificateClaims(OfNetwork):
     """The claims of a frame's cells: a class is the largest output on every picture of a cell, or not on one."""
 
     def __init__(self, cells: StoredCells, scene: Any, poses: Poses, report: dict[str, Any], model: Path) -> None:
@@ -122,7 +122,7 @@ class Certificate(OfNetwork):
         return least, most
 
 
-class Statement(Verdicts):
+class StatementClaims(Verdicts):
     """The claims of a frame's cells about the picture itself."""
 
     def __init__(self, cells: StoredCells, scene: Any, poses: Poses, report: dict[str, Any], scale: float) -> None:

@@ -10,8 +10,8 @@ from ns_abstract.methods.nerf.hash_bounds.edges import edges_of
 from ns_abstract.methods.nerf.hash_bounds.light import light_of
 from ns_abstract.methods.nerf.hash_bounds.network import (
     HeadWeights,
+    LayerZonotope,
     NetWeights,
-    Zonotope,
     head_weights,
     net_weights,
     zonotope,
@@ -51,7 +51,7 @@ def field_arrays(field: NerfactoField) -> FieldArrays:
     )
 
 
-def _rooms(net: NetWeights, symbols: int, layers: int = 0) -> tuple[Zonotope, ...]:
+def _rooms(net: NetWeights, symbols: int, layers: int = 0) -> tuple[LayerZonotope, ...]:
     """Neurons of every layer, at least ``layers``; ``symbols`` rows before its first ReLU."""
     rows = symbols + int(net.sizes[1:-1].sum())
     found = tuple(zonotope(rows, int(n)) for n in net.sizes[1:])

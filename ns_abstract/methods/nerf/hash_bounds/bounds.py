@@ -128,7 +128,7 @@ class HashBounds:
     ) -> None:  # fmt: skip
         d = cells.shape[1]
         origin_radius, direction_radius = bundle.rounded
-        limits = pieces.Limits((_TUNING.dark_places * tolerance, _TUNING.dark * tolerance), _TUNING.dim * tolerance)
+        limits = pieces.WorkLimits((_TUNING.dark_places * tolerance, _TUNING.dark * tolerance), _TUNING.dim * tolerance)
         room = self._rooms.pop() if self._rooms else piece_room(self.source, self.arrays, d)
         for start in range(0, len(cells), _TUNING.rays):
             check_cancelled()

@@ -52,7 +52,7 @@ def net_weights(net: DenseNet) -> NetWeights:
     return NetWeights(sizes, weight, np.abs(weight), bias, rounding)
 
 
-class Zonotope(NamedTuple):
+class LayerZonotope(NamedTuple):
     """Room for the neurons of one layer.
 
     Attributes:
@@ -65,9 +65,9 @@ class Zonotope(NamedTuple):
     size: np.ndarray
 
 
-def zonotope(rows: int, neurons: int) -> Zonotope:
+def zonotope(rows: int, neurons: int) -> LayerZonotope:
     """Room for ``rows`` of ``neurons``."""
-    return Zonotope(np.zeros((rows, neurons)), np.zeros(neurons), np.zeros(neurons))
+    return LayerZonotope(np.zeros((rows, neurons)), np.zeros(neurons), np.zeros(neurons))
 
 
 @njit(cache=True, error_model="numpy")
@@ -108,7 +108,7 @@ def relu(z, count, n, live):
     """max(0, z) of ``n`` neurons in ``count`` rows, in place (design.md, H4).
 
     Args:
-        z: `Zonotope`.
+        z: `LayerZonotope`.
         count, n: Rows and neurons.
         live: [n] numbers of the neurons that may be above 0; overwritten.
 
@@ -155,12 +155,12 @@ def linear(z, count, live, weight, absolute, bias, rounding, out, rest):
     """Neurons ``out`` [n] of a layer.
 
     Args:
-        z: `Zonotope` of the layer's inputs, ``count`` rows.
+        z: `LayerZonotope` of the layer's inputs, ``count`` rows.
         live: [k] those of them that are looked at.
         weight: [inputs, n and more, to whole pairs of lines].
         absolute, bias: Absolute weights, and [n and more].
         rounding: Relative error of the layer's sums.
-        out: `Zonotope`; its radius may hold what others add.
+        out: `LayerZonotope`; its radius may hold what others add.
         rest: [ROWS, two lines] scratch.
     """
     rows, radius = out.rows, out.radius
@@ -189,7 +189,7 @@ def finish(rooms, count, weights, live, rest):
     """The layers behind the first one, whose neurons before their ReLU are in ``rooms[0]``; returns the rows.
 
     Args:
-        rooms: `Zonotope` of every layer, and more.
+        rooms: `LayerZonotope` of every layer, and more.
         count: Rows of the first.
         weights: `NetWeights`.
         live: [most neurons] scratch.
@@ -268,10 +268,10 @@ def colors(z, count, seen, head, rooms, live, rest):
     """Neurons of colours before the sigmoid in ``rooms[-1]`` from those of the density's network; returns the rows.
 
     Args:
-        z: `Zonotope` of the density's network, ``count`` rows.
+        z: `LayerZonotope` of the density's network, ``count`` rows.
         seen: What `look_at_direction` made: rows and radius.
         head: `HeadWeights`.
-        rooms: `Zonotope` of every layer.
+        rooms: `LayerZonotope` of every layer.
         live: [most neurons] scratch.
         rest: [ROWS, two lines] scratch.
     """

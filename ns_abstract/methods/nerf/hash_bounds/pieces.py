@@ -36,8 +36,8 @@ from ns_abstract.methods.nerf.hash_bounds.forms import (
 from ns_abstract.methods.nerf.hash_bounds.light import Light, add_depth, begin, give_up
 from ns_abstract.methods.nerf.hash_bounds.network import (
     HeadWeights,
+    LayerZonotope,
     NetWeights,
-    Zonotope,
     colors,
     finish,
     from_features,
@@ -105,8 +105,8 @@ class PieceRoom(NamedTuple):
     features: np.ndarray
     edges: tuple[Edges, ...]
     light: tuple[Light, ...]
-    rooms: tuple[tuple[Zonotope, ...], ...]
-    head: tuple[Zonotope, ...]
+    rooms: tuple[tuple[LayerZonotope, ...], ...]
+    head: tuple[LayerZonotope, ...]
     colors: tuple[np.ndarray, np.ndarray, np.ndarray]
     live: np.ndarray
     rest: np.ndarray
@@ -128,7 +128,7 @@ class RayPolynomials(NamedTuple):
     exponents: np.ndarray
 
 
-class Limits(NamedTuple):
+class WorkLimits(NamedTuple):
     """What decides about work alone.
 
     Attributes:
@@ -148,7 +148,7 @@ def density_of(field, place, line, rooms, room, out):
         field: `DensityArrays`.
         place: Forms.
         line: See `forms`.
-        rooms: `Zonotope` of every layer.
+        rooms: `LayerZonotope` of every layer.
         room: `PieceRoom`.
         out: [n + 3].
     """
@@ -266,7 +266,7 @@ def bound_piece(field, rays, ray, middle, half, limits, room, out, shown):
         rays: `RayPolynomials`.
         ray: Number of the ray.
         middle, half: [d] in [-1, 1].
-        limits: `Limits`.
+        limits: `WorkLimits`.
         room: `PieceRoom`.
         out: [2, 3]; overwritten: [0, 1] where nothing is known.
         shown: [3, n + 3] forms of the colours (`composition.form_color`), of infinite radius where nothing is known.
