@@ -20,7 +20,8 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.specification import parse_perturbation
 from ns_abstract.verify.network import OutputBounds
 from ns_abstract.verify.preprocess import Preprocess, parse_preprocess
-from ns_abstract.verify.properties import Claim, DetectionClaim, TrueValues, decode, parse_property
+from ns_abstract.verify.properties import Claim, DetectionClaim, TrueValues, decode
+from ns_abstract.verify.property_reading import parse_property
 from ns_abstract.verify.vnnlib import load_vnnlib
 
 SHAPE = (3, 16, 16)

@@ -32,9 +32,10 @@ from ns_abstract.verify.network import (
 from ns_abstract.verify.network import shared_coefficients as family_module
 from ns_abstract.verify.network.bounds import NetworkBounds
 from ns_abstract.verify.network.shared_coefficients import _ReusedBounds, _ReusingCells
+from ns_abstract.verify.picture_sets import PictureSets, hull_of_sets
 from ns_abstract.verify.properties import Query
 from ns_abstract.verify.search import Search
-from ns_abstract.verify.subboxes import PictureSets, PixelWeights, SubBoxProof, divisions, hull_of_sets
+from ns_abstract.verify.subboxes import PixelWeights, SubBoxProof, divisions
 
 SHAPE = (2, 6, 6)
 

@@ -37,7 +37,7 @@ from ns_abstract.methods.splat.write import write_splatfacto_run
 from ns_abstract.nerfstudio.torchvision_operators import declare_missing
 from ns_abstract.perturbation.specification import FILE_KEYS, load_perturbation, parse_perturbation
 from ns_abstract.reach.loop import parse_loop
-from ns_abstract.verify.properties import parse_property
+from ns_abstract.verify.property_reading import parse_property
 
 TABLES = (*config_keys.TABLES, *path_keys.TABLES)
 MODELS = {

@@ -32,6 +32,7 @@ from ns_abstract.verify.network import (
     neuron_bounds,
     neuron_selection,
     output_bounds,
+    work_budget,
 )
 from ns_abstract.verify.network.bounds import NetworkBounds
 from ns_abstract.verify.network.coefficients import columns_of, concretize
@@ -185,8 +186,10 @@ def test_deep_networks_are_bounded(allowed: float, tmp_path: Path, monkeypatch: 
     images = image_sets((2, 16, 16), 2, 2, 0.01, 0.002)
     plain = bound_outputs(network, images, rows, np.zeros(4))
     monkeypatch.setattr(cost_model, "_DEEP", 0.0)
-    monkeypatch.setattr(cost_model, "_ALLOWED", allowed)
-    monkeypatch.setattr(cost_model, "_PLANNED", allowed)
+    for module in (cost_model, work_budget):
+        monkeypatch.setattr(module, "ALLOWED_PRODUCTS", allowed)
+    for module in (cost_model, work_budget):
+        monkeypatch.setattr(module, "PLANNED_PRODUCTS", allowed)
     threads = torch.get_num_threads()
     found = []
     try:
@@ -213,9 +216,9 @@ def test_rows_that_end_on_the_way_lie_below_the_exact_minimum(
 ) -> None:
     """Rows for all numbers of a layer may end at an earlier one: what they say there holds, and is not for nothing."""
     monkeypatch.setattr(cost_model, "_DEEP", 0.0)
-    monkeypatch.setattr(cost_model, "_CHEAP", 0.0)
-    monkeypatch.setattr(cost_model, "_RENEW", -1.0)
-    monkeypatch.setattr(cost_model, "_ENOUGH", enough)
+    monkeypatch.setattr(work_budget, "_CHEAP", 0.0)
+    monkeypatch.setattr(work_budget, "_RENEW", -1.0)
+    monkeypatch.setattr(work_budget, "_ENOUGH", enough)
     ended, said, gaps, spans = 0, {}, 0.0, 0.0
     one_hot, bounded = NeuronBounds._one_hot, NeuronBounds.bounded
 
@@ -261,11 +264,11 @@ def planned(monkeypatch: pytest.MonkeyPatch, which: int | None = None) -> list[c
     monkeypatch.setattr(cost_model, "_APART", 0.0)
     if which is not None:
 
-        def ways(run: cost_model.WorkBudget, index: int, _: int) -> tuple[list[cost_model.BackwardRoute], float]:
+        def ways(run: work_budget.WorkBudget, index: int, _: int) -> tuple[list[cost_model.BackwardRoute], float]:
             known = run.costs.ways(index)
             return [known[min(which, len(known) - 1)]], 0.0
 
-        monkeypatch.setattr(cost_model.WorkBudget, "ways", ways)
+        monkeypatch.setattr(work_budget.WorkBudget, "ways", ways)
     used: list[cost_model.BackwardRoute] = []
     ready = IntermediateBounds.ready
 
@@ -373,7 +376,7 @@ def test_rows_that_rest_on_several_nodes(
     if which in (0, 1):
         assert max(len(way.rests) for way in used) > 1
     middle = rows @ network(torch.from_numpy(0.5 * (images.lower + images.upper)).reshape(1, *shape)).numpy().T
-    monkeypatch.setattr(cost_model.WorkBudget, "ways", lambda *_: ([], 0.0))
+    monkeypatch.setattr(work_budget.WorkBudget, "ways", lambda *_: ([], 0.0))
     none = bound_outputs(network, images, rows, np.zeros(4), arithmetic="real")
     gaps = [(middle.T - one.lower).mean() for one in (found[0], none)]
     assert gaps[0] <= (0.8 if which is None else 1.05) * gaps[1]
@@ -400,11 +403,12 @@ def test_short_rows_keep_deep_networks_bounded(tmp_path: Path, monkeypatch: pyte
     total = cost_model.CostModel(network).total
     gaps = []
     for part in (10.0, 0.1, 0.03, 0.0):
-        monkeypatch.setattr(cost_model, "_PLANNED", part * total)
-        taken: list[cost_model.WorkBudget] = []
-        start = cost_model.WorkBudget.__init__
+        for module in (cost_model, work_budget):
+            monkeypatch.setattr(module, "PLANNED_PRODUCTS", part * total)
+        taken: list[work_budget.WorkBudget] = []
+        start = work_budget.WorkBudget.__init__
         monkeypatch.setattr(
-            cost_model.WorkBudget,
+            work_budget.WorkBudget,
             "__init__",
             lambda run, net, start=start, taken=taken: (taken.append(run), start(run, net))[1],
         )
@@ -421,7 +425,7 @@ import sys
 from pathlib import Path
 import numpy as np, torch
 from onnx_files import image_sets
-from ns_abstract.verify.network import bound_outputs, load_network, cost_model
+from ns_abstract.verify.network import bound_outputs, load_network, cost_model, work_budget
 from ns_abstract.verify.network.explain import estimate
 torch.set_num_threads(1)
 cost_model._DEEP = cost_model._OVER = 0.0
@@ -434,9 +438,9 @@ network = load_network(Path(sys.argv[1]))
 images = image_sets(network.input_shape, 1, 2, 1e-4, 1e-4)
 small = image_sets(network.input_shape, 1, 2, 1e-30, 1e-31)
 rows = np.eye(3)
-cost_model._PLANNED = 0.0
+cost_model.PLANNED_PRODUCTS = work_budget.PLANNED_PRODUCTS = 0.0
 bound_outputs(network, small, rows, np.zeros(3), arithmetic="real")
-cost_model._PLANNED = float(sys.argv[3])
+cost_model.PLANNED_PRODUCTS = work_budget.PLANNED_PRODUCTS = float(sys.argv[3])
 before = peak("VmRSS")
 Path("/proc/self/clear_refs").write_text("5")
 found = bound_outputs(network, images, rows, np.zeros(3), memory=int(sys.argv[2]), arithmetic="real")
@@ -484,7 +488,7 @@ def test_plans_keep_to_what_is_allowed(tmp_path: Path, monkeypatch: pytest.Monke
     assert costs.plan(costs.total, [1e-30], 1.0).products < 0.1 * costs.total
     monkeypatch.setattr(cost_model, "_OVER", 0.0)
     monkeypatch.setattr(cost_model, "_DEEP", 0.0)
-    run = cost_model.WorkBudget(network)
+    run = work_budget.WorkBudget(network)
     for k in range(4):
         run.learns(k, 1e9, 1.0)
     run.ways(3, 512)
@@ -529,7 +533,7 @@ def test_early_rows_keep_later_ones_exact(tmp_path: Path, monkeypatch: pytest.Mo
     middle = rows @ network(torch.from_numpy(0.5 * (images.lower + images.upper)).reshape(1, *shape)).numpy().T
     gaps = []
     for cheap in (0.0, 0.03):
-        monkeypatch.setattr(cost_model, "_CHEAP", cheap)
+        monkeypatch.setattr(work_budget, "_CHEAP", cheap)
         cells = NetworkBounds(network, images, "everywhere", 1 << 30, "real")
         # rows of outputs in float64 lose next to nothing of themselves
         cells.intermediate.relaxations.pop()
@@ -627,7 +631,7 @@ def test_curves_are_bounded_by_what_rows_leave(deep: bool, tmp_path: Path, monke
     if deep:
         monkeypatch.setattr(cost_model, "_DEEP", 0.0)
         # nor are all numbers of a node bounded for another reason
-        monkeypatch.setattr(cost_model, "_CHEAP", 0.0)
+        monkeypatch.setattr(work_budget, "_CHEAP", 0.0)
     found = bound_outputs(network, images, rows, np.zeros(3), arithmetic="real").lower
     with monkeypatch.context() as patch:
         patch.setattr(neuron_selection, "_HALF", -1.0)
@@ -644,7 +648,7 @@ def test_curves_are_bounded_by_what_rows_leave(deep: bool, tmp_path: Path, monke
 @pytest.mark.slow
 def test_deep_networks_are_given_up_early(tmp_path: Path) -> None:
     network = load_network(residual(tmp_path))
-    run = cost_model.WorkBudget(network)
+    run = work_budget.WorkBudget(network)
     assert run.vain(0.95, 0.0, 0.1) and run.left > 0.0
     assert not run.vain(0.5, 0.5, 0.9) and run.left > 0.0
     assert run.vain(0.5, 0.95, 0.9) and run.left == 0.0

@@ -18,7 +18,7 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.specification import parse_perturbation
 from ns_abstract.reach.loop import parse_loop
 from ns_abstract.verify.picture_properties import PICTURE_TYPES, is_of_picture, parse_picture_property
-from ns_abstract.verify.properties import loading, parse_property, property_keys
+from ns_abstract.verify.property_reading import loading, parse_property, property_keys
 
 ROOT = Path(__file__).resolve().parents[1]
 OUTPUTS = 125 * 2 * 2

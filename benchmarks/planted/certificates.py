@@ -33,6 +33,7 @@ _HELD = "test_phase_tree.py::test_branches_hold_for_the_images_in_them[small-1.0
 _LEVELS = "test_eight_bit.py::test_sets_hold_rounded_pictures"
 
 _FAMILY, _COVER = "verify/network/shared_coefficients.py", "verify/subboxes.py"
+_HULL = "verify/picture_sets.py"
 _SHARED = "test_cover.py::test_rows_of_one_cell_hold_every_value"
 
 CERTIFICATES = (
@@ -88,12 +89,12 @@ CERTIFICATES = (
     ),
     Fault(
         "parts: joined sets forget that slopes differ",
-        _COVER, "hull_of_sets", "np.abs(a_low - by * common).sum(axis=-1)", "0.0",
+        _HULL, "hull_of_sets", "np.abs(a_low - by * common).sum(axis=-1)", "0.0",
         "test_cover.py::test_joined_sets_hold_every_part[0.0]",
     ),
     Fault(
         "parts: ends of boxes are taken to be exact",
-        _COVER, "hull_of_sets", "(np.abs(lower) + np.abs(upper)).max(axis=0) / reach", "0.0 * reach",
+        _HULL, "hull_of_sets", "(np.abs(lower) + np.abs(upper)).max(axis=0) / reach", "0.0 * reach",
         "test_cover.py::test_joined_sets_hold_every_part[300000.0]",
     ),
     Fault(
@@ -350,11 +351,11 @@ CERTIFICATES = (
     ),
     Fault(
         "search: bounds that cross are taken",
-        _COVER, "PictureSets.sane", "(self.lower <= self.upper).all()", "True", _IMAGES + "[crossed]",
+        _HULL, "PictureSets.sane", "(self.lower <= self.upper).all()", "True", _IMAGES + "[crossed]",
     ),
     Fault(
         "search: linear sets that are no numbers are taken",
-        _COVER, "PictureSets.sane", "(*self.linear, self.lower, self.upper)", "(self.lower, self.upper)",
+        _HULL, "PictureSets.sane", "(*self.linear, self.lower, self.upper)", "(self.lower, self.upper)",
         _IMAGES + "[NaN slope]",
     ),
     Fault(

@@ -229,7 +229,7 @@ VERDICTS = (
     ),
     Fault(
         "network: forms of cheap nodes stay loose where nothing is open",
-        "verify/network/cost_model.py",
+        "verify/network/work_budget.py",
         "WorkBudget.renews",
         "products < self._cheap",
         "False",
@@ -261,9 +261,9 @@ VERDICTS = (
     ),
     Fault(
         "network: rows are passed where nothing will be known in the end",
-        "verify/network/cost_model.py",
+        "verify/network/work_budget.py",
         "WorkBudget.ways",
-        "plan.widest > _HOPELESS * self._size",
+        "plan.widest > HOPELESS_WIDTH * self._size",
         "False",
         "test_network_bounds.py::test_plans_keep_to_what_is_allowed",
     ),

@@ -21,7 +21,8 @@ from ns_abstract.verify.eight_bit import Picture
 from ns_abstract.verify.model import NetworkModel
 from ns_abstract.verify.network import NetworkArithmetic, load_network
 from ns_abstract.verify.network.explain import check_cell
-from ns_abstract.verify.properties import Property, loading, parse_property
+from ns_abstract.verify.properties import Property
+from ns_abstract.verify.property_reading import loading, parse_property
 
 if TYPE_CHECKING:
     pass

@@ -16,7 +16,8 @@ from ns_abstract.perturbation.variations import KEYS, SELECT_KEYS, VARIATIONS
 from ns_abstract.reach import dynamics, loop
 from ns_abstract.verify import preprocess
 from ns_abstract.verify.picture_properties import CHANNELS, COMMON, PICTURE_TYPES, STATISTICS
-from ns_abstract.verify.properties import COMPONENTS, property_keys
+from ns_abstract.verify.properties import COMPONENTS
+from ns_abstract.verify.property_reading import property_keys
 
 Schema = dict[str, Any]
 

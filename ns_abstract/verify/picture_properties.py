@@ -34,7 +34,8 @@ from ns_abstract.verify.picture_measures import (
     Region,
 )
 from ns_abstract.verify.preprocess import Preprocess, parse_preprocess
-from ns_abstract.verify.properties import Claim, Property, Query, parse_partitions
+from ns_abstract.verify.properties import Claim, Property, Query
+from ns_abstract.verify.property_reading import parse_partitions
 
 _TUNING = MeasureTuning()
 STATISTICS = ("mean", "least", "greatest")

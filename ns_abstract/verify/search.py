@@ -21,9 +21,10 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.refine.protocol import SceneSample
 from ns_abstract.verify.cells import Cell, CellGrid
+from ns_abstract.verify.picture_sets import PictureSets
 from ns_abstract.verify.properties import Claim, LinearClaim
 from ns_abstract.verify.protocol import FrameImages, Model
-from ns_abstract.verify.subboxes import PictureSets, PixelWeights, SubBoxProof
+from ns_abstract.verify.subboxes import PixelWeights, SubBoxProof
 
 Verdict = Literal["certified", "falsified", "unknown"]
 

@@ -14,11 +14,11 @@ from functools import cached_property
 
 import numpy as np
 
-from ns_abstract.arithmetic.network_charges import OWN_MARGIN
 from ns_abstract.arithmetic.rounding import NONZERO
 from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.verify.network import ImageSets, OutputBounds
+from ns_abstract.verify.picture_sets import PictureSets, hull_of_sets
 from ns_abstract.verify.properties import Claim, Query
 from ns_abstract.verify.protocol import FrameImages, Model, SharedBounds, SharedBoundsModel
 
@@ -28,15 +28,13 @@ _POWER = 1.6
 
 @dataclass(frozen=True)
 class CoverTuning:
-    """Looks about the middle of a set, and slopes of parts together. None of them decides whether a bound holds."""
+    """Looks about the middle of a set. None of them decides whether a bound holds."""
 
     #: What the mean width of pixels costs at most, however little the margin's gradient says: signs of units become
     #: open by it. Networks that bear more are told by boxes about the set's middle, of which the least is so small a
     #: part of it.
     opening: float = 42.0
     least: float = 2.0**-9
-    #: Parts are taken to be no narrower where their slopes are put together, and no nearer to each other.
-    least_share: float = 1e-12
 
 
 _TUNING = CoverTuning()
@@ -58,29 +56,6 @@ _CUTS = 6
 _SPARE, _STEP = 0.35, 0.6
 #: How many margins a part may miss a proof by for rows of its own before the last activation to help.
 _NEAR = 0.5
-
-
-@dataclass(frozen=True)
-class PictureSets:
-    """Linear sets of pictures over a box, from `ns_abstract.verify.protocol.FrameImages.sets`."""
-
-    box: ParameterBox
-    linear: tuple[np.ndarray, ...]
-    lower: np.ndarray
-    upper: np.ndarray
-
-    @property
-    def sane(self) -> bool:
-        """Whether all is finite, and the bounds do not cross."""
-        finite = all(np.isfinite(v).all() for v in (*self.linear, self.lower, self.upper))
-        return finite and bool((self.lower <= self.upper).all())
-
-    @property
-    def widths(self) -> np.ndarray:
-        """[H, W, 3] widths of the sets at a p."""
-        a_lower, b_lower, a_upper, b_upper = (np.asarray(v, np.float64) for v in self.linear)
-        wide = b_upper - b_lower + np.abs(a_upper - a_lower).sum(axis=-1)
-        return np.minimum(wide, np.asarray(self.upper, np.float64) - self.lower)
 
 
 @dataclass(frozen=True)
@@ -483,43 +458,3 @@ def divisions(effects: np.ndarray, cost: float, aim: float, most: int) -> list[i
         # what a further part gains, by what it costs
         counts[np.argmax(gains / (counts * (counts + 1) * np.log1p(1.0 / counts)))] += 1
     return counts.tolist()
-
-
-def hull_of_sets(parts: Sequence[PictureSets]) -> PictureSets:
-    """Return linear sets over the hull of the boxes of ``parts`` that contain every picture of each (V15)."""
-    boxes = [sets.box for sets in parts]
-    lower, upper = (np.array([getattr(box, name) for box in boxes]) for name in ("lower", "upper"))
-    first = boxes[0]
-    around = ParameterBox(
-        first.names, first.units, tuple(lower.min(axis=0).tolist()), tuple(upper.max(axis=0).tolist())
-    )
-    middle, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
-    center, reach = around.middle, 0.5 * (np.array(around.upper) - np.array(around.lower))
-    # p of the wider box is ``place + share q`` for q of a part
-    place, share = (middle - center) / reach, half / reach
-    a_low, b_low, a_high, b_high = (np.array([sets.linear[k] for sets in parts], np.float64) for k in range(4))
-    # any slopes will do: these are the least squares' of the parts' middles, each taken by its volume
-    weight = np.maximum(share, _TUNING.least_share).prod(axis=1)
-    weight /= weight.sum()
-    d, ones = first.dimensions, (1,) * (b_low.ndim - 1)
-    slope, value = 0.5 * (a_low + a_high), 0.5 * (b_low + b_high)
-    # float32's place is enough for what is arbitrary
-    at, by = place.reshape(-1, *ones, d), share.reshape(-1, *ones, d)
-    value = value - np.tensordot(weight, value, 1)
-    moment = (place**2 + share**2 / 3.0) * weight[:, None]
-    common = np.tensordot(weight, value[..., None] * at + slope * by / 3.0, 1) / np.maximum(
-        moment.sum(axis=0), _TUNING.least_share
-    )
-    moved = (at * common).sum(axis=-1)
-    low = b_low - moved - np.abs(a_low - by * common).sum(axis=-1)
-    high = b_high - moved + np.abs(a_high - by * common).sum(axis=-1)
-    # rounding of places, shares and the sums above; ends of boxes are rounded relative to themselves, not to widths
-    ends = (np.abs(lower) + np.abs(upper)).max(axis=0) / reach
-    sizes = np.abs(b_low) + np.abs(b_high) + np.abs(a_low).sum(axis=-1) + np.abs(a_high).sum(axis=-1)
-    room = OWN_MARGIN * (sizes + (np.abs(common) * (2.0 + ends)).sum(axis=-1))
-    return PictureSets(
-        around,
-        (common, (low - room).min(axis=0), common, (high + room).max(axis=0)),
-        np.min([sets.lower for sets in parts], axis=0),
-        np.max([sets.upper for sets in parts], axis=0),
-    )

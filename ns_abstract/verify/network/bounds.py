@@ -10,7 +10,6 @@ import numpy as np
 from ns_abstract.verify.network.backward import BackwardPass
 from ns_abstract.verify.network.coefficient_source import CoefficientSource
 from ns_abstract.verify.network.coefficients import Float64
-from ns_abstract.verify.network.cost_model import WorkBudget
 from ns_abstract.verify.network.dependence import dependence
 from ns_abstract.verify.network.forward import ForwardPass
 from ns_abstract.verify.network.graph import Network, NetworkArithmetic
@@ -24,6 +23,7 @@ from ns_abstract.verify.network.output_bounds import OutputRows
 from ns_abstract.verify.network.propagation import ForwardPropagation
 from ns_abstract.verify.network.row_ascent import RowAscent
 from ns_abstract.verify.network.subnormals import subnormals_kept
+from ns_abstract.verify.network.work_budget import WorkBudget
 
 
 @subnormals_kept()

@@ -33,25 +33,13 @@ _PASSING = 40.0
 #: A network is deep if rows for all of its numbers take more products than this; about a minute of one core.
 _DEEP = 2e12
 #: Products that rows for inner nodes may take in one cell of a deep network; about three minutes of one core.
-_ALLOWED = 5e12
+ALLOWED_PRODUCTS = 5e12
 #: Products that rows may take in one cell of a network whose rows end by plan; about six minutes of one core.
-_PLANNED = 1.5e13
+PLANNED_PRODUCTS = 1.5e13
 #: Where rows for all numbers take so many times more than is allowed, they end by plan.
 _OVER = 1.5
 #: Layers that forms pass well, as a rule.
 _TIGHT = 4
-#: Part of a node's numbers past which all of them are bounded by rows.
-_RENEW = 0.01
-#: Part of what is allowed that rows of one node may take whatever is open.
-_CHEAP = 0.03
-#: Part of widths that these have to leave at most.
-_WORTH = 0.1
-#: Widths, as a part of a node's numbers, that rows of dearer nodes need not improve.
-_ENOUGH = 0.03
-#: Parts of widths and of signs not found out past which rows are given up.
-_KEPT, _LOST = 0.9, 0.9
-#: Part of a node's numbers that have to be open for that to end all.
-_MOST = 0.5
 #: Plans that are compared at first, and to either side of one made before; in the first of them rows for all numbers
 #: cost so much (a logarithm of widths). By how much rows have to be the better.
 _STEPS, _LIKE, _DEAREST, _CLOSE = 64, 6, 2.0**18, 0.1
@@ -66,9 +54,9 @@ _BENDS, _ROUNDS = 0.1, 5e-5
 #: How loose an image's form is taken to be where nothing is known; past the other nothing is foreseen.
 _USUAL, _HUGE = 1e-8, 1e100
 #: Width of bounds, as a part of numbers, past which nothing is worth any rows if it is foreseen.
-_HOPELESS = 1e3
-#: Ways that are tried, and numbers of a node that they are tried with.
-_TRIED, TRIALS = 6, 32
+HOPELESS_WIDTH = 1e3
+#: Numbers of a node that ways are tried with.
+TRIALS = 32
 #: Layers whose rows stay in their windows.
 _WINDOWED = (Activation, ChannelEmbedding, Pad, Product, ScaleLayer, Sum)
 
@@ -336,10 +324,10 @@ class CostModel:
             near = min(near * self._sizes[k][0], _HUGE)
             count = bounded.get(k)
             if count is not None:
-                score = _log(near) - _CLOSE
+                score = log_or_least(near) - _CLOSE
                 for way in self.ways(k):
                     widths = way.spread(spread, size)
-                    value = _log(widths) + rate * count * way.price
+                    value = log_or_least(widths) + rate * count * way.price
                     if value < score:
                         score, near, ways[k] = value, widths, way
                 widest = max(widest, near)
@@ -371,7 +359,7 @@ class CostModel:
     @property
     def planned(self) -> bool:
         """Whether rows for all numbers cost so much that each is passed back as far as it pays (N18)."""
-        return self.total > max(_DEEP, _OVER * _ALLOWED)
+        return self.total > max(_DEEP, _OVER * ALLOWED_PRODUCTS)
 
     def foreseen(self, part: float, deep: float) -> CostEstimate:
         """What rows of one cell will take (N13).
@@ -382,107 +370,18 @@ class CostModel:
         if not self.deep:
             return CostEstimate(part * self.total, 0.0, False)
         if self.planned:
-            plan = self.plan(_PLANNED, [_USUAL], 1.0)
-            if plan.widest > _HOPELESS:
+            plan = self.plan(PLANNED_PRODUCTS, [_USUAL], 1.0)
+            if plan.widest > HOPELESS_WIDTH:
                 return CostEstimate(0.0, 0.0, True)
             return CostEstimate(plan.products, sum(self.bounded[k] for k in plan.ways), False)
         taken = [(index, deep * products) for index, products in self.nodes if self.network.depth[index] > _TIGHT]
-        share = min(1.0, _ALLOWED / max(1.0, sum(products for _, products in taken)))
+        share = min(1.0, ALLOWED_PRODUCTS / max(1.0, sum(products for _, products in taken)))
         # where a sign is not all that is asked, numbers have two rows
         phases = {node.inputs[0] for node in self.network.nodes if isinstance(node.layer, LeakyRelu)}
         return CostEstimate(share * sum(n if k in phases else 2.0 * n for k, n in taken), 0.0, False)
 
 
-class WorkBudget:
-    """Decides from the work spent on a cell whether further backward passes pay."""
-
-    def __init__(self, network: Network) -> None:
-        self.network = network
-        self.costs = cost_model_of(network)
-        self.deep = self.costs.deep
-        self.planned = self.costs.planned
-        self.left = _PLANNED if self.planned else _ALLOWED
-        self._bounded = dict(self.costs.bounded) if self.planned else {}
-        self._spread: list[float] = []
-        self._size = 1.0
-        self._step: int | None = None
-
-    @property
-    def rests(self) -> set[int]:
-        """Nodes whose bounds rows of later ones may end on."""
-        return self.costs.rests if self.planned else set()
-
-    def learns(self, index: int, radius: float, size: float) -> None:
-        """Forms of node ``index``, the next or an earlier one, are so loose (N1), and its numbers of this size."""
-        self._spread[index:] = [radius, *self._spread[index + 1 :]]
-        self._size = size or self._size
-
-    def ways(self, index: int, count: int) -> tuple[list[BackwardRoute], float]:
-        """Ways of rows for ``count`` numbers of node ``index`` that are worth a trial, and what a product costs (N18).
-
-        There are none if its form is as good, or nothing will be known in the end.
-        """
-        self._bounded[index] = float(count)
-        plan = self.costs.plan(max(self.left, 1.0), self._spread[:index], self._size, self._bounded, self._step)
-        self._step = plan.step
-        if plan.widest > _HOPELESS * self._size:
-            self.left = 0.0
-        if index not in plan.ways:
-            return [], plan.rate
-        ways = [way for way in self.costs.ways(index) if count * way.price <= self.left]
-        ways.sort(key=lambda way: _log(way.spread(self._spread, self._size)) + plan.rate * count * way.price)
-        return ways[:_TRIED], plan.rate
-
-    def nearest(self, index: int, count: int) -> BackwardRoute | None:
-        """The longest way of ``count`` rows of node ``index``, of those that are cheap; what it takes is taken."""
-        best = None
-        for way in self.costs.ways(index):
-            if count * way.price < _CHEAP * self.left:
-                best = way
-        if best is not None:
-            self.left -= count * best.price
-        return best
-
-    def renews(self, part: float, products: float) -> bool:
-        """Whether all numbers of a node are bounded by rows, for ``products``, if ``part`` of them is open."""
-        return part > _RENEW or products < self._cheap
-
-    @property
-    def _cheap(self) -> float:
-        """Products that rows of one node may take whatever is open: fewer where not all rows can be afforded."""
-        return _CHEAP * _ALLOWED * min(1.0, _ALLOWED / self.costs.total)
-
-    def suffices(self, products: float) -> float:
-        """Width, as a part of a node's numbers, at which rows for all of them may end on the way (N17)."""
-        return 0.0 if products < self._cheap else _ENOUGH
-
-    def takes(self, products: float) -> bool:
-        """Whether so many products are left; they are taken then."""
-        if products > self.left:
-            return False
-        self.left -= products
-        return True
-
-    def spares(self, products: float) -> None:
-        """So many products were not taken after all."""
-        self.left += products
-
-    def gains(self, kept: float, part: float) -> bool:
-        """Whether rows for all numbers are worth it that leave so large a part of widths, if ``part`` is open."""
-        return part > _RENEW or kept < _WORTH
-
-    def vain(self, kept: float, unstable: float, part: float) -> bool:
-        """Leave a node as it is if rows leave so large a part of widths, or of signs not found out.
-
-        Where most of it is open, ``part``, the nodes behind it are given up, too.
-        """
-        hopeless = kept > _KEPT or unstable > _LOST
-        if hopeless and part > _MOST:
-            self.left = 0.0
-        return hopeless
-
-
-def _log(value: float) -> float:
+def log_or_least(value: float) -> float:
     """Its logarithm; of nothing a very small number's."""
     return float(np.log(max(value, 2.0**-1000)))
 

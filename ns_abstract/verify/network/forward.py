@@ -10,7 +10,6 @@ import torch
 from ns_abstract.arithmetic.network_charges import SPARE, UNIT
 from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.verify.network.bilinear import Product
-from ns_abstract.verify.network.cost_model import WorkBudget
 from ns_abstract.verify.network.forms import NodeForm
 from ns_abstract.verify.network.intermediate_bounds import IntermediateBounds
 from ns_abstract.verify.network.layers import Activation, LeakyRelu
@@ -19,6 +18,7 @@ from ns_abstract.verify.network.max_pooling import MaxPool
 from ns_abstract.verify.network.neuron_selection import NeuronSelection
 from ns_abstract.verify.network.propagation import ForwardPropagation
 from ns_abstract.verify.network.slope_optimisation import SplitNeurons
+from ns_abstract.verify.network.work_budget import WorkBudget
 
 
 class ForwardPass:

@@ -12,12 +12,12 @@ from ns_abstract.arithmetic.network_charges import FLUSH, FLUSHES, OWN_FEW, OWN_
 from ns_abstract.verify.network.backward import ROWS_AT_ONCE, BackwardPass
 from ns_abstract.verify.network.coefficient_source import CoefficientSource
 from ns_abstract.verify.network.coefficients import Coefficients, Int64
-from ns_abstract.verify.network.cost_model import WorkBudget
 from ns_abstract.verify.network.forms import NodeForm, NodeInterval
 from ns_abstract.verify.network.intermediate_bounds import IntermediateBounds
 from ns_abstract.verify.network.max_pooling import MaxPool, WindowInputs, WindowPlanes, upper_planes
 from ns_abstract.verify.network.relaxations import MaxPoolPlanes
 from ns_abstract.verify.network.stopping import NeuronTarget, StoppingCriterion
+from ns_abstract.verify.network.work_budget import WorkBudget
 
 #: Differences in windows are bounded by rows if so large a part of so many, which are tried first, is decided by it.
 _TRIED, _CLOSES = 64, 0.1

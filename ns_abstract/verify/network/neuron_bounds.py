@@ -8,11 +8,12 @@ import torch
 from ns_abstract.verify.network.backward import ROWS_AT_ONCE, BackwardPass
 from ns_abstract.verify.network.coefficient_source import CoefficientSource
 from ns_abstract.verify.network.coefficients import Coefficients, Float64, Int64, grid
-from ns_abstract.verify.network.cost_model import WorkBudget, on_threads
+from ns_abstract.verify.network.cost_model import on_threads
 from ns_abstract.verify.network.forms import NodeForm
 from ns_abstract.verify.network.intermediate_bounds import IntermediateBounds
 from ns_abstract.verify.network.row_ascent import RowAscent
 from ns_abstract.verify.network.stopping import BackwardBounds, BackwardTrace, NeuronTarget, StoppingCriterion
+from ns_abstract.verify.network.work_budget import WorkBudget
 
 
 class NeuronBounds:

@@ -9,12 +9,13 @@ from torch import Tensor
 
 from ns_abstract.verify.network.coefficient_source import CoefficientSource
 from ns_abstract.verify.network.coefficients import grid
-from ns_abstract.verify.network.cost_model import TRIALS, WorkBudget
+from ns_abstract.verify.network.cost_model import TRIALS
 from ns_abstract.verify.network.forms import NodeForm
 from ns_abstract.verify.network.intermediate_bounds import IntermediateBounds
 from ns_abstract.verify.network.layers import Activation, LeakyRelu
 from ns_abstract.verify.network.neuron_bounds import NeuronBounds
 from ns_abstract.verify.network.stopping import NeuronTarget
+from ns_abstract.verify.network.work_budget import WorkBudget
 
 #: So many open numbers of a node are tightened only if some of them gain by it: if not so large a part of these
 #: keeps so large a part of its width.
