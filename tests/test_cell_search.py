@@ -21,7 +21,7 @@ from ns_abstract.execution.worker_cache import Recipe
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.cells import Cell, CellGrid
-from ns_abstract.verify.search import BlockResult, FinishedCell
+from ns_abstract.verify.search_results import BlockResult, FinishedCell
 from ns_abstract.verify.store import Store, fractions
 
 BOX = ParameterBox(("x", "y"), ("m", "rad"), (-1.5, -1.0), (1.5, 1.0))

@@ -20,7 +20,8 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.verify.cells import HALVINGS, Cell, CellGrid, initial_divisions
 from ns_abstract.verify.network import ImageSets, OutputBounds
 from ns_abstract.verify.properties import LinearClaim, Query
-from ns_abstract.verify.search import BLOCK, BlockResult, ContradictionError, FinishedCell, Search
+from ns_abstract.verify.search import BLOCK, Search
+from ns_abstract.verify.search_results import BlockResult, ContradictionError, FinishedCell
 from ns_abstract.verify.store import CellBlock, Store, fractions
 
 CLAIM = LinearClaim(np.array([[1.0, -1.0]]), np.zeros(1), ((0,),))

@@ -54,7 +54,7 @@ from ns_abstract.refine.result import FrameResult, TracePoint
 from ns_abstract.report.certificate import write_certificate
 from ns_abstract.report.record import Report, RunRecord
 from ns_abstract.report.run import file_stamp
-from ns_abstract.verify.search import BlockResult, FinishedCell
+from ns_abstract.verify.search_results import BlockResult, FinishedCell
 
 SIZE = 16
 PREPROCESS = {"resize": [SIZE, SIZE], "mean": [0.4, 0.45, 0.5], "std": [0.25, 0.25, 0.3]}

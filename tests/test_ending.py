@@ -47,7 +47,7 @@ from ns_abstract.methods.nerf.render import NerfRenderer
 from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.refine.engine import Refinement, RefinementGoal
 from ns_abstract.verify.cells import CellGrid
-from ns_abstract.verify.search import BlockResult
+from ns_abstract.verify.search_results import BlockResult
 
 YAW = {"rotation": {"yaw": 0.02}}
 #: Long enough for any machine; what is waited for does not come by itself.

@@ -21,7 +21,7 @@ VERDICTS = (
     ),
     Fault(
         "a margin that is no number breaks the property",
-        _SEARCH,
+        "verify/cell_samples.py",
         "_fails",
         "math.isfinite(margin) and margin <= 0.0",
         "not margin > 0.0",

@@ -34,7 +34,7 @@ from ns_abstract.report.certificate import LastReport
 from ns_abstract.report.figures import percent
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.scene_margin import ProveCell, SceneMargin, VariationKind
-from ns_abstract.verify.search import BlockResult
+from ns_abstract.verify.search_results import BlockResult
 from ns_abstract.verify.store import CellBlock, Store
 
 P = TypeVar("P")

@@ -45,7 +45,8 @@ from ns_abstract.verify.protocol import FrameImages as SearchedScene
 from ns_abstract.verify.protocol import Model as SearchedModel
 from ns_abstract.verify.registration import RegisteredImages, RegisteredModel
 from ns_abstract.verify.scene_margin import KINDS, CellOutcome, ProveCell, VariationKind, bounded_kinds
-from ns_abstract.verify.search import BLOCK, BlockResult, ContradictionError, Search
+from ns_abstract.verify.search import BLOCK, Search
+from ns_abstract.verify.search_results import BlockResult, ContradictionError
 from ns_abstract.verify.subboxes import SubBoxProof
 
 if TYPE_CHECKING:

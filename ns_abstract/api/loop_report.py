@@ -20,7 +20,7 @@ from ns_abstract.reach.tubes import Dependence, Tube
 from ns_abstract.report.certificate import SCENE_MARGIN
 from ns_abstract.report.outside import SceneDrawing
 from ns_abstract.report.run import Run, file_stamp, plain
-from ns_abstract.verify.search import Verdict
+from ns_abstract.verify.search_results import Verdict
 from ns_abstract.verify.store import Store, Tally, fractions
 
 #: Random runs; runs from a cell whose tube is shown; cells whose tube is shown.

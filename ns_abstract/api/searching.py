@@ -12,7 +12,7 @@ from ns_abstract.execution.engines import Engine
 from ns_abstract.execution.scheduler import Task, work
 from ns_abstract.execution.stopping import StopRequest
 from ns_abstract.verify.cells import Cell, CellGrid
-from ns_abstract.verify.search import BlockResult
+from ns_abstract.verify.search_results import BlockResult
 from ns_abstract.verify.store import CellBlock, Store
 
 #: Seconds between notes of progress, and between reports.

@@ -24,7 +24,7 @@ from ns_abstract.reach.tubes import Tube, TubeBuilder
 from ns_abstract.refine.protocol import SceneSample
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.scene_margin import CellOutcome
-from ns_abstract.verify.search import FAILURES, BlockResult, ContradictionError, FinishedCell, failure_text
+from ns_abstract.verify.search_results import FAILURES, BlockResult, ContradictionError, FinishedCell, failure_text
 
 Float64 = NDArray[np.float64]
 Question = Literal["safe", "reaches"]

@@ -23,7 +23,7 @@ from ns_abstract.refine.protocol import Bounds, Frame, LinearSets, PartsFrame, S
 from ns_abstract.verify.cell_boxes import aligned, divided, inner_cell, resolved, slabs, sub_box_counts
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.photo import Photo
-from ns_abstract.verify.search import BlockResult, FinishedCell
+from ns_abstract.verify.search_results import BlockResult, FinishedCell
 
 #: Grid units along each parameter, as a power of two.
 UNITS = 20

@@ -15,7 +15,7 @@ import numpy as np
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.location import FoundPose
 from ns_abstract.verify.location_cover import PoseCover
-from ns_abstract.verify.search import BlockResult, FinishedCell
+from ns_abstract.verify.search_results import BlockResult, FinishedCell
 from ns_abstract.verify.store import CellBlock, Store
 
 #: Poses that explain the photo which are kept, by frame.

@@ -10,23 +10,22 @@ import itertools
 import math
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import torch
 
 from ns_abstract.execution.cancellation import check_cancelled
-from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.refine.protocol import SceneSample
+from ns_abstract.verify.cell_samples import CellSamples, Sample, sample_key
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.picture_sets import PictureSets
 from ns_abstract.verify.properties import Claim, LinearClaim
 from ns_abstract.verify.protocol import FrameImages, Model
+from ns_abstract.verify.search_results import FAILURES, BlockResult, ContradictionError, FinishedCell, failure_text
 from ns_abstract.verify.subboxes import PixelWeights, SubBoxProof
-
-Verdict = Literal["certified", "falsified", "unknown"]
 
 #: Most cells examined together.
 BLOCK = 8
@@ -57,121 +56,6 @@ NO_NUMBER = "the margin of a picture is no finite number"
 _BRANCHES, _NEAR = 256, 3.0
 #: A scene among so many, in their order, attacks a proof.
 _ATTACKERS = 24
-
-
-@dataclass(frozen=True)
-class FinishedCell:
-    """A finished cell with its verdict.
-
-    Attributes:
-        cell: The cell.
-        verdict: "certified", "falsified" or "unknown".
-        margin: Proven lower bound of the margin; that of the counterexample; or the best bound, or None.
-        seconds: Time spent on it.
-        counterexample: Parameter values, or None.
-        image: [H, W, 3] float32 picture of the counterexample, or None.
-        outputs: [n] what the network says about it, or None.
-        reason: Why nothing is known, or "".
-        undecided: Whether some picture of the cell says neither that the property holds nor that it fails.
-        scene: What tells the counterexample's scene from others of the set, by name; None: only poses vary.
-    """
-
-    cell: Cell
-    verdict: Verdict
-    margin: float | None
-    seconds: float
-    counterexample: tuple[float, ...] | None = None
-    image: np.ndarray | None = field(default=None, repr=False)
-    outputs: np.ndarray | None = field(default=None, repr=False)
-    reason: str = ""
-    undecided: bool = False
-    scene: Mapping[str, np.ndarray] | None = field(default=None, repr=False)
-
-
-@dataclass(frozen=True)
-class BlockResult:
-    """The result of a block of cells.
-
-    Attributes:
-        leaves: Cells that are done with.
-        blocks: Cells to examine next.
-        ranks: How far off a proof of each block is, about (see `Search._rank`); the nearest are best examined first.
-        samples: Whether the property was seen to hold at the middle of each cell.
-        bounded: Cells whose network bounds were computed.
-        seconds: Time spent.
-    """
-
-    leaves: tuple[FinishedCell, ...]
-    blocks: tuple[tuple[Cell, ...], ...]
-    samples: tuple[tuple[Cell, bool], ...]
-    bounded: int
-    seconds: float
-    ranks: tuple[float, ...] = ()
-
-
-#: A pose, and the scene of the set that is shown; None: the stored one, or the nearest to it.
-Sample = tuple[np.ndarray, "SceneSample | None"]
-
-
-@dataclass
-class _CellSamples:
-    """Concrete pictures of one cell, with their margins."""
-
-    cell: Cell
-    box: ParameterBox
-    samples: list[Sample] = field(default_factory=list)
-    margins: list[float] = field(default_factory=list)
-
-    @property
-    def worst(self) -> int:
-        """The sample with the smallest margin that is a number."""
-        return int(np.argmin(np.where(np.isfinite(self.margins), self.margins, np.inf)))
-
-    @property
-    def poses(self) -> dict[bytes, np.ndarray]:
-        """Those that were looked at, each once."""
-        return {pose.tobytes(): pose for pose, _ in self.samples}
-
-    def _where(self, holds: Callable[[float], bool]) -> set[bytes]:
-        return {pose.tobytes() for (pose, _), margin in zip(self.samples, self.margins, strict=True) if holds(margin)}
-
-    @property
-    def broken(self) -> int:
-        """Poses at which the property fails, for some scene."""
-        return len(self._where(_fails))
-
-    @property
-    def undecided(self) -> int:
-        """Poses with a margin of which nothing is known: it is no finite number."""
-        return len(self._where(_unknown))
-
-    @property
-    def hopeless(self) -> bool:
-        """Whether there is no pose at which the property was seen to hold for all scenes."""
-        return len(self._where(_spoilt)) == len(self.poses)
-
-    @property
-    def wavers(self) -> bool:
-        """Whether margins differ so much that there may be poses where the property fails."""
-        finite = [margin for margin in self.margins if math.isfinite(margin)]
-        return bool(finite) and 2.0 * min(finite) <= max(finite)
-
-    @property
-    def holds(self) -> bool:
-        """Whether the property was seen to hold at the first pose, the middle, for all scenes."""
-        return self.samples[0][0].tobytes() not in self._where(_spoilt)
-
-
-def _fails(margin: float) -> bool:
-    return math.isfinite(margin) and margin <= 0.0
-
-
-def _unknown(margin: float) -> bool:
-    return not math.isfinite(margin)
-
-
-def _spoilt(margin: float) -> bool:
-    return not 0.0 < margin < math.inf
 
 
 class Search:
@@ -212,7 +96,7 @@ class Search:
     def margins(self, samples: Sequence[Sample]) -> tuple[np.ndarray, np.ndarray]:
         """[s] concrete margins and [s, n] outputs at poses, each of a scene of the set."""
         images = np.stack([self._image(*sample) for sample in samples])
-        self._latest = {_key(sample): image for sample, image in zip(samples, images, strict=True)}
+        self._latest = {sample_key(sample): image for sample, image in zip(samples, images, strict=True)}
         outputs = np.asarray(self.model.outputs(images), np.float64)
         with torch.no_grad():
             margin = self.claim.margin(torch.from_numpy(outputs), torch.from_numpy(np.stack([p for p, _ in samples])))
@@ -230,7 +114,7 @@ class Search:
             WorkCancelledError: There is no time for it (`ns_abstract.execution.cancellation`).
         """
         begin = time.perf_counter()
-        samples = [_CellSamples(cell, self.grid.box_of(cell)) for cell in block]
+        samples = [CellSamples(cell, self.grid.box_of(cell)) for cell in block]
         outputs = self._sample(samples, self._early)
         bounded: dict[int, float] = {}
         reasons: dict[int, str] = {}
@@ -264,14 +148,14 @@ class Search:
 
     # ---------------------------------------------------------------- concrete poses
 
-    def _early(self, cell: _CellSamples) -> list[Sample]:
+    def _early(self, cell: CellSamples) -> list[Sample]:
         """The middle and two opposite corners."""
         box = cell.box
         if not box.dimensions:
             return [(box.middle, None)]
         return [(pose, None) for pose in (box.middle, np.array(box.lower), np.array(box.upper))[: 1 + _EARLY]]
 
-    def _attack(self, cell: _CellSamples) -> list[Sample]:
+    def _attack(self, cell: CellSamples) -> list[Sample]:
         """A random pose and scene: no proof is believed without."""
         generator = _generator(cell.cell)
         poses = list(cell.box.sample(1, generator)) if cell.box.dimensions else []
@@ -281,10 +165,10 @@ class Search:
         member = next(itertools.islice(self._members(cell), number, None))
         return [(pose, member) for pose in poses or [cell.box.middle]]
 
-    def _members(self, cell: _CellSamples) -> Iterator[SceneSample]:
+    def _members(self, cell: CellSamples) -> Iterator[SceneSample]:
         return self.scene.scene_samples(int(_generator(cell.cell).integers(1 << 31)))
 
-    def _late(self, cell: _CellSamples) -> list[Sample]:
+    def _late(self, cell: CellSamples) -> list[Sample]:
         """Corners and random poses that no sample has been yet."""
         box = cell.box
         if not box.dimensions:
@@ -294,23 +178,21 @@ class Search:
         fresh = {pose.tobytes(): pose for pose in (*poses, *box.sample(_RANDOM, generator))}
         return [(pose, None) for key, pose in fresh.items() if key not in cell.poses]
 
-    def _sample(
-        self, cells: Sequence[_CellSamples], choose: Callable[[_CellSamples], list[Sample]]
-    ) -> list[np.ndarray]:
+    def _sample(self, cells: Sequence[CellSamples], choose: Callable[[CellSamples], list[Sample]]) -> list[np.ndarray]:
         """Add samples to the cells; returns the outputs at each cell's first new one."""
         chosen = [choose(cell) for cell in cells]
         # neighbours share corners
-        unique = {_key(sample): sample for samples in chosen for sample in samples}
+        unique = {sample_key(sample): sample for samples in chosen for sample in samples}
         if not unique:
             return []
         margins, outputs = self.margins(list(unique.values()))
         place = {key: k for k, key in enumerate(unique)}
         for cell, samples in zip(cells, chosen, strict=True):
             cell.samples += samples
-            cell.margins += [float(margins[place[_key(sample)]]) for sample in samples]
-        return [outputs[place[_key(samples[0])]] for samples in chosen if samples]
+            cell.margins += [float(margins[place[sample_key(sample)]]) for sample in samples]
+        return [outputs[place[sample_key(samples[0])]] for samples in chosen if samples]
 
-    def _vary(self, cells: Sequence[_CellSamples]) -> None:
+    def _vary(self, cells: Sequence[CellSamples]) -> None:
         """Scenes of the set that break the property, at every pose looked at of every cell without a proof (V12).
 
         The nearest is moved to the ends of its ranges along the signs of the margin's gradient, the worst by then half
@@ -335,7 +217,7 @@ class Search:
             members = [best]
             self._shown(cell, [(other, best) for key, other in cell.poses.items() if key != pose.tobytes()])
 
-    def _shown(self, cell: _CellSamples, samples: list[Sample]) -> list[float]:
+    def _shown(self, cell: CellSamples, samples: list[Sample]) -> list[float]:
         """Add samples to a cell; their margins."""
         self._sample([cell], lambda _: samples)
         return cell.margins[len(cell.margins) - len(samples) :]
@@ -344,7 +226,7 @@ class Search:
         """The margin's negative."""
         return -self.claim.margin(self.model.differentiable(picture[None]), values[None])[0]
 
-    def _descend_worst_cell(self, cells: Sequence[_CellSamples]) -> None:
+    def _descend_worst_cell(self, cells: Sequence[CellSamples]) -> None:
         """Projected gradient descent of the margin in the cell that came closest to a counterexample.
 
         With one parameter, samples do better than gradients.
@@ -358,7 +240,7 @@ class Search:
         if step is not None:
             self._sample([cell], lambda c: [(step, None)])
 
-    def _descend(self, cell: _CellSamples) -> np.ndarray | None:
+    def _descend(self, cell: CellSamples) -> np.ndarray | None:
         low, high = (torch.tensor(v, dtype=torch.float64) for v in (cell.box.lower, cell.box.upper))
 
         def evaluate(scaled: torch.Tensor) -> tuple[float, torch.Tensor]:
@@ -392,7 +274,7 @@ class Search:
 
     def _bound(
         self,
-        cells: Sequence[_CellSamples],
+        cells: Sequence[CellSamples],
         outputs: Sequence[np.ndarray],
         numbers: Sequence[int],
         bounded: dict[int, float],
@@ -454,7 +336,7 @@ class Search:
             else:
                 reasons[number] = "the network's bounds are not finite"
 
-    def _too_wide(self, cell: _CellSamples, number: int, sets: PictureSets, costs: np.ndarray) -> bool:
+    def _too_wide(self, cell: CellSamples, number: int, sets: PictureSets, costs: np.ndarray) -> bool:
         """Whether the network's bounds would be wasted on the sets.
 
         ``costs[number]`` becomes the part of the margin that they cost. A guess by the margin's gradient at the middle,
@@ -469,7 +351,7 @@ class Search:
 
     def _covered(
         self,
-        cell: _CellSamples,
+        cell: CellSamples,
         number: int,
         outputs: np.ndarray,
         bounded: dict[int, float],
@@ -492,10 +374,10 @@ class Search:
         elif outcome.cuts:
             cuts[number] = outcome.cuts
 
-    def _weights(self, cell: _CellSamples) -> PixelWeights | None:
+    def _weights(self, cell: CellSamples) -> PixelWeights | None:
         """The margin's gradient at the middle, as a part of the margin; None where one of them is no number."""
         values = cell.box.middle
-        image = self._latest.get(_key((values, None)))
+        image = self._latest.get(sample_key((values, None)))
         image = self._image(values, None) if image is None else image
         try:
             picture = torch.from_numpy(image.astype(np.float64)).requires_grad_(True)
@@ -508,7 +390,7 @@ class Search:
         here = float(margin.detach())
         return PixelWeights(gradient.numpy() / here, here) if here > 0.0 else None
 
-    def _branching(self, cell: _CellSamples, margin: float) -> Sequence[Sequence[int]]:
+    def _branching(self, cell: CellSamples, margin: float) -> Sequence[Sequence[int]]:
         """The claim's groups, if branches may prove a cell that cannot be cut any more, and nothing else can (N16)."""
         if not isinstance(self.claim, LinearClaim) or self._splittable(cell.cell) or cell.broken or cell.undecided:
             return ()
@@ -522,7 +404,7 @@ class Search:
 
     def _verdicts(
         self,
-        seen: Sequence[_CellSamples],
+        seen: Sequence[CellSamples],
         bounded: dict[int, float],
         reasons: dict[int, str],
         slopes: np.ndarray,
@@ -561,7 +443,7 @@ class Search:
                 leaves.append(FinishedCell(cell.cell, "unknown", bound, 0.0, reason=reason, undecided=undecided))
         return leaves, children
 
-    def _rank(self, cell: _CellSamples, bound: float | None, cost: float) -> float:
+    def _rank(self, cell: CellSamples, bound: float | None, cost: float) -> float:
         """How many times the bound of ``cell`` misses the margin that samples show: its parts need about as many cuts.
 
         Largest cells first would prove nothing for long where all cells need several cuts; the nearest to a proof
@@ -578,7 +460,7 @@ class Search:
             return min(cost, RANK_FIRST / 2.0) if math.isfinite(cost) else _RANK_UNKNOWN * (1.0 + share)
         return min((margin - bound) / margin, _RANK_UNKNOWN)
 
-    def _cuts(self, cell: _CellSamples, bound: float | None, cost: float) -> tuple[float, int]:
+    def _cuts(self, cell: CellSamples, bound: float | None, cost: float) -> tuple[float, int]:
         """How many times narrower parts should be for a proof, and how many there may be."""
         if cell.broken:
             return 0.25, 4
@@ -587,7 +469,7 @@ class Search:
         margin = cell.margins[cell.worst]
         return (0.25, 4) if margin - bound > _FAR * margin else (0.5, 2)
 
-    def _counterexample(self, cell: _CellSamples) -> FinishedCell:
+    def _counterexample(self, cell: CellSamples) -> FinishedCell:
         """The worst pose, rendered and classified once more."""
         values, member = cell.samples[cell.worst]
         image = self._image(values, member)
@@ -609,27 +491,8 @@ class Search:
         )
 
 
-class ContradictionError(RuntimeError):
-    """Raised where a cell was proved although a pose in it breaks the property: a fault of the program."""
-
-
-#: What may go wrong in one cell without ending the run; lack of memory and a user's mistake do end it.
-FAILURES = (ArithmeticError, ValueError, IndexError, KeyError, TypeError, RuntimeError, AssertionError)
-
-
-def failure_text(error: Exception) -> str:
-    """Return one of `FAILURES` as a line of text."""
-    return " ".join(f"{type(error).__name__}: {error}".split())[:200]
-
-
 def _timed(leaf: FinishedCell, seconds: float) -> FinishedCell:
     return replace(leaf, seconds=seconds)
-
-
-def _key(sample: Sample) -> tuple[bytes, int]:
-    """Return a key that is equal for equal pictures; scene samples are distinguished by identity."""
-    pose, member = sample
-    return pose.tobytes(), id(member)
 
 
 def _generator(cell: Cell) -> np.random.Generator:

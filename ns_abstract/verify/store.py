@@ -23,7 +23,8 @@ import numpy as np
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.scene_margin import CellOutcome
-from ns_abstract.verify.search import RANK_FIRST, BlockResult, FinishedCell, Verdict
+from ns_abstract.verify.search import RANK_FIRST
+from ns_abstract.verify.search_results import BlockResult, FinishedCell, Verdict
 from ns_abstract.verify.store_file import BLOCK, FRAME, StoreFile, TableChecksum
 
 #: One open block of so many is the one with the largest cells, all others are those nearest to a proof.

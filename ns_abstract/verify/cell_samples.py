@@ -1,0 +1,83 @@
+"""Concrete pictures of one cell of a search, with their margins."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.refine.protocol import SceneSample
+from ns_abstract.verify.cells import Cell
+
+#: A pose, and the scene of the set that is shown; None: the stored one, or the nearest to it.
+Sample = tuple[np.ndarray, "SceneSample | None"]
+
+
+@dataclass
+class CellSamples:
+    """Concrete pictures of one cell, with their margins."""
+
+    cell: Cell
+    box: ParameterBox
+    samples: list[Sample] = field(default_factory=list)
+    margins: list[float] = field(default_factory=list)
+
+    @property
+    def worst(self) -> int:
+        """The sample with the smallest margin that is a number."""
+        return int(np.argmin(np.where(np.isfinite(self.margins), self.margins, np.inf)))
+
+    @property
+    def poses(self) -> dict[bytes, np.ndarray]:
+        """Those that were looked at, each once."""
+        return {pose.tobytes(): pose for pose, _ in self.samples}
+
+    def _where(self, holds: Callable[[float], bool]) -> set[bytes]:
+        return {pose.tobytes() for (pose, _), margin in zip(self.samples, self.margins, strict=True) if holds(margin)}
+
+    @property
+    def broken(self) -> int:
+        """Poses at which the property fails, for some scene."""
+        return len(self._where(_fails))
+
+    @property
+    def undecided(self) -> int:
+        """Poses with a margin of which nothing is known: it is no finite number."""
+        return len(self._where(_unknown))
+
+    @property
+    def hopeless(self) -> bool:
+        """Whether there is no pose at which the property was seen to hold for all scenes."""
+        return len(self._where(_spoilt)) == len(self.poses)
+
+    @property
+    def wavers(self) -> bool:
+        """Whether margins differ so much that there may be poses where the property fails."""
+        finite = [margin for margin in self.margins if math.isfinite(margin)]
+        return bool(finite) and 2.0 * min(finite) <= max(finite)
+
+    @property
+    def holds(self) -> bool:
+        """Whether the property was seen to hold at the first pose, the middle, for all scenes."""
+        return self.samples[0][0].tobytes() not in self._where(_spoilt)
+
+
+def _fails(margin: float) -> bool:
+    return math.isfinite(margin) and margin <= 0.0
+
+
+def _unknown(margin: float) -> bool:
+    return not math.isfinite(margin)
+
+
+def _spoilt(margin: float) -> bool:
+    return not 0.0 < margin < math.inf
+
+
+def sample_key(sample: Sample) -> tuple[bytes, int]:
+    """Return a key that is equal for equal pictures; scene samples are distinguished by identity."""
+    pose, member = sample
+    return pose.tobytes(), id(member)
