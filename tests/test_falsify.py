@@ -18,11 +18,12 @@ from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.perturbation.specification import parse_perturbation
-from ns_abstract.verify.attack.falsify import Attack, falsify, merge
+from ns_abstract.verify.attack.falsify import falsify
 from ns_abstract.verify.attack.soundness import (
     compiled_renderer,
     reference_renderer,
 )
+from ns_abstract.verify.attack.violations import Attack, merge
 
 torch.set_num_threads(1)
 RUNS = Path(__file__).resolve().parents[2] / "shared" / "runs"

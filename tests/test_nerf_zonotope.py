@@ -15,10 +15,11 @@ from ns_abstract.arithmetic.simd.lanes import LINE
 from ns_abstract.methods.nerf import relu_kernel, zonotope
 from ns_abstract.methods.nerf.field_kernel import CHUNK
 from ns_abstract.methods.nerf.layer_kernel import BLOCK, LayerInput, LayerOutput, LayerWeights, linear
+from ns_abstract.methods.nerf.layer_polynomials import PreActivation
 from ns_abstract.methods.nerf.outputs import greatest, opacity
 from ns_abstract.methods.nerf.ray_field import basis_of
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer
-from ns_abstract.methods.nerf.zonotope import FieldBounds, PreActivation
+from ns_abstract.methods.nerf.zonotope import FieldBounds
 
 #: A tolerance of zero: what is compared carries its own rounding.
 FIELDS = {

@@ -21,7 +21,7 @@ from ns_abstract.verify.network import ImageSets, Network, NetworkArithmetic, bo
 from ns_abstract.verify.network.bounds import NetworkBounds
 from ns_abstract.verify.network.layers import Convolution, LeakyRelu, Matrix
 from ns_abstract.verify.network.phase_tree import PhaseTree, _Branch, _GroupRows
-from ns_abstract.verify.vnnlib import InputRegion, UnsafeSet
+from ns_abstract.verify.vnnlib_sets import InputRegion, UnsafeSet
 
 MOST = 100
 

@@ -15,7 +15,7 @@ from ns_abstract.verify.network import ImageSets, Network, NetworkArithmetic, bo
 from ns_abstract.verify.network.activations import Power, Reciprocal
 from ns_abstract.verify.network.composite_layers import CompositeBuilder
 from ns_abstract.verify.network.weighted_means import centred
-from ns_abstract.verify.vnnlib import InputRegion, UnsafeSet
+from ns_abstract.verify.vnnlib_sets import InputRegion, UnsafeSet
 
 WEIGHTS = np.array([[10.0, 20.0, 40.0, 80.0, 160.0, 320.0], [3.0, 1.0, 4.0, 1.0, 5.0, 9.0]])
 

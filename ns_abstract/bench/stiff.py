@@ -25,8 +25,9 @@ from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, Rasteriser
 from ns_abstract.methods.splat.frame import SplatFrame, TileBounds, VisibleContext
 from ns_abstract.refine.engine import Refinement, RefinementGoal
 from ns_abstract.refine.result import mean_pixel_gap
-from ns_abstract.verify.attack.falsify import Violation, falsify, merge
+from ns_abstract.verify.attack.falsify import falsify
 from ns_abstract.verify.attack.soundness import compiled_renderer, reference_renderer
+from ns_abstract.verify.attack.violations import Violation, merge
 
 ARITHMETICS = ("float32", "real")
 

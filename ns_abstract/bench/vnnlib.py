@@ -27,8 +27,9 @@ from ns_abstract.verify.network import Network, NetworkArithmetic, load_network
 from ns_abstract.verify.network.comparison import compare
 from ns_abstract.verify.network.explain import check_cell
 from ns_abstract.verify.network.load import onnx_runner
-from ns_abstract.verify.vnnlib import InputRegion, load_query
+from ns_abstract.verify.vnnlib import load_query
 from ns_abstract.verify.vnnlib2 import Vnnlib2Query
+from ns_abstract.verify.vnnlib_sets import InputRegion
 
 _LIST_LIMIT = 16 << 20
 _INSTANCES = 100_000

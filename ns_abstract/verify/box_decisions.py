@@ -19,7 +19,7 @@ from ns_abstract.verify.network.branching import branch
 from ns_abstract.verify.network.phase_tree import PhaseTree
 from ns_abstract.verify.network.subnormals import subnormals_kept
 from ns_abstract.verify.network.weighted_means import centred
-from ns_abstract.verify.vnnlib import InputRegion, UnsafeSet
+from ns_abstract.verify.vnnlib_sets import InputRegion, UnsafeSet
 
 #: The competitions' words: an unsafe output was found; there is none; not decided; not decided in time.
 Verdict = Literal["sat", "unsat", "unknown", "timeout"]

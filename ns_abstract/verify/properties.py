@@ -24,7 +24,7 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.differentiable_pose import differentiable_pose
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.verify.preprocess import Preprocess
-from ns_abstract.verify.vnnlib import UnsafeSet
+from ns_abstract.verify.vnnlib_sets import UnsafeSet
 
 if TYPE_CHECKING:
     from ns_abstract.verify.network import OutputBounds

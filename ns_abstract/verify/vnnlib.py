@@ -25,6 +25,7 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import read_text
 from ns_abstract.io.packed import unpacked
 from ns_abstract.verify.vnnlib2 import Vnnlib2Query, is_version_2, joined, parse_query
+from ns_abstract.verify.vnnlib_sets import InputRegion, UnsafeSet
 
 _LIMIT = 256 << 20
 _TOKEN = re.compile(r'\s+|;[^\n]*|(?P<text>[()]|"[^"]*"|[^\s();"]+)|(?P<bad>.)', re.DOTALL)
@@ -82,42 +83,6 @@ class _Run:
 
 #: ``rows @ y + offset <= 0`` for all rows of a list: one way to be unsafe.
 _Conjunction = list[_Linear | _Run]
-
-
-@dataclass(frozen=True)
-class UnsafeSet:
-    """Outputs y are unsafe if ``rows[g] @ y + offset[g] <= 0`` holds for every row of some group g.
-
-    Attributes:
-        rows: [k, n].
-        offset: [k].
-        groups: Row numbers of each group.
-        inputs: Number of assertions on inputs that were set aside.
-    """
-
-    rows: np.ndarray
-    offset: np.ndarray
-    groups: tuple[tuple[int, ...], ...]
-    inputs: int
-
-
-@dataclass(frozen=True)
-class InputRegion:
-    """A box of inputs with the outputs that are unsafe there.
-
-    Attributes:
-        lower, upper: [n] float64.
-        unsafe: Outputs; without rows and groups, any output is unsafe.
-    """
-
-    lower: np.ndarray
-    upper: np.ndarray
-    unsafe: UnsafeSet
-
-    def holds(self, output: np.ndarray) -> bool:
-        """Whether ``output`` is unsafe."""
-        value = self.unsafe.rows @ output + self.unsafe.offset
-        return any(bool((value[list(group)] <= 0.0).all()) for group in self.unsafe.groups)
 
 
 class _VariableCounts(NamedTuple):

@@ -12,7 +12,7 @@ from ns_abstract.arithmetic.rounding import (
     COMPOSITE_ROUNDING,
     SOFTPLUS_LINE,
 )
-from ns_abstract.methods.nerf.zonotope import PreActivation
+from ns_abstract.methods.nerf.layer_polynomials import PreActivation
 
 
 def greatest(value: PreActivation) -> Tensor:

@@ -20,12 +20,12 @@ from ns_abstract.arithmetic.rounding import DENSITY_ROUNDING, DIRECTION_ROUNDING
 from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.methods.nerf.division import Division
 from ns_abstract.methods.nerf.hsv import shifted_bounds
+from ns_abstract.methods.nerf.layer_polynomials import PostActivation, PreActivation
 from ns_abstract.methods.nerf.outputs import bounds_by_part, brightness, greatest, opacity
 from ns_abstract.methods.nerf.ray_bundle import RayBundle
 from ns_abstract.methods.nerf.ray_field import RAY_TUNING, RayBounds, RayField, RayRequest, Shifts
 from ns_abstract.methods.nerf.samples import composite, field_hulls
 from ns_abstract.methods.nerf.white import WhiteSamples
-from ns_abstract.methods.nerf.zonotope import PostActivation, PreActivation
 
 #: Samples of a ray that are bounded before the light that is left is looked at.
 _BLOCK = 8

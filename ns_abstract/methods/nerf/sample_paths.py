@@ -20,12 +20,13 @@ from ns_abstract.arithmetic.rounding import DIRECTION_ROUNDING, FOLLOWED_UP, LIN
 from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.methods.nerf.division import Division
 from ns_abstract.methods.nerf.hsv import Range, shifted_bounds
+from ns_abstract.methods.nerf.layer_polynomials import PostActivation, PreActivation
 from ns_abstract.methods.nerf.occupancy import OccupancyGrid
 from ns_abstract.methods.nerf.outputs import bounds_by_part, brightness, density, opacity
 from ns_abstract.methods.nerf.ray_bundle import TAYLOR, RayBundle
 from ns_abstract.methods.nerf.render import Sampling
 from ns_abstract.methods.nerf.samples import composite, edge_bounds
-from ns_abstract.methods.nerf.zonotope import FieldBounds, PostActivation, PreActivation
+from ns_abstract.methods.nerf.zonotope import FieldBounds
 
 #: Parts of a cell, by axis and number of parameters: samples are told apart by them at no cost.
 _INNER = {1: 16, 2: 4}

@@ -11,13 +11,14 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike, NDArray
 
 from ns_abstract.geometry.box import Float64Array, ParameterBox
+from ns_abstract.verify.attack.violations import KEPT, STRATEGIES, Attack, Violation, _severity
 
 #: Parameter values [d] to an image [H, W, 3].
 Render = Callable[[Float64Array], NDArray[np.floating]]
@@ -26,10 +27,8 @@ RenderPixels = Callable[[Float64Array, NDArray[np.int64]], NDArray[np.floating]]
 #: The same in torch, differentiable with respect to the values.
 DifferentiableRender = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 
-STRATEGIES = ("given", "corners", "random", "ascent", "jumps")
 
 _CORNERS = 64
-_KEPT = 16
 # of the poses left after the given ones
 _SHARES = {"corners": 0.4, "random": 0.4, "ascent": 0.6}
 _ASCENT_STEPS = 16
@@ -48,67 +47,6 @@ class SuspectTuning:
 
 
 _TUNING = SuspectTuning()
-
-
-@dataclass(frozen=True)
-class Violation:
-    """One value outside its bounds.
-
-    Attributes:
-        values: The pose's parameters, in the box's order and units.
-        row, column, channel: Where.
-        value: What was rendered.
-        bound: The bound it breaks: the lower one if ``value`` is less, else the upper one.
-        amount: Their distance; NaN where one is not a number.
-    """
-
-    values: tuple[float, ...]
-    row: int
-    column: int
-    channel: int
-    value: float
-    bound: float
-    amount: float
-
-
-@dataclass(frozen=True)
-class Attack:
-    """The result of an attack: violations, the closest approach, and the work that was done.
-
-    Attributes:
-        poses: Images rendered in full.
-        probes: Single pixels rendered besides (their values are compared as well).
-        steps: Evaluations of the twin.
-        comparisons: Pixel channels compared with their bounds.
-        violations: Comparisons that failed, and bounds that are not finite.
-        not_finite: Of those, the values and bounds that are not finite numbers.
-        worst: The worst violation of at most 16 pixel channels, largest first, NaN before all.
-        witness_lower, witness_upper: [H, W, 3] least and largest values rendered; NaN where every
-            image was NaN.
-        tried: Poses by strategy.
-        closest: [n, d] poses at which a pixel came closest to a bound relative to the gap, at most 8.
-        seconds: Time spent.
-    """
-
-    poses: int
-    probes: int
-    steps: int
-    comparisons: int
-    violations: int
-    not_finite: int
-    worst: tuple[Violation, ...]
-    witness_lower: Float64Array = field(repr=False)
-    witness_upper: Float64Array = field(repr=False)
-    tried: dict[str, int]
-    closest: Float64Array = field(repr=False)
-    seconds: float
-
-    @property
-    def amount(self) -> float:
-        """How far the worst value lies outside: 0 if nothing does, infinity if something is no number."""
-        if not self.worst:
-            return 0.0
-        return float("inf") if np.isnan(self.worst[0].amount) else self.worst[0].amount
 
 
 class _BudgetSpentError(Exception):
@@ -142,7 +80,7 @@ class _ImageExtremes:
         bad = ~(np.isfinite(self.lower) & np.isfinite(self.upper))
         self.not_finite += int(bad.sum())
         self.violations += int(bad.sum())
-        for place in np.argwhere(bad)[:_KEPT]:
+        for place in np.argwhere(bad)[:KEPT]:
             bound = self.lower[tuple(place)] if not np.isfinite(self.lower[tuple(place)]) else self.upper[tuple(place)]
             row, column, channel = map(int, place)
             self._keep(Violation((), row, column, channel, float("nan"), float(bound), float("nan")))
@@ -199,7 +137,7 @@ class _ImageExtremes:
         amount = np.where(image < lower, lower - image, image - upper)
         places = np.argwhere(counted)
         # worst first, NaN before all
-        ranks = np.argsort(-np.nan_to_num(amount[counted], nan=np.inf, posinf=np.inf), kind="stable")[:_KEPT]
+        ranks = np.argsort(-np.nan_to_num(amount[counted], nan=np.inf, posinf=np.inf), kind="stable")[:KEPT]
         for place in places[ranks]:
             index = tuple(place)
             row, column = (int(place[0]), int(place[1])) if pixels is None else map(int, pixels[place[0]])
@@ -268,7 +206,7 @@ class _ImageExtremes:
         return np.array(unique, np.float64).reshape(len(unique), self.box.dimensions)
 
     def attack(self, seconds: float) -> Attack:
-        worst = sorted(self.found.values(), key=_severity, reverse=True)[:_KEPT]
+        worst = sorted(self.found.values(), key=_severity, reverse=True)[:KEPT]
         unseen = self.most < self.least
         return Attack(
             poses=len(self.poses),
@@ -295,10 +233,6 @@ class _Target:
     channel: int
     sign: float
     pose: Float64Array
-
-
-def _severity(violation: Violation) -> float:
-    return np.inf if np.isnan(violation.amount) else violation.amount
 
 
 def _corners(box: ParameterBox, count: int, generator: np.random.Generator) -> Float64Array:
@@ -493,22 +427,3 @@ def _search(
         # nothing moved enough to be searched
         while True:
             record.image(box.sample(1, generator)[0], "random")
-
-
-def merge(attacks: Sequence[Attack]) -> Attack:
-    """Return one result for several attacks on images of one size."""
-    worst = sorted((v for a in attacks for v in a.worst), key=_severity, reverse=True)[:_KEPT]
-    return Attack(
-        poses=sum(a.poses for a in attacks),
-        probes=sum(a.probes for a in attacks),
-        steps=sum(a.steps for a in attacks),
-        comparisons=sum(a.comparisons for a in attacks),
-        violations=sum(a.violations for a in attacks),
-        not_finite=sum(a.not_finite for a in attacks),
-        worst=tuple(worst),
-        witness_lower=np.fmin.reduce([a.witness_lower for a in attacks]),
-        witness_upper=np.fmax.reduce([a.witness_upper for a in attacks]),
-        tried={name: sum(a.tried[name] for a in attacks) for name in STRATEGIES},
-        closest=np.concatenate([a.closest for a in attacks]),
-        seconds=sum(a.seconds for a in attacks),
-    )

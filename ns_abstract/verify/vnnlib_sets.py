@@ -1,0 +1,43 @@
+"""What a VNN-LIB file asks: unsafe sets of outputs, and regions of inputs."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class UnsafeSet:
+    """Outputs y are unsafe if ``rows[g] @ y + offset[g] <= 0`` holds for every row of some group g.
+
+    Attributes:
+        rows: [k, n].
+        offset: [k].
+        groups: Row numbers of each group.
+        inputs: Number of assertions on inputs that were set aside.
+    """
+
+    rows: np.ndarray
+    offset: np.ndarray
+    groups: tuple[tuple[int, ...], ...]
+    inputs: int
+
+
+@dataclass(frozen=True)
+class InputRegion:
+    """A box of inputs with the outputs that are unsafe there.
+
+    Attributes:
+        lower, upper: [n] float64.
+        unsafe: Outputs; without rows and groups, any output is unsafe.
+    """
+
+    lower: np.ndarray
+    upper: np.ndarray
+    unsafe: UnsafeSet
+
+    def holds(self, output: np.ndarray) -> bool:
+        """Whether ``output`` is unsafe."""
+        value = self.unsafe.rows @ output + self.unsafe.offset
+        return any(bool((value[list(group)] <= 0.0).all()) for group in self.unsafe.groups)
