@@ -62,7 +62,7 @@ def test_it_shares_no_code_and_stays_small() -> None:
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
             for name in names:
                 assert not name.startswith("ns_abstract") or name.startswith("ns_abstract.check."), (file, name)
-    assert 0 < lines[False] <= 1705 and 0 < lines[True] <= 440
+    assert 0 < lines[False] <= 1715 and 0 < lines[True] <= 440
 
 
 # ---------------------------------------------------------------- enclosures

@@ -26,7 +26,7 @@ CHECKS = (
     ),
     Fault(
         "checker: an open depth order is that of the middle",
-        _SPLATS,
+        "check/blending.py",
         "_swaps",
         "((back[:, k:] <= dhigh[:, :-k]) & inside[:, k:]).any()",
         "False",
@@ -34,7 +34,7 @@ CHECKS = (
     ),
     Fault(
         "checker: a stop that is open is none",
-        _SPLATS,
+        "check/blending.py",
         "blended",
         "np.where(a.any(axis=1), a.argmax(axis=1), n)",
         "np.full(count, n)",

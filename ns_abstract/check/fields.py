@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from ns_abstract.check.blending import from_the_back
 from ns_abstract.check.forms import Affine, Array, U, total
 from ns_abstract.check.poses import CameraForms, CheckedCamera
-from ns_abstract.check.splats import from_the_back, wide
+from ns_abstract.check.splats import wide
 
 #: Neurons of a layer and sample that keep a symbol of their own where they may bend; boxes that are looked at together.
 SYMBOLS, TOGETHER = 256, 4

@@ -1,0 +1,130 @@
+"""Blending of fragments from the front to the back, in forms."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ns_abstract.check.forms import TINY, Affine, Array, U
+
+#: Light at which the rasteriser stops.
+STOP = 1e-4
+#: Relative room around decisions, for the rounding of their thresholds.
+ROOM = 1e-12
+#: Places in the order that a Gaussian may move by before a box is given up.
+LONGEST = 96
+
+
+def picked(part: Any, row: Array, index: Array) -> Any:
+    """Elements ``index`` of the rows [W, 1] of forms and arrays [..., B, n], and of those in lists and tuples."""
+    if isinstance(part, Affine):
+        return part.of(lambda a: a[..., row, index])
+    if isinstance(part, np.ndarray):
+        return part[row, index]
+    parts = [picked(e, row, index) for e in part]
+    return type(part)(*parts) if isinstance(part, tuple) else parts
+
+
+def blended(
+    alpha: Affine, color: Affine, depth: Affine, shows: Array, background: Array, unit: float
+) -> tuple[Affine, Array]:
+    """The blended colours [B, 3] before the clamp, and which of the fragments [B, n] matter; colours are [3, B, n]."""
+    count, n = shows.shape
+    # those that do not show stand behind all others
+    order = np.argsort(np.where(shows, depth.c, np.inf), axis=1, kind="stable")
+    alpha, color, depth, shows = picked([alpha, color, depth, shows], np.arange(count)[:, None], order)
+    color = color.of(lambda a: np.moveaxis(a, -3, -1))
+    al, ah = (np.clip(a, 0.0, 1.0) for a in alpha.range())
+    cl, ch = color.range()
+    # a slope that all share changes no order
+    common = (depth.g * (shows / np.maximum(shows.sum(axis=1, keepdims=True), 1))).sum(axis=2, keepdims=True)
+    room = (np.abs(depth.g - common).sum(axis=0) + depth.r) * (1.0 + 64.0 * U) + 64.0 * U * depth.size()
+    room = np.where(np.isnan(room), np.inf, room)
+    low, high = (np.where(shows, depth.c + s * room, -s * np.inf) for s in (-1.0, 1.0))
+    front, back = np.maximum.accumulate(high, axis=1), np.minimum.accumulate(low[:, ::-1], axis=1)[:, ::-1]
+    # whether all in front of a place is surely in front of all behind it
+    clean = np.ones((count, n + 1), bool)
+    clean[:, 1:n] = front[:, :-1] < back[:, 1:]
+    step = 1.0 + 8.0 * n * U + 4.0 * n * unit
+    most, least = (
+        np.concatenate([np.ones((count, 1)), np.cumprod(1.0 - a, axis=1)], axis=1) * s
+        for a, s in ((al, step), (ah, 1.0 / step))
+    )
+    most[:, 0] = least[:, 0] = 1.0
+    place = np.arange(n + 1)[None]
+    # the first fragment at which the rasteriser may stop, and the first at which it surely has stopped
+    may, sure = least[:, 1:] <= STOP * (1.0 + ROOM + 4.0 * unit), most[:, 1:] <= STOP * (1.0 - ROOM - 4.0 * unit)
+    first, last = (np.where(a.any(axis=1), a.argmax(axis=1), n)[:, None] for a in (may, sure))
+    begin = np.where(clean & (place <= first), place, 0).max(axis=1)[:, None]
+    plain = np.take_along_axis(clean, last, 1) & np.take_along_axis(clean, np.minimum(last + 1, n), 1)
+    end = np.where(plain, last, np.where(clean & (place > last), place, n).min(axis=1)[:, None])
+    inside = place[:, :-1] < end
+    form = from_the_back(alpha, color, inside, background, unit)
+    # other orders than that of the centres, and earlier stops
+    lower, upper = _swaps((low, high, front, back), inside, most, ah, cl, ch)
+    at = ((place[:, :-1] >= begin) & (place[:, :-1] < end))[..., None]
+    room = 1.0 + ROOM + 8.0 * n * unit
+    light = np.where(at[..., 0], STOP * room / np.maximum(1.0 - ah, 1e-3), 0.0).max(axis=1, initial=0.0)
+    light = np.minimum(light, np.take_along_axis(most, begin, 1)[:, 0])[:, None] * (begin < end) * room
+    darkest = np.minimum(np.where(at, cl, np.inf).min(axis=1, initial=np.inf), background)
+    brightest = np.maximum(np.where(at, ch, -np.inf).max(axis=1, initial=-np.inf), background)
+    with np.errstate(invalid="ignore"):
+        lower = lower - np.where(light > 0.0, light * (brightest - background), 0.0)
+        upper = upper + np.where(light > 0.0, light * (background - darkest), 0.0)
+        rest = 0.5 * (upper - lower) * (1.0 + ROOM) + 8.0 * U * (np.abs(form.c) + 1.0)
+        middle = 0.5 * (lower + upper)
+    bad = ~np.isfinite(rest)
+    form = Affine(form.c + np.where(bad, 0.0, middle), form.g, form.r + np.where(bad, np.inf, rest))
+    keep = np.zeros((count, n), bool)
+    np.put_along_axis(keep, order, (place[:, :-1] < end + 1) & shows, 1)
+    return form, keep
+
+
+def from_the_back(alpha: Affine, color: Affine, inside: Array, background: Array, unit: float) -> Affine:
+    """The colours [B, 3] of fragments that are blended in the order of their centres.
+
+    S' = S + alpha (C - S): errors of S are met by 1 - alpha, those of C by alpha. In float32 a fragment's light errs by
+    2 units for each in front of it, sums by one for each.
+    """
+    count, n = inside.shape
+    size = np.maximum(color.size().max(axis=(1, 2), initial=0.0), np.abs(background).max(initial=1.0))[:, None]
+    c, r = np.broadcast_to(background, (count, 3)), np.zeros((count, 3))
+    g = np.zeros((len(alpha.g), count, 3))
+    al, ah = (np.clip(a, 0.0, 1.0) for a in alpha.range())
+    slope = alpha.slope
+    for k in np.flatnonzero((inside & (ah > 0.0)).any(axis=0))[::-1]:
+        used = inside[:, k, None] * 1.0
+        a, da, ra, s = (v[..., k, None] * used for v in (alpha.c, alpha.g, alpha.r, slope))
+        d, dg = color.c[:, k] - c, color.g[:, :, k] - g
+        tilt = np.abs(dg).sum(axis=0)
+        r = (1.0 - al[:, k, None] * used) * r + ah[:, k, None] * used * color.r[:, k]
+        r = (r + ra * (np.abs(d) + tilt) + s * tilt) * (1.0 + 16.0 * U) + 32.0 * U * size + TINY
+        c, g = c + a * d, g + a * dg + da * d
+    # what is outside of the colours is not known better than that
+    return Affine(c, g, np.where(np.isfinite(r), r, np.inf)).wider((4.0 * n + 16.0) * unit * size)
+
+
+def _swaps(depths: Any, inside: Array, most: Array, ah: Array, cl: Array, ch: Array) -> tuple[Array, Array]:
+    """What other orders than that of the centres may change: [B, 3] least and largest.
+
+    Sorting by exchanges of neighbours exchanges each inverted pair once; an exchange changes the colour by the
+    transmittance in front times both alphas times the difference of colours. What is surely in front of both is in
+    front of them throughout.
+    """
+    (count, n), (dlow, dhigh, front, back) = inside.shape, depths
+    begin = np.stack([np.searchsorted(f, low) for f, low in zip(front, dlow, strict=True)])
+    light, lower, upper = np.take_along_axis(most, begin, 1), np.zeros((count, 3)), np.zeros((count, 3))
+    for k in range(1, n):
+        if not ((back[:, k:] <= dhigh[:, :-k]) & inside[:, k:]).any():
+            break
+        if k > LONGEST:
+            return lower - np.inf, upper + np.inf
+        pair = inside[:, :-k] & inside[:, k:] & ~(dhigh[:, :-k] < dlow[:, k:])
+        rows = np.flatnonzero(pair.any(axis=1))
+        weight = np.where(pair, np.maximum(light[:, :-k], light[:, k:]) * ah[:, :-k] * ah[:, k:], 0.0)[rows, :, None]
+        with np.errstate(invalid="ignore"):
+            down = np.where(weight > 0.0, weight * np.minimum(cl[rows, k:] - ch[rows, :-k], 0.0), 0.0)
+            up = np.where(weight > 0.0, weight * np.maximum(ch[rows, k:] - cl[rows, :-k], 0.0), 0.0)
+        lower[rows], upper[rows] = lower[rows] + down.sum(axis=1), upper[rows] + up.sum(axis=1)
+    return lower * (1.0 + ROOM), upper * (1.0 + ROOM)
