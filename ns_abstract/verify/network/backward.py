@@ -148,25 +148,7 @@ class BackwardPass:
             gathered = batch.total.copy() if batch.trace is not None else batch.total
             if batch.trace is not None and not batch.trace.short and self._depends(start, at):
                 batch.trace.keep(at, here, node.layer.shape, batch.number)
-            if isinstance(node.layer, Activation):
-                lines, which = batch.passage.lines[at], batch.cell
-                if batch.chosen is not None and at in batch.chosen.lines:
-                    lines, which = batch.chosen.lines[at], batch.number
-                pass_activation(here.value, here.y, here.x, which, lines, batch.total)
-                parts = [here]
-            elif isinstance(node.layer, MaxPool):
-                parts = [batch.passage.maxima[at].backward(here, node.layer, batch.cell, batch.total)]
-            elif isinstance(node.layer, Product):
-                # every reader changes its rows in place
-                parts = [here, Coefficients(here.value.copy(), here.y, here.x)]
-                for part, lines in zip(parts, batch.passage.products[at], strict=True):
-                    pass_activation(part.value, part.y, part.x, batch.cell, lines, batch.total)
-            else:
-                if at == start or at not in self.intermediate.folded:
-                    shape = grid(node.layer.shape)
-                    noise = batch.passage.noise[at].reshape(self.intermediate.count, *shape).contiguous().numpy()
-                    charge(here.value, here.y, here.x, batch.cell, noise, batch.total)
-                parts = node.layer.backward(here)
+            parts = self._inputs_of(start, at, batch, here)
             if batch.trace is not None and (batch.trace.short or isinstance(node.layer, (MaxPool, Product))):
                 batch.trace.fixed[batch.number] += batch.total - gathered
             for source, part in zip(node.inputs, parts, strict=True):
@@ -184,6 +166,29 @@ class BackwardPass:
             if 0 in batch.waiting:
                 batch.trace.keep(0, batch.waiting[0], self.network.input_shape, batch.number)
         self._bound_rows(0, batch, self.intermediate.columns, found)
+
+    def _inputs_of(self, start: int, at: int, batch: CoefficientBatch, here: Coefficients) -> list[Coefficients]:
+        """Coefficients of the inputs of node ``at`` in place of its own ``here``; constants go to ``batch.total``."""
+        layer = self.network.nodes[at - 1].layer
+        if isinstance(layer, Activation):
+            lines, which = batch.passage.lines[at], batch.cell
+            if batch.chosen is not None and at in batch.chosen.lines:
+                lines, which = batch.chosen.lines[at], batch.number
+            pass_activation(here.value, here.y, here.x, which, lines, batch.total)
+            return [here]
+        if isinstance(layer, MaxPool):
+            return [batch.passage.maxima[at].backward(here, layer, batch.cell, batch.total)]
+        if isinstance(layer, Product):
+            # every reader changes its rows in place
+            parts = [here, Coefficients(here.value.copy(), here.y, here.x)]
+            for part, lines in zip(parts, batch.passage.products[at], strict=True):
+                pass_activation(part.value, part.y, part.x, batch.cell, lines, batch.total)
+            return parts
+        if at == start or at not in self.intermediate.folded:
+            shape = grid(layer.shape)
+            noise = batch.passage.noise[at].reshape(self.intermediate.count, *shape).contiguous().numpy()
+            charge(here.value, here.y, here.x, batch.cell, noise, batch.total)
+        return layer.backward(here)
 
     def _depends(self, start: int, at: int) -> bool:
         """Whether what rows that start at node ``start`` gather at another one depends on the cell's ranges (N15)."""
