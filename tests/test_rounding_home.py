@@ -14,7 +14,7 @@ import pytest
 
 from ns_abstract.arithmetic import rounding
 from ns_abstract.arithmetic.chebyshev import ChebyshevBasis
-from ns_abstract.methods.nerf import bounds as fields
+from ns_abstract.methods.nerf import ray_field
 from ns_abstract.methods.splat import depth_pairs
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -182,7 +182,7 @@ def test_every_charge_is_used() -> None:
 
 
 #: Polynomials that fields are bounded with: number of variables, degree, grid.
-BASES = [(d, *size) for d, size in fields._DEGREES.items()] + [(1, *fields._SHALLOW_DEGREE)]
+BASES = [(d, *size) for d, size in ray_field._DEGREES.items()] + [(1, *ray_field._SHALLOW_DEGREE)]
 BASES += [(d, 1, 2) for d in (5, 6, 7)]
 
 

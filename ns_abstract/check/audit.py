@@ -50,9 +50,10 @@ def opened(folder: Path, moved: dict[str, Path | None]) -> tuple[list[str], list
     report, name = read_report(folder), folder / "report.json"
     try:
         parts, subjects = _opened(folder, report, moved)
-        if not subjects:
+        wrong = [f"frame {c.index}: {text}" for c in parts for text in structure(c, report)]
+        if not subjects and not wrong:
             raise BadInput("claims nothing: no cell has a result or verdict", name, fix="finish it: --resume")
-        return [f"frame {c.index}: {text}" for c in parts for text in structure(c, report)], subjects
+        return wrong, subjects
     except (KeyError, TypeError, AttributeError, IndexError, OverflowError):
         raise BadInput("is not the report of a result", name, fix="make the result again") from None
 

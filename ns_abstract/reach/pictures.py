@@ -76,7 +76,7 @@ class Pictures:
 
 @dataclass(frozen=True)
 class PropertyView:
-    """The pictures that one property of a loop is read off.
+    """The pictures that one property of a loop is read off (L7).
 
     Attributes:
         prop: The property.

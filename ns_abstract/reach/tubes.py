@@ -296,7 +296,7 @@ class Tube:
     reason: str = ""
 
     def safe(self, loop: Loop) -> float:
-        """Lower bound, over all steps, of the distance to unsafe sets along the best face, and of required margins."""
+        """Lower bound, over all steps, of the distance to unsafe sets along the best face (L4), and of margins."""
         clearances = [clearance(step, loop.unsafe) for step in self.sets]
         return float(min([*clearances, *self.views[:, : len(loop.required)].ravel()], default=np.inf))
 

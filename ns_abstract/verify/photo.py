@@ -24,7 +24,7 @@ _FITS = 8
 
 @dataclass(frozen=True)
 class Brightness:
-    """What a camera may do to all values of a picture alike: it shows ``gain * value + offset``, clipped to [0, 1].
+    """What a camera may do to all values alike (U6): it shows ``gain * value + offset``, clipped to [0, 1].
 
     Attributes:
         gain, offset: Ends of their intervals; gains are above 0.
