@@ -33,6 +33,8 @@ class CalibrationTuning:
     #: with the least product of noise and ``1 + price * part`` is chosen.
     parts: tuple[float, ...] = (0.01, 0.02, 0.05, 0.1, 0.2)
     price: float = 5.0
+    #: Mean square of the residuals from which on the reported dB say no more.
+    least_error: float = 1e-12
 
 
 @dataclass(frozen=True)
@@ -110,7 +112,7 @@ def calibrate(
     parts = sorted({outliers, *(part for part in tuning.parts if part > outliers)})
     needed = {part: max(noise, *(_noise(residual, part) for residual in residuals)) for part in parts}
     best = min(parts, key=lambda part: needed[part] * (1.0 + tuning.price * part))
-    psnr = -10.0 * math.log10(max(float(np.mean(errors)), 1e-12))
+    psnr = -10.0 * math.log10(max(float(np.mean(errors)), tuning.least_error))
     by_part = {f"{part:g}": value for part, value in needed.items()}
     return Calibration(needed[best], best, str(file), len(chosen), size, psnr, by_part)
 

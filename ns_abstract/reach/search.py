@@ -64,7 +64,7 @@ class SimulatedRun:
     views: Float64
 
     def margin(self, loop: Loop, question: Question) -> float:
-        """How far the run is from going wrong: it does where this is not above 0. Its sign is exact; NaN: no number."""
+        """How far the run is from going wrong (L7): not above 0 where it does. Its sign is exact; NaN: no number."""
         if not np.isfinite(self.states).all():
             return math.nan
         states = self.states.tolist()

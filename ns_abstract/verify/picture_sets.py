@@ -10,8 +10,16 @@ import numpy as np
 from ns_abstract.arithmetic.network_charges import OWN_MARGIN
 from ns_abstract.geometry.box import ParameterBox
 
-#: A preference: parts are taken to be no narrower where their slopes are put together, and no nearer to each other.
-_LEAST_SHARE = 1e-12
+
+@dataclass(frozen=True)
+class HullTuning:
+    """Slopes of a hull. None of them decides whether a bound holds."""
+
+    #: Parts are taken to be no narrower where their slopes are put together, and no nearer to each other.
+    least_share: float = 1e-12
+
+
+_TUNING = HullTuning()
 
 
 @dataclass(frozen=True)
@@ -51,7 +59,7 @@ def hull_of_sets(parts: Sequence[PictureSets]) -> PictureSets:
     place, share = (middle - center) / reach, half / reach
     a_low, b_low, a_high, b_high = (np.array([sets.linear[k] for sets in parts], np.float64) for k in range(4))
     # any slopes will do: these are the least squares' of the parts' middles, each taken by its volume
-    weight = np.maximum(share, _LEAST_SHARE).prod(axis=1)
+    weight = np.maximum(share, _TUNING.least_share).prod(axis=1)
     weight /= weight.sum()
     d, ones = first.dimensions, (1,) * (b_low.ndim - 1)
     slope, value = 0.5 * (a_low + a_high), 0.5 * (b_low + b_high)
@@ -60,7 +68,7 @@ def hull_of_sets(parts: Sequence[PictureSets]) -> PictureSets:
     value = value - np.tensordot(weight, value, 1)
     moment = (place**2 + share**2 / 3.0) * weight[:, None]
     common = np.tensordot(weight, value[..., None] * at + slope * by / 3.0, 1) / np.maximum(
-        moment.sum(axis=0), _LEAST_SHARE
+        moment.sum(axis=0), _TUNING.least_share
     )
     moved = (at * common).sum(axis=-1)
     low = b_low - moved - np.abs(a_low - by * common).sum(axis=-1)
