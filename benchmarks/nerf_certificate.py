@@ -18,13 +18,13 @@ from typing import Any, cast
 
 import numpy as np
 import torch
+from nerfacto import camera_of
 from torch import nn
 from torch.nn import functional
 from views import HELD, export, fit, pictures
 
 import ns_abstract as nsa
 from ns_abstract.geometry.camera_path import load_camera_path
-from ns_abstract.geometry.keyframe_cameras import look_at
 from ns_abstract.io.jsonio import load_json
 from ns_abstract.refine.protocol import RayFrame
 from ns_abstract.verify.model import NetworkModel
@@ -43,10 +43,11 @@ def network(side: int) -> nn.Sequential:
 
 
 def vertical_orbit() -> dict[str, Any]:
-    """A camera path of one view of the normalised frame's origin, with an orbit about the vertical axis."""
-    pose = np.eye(4)
-    pose[:3] = look_at((1.3, -1.0, 0.8), (0.0, 0.0, 0.1))[:3]
-    view = {"camera_to_world": pose.ravel().tolist(), "fov": math.degrees(2.0 * math.atan(0.5 / 1.4)), "aspect": 1}
+    """A camera path of the view of `nerfacto.py`, with an orbit about the vertical axis."""
+    camera = camera_of(1)
+    pose = np.vstack([camera.camera_to_world, [0.0, 0.0, 0.0, 1.0]])
+    fov = math.degrees(2.0 * math.atan(0.5 / camera.fx))
+    view = {"camera_to_world": pose.ravel().tolist(), "fov": fov, "aspect": 1}
     orbit = {"target": [0.0, 0.0, 0.1], "axis": [0.0, 0.0, 1.0], "azimuth": [0.0, 2.0 * math.pi]}
     perturbation = {"version": 1, "sweep": "keyframes", "orbit": orbit}
     return {"camera_type": "perspective", "camera_path": [view], "fps": 1, "seconds": 1, "perturbation": perturbation}

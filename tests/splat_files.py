@@ -19,6 +19,7 @@ import numpy as np
 import torch
 from PIL import Image
 
+from ns_abstract.methods.splat.ply import write_ply
 from ns_abstract.methods.splat.scene import SplatScene
 
 C0 = 0.28209479177387814
@@ -471,6 +472,15 @@ def read_sog(meta: dict[str, Any], pictures: dict[str, bytes]) -> SplatScene:
 
 
 # Checkpoints of gsplat's trainer, folders of Inria's
+
+
+def write_inria(source: SplatScene, folder: Path, arguments: str, iteration: int = 7) -> Path:
+    """``point_cloud`` and ``cfg_args``; the folder."""
+    inner = folder / f"point_cloud/iteration_{iteration}"
+    inner.mkdir(parents=True)
+    write_ply(source, inner / "point_cloud.ply")
+    (folder / "cfg_args").write_text(arguments)
+    return folder
 
 
 def write_checkpoints(source: SplatScene, folder: Path, ranks: int = 1, config: str | None = None, **more: Any) -> Path:

@@ -187,7 +187,6 @@ def test_pixels_contain_pictures_of_another_renderer(mode: str, version: str) ->
     assert narrow > 24
 
 
-@pytest.mark.slow
 def test_a_change_of_order_is_enclosed() -> None:
     """Two Gaussians at nearly one depth, of other colours, seen from both sides of the tie."""
     scene = blob_scene(2, degree=0)

@@ -26,6 +26,7 @@ from splat_files import (
     write_checkpoints,
     write_compressed,
     write_glb,
+    write_inria,
     write_sog,
     write_splat,
     write_spz,
@@ -510,10 +511,7 @@ def test_decoded_formats_are_checked_as_ply_files(name: str, tmp_path: Path) -> 
     elif name == "sog":
         write_sog(file, *sog_parts(scene))
     elif name == "inria":
-        (tmp_path / "point_cloud/iteration_7").mkdir(parents=True)
-        write_ply(scene, tmp_path / "point_cloud/iteration_7/point_cloud.ply")
-        (tmp_path / "cfg_args").write_text("Namespace(sh_degree=0, white_background=False)")
-        file = tmp_path
+        file = write_inria(scene, tmp_path, "Namespace(sh_degree=0, white_background=False)")
     else:
         {"splat": write_splat, "spz": write_spz, "compressed.ply": write_compressed}[name](scene, file)
     method = nsa.load_scene(file).method()

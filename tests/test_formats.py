@@ -29,6 +29,7 @@ from splat_files import (
     write_checkpoints,
     write_compressed,
     write_glb,
+    write_inria,
     write_sog,
     write_splat,
     write_spz,
@@ -212,10 +213,7 @@ def test_unknown_places_of_sog_quaternions_are_no_rotation(tmp_path: Path) -> No
 
 def inria(folder: Path, arguments: str = "Namespace(sh_degree=3, white_background=True)") -> Path:
     for iteration, count in ((7000, 20), (30000, 30)):
-        inner = folder / f"point_cloud/iteration_{iteration}"
-        inner.mkdir(parents=True)
-        write_ply(source(1, count), inner / "point_cloud.ply")
-    (folder / "cfg_args").write_text(arguments)
+        write_inria(source(1, count), folder, arguments, iteration)
     return folder
 
 

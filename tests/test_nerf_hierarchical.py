@@ -12,12 +12,11 @@ from nerfs import BINS, attack_first_rays, pixels_of, poses, tiny_scene
 from ns_abstract.arithmetic.rounding import COMPOSITE_ROUNDING
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
-from ns_abstract.methods.nerf import bounds as bounds_module
 from ns_abstract.methods.nerf import sample_cells
 from ns_abstract.methods.nerf.bounds import NerfBounds
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.method import NerfMethod
-from ns_abstract.methods.nerf.ray_field import RayBounds, RayRequest
+from ns_abstract.methods.nerf.ray_field import RAY_TUNING, RayBounds, RayRequest
 from ns_abstract.methods.nerf.render import NerfRenderer
 from ns_abstract.methods.nerf.samples import composite, edge_bounds, field_hulls
 from ns_abstract.methods.nerf.scene import NerfScene
@@ -33,7 +32,7 @@ def by_bins(scene: NerfScene, pose_set: PoseBox) -> RayBounds:
     """Without samples that are followed."""
     bounds, tolerance = NerfBounds(scene, BINS, pose_set.box.dimensions), 0.05 / sample_cells._SWEPT
     asked = RayRequest(pose_set, pose_set.box, pixels_of(pose_set.camera)[:6], tolerance, None, None, [])
-    return bounds._apart(asked, None, False, bounds_module._DISPLACEMENT)
+    return bounds._apart(asked, None, False, RAY_TUNING.displacement)
 
 
 @pytest.mark.slow

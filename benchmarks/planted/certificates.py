@@ -351,11 +351,11 @@ CERTIFICATES = (
     ),
     Fault(
         "search: bounds that cross are taken",
-        _HULL, "PictureSets.sane", "(self.lower <= self.upper).all()", "True", _IMAGES + "[crossed]",
+        _HULL, "sane", "(lower <= upper).all()", "True", _IMAGES + "[crossed]",
     ),
     Fault(
         "search: linear sets that are no numbers are taken",
-        _HULL, "PictureSets.sane", "(*self.linear, self.lower, self.upper)", "(self.lower, self.upper)",
+        _HULL, "sane", "(*linear, lower, upper)", "(lower, upper)",
         _IMAGES + "[NaN slope]",
     ),
     Fault(

@@ -147,9 +147,9 @@ def training_data(scene: Scene) -> Path:
         for n in range(min(3, len(recorded.parts)), 0, -1)
     )]  # fmt: skip
     for place in places:
-        found = place if place.name == _DATA else place / _DATA
-        if found.is_file():
-            return found
+        data = place if place.name == _DATA else place / _DATA
+        if data.is_file():
+            return data
     raise InputError(
         f"no {_DATA} in {recorded}, nor near the run", file=run.file, field=_OPTION,
         fix="put the data set's folder beside the run, or give --noise and --outliers",

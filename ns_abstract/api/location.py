@@ -203,11 +203,11 @@ def calibrated(scene: Scene, job: Job, options: PhotoOptions) -> tuple[PhotoOpti
     Raises:
         InputError: There are no photos.
     """
-    found = calibrate(
+    calibration = calibrate(
         scene,
         job.pose_sets[0].camera.height,
         noise=options.noise,
         outliers=options.outliers,
         arithmetic=job.arithmetic,
     )
-    return replace(options, noise=found.noise, outliers=found.outliers), found
+    return replace(options, noise=calibration.noise, outliers=calibration.outliers), calibration

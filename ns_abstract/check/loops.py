@@ -25,8 +25,8 @@ class LoopClaims(OfNetwork):
         if loop["dynamics"].get("type") != "affine":
             problem = "has dynamics that this program does not follow"
             raise BadInput(problem, "report.json", "loop.dynamics.type", "audit an affine loop")
-        stated = [area for area in [*(loop.get("unsafe") or []), loop.get("goal") or {}] if area]
-        if not all("box" in area or "half_space" in area for area in stated):
+        areas = [area for area in [*(loop.get("unsafe") or []), loop.get("goal") or {}] if area]
+        if not all("box" in area or "half_space" in area for area in areas):
             problem = "has properties of the picture, which this program does not follow along a loop"
             raise BadInput(problem, "report.json", "loop.unsafe", "audit a loop whose areas are boxes or half-spaces")
         height, width = self.shape["resize"]

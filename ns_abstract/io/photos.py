@@ -16,8 +16,9 @@ _MOST_PIXELS, _MOST_MASK_BYTES = 1 << 26, 64 << 20
 #: Grey level of 255 from which on a pixel of such a mask is white.
 _WHITE = 128
 #: Formats that hold values without loss of meaning: a .jpg's compression is noise like others.
-_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm")
 _FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "PPM")
+#: Names of pictures in a folder.
+_ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm")
 
 
 def read_photo(file: Path, field: str = "--image") -> np.ndarray:

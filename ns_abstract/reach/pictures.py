@@ -18,6 +18,7 @@ from ns_abstract.geometry.tiles import assemble
 from ns_abstract.refine.protocol import Frame, Method, SceneSample
 from ns_abstract.verify.camera_response import CameraResponse, response_sets
 from ns_abstract.verify.picture_properties import MeasureModel, PictureProperty
+from ns_abstract.verify.picture_sets import sane
 
 Float64 = NDArray[np.float64]
 
@@ -100,9 +101,8 @@ class PropertyView:
     def bound(self, box: ParameterBox) -> tuple[float, Float64]:
         """Lower bound of the margin over a box of poses, and slopes [d]; minus infinity where nothing is known."""
         linear, lower, upper, slopes = self.pictures.sets(box)
-        known = all(np.isfinite(part).all() for part in (*linear, lower, upper)) and bool((lower <= upper).all())
         steep = np.abs(np.asarray(slopes, np.float64))
-        if not known:
+        if not sane(linear, lower, upper):
             return -math.inf, steep
         claim = self.prop.bind(self.pictures.pose_set, lambda: lower)
         query = claim.query(np.zeros((1, len(claim.limits))))

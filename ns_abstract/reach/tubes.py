@@ -28,6 +28,7 @@ from ns_abstract.reach.loop import Control, HalfSpace, Loop
 from ns_abstract.reach.pictures import LoopPictures, PropertyView
 from ns_abstract.verify.model import NetworkModel
 from ns_abstract.verify.network import OutputBounds
+from ns_abstract.verify.picture_sets import sane
 from ns_abstract.verify.properties import Query
 
 Float64 = NDArray[np.float64]
@@ -449,7 +450,7 @@ class TubeBuilder:
             return "the camera may leave the range of poses"
         box, scaled = poses
         linear, lower, upper, slopes = self.view.sets(box)
-        if not all(np.isfinite(part).all() for part in (*linear, lower, upper)) or (lower > upper).any():
+        if not sane(linear, lower, upper):
             return "the picture's bounds are not finite"
         controls = self.pilot.bound(linear, lower, upper)
         if controls is None:

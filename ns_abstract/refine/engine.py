@@ -35,8 +35,6 @@ from ns_abstract.refine.tuning import TUNING, Tuning
 _SLACK_SHARE = 0.1
 #: Cells that may still be bounded where their number is not limited.
 _UNLIMITED = 1 << 60
-#: In place of bounds that the leaves have and nobody else keeps.
-_NO_BOUNDS = np.empty((0, 0, 0, 0), np.float32)
 
 
 class Refinement:
@@ -216,8 +214,9 @@ class Refinement:
         partition = InitialPartition(self.tiles, self.splitter, self.inner, self.goal, self.tuning).choose()
         parts = partition.parts
         self.leaves.begin(len(parts))
+        cells: list[LeafCell] = []
         # bounds of all cells only where somebody keeps them
-        leaves: list[BoundedCell] = []
+        kept: list[BoundedCell] = []
         for number, part in enumerate(parts):
             if number and self._over():
                 if self.stopped():
@@ -225,9 +224,13 @@ class Refinement:
                 # slower than expected: one cell for the whole set is better than no bounds
                 self.leaf_sets.clear()
                 self.leaves.begin(1)
-                leaves = [self._initial_cell(self.splitter.whole, None)]
+                leaf = self._initial_cell(self.splitter.whole, None)
+                cells, kept = [leaf[0]], [leaf]
                 break
-            leaves.append(self._initial_cell(part, partition))
+            leaf = self._initial_cell(part, partition)
+            cells.append(leaf[0])
+            if self.initial is not None:
+                kept.append(leaf)
             if number % 2:
                 self.inner.render(part.box.middle)
             elif len(parts) > 1:
@@ -237,8 +240,8 @@ class Refinement:
                 due = int(share * points) > int(number / len(parts) * points)
                 self._record(share, keep=number < self.tuning.first_points or due)
         if self.initial is not None:
-            self.initial.extend(leaves)
-        return self._covered([cell for cell, _, _ in leaves])
+            self.initial.extend(kept)
+        return self._covered(cells)
 
     def _covered(self, cells: list[LeafCell]) -> bool:
         """Go on with ``cells`` that cover the set and whose bounds the leaves have; returns True."""
@@ -260,7 +263,7 @@ class Refinement:
             [(lower, upper, bounds)] = self._bound([cell], None, everything)
         self.leaves.take(cell, lower, upper)
         self.leaf_sets.keep(cell, bounds, everything)
-        return (cell, lower, upper) if self.initial is not None else (cell, _NO_BOUNDS, _NO_BOUNDS)
+        return cell, lower, upper
 
     def _refine(self) -> None:
         self.frame.set_tolerance(0.0)

@@ -319,8 +319,7 @@ class _Examination:
         search, tiled, side = self.search, self.search.tiled, self.search.frame.side
         least, most = (in_tiles(end, side) for end in nearby(assemble(picture, search.frame.camera), 1))
         gaps = np.where(tiled.counted, np.maximum(least - tiled.high, tiled.low - most).max(axis=-1), -np.inf)
-        count = min(gaps.size, round(search.tuning.surplus * (tiled.allowed + 1)))
-        return (gaps > 0.0) & (gaps >= np.partition(gaps, gaps.size - count, axis=None)[gaps.size - count])
+        return (gaps > 0.0) & self._largest(gaps)
 
     def _promising(self, picture: np.ndarray, moved: float) -> np.ndarray:
         """[T, side, side] counted pixels that bounds are most likely to exclude: a guess of work.
@@ -339,8 +338,12 @@ class _Examination:
         if self.share < search.tuning.promise:
             return np.zeros_like(chosen)
         likely = np.where(chosen, likely, -np.inf)
-        count = min(likely.size, round(search.tuning.surplus * (tiled.allowed + 1)))
-        return chosen & (likely >= np.partition(likely, likely.size - count, axis=None)[likely.size - count])
+        return chosen & self._largest(likely)
+
+    def _largest(self, values: np.ndarray) -> np.ndarray:
+        """Which of the values by pixel are among the largest, as many as pixels are bounded to exclude a cell."""
+        count = min(values.size, round(self.search.tuning.surplus * (self.search.tiled.allowed + 1)))
+        return values >= np.partition(values, values.size - count, axis=None)[values.size - count]
 
     def _bound(self, box: ParameterBox, tiles: np.ndarray, linear: bool, pixels: np.ndarray | None = None) -> Bounds:
         """Bounds of ``tiles``, or of some of their ``pixels`` alone where the frame can leave out the others."""

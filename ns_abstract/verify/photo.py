@@ -47,9 +47,9 @@ class Brightness:
         for side, sign, offset in ((low, -1.0, self.offset[1]), (high, 1.0, self.offset[0])):
             moved = side - offset
             size = (np.abs(side) + abs(offset)) / self.gain[0]
-            found = np.stack([moved / gain for gain in self.gain])
-            found = found.min(axis=0) if sign < 0.0 else found.max(axis=0)
-            ends.append(found + sign * BRIGHTNESS_ROUNDING * size)
+            values = np.stack([moved / gain for gain in self.gain])
+            furthest = values.min(axis=0) if sign < 0.0 else values.max(axis=0)
+            ends.append(furthest + sign * BRIGHTNESS_ROUNDING * size)
         return np.where(low <= 0.0, -np.inf, ends[0]), np.where(high >= 1.0, np.inf, ends[1])
 
     def outside(self, picture: np.ndarray, low: Float64Array, high: Float64Array, counted: np.ndarray) -> np.ndarray:
@@ -69,8 +69,8 @@ class Brightness:
             rows = np.stack([values, np.ones_like(values)], axis=1) * weight[:, None]
             if not np.isfinite(rows).all():
                 break
-            found = np.linalg.lstsq(rows, middle * weight, rcond=None)[0]
-            gain = float(np.clip(found[0], *self.gain))
+            fitted = np.linalg.lstsq(rows, middle * weight, rcond=None)[0]
+            gain = float(np.clip(fitted[0], *self.gain))
             offset = float(np.clip(np.average(middle - gain * values, weights=weight**2), *self.offset))
         assert best is not None
         return best

@@ -22,6 +22,11 @@ class HullTuning:
 _TUNING = HullTuning()
 
 
+def sane(linear: Sequence[np.ndarray], lower: np.ndarray, upper: np.ndarray) -> bool:
+    """Whether linear sets and bounds are all finite, and the bounds do not cross."""
+    return all(np.isfinite(v).all() for v in (*linear, lower, upper)) and bool((lower <= upper).all())
+
+
 @dataclass(frozen=True)
 class PictureSets:
     """Linear sets of pictures over a box, from `ns_abstract.verify.protocol.FrameImages.sets`."""
@@ -34,8 +39,7 @@ class PictureSets:
     @property
     def sane(self) -> bool:
         """Whether all is finite, and the bounds do not cross."""
-        finite = all(np.isfinite(v).all() for v in (*self.linear, self.lower, self.upper))
-        return finite and bool((self.lower <= self.upper).all())
+        return sane(self.linear, self.lower, self.upper)
 
     @property
     def widths(self) -> np.ndarray:

@@ -5,28 +5,22 @@ from __future__ import annotations
 import math
 
 import numpy as np
-import torch
 
 from ns_abstract.arithmetic.outward import outward
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.nerf.division import ENDS, Division, division_for, regroup_parts
-from ns_abstract.methods.nerf.ray_bundle import TAYLOR, RayBundle
+from ns_abstract.methods.nerf.ray_bundle import RayBundle
 from ns_abstract.methods.nerf.ray_field import (
     RAY_TUNING,
     RayBounds,
     RayField,
     RayRequest,
     Shifts,
-    basis_of,
     typical_displacement,
 )
-from ns_abstract.methods.nerf.render import Sampling
 from ns_abstract.methods.nerf.sample_cells import SampleCellBounds
 from ns_abstract.methods.nerf.sample_paths import BundleBounds, SamplePaths
-from ns_abstract.methods.nerf.scene import NerfScene
-from ns_abstract.methods.nerf.white import WhiteSamples
-from ns_abstract.methods.nerf.zonotope import FieldBounds
 
 #: Halvings below cells of the starting width, by number of parameters (one level may concern any axis).
 _DEEPER = {0: 0, 1: 2}
@@ -37,8 +31,6 @@ _FINER = {2: 1}
 _PARTS = 4096
 
 
-#: Half the way of a sample over a cell to begin with.
-_DISPLACEMENT = 0.02
 #: Where samples are followed: halvings below first cells by axis, of the deepest cells into parts, and the least way.
 _FOLLOWED_DEEPER = 3
 _FOLLOWED_FINER, _FOLLOWED_FINER_MORE = {1: 2, 2: 2}, 1
@@ -49,37 +41,7 @@ _NUMBERS = 1 << 21
 
 
 class NerfBounds(RayField):
-    """Bounds of a scene's rays.
-
-    Args:
-        scene: The scene.
-        sampling: Uniform, or hierarchical: bounded where the coarse pass puts samples (design.md, F16), or wherever
-            they may be (F10, F14).
-        dimensions: Number of parameters.
-        device: Where the network is bounded.
-        compiled: Whether by kernels compiled for a processor; None: where ``device`` is one.
-        white: Which samples are white, the others black, in place of the field's colours; None: these. Of uniform
-            samples alone.
-    """
-
-    def __init__(
-        self,
-        scene: NerfScene,
-        sampling: Sampling,
-        dimensions: int,
-        device: torch.device | str = "cpu",
-        compiled: bool | None = None,
-        white: WhiteSamples | None = None,
-    ) -> None:
-        super().__init__(scene, sampling, dimensions, device, compiled, white)
-        #: Samples that the coarse pass places.
-        self.paths = None
-        if self.swept:
-            coarse = FieldBounds(scene.coarse, basis_of(dimensions, scene.coarse), device=device, compiled=compiled)
-            self.paths = SamplePaths(coarse, self.field, sampling, scene.occupancy, self.batch)
-        self.taylor = min(TAYLOR, max(1, self.basis.degree))
-        #: Where to begin to look for `RayBounds.displacement`.
-        self.displacement = _DISPLACEMENT if self.paths is None else RAY_TUNING.followed
+    """Bounds of a scene's rays; arguments as of `RayField`."""
 
     def rays(
         self,
@@ -111,7 +73,7 @@ class NerfBounds(RayField):
         if not loose.size:
             return ray_bounds
         # narrower boxes would not help: samples anywhere in their bins
-        bins = self._apart(request.take(loose), None, division is not None, _DISPLACEMENT)
+        bins = self._apart(request.take(loose), None, division is not None, RAY_TUNING.displacement)
         ray_bounds.lower[loose] = np.maximum(ray_bounds.lower[loose], bins.lower)
         ray_bounds.upper[loose] = np.minimum(ray_bounds.upper[loose], bins.upper)
         ray_bounds.alpha[loose] = bins.alpha

@@ -13,7 +13,9 @@ from ns_abstract.arithmetic.chebyshev import ChebyshevBasis
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.nerf.hsv import Range
+from ns_abstract.methods.nerf.ray_bundle import TAYLOR
 from ns_abstract.methods.nerf.render import Sampling
+from ns_abstract.methods.nerf.sample_paths import SamplePaths
 from ns_abstract.methods.nerf.scene import FieldWeights, NerfScene
 from ns_abstract.methods.nerf.white import WhiteSamples
 from ns_abstract.methods.nerf.zonotope import ERROR_TERMS, FieldBounds
@@ -39,6 +41,8 @@ class RayTuning:
     alike: float = 2.0**-9
     #: Light that a sample may leave open before compositing has shown where it matters.
     coarse: float = 0.1
+    #: Half the way of a sample over a cell to begin with.
+    displacement: float = 0.02
     #: Half the way of one that is followed, whose place the coarse pass moves, too.
     followed: float = 5e-4
     least_followed: float = 2e-6
@@ -122,7 +126,8 @@ class RayField:
 
     Args:
         scene: The scene.
-        sampling: Uniform or hierarchical.
+        sampling: Uniform, or hierarchical: bounded where the coarse pass puts samples (design.md, F16), or wherever
+            they may be (F10, F14).
         dimensions: Number of parameters.
         device: Where the network is bounded.
         compiled: Whether by kernels compiled for a processor; None: where ``device`` is one.
@@ -148,6 +153,14 @@ class RayField:
         self.batch = _BATCH if self.field.compiled else cells_at_once(scene.fine, self.basis)
         self.occupancy = scene.occupancy
         self.distances, self.lengths = sampling.bins
+        #: Samples that the coarse pass places.
+        self.paths = None
+        if self.swept:
+            coarse = FieldBounds(scene.coarse, basis_of(dimensions, scene.coarse), device=device, compiled=compiled)
+            self.paths = SamplePaths(coarse, self.field, sampling, scene.occupancy, self.batch)
+        self.taylor = min(TAYLOR, max(1, self.basis.degree))
+        #: Where to begin to look for `RayBounds.displacement`.
+        self.displacement = RAY_TUNING.displacement if self.paths is None else RAY_TUNING.followed
 
     @property
     def compiled(self) -> bool:

@@ -48,7 +48,7 @@ _KEPT = 1 << 29
 _TRIED, _ROUNDS = 8, 3
 
 #: Bounds of one group: arguments of `NerfBounds.rays` behind the poses, by group, to what it found.
-Run = Callable[[Sequence[tuple]], list[RayBounds]]
+BoundBatches = Callable[[Sequence[tuple]], list[RayBounds]]
 PixelWeightSource = Callable[[], "np.ndarray | None"]
 
 
@@ -118,7 +118,7 @@ class PoseStrips:
         run: Bounds groups of rays, here or in other processes.
     """
 
-    def __init__(self, bounds: RayBounder, pose_set: PoseBox, pixels: np.ndarray, run: Run) -> None:
+    def __init__(self, bounds: RayBounder, pose_set: PoseBox, pixels: np.ndarray, run: BoundBatches) -> None:
         self.bounds, self.pose_set, self.geometry = bounds, pose_set, pose_set.geometry
         self.pixels, self.run = pixels, run
         self.poses = self.geometry.box

@@ -19,7 +19,7 @@ from ns_abstract.verify.network.scalar_function import ScalarFunction
 from ns_abstract.verify.network.sparse_layers import Variance
 
 #: One output, flattened, for one image [1, ...].
-Run = Callable[[np.ndarray], np.ndarray]
+Evaluate = Callable[[np.ndarray], np.ndarray]
 #: A reading that differs more than this, relative to the largest output, is wrong and not rounded,
 _DIFFERENCE = 2.0**-10
 #: unless float32 itself differs from float64 by so much: more than this part of it.
@@ -34,7 +34,7 @@ _SECONDS, _STEPS, _PATIENCE = 1.0, 24, 8
 _BOUNDED, _UNITS = 32, 1 << 16
 
 
-def compare(network: Network, run: Run, images: Iterable[np.ndarray], *, usual: bool = True) -> None:
+def compare(network: Network, run: Evaluate, images: Iterable[np.ndarray], *, usual: bool = True) -> None:
     """Raise InputError if the network as read and the runtime of its file give different outputs.
 
     Args:

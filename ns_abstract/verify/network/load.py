@@ -11,7 +11,7 @@ import onnxruntime
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import file_size, show
-from ns_abstract.verify.network.comparison import Run, compare, probes
+from ns_abstract.verify.network.comparison import Evaluate, compare, probes
 from ns_abstract.verify.network.graph import Network
 from ns_abstract.verify.network.onnx_file import read_onnx
 from ns_abstract.verify.network.onnx_graph import ReadRequest
@@ -85,7 +85,7 @@ def onnx_session(path: Path) -> onnxruntime.InferenceSession:
         raise InputError(f"onnxruntime refuses it: {error}", file=path, fix="export the network again") from None
 
 
-def onnx_runner(path: Path, output: str = "", shape: Sequence[int] | None = None) -> Run:
+def onnx_runner(path: Path, output: str = "", shape: Sequence[int] | None = None) -> Evaluate:
     """Runs the model in onnxruntime on one image [1, ...] in the type that it wants; returns one output, flattened.
 
     A model without a batch is given the image alone; one of a fixed batch, as many copies.
