@@ -84,8 +84,8 @@ def leave_out(step: str) -> None:
         return inside
 
     @njit
-    def exact_features(table, resolution, place, ranges, out):
-        features(table, resolution, place, ranges, out)
+    def exact_features(table, resolution, place, ranges, out, room):
+        features(table, resolution, place, ranges, out, room)
         out[:, -1] = 0.0
 
     @njit

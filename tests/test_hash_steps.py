@@ -211,7 +211,7 @@ def test_features_are_enclosed_across_faces() -> None:
         size = (1e-9, 0.02, 0.7, 3.0, 40.0)[k % 5] / resolution
         x = np.stack([random_form(rng, min(max(c, 0.01), 0.99), size) for c in center])
         out = np.zeros((2, 5))
-        features.level_features(table, float(resolution), x, ranges, out)
+        features.level_features(table, float(resolution), x, ranges, out, features.feature_room(2))
         exact = trilinear(table, resolution, [member(rng, one, pose, place) for one in x])
         assert all(holds(one, pose, place, v) for one, v in zip(out, exact, strict=True))
 

@@ -7,6 +7,7 @@ import numpy as np
 from ns_abstract.arithmetic.simd.lanes import LINE
 from ns_abstract.arithmetic.simd.products import ROWS
 from ns_abstract.methods.nerf.hash_bounds.edges import edges_of
+from ns_abstract.methods.nerf.hash_bounds.features import feature_room
 from ns_abstract.methods.nerf.hash_bounds.light import light_of
 from ns_abstract.methods.nerf.hash_bounds.network import (
     HeadWeights,
@@ -74,6 +75,7 @@ def piece_room(field: NerfactoField, arrays: FieldArrays, dimensions: int) -> Pi
         (forms, forms.copy(), np.zeros((3, 3, n + 3)), np.zeros((3, 3, n + 3)), np.zeros(3, np.bool_)),
         (np.zeros((HARMONICS, n + 3)), np.zeros((n + 2, neurons)), np.zeros(neurons)),
         np.zeros((max(features), n + 3)),
+        feature_room(max(one.table.shape[2] for one in densities)),
         tuple(edges_of(count, n) for count in field.samples),
         tuple(light_of(count, n) for count in field.samples),
         rooms,

@@ -44,7 +44,7 @@ def edges_of(count: int, n: int) -> Edges:
     )  # fmt: skip
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def space(edges, j, spacing, line, work):
     """Fill in the distance of edge ``j`` (design.md, H2).
 
@@ -63,7 +63,8 @@ def space(edges, j, spacing, line, work):
     room = SPACING_ROUNDING * (abs(first) + abs(last))
     at_low, at_high = first + (last - first) * low - room, first + (last - first) * high + room
     if not piecewise:
-        out[:] = y
+        for s in range(n + 3):
+            out[s] = y[s]
         out[n + 2] += room
         edges.near[j], edges.far[j] = at_low, at_high
         return
@@ -97,7 +98,7 @@ def space(edges, j, spacing, line, work):
     _keep_finite(out, edges.near[j], edges.far[j])
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _keep_finite(form, low, high):
     """Replace a ``form`` by the interval from ``low`` to ``high`` where that is as good as its own rest."""
     n = form.shape[0] - 3
@@ -109,7 +110,7 @@ def _keep_finite(form, low, high):
         form[n + 2] = 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def middle_of(edges, i, out):
     """The middle of interval ``i`` as a form ``out`` [n + 3] without radius.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit
@@ -13,11 +14,42 @@ from ns_abstract.methods.nerf.nerfacto_kernel import hash_row
 
 #: Most nodes of a level whose slopes are looked at, and of which the hull of values is taken.
 FORM_NODES, HULL_NODES = 216, 4096
+#: Most nodes by axis of those whose slopes are looked at.
+_MOST_NODES = 6
 
 
-@njit(cache=True, error_model="numpy")
+class FeatureRoom(NamedTuple):
+    """Scratch of `level_features`, which is called so often that making it would take as long as using it.
+
+    Attributes:
+        cells: [2, 3] first node and number of nodes.
+        ends: [4, 3] place, least and largest place in cells, and half of the reach.
+        nodes: [6, 6, 6, F] values at the nodes of a small box.
+        kept: [2, 6, 6, 6] values on its faces.
+        slopes: [2, 3] least and largest slopes.
+        hull: [2, F] least and largest values.
+    """
+
+    cells: np.ndarray
+    ends: np.ndarray
+    nodes: np.ndarray
+    kept: np.ndarray
+    slopes: np.ndarray
+    hull: np.ndarray
+
+
+def feature_room(features: int) -> FeatureRoom:
+    """Room for levels of so many ``features``."""
+    box = (_MOST_NODES,) * 3
+    return FeatureRoom(
+        np.zeros((2, 3), np.int64), np.zeros((4, 3)), np.zeros((*box, features)), np.zeros((2, *box)), np.zeros((2, 3)),
+        np.zeros((2, features)),
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _gather(table, first, counts, nodes):
-    """Values ``nodes`` [counts, F] of a level's ``table`` [2^T, F] from the corner ``first`` [3] on."""
+    """Values ``nodes`` [6, 6, 6, F] of a level's ``table`` [2^T, F] from the corner ``first`` [3] on."""
     for i in range(counts[0]):
         for j in range(counts[1]):
             for k in range(counts[2]):
@@ -26,7 +58,7 @@ def _gather(table, first, counts, nodes):
                     nodes[i, j, k, f] = table[row, f]
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _hull(table, first, counts, low, high):
     """Least and largest value [F] of the nodes from ``first`` on."""
     low[:], high[:] = np.inf, -np.inf
@@ -39,12 +71,20 @@ def _hull(table, first, counts, low, high):
                     high[f] = max(high[f], table[row, f])
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
+def _across(nodes, i, j, k, y, z, f):
+    """The value of a feature on the face ``i`` of nodes, at ``y`` and ``z`` from the node (j, k)."""
+    a = nodes[i, j, k, f] + y * (nodes[i, j + 1, k, f] - nodes[i, j, k, f])
+    b = nodes[i, j, k + 1, f] + y * (nodes[i, j + 1, k + 1, f] - nodes[i, j, k + 1, f])
+    return a + z * (b - a)
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _slopes(nodes, counts, place, low, high, f, kept, slopes):
     """The value of a feature at ``place`` and its slopes [2, 3] between there and the box (design.md, H3).
 
     Args:
-        nodes: [counts, F] values.
+        nodes: [6, 6, 6, F] values.
         counts: [3] nodes by axis, at least 2.
         place, low, high: [3] in cells from the first node on.
         f: The feature.
@@ -52,24 +92,19 @@ def _slopes(nodes, counts, place, low, high, f, kept, slopes):
         slopes: [2, 3] least and largest; overwritten.
     """
     nx, ny, nz = counts
-    cell = np.empty(3, np.int64)
-    for a in range(3):
-        cell[a] = min(max(int(math.floor(place[a])), 0), counts[a] - 2)
-    cx, cy, cz = cell
+    cx = min(max(int(math.floor(place[0])), 0), nx - 2)
+    cy = min(max(int(math.floor(place[1])), 0), ny - 2)
+    cz = min(max(int(math.floor(place[2])), 0), nz - 2)
     rx, ry, rz = place[0] - cx, place[1] - cy, place[2] - cz
     slopes[0], slopes[1] = np.inf, -np.inf
     # along x, where y and z are those of the place
     value = 0.0
     for i in range(nx - 1):
-        ends = np.empty(2)
-        for e in range(2):
-            a = nodes[i + e, cy, cz, f] + ry * (nodes[i + e, cy + 1, cz, f] - nodes[i + e, cy, cz, f])
-            b = nodes[i + e, cy, cz + 1, f] + ry * (nodes[i + e, cy + 1, cz + 1, f] - nodes[i + e, cy, cz + 1, f])
-            ends[e] = a + rz * (b - a)
-        step = ends[1] - ends[0]
+        here, there = _across(nodes, i, cy, cz, ry, rz, f), _across(nodes, i + 1, cy, cz, ry, rz, f)
+        step = there - here
         slopes[0, 0], slopes[1, 0] = min(slopes[0, 0], step), max(slopes[1, 0], step)
         if i == cx:
-            value = ends[0] + rx * step
+            value = here + rx * step
     # at the ends of the box along x, and at nodes between; the same along y
     at_x, at_y = kept[0], kept[1]
     for i in range(nx):
@@ -105,8 +140,8 @@ def _slopes(nodes, counts, place, low, high, f, kept, slopes):
     return value
 
 
-@njit(cache=True, error_model="numpy")
-def level_features(table, resolution, point, ranges, out):
+@njit(cache=True, error_model="numpy", _nrt=False)
+def level_features(table, resolution, point, ranges, out, room):
     """Forms of one level's features at a contracted point (design.md, H3).
 
     Args:
@@ -115,10 +150,11 @@ def level_features(table, resolution, point, ranges, out):
         point: [3, n + 3] forms in [0, 1].
         ranges: [2, F] least and largest value of the level.
         out: [F, n + 3].
+        room: `FeatureRoom`.
     """
     features, width = out.shape
-    first, counts = np.empty(3, np.int64), np.empty(3, np.int64)
-    place, low, high, reach = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    first, counts = room.cells[0], room.cells[1]
+    place, low, high, reach = room.ends[0], room.ends[1], room.ends[2], room.ends[3]
     nodes = 1
     for a in range(3):
         q = resolution * point[a, 0]
@@ -130,20 +166,20 @@ def level_features(table, resolution, point, ranges, out):
         place[a], low[a], high[a] = q - begin, below - begin, above - begin
         # beyond any number of nodes that is looked at
         nodes = min(nodes * min(counts[a], 1 << 16), 1 << 30)
-    if nodes > FORM_NODES or max(counts[0], counts[1], counts[2]) > 6:
-        least, most = np.empty(features), np.empty(features)
+    if nodes > FORM_NODES or max(counts[0], counts[1], counts[2]) > _MOST_NODES:
+        least, most = room.hull[0], room.hull[1]
         if nodes <= HULL_NODES:
             _hull(table, first, counts, least, most)
         else:
-            least[:], most[:] = ranges[0], ranges[1]
+            for f in range(features):
+                least[f], most[f] = ranges[0, f], ranges[1, f]
         for f in range(features):
             out[f] = 0.0
             out[f, 0] = 0.5 * (least[f] + most[f])
             size = max(abs(least[f]), abs(most[f]))
             out[f, -1] = (0.5 * (most[f] - least[f]) + TRILINEAR_ROUNDING * size) * HASH_UP
         return
-    values = np.empty((counts[0], counts[1], counts[2], features))
-    kept, slopes = np.empty((2, 6, 6, 6)), np.empty((2, 3))
+    values, slopes = room.nodes, room.slopes
     _gather(table, first, counts, values)
     for f in range(features):
         size = 0.0
@@ -152,7 +188,7 @@ def level_features(table, resolution, point, ranges, out):
                 for k in range(counts[2]):
                     size = max(size, abs(values[i, j, k, f]))
         out[f] = 0.0
-        out[f, 0] = _slopes(values, counts, place, low, high, f, kept, slopes)
+        out[f, 0] = _slopes(values, counts, place, low, high, f, room.kept, slopes)
         rest = TRILINEAR_ROUNDING * size
         for a in range(3):
             slope = 0.5 * (slopes[0, a] + slopes[1, a])

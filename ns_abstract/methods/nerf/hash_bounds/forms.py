@@ -3,6 +3,11 @@
 A form is an array [n + 3]: centre, coefficients of the n pose symbols, that of the place symbol, and a radius.
 Over one parameter ``p`` the pose symbols are two, ``p`` and ``2 p^2 - 1`` ("line"), so that curvature is followed;
 over more they are the parameters themselves.
+
+Kernels here are called millions of times with records of many arrays, so they are compiled without numba's counting of
+references (``_nrt=False``), which took half of the time and made threads wait for one another. Such a kernel makes no
+array of its own; numba refuses to compile one that would. One that does says ``_nrt=True``, as it would take over the
+setting of its caller.
 """
 
 from __future__ import annotations
@@ -43,7 +48,7 @@ class BandTuning:
 _FLAT, _MARGIN = BandTuning.flat, BandTuning.margin
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def exp_below(x):
     """A lower bound of ``exp(x)``; ``x`` is not NaN."""
     if x < _LEAST:
@@ -51,7 +56,7 @@ def exp_below(x):
     return exp_kernel(min(x, _MOST)) * EXP_DOWN
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def exp_above(x):
     """An upper bound of ``exp(x)``, infinite where the function may overflow."""
     if not x < _MOST:
@@ -59,7 +64,7 @@ def exp_above(x):
     return exp_kernel(max(x, _LEAST)) * EXP_UP
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def pose_range(a, line, n):
     """Least and largest value of the pose part of the form ``a``, without its centre."""
     if line:
@@ -75,7 +80,7 @@ def pose_range(a, line, n):
     return -spread, spread
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def form_range(a, line):
     """Least and largest value of the form ``a``, rounded outward."""
     n = a.shape[0] - 3
@@ -85,7 +90,7 @@ def form_range(a, line):
     return a[0] + low - rest - slack, a[0] + high + rest + slack
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def spread_of(a):
     """The sum of the absolute coefficients of a form and its radius."""
     total = 0.0
@@ -94,7 +99,7 @@ def spread_of(a):
     return total * HASH_UP
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def multiply(a, b, line, out):
     """``out = a b`` (design.md, H1); ``out`` is neither of them."""
     k = a.shape[0] - 1
@@ -118,7 +123,7 @@ def multiply(a, b, line, out):
     out[k] = (rest + HASH_PRODUCT_ROUNDING * size_a * size_b) * HASH_UP + UNDERFLOW64
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def scale_add(a, factor, b, shift, out):
     """``out = factor a + b + shift``; ``b`` may be ``out``."""
     k = a.shape[0] - 1
@@ -130,7 +135,7 @@ def scale_add(a, factor, b, shift, out):
     out[k] = (abs(factor) * a[k] + b[k] + FORM_ROUNDING * size) * HASH_UP + UNDERFLOW64
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def compose(a, derivatives, line, out, scratch):
     """``out = f(a)`` by Taylor's formula of order 2 about the centre (design.md, A3).
 
@@ -157,7 +162,7 @@ def compose(a, derivatives, line, out, scratch):
     out[k] = (rest + HASH_PRODUCT_ROUNDING * size) * HASH_UP + UNDERFLOW64
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def reciprocal(a, line, out, scratch):
     """``out = 1 / a`` of a form that is above 0, else one of infinite radius."""
     low, _ = form_range(a, line)
@@ -171,7 +176,7 @@ def reciprocal(a, line, out, scratch):
     compose(a, (inverse, -square, square * inverse, 1.0 / (low * low * low * low) * HASH_UP), line, out, scratch)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def exp_band(center, low, high):
     """A polynomial and a rest that enclose ``exp`` on an interval (design.md, H5).
 
@@ -203,7 +208,7 @@ def exp_band(center, low, high):
     return 0.5 * (top + bottom), slope, 0.0, 0.5 * (top - bottom) + rounding + UNDERFLOW64
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def sigmoid(x):
     """The logistic function, up to a relative error of 2^-48."""
     if x >= 0.0:
@@ -212,7 +217,7 @@ def sigmoid(x):
     return e / (1.0 + e)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def sigmoid_band(center, low, high):
     """Like `exp_band`, of the logistic function: value, slope, half the second derivative, and rest."""
     if not (low <= center <= high and high - low < np.inf):
@@ -244,7 +249,7 @@ def sigmoid_band(center, low, high):
     return 0.5 * (top + bottom), slope, 0.0, 0.5 * (top - bottom) + HASH_BAND_ROUNDING * (1.0 + slope * reach)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def apply_band(form, band, line, out):
     """``out = f(form)`` by what `exp_band` or `sigmoid_band` returned for the form's centre and range (H5)."""
     n = form.shape[0] - 3

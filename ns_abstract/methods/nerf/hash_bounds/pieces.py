@@ -24,7 +24,7 @@ from ns_abstract.methods.nerf.hash_bounds.composition import (
 )
 from ns_abstract.methods.nerf.hash_bounds.distribution import follow
 from ns_abstract.methods.nerf.hash_bounds.edges import Edges, middle_of, space
-from ns_abstract.methods.nerf.hash_bounds.features import level_features
+from ns_abstract.methods.nerf.hash_bounds.features import FeatureRoom, level_features
 from ns_abstract.methods.nerf.hash_bounds.forms import (
     apply_band,
     exp_above,
@@ -93,6 +93,7 @@ class PieceRoom(NamedTuple):
         ray: Forms [3, n + 3] of the origin and direction, and what `quotients` makes.
         directions: [16, n + 3] harmonics, and what the first layer makes of them.
         features: [features, n + 3] of the widest encoding.
+        levels: Of one level of it.
         edges, light: Of every round.
         rooms: Neurons of density networks by round, of as many layers for each; ``head``: of the network of colours.
         colors: [N, 3, n + 4] forms, [2, N, 3] bounds, and as many numbers of scratch.
@@ -103,6 +104,7 @@ class PieceRoom(NamedTuple):
     ray: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
     directions: tuple[np.ndarray, np.ndarray, np.ndarray]
     features: np.ndarray
+    levels: FeatureRoom
     edges: tuple[Edges, ...]
     light: tuple[Light, ...]
     rooms: tuple[tuple[LayerZonotope, ...], ...]
@@ -140,7 +142,7 @@ class WorkLimits(NamedTuple):
     dim: float
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", _nrt=False, nogil=True)
 def density_of(field, place, line, rooms, room, out):
     """The form of a density's logarithm at contracted ``place`` [3, n + 3]; returns the rows of its network.
 
@@ -156,7 +158,7 @@ def density_of(field, place, line, rooms, room, out):
     for level in range(levels):
         level_features(
             field.table[level], float(field.resolutions[level]), place, field.ranges[level],
-            room.features[level * features : (level + 1) * features],
+            room.features[level * features : (level + 1) * features], room.levels,
         )  # fmt: skip
     count = from_features(room.features[: levels * features], field.net, rooms[0])
     count = finish(rooms, count, field.net, room.live, room.rest)
@@ -164,7 +166,7 @@ def density_of(field, place, line, rooms, room, out):
     return count
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", _nrt=False, nogil=True)
 def _sample(field, edges, light, i, line, rooms, room):
     """Fill in the depth of interval ``i`` of a round; returns whether something is known, and the network's rows."""
     work, wide = room.work
@@ -174,7 +176,7 @@ def _sample(field, edges, light, i, line, rooms, room):
     count = 0
     out[:] = 0.0
     out[-1] = np.inf
-    if point(room.ray, distance, line, place, work[6:17]):
+    if point(room.ray, distance, line, place, work[6:19]):
         count = density_of(field, place, line, rooms, room, value)
         low, high = form_range(value, line)
         if low <= high:
@@ -187,7 +189,7 @@ def _sample(field, edges, light, i, line, rooms, room):
     return add_depth(edges, i, out, bounds, shares, line, light, wide), count
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", _nrt=False, nogil=True)
 def _color(field, edges, i, count, line, rooms, room):
     """Fill in the colours of sample ``i`` from ``count`` rows of the density's network."""
     forms, bounds, _ = room.colors
@@ -220,7 +222,7 @@ def _color(field, edges, i, count, line, rooms, room):
         bounds[1, i, c] = min(ends[1] + HASH_BAND_ROUNDING, 1.0)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", _nrt=False, nogil=True)
 def _round(field, edges, light, count, dark, line, rooms, room):
     """Depths of a round that places samples; returns whether something is known."""
     begin(light)
@@ -234,7 +236,7 @@ def _round(field, edges, light, count, dark, line, rooms, room):
     return True
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", _nrt=False, nogil=True)
 def _start(rays, ray, middle, half, field, line, room):
     """Forms of a ray over a piece, the first edges, and what the head makes of the direction."""
     origin, direction, ratios, shifts, along = room.ray
@@ -257,7 +259,7 @@ def _start(rays, ray, middle, half, field, line, room):
         space(edges, j, field.spacing, line, work)
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", _nrt=False, nogil=True)
 def bound_piece(field, rays, ray, middle, half, limits, room, out, shown):
     """Bounds ``out`` [2, 3] of a ray's colour over the box ``middle`` +- ``half`` [d] (design.md, H6, H7).
 
@@ -319,7 +321,7 @@ def bound_piece(field, rays, ray, middle, half, limits, room, out, shown):
     return True
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", _nrt=False, nogil=True)
 def _longest_axis(rays, ray, half):
     """The axis along which points move most."""
     terms, d = rays.exponents.shape
@@ -335,7 +337,7 @@ def _longest_axis(rays, ray, half):
     return axis
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", _nrt=False, nogil=True)
 def _on_part(form, line, low, high):
     """Bounds of a ``form`` where its parameters lie between ``low`` and ``high`` [d] in [-1, 1]."""
     n = form.shape[0] - 3
@@ -361,7 +363,7 @@ def _on_part(form, line, low, high):
     return least - rest, most + rest
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", _nrt=True, nogil=True)
 def _keep(out, counts, place, cells, found, shown, line, low, high):
     """Unite the bounds of a piece with those ``out`` [parts, 2, 3] of all parts that it meets.
 
@@ -403,7 +405,7 @@ def _keep(out, counts, place, cells, found, shown, line, low, high):
             return
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", _nrt=True, nogil=True)
 def bound_ray(field, rays, ray, cells, deepest, most, goal, limits, shifts, room, counts, out):
     """Bounds of a ray by part of the box, pieces halved until they are good or as small as allowed (design.md, H8).
 
@@ -479,7 +481,7 @@ def bound_ray(field, rays, ray, cells, deepest, most, goal, limits, shifts, room
     return first, tried, kept
 
 
-@njit(cache=True, error_model="numpy", nogil=True)
+@njit(cache=True, error_model="numpy", _nrt=True, nogil=True)
 def bound_rays(field, rays, cells, deepest, most, goal, limits, shifts, room, counts, out, pieces):
     """`bound_ray` of all rays.
 

@@ -12,7 +12,7 @@ from ns_abstract.methods.nerf.hash_bounds.forms import form_range, multiply, rec
 _ALONG = 0.25
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def line_form(coefficients, exponents, radius, middle, half, line, out):
     """The polynomial ``sum_a c_a p^a`` on the box ``middle + half q`` as a form of ``q`` (design.md, H1).
 
@@ -63,7 +63,7 @@ def line_form(coefficients, exponents, radius, middle, half, line, out):
     out[-1] = (rest + HASH_RAY_ROUNDING * size) * HASH_UP
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def harmonics(direction, line, out, work):
     """The 16 harmonics of ``(direction + 1) / 2`` as forms [16, n + 3] (``components_from_spherical_harmonics``).
 
@@ -115,7 +115,15 @@ def harmonics(direction, line, out, work):
     scale_add(r, 0.3731763325901154, nothing, 0.0, out[12])
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
+def _negate(a, out):
+    """``out = -a``; it may be ``a`` itself."""
+    for s in range(a.shape[0] - 1):
+        out[s] = -a[s]
+    out[-1] = a[-1]
+
+
+@njit(cache=True, error_model="numpy", _nrt=False)
 def quotients(origin, direction, line, ratios, shifts, along, work):
     """Forms by which far points are followed, by axis j: ``d_i / d_j`` and ``o_i - o_j d_i / d_j`` (design.md, H2).
 
@@ -135,10 +143,9 @@ def quotients(origin, direction, line, ratios, shifts, along, work):
         if low > 0.0:
             reciprocal(direction[j], line, inverse, work[2:])
         else:
-            product[:] = -direction[j]
-            product[-1] = direction[j, -1]
+            _negate(direction[j], product)
             reciprocal(product, line, inverse, work[2:])
-            inverse[:-1] = -inverse[:-1]
+            _negate(inverse, inverse)
         for i in range(3):
             if i != j:
                 multiply(direction[i], inverse, line, ratios[j, i])
@@ -146,7 +153,7 @@ def quotients(origin, direction, line, ratios, shifts, along, work):
                 scale_add(product, -1.0, origin[i], 0.0, shifts[j, i])
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=True)
 def _hull_of_slopes(low, high, jacobian):
     """Slopes [2, 3, 3] of the contraction, least and largest over a box (design.md, H2)."""
     nearest, least_of_all = np.empty(3), 0.0
@@ -193,7 +200,7 @@ def _hull_of_slopes(low, high, jacobian):
                 jacobian[1, i, k] = max(jacobian[1, i, k], most)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=True)
 def contracted(x):
     """[3] nerfstudio's contraction of a point [3] by the maximum norm."""
     m = max(abs(x[0]), abs(x[1]), abs(x[2]))
@@ -202,7 +209,7 @@ def contracted(x):
     return (2.0 - 1.0 / m) * (x / m)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=True)
 def _at_kinks(x, low, high, out):
     """Contraction of the forms ``x`` [3, n + 3] over a box on which it has kinks: a mean-value form."""
     width = x.shape[1]
@@ -222,7 +229,7 @@ def _at_kinks(x, low, high, out):
         out[i, -1] = rest * HASH_UP
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _largest(x, axis, positive, room, line, difference):
     """Whether the coordinate ``axis`` surely is the largest of the forms ``x`` [3, n + 3] in size, by ``room``."""
     sign = 1.0 if positive else -1.0
@@ -237,7 +244,7 @@ def _largest(x, axis, positive, room, line, difference):
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def point(ray, distance, line, out, work):
     """Contracted point at ``distance`` as forms of ``(v + 2) / 4`` in [0, 1]^3 (design.md, H2).
 
@@ -246,14 +253,14 @@ def point(ray, distance, line, out, work):
         distance: [n + 3] with the place symbol.
         line: See `forms`.
         out: [3, n + 3].
-        work: [11, n + 3].
+        work: [13, n + 3].
 
     Returns:
         Whether the point surely lies inside of (0, 1)^3.
     """
     origin, direction, ratios, shifts, along = ray
     x, t = work[:3], work[3]
-    low, high, size, radius = np.empty(3), np.empty(3), 0.0, 0.0
+    low, high, size, radius = work[11], work[12], 0.0, 0.0
     for i in range(3):
         multiply(direction[i], distance, line, t)
         scale_add(t, 1.0, origin[i], 0.0, x[i])
@@ -272,16 +279,19 @@ def point(ray, distance, line, out, work):
             if near >= 1.0 and near > nearest and _largest(x, j, low[j] > 0.0, POINT_PLACE_ROUNDING * size, line, t):
                 axis, nearest = j, near
     if radius < 1.0:
-        out[:] = x
+        for i in range(3):
+            for s in range(x.shape[1]):
+                out[i, s] = x[i, s]
         nearest = 1.0
     elif axis >= 0:
-        _outside(axis, low[axis] > 0.0, origin, ratios, shifts, along, x, line, out, work[3:])
+        _outside(axis, low[axis] > 0.0, origin, ratios, shifts, along, x, line, out, work[3:11])
     else:
         _at_kinks(x, low, high, out)
         nearest = 1.0
     inside = True
     for i in range(3):
-        out[i] *= 0.25
+        for s in range(out.shape[1]):
+            out[i, s] *= 0.25
         out[i, 0] += 0.5
         out[i, -1] = out[i, -1] * HASH_UP + POINT_PLACE_ROUNDING * (1.0 + size / nearest)
         least, most = form_range(out[i], line)
@@ -289,7 +299,7 @@ def point(ray, distance, line, out, work):
     return inside
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", _nrt=False)
 def _outside(axis, positive, origin, ratios, shifts, along, x, line, out, work):
     """Contraction where the coordinate ``axis`` is the largest and above 1 in size (design.md, H2)."""
     m, inverse, square, factor, rest, scratch = work[0], work[1], work[2], work[3], work[4], work[5:7]
