@@ -163,7 +163,6 @@ def test_other_methods_are_refused(nerfstudio: SimpleNamespace, folder: Path, tm
         nerfstudio.viewing.open_run(file)
 
 
-@pytest.mark.slow
 def test_options_of_the_scene_reach_the_viewer(nerfstudio: SimpleNamespace, folder: Path) -> None:
     file = folder / "blobs" / "splatfacto" / STAMP / "config.yml"
     overrides = Overrides(rasterize_mode="antialiased", background=(1.0, 0.5, 0.0), load_step=29999)
@@ -176,7 +175,6 @@ def test_options_of_the_scene_reach_the_viewer(nerfstudio: SimpleNamespace, fold
             nerfstudio.viewing.open_run(file, overrides=refused)
 
 
-@pytest.mark.slow
 def test_ply_opens(nerfstudio: SimpleNamespace, tmp_path: Path) -> None:
     write_ply(blob_scene(), tmp_path / "scene.ply")
     _, pipeline, _ = nerfstudio.viewing.open_run(nerfstudio.viewing.run_of_ply(tmp_path / "scene.ply", tmp_path))
@@ -186,7 +184,6 @@ def test_ply_opens(nerfstudio: SimpleNamespace, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- outputs
 
 
-@pytest.mark.slow
 def test_outputs_are_splatfactos(model: Any, nerfstudio: SimpleNamespace, config_file: Path) -> None:
     camera = cameras(nerfstudio)
     found = model.get_outputs(camera)
@@ -211,7 +208,6 @@ def test_outputs_are_splatfactos(model: Any, nerfstudio: SimpleNamespace, config
     np.testing.assert_allclose((1.0 - shown[0][1][..., 0])[free], (high - low)[free], atol=1e-12)
 
 
-@pytest.mark.slow
 def test_depth_of_one_gaussian(nerfstudio: SimpleNamespace) -> None:
     scene = blob_scene(1)
     scene = dataclasses.replace(scene, means=np.zeros((1, 3), np.float32), opacity_logits=np.full(1, 9.0, np.float32))
@@ -224,7 +220,6 @@ def test_depth_of_one_gaussian(nerfstudio: SimpleNamespace) -> None:
     np.testing.assert_allclose(depth, expected, rtol=1e-12)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("attack", ["poses", "lower bound raised"])
 def test_abstract_outputs_hold(model: Any, nerfstudio: SimpleNamespace, attack: str) -> None:
     found = model.get_outputs_for_camera(cameras(nerfstudio))
@@ -268,7 +263,6 @@ def test_crop_and_background_reach_the_bounds(model: Any, nerfstudio: SimpleName
     assert model.abstract_source() is not source
 
 
-@pytest.mark.slow
 def test_no_abstract_outputs_in_training(model: Any, nerfstudio: SimpleNamespace) -> None:
     model.train()
     try:
@@ -283,7 +277,6 @@ def test_no_abstract_outputs_in_training(model: Any, nerfstudio: SimpleNamespace
         model._evaluating = True
 
 
-@pytest.mark.slow
 def test_trouble_shows_what_is_known(model: Any, nerfstudio: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
     def fail() -> None:
         raise ArithmeticError("trouble")
@@ -294,7 +287,6 @@ def test_trouble_shows_what_is_known(model: Any, nerfstudio: SimpleNamespace, mo
     assert found["rgb"].shape == (40, 56, 3)
 
 
-@pytest.mark.slow
 def test_depth_outputs_hold(model: Any, nerfstudio: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(model.config.abstract, "depth", True)
     monkeypatch.setattr(model.config.abstract, "gsplat_version", "1.5.3")
@@ -314,7 +306,6 @@ def test_depth_outputs_hold(model: Any, nerfstudio: SimpleNamespace, monkeypatch
     assert (nothing["abstract_depth_lower"] == 0.0).all() and (nothing["abstract_depth_upper"] == 1e10).all()
 
 
-@pytest.mark.slow
 def test_pixels_of_small_pictures_are_repeated(nerfstudio: SimpleNamespace) -> None:
     from ns_abstract.viewer.views import Snapshot
 
@@ -505,7 +496,6 @@ def test_render_thread_survives_interrupts(
     assert sys.gettrace() is None
 
 
-@pytest.mark.slow
 def test_requests_that_are_lost_are_made_again(nerfstudio: SimpleNamespace) -> None:
     made: list[float] = []
     heeded = threading.Event()
@@ -527,14 +517,12 @@ def test_requests_that_are_lost_are_made_again(nerfstudio: SimpleNamespace) -> N
     assert heeded.wait(3600.0) and len(made) >= 4
 
 
-@pytest.mark.slow
 def test_words_for_every_state(nerfstudio: SimpleNamespace) -> None:
     view = ViewRequest(nerfstudio.panel.camera_of(cameras(nerfstudio)), perturbation_of({"x": 0.01}))
     text = nerfstudio.panel.describe(view, None, Status("failed", "out of memory"))
     assert "no bounds yet" in text and "stopped: out of memory" in text
 
 
-@pytest.mark.slow
 def test_options_are_ns_viewers(nerfstudio: SimpleNamespace) -> None:
     from nerfstudio.configs.base_config import ViewerConfig
     from nerfstudio.scripts.viewer.run_viewer import RunViewer
@@ -568,7 +556,6 @@ def test_methods_train_like_their_parents(nerfstudio: SimpleNamespace, ours: str
             assert getattr(mine.pipeline.model, entry.name) == getattr(stock.pipeline.model, entry.name)
 
 
-@pytest.mark.slow
 def test_nerf_has_the_chosen_size(nerfstudio: SimpleNamespace) -> None:
     import torch
     from nerfstudio.data.scene_box import SceneBox
@@ -809,7 +796,6 @@ def test_render_writes_abstract_images(nerfstudio: SimpleNamespace, folder: Path
 
 def test_members_of_enumerations_as_some_pythons_write_them() -> None:
     """Python 3.11.0 to 3.11.3 store a member as ``getattr(Class, "NAME")``: that much may be named, and no more."""
-    torchvision_operators.declare_missing()
     loading = importlib.import_module("ns_abstract.nerfstudio.loading")
     python = "tag:yaml.org,2002:python/"
 
