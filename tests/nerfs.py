@@ -102,14 +102,16 @@ def raw_outputs(weights: FieldWeights, x: torch.Tensor, direction: torch.Tensor)
 def attack_first_rays(scene: NerfScene, pose_set: PoseBox, found: RayBounds) -> tuple[int, int]:
     """Comparisons and violations of bounds of the first rays, sampled as `BINS` says.
 
-    By random poses, corners, gradient ascent and jumps.
+    By random poses, corners, gradient ascent and jumps, of a picture of these rays alone where they are of one row.
     """
-    camera = pose_set.camera
-    lower, upper = np.zeros((camera.height * camera.width, 3)), np.ones((camera.height * camera.width, 3))
-    lower[: len(found.lower)], upper[: len(found.lower)] = found.lower, found.upper
-    shape = (camera.height, camera.width, 3)
-    render, probe, twin = nerf_renderer(scene, pose_set, BINS)
+    camera, count = pose_set.camera, len(found.lower)
+    width, height = min(count, camera.width), -(-count // camera.width)
+    shown = dataclasses.replace(pose_set, camera=dataclasses.replace(camera, width=width, height=height))
+    lower, upper = np.zeros((height * width, 3)), np.ones((height * width, 3))
+    lower[:count], upper[:count] = found.lower, found.upper
+    shape = (height, width, 3)
+    render, probe, twin = nerf_renderer(scene, shown, BINS)
     result = falsify(
-        lower.reshape(shape), upper.reshape(shape), pose_set.box, render, twin, probe=probe, poses=40, seed=1
+        lower.reshape(shape), upper.reshape(shape), pose_set.box, render, twin, probe=probe, poses=24, seed=1
     )
     return result.comparisons, result.violations

@@ -460,6 +460,7 @@ def test_other_renderers(
     check_samples(blobs, tmp_path, 1, **options)
 
 
+@pytest.mark.slow
 def test_real_bounds_lie_inside_float32_bounds_of_one_pose(
     make_blobs: Callable[..., Inputs], tmp_path: Path, call: Callable[..., tuple[int, str]]
 ) -> None:

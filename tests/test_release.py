@@ -16,6 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 pytestmark = pytest.mark.skipif(not (ROOT / "docs").is_dir(), reason="the documentation is not beside the tests")
 
 
+@pytest.mark.slow
 def test_method_page_names_what_is_registered() -> None:
     pytest.importorskip("nerfstudio")
     declare_missing()
