@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
@@ -19,8 +20,10 @@ from ns_abstract.execution.cancellation import Deadline
 from ns_abstract.verify import box_decisions
 from ns_abstract.verify.network import ImageSets, Network, NetworkArithmetic, bound_outputs, load_network
 from ns_abstract.verify.network.bounds import NetworkBounds
+from ns_abstract.verify.network.coefficients import grid
 from ns_abstract.verify.network.layers import Convolution, LeakyRelu, Matrix
 from ns_abstract.verify.network.phase_tree import PhaseTree, _Branch, _GroupRows
+from ns_abstract.verify.network.stopping import BackwardBounds
 from ns_abstract.verify.vnnlib_sets import InputRegion, UnsafeSet
 
 MOST = 100
@@ -137,6 +140,21 @@ def test_branches_hold_for_the_images_in_them(name: str, radius: float, tmp_path
     tree = tree_of(network, images, rows, np.zeros(4))
     assert sum(len(own.units.flat) for own in tree.relus.values()) >= 5
     assert least_excess(network, tree, images, rows, 40 if name == "small" else 4) >= 0.0
+
+
+def test_what_is_not_known_is_not_proved(tmp_path: Path) -> None:
+    """Neither in a cell without finite intermediate bounds, nor by a bound of a row that is not finite."""
+    network = load_network(small(tmp_path))
+    x, rows = np.zeros(math.prod(network.input_shape)), np.ones((1, math.prod(network.output_shape)))
+    tree = tree_of(network, box(x - 1.0, x + 1.0), rows, np.array([1e6]))
+    assert tree.prove([0], MOST).proved
+    tree.intermediate.good[0] = False
+    assert tree.prove([0], MOST) == (False, 0, -np.inf)
+    group = _GroupRows.of(tree.shifted, [0], grid(network.shape(tree.index)))
+    bounds = BackwardBounds.unknown(3, 1)
+    bounds.plane[:], bounds.lower[:] = 0.0, [np.inf, np.nan, 1.0]
+    assert np.isfinite(group.lower(bounds)).tolist() == [False, False, True]
+    assert (group.lower(bounds)[:2] == -np.inf).all()
 
 
 def test_functions_without_curved_parts_choose_nothing(tmp_path: Path) -> None:

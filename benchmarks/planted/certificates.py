@@ -313,6 +313,21 @@ CERTIFICATES = (
         "test_phase_tree.py::test_claims_next_to_the_exact_minimum[real]",
     ),
     Fault(
+        "phase tree: a cell that was given up is proved",
+        _TREE, "PhaseTree.prove", "not self.intermediate.good[0]", "False",
+        "test_phase_tree.py::test_what_is_not_known_is_not_proved",
+    ),
+    Fault(
+        "phase tree: what is left where all phases are assumed is proved",
+        _TREE, "PhaseTree.prove", "ended and self._climbed(rows, ended, self.tuning.last_steps)", "False",
+        "test_phase_tree.py::test_claims_next_to_the_exact_minimum[real]",
+    ),
+    Fault(
+        "phase tree: an infinite bound proves a row",
+        _TREE, "_GroupRows.lower", "np.isfinite(lower)", "~np.isnan(lower)",
+        "test_phase_tree.py::test_what_is_not_known_is_not_proved",
+    ),
+    Fault(
         "weighted means: any sum is a mean's",
         "verify/network/weighted_means.py", "_mean", "bool((total.weight == 1.0).all())", "True",
         "test_weighted_means.py::test_numbers_that_are_no_shares_stay",

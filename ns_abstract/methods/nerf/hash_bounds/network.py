@@ -13,7 +13,7 @@ from numba import njit
 
 from ns_abstract.arithmetic.rounding import BIAS_ROUNDING, HASH_UP, RELU_ROUNDING, gamma
 from ns_abstract.arithmetic.simd.lanes import LINE
-from ns_abstract.methods.nerf.hash_bounds.forms import spread_of
+from ns_abstract.methods.nerf.hash_bounds.forms import UNCOUNTED, spread_of
 from ns_abstract.methods.nerf.hash_field import DenseNet
 from ns_abstract.methods.nerf.layer_kernel import multiply as product
 
@@ -70,7 +70,7 @@ def zonotope(rows: int, neurons: int) -> LayerZonotope:
     return LayerZonotope(np.zeros((rows, neurons)), np.zeros(neurons), np.zeros(neurons))
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(**UNCOUNTED)
 def from_features(features, weights, out):
     """Neurons ``out`` of the first layer from forms ``features`` [F, n + 3], each with a symbol of its own.
 
@@ -103,7 +103,7 @@ def from_features(features, weights, out):
     return shared + count
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(**UNCOUNTED)
 def relu(z, count, n, live):
     """max(0, z) of ``n`` neurons in ``count`` rows, in place (design.md, H4).
 
@@ -151,7 +151,7 @@ def relu(z, count, n, live):
     return count, alive
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(**UNCOUNTED)
 def linear(z, count, live, weight, absolute, bias, rounding, out, rest):
     """Neurons ``out`` [n] of a layer.
 
@@ -185,7 +185,7 @@ def linear(z, count, live, weight, absolute, bias, rounding, out, rest):
         radius[j] = (radius[j] + BIAS_ROUNDING * (abs(bias[j]) + abs(rows[0, j]))) * HASH_UP
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(**UNCOUNTED)
 def finish(rooms, count, weights, live, rest):
     """The layers behind the first one, whose neurons before their ReLU are in ``rooms[0]``; returns the rows.
 
@@ -207,7 +207,7 @@ def finish(rooms, count, weights, live, rest):
     return count
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(**UNCOUNTED)
 def sizes_of(z, count):
     """Fill in bounds of the absolute values of neurons, from ``count`` rows."""
     n = z.rows.shape[1]
@@ -245,7 +245,7 @@ def head_weights(net: DenseNet, harmonics: int) -> HeadWeights:
     return HeadWeights(weights, np.ascontiguousarray(first[:harmonics]), geometry, np.abs(geometry))
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(**UNCOUNTED)
 def look_at_direction(forms, head, rows, radius):
     """What the first layer of the ``head`` adds up of a direction's harmonics ``forms`` [16, n + 3].
 
@@ -264,7 +264,7 @@ def look_at_direction(forms, head, rows, radius):
             radius[j] += own * abs(head.direction[f, j])
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(**UNCOUNTED)
 def colors(z, count, seen, head, rooms, live, rest):
     """Neurons of colours before the sigmoid in ``rooms[-1]`` from those of the density's network; returns the rows.
 
@@ -290,7 +290,7 @@ def colors(z, count, seen, head, rooms, live, rest):
     return finish(rooms, count, head.net, live, rest)
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(**UNCOUNTED)
 def output_form(z, count, j, shared, out):
     """Neuron ``j`` of ``count`` rows as a form ``out`` [shared + 1]: error symbols go to the radius."""
     rest = z.radius[j]

@@ -6,13 +6,21 @@ import numpy as np
 from numba import njit
 
 from ns_abstract.arithmetic.rounding import HASH_RAY_ROUNDING, HASH_UP, POINT_PLACE_ROUNDING
-from ns_abstract.methods.nerf.hash_bounds.forms import form_range, multiply, reciprocal, scale_add, spread_of
+from ns_abstract.methods.nerf.hash_bounds.forms import (
+    COUNTED,
+    UNCOUNTED,
+    form_range,
+    multiply,
+    reciprocal,
+    scale_add,
+    spread_of,
+)
 
 #: A ray whose direction has at least this much of the largest coordinate's axis is followed by quotients.
 _ALONG = 0.25
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(**UNCOUNTED)
 def line_form(coefficients, exponents, radius, middle, half, line, out):
     """The polynomial ``sum_a c_a p^a`` on the box ``middle + half q`` as a form of ``q`` (design.md, H1).
 
@@ -63,7 +71,7 @@ def line_form(coefficients, exponents, radius, middle, half, line, out):
     out[-1] = (rest + HASH_RAY_ROUNDING * size) * HASH_UP
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(**UNCOUNTED)
 def harmonics(direction, line, out, work):
     """The 16 harmonics of ``(direction + 1) / 2`` as forms [16, n + 3] (``components_from_spherical_harmonics``).
 
@@ -115,7 +123,7 @@ def harmonics(direction, line, out, work):
     scale_add(r, 0.3731763325901154, nothing, 0.0, out[12])
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(**UNCOUNTED)
 def _negate(a, out):
     """``out = -a``; it may be ``a`` itself."""
     for s in range(a.shape[0] - 1):
@@ -123,7 +131,7 @@ def _negate(a, out):
     out[-1] = a[-1]
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(**UNCOUNTED)
 def quotients(origin, direction, line, ratios, shifts, along, work):
     """Forms by which far points are followed, by axis j: ``d_i / d_j`` and ``o_i - o_j d_i / d_j`` (design.md, H2).
 
@@ -153,7 +161,7 @@ def quotients(origin, direction, line, ratios, shifts, along, work):
                 scale_add(product, -1.0, origin[i], 0.0, shifts[j, i])
 
 
-@njit(cache=True, error_model="numpy", _nrt=True)
+@njit(**COUNTED)
 def _hull_of_slopes(low, high, jacobian):
     """Slopes [2, 3, 3] of the contraction, least and largest over a box (design.md, H2)."""
     nearest, least_of_all = np.empty(3), 0.0
@@ -200,7 +208,7 @@ def _hull_of_slopes(low, high, jacobian):
                 jacobian[1, i, k] = max(jacobian[1, i, k], most)
 
 
-@njit(cache=True, error_model="numpy", _nrt=True)
+@njit(**COUNTED)
 def contracted(x):
     """[3] nerfstudio's contraction of a point [3] by the maximum norm."""
     m = max(abs(x[0]), abs(x[1]), abs(x[2]))
@@ -209,7 +217,7 @@ def contracted(x):
     return (2.0 - 1.0 / m) * (x / m)
 
 
-@njit(cache=True, error_model="numpy", _nrt=True)
+@njit(**COUNTED)
 def _at_kinks(x, low, high, out):
     """Contraction of the forms ``x`` [3, n + 3] over a box on which it has kinks: a mean-value form."""
     width = x.shape[1]
@@ -229,7 +237,7 @@ def _at_kinks(x, low, high, out):
         out[i, -1] = rest * HASH_UP
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(**UNCOUNTED)
 def _largest(x, axis, positive, room, line, difference):
     """Whether the coordinate ``axis`` surely is the largest of the forms ``x`` [3, n + 3] in size, by ``room``."""
     sign = 1.0 if positive else -1.0
@@ -244,7 +252,7 @@ def _largest(x, axis, positive, room, line, difference):
     return True
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(**UNCOUNTED)
 def point(ray, distance, line, out, work):
     """Contracted point at ``distance`` as forms of ``(v + 2) / 4`` in [0, 1]^3 (design.md, H2).
 
@@ -299,7 +307,7 @@ def point(ray, distance, line, out, work):
     return inside
 
 
-@njit(cache=True, error_model="numpy", _nrt=False)
+@njit(**UNCOUNTED)
 def _outside(axis, positive, origin, ratios, shifts, along, x, line, out, work):
     """Contraction where the coordinate ``axis`` is the largest and above 1 in size (design.md, H2)."""
     m, inverse, square, factor, rest, scratch = work[0], work[1], work[2], work[3], work[4], work[5:7]
