@@ -5,9 +5,9 @@ Over one parameter ``p`` the pose symbols are two, ``p`` and ``2 p^2 - 1`` ("lin
 over more they are the parameters themselves.
 
 Kernels here are called millions of times with records of many arrays, so they are compiled without numba's counting of
-references (`UNCOUNTED`), which took half of the time and made threads wait for one another. Such a kernel makes no array
-of its own; numba refuses to compile one that would. One that does is `COUNTED`, and says so, as it would take over the
-setting of its caller.
+references (`UNCOUNTED`), which took half of the time and made threads wait for one another. Such a kernel makes no
+array of its own; numba refuses to compile one that would. One that does is `COUNTED`, and says so, as it would take
+over the setting of its caller.
 """
 
 from __future__ import annotations
