@@ -15,7 +15,7 @@ from ns_abstract.methods.nerf.hash_bounds.light import depths_functional, times
 from ns_abstract.methods.nerf.hsv import shift_box
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def interval_colors(light, count, low, high, background, last, out):
     """Bounds ``out`` [2, 3] of a ray's colour from those of its samples alone (design.md, F8).
 
@@ -43,7 +43,7 @@ def interval_colors(light, count, low, high, background, last, out):
         out[1, c] += slack
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def shifted_interval_colors(light, count, colors, shift, background, last, room, out):
     """`interval_colors` [2, 3] where hue and saturation are added to all samples' colours (design.md, F9).
 
@@ -64,7 +64,7 @@ def shifted_interval_colors(light, count, colors, shift, background, last, room,
             out[0, c], out[1, c] = 0.0, 1.0
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def weight_bounds(light, i, last):
     """Bounds of the weight of sample i; ``last``: of what the picture takes of its colour, if it is the last one."""
     if last:
@@ -74,7 +74,7 @@ def weight_bounds(light, i, last):
     return max(low - HASH_LIGHT_ROUNDING, 0.0), high + HASH_LIGHT_ROUNDING
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _products(light, count, i, whole, color, line):
     """Products of deviations of the weight of sample i and of its colour: the centre's shift, its coefficient, rest.
 
@@ -107,7 +107,7 @@ def _products(light, count, i, whole, color, line):
     return 0.0, 0.0, apart
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def form_color(light, count, colors, background, last, line, out):
     """One channel of a ray's colour as a form (design.md, H7).
 
@@ -154,7 +154,7 @@ def form_color(light, count, colors, background, last, line, out):
     out[n + 2] = (rest + HASH_SAMPLE_ROUNDING * (count + 4.0) * size) * HASH_UP
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def form_bounds(form, line):
     """Bounds of what `form_color` makes; all numbers where it is not finite."""
     n = form.shape[0] - 3

@@ -19,7 +19,7 @@ from ns_abstract.methods.nerf.hash_bounds.light import depths_functional
 from ns_abstract.methods.nerf.render import HISTOGRAM_PADDING
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _excess(light, count, k, share, line, out):
     """``share D - 1 + A_k - a k``: how far the share of the distribution is beyond edge k, times D (design.md, H6).
 
@@ -54,7 +54,7 @@ def _excess(light, count, k, share, line, out):
     return low, high, rest
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _bin(light, k, line, out):
     """Weight and padding of bin k: pose symbols ``out`` [n + 3] of the form, its rest, and bounds."""
     n = out.shape[0] - 3
@@ -79,7 +79,7 @@ def _bin(light, k, line, out):
     return rest, low, high
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _one_bin(light, count, edges, k, share, line, out, work):
     """Place of an edge that surely lies in bin k (design.md, H6)."""
     n = out.shape[0] - 3
@@ -139,7 +139,7 @@ def _one_bin(light, count, edges, k, share, line, out, work):
     return (followed + rest) * HASH_UP + HASH_PLACE_ROUNDING * (1.0 + abs(scale) * reach)
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _slopes_of_bins(light, edges, first, past, line, work):
     """Least and largest slope of the places in bins ``first`` to ``past`` (exclusive)."""
     least, most = np.inf, 0.0
@@ -151,7 +151,7 @@ def _slopes_of_bins(light, edges, first, past, line, work):
     return least * (1.0 - HASH_LIGHT_ROUNDING), most * (1.0 + HASH_LIGHT_ROUNDING)
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _several_bins(light, count, edges, first, past, share, line, out, work):
     """Place of an edge in one of several bins: from a knot on by slopes of either side (design.md, H6)."""
     n = out.shape[0] - 3
@@ -179,7 +179,7 @@ def _several_bins(light, count, edges, first, past, share, line, out, work):
     return (symbols + abs(slope) * rest + max(wide[0], wide[1]) + 0.5 * abs(corner)) * HASH_UP + HASH_PLACES_ROUNDING
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def follow(light, count, edges, wanted, line, out, work):
     """Places ``out`` of the edges of the next round (design.md, H6).
 
@@ -225,7 +225,7 @@ def follow(light, count, edges, wanted, line, out, work):
     return True
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _within(light, count, edges, first, past, share, line, work):
     """Bounds of the place of an edge in the bins from ``first`` to ``past`` (exclusive)."""
     low, _, _ = _excess(light, count, first, share, line, work[0])

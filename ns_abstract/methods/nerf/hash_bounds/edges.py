@@ -44,7 +44,7 @@ def edges_of(count: int, n: int) -> Edges:
     )  # fmt: skip
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def space(edges, j, spacing, line, work):
     """Fill in the distance of edge ``j`` (design.md, H2).
 
@@ -98,7 +98,7 @@ def space(edges, j, spacing, line, work):
     _keep_finite(out, edges.near[j], edges.far[j])
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _keep_finite(form, low, high):
     """Replace a ``form`` by the interval from ``low`` to ``high`` where that is as good as its own rest."""
     n = form.shape[0] - 3
@@ -110,7 +110,7 @@ def _keep_finite(form, low, high):
         form[n + 2] = 0.0
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def middle_of(edges, i, out):
     """The middle of interval ``i`` as a form ``out`` [n + 3] without radius.
 

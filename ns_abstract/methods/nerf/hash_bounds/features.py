@@ -47,7 +47,7 @@ def feature_room(features: int) -> FeatureRoom:
     )  # fmt: skip
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _gather(table, first, counts, nodes):
     """Values ``nodes`` [6, 6, 6, F] of a level's ``table`` [2^T, F] from the corner ``first`` [3] on."""
     for i in range(counts[0]):
@@ -58,7 +58,7 @@ def _gather(table, first, counts, nodes):
                     nodes[i, j, k, f] = table[row, f]
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _hull(table, first, counts, low, high):
     """Least and largest value [F] of the nodes from ``first`` on."""
     low[:], high[:] = np.inf, -np.inf
@@ -71,7 +71,7 @@ def _hull(table, first, counts, low, high):
                     high[f] = max(high[f], table[row, f])
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _across(nodes, i, j, k, y, z, f):
     """The value of a feature on the face ``i`` of nodes, at ``y`` and ``z`` from the node (j, k)."""
     a = nodes[i, j, k, f] + y * (nodes[i, j + 1, k, f] - nodes[i, j, k, f])
@@ -79,7 +79,7 @@ def _across(nodes, i, j, k, y, z, f):
     return a + z * (b - a)
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _slopes(nodes, counts, place, low, high, f, kept, slopes):
     """The value of a feature at ``place`` and its slopes [2, 3] between there and the box (design.md, H3).
 
@@ -140,7 +140,7 @@ def _slopes(nodes, counts, place, low, high, f, kept, slopes):
     return value
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def level_features(table, resolution, point, ranges, out, room):
     """Forms of one level's features at a contracted point (design.md, H3).
 

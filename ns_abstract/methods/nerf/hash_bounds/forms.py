@@ -31,8 +31,8 @@ from ns_abstract.arithmetic.rounding import (
 )
 
 #: How kernels are compiled that make no array, and those that do.
-UNCOUNTED: dict[str, Any] = {"cache": True, "error_model": "numpy", "_nrt": False}
-COUNTED: dict[str, Any] = {"cache": True, "error_model": "numpy", "_nrt": True}
+UNCOUNTED: dict[str, Any] = {"_nrt": False}
+COUNTED: dict[str, Any] = {"_nrt": True}
 #: Past these arguments an exponential is 0 or more than any number.
 _LEAST, _MOST = -700.0, 700.0
 #: Ranges up to this half-width are followed by Taylor's formula, wider ones by a chord.
@@ -52,7 +52,7 @@ class BandTuning:
 _FLAT, _MARGIN = BandTuning.flat, BandTuning.margin
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def exp_below(x):
     """A lower bound of ``exp(x)``; ``x`` is not NaN."""
     if x < _LEAST:
@@ -60,7 +60,7 @@ def exp_below(x):
     return exp_kernel(min(x, _MOST)) * EXP_DOWN
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def exp_above(x):
     """An upper bound of ``exp(x)``, infinite where the function may overflow."""
     if not x < _MOST:
@@ -68,7 +68,7 @@ def exp_above(x):
     return exp_kernel(max(x, _LEAST)) * EXP_UP
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def pose_range(a, line, n):
     """Least and largest value of the pose part of the form ``a``, without its centre."""
     if line:
@@ -84,7 +84,7 @@ def pose_range(a, line, n):
     return -spread, spread
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def form_range(a, line):
     """Least and largest value of the form ``a``, rounded outward."""
     n = a.shape[0] - 3
@@ -94,7 +94,7 @@ def form_range(a, line):
     return a[0] + low - rest - slack, a[0] + high + rest + slack
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def spread_of(a):
     """The sum of the absolute coefficients of a form and its radius."""
     total = 0.0
@@ -103,7 +103,7 @@ def spread_of(a):
     return total * HASH_UP
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def multiply(a, b, line, out):
     """``out = a b`` (design.md, H1); ``out`` is neither of them."""
     k = a.shape[0] - 1
@@ -127,7 +127,7 @@ def multiply(a, b, line, out):
     out[k] = (rest + HASH_PRODUCT_ROUNDING * size_a * size_b) * HASH_UP + UNDERFLOW64
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def scale_add(a, factor, b, shift, out):
     """``out = factor a + b + shift``; ``b`` may be ``out``."""
     k = a.shape[0] - 1
@@ -139,7 +139,7 @@ def scale_add(a, factor, b, shift, out):
     out[k] = (abs(factor) * a[k] + b[k] + FORM_ROUNDING * size) * HASH_UP + UNDERFLOW64
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def compose(a, derivatives, line, out, scratch):
     """``out = f(a)`` by Taylor's formula of order 2 about the centre (design.md, A3).
 
@@ -166,7 +166,7 @@ def compose(a, derivatives, line, out, scratch):
     out[k] = (rest + HASH_PRODUCT_ROUNDING * size) * HASH_UP + UNDERFLOW64
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def reciprocal(a, line, out, scratch):
     """``out = 1 / a`` of a form that is above 0, else one of infinite radius."""
     low, _ = form_range(a, line)
@@ -180,7 +180,7 @@ def reciprocal(a, line, out, scratch):
     compose(a, (inverse, -square, square * inverse, 1.0 / (low * low * low * low) * HASH_UP), line, out, scratch)
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def exp_band(center, low, high):
     """A polynomial and a rest that enclose ``exp`` on an interval (design.md, H5).
 
@@ -212,7 +212,7 @@ def exp_band(center, low, high):
     return 0.5 * (top + bottom), slope, 0.0, 0.5 * (top - bottom) + rounding + UNDERFLOW64
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def sigmoid(x):
     """The logistic function, up to a relative error of 2^-48."""
     if x >= 0.0:
@@ -221,7 +221,7 @@ def sigmoid(x):
     return e / (1.0 + e)
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def sigmoid_band(center, low, high):
     """Like `exp_band`, of the logistic function: value, slope, half the second derivative, and rest."""
     if not (low <= center <= high and high - low < np.inf):
@@ -253,7 +253,7 @@ def sigmoid_band(center, low, high):
     return 0.5 * (top + bottom), slope, 0.0, 0.5 * (top - bottom) + HASH_BAND_ROUNDING * (1.0 + slope * reach)
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def apply_band(form, band, line, out):
     """``out = f(form)`` by what `exp_band` or `sigmoid_band` returned for the form's centre and range (H5)."""
     n = form.shape[0] - 3

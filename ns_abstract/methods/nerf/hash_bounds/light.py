@@ -64,13 +64,13 @@ def light_of(count: int, n: int) -> Light:
     )  # fmt: skip
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def times(a, b):
     """``a b``, 0 where ``a`` is 0 although ``b`` is infinite."""
     return 0.0 if a == 0.0 else a * b
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def add_depth(edges, i, density, bounds, shares, line, light, work):
     """Fill in interval ``i`` and its end from the form of its ``density`` (design.md, H6).
 
@@ -127,7 +127,7 @@ def add_depth(edges, i, density, bounds, shares, line, light, work):
     return True
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def begin(light):
     """Set the light at the first edge: all of it."""
     light.total[0] = 0.0
@@ -138,7 +138,7 @@ def begin(light):
     light.left[0] = 1.0
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _add_up(light, i, line, n):
     """Sum and light behind interval ``i``."""
     x, total, k = light.depth[i], light.total, i + 1
@@ -192,7 +192,7 @@ def _add_up(light, i, line, n):
     out[3] = (half + HASH_SUM_ROUNDING) * HASH_UP
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def give_up(light, first, count):
     """Leave open the depths of the intervals from ``first`` on."""
     n = light.depth.shape[1] - 4
@@ -203,7 +203,7 @@ def give_up(light, first, count):
         _add_up(light, i, False, n)
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def depths_functional(light, count, k, at_end, at_start, behind, own, scale):
     """Sum of the absolute coefficients of ``scale (at_end dS_N + at_start dS_k + behind dS_k+1) + own symbols``.
 

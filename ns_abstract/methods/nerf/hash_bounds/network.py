@@ -70,7 +70,7 @@ def zonotope(rows: int, neurons: int) -> LayerZonotope:
     return LayerZonotope(np.zeros((rows, neurons)), np.zeros(neurons), np.zeros(neurons))
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def from_features(features, weights, out):
     """Neurons ``out`` of the first layer from forms ``features`` [F, n + 3], each with a symbol of its own.
 
@@ -103,7 +103,7 @@ def from_features(features, weights, out):
     return shared + count
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def relu(z, count, n, live):
     """max(0, z) of ``n`` neurons in ``count`` rows, in place (design.md, H4).
 
@@ -151,7 +151,7 @@ def relu(z, count, n, live):
     return count, alive
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def linear(z, count, live, weight, absolute, bias, rounding, out, rest):
     """Neurons ``out`` [n] of a layer.
 
@@ -185,7 +185,7 @@ def linear(z, count, live, weight, absolute, bias, rounding, out, rest):
         radius[j] = (radius[j] + BIAS_ROUNDING * (abs(bias[j]) + abs(rows[0, j]))) * HASH_UP
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def finish(rooms, count, weights, live, rest):
     """The layers behind the first one, whose neurons before their ReLU are in ``rooms[0]``; returns the rows.
 
@@ -207,7 +207,7 @@ def finish(rooms, count, weights, live, rest):
     return count
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def sizes_of(z, count):
     """Fill in bounds of the absolute values of neurons, from ``count`` rows."""
     n = z.rows.shape[1]
@@ -245,7 +245,7 @@ def head_weights(net: DenseNet, harmonics: int) -> HeadWeights:
     return HeadWeights(weights, np.ascontiguousarray(first[:harmonics]), geometry, np.abs(geometry))
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def look_at_direction(forms, head, rows, radius):
     """What the first layer of the ``head`` adds up of a direction's harmonics ``forms`` [16, n + 3].
 
@@ -264,7 +264,7 @@ def look_at_direction(forms, head, rows, radius):
             radius[j] += own * abs(head.direction[f, j])
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def colors(z, count, seen, head, rooms, live, rest):
     """Neurons of colours before the sigmoid in ``rooms[-1]`` from those of the density's network; returns the rows.
 
@@ -290,7 +290,7 @@ def colors(z, count, seen, head, rooms, live, rest):
     return finish(rooms, count, head.net, live, rest)
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def output_form(z, count, j, shared, out):
     """Neuron ``j`` of ``count`` rows as a form ``out`` [shared + 1]: error symbols go to the radius."""
     rest = z.radius[j]

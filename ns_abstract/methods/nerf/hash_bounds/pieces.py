@@ -144,7 +144,7 @@ class WorkLimits(NamedTuple):
     dim: float
 
 
-@njit(nogil=True, **UNCOUNTED)
+@njit(cache=True, error_model="numpy", nogil=True, **UNCOUNTED)
 def density_of(field, place, line, rooms, room, out):
     """The form of a density's logarithm at contracted ``place`` [3, n + 3]; returns the rows of its network.
 
@@ -168,7 +168,7 @@ def density_of(field, place, line, rooms, room, out):
     return count
 
 
-@njit(nogil=True, **UNCOUNTED)
+@njit(cache=True, error_model="numpy", nogil=True, **UNCOUNTED)
 def _sample(field, edges, light, i, line, rooms, room):
     """Fill in the depth of interval ``i`` of a round; returns whether something is known, and the network's rows."""
     work, wide = room.work
@@ -191,7 +191,7 @@ def _sample(field, edges, light, i, line, rooms, room):
     return add_depth(edges, i, out, bounds, shares, line, light, wide), count
 
 
-@njit(nogil=True, **UNCOUNTED)
+@njit(cache=True, error_model="numpy", nogil=True, **UNCOUNTED)
 def _color(field, edges, i, count, line, rooms, room):
     """Fill in the colours of sample ``i`` from ``count`` rows of the density's network."""
     forms, bounds, _ = room.colors
@@ -224,7 +224,7 @@ def _color(field, edges, i, count, line, rooms, room):
         bounds[1, i, c] = min(ends[1] + HASH_BAND_ROUNDING, 1.0)
 
 
-@njit(nogil=True, **UNCOUNTED)
+@njit(cache=True, error_model="numpy", nogil=True, **UNCOUNTED)
 def _round(field, edges, light, count, dark, line, rooms, room):
     """Depths of a round that places samples; returns whether something is known."""
     begin(light)
@@ -238,7 +238,7 @@ def _round(field, edges, light, count, dark, line, rooms, room):
     return True
 
 
-@njit(nogil=True, **UNCOUNTED)
+@njit(cache=True, error_model="numpy", nogil=True, **UNCOUNTED)
 def _start(rays, ray, middle, half, field, line, room):
     """Forms of a ray over a piece, the first edges, and what the head makes of the direction."""
     origin, direction, ratios, shifts, along = room.ray
@@ -261,7 +261,7 @@ def _start(rays, ray, middle, half, field, line, room):
         space(edges, j, field.spacing, line, work)
 
 
-@njit(nogil=True, **UNCOUNTED)
+@njit(cache=True, error_model="numpy", nogil=True, **UNCOUNTED)
 def bound_piece(field, rays, ray, middle, half, limits, room, out, shown):
     """Bounds ``out`` [2, 3] of a ray's colour over the box ``middle`` +- ``half`` [d] (design.md, H6, H7).
 
@@ -323,7 +323,7 @@ def bound_piece(field, rays, ray, middle, half, limits, room, out, shown):
     return True
 
 
-@njit(nogil=True, **UNCOUNTED)
+@njit(cache=True, error_model="numpy", nogil=True, **UNCOUNTED)
 def _longest_axis(rays, ray, half):
     """The axis along which points move most."""
     terms, d = rays.exponents.shape
@@ -339,7 +339,7 @@ def _longest_axis(rays, ray, half):
     return axis
 
 
-@njit(nogil=True, **UNCOUNTED)
+@njit(cache=True, error_model="numpy", nogil=True, **UNCOUNTED)
 def _on_part(form, line, low, high):
     """Bounds of a ``form`` where its parameters lie between ``low`` and ``high`` [d] in [-1, 1]."""
     n = form.shape[0] - 3
@@ -365,7 +365,7 @@ def _on_part(form, line, low, high):
     return least - rest, most + rest
 
 
-@njit(nogil=True, **COUNTED)
+@njit(cache=True, error_model="numpy", nogil=True, **COUNTED)
 def _keep(out, counts, place, cells, found, shown, line, low, high):
     """Unite the bounds of a piece with those ``out`` [parts, 2, 3] of all parts that it meets.
 
@@ -407,7 +407,7 @@ def _keep(out, counts, place, cells, found, shown, line, low, high):
             return
 
 
-@njit(nogil=True, **COUNTED)
+@njit(cache=True, error_model="numpy", nogil=True, **COUNTED)
 def bound_ray(field, rays, ray, cells, deepest, most, goal, limits, shifts, room, counts, out):
     """Bounds of a ray by part of the box, pieces halved until they are good or as small as allowed (design.md, H8).
 
@@ -483,7 +483,7 @@ def bound_ray(field, rays, ray, cells, deepest, most, goal, limits, shifts, room
     return first, tried, kept
 
 
-@njit(nogil=True, **COUNTED)
+@njit(cache=True, error_model="numpy", nogil=True, **COUNTED)
 def bound_rays(field, rays, cells, deepest, most, goal, limits, shifts, room, counts, out, pieces):
     """`bound_ray` of all rays.
 

@@ -20,7 +20,7 @@ from ns_abstract.methods.nerf.hash_bounds.forms import (
 _ALONG = 0.25
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def line_form(coefficients, exponents, radius, middle, half, line, out):
     """The polynomial ``sum_a c_a p^a`` on the box ``middle + half q`` as a form of ``q`` (design.md, H1).
 
@@ -71,7 +71,7 @@ def line_form(coefficients, exponents, radius, middle, half, line, out):
     out[-1] = (rest + HASH_RAY_ROUNDING * size) * HASH_UP
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def harmonics(direction, line, out, work):
     """The 16 harmonics of ``(direction + 1) / 2`` as forms [16, n + 3] (``components_from_spherical_harmonics``).
 
@@ -123,7 +123,7 @@ def harmonics(direction, line, out, work):
     scale_add(r, 0.3731763325901154, nothing, 0.0, out[12])
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _negate(a, out):
     """``out = -a``; it may be ``a`` itself."""
     for s in range(a.shape[0] - 1):
@@ -131,7 +131,7 @@ def _negate(a, out):
     out[-1] = a[-1]
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def quotients(origin, direction, line, ratios, shifts, along, work):
     """Forms by which far points are followed, by axis j: ``d_i / d_j`` and ``o_i - o_j d_i / d_j`` (design.md, H2).
 
@@ -161,7 +161,7 @@ def quotients(origin, direction, line, ratios, shifts, along, work):
                 scale_add(product, -1.0, origin[i], 0.0, shifts[j, i])
 
 
-@njit(**COUNTED)
+@njit(cache=True, error_model="numpy", **COUNTED)
 def _hull_of_slopes(low, high, jacobian):
     """Slopes [2, 3, 3] of the contraction, least and largest over a box (design.md, H2)."""
     nearest, least_of_all = np.empty(3), 0.0
@@ -208,7 +208,7 @@ def _hull_of_slopes(low, high, jacobian):
                 jacobian[1, i, k] = max(jacobian[1, i, k], most)
 
 
-@njit(**COUNTED)
+@njit(cache=True, error_model="numpy", **COUNTED)
 def contracted(x):
     """[3] nerfstudio's contraction of a point [3] by the maximum norm."""
     m = max(abs(x[0]), abs(x[1]), abs(x[2]))
@@ -217,7 +217,7 @@ def contracted(x):
     return (2.0 - 1.0 / m) * (x / m)
 
 
-@njit(**COUNTED)
+@njit(cache=True, error_model="numpy", **COUNTED)
 def _at_kinks(x, low, high, out):
     """Contraction of the forms ``x`` [3, n + 3] over a box on which it has kinks: a mean-value form."""
     width = x.shape[1]
@@ -237,7 +237,7 @@ def _at_kinks(x, low, high, out):
         out[i, -1] = rest * HASH_UP
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _largest(x, axis, positive, room, line, difference):
     """Whether the coordinate ``axis`` surely is the largest of the forms ``x`` [3, n + 3] in size, by ``room``."""
     sign = 1.0 if positive else -1.0
@@ -252,7 +252,7 @@ def _largest(x, axis, positive, room, line, difference):
     return True
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def point(ray, distance, line, out, work):
     """Contracted point at ``distance`` as forms of ``(v + 2) / 4`` in [0, 1]^3 (design.md, H2).
 
@@ -307,7 +307,7 @@ def point(ray, distance, line, out, work):
     return inside
 
 
-@njit(**UNCOUNTED)
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
 def _outside(axis, positive, origin, ratios, shifts, along, x, line, out, work):
     """Contraction where the coordinate ``axis`` is the largest and above 1 in size (design.md, H2)."""
     m, inverse, square, factor, rest, scratch = work[0], work[1], work[2], work[3], work[4], work[5:7]
