@@ -112,6 +112,6 @@ def attack_first_rays(scene: NerfScene, pose_set: PoseBox, found: RayBounds) -> 
     shape = (height, width, 3)
     render, probe, twin = nerf_renderer(scene, shown, BINS)
     result = falsify(
-        lower.reshape(shape), upper.reshape(shape), pose_set.box, render, twin, probe=probe, poses=24, seed=1
+        lower.reshape(shape), upper.reshape(shape), pose_set.box, render, twin, probe=probe, poses=40, seed=1
     )
     return result.comparisons, result.violations

@@ -11,8 +11,8 @@ from benchmark_scripts import script
 
 TESTS = Path(__file__).resolve().parent
 FILES = sorted(path.name for path in TESTS.glob("test_*.py"))
-#: Of one whole session of a user each, or of the whole site, which is slow or nothing.
-WHOLE = {"test_browser.py", "test_site.py", "test_tutorial.py"}
+#: Of one whole session of a user each, which is slow or nothing.
+WHOLE = {"test_browser.py", "test_tutorial.py"}
 #: Sources whose planted faults show alone in what takes seconds: a certified loop, kernels that are compiled anew,
 #: skipped fragments in every mode, a whole search of a network.
 LONG = {

@@ -58,7 +58,6 @@ def test_start_page_notebooks_and_commands(site):
     assert "--tyro-write-completion" in commands
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(chromium() is None, reason="Chromium is not installed")
 def test_browser_shows_formulas(site, tmp_path):
     with Browser((site / "dev" / "design" / "index.html").as_uri(), tmp_path / "profile") as page:
