@@ -8,6 +8,7 @@ from ns_abstract.arithmetic.simd.lanes import LINE
 from ns_abstract.arithmetic.simd.products import ROWS
 from ns_abstract.methods.nerf.hash_bounds.edges import edges_of
 from ns_abstract.methods.nerf.hash_bounds.features import feature_room
+from ns_abstract.methods.nerf.hash_bounds.forms import form_width
 from ns_abstract.methods.nerf.hash_bounds.light import light_of
 from ns_abstract.methods.nerf.hash_bounds.network import (
     HeadWeights,
@@ -17,7 +18,7 @@ from ns_abstract.methods.nerf.hash_bounds.network import (
     net_weights,
     zonotope,
 )
-from ns_abstract.methods.nerf.hash_bounds.pieces import DensityArrays, FieldArrays, PieceRoom, form_width
+from ns_abstract.methods.nerf.hash_bounds.pieces import DensityArrays, FieldArrays, PieceRoom
 from ns_abstract.methods.nerf.hash_field import LAYERS_LIMIT, DenseNet, HashEncoding, NerfactoField
 
 #: Harmonics of a direction.

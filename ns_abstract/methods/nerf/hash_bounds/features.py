@@ -12,10 +12,8 @@ from ns_abstract.arithmetic.rounding import CELL_ROUNDING, HASH_UP, TRILINEAR_RO
 from ns_abstract.methods.nerf.hash_bounds.forms import UNCOUNTED, spread_of
 from ns_abstract.methods.nerf.nerfacto_kernel import hash_row
 
-#: Most nodes of a level whose slopes are looked at, and of which the hull of values is taken.
-FORM_NODES, HULL_NODES = 216, 4096
-#: Most nodes by axis of those whose slopes are looked at.
-_MOST_NODES = 6
+#: Most nodes by axis of a level whose slopes are looked at, and in all of those of which the hull of values is taken.
+FORM_NODES, HULL_NODES = 6, 4096
 
 
 class FeatureRoom(NamedTuple):
@@ -40,7 +38,7 @@ class FeatureRoom(NamedTuple):
 
 def feature_room(features: int) -> FeatureRoom:
     """Room for levels of so many ``features``."""
-    box = (_MOST_NODES,) * 3
+    box = (FORM_NODES,) * 3
     return FeatureRoom(
         np.zeros((2, 3), np.int64), np.zeros((4, 3)), np.zeros((*box, features)), np.zeros((2, *box)), np.zeros((2, 3)),
         np.zeros((2, features)),
@@ -166,7 +164,7 @@ def level_features(table, resolution, point, ranges, out, room):
         place[a], low[a], high[a] = q - begin, below - begin, above - begin
         # beyond any number of nodes that is looked at
         nodes = min(nodes * min(counts[a], 1 << 16), 1 << 30)
-    if nodes > FORM_NODES or max(counts[0], counts[1], counts[2]) > _MOST_NODES:
+    if max(counts[0], counts[1], counts[2]) > FORM_NODES:
         least, most = room.hull[0], room.hull[1]
         if nodes <= HULL_NODES:
             _hull(table, first, counts, least, most)

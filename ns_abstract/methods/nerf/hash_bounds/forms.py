@@ -52,6 +52,11 @@ class BandTuning:
 _FLAT, _MARGIN = BandTuning.flat, BandTuning.margin
 
 
+def form_width(dimensions: int) -> int:
+    """Pose symbols of sets with so many parameters."""
+    return 2 if dimensions == 1 else dimensions
+
+
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def exp_below(x):
     """A lower bound of ``exp(x)``; ``x`` is not NaN."""

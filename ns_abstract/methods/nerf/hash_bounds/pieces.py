@@ -495,8 +495,3 @@ def bound_rays(field, rays, cells, deepest, most, goal, limits, shifts, room, co
     """
     for k in range(cells.shape[0]):
         pieces[k] = bound_ray(field, rays, k, cells[k], deepest, most, goal[k], limits, shifts, room, counts, out[k])
-
-
-def form_width(dimensions: int) -> int:
-    """Pose symbols of sets with so many parameters."""
-    return 2 if dimensions == 1 else dimensions

@@ -292,7 +292,7 @@ def point(ray, distance, line, out, work):
                 out[i, s] = x[i, s]
         nearest = 1.0
     elif axis >= 0:
-        _outside(axis, low[axis] > 0.0, origin, ratios, shifts, along, x, line, out, work[3:11])
+        _outside(axis, low[axis] > 0.0, origin, ratios, shifts, along, x, line, out, work[3:])
     else:
         _at_kinks(x, low, high, out)
         nearest = 1.0
