@@ -93,4 +93,20 @@ PROCESSES = (
         "test_api.py::test_pictures_are_not_rounded_and_need_no_sums_of_bounds",
         compiled=True,
     ),
+    Fault(
+        "kernels: those of a level are taken on a processor that lacks it",
+        "arithmetic/shipped_kernels.py",
+        "shipped_folder",
+        "folder.is_dir() and runs(level)",
+        "folder.is_dir()",
+        "test_shipped_kernels.py::test_highest_level_that_the_processor_has",
+    ),
+    Fault(
+        "kernels: those of other sources are taken",
+        "arithmetic/shipped_kernels.py",
+        "shipped_folder",
+        "package / SHIPPED / level / key[:32]",
+        "next((package / SHIPPED / level).iterdir())",
+        "test_shipped_kernels.py::test_highest_level_that_the_processor_has",
+    ),
 )

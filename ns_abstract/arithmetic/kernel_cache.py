@@ -13,7 +13,7 @@ may use, and what is read back is what was written:
 ROOT is ``$NS_ABSTRACT_CACHE_DIR``, or ``kernels`` in the cache folder that the platform provides. Where that cannot be
 written, a temporary folder serves the process and those that it starts. The installation itself is never written to.
 numba is told by its setting ``CACHE_LOCATOR_CLASSES``. Kept are kernels that Python calls; they hold what they call
-(`kernel_linking`).
+(`kernel_linking`). An installation may bring kernels along (`shipped_kernels`), which are taken where none are kept.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ import platformdirs
 from numba.core.caching import FunctionCache
 
 from ns_abstract.arithmetic import kernel_linking
+from ns_abstract.arithmetic.shipped_kernels import adopt, shipped_folder
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
 
@@ -92,6 +93,7 @@ class KernelStore:
     def __init__(self, root: Path, key: str, session: Path | None = None) -> None:
         self._folder = root / key[:32]
         self._sources = [self._folder]
+        self._shipped: Path | None = None
         self._blobs = self._folder / "blobs"
         self._blobs.mkdir(parents=True, exist_ok=True)
         owner = f"session-{socket.gethostname()}-{os.getpid()}-"
@@ -116,19 +118,26 @@ class KernelStore:
         """Whether nothing was kept when this process began."""
         return not self._entries
 
-    def also_from(self, folder: Path) -> None:
-        """Take what is missing from a version's folder that cannot be written."""
+    def also_from(self, folder: Path, shipped: bool = False) -> None:
+        """Take what is missing from a version's folder that is not written to, or that was ``shipped`` for a level."""
         self._sources.append(folder)
+        if shipped:
+            self._shipped = folder
         self._entries = _read_manifest(folder) | self._entries
 
-    def fetch(self, place: str) -> str:
-        """The session's folder of one module, with what is kept of its functions; damaged files are left out."""
+    def fetch(self, place: str, stamp: str) -> str:
+        """The session's folder of one module, with what is kept of its functions; damaged files are left out.
+
+        Args:
+            place: Names the module.
+            stamp: Of the sources that its kernels belong to.
+        """
         folder = self.session / place
         if not folder.exists():
             with _locked(self.session / "lock"):
                 if not folder.exists():
                     folder.mkdir(parents=True)
-                    self._link(place)
+                    self._link(place, stamp)
         return str(folder)
 
     @contextmanager
@@ -171,7 +180,7 @@ class KernelStore:
         with self._claims.pop(kernel, ExitStack()), _locked(self.session / "lock"):
             save()
 
-    def _link(self, place: str) -> None:
+    def _link(self, place: str, stamp: str) -> None:
         """Bring what is kept of a module's functions into the session's folder."""
         folder = self.session / place
         for name, wanted in self._entries.items():
@@ -186,7 +195,9 @@ class KernelStore:
                     os.link(blob, path)
                 except OSError:
                     shutil.copyfile(blob, path)
-                self._published[path] = _stamp(path)
+            if any(blob.parent.parent == self._shipped for blob in blobs.values()):
+                adopt(folder, name.rpartition("/")[2], stamp)
+            self._published |= {folder / file: _stamp(folder / file) for file in blobs}
 
     def _blob(self, digest: str) -> Path | None:
         for source in self._sources:
@@ -194,7 +205,8 @@ class KernelStore:
             with suppress(OSError):
                 if hashlib.sha256(path.read_bytes()).hexdigest() == digest:
                     return path
-                path.unlink()
+                if source == self._folder:
+                    path.unlink()
         return None
 
     def publish(self) -> None:
@@ -371,6 +383,8 @@ def store() -> KernelStore:
         InputError: No folder can be written, not even a temporary one.
     """
     opened_store = _open()
+    if (shipped := shipped_folder(PACKAGE, source_key())) is not None:
+        opened_store.also_from(shipped, shipped=True)
     process = os.getpid()
     Finalize(None, lambda: os.getpid() == process and opened_store.close(), exitpriority=-80)
     if opened_store.empty:
@@ -386,7 +400,7 @@ class KernelLocator:
         self._stamp = source_key()
         if PACKAGE / OUTER in path.parents:
             self._stamp += hashlib.sha256(path.read_bytes()).hexdigest()
-        self._path = store().fetch(path.relative_to(PACKAGE).with_suffix("").as_posix())
+        self._path = store().fetch(path.relative_to(PACKAGE).with_suffix("").as_posix(), self._stamp)
 
     @classmethod
     def from_function(cls, py_func: Any, py_file: str) -> KernelLocator | None:
