@@ -36,17 +36,11 @@ def depth_order(visible, depth):
     """Indices ``visible`` sorted by ``depth[visible]``, equal depths by index."""
     keys = depth[visible]
     order = np.argsort(keys)
-    return _sort_ties(visible[order], keys[order])
-
-
-@njit(cache=True, error_model="numpy")
-def _sort_ties(order, keys):
-    start = 0
-    for k in range(1, order.size + 1):
-        if k == order.size or keys[k] != keys[start]:
-            if k - start > 1:
-                order[start:k] = np.sort(order[start:k])
-            start = k
+    keys, order = keys[order], visible[order]
+    same = keys[1:] == keys[:-1]
+    if same.any():
+        tied = np.append(same, False) | np.append(False, same)
+        order[tied] = order[tied][np.lexsort((order[tied], keys[tied]))]
     return order
 
 
@@ -126,13 +120,9 @@ def visible_again(marks, numbers, box, tiles, side):
     return numbers_marked, pixels
 
 
-@njit(cache=True, error_model="numpy")
 def longest_first(wanted, offsets):
     """Positions in ``wanted`` (tile numbers), those with the longest lists first: threads end together."""
-    lengths = np.empty(wanted.size, np.int64)
-    for k in range(wanted.size):
-        lengths[k] = offsets[wanted[k]] - offsets[wanted[k] + 1]
-    return np.argsort(lengths, kind="mergesort")
+    return np.argsort(offsets[wanted] - offsets[wanted + 1], kind="stable")
 
 
 @njit(cache=True, error_model="numpy")
