@@ -73,7 +73,7 @@ class Render(GivenSet):
         Raises:
             InputError: Options do not go together.
         """
-        return _files(self, seed=self.seed, outputs=self.outputs)
+        return _files(self, downscale_factor=self.downscale_factor, seed=self.seed, outputs=self.outputs)
 
 
 @dataclass
@@ -132,20 +132,7 @@ class Certify(GivenSet):
         """
         from ns_abstract.api.certification import CertifySettings
 
-        return CertifySettings(
-            self.load_config,
-            self.camera_path_filename,
-            self.model,
-            self.property,
-            self.perturbation_filename,
-            arithmetic=self.arithmetic,
-            network_arithmetic=self.network_arithmetic,
-            picture=self.picture,
-            workers=self.where.ray_processes,
-            given_set=given_set(self),
-            program=self.program,
-            overrides=self.overrides,
-        )
+        return CertifySettings(_files(self), self.model, self.property, self.network_arithmetic, self.picture)
 
 
 @dataclass
@@ -204,7 +191,7 @@ class Compare(GivenSet):
         Raises:
             InputError: Options do not go together.
         """
-        return _files(self, seed=self.seed)
+        return _files(self, downscale_factor=self.downscale_factor, seed=self.seed)
 
     @property
     def other_source(self) -> SceneSource:
@@ -298,10 +285,12 @@ class Locate(GivenSet):
         )
         # the photos of a sequence are read one by one
         image = self.image or Path()
-        return LocateSettings(_files(self), image, self.mask, photo, self.calibrate)
+        return LocateSettings(
+            _files(self, downscale_factor=self.downscale_factor), image, self.mask, photo, self.calibrate
+        )
 
 
-def _files(options: Render | Compare | Locate, **more: Any) -> Settings:
+def _files(options: Render | Certify | Compare | Locate, **more: Any) -> Settings:
     """The files of a command, and what is bounded of them.
 
     Raises:
@@ -313,7 +302,6 @@ def _files(options: Render | Compare | Locate, **more: Any) -> Settings:
         options.load_config,
         options.camera_path_filename,
         options.perturbation_filename,
-        downscale_factor=options.downscale_factor,
         arithmetic=options.arithmetic,
         memory_limit=options.memory_limit,
         workers=options.where.ray_processes,

@@ -17,4 +17,4 @@ def range_of(x: Interval | Enclosure) -> Interval:
 
 def constant_like(like: Face, values: Interval) -> Face:
     """Return constants that enclose ``values``, in the arithmetic and basis of ``like``."""
-    return values if isinstance(like, Interval) else type(like).of(like.basis, values)
+    return type(like).lift(values) if isinstance(like, Interval) else type(like).of(like.basis, values)
