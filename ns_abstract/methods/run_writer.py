@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
 import struct
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from string import Template
 from typing import Any, Protocol
@@ -118,7 +119,68 @@ def background_name(colour: NDArray[np.float32]) -> str:
     return json.dumps([float(c) for c in colour])
 
 
-def lpips_state(prefix: str) -> dict[str, Any]:
+def optimizer_lines(kind: str, eps: str, groups: Mapping[str, tuple[str, tuple[str, str, int] | None]]) -> str:
+    """What config.yml says of the optimizers, from "optimizers:" to the line before "output_dir:".
+
+    Args:
+        kind: "Adam" or "RAdam".
+        eps: Of all of them.
+        groups: Learning rate of each group of parameters, and of its schedule the last rate, the first one and the
+            steps of warming up; numbers as YAML spells them.
+    """
+    lines = ["optimizers:"]
+    target = f"&id001 !!python/name:torch.optim.{kind.lower()}.{kind} ''"
+    schedule = "&id002 !!python/name:nerfstudio.engine.schedulers.ExponentialDecayScheduler ''"
+    for name, (rate, decay) in groups.items():
+        lines.append(f"""\
+  {name}:
+    optimizer: !!python/object:nerfstudio.engine.optimizers.{kind}OptimizerConfig
+      _target: {target}
+      eps: {eps}
+      lr: {rate}
+      max_norm: null
+      weight_decay: 0""")
+        target = "*id001"
+        if decay is None:
+            lines.append("    scheduler: null")
+            continue
+        last, first, warm_up = decay
+        lines.append(f"""\
+    scheduler: !!python/object:nerfstudio.engine.schedulers.ExponentialDecaySchedulerConfig
+      _target: {schedule}
+      lr_final: {last}
+      lr_pre_warmup: {first}
+      max_steps: 30000
+      ramp: cosine
+      warmup_steps: {warm_up}""")
+        schedule = "*id002"
+    return "\n".join(lines)
+
+
+def checkpoint_bytes(
+    model: Mapping[str, ArrayLike], optimizers: Mapping[str, Any], schedulers: Mapping[str, Any]
+) -> bytes:
+    """A checkpoint of plain tensors, numbers, lists and dictionaries: loads with weights_only.
+
+    Args:
+        model: Arrays of the model by name; equal objects are stored once.
+        optimizers, schedulers: States by group of parameters.
+    """
+    import torch
+
+    tensors = {id(array): torch.tensor(array) for array in model.values()}
+    pipeline = {"_model.device_indicator_param": torch.empty(0, dtype=torch.float32)}
+    pipeline |= {f"_model.{key}": tensors[id(array)] for key, array in model.items()}
+    pipeline |= _lpips_state("_model.lpips.net.")
+    state = {
+        "step": STEP, "pipeline": pipeline, "optimizers": optimizers, "schedulers": schedulers, "scalers": {},
+    }  # fmt: skip
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    return buffer.getvalue()
+
+
+def _lpips_state(prefix: str) -> dict[str, Any]:
     """Zeros in place of the LPIPS metric's tensors, whose names begin with ``prefix``."""
     import torch
 
@@ -260,6 +322,15 @@ _DATAPARSER = """\
       scale_factor: 1.0
       scene_scale: 1.0
       train_split_fraction: 0.9"""
+#: What config.yml of a method with camera optimisation says of it: there is none.
+CAMERA_OPTIMIZER = """\
+    camera_optimizer: !!python/object:nerfstudio.cameras.camera_optimizers.CameraOptimizerConfig
+      _target: !!python/name:nerfstudio.cameras.camera_optimizers.CameraOptimizer ''
+      mode: 'off'
+      optimizer: null
+      rot_l2_penalty: 0.001
+      scheduler: null
+      trans_l2_penalty: 0.01"""
 _TAIL = Template(
     """\
 project_name: nerfstudio-project

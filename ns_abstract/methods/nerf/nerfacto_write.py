@@ -11,8 +11,14 @@ from numpy.typing import ArrayLike
 
 from ns_abstract.geometry.keyframe_cameras import KeyframeCamera
 from ns_abstract.methods.nerf.hash_field import DenseNet, HashEncoding, NerfactoScene
-from ns_abstract.methods.nerf.write import DATAMANAGER, STEPS, checkpoint_bytes
-from ns_abstract.methods.run_writer import background_name, write_run
+from ns_abstract.methods.nerf.write import DATAMANAGER, STEPS, field_states
+from ns_abstract.methods.run_writer import (
+    CAMERA_OPTIMIZER,
+    background_name,
+    checkpoint_bytes,
+    optimizer_lines,
+    write_run,
+)
 
 
 def write_nerfacto_run(
@@ -43,6 +49,8 @@ def write_nerfacto_run(
     ]
     behind = field.background
     config = _CONFIG.safe_substitute(
+        optimizers=_OPTIMIZERS,
+        camera_optimizer=CAMERA_OPTIMIZER,
         datamanager=DATAMANAGER,
         background=behind if isinstance(behind, str) else background_name(behind.astype(np.float32)),
         far=repr(float(field.far)),
@@ -58,8 +66,8 @@ def write_nerfacto_run(
     )
     return write_run(
         _Shown(scene), Path(folder), "nerfacto", timestamp, experiment_name, data=f"data-{experiment_name}",
-        checkpoint=checkpoint_bytes(_arrays(scene), ("fields", "proposal_networks")), config=config, steps=STEPS,
-        views=views, render=render,
+        checkpoint=checkpoint_bytes(_arrays(scene), field_states(("fields", "proposal_networks")), {}), config=config,
+        steps=STEPS, views=views, render=render,
     )  # fmt: skip
 
 
@@ -116,29 +124,14 @@ def _arrays(scene: NerfactoScene) -> dict[str, ArrayLike]:
     return found
 
 
+_OPTIMIZERS = optimizer_lines("Adam", "1.0e-15", {"fields": ("0.01", None), "proposal_networks": ("0.01", None)})
 # what config.yml of nerfacto says
 _CONFIG = Template(
     """\
 max_num_iterations: 30000
 method_name: nerfacto
 mixed_precision: false
-optimizers:
-  fields:
-    optimizer: !!python/object:nerfstudio.engine.optimizers.AdamOptimizerConfig
-      _target: &id001 !!python/name:torch.optim.adam.Adam ''
-      eps: 1.0e-15
-      lr: 0.01
-      max_norm: null
-      weight_decay: 0
-    scheduler: null
-  proposal_networks:
-    optimizer: !!python/object:nerfstudio.engine.optimizers.AdamOptimizerConfig
-      _target: *id001
-      eps: 1.0e-15
-      lr: 0.01
-      max_norm: null
-      weight_decay: 0
-    scheduler: null
+$optimizers
 output_dir: !!python/object/apply:pathlib.PosixPath []
 $datamanager
   model: !!python/object:nerfstudio.models.nerfacto.NerfactoModelConfig
@@ -147,13 +140,7 @@ $datamanager
     average_init_density: $density
     background_color: $background
     base_res: $base_res
-    camera_optimizer: !!python/object:nerfstudio.cameras.camera_optimizers.CameraOptimizerConfig
-      _target: !!python/name:nerfstudio.cameras.camera_optimizers.CameraOptimizer ''
-      mode: 'off'
-      optimizer: null
-      rot_l2_penalty: 0.001
-      scheduler: null
-      trans_l2_penalty: 0.01
+$camera_optimizer
     collider_params:
       far_plane: 6.0
       near_plane: 2.0

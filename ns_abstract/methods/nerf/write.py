@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from string import Template
+from typing import Any
 
 from numpy.typing import ArrayLike
 
 from ns_abstract.geometry.keyframe_cameras import KeyframeCamera
 from ns_abstract.methods.nerf.scene import FieldWeights, NerfScene
-from ns_abstract.methods.run_writer import STEP, background_name, lpips_state, write_run
+from ns_abstract.methods.run_writer import background_name, checkpoint_bytes, optimizer_lines, write_run
 
 
 def write_nerf_run(
@@ -35,6 +35,7 @@ def write_nerf_run(
         InputError: ``timestamp`` or ``experiment_name`` is not a plain folder name.
     """
     config = _CONFIG.safe_substitute(
+        optimizers=_OPTIMIZERS,
         datamanager=DATAMANAGER,
         background=background_name(scene.background),
         far=repr(float(scene.far)),
@@ -44,8 +45,8 @@ def write_nerf_run(
     # a data set of its own: a Splatfacto run may stand in the same folder
     return write_run(
         scene, Path(folder), "vanilla-nerf", timestamp, experiment_name, data=f"data-{experiment_name}",
-        checkpoint=checkpoint_bytes(_pipeline(scene), ("fields",)), config=config, steps=STEPS, views=views,
-        render=render,
+        checkpoint=checkpoint_bytes(_pipeline(scene), field_states(("fields",)), {}), config=config, steps=STEPS,
+        views=views, render=render,
     )  # fmt: skip
 
 
@@ -58,30 +59,10 @@ def _pipeline(scene: NerfScene) -> dict[str, ArrayLike]:
     }
 
 
-def checkpoint_bytes(model: Mapping[str, ArrayLike], optimizers: Sequence[str]) -> bytes:
-    """A checkpoint of plain tensors, numbers, lists and dictionaries: loads with weights_only.
-
-    Args:
-        model: Arrays of the model by name; equal objects are stored once.
-        optimizers: Names of the groups of parameters.
-    """
-    import torch
-
-    tensors = {id(array): torch.tensor(array) for array in model.values()}
-    pipeline = {"_model.device_indicator_param": torch.empty(0, dtype=torch.float32)}
-    pipeline |= {f"_model.{key}": tensors[id(array)] for key, array in model.items()}
-    pipeline |= lpips_state("_model.lpips.net.")
+def field_states(names: Sequence[str]) -> dict[str, Any]:
+    """States of optimizers that have done nothing, of groups of parameters with these names."""
     group = {"lr": 0.0005, "betas": (0.9, 0.999), "eps": 1e-8, "weight_decay": 0, "params": []}
-    state = {
-        "step": STEP,
-        "pipeline": pipeline,
-        "optimizers": {name: {"state": {}, "param_groups": [group]} for name in optimizers},
-        "schedulers": {},
-        "scalers": {},
-    }
-    buffer = io.BytesIO()
-    torch.save(state, buffer)
-    return buffer.getvalue()
+    return {name: {"state": {}, "param_groups": [group]} for name in names}
 
 
 def _named(weights: FieldWeights) -> dict[str, ArrayLike]:
@@ -124,29 +105,14 @@ $dataparser
     train_num_images_to_sample_from: -1
     train_num_rays_per_batch: 1024
     train_num_times_to_repeat_images: -1"""
+_OPTIMIZERS = optimizer_lines("RAdam", "1.0e-08", {"fields": ("0.0005", None), "temporal_distortion": ("0.0005", None)})
 # what config.yml of vanilla-nerf says
 _CONFIG = Template(
     """\
 max_num_iterations: 1000000
 method_name: vanilla-nerf
 mixed_precision: false
-optimizers:
-  fields:
-    optimizer: !!python/object:nerfstudio.engine.optimizers.RAdamOptimizerConfig
-      _target: &id001 !!python/name:torch.optim.radam.RAdam ''
-      eps: 1.0e-08
-      lr: 0.0005
-      max_norm: null
-      weight_decay: 0
-    scheduler: null
-  temporal_distortion:
-    optimizer: !!python/object:nerfstudio.engine.optimizers.RAdamOptimizerConfig
-      _target: *id001
-      eps: 1.0e-08
-      lr: 0.0005
-      max_norm: null
-      weight_decay: 0
-    scheduler: null
+$optimizers
 output_dir: !!python/object/apply:pathlib.PosixPath []
 $datamanager
   model: !!python/object:nerfstudio.models.vanilla_nerf.VanillaModelConfig

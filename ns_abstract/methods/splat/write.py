@@ -7,7 +7,6 @@ commands in the folder given to ``write_splatfacto_run``. The whole folder can b
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from string import Template
@@ -17,7 +16,13 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ns_abstract.geometry.keyframe_cameras import KeyframeCamera
-from ns_abstract.methods.run_writer import STEP, background_name, lpips_state, write_run
+from ns_abstract.methods.run_writer import (
+    CAMERA_OPTIMIZER,
+    background_name,
+    checkpoint_bytes,
+    optimizer_lines,
+    write_run,
+)
 from ns_abstract.methods.splat.scene import SplatScene
 
 _REST_BANDS = 15  # features_rest of SH degree 3
@@ -64,6 +69,8 @@ def write_splatfacto_run(
         InputError: ``timestamp`` or ``experiment_name`` is not a plain folder name.
     """
     config = _CONFIG.safe_substitute(
+        optimizers=_OPTIMIZERS,
+        camera_optimizer=CAMERA_OPTIMIZER,
         count=scene.count,
         background=background_name(scene.background),
         mode=scene.rasterize_mode,
@@ -76,9 +83,6 @@ def write_splatfacto_run(
 
 
 def _checkpoint_bytes(scene: SplatScene) -> bytes:
-    """A checkpoint of plain tensors, numbers, lists and dictionaries: loads with weights_only."""
-    import torch
-
     n = scene.count
     rest = np.zeros((n, _REST_BANDS if scene.color_model == "sh" else 0, 3), np.float32)
     rest[:, : scene.sh.shape[1] - 1] = scene.sh[:, 1:]
@@ -90,22 +94,11 @@ def _checkpoint_bytes(scene: SplatScene) -> bytes:
         "quats": scene.quats,
         "scales": scene.log_scales,
     }
-
-    pipeline: dict[str, torch.Tensor] = {"_model.device_indicator_param": torch.empty(0, dtype=torch.float32)}
-    for name, value in gaussians.items():
-        pipeline[f"_model.gauss_params.{name}"] = torch.from_numpy(np.array(value, np.float32))
-    pipeline |= lpips_state("_model.lpips.net.")
-
-    state = {
-        "step": STEP,
-        "pipeline": pipeline,
-        "optimizers": {name: _adam_state(name, rate) for name, rate in _LEARNING_RATES.items()},
-        "schedulers": {"means": _scheduler_state(_LEARNING_RATES["means"])},
-        "scalers": {},
-    }
-    buffer = io.BytesIO()
-    torch.save(state, buffer)
-    return buffer.getvalue()
+    return checkpoint_bytes(
+        {f"gauss_params.{name}": np.array(value, np.float32) for name, value in gaussians.items()},
+        {name: _adam_state(name, rate) for name, rate in _LEARNING_RATES.items()},
+        {"means": _scheduler_state(_LEARNING_RATES["means"])},
+    )
 
 
 def _adam_state(name: str, rate: float) -> dict[str, Any]:
@@ -140,95 +133,27 @@ def _scheduler_state(rate: float) -> dict[str, Any]:
     }
 
 
+_OPTIMIZERS = optimizer_lines(
+    "Adam",
+    "1.0e-15",
+    {
+        "bilateral_grid": ("0.002", ("0.0001", "0", 1000)),
+        "camera_opt": ("0.0001", ("5.0e-07", "0", 1000)),
+        "features_dc": ("0.0025", None),
+        "features_rest": ("0.000125", None),
+        "means": ("0.00016", ("1.6e-06", "1.0e-08", 0)),
+        "opacities": ("0.05", None),
+        "quats": ("0.001", None),
+        "scales": ("0.005", None),
+    },
+)
 # what config.yml of Splatfacto says; $dataparser is for the writer
 _CONFIG = Template(
     """\
 max_num_iterations: 30000
 method_name: splatfacto
 mixed_precision: false
-optimizers:
-  bilateral_grid:
-    optimizer: !!python/object:nerfstudio.engine.optimizers.AdamOptimizerConfig
-      _target: &id001 !!python/name:torch.optim.adam.Adam ''
-      eps: 1.0e-15
-      lr: 0.002
-      max_norm: null
-      weight_decay: 0
-    scheduler: !!python/object:nerfstudio.engine.schedulers.ExponentialDecaySchedulerConfig
-      _target: &id002 !!python/name:nerfstudio.engine.schedulers.ExponentialDecayScheduler ''
-      lr_final: 0.0001
-      lr_pre_warmup: 0
-      max_steps: 30000
-      ramp: cosine
-      warmup_steps: 1000
-  camera_opt:
-    optimizer: !!python/object:nerfstudio.engine.optimizers.AdamOptimizerConfig
-      _target: *id001
-      eps: 1.0e-15
-      lr: 0.0001
-      max_norm: null
-      weight_decay: 0
-    scheduler: !!python/object:nerfstudio.engine.schedulers.ExponentialDecaySchedulerConfig
-      _target: *id002
-      lr_final: 5.0e-07
-      lr_pre_warmup: 0
-      max_steps: 30000
-      ramp: cosine
-      warmup_steps: 1000
-  features_dc:
-    optimizer: !!python/object:nerfstudio.engine.optimizers.AdamOptimizerConfig
-      _target: *id001
-      eps: 1.0e-15
-      lr: 0.0025
-      max_norm: null
-      weight_decay: 0
-    scheduler: null
-  features_rest:
-    optimizer: !!python/object:nerfstudio.engine.optimizers.AdamOptimizerConfig
-      _target: *id001
-      eps: 1.0e-15
-      lr: 0.000125
-      max_norm: null
-      weight_decay: 0
-    scheduler: null
-  means:
-    optimizer: !!python/object:nerfstudio.engine.optimizers.AdamOptimizerConfig
-      _target: *id001
-      eps: 1.0e-15
-      lr: 0.00016
-      max_norm: null
-      weight_decay: 0
-    scheduler: !!python/object:nerfstudio.engine.schedulers.ExponentialDecaySchedulerConfig
-      _target: *id002
-      lr_final: 1.6e-06
-      lr_pre_warmup: 1.0e-08
-      max_steps: 30000
-      ramp: cosine
-      warmup_steps: 0
-  opacities:
-    optimizer: !!python/object:nerfstudio.engine.optimizers.AdamOptimizerConfig
-      _target: *id001
-      eps: 1.0e-15
-      lr: 0.05
-      max_norm: null
-      weight_decay: 0
-    scheduler: null
-  quats:
-    optimizer: !!python/object:nerfstudio.engine.optimizers.AdamOptimizerConfig
-      _target: *id001
-      eps: 1.0e-15
-      lr: 0.001
-      max_norm: null
-      weight_decay: 0
-    scheduler: null
-  scales:
-    optimizer: !!python/object:nerfstudio.engine.optimizers.AdamOptimizerConfig
-      _target: *id001
-      eps: 1.0e-15
-      lr: 0.005
-      max_norm: null
-      weight_decay: 0
-    scheduler: null
+$optimizers
 output_dir: !!python/object/apply:pathlib.PosixPath []
 pipeline: !!python/object:nerfstudio.pipelines.base_pipeline.VanillaPipelineConfig
   _target: !!python/name:nerfstudio.pipelines.base_pipeline.VanillaPipeline ''
@@ -252,13 +177,7 @@ $dataparser
   model: !!python/object:nerfstudio.models.splatfacto.SplatfactoModelConfig
     _target: !!python/name:nerfstudio.models.splatfacto.SplatfactoModel ''
     background_color: $background
-    camera_optimizer: !!python/object:nerfstudio.cameras.camera_optimizers.CameraOptimizerConfig
-      _target: !!python/name:nerfstudio.cameras.camera_optimizers.CameraOptimizer ''
-      mode: 'off'
-      optimizer: null
-      rot_l2_penalty: 0.001
-      scheduler: null
-      trans_l2_penalty: 0.01
+$camera_optimizer
     collider_params:
       far_plane: 6.0
       near_plane: 2.0
