@@ -131,24 +131,24 @@ class Picture(Claims):
         bounds, middle = self.bounds(claim), 0.5 * (low + high)
         half, none = np.maximum(high - middle, middle - low), np.zeros(len(low))
         nothing = Affine(none, np.zeros((low.shape[1], len(low))), none + np.inf)
-        kept = motion = None
+        counted = motion = None
         if (worst := bounds.excess(middle, half, nothing)[0]).max() > 0.0:
-            form, kept, motion = self._forms(claim, low, high, near, unit)
+            form, counted, motion = self._forms(claim, low, high, near, unit)
             worst, sure = bounds.excess(middle, half, form)
-            return ClaimMargins(-worst.max(axis=0), -sure.max(axis=0), kept, motion)
+            return ClaimMargins(-worst.max(axis=0), -sure.max(axis=0), counted, motion)
         # the bounds [0, 1] or wider hold whatever is drawn
         return ClaimMargins(-worst.max(axis=0), none + 1.0)
 
     def _forms(self, claim: PixelClaim, low: Array, high: Array, near: Array, unit: float) -> Any:
         view = self.poses.view(low, high)
         pixel = np.full(len(low), claim.row), np.full(len(low), claim.column)
-        kept = motion = None
+        counted = motion = None
         if isinstance(self.scene, ActivatedScene):
             at = np.broadcast_to(near, (len(low), len(near)))
-            form, kept, motion = pixels(self.scene, self.poses.camera, view, at, pixel, unit)
+            form, counted, motion = pixels(self.scene, self.poses.camera, view, at, pixel, unit)
         else:
             form = self.scene.pixels(self.poses.camera, view, pixel)
-        return form.of(lambda a: a[..., claim.channel]), kept, motion
+        return form.of(lambda a: a[..., claim.channel]), counted, motion
 
     def detail(self, claim: PixelClaim, point: Array) -> dict[str, Any]:
         """The pose, the picture's value, its error, and by how much which bound is left."""

@@ -235,8 +235,8 @@ def _fragments(
         maybe, certain = _tiles(cam, pixel, (mx, my), squares, unit)
         shows, surely = shows & maybe, surely & certain & ~wild
     elif unit:
-        kept, level = _kept(p, rules.ellipses)
-        surely = surely & kept & (least >= LEAST_ALPHA * level)
+        ellipse_kept, level = _kept(p, rules.ellipses)
+        surely = surely & ellipse_kept & (least >= LEAST_ALPHA * level)
     alow, ahigh = alpha.range()
     # the form must say no less than the interval, and stay below the cap
     rough = ~((ahigh - alow) <= 1.5 * (most - least)) | ~(ahigh <= rules.cap) | ~(alow >= 0.0) | ~surely
@@ -315,9 +315,9 @@ def _kept(p: ProjectedForms, ellipses: bool) -> tuple[Array, Array]:
     kept, room = (p.kappa < 0.03) & (span < 4000.0), 2.0**10
     if ellipses:
         thin, room = 1.0 / (p.inverse.range()[1] * a * c), 2.0**19
-        kept &= (p.kappa < 2.0**-10) & (thin * thin > 2.0**10 * FLOAT)
-        kept &= thin * np.sqrt(BLUR) > 2.0**10 * FLOAT * span
-        kept &= span * np.sqrt(np.maximum(a, c) / BLUR) < 2.0**-6 / FLOAT
+        sharp = (p.kappa < 2.0**-10) & (thin * thin > 2.0**10 * FLOAT)
+        short = thin * np.sqrt(BLUR) > 2.0**10 * FLOAT * span
+        kept = kept & sharp & short & (span * np.sqrt(np.maximum(a, c) / BLUR) < 2.0**-6 / FLOAT)
     return kept, 1.0 + 16.0 * p.kappa + room * FLOAT
 
 
@@ -403,12 +403,12 @@ def pixels(
             [alpha, view.color, view.depth, shows], np.arange(len(index))[:, None], used[None]
         )
         form, keep = blended(alpha, color, depth, some, splats.background, unit)
-        kept, seen = np.zeros(shows.shape, bool), shows.any(axis=1)[:, None]
-        kept[:, used] = keep
+        counted, seen = np.zeros(shows.shape, bool), shows.any(axis=1)[:, None]
+        counted[:, used] = keep
         # where nothing shows the background is drawn, exactly
         c, r = np.where(seen, form.c, splats.background), np.where(seen, form.r, 0.0)
         form = Affine(c, np.where(seen, form.g, 0.0), r)
-        return form, kept[:, :count], motion
+        return form, counted[:, :count], motion
 
 
 def pictures(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit: float) -> Affine:
@@ -433,8 +433,8 @@ def several(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, numbe
     for start in range(0, len(lists), step):
         chosen = lists[start : start + step]
         index = np.full((len(chosen), longest), -1)
-        for place, found in zip(index, chosen, strict=True):
-            place[: len(found)] = np.searchsorted(every, found)
+        for place, gaussians in zip(index, chosen, strict=True):
+            place[: len(gaussians)] = np.searchsorted(every, gaussians)
         box, place = np.divmod(np.arange(start, start + len(chosen)), size)
         part = picked(whole, box[:, None], index)
         parts.append(pixels(splats, cam, part, index, np.divmod(numbers[place], cam.width), unit)[0].clamped(0.0, 1.0))

@@ -65,10 +65,12 @@ def locate_photos(options: Locate, stop: SignalStop) -> None:
 
 def _tell(console: Any, location: Location) -> None:
     """Print what is looked for."""
-    method, photo, found = location.job.method, location.photo, location.calibration
-    if found is not None:
-        text = f"calibrated on {found.photos} training photos ({found.psnr:.1f} dB): noise {found.noise:.4f}, outliers"
-        console.print(f"{text} {found.outliers:g}", markup=False, soft_wrap=True)
+    method, photo, calibration = location.job.method, location.photo, location.calibration
+    if calibration is not None:
+        text = f"calibrated on {calibration.photos} training photos ({calibration.psnr:.1f} dB): noise"
+        console.print(
+            f"{text} {calibration.noise:.4f}, outliers {calibration.outliers:g}", markup=False, soft_wrap=True
+        )
     console.print(
         f"{method.name}: {method.content}; {photo.allowed} of {int(photo.counted.sum())} pixels may show anything",
         markup=False,

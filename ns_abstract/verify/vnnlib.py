@@ -263,7 +263,7 @@ def _declares(expression: Any, declared: set[str]) -> bool:
 def _expressions(text: str, runs: bool = False) -> list[Any]:
     """Nested lists of tokens; ``runs``: and of `_Run` inside of conjunctions."""
     stack: list[list[Any]] = [[]]
-    known: dict[str, tuple[int, int, float]] = {}
+    places: dict[str, tuple[int, int, float]] = {}
     at, number = 0, 0
     while at < len(text):
         if number % _ASKED == 0:
@@ -272,7 +272,7 @@ def _expressions(text: str, runs: bool = False) -> list[Any]:
         run = _RUN.match(text, at) if runs and stack[-1][:1] == ["and"] else None
         if run:
             check_cancelled()
-            stack[-1].append(_Run([part.strip() for part in run[0].split(")")[:-1]], known))
+            stack[-1].append(_Run([part.strip() for part in run[0].split(")")[:-1]], places))
             at = run.end()
             continue
         match = _TOKEN.match(text, at)

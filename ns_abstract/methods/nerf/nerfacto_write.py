@@ -100,28 +100,28 @@ def _grid(encoding: HashEncoding) -> dict[str, int]:
 def _arrays(scene: NerfactoScene) -> dict[str, ArrayLike]:
     """The arrays of the fields under Nerfstudio's names, float32."""
     field = scene.field
-    found: dict[str, ArrayLike] = {"field.aabb": np.array([[-1.0] * 3, [1.0] * 3], np.float32)}
+    arrays: dict[str, ArrayLike] = {"field.aabb": np.array([[-1.0] * 3, [1.0] * 3], np.float32)}
 
     def net(name: str, layers: DenseNet) -> None:
         for k, (weight, bias) in enumerate(zip(layers.weights, layers.biases, strict=True)):
-            found[f"{name}.layers.{k}.weight"] = weight.astype(np.float32)
-            found[f"{name}.layers.{k}.bias"] = bias.astype(np.float32)
+            arrays[f"{name}.layers.{k}.weight"] = weight.astype(np.float32)
+            arrays[f"{name}.layers.{k}.bias"] = bias.astype(np.float32)
 
     def grid(name: str, encoding: HashEncoding) -> np.ndarray:
         sizes = _grid(encoding)
         for key in ("max_res", "num_levels", "log2_hashmap_size"):
-            found[f"{name}.{key}"] = np.array(sizes[key])
+            arrays[f"{name}.{key}"] = np.array(sizes[key])
         return encoding.table.reshape(-1, encoding.table.shape[2]).astype(np.float32)
 
-    found["field.mlp_base.model.0.hash_table"] = grid("field", field.encoding)
+    arrays["field.mlp_base.model.0.hash_table"] = grid("field", field.encoding)
     net("field.mlp_base.model.1", field.density_net)
     net("field.mlp_head", field.color_net)
     for k, one in enumerate(field.proposals):
         name = f"proposal_networks.{k}"
-        found[f"{name}.aabb"] = found["field.aabb"]
-        found[f"{name}.encoding.hash_table"] = found[f"{name}.mlp_base.0.hash_table"] = grid(name, one.encoding)
+        arrays[f"{name}.aabb"] = arrays["field.aabb"]
+        arrays[f"{name}.encoding.hash_table"] = arrays[f"{name}.mlp_base.0.hash_table"] = grid(name, one.encoding)
         net(f"{name}.mlp_base.1", one.net)
-    return found
+    return arrays
 
 
 _OPTIMIZERS = optimizer_lines("Adam", "1.0e-15", {"fields": ("0.01", None), "proposal_networks": ("0.01", None)})

@@ -106,11 +106,11 @@ class HashBounds:
             self._run(bundle, cells, goal, tolerance, ranges, counts, bounds_by_part, bounded)
             displacement = self._learned(displacement, bounded)
         low, high = bounds_by_part[..., 0, :], bounds_by_part[..., 1, :]
-        found = RayBounds(low.min(axis=(1, 2)), high.max(axis=(1, 2)), alpha, int(bounded[:, 1].sum()), displacement)
+        result = RayBounds(low.min(axis=(1, 2)), high.max(axis=(1, 2)), alpha, int(bounded[:, 1].sum()), displacement)
         if division is not None:
             shape = n, low.shape[1], *division.parts, 3
-            found.parts = np.stack(outward(low.reshape(shape), high.reshape(shape)))
-        return found
+            result.parts = np.stack(outward(low.reshape(shape), high.reshape(shape)))
+        return result
 
     def _first_cells(self, moves: np.ndarray, displacement: float) -> np.ndarray | None:
         """[n, d] pieces by axis on which points move by at most ``displacement``; None where these are too many."""
@@ -147,9 +147,9 @@ class HashBounds:
         """Where later rays had better begin."""
         if not self.dimensions:
             return displacement
-        first, kept = bounded[:, 0].sum(), bounded[:, 2].sum()
-        if kept == first == len(bounded):
+        first, finite = bounded[:, 0].sum(), bounded[:, 2].sum()
+        if finite == first == len(bounded):
             # the box is narrower than a piece may be
             return displacement
-        factor = _TUNING.wider * (first / max(kept, 1)) ** (1.0 / self.dimensions)
+        factor = _TUNING.wider * (first / max(finite, 1)) ** (1.0 / self.dimensions)
         return max(_TUNING.least_displacement, displacement * min(max(factor, 0.25), 2.0))
