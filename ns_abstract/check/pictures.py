@@ -12,6 +12,9 @@ from ns_abstract.check.poses import Poses
 from ns_abstract.check.results import StoredCells
 from ns_abstract.check.splats import ActivatedScene, meeting, pixels, reaches, several
 
+#: Room for the float64 rounding of a claim's planes, relative to their terms.
+_ROUNDED = 1e-13
+
 
 class PixelClaim(NamedTuple):
     """A pixel's channel over a cell, and a pose [1, d] that may refute it."""
@@ -44,13 +47,13 @@ class ClaimedBounds(NamedTuple):
             slope = plane[:, None] * (half / span).T
             middle = constant + ((centre - 0.5 * (self.low + self.high)) / span) @ plane
             tilt, reach = np.abs(slope - form.g).sum(axis=0) + form.r, np.abs(slope).sum(axis=0)
-            room = 1e-13 * (np.abs(plane).sum() + tilt + np.abs(middle - c))
+            room = _ROUNDED * (np.abs(plane).sum() + tilt + np.abs(middle - c))
             # a bound beyond the end of [0, 1] holds, and one beyond the other end does not
-            holds = side * (middle - end) + reach + 1e-13 * (np.abs(plane).sum() + 1.0) <= 0.0
+            holds = side * (middle - end) + reach + _ROUNDED * (np.abs(plane).sum() + 1.0) <= 0.0
             past = side * (middle - 1.0 + end) + reach - 1e-9
             flat, holds_flat = side * (fixed - c), side * (fixed - end) <= 0.0
             for ends, a, b in (
-                (worst, np.maximum(side * (middle - c) + tilt + room, past), flat + moved * (1.0 + 1e-13)),
+                (worst, np.maximum(side * (middle - c) + tilt + room, past), flat + moved * (1.0 + _ROUNDED)),
                 (sure, side * (middle - c) - form.width - 8.0 * room, flat - form.width - 8.0 * room),
             ):
                 ends.append(np.maximum(np.where(holds, -1.0, a), -1.0 if holds_flat else b))
