@@ -4,16 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from string import Template
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ns_abstract.geometry.keyframe_cameras import KeyframeCamera
 from ns_abstract.methods.nerf.hash_field import DenseNet, HashEncoding, NerfactoScene
-from ns_abstract.methods.nerf.write import DATAMANAGER, STEPS, field_states
+from ns_abstract.methods.nerf.write import STEPS, field_states
 from ns_abstract.methods.run_writer import (
-    CAMERA_OPTIMIZER,
     background_name,
     checkpoint_bytes,
     optimizer_lines,
@@ -48,10 +46,8 @@ def write_nerfacto_run(
         for one in field.proposals
     ]
     behind = field.background
-    config = _CONFIG.safe_substitute(
+    config = dict(
         optimizers=_OPTIMIZERS,
-        camera_optimizer=CAMERA_OPTIMIZER,
-        datamanager=DATAMANAGER,
         background=behind if isinstance(behind, str) else background_name(behind.astype(np.float32)),
         far=repr(float(field.far)),
         density=repr(float(field.average_init_density)),
@@ -125,60 +121,3 @@ def _arrays(scene: NerfactoScene) -> dict[str, ArrayLike]:
 
 
 _OPTIMIZERS = optimizer_lines("Adam", "1.0e-15", {"fields": ("0.01", None), "proposal_networks": ("0.01", None)})
-# what config.yml of nerfacto says
-_CONFIG = Template(
-    """\
-max_num_iterations: 30000
-method_name: nerfacto
-mixed_precision: false
-$optimizers
-output_dir: !!python/object/apply:pathlib.PosixPath []
-$datamanager
-  model: !!python/object:nerfstudio.models.nerfacto.NerfactoModelConfig
-    _target: !!python/name:nerfstudio.models.nerfacto.NerfactoModel ''
-    appearance_embed_dim: 32
-    average_init_density: $density
-    background_color: $background
-    base_res: $base_res
-$camera_optimizer
-    collider_params:
-      far_plane: 6.0
-      near_plane: 2.0
-    disable_scene_contraction: false
-    distortion_loss_mult: 0.002
-    enable_collider: true
-    eval_num_rays_per_chunk: 4096
-    far_plane: $far
-    features_per_level: $features_per_level
-    hidden_dim: $hidden
-    hidden_dim_color: $color
-    hidden_dim_transient: 64
-    implementation: torch
-    interlevel_loss_mult: 1.0
-    log2_hashmap_size: $log2_hashmap_size
-    loss_coefficients:
-      rgb_loss_coarse: 1.0
-      rgb_loss_fine: 1.0
-    max_res: $max_res
-    near_plane: 0.05
-    num_levels: $num_levels
-    num_nerf_samples_per_ray: $nerf_samples
-    num_proposal_iterations: $rounds
-    num_proposal_samples_per_ray: !!python/tuple $samples
-    orientation_loss_mult: 0.0001
-    pred_normal_loss_mult: 0.001
-    predict_normals: false
-    prompt: null
-    proposal_initial_sampler: $spacing
-    proposal_net_args_list:$proposals
-    proposal_update_every: 5
-    proposal_warmup: 5000
-    proposal_weights_anneal_max_num_iters: 1000
-    proposal_weights_anneal_slope: 10.0
-    use_appearance_embedding: false
-    use_average_appearance_embedding: true
-    use_gradient_scaling: false
-    use_proposal_weight_anneal: true
-    use_same_proposal_network: false
-    use_single_jitter: true"""
-)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,6 @@ from numpy.typing import ArrayLike
 
 from ns_abstract.geometry.keyframe_cameras import KeyframeCamera
 from ns_abstract.methods.run_writer import (
-    CAMERA_OPTIMIZER,
     background_name,
     checkpoint_bytes,
     optimizer_lines,
@@ -68,14 +66,13 @@ def write_splatfacto_run(
     Raises:
         InputError: ``timestamp`` or ``experiment_name`` is not a plain folder name.
     """
-    config = _CONFIG.safe_substitute(
-        optimizers=_OPTIMIZERS,
-        camera_optimizer=CAMERA_OPTIMIZER,
-        count=scene.count,
-        background=background_name(scene.background),
-        mode=scene.rasterize_mode,
-        degree=3 if scene.color_model == "sh" else 0,
-    )
+    config = {
+        "optimizers": _OPTIMIZERS,
+        "count": scene.count,
+        "background": background_name(scene.background),
+        "mode": scene.rasterize_mode,
+        "degree": 3 if scene.color_model == "sh" else 0,
+    }
     return write_run(
         scene, Path(folder), "splatfacto", timestamp, experiment_name, data="data", checkpoint=_checkpoint_bytes(scene),
         config=config, steps=_STEPS, views=views, render=render,
@@ -146,78 +143,6 @@ _OPTIMIZERS = optimizer_lines(
         "quats": ("0.001", None),
         "scales": ("0.005", None),
     },
-)
-# what config.yml of Splatfacto says; $dataparser is for the writer
-_CONFIG = Template(
-    """\
-max_num_iterations: 30000
-method_name: splatfacto
-mixed_precision: false
-$optimizers
-output_dir: !!python/object/apply:pathlib.PosixPath []
-pipeline: !!python/object:nerfstudio.pipelines.base_pipeline.VanillaPipelineConfig
-  _target: !!python/name:nerfstudio.pipelines.base_pipeline.VanillaPipeline ''
-  datamanager: !!python/object:nerfstudio.data.datamanagers.full_images_datamanager.FullImageDatamanagerConfig
-    _target: !!python/name:nerfstudio.data.datamanagers.full_images_datamanager.FullImageDatamanager ''
-    cache_images: cpu
-    cache_images_type: uint8
-    camera_res_scale_factor: 1.0
-    data: *data
-$dataparser
-    eval_image_indices: !!python/tuple
-    - 0
-    eval_num_images_to_sample_from: -1
-    eval_num_times_to_repeat_images: -1
-    fps_reset_every: 100
-    images_on_gpu: false
-    masks_on_gpu: false
-    max_thread_workers: null
-    train_cameras_sampling_seed: 42
-    train_cameras_sampling_strategy: random
-  model: !!python/object:nerfstudio.models.splatfacto.SplatfactoModelConfig
-    _target: !!python/name:nerfstudio.models.splatfacto.SplatfactoModel ''
-    background_color: $background
-$camera_optimizer
-    collider_params:
-      far_plane: 6.0
-      near_plane: 2.0
-    color_corrected_metrics: false
-    cull_alpha_thresh: 0.1
-    cull_scale_thresh: 0.5
-    cull_screen_size: 0.15
-    densify_grad_thresh: 0.0008
-    densify_size_thresh: 0.01
-    enable_collider: true
-    eval_num_rays_per_chunk: 4096
-    grid_shape: !!python/tuple
-    - 16
-    - 16
-    - 8
-    loss_coefficients:
-      rgb_loss_coarse: 1.0
-      rgb_loss_fine: 1.0
-    max_gauss_ratio: 10.0
-    n_split_samples: 2
-    num_downscales: 2
-    num_random: $count
-    output_depth_during_training: false
-    prompt: null
-    random_init: true
-    random_scale: 10.0
-    rasterize_mode: $mode
-    refine_every: 100
-    reset_alpha_every: 30
-    resolution_schedule: 3000
-    sh_degree: $degree
-    sh_degree_interval: 1000
-    split_screen_size: 0.05
-    ssim_lambda: 0.2
-    stop_screen_size_at: 4000
-    stop_split_at: 15000
-    use_absgrad: true
-    use_bilateral_grid: false
-    use_scale_regularization: false
-    warmup_length: 500"""
 )
 _STEPS = """\
 steps_per_eval_all_images: 1000
