@@ -65,7 +65,7 @@ def join_sample_cells(parts: list[_SampleCells]) -> _SampleCells:
 
 
 class SampleCellBounds:
-    """The bounds of one pencil of rays; see `NerfBounds.rays`."""
+    """The bounds of one pencil of rays; see `BoundedRays.rays`."""
 
     def __init__(
         self,
