@@ -100,8 +100,9 @@ def add_cell(
     rng: np.random.Generator,
 ) -> None:  # fmt: skip
     """Bound a cell of the set with this number and pick its poses."""
+    from both_ways import bounded_both_ways  # pyright: ignore[reportMissingImports]
+
     from ns_abstract.arithmetic.outward import outward
-    from ns_abstract.bench.soundness import bounded_both_ways
     from ns_abstract.geometry.tiles import assemble
 
     of_cell, lower, upper = bounded_both_ways(bounds, poses, cell, layers)

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from network_table import FUNCTIONS, SUMS, SYMBOLS, Row  # pyright: ignore[reportMissingImports]
+
 from ns_abstract.arithmetic import network_charges
-from ns_abstract.arithmetic.network_table import FUNCTIONS, SUMS, SYMBOLS, Row
 
 CHARGES = Path(__file__).resolve().parents[1] / "docs" / "dev" / "network-charges.md"
 
@@ -30,7 +31,7 @@ def page() -> str:
     return f"""# What networks are charged with
 
 For every kind of layer: how far a float32 program may be from the layer's exact value, which programs that covers, and
-where it is proved. The table is `ns_abstract/arithmetic/network_table.py`, its constants with their counts are in
+where it is proved. The table is `benchmarks/network_table.py`, its constants with their counts are in
 `ns_abstract/arithmetic/network_charges.py`; `python benchmarks/network_ledger.py --write` writes this page and measures
 every row ([measurements](measurements.md#ledger-of-networks-charges)).
 

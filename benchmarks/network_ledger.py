@@ -33,8 +33,8 @@ sys.path[:0] = [str(ROOT), str(ROOT / "tests"), str(ROOT / "benchmarks")]
 import extreme_networks as extreme  # noqa: E402  # pyright: ignore[reportMissingImports]
 import network_attack as attack  # noqa: E402  # pyright: ignore[reportMissingImports]
 from network_charges_page import CHARGES, page  # noqa: E402  # pyright: ignore[reportMissingImports]
+from network_table import ROWS  # noqa: E402  # pyright: ignore[reportMissingImports]
 
-from ns_abstract.arithmetic.network_table import ROWS  # noqa: E402
 from ns_abstract.io.errors import InputError  # noqa: E402
 from ns_abstract.verify.network import ImageSets, bound_outputs  # noqa: E402
 from ns_abstract.verify.network.onnx_file import read_onnx  # noqa: E402

@@ -22,6 +22,7 @@ import numpy as np
 import torch
 
 from ns_abstract.api.certification import CertifySettings, open_certification
+from ns_abstract.api.files import Settings
 from ns_abstract.cli.common import DONE
 
 NOSE = {"type": "visible", "select": {"box": [[0.3, -2, -2], [2, 2, 2]]}, "weight": 0.5, "pixels": 40}
@@ -112,7 +113,7 @@ def wrong(row: Row, options: argparse.Namespace, folder: Path, count: int) -> tu
     import sqlite3
 
     config, path, prop, spec = files(row, options, folder)
-    job = open_certification(CertifySettings(config, path, None, prop, spec))
+    job = open_certification(CertifySettings(Settings(config, path, spec), None, prop))
     rng, contradictions, shares, looked = np.random.default_rng(11), 0, [], 0
     with sqlite3.connect(folder / "out" / "cells.sqlite") as base:
         rows = base.execute("SELECT frame, lower, upper FROM cells WHERE verdict = 'certified'").fetchall()

@@ -20,6 +20,29 @@ needs_nerfstudio = pytest.mark.skipif(
     importlib.util.find_spec("nerfstudio") is None, reason="nerfstudio is not installed (extra nerfstudio)"
 )
 
+#: How a program begins that evaluates Nerfstudio in a process of its own, without weights from elsewhere.
+START = """
+import sys
+
+import torch
+
+torch.set_num_threads(1)
+try:
+    import torchvision
+except RuntimeError:
+    # A torchvision built for CUDA beside a CPU torch: declare the operators that it registers fakes for.
+    for name in [m for m in sys.modules if m.split(".")[0] == "torchvision"]:
+        del sys.modules[name]
+    library = torch.library.Library("torchvision", "FRAGMENT")
+    library.define("nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+    library.define("qnms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
+    import torchvision
+import torchmetrics.functional.image.lpips as lpips
+
+features = lpips._get_tv_model_features
+lpips._get_tv_model_features = lambda net, pretrained=False: features(net, pretrained=False)
+"""
+
 
 def environment(folder: Path) -> dict[str, str]:
     """For commands: this package with the entry points that pyproject.toml states, and no network."""

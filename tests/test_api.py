@@ -164,8 +164,9 @@ def test_third_representation_from_the_command_line(wall: nsa.Scene, tmp_path: P
     value = {"version": 1, "frame": "world", "units": "dataset", "translation": {"y": 0.03}}
     spec.write_text(json.dumps(value))
     options = render_command.Render(
-        wall.source.file, blobs.path, tmp_path / "out", perturbation_filename=spec, frames=(1,), time_budget=20.0
-    )
+        load_config=wall.source.file, camera_path_filename=blobs.path, output_dir=tmp_path / "out",
+        perturbation_filename=spec, frames=(1,), time_budget=20.0,
+    )  # fmt: skip
     assert render_command.render(options) == 0
     document = json.loads((tmp_path / "out" / "report.json").read_text())
     assert document["renderer"]["name"] == "wall" and document["guarantee"] == "real-sound"
@@ -265,8 +266,9 @@ def test_splats(blobs: Inputs, tmp_path: Path) -> None:
     # the command keeps cells where they are small
     result = nsa.bound(scene, nsa.PoseSet.from_json(path.cameras[0], spec), target_ratio=1.5, keep_cells=True)
     options = render_command.Render(
-        blobs.config, blobs.path, tmp_path, perturbation_filename=blobs.spec, frames=(0,), target_ratio=1.5
-    )
+        load_config=blobs.config, camera_path_filename=blobs.path, output_dir=tmp_path,
+        perturbation_filename=blobs.spec, frames=(0,), target_ratio=1.5,
+    )  # fmt: skip
     assert render_command.render(options) == 0
     stored = load_frame(tmp_path / "frame_00000.npz").result
     for name in PICTURES:

@@ -86,19 +86,19 @@ def test_perturbations_of_a_path_and_none(make_blobs: Any) -> None:
     )
 
 
-def question(blobs: Inputs, folder: Path) -> CertifySettings:
+def question(blobs: Inputs, folder: Path, spec: Path | None) -> CertifySettings:
     net = classifier(folder / "net.onnx")
     prop = {"type": "classification", "label": 0, "preprocess": {"resize": [16, 16]}}
-    return CertifySettings(blobs.config, blobs.path, net, write_json(folder / "prop.json", prop), blobs.spec)
+    return CertifySettings(Settings(blobs.config, blobs.path, spec), net, write_json(folder / "prop.json", prop))
 
 
 def test_certificate(blobs: Inputs, tmp_path: Path) -> None:
-    job = open_certification(question(blobs, tmp_path))
+    job = open_certification(question(blobs, tmp_path, blobs.spec))
     found = table(job.assumptions)
     assert found["picture size"] == ("16 x 16", "prop.json: preprocess.resize")
     assert found["network output"] == ("y", "default") and found["network_arithmetic"] == ("float32", "default")
     assert found["picture"] == ("float", "default") and found["varied"][1] == "spec.json"
-    told = replace(question(blobs, tmp_path), picture="8-bit", network_arithmetic="real", perturbation_filename=None)
+    told = replace(question(blobs, tmp_path, None), picture="8-bit", network_arithmetic="real")
     found = table(open_certification(told).assumptions)
     assert found["picture"] == ("8-bit", "--picture") and found["network_arithmetic"] == (
         "real",
@@ -126,7 +126,7 @@ def test_reports_and_results_have_them(blobs: Inputs, tmp_path: Path, in_process
     poses = nsa.PoseSet(camera, {"x": 0.01})
     found = table(nsa.bound(scene, poses, time_budget=5.0, target_ratio=3.0).assumptions)
     assert found["picture size"] == ("32 x 32", "the camera") and found["varied"] == ("x", "the set of poses")
-    asked = question(blobs, tmp_path)
+    asked = question(blobs, tmp_path, blobs.spec)
     certificate = nsa.certify(scene, poses, asked.model, asked.property, time_budget=5.0)
     assert table(certificate.assumptions)["network output"] == ("y", "default")
 

@@ -32,6 +32,7 @@ from waiting import LONG, until
 from ns_abstract.api import showing
 from ns_abstract.api.cell_search import examine_block
 from ns_abstract.api.certification import Certification, CertifySettings, FramePictures, open_certification
+from ns_abstract.api.files import Settings
 from ns_abstract.api.showing import look_closer
 from ns_abstract.cli import certify as certify_command
 from ns_abstract.cli.certify import Certify, certify
@@ -92,8 +93,8 @@ class Case:
 
     @property
     def job(self) -> Certification:
-        files = self.blobs.config, self.blobs.path, self.net, self.prop, self.spec
-        return open_certification(CertifySettings(*files, picture=self.picture))
+        files = Settings(self.blobs.config, self.blobs.path, self.spec)
+        return open_certification(CertifySettings(files, self.net, self.prop, picture=self.picture))
 
 
 def report(folder: Path) -> dict[str, Any]:
@@ -224,9 +225,9 @@ def test_given_set_is_that_of_a_file(
     wrong = case.options(tmp_path / "out", perturbation_filename=None, translation=(0.1, 0.2))
     code, _, said = in_process(certify_command.main, wrong)
     assert code == 2 and said.count("\n") == 1 and "--translation: found 2 numbers" in said
-    job = CertifySettings(blobs.config, blobs.path, net, case.prop, given_set={"version": 1, "rotation": {"yaw": -1.0}})
+    files = Settings(blobs.config, blobs.path, given_set={"version": 1, "rotation": {"yaw": -1.0}})
     with pytest.raises(InputError, match="not negative") as caught:
-        open_certification(job)
+        open_certification(CertifySettings(files, net, case.prop))
     assert caught.value.field == "--rotation.yaw" and caught.value.file is None
 
 

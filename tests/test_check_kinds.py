@@ -31,6 +31,7 @@ from splat_files import (
     write_splat,
     write_spz,
 )
+from test_check import splats_of
 
 import ns_abstract as nsa
 from ns_abstract.api.checking import check
@@ -45,7 +46,6 @@ from ns_abstract.check.splats import (
     FLOAT,
     ActivatedScene,
     _kept,
-    activated,
     meeting,
     pictures,
     pixels,
@@ -64,17 +64,7 @@ from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.splat.constants import VERSIONS
 from ns_abstract.methods.splat.ply import write_ply
 from ns_abstract.methods.splat.reference import Reference
-from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.verify.picture_properties import parse_picture_property
-
-
-def splats_of(scene: SplatScene, version: str = "1.4.0") -> ActivatedScene:
-    return activated(
-        scene.means, scene.log_scales, scene.quats, scene.opacity_logits, scene.sh, sigmoid=False,
-        degree=scene.sh_degree, antialiased=scene.rasterize_mode == "antialiased", background=scene.background,
-        version=version,
-    )  # fmt: skip
-
 
 # ---------------------------------------------------------------- float32
 

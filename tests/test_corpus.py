@@ -131,7 +131,7 @@ def write_results(files: dict[str, Path]) -> None:
 
 def write_search(files: dict[str, Path]) -> None:
     """What ns-abstract-certify leaves, without the work: some cells with a verdict, some open blocks, a report."""
-    settings = CertifySettings(files["config"], files["path"], files["net"], files["prop"], files["spec"])
+    settings = CertifySettings(Settings(files["config"], files["path"], files["spec"]), files["net"], files["prop"])
     job = open_certification(settings)
     # kernels are compiled here, which no case is charged for
     compile_beside(job.job, 0)

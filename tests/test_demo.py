@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from benchmark_scripts import script
+from nerfstudio_runs import START
 
 from ns_abstract.demo.paths import (
     TARGET,
@@ -347,7 +348,7 @@ def test_names_that_leave_the_folder_are_refused(tmp_path: Path, name: str) -> N
 
 
 # Runs in its own process: Nerfstudio changes global state, and takes paths from the working directory.
-NERFSTUDIO = textwrap.dedent(
+NERFSTUDIO = START + textwrap.dedent(
     """
     import sys
     from pathlib import Path
@@ -355,21 +356,6 @@ NERFSTUDIO = textwrap.dedent(
     import numpy as np
     import torch
 
-    torch.set_num_threads(1)
-    try:
-        import torchvision
-    except RuntimeError:
-        # A torchvision built for CUDA beside a CPU torch: declare the operators that it registers fakes for.
-        for name in [m for m in sys.modules if m.split(".")[0] == "torchvision"]:
-            del sys.modules[name]
-        library = torch.library.Library("torchvision", "FRAGMENT")
-        library.define("nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
-        library.define("qnms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
-        import torchvision
-    import torchmetrics.functional.image.lpips as lpips
-
-    features = lpips._get_tv_model_features
-    lpips._get_tv_model_features = lambda net, pretrained=False: features(net, pretrained=False)
     try:
         from nerfstudio.utils.eval_utils import eval_setup
     except Exception as error:

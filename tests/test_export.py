@@ -20,6 +20,7 @@ from PIL import Image
 from test_cli import call, one_line  # noqa: F401
 
 from ns_abstract.api.certification import Certification, CertifySettings, open_certification
+from ns_abstract.api.files import Settings
 from ns_abstract.cli import export as export_command
 from ns_abstract.cli import render as render_command
 from ns_abstract.io.atomic import write_json
@@ -211,7 +212,7 @@ def instances(blobs: Inputs, tmp_path_factory: pytest.TempPathFactory) -> Callab
 
     def make(prop: dict, name: str, *more: object, spec: Path | None = blobs.spec) -> tuple[Path, Certification]:
         file = write_json(folder / f"{name}.json", prop | {"preprocess": PREPROCESS})
-        settings = CertifySettings(blobs.config, blobs.path, net, file, spec)
+        settings = CertifySettings(Settings(blobs.config, blobs.path, spec), net, file)
         options: list[object] = ["vnnlib", "--frames", 0, "--output-dir", folder / name, "--model", net]
         options += ["--load-config", blobs.config, "--camera-path-filename", blobs.path, "--property", file]
         options += [] if spec is None else ["--perturbation-filename", spec]

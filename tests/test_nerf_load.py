@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 import torch
 from nerfs import UNIFORM, NerfNetwork, other_view, tiny_scene, view
+from nerfstudio_runs import START
 from scene_files import change, checkpoint_of
 from test_cli import one_line
 
@@ -200,7 +201,7 @@ def test_pictures_do_not_depend_on_how_they_are_cut() -> None:
 
 
 # Runs in its own process: Nerfstudio changes global state, and takes paths from the working directory.
-NERFSTUDIO = textwrap.dedent(
+NERFSTUDIO = START + textwrap.dedent(
     """
     import json
     import sys
@@ -209,21 +210,6 @@ NERFSTUDIO = textwrap.dedent(
     import numpy as np
     import torch
 
-    torch.set_num_threads(1)
-    try:
-        import torchvision
-    except RuntimeError:
-        # A torchvision built for CUDA beside a CPU torch: declare the operators that it registers fakes for.
-        for name in [m for m in sys.modules if m.split(".")[0] == "torchvision"]:
-            del sys.modules[name]
-        library = torch.library.Library("torchvision", "FRAGMENT")
-        library.define("nms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
-        library.define("qnms(Tensor dets, Tensor scores, float iou_threshold) -> Tensor")
-        import torchvision
-    import torchmetrics.functional.image.lpips as lpips
-
-    features = lpips._get_tv_model_features
-    lpips._get_tv_model_features = lambda net, pretrained=False: features(net, pretrained=False)
     try:
         from nerfstudio.cameras.camera_paths import get_path_from_json
         from nerfstudio.utils.eval_utils import eval_setup

@@ -19,7 +19,7 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import ImageSets, bound_outputs, load_network
 from ns_abstract.verify.network.interpolation import nearest_pixels
 from ns_abstract.verify.network.load import onnx_runner
-from ns_abstract.verify.vnnlib import load_regions, load_vnnlib
+from ns_abstract.verify.vnnlib import load_query, load_vnnlib
 
 CASES = Path(__file__).resolve().parents[2] / "shared" / "data" / "network_cases"
 
@@ -109,7 +109,7 @@ def test_the_declared_variables_are_the_networks(declared: tuple[int, int], tmp_
     file.write_text("\n".join([*lines, "(assert (<= Y_0 1))"]))
     (tmp_path / "q.VNNLIB.gz").write_bytes(gzip.compress(file.read_bytes()))
     for path, read in itertools.product(
-        (file, tmp_path / "q.VNNLIB.gz"), (lambda p: load_vnnlib(p, 4, 2), lambda p: load_regions(p, 2, 4))
+        (file, tmp_path / "q.VNNLIB.gz"), (lambda p: load_vnnlib(p, 4, 2), lambda p: load_query(p, 2, 4)[0])
     ):
         if declared == (2, 4):
             read(path)

@@ -18,6 +18,7 @@ from test_certify_cli import cells, report
 
 import ns_abstract as nsa
 from ns_abstract.api.certification import CertifySettings, open_certification
+from ns_abstract.api.files import Settings
 from ns_abstract.api.picture_question import PlanePictures, depth_range
 from ns_abstract.cli import certify as certify_command
 from ns_abstract.geometry.box import ParameterBox
@@ -185,7 +186,7 @@ class Case:
 
     @property
     def pictures(self) -> tuple[Any, PlanePictures]:
-        settings = CertifySettings(self.blobs.config, self.blobs.path, None, self.prop, self.spec)
+        settings = CertifySettings(Settings(self.blobs.config, self.blobs.path, self.spec), None, self.prop)
         job = open_certification(settings)
         found = job.pictures(0)
         assert isinstance(found, PlanePictures)

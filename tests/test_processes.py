@@ -73,8 +73,10 @@ def test_a_report_with_a_faulty_worker_is_sampled(
     blobs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def command(resume: bool = False) -> dict[str, Any]:
-        frames = Render(blobs.config, blobs.path, tmp_path, perturbation_filename=blobs.spec, frames=(0, 1),
-                        time_budget=60.0, target_ratio=3.0, resume=resume)  # fmt: skip
+        frames = Render(
+            load_config=blobs.config, camera_path_filename=blobs.path, output_dir=tmp_path, time_budget=60.0,
+            perturbation_filename=blobs.spec, frames=(0, 1), target_ratio=3.0, resume=resume,
+        )  # fmt: skip
         assert render(frames) == 0
         return json.loads((tmp_path / "report.json").read_text())
 

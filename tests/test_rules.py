@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
+from linear_bounds import LinearBounds, sumcumprod_lines, weighted
+from paper_table import RULES, corner_inverse
 
 from ns_abstract.arithmetic.form_array import FormArray
 from ns_abstract.geometry.camera_path import PinholeCamera
@@ -22,17 +24,12 @@ from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, PAPER
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.paper import (
-    RULES,
     Enclosure,
     Interval,
-    LinearBounds,
     adjugate_inverse,
     blend,
-    convex_combination,
-    corner_inverse,
     cumulative_blend,
     matrix_inverse,
-    ordered_blend,
     sort_by,
     sorted_blend,
     sumcumprod,
@@ -396,8 +393,7 @@ def test_interval_operations_contain(ends, s: float, t: float, exponent: int) ->
     fu, fv = Fraction(u), Fraction(v)
     for bound, truth in (
         (x + y, fu + fv), (x - y, fu - fv), (x * y, fu * fv), (x.square(), fu * fu), (x.absolute(), abs(fu)),
-        (x.power(exponent), fu**exponent), (x.clip(-1.0, 2.0), min(max(fu, Fraction(-1)), Fraction(2))),
-        (x.hull(y), fv), (-x, -fu),
+        (x.power(exponent), fu**exponent), (-x, -fu),
     ):  # fmt: skip
         assert within(float(bound.lower), truth, float(bound.upper))
     if fv:
@@ -409,8 +405,7 @@ def test_interval_operations_contain(ends, s: float, t: float, exponent: int) ->
     form = Enclosure.parameters(Interval.stack([x, y]))
     p = parameters([Interval.stack([x, y])], [np.array([u, v])])
     for bound, truth in (
-        (form[0].absolute(), abs(fu)), (form[0].power(exponent), fu**exponent), (form[0] * form[0], fu * fu),
-        (form[0].clip(-1.0, 2.0), min(max(fu, Fraction(-1)), Fraction(2))), (form[0] * form[1], fu * fv),
+        (form[0].power(exponent), fu**exponent), (form[0] * form[0], fu * fu), (form[0] * form[1], fu * fv),
     ):  # fmt: skip
         assert outside(bound, _scalar(truth)) == 0
         assert outside_form(bound.form, p, _scalar(truth)) == 0
@@ -597,7 +592,8 @@ def test_example_1() -> None:
     assert round(spread(matrix_inverse(quadratic, order=3)), 2) == 0.70
     # the adjugate's figure is met by the planes that suit each end best, by no fixed choice for both
     fixed = adjugate_inverse(lines).range
-    best = fixed.intersect(adjugate_inverse(lines, (1.0, 0.375)).range)
+    with weighted(1.0, 1.0, *[0.375] * 4):
+        best = fixed.intersect(adjugate_inverse(lines).range)
     assert round(spread(best), 2) == 1.22 and spread(fixed) > 1.3
     assert spread(matrix_inverse(EXAMPLE_1, order=4)) < spread(adjugate_inverse(EXAMPLE_1))
 
@@ -607,8 +603,9 @@ def test_example_3() -> None:
     middle = np.array([0.2, 0.5, 0.6, 0.8, 0.1])
     alphas = Interval(middle - 0.1, middle + 0.1)
     lines = LinearBounds.parameters(alphas)
-    for face in (alphas, lines, Enclosure.parameters(alphas)):
-        bound = sumcumprod(face, colors)
+    for bound in (
+        sumcumprod(alphas, colors), sumcumprod_lines(lines, colors), sumcumprod(Enclosure.parameters(alphas), colors),
+    ):  # fmt: skip
         assert f"{float(bound.bounds()[0]):.4f} {float(bound.bounds()[1]):.4f}" == "0.8266 0.9256"
     naive = cumulative_blend(lines, colors)
     assert f"{float(naive.bounds()[0]):.3f} {float(naive.bounds()[1]):.3f}" == "0.780 1.029"
@@ -688,7 +685,7 @@ def decides_at_one_end(alphas: Interval, depths: Interval, colors: np.ndarray) -
 
 
 def test_uncertain_order_contains_every_order() -> None:
-    rules = (vr_ind, ordered_blend, sorted_blend)
+    rules = (vr_ind, sorted_blend)
     caught = 0
     for seed in range(6):
         alphas, depths, colors = layers(seed)
@@ -697,21 +694,19 @@ def test_uncertain_order_contains_every_order() -> None:
         lines = LinearBounds.parameters(
             Interval(*(np.concatenate(pair) for pair in zip(alphas.bounds(), depths.bounds(), strict=False)))
         )
-        bounds += [rule(lines[:4], lines[4:], colors) for rule in (vr_ind, sorted_blend)]
+        bounds += [rule(lines[:4], lines[4:], colors) for rule in rules]
         mutant = decides_at_one_end(alphas, depths, colors)
         for a, d in points([alphas, depths], np.random.default_rng(seed), 30):
             truth = _scalar(blended(a, d, colors))
             assert all(outside(bound, truth) == 0 for bound in bounds)
             caught += outside(mutant, truth)
-        # using that the weights add up to 1 can only help
-        assert bounds[0].encloses(bounds[2])
     assert caught > 0
 
 
 def test_ties_enclose_both_orders() -> None:
     alphas, colors = Interval([0.5, 0.5]), np.array([1.0, 0.0])
     for depths in (np.array([1.0, 1.0]), np.array([-0.0, 0.0])):
-        for rule in (vr_ind, ordered_blend, sorted_blend):
+        for rule in (vr_ind, sorted_blend):
             assert rule(alphas, Interval(depths), colors).encloses(Interval(0.25, 0.5))
     kept = sort_by(Interval([9.0, 3.0, 7.0]), Interval([5.0, 13.0, 8.0]))
     assert kept.lower.tolist() == kept.upper.tolist() == [9.0, 7.0, 3.0]
@@ -745,26 +740,6 @@ def test_swapped_blend_ends_are_caught() -> None:
         upper += Fraction(float(a)) * (c - upper)
     mutant = Interval(0.0, float(upper))
     assert outside(mutant, _scalar(blended(alphas.upper, np.arange(4), colors))) == 1
-
-
-@settings(max_examples=30, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.integers(1, 6))
-def test_convex_combination_is_exact(seed: int, n: int) -> None:
-    rng = np.random.default_rng(seed)
-    w = rng.dirichlet(np.ones(n))
-    weights = Interval(np.maximum(w - rng.uniform(0, 0.3, n), 0.0), w + rng.uniform(0, 0.3, n))
-    values = rng.uniform(-1.0, 2.0, n)
-    bound = convex_combination(weights, values)
-    rest = 1 - sum(exact(weights.lower), Fraction(0))
-    assume(rest >= 0)
-    for order, end in ((np.argsort(-values), bound.upper), (np.argsort(values), bound.lower)):
-        total, left = sum(exact(weights.lower) * exact(values), Fraction(0)), rest
-        for i in order:
-            part = min(left, Fraction(float(weights.upper[i])) - Fraction(float(weights.lower[i])))
-            total, left = total + part * Fraction(float(values[i])), left - part
-        assert left == 0
-        assert within(float(bound.lower), total, float(bound.upper))
-        assert abs(float(total) - float(end)) <= 1e-14
 
 
 @settings(max_examples=30, deadline=None)
@@ -808,10 +783,12 @@ def test_inverses_contain(seed: int, n: int, order: int, norm: str) -> None:
         bounds += [corner_inverse(operand)]
         if n < 3:
             bounds.append(matrix_inverse(Enclosure.parameters(operand, 2), order=order, norm=norm))
-            bounds.append(matrix_inverse(LinearBounds.parameters(operand), order=order, norm=norm, weights=(0.5, 0.25)))
+            with weighted(0.5, 0.25):
+                bounds.append(matrix_inverse(LinearBounds.parameters(operand), order=order, norm=norm))
         if n == 2:
             bounds.append(adjugate_inverse(operand))
-            bounds.append(adjugate_inverse(LinearBounds.parameters(operand), (0.5, 0.75)))
+            with weighted(0.5, 1.0, *[0.75] * 4):
+                bounds.append(adjugate_inverse(LinearBounds.parameters(operand)))
         for (at,) in points([operand], rng, 3):
             truth = exact_inverse(exact(at))
             assert all(outside(bound, truth) == 0 for bound in bounds)

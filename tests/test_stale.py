@@ -83,7 +83,9 @@ def test_fingerprints_name_version_and_rules(blobs: Inputs, tmp_path: Path) -> N
         tmp_path / "prop.json", {"type": "classification", "label": 0, "preprocess": {"resize": [16, 16]}}
     )
     rendered = open_job(Settings(blobs.config, blobs.path, blobs.spec)).fingerprint
-    certified = open_certification(CertifySettings(blobs.config, blobs.path, net, prop, blobs.spec)).fingerprint
+    certified = open_certification(
+        CertifySettings(Settings(blobs.config, blobs.path, blobs.spec), net, prop)
+    ).fingerprint
     config, loop = write_loop_demo(tmp_path / "loop")
     reached = open_loop(nsa.load_scene(config), loop).fingerprint
     assert rendered["ns_abstract"] == nsa.__version__
@@ -203,7 +205,7 @@ def test_worker_with_other_rules_is_refused(
         net = classifier(tmp_path / "net.onnx")
         value = {"type": "classification", "label": 0, "preprocess": {"resize": [16, 16]}}
         prop = write_json(tmp_path / "prop.json", value)
-        recipe = open_certification(CertifySettings(blobs.config, blobs.path, net, prop, blobs.spec)).recipe
+        recipe = open_certification(CertifySettings(Settings(blobs.config, blobs.path, blobs.spec), net, prop)).recipe
         monkeypatch.setattr(certification, "_RULES", certification._RULES - 1)
     worker_cache.clear_cache()
     with pytest.raises(InputError, match=r"worker's results would be computed by.*same version on all machines"):

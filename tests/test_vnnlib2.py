@@ -17,7 +17,7 @@ from test_vnnlib_runner import LOWER, UPPER, grid_outputs, net
 from ns_abstract.bench.vnnlib import run_folder, verify_query
 from ns_abstract.cli import bench
 from ns_abstract.io.errors import InputError
-from ns_abstract.verify.vnnlib import load_query, load_regions, load_vnnlib
+from ns_abstract.verify.vnnlib import load_query, load_vnnlib
 from ns_abstract.verify.vnnlib2 import write_query
 
 HEAD = "(vnnlib-version <2.0>)\n(declare-network f (declare-input X {0} [{1}]) (declare-output Y {0} [{2}]))\n"
@@ -31,7 +31,7 @@ def query(condition: str, kind: str = "real", inputs: str = "2", outputs: str = 
 
 
 def read(text: str, shapes: tuple[Any, Any] = ((2,), (2,))) -> Any:
-    return load_regions(Path("query"), *shapes, text=text)
+    return load_query(Path("query"), *shapes, text=text)[0]
 
 
 @pytest.mark.parametrize("kind", ["real", "float32"])
@@ -158,7 +158,7 @@ def test_bad_queries_are_errors_of_one_line(name: str, tmp_path: Path) -> None:
     file = tmp_path / "q.vnnlib"
     file.write_text(text)
     with pytest.raises(InputError, match=words) as caught:
-        load_regions(file, (2,), (2,))
+        load_query(file, (2,), (2,))[0]
     assert "\n" not in str(caught.value) and len(str(caught.value)) < 600 and caught.value.fix
     if name != "no bounds":
         # a property of pictures sets bounds of inputs aside

@@ -21,7 +21,7 @@ from ns_abstract.execution.cancellation import Deadline
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify import box_decisions
 from ns_abstract.verify.network import load_network
-from ns_abstract.verify.vnnlib import load_regions
+from ns_abstract.verify.vnnlib import load_query
 
 LOWER, UPPER = np.array([-0.5, 0.1]), np.array([0.75, 0.9])
 
@@ -115,7 +115,7 @@ def test_runs_of_bounds_mean_what_single_ones_mean(tmp_path: Path) -> None:
         parts += ["(<= X_3 -1.25)", "(>= X_3 -9.5e0)", f"(<= Y_0 {way}.5)", *parts[:9], "(<= X_4 -2)"]
         ways.append(f"(and {' '.join(parts)})")
     text = declare + f"(assert (or\n{chr(10).join(ways)}))"
-    found = [load_regions(tmp_path, 12, 1, one) for one in (text, text.replace("= X", "=  X"))]
+    found = [load_query(tmp_path, 12, 1, one)[0] for one in (text, text.replace("= X", "=  X"))]
     assert len(found[0]) == 3
     for one, other in zip(*found, strict=True):
         np.testing.assert_array_equal(one.lower, other.lower)
@@ -124,7 +124,7 @@ def test_runs_of_bounds_mean_what_single_ones_mean(tmp_path: Path) -> None:
     assert found[0][0].upper[3] == -1.25 and found[0][1].upper[4] <= -2.0
     for bad, said in (("(<= X_12 1.0)", "X_12"), ("(<= X_1 1e999)", "1e999"), ("(<= X_1 1.2.3)", "1.2.3")):
         with pytest.raises(InputError, match=said):
-            load_regions(tmp_path, 12, 1, text.replace("(<= X_3 -1.25)", bad))
+            load_query(tmp_path, 12, 1, text.replace("(<= X_3 -1.25)", bad))[0]
 
 
 @pytest.mark.slow
@@ -157,7 +157,7 @@ def test_unsafe_instances_are_never_proved(tmp_path: Path, monkeypatch: pytest.M
                 assert ((lower <= x) & (x <= upper)).all()
                 y = run(x.astype(np.float32)[None])[0].astype(np.float64)
                 assert [values["Y_0"], values["Y_1"]] == y.tolist()
-                (region,) = load_regions(tmp_path / "a", 20, 2, conditions[name])
+                (region,) = load_query(tmp_path / "a", 20, 2, conditions[name])[0]
                 assert region.holds(y)
         for path in tmp_path.glob("*.vnnlib*"):
             path.unlink()
@@ -167,7 +167,7 @@ def test_unsafe_instances_are_never_proved(tmp_path: Path, monkeypatch: pytest.M
 def proved(file: Path, condition: str, asks: int = 400) -> str:
     """What proofs alone say, since no output that the program computes is finite, until time has been asked for."""
     times = itertools.count()
-    regions = load_regions(file.parent / "a", 2, 2, text(condition))
+    regions = load_query(file.parent / "a", 2, 2, text(condition))[0]
     return box_decisions.decide(
         load_network(file), lambda image: np.full(2, np.nan), regions, Deadline(request=lambda: next(times) > asks)
     ).word
@@ -199,7 +199,7 @@ def test_planted_faults_are_noticed(tmp_path: Path, monkeypatch: pytest.MonkeyPa
 
 def test_time_is_kept(tmp_path: Path) -> None:
     file = net(tmp_path, 1)
-    regions = load_regions(tmp_path / "a", 2, 2, text("(<= Y_0 -1e9)"))
+    regions = load_query(tmp_path / "a", 2, 2, text("(<= Y_0 -1e9)"))[0]
     answer = box_decisions.decide(load_network(file), session(file), regions, Deadline(request=lambda: True))
     assert answer.word == "timeout"
 
@@ -215,12 +215,12 @@ def test_time_is_kept(tmp_path: Path) -> None:
 )
 def test_constraints_that_are_refused(condition: str, said: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=said):
-        load_regions(tmp_path / "a", 2, 2, text(condition).replace("(assert", "(declare-const X_7 Real)(assert", 1))
+        load_query(tmp_path / "a", 2, 2, text(condition).replace("(assert", "(declare-const X_7 Real)(assert", 1))[0]
 
 
 def test_inputs_without_bounds_are_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="X_1 has no bounds"):
-        load_regions(tmp_path / "a", 2, 2, text("(<= Y_0 1.0)").replace("(assert (<= X_1 0.9))", ""))
+        load_query(tmp_path / "a", 2, 2, text("(<= Y_0 1.0)").replace("(assert (<= X_1 0.9))", ""))[0]
 
 
 @pytest.mark.parametrize(

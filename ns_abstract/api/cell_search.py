@@ -38,6 +38,7 @@ from ns_abstract.verify.search_results import BlockResult
 from ns_abstract.verify.store import CellBlock, Store
 
 P = TypeVar("P")
+C = TypeVar("C")
 #: A row of ``cells``, JSON read: see `Store.leaves`.
 Row = dict[str, Any]
 
@@ -396,6 +397,7 @@ def check_arguments(request: Request, workers: int, output_dir: str | os.PathLik
 def answered(
     question: CellQuestion[P],
     request: Request,
+    on_progress: Callable[[P], object] | None,
     engine: Callable[[ExitStack], Engine],
     output_dir: str | os.PathLike[str] | None,
 ) -> tuple[dict[int, list[Row]], dict[str, Any]]:
@@ -404,6 +406,7 @@ def answered(
     Args:
         question: What is claimed.
         request: How much is to be done.
+        on_progress: Told about once a second.
         engine: See `CellSearch.run`.
         output_dir: Output folder; None: nothing is kept on disk.
     """
@@ -412,8 +415,30 @@ def answered(
             output_dir = stack.enter_context(tempfile.TemporaryDirectory(prefix="ns-abstract-"))
         stop = stack.enter_context(interruptible())
         search = CellSearch(question, Path(output_dir))
-        document = search.run(engine, stop, replace(request, on_progress=listener(stop, request.on_progress)))
+        document = search.run(engine, stop, replace(request, on_progress=listener(stop, on_progress)))
         return search.rows, document
+
+
+def result_cells(rows: Mapping[int, list[Row]], make: Callable[..., C], *columns: str) -> tuple[C, ...]:
+    """Cells of a result.
+
+    Args:
+        rows: Cells by number of their set.
+        make: Takes the number, the ends of the box, the verdict, ``columns`` of the row and its counterexample or None.
+        columns: Names of what else a cell says.
+    """
+
+    def array(values: Any) -> np.ndarray | None:
+        return None if values is None else np.array(values, np.float64)
+
+    return tuple(
+        make(
+            number, array(row["lower"]), array(row["upper"]), row["verdict"], *(row[name] for name in columns),
+            array(row["counterexample"]),
+        )
+        for number, entries in sorted(rows.items())
+        for row in entries
+    )  # fmt: skip
 
 
 def cell_place(cell: Cell, otherwise: str) -> str:

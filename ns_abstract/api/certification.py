@@ -7,15 +7,15 @@ import itertools
 import json
 import math
 import time
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from ns_abstract.api.files import Settings, path_sets
+from ns_abstract.api.files import Settings, open_job
 from ns_abstract.api.frame_pictures import FramePictures, PropertySource
 from ns_abstract.api.job import Job, require_sound_platform, warm_up
 from ns_abstract.api.network_question import Question
@@ -24,13 +24,10 @@ from ns_abstract.arithmetic.forms import MAX_DIMENSIONS
 from ns_abstract.execution.cancellation import cancel_when
 from ns_abstract.execution.worker_cache import Recipe
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.camera_path import load_camera_path
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import show
-from ns_abstract.methods.overrides import Overrides
-from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.refine.protocol import RayFrame
 from ns_abstract.verify.camera_response import CameraResponse
@@ -434,34 +431,20 @@ class CertifySettings:
     """What to certify, as the command line says it.
 
     Attributes:
-        load_config: config.yml of a run, or a scene file.
-        camera_path_filename: Camera path JSON.
+        files: The scene and the sets of poses.
         model: Network, .onnx; None: the property is one of the picture.
         property: PROP.json.
-        perturbation_filename: Perturbation JSON; None: the camera path holds it.
-        workers: Processes that bound the rays of a NeRF.
-        arithmetic: "float32" or "real"; None: the strongest that the scene has.
-        network_arithmetic: The same of the network.
+        network_arithmetic: "float32" or "real", of the network.
         picture: Whether the network is shown floats or pictures of 8 bits.
         memory: Bytes for the bounds of one process.
-        given_set: The content of a perturbation file, in place of one; errors name its keys as options.
-        program: Which program draws the scene.
-        overrides: What the user says of the scene in place of its files.
     """
 
-    load_config: Path
-    camera_path_filename: Path
+    files: Settings
     model: Path | None
     property: Path
-    perturbation_filename: Path | None = None
-    arithmetic: str | None = None
     network_arithmetic: NetworkArithmetic = "float32"
     picture: Picture = "float"
     memory: int = MEMORY
-    workers: int = 1
-    given_set: Mapping[str, Any] | None = None
-    program: ProgramOptions = field(default_factory=ProgramOptions)
-    overrides: Overrides = field(default_factory=Overrides)
 
 
 def open_certification(settings: CertifySettings) -> Certification:
@@ -471,24 +454,5 @@ def open_certification(settings: CertifySettings) -> Certification:
         InputError: A file or a field cannot be used.
     """
     question = asked(settings.model, PropertySource.of(settings.property))
-    files = Settings(
-        settings.load_config,
-        settings.camera_path_filename,
-        settings.perturbation_filename,
-        arithmetic=settings.arithmetic,
-        given_set=settings.given_set,
-        program=settings.program,
-        overrides=settings.overrides,
-    )
-    scene = files.scene.open()
-    path = load_camera_path(files.camera_path_filename, 1, scene.run_frame)
-    sets = [question.drawn(poses) for poses in path_sets(files, scene, path, default=Perturbation())]
-    origin = settings.perturbation_filename or settings.camera_path_filename
-    try:
-        job = Job(
-            scene, sets, arithmetic=settings.arithmetic, workers=settings.workers, notes=path.notes,
-            set_choices=files.set_choices(sets, path),
-        )  # fmt: skip
-    except InputError as error:
-        raise error.within(origin) if error.field and not error.field.startswith("--") else error from None
+    job = open_job(settings.files, default=Perturbation(), drawn=question.drawn)
     return Certification(job, question, settings.memory, settings.network_arithmetic, settings.picture)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any, Literal
 
 import numpy as np
@@ -19,6 +19,7 @@ from ns_abstract.api.cell_search import (
     answered,
     cell_place,
     check_arguments,
+    result_cells,
     shares_text,
 )
 from ns_abstract.api.certificate_report import CertificateReport
@@ -337,7 +338,8 @@ def certify(
     }
     rows, document = answered(
         CertificateQuestion(certification, range(len(drawn)), settings, ("ns_abstract.certify",)),
-        request if on_progress is None else replace(request, on_progress=on_progress),
+        request,
+        on_progress,
         lambda engines: engines.enter_context(started(engine, scheduler_address, 1 if scene.rays else workers)),
         output_dir,
     )
@@ -346,24 +348,12 @@ def certify(
 
 def certificate(job: Certification, rows: Mapping[int, list[Row]], document: Mapping[str, Any]) -> Certificate:
     """The result of a search that has ended with these rows of cells by frame."""
-    cells = [
-        CertifiedCell(
-            frame,
-            np.array(row["lower"], np.float64),
-            np.array(row["upper"], np.float64),
-            row["verdict"],
-            row["margin"],
-            None if row["counterexample"] is None else np.array(row["counterexample"], np.float64),
-        )
-        for frame, entries in sorted(rows.items())
-        for row in entries
-    ]
     covered = coverage(document["frames"])
     return Certificate(
         certified=covered["certified"],
         falsified=covered["falsified"],
         unknown=covered["unknown"],
-        cells=tuple(cells),
+        cells=result_cells(rows, CertifiedCell, "margin"),
         verdict=verdict(document["frames"]),
         parameters=tuple(job.job.parameters),
         sentence=job.property.sentence(),

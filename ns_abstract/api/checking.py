@@ -122,20 +122,20 @@ def _audited(
     on_progress: Callable[[Audit], object] | None,
 ) -> Audit:
     begin = time.monotonic()
-    found, spent = [], []
+    finished, spent = [], []
     try:
         wrong, subjects = opened(folder, moved)
         audit = Audit(structure=wrong)
         start = time.monotonic()
         for outcome in outcomes(subjects, 0 if wrong else claims, begin + seconds - start, seed):
-            found.append(outcome)
+            finished.append(outcome)
             spent.append(time.monotonic() - start)
             if on_progress is not None:
-                audit._tally(found)
+                audit._tally(finished)
                 if on_progress(audit) is False:
                     break
             start = time.monotonic()
-        audit._tally(found)
+        audit._tally(finished)
     except BadInput as error:
         raise InputError(error.problem, fix=error.fix, file=error.file, field=error.field) from None
     audit.seconds, audit.median_seconds = time.monotonic() - begin, statistics.median(spent) if spent else 0.0

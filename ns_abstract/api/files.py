@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -115,7 +115,10 @@ def pose_set(path: CameraPath, index: int, perturbation: Perturbation) -> PoseBo
 
 
 def open_job(
-    settings: Settings, perturbation: Perturbation | None = None, default: Perturbation | None = None
+    settings: Settings,
+    perturbation: Perturbation | None = None,
+    default: Perturbation | None = None,
+    drawn: Callable[[PoseBox], PoseBox] | None = None,
 ) -> PathJob:
     """Open the files of a command line.
 
@@ -123,6 +126,7 @@ def open_job(
         settings: What to bound.
         perturbation: For every entry of the path, in place of what the files say.
         default: For entries of which the files say nothing; without it they are an error.
+        drawn: Gives each set the size of picture that is asked about; None: the path's.
 
     Raises:
         InputError: A file, a field or an option cannot be used.
@@ -130,7 +134,8 @@ def open_job(
     scene = settings.scene.open()
     path = load_camera_path(settings.camera_path_filename, settings.downscale_factor, scene.run_frame)
     # a set that cannot be made is found before hours of work
-    return PathJob(settings, scene, path, path_sets(settings, scene, path, perturbation, default))
+    sets = path_sets(settings, scene, path, perturbation, default)
+    return PathJob(settings, scene, path, sets if drawn is None else tuple(map(drawn, sets)))
 
 
 def path_sets(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Literal, cast
 
@@ -19,6 +19,7 @@ from ns_abstract.api.cell_search import (
     SearchProgress,
     answered,
     check_arguments,
+    result_cells,
 )
 from ns_abstract.api.job import Job
 from ns_abstract.api.location import Location, PhotoOptions, calibrated
@@ -269,7 +270,8 @@ def locate(
     settings = {"time_budget": time_budget, "arithmetic": arithmetic, "workers": workers, "engine": engine}
     rows, document = answered(
         LocationQuestion(location, range(len(sets)), {**settings, **vars(options)}, ("ns_abstract.locate",)),
-        request if on_progress is None else replace(request, on_progress=on_progress),
+        request,
+        on_progress,
         lambda engines: engines.enter_context(started(engine, scheduler_address, 1 if scene.rays else workers)),
         output_dir,
     )
@@ -314,24 +316,13 @@ def _checked_mask(mask: ArrayLike, job: Job) -> np.ndarray:
 
 def located(job: Location, rows: Mapping[int, list[Row]], document: Mapping[str, Any]) -> Located:
     """The result of a search that has ended with these rows of cells by frame."""
-    cells = [
-        LocatedCell(
-            frame,
-            np.array(row["lower"], np.float64),
-            np.array(row["upper"], np.float64),
-            row["verdict"],
-            None if row["counterexample"] is None else np.array(row["counterexample"], np.float64),
-        )
-        for frame, entries in sorted(rows.items())
-        for row in entries
-    ]
     hull = document["hull"]
     return Located(
         possible_volume=document["possible_volume"],
         hull=None if hull is None else (np.array(hull["lower"]), np.array(hull["upper"])),
         best=document["best"],
         answer=document["answer"],
-        cells=tuple(cells),
+        cells=result_cells(rows, LocatedCell),
         parameters=tuple(job.job.parameters),
         guarantee=short_guarantee(job.job.method.guarantee, document["scene"].get("bounded")),
         state=document["state"],

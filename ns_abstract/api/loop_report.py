@@ -19,7 +19,7 @@ from ns_abstract.reach.search import QUESTIONS, Question, SimulatedRun, sampled_
 from ns_abstract.reach.tubes import Dependence, Tube
 from ns_abstract.report.certificate import SCENE_MARGIN
 from ns_abstract.report.outside import SceneDrawing
-from ns_abstract.report.run import Run, file_stamp, plain
+from ns_abstract.report.run import CommandRun, file_stamp, plain
 from ns_abstract.verify.search_results import Verdict
 from ns_abstract.verify.store import Store, Tally, fractions
 
@@ -59,7 +59,7 @@ class LoopReport:
 
     def __init__(self, job: LoopJob, settings: Mapping[str, Any], command: tuple[str, ...]) -> None:
         self.job = job
-        self.about = Run(
+        self.about = CommandRun(
             guarantee=job.job.method.guarantee,
             renderer={name: job.job.method.program[name] for name in ("name", "version")},
             scene=job.job.describe(),

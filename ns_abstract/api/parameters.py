@@ -40,16 +40,16 @@ def sub_box(whole: ParameterBox, given: Any) -> ParameterBox:
     return box
 
 
-def point_of(whole: ParameterBox, given: Any) -> NDArray[np.float64]:
+def point_of(whole: ParameterBox, values: Any) -> NDArray[np.float64]:
     """Values [d] of a pose of the set, from numbers in the order of the parameters or by name.
 
     Raises:
         InputError: They are none, or outside of the set.
     """
-    if isinstance(given, Mapping) and set(given) == set(whole.names):
-        given = [given[name] for name in whole.names]
+    if isinstance(values, Mapping) and set(values) == set(whole.names):
+        values = [values[name] for name in whole.names]
     try:
-        point = np.asarray(given, np.float64).reshape(-1)
+        point = np.asarray(values, np.float64).reshape(-1)
     except (TypeError, ValueError):
         point = np.full(whole.dimensions, np.nan)
     if point.shape != (whole.dimensions,) or not whole.contains(point):

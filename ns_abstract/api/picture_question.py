@@ -205,11 +205,11 @@ class PlanePictures(FramePictures):
         if frame.tilewise:
 
             def weigh() -> np.ndarray | None:
-                found = self.weigh(box)
+                weights = self.weigh(box)
                 costs = np.zeros((*self.wanted.shape, COLORS))
-                if found is not None:
-                    costs[..., : len(channels)] = found[..., channels]
-                return None if found is None else costs
+                if weights is not None:
+                    costs[..., : len(channels)] = weights[..., channels]
+                return None if weights is None else costs
 
             return cast("RayFrame", frame).sets(box, weigh), np.arange(frame.tile_count)
         pixels = in_tiles(self.wanted, frame.side)

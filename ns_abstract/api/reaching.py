@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from ns_abstract.api.cell_search import (
     answered,
     cell_place,
     check_arguments,
+    result_cells,
     shares_text,
 )
 from ns_abstract.api.loop_job import LoopJob, open_loop
@@ -237,7 +238,8 @@ def reach(
     settings = {"time_budget": time_budget, "arithmetic": arithmetic, "workers": workers, "engine": engine}
     rows, document = answered(
         LoopQuestion(job, settings, ("ns_abstract.reach",), film=film),
-        request if on_progress is None else replace(request, on_progress=on_progress),
+        request,
+        on_progress,
         lambda engines: engines.enter_context(started(engine, scheduler_address, workers)),
         output_dir,
     )
@@ -246,18 +248,6 @@ def reach(
 
 def result(job: LoopJob, rows: Mapping[int, list[Row]], document: Mapping[str, Any]) -> ReachResult:
     """The result of a search that has ended with these rows of cells by question."""
-    cells = [
-        ReachCell(
-            QUESTIONS[number],
-            np.array(row["lower"], np.float64),
-            np.array(row["upper"], np.float64),
-            row["verdict"],
-            row["margin"],
-            None if row["counterexample"] is None else np.array(row["counterexample"], np.float64),
-        )
-        for number, entries in sorted(rows.items())
-        for row in entries
-    ]
     questions = document["questions"]
     fractions = {name: questions[name]["certified"] if name in questions else None for name in QUESTIONS}
     return ReachResult(
@@ -265,7 +255,7 @@ def result(job: LoopJob, rows: Mapping[int, list[Row]], document: Mapping[str, A
         reaches=fractions["reaches"],
         falsified=list(questions.values())[-1]["falsified"],
         verdict=document["verdict"],
-        cells=tuple(cells),
+        cells=result_cells(rows, lambda number, *more: ReachCell(QUESTIONS[number], *more), "margin"),
         parameters=tuple(zip(job.loop.box.names, job.loop.box.units, strict=True)),
         state=document["state"],
         seconds=document["seconds"],

@@ -37,8 +37,8 @@ def load_motion(file: Path, sets: Mapping[int, PoseBox], dataset_scale: float) -
         "sweep": motion.sweep != "keyframes", "orbit": motion.orbit is not None, "scene": bool(motion.scene),
         "hue": motion.hue is not None, "saturation": motion.saturation is not None,
     }  # fmt: skip
-    for name, given in others.items():
-        if given:
+    for name, present in others.items():
+        if present:
             raise InputError("is no motion", file=file, field=name, fix="state translation and rotation alone")
     ranges = {name: ends for name, ends in {**motion.translation, **motion.rotation}.items() if ends != (0.0, 0.0)}
     for poses in sets.values():
@@ -133,9 +133,9 @@ class PhotoSequence:
             numbers, poses = tuple(alive), tuple(alive.values())
             document = search(self._location(k, poses), tuple(range(len(poses))), self.folder / folder)
             frames = [{**frame, "index": numbers[frame["index"]]} for frame in document["frames"]]
-            kept = ("answer", "possible_volume", "hull", "best", "seconds", "state")
+            reported = ("answer", "possible_volume", "hull", "best", "seconds", "state")
             self.entries.append(
-                {"image": file_stamp(self.images[k]), "folder": folder, **{name: document[name] for name in kept}}
+                {"image": file_stamp(self.images[k]), "folder": folder, **{name: document[name] for name in reported}}
                 | {"frames": frames}
             )
             self._write()

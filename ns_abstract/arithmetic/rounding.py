@@ -464,94 +464,109 @@ class Charges(NamedTuple):
 
 def charges(a: Arithmetic) -> Charges:
     """Every charge of the splat kernels, with the count of roundings it covers (design.md, the label named)."""
+    return Charges(
+        flush=a.flush, overflow=a.overflow, **_gaussian_charges(a), **_color_charges(a.unit), **_pixel_charges(a)
+    )
+
+
+def _gaussian_charges(a: Arithmetic) -> dict[str, float]:
+    u = a.unit
+    return {
+        # G2: R and C to float32, -R C, R mu, the last sum: 6 on |R||C|; 4 to spare
+        "camera_coordinate": 10.0 * u,
+        # G5: 1/z, and what is of second order
+        "reciprocal_depth": (a.division + 1.0) * u,
+        # G5: a product, and what is of second order
+        "ratio": 2.0 * u,
+        # G5: focal length and centre to float32, two products, a sum: 5; 3 to spare
+        "mean": 8.0 * u,
+        # G6: of the clamp's limits: divisions and products of the intrinsics, 8
+        "clamp": 8.0 * u,
+        # G6: focal length, clamped ratio, three products: 5; 3 to spare
+        "jacobian": 8.0 * u,
+        # G11: R rounded twice
+        "rotation": 2.0 * u,
+        # G6: 1/|q|: half of 4, rsqrt; a component: 1; products of two: 1; twice, their sum and 1: 33; 19 see there
+        "rotation_entry": (2.0 * (2.0 * (3.0 + a.rsqrt) + 2.0) + 1.0 + 19.0) * u,
+        # G6: products and sums of M M^T: 5 of 13, the others are in ``rotation_entry``
+        "covariance_products": 5.0 * u,
+        # G6: R twice, two products of matrices, two with J: 14; 6.5 to spare
+        "covariance": 20.5 * u,
+        # G6: of |Sigma| where its own error multiplies another
+        "covariance_size": 64.0 * u,
+        "covariance_size_products": 8.0 * u,
+        # G6: 0.3 to float32, its sum
+        "blur": 2.0 * u,
+        # G8: two products, a difference, of ac + b^2: 3; 3 to spare
+        "determinant": 6.0 * u,
+        # G8: a sum, a product, 2 to spare; a square, a difference, 2 to spare
+        "half_trace": 4.0 * u,
+        "discriminant": 4.0 * u,
+        # G8: a root and the sums and products beside it, as much again
+        "radius": 2.0 * a.sqrt * u,
+        # G7: 28 and 8; 44 to spare
+        "conic": 80.0 * u,
+        # G11: five products of matrices of three: 15; 1 to spare
+        "gram": 16.0 * u,
+        # G11: a division under the root, the root, the product with the opacity, 1 to spare
+        "compensation": (0.5 * a.division + a.sqrt + 2.0) * u,
+        # G9: 0.01 to float32; 3 to spare
+        "near": 4.0 * u,
+        # G8: mean -+ radius, 1; a division by 16, 4; 3 to spare
+        "tile": 8.0 * u,
+        # G9: a sigmoid is an exponential, a sum and a division; 3 to spare
+        "opacity": (a.exp + 1.0 + a.division + 3.0) * u,
+        # G9: __expf of at most 5.55, below 18, the product, the opacity; 33 to spare
+        "exponent_limit": 64.0 * u,
+        # G10: a product and two sums, 3, on |R||mu|; the last sum, 1, on z; second order
+        "depth_products": 4.2 * u,
+        "depth": 1.1 * u,
+        # O1: R rounded twice, its product with the difference; 1 to spare
+        "viewing_axis": 4.0 * u,
+    }
+
+
+def _color_charges(u: float) -> dict[str, float]:
+    return {
+        # C3: torch.inverse of the view matrix, of 1 + |T|
+        "camera_position": 80.0 * u,
+        # C3: mean minus camera, of |mean|
+        "direction_mean": 2.0 * u,
+        # C3: a normalised direction
+        "direction": 16.0 * u,
+        # C3: a basis function's polynomial, its product, 16 sums, of sum |sh| |basis|; the sum with 0.5
+        "harmonics": 40.0 * u,
+        "color_sum": u,
+        # S4: a sum of colour and shift, the ends' own rounding
+        "shifted_color": 4.0 * u,
+        # C1: a product and a sum, or a sigmoid, at most 5; 3 to spare
+        "plain_color": 8.0 * u,
+    }
+
+
+def _pixel_charges(a: Arithmetic) -> dict[str, float]:
     u = a.unit
     # what the package's own float64 evaluation of the same formula adds to each rounding
     both = u + 8.0 * UNIT64
     by_argument = a.fast_exp_per_unit_argument + 0.654
-    return Charges(
-        flush=a.flush,
-        overflow=a.overflow,
-        # G2: R and C to float32, -R C, R mu, the last sum: 6 on |R||C|; 4 to spare
-        camera_coordinate=10.0 * u,
-        # G5: 1/z, and what is of second order
-        reciprocal_depth=(a.division + 1.0) * u,
-        # G5: a product, and what is of second order
-        ratio=2.0 * u,
-        # G5: focal length and centre to float32, two products, a sum: 5; 3 to spare
-        mean=8.0 * u,
-        # G6: of the clamp's limits: divisions and products of the intrinsics, 8
-        clamp=8.0 * u,
-        # G6: focal length, clamped ratio, three products: 5; 3 to spare
-        jacobian=8.0 * u,
-        # G11: R rounded twice
-        rotation=2.0 * u,
-        # G6: 1/|q|: half of 4, rsqrt; a component: 1; products of two: 1; twice, their sum and 1: 33; 19 see there
-        rotation_entry=(2.0 * (2.0 * (3.0 + a.rsqrt) + 2.0) + 1.0 + 19.0) * u,
-        # G6: products and sums of M M^T: 5 of 13, the others are in ``rotation_entry``
-        covariance_products=5.0 * u,
-        # G6: R twice, two products of matrices, two with J: 14; 6.5 to spare
-        covariance=20.5 * u,
-        # G6: of |Sigma| where its own error multiplies another
-        covariance_size=64.0 * u,
-        covariance_size_products=8.0 * u,
-        # G6: 0.3 to float32, its sum
-        blur=2.0 * u,
-        # G8: two products, a difference, of ac + b^2: 3; 3 to spare
-        determinant=6.0 * u,
-        # G8: a sum, a product, 2 to spare; a square, a difference, 2 to spare
-        half_trace=4.0 * u,
-        discriminant=4.0 * u,
-        # G8: a root and the sums and products beside it, as much again
-        radius=2.0 * a.sqrt * u,
-        # G7: 28 and 8; 44 to spare
-        conic=80.0 * u,
-        # G11: five products of matrices of three: 15; 1 to spare
-        gram=16.0 * u,
-        # G11: a division under the root, the root, the product with the opacity, 1 to spare
-        compensation=(0.5 * a.division + a.sqrt + 2.0) * u,
-        # G9: 0.01 to float32; 3 to spare
-        near=4.0 * u,
-        # G8: mean -+ radius, 1; a division by 16, 4; 3 to spare
-        tile=8.0 * u,
-        # G9: a sigmoid is an exponential, a sum and a division; 3 to spare
-        opacity=(a.exp + 1.0 + a.division + 3.0) * u,
-        # G9: __expf of at most 5.55, below 18, the product, the opacity; 33 to spare
-        exponent_limit=64.0 * u,
-        # G10: a product and two sums, 3, on |R||mu|; the last sum, 1, on z; second order
-        depth_products=4.2 * u,
-        depth=1.1 * u,
-        # O1: R rounded twice, its product with the difference; 1 to spare
-        viewing_axis=4.0 * u,
-        # C3: torch.inverse of the view matrix, of 1 + |T|
-        camera_position=80.0 * u,
-        # C3: mean minus camera, of |mean|
-        direction_mean=2.0 * u,
-        # C3: a normalised direction
-        direction=16.0 * u,
-        # C3: a basis function's polynomial, its product, 16 sums, of sum |sh| |basis|; the sum with 0.5
-        harmonics=40.0 * u,
-        color_sum=u,
-        # S4: a sum of colour and shift, the ends' own rounding
-        shifted_color=4.0 * u,
-        # C1: a product and a sum, or a sigmoid, at most 5; 3 to spare
-        plain_color=8.0 * u,
+    return {
         # B4: a constant in the program's format, 1; a comparison is exact
-        threshold=2.0 * u,
+        "threshold": 2.0 * u,
         # B3: __expf at 0, the product with the opacity; 25 to spare
-        exponential=(a.fast_exp + 1.0 + 25.0) * u,
+        "exponential": (a.fast_exp + 1.0 + 25.0) * u,
         # B3: what __expf adds for each unit of the exponent, at its least and over its range
-        exponential_by_argument=by_argument * u,
-        exponential_by_range=2.0 * by_argument * u,
+        "exponential_by_argument": by_argument * u,
+        "exponential_by_range": 2.0 * by_argument * u,
         # B5, B6: a difference and a product of the running transmittance, 2; the stop's constant, 1
-        transmittance=8.0 * u,
+        "transmittance": 8.0 * u,
         # B6: what the light that a stop leaves may be off by: two steps and the threshold, 5
-        lost_light=16.0 * u,
+        "lost_light": 16.0 * u,
         # B8: a product with alpha, one with the light, a sum
-        blend_fragment=3.0 * both,
+        "blend_fragment": 3.0 * both,
         # B8: the background's product and sum, the clamp: 6; 10 to spare
-        blend_pixel=16.0 * both,
+        "blend_pixel": 16.0 * both,
         # B8: a sum, for each fragment that is left out
-        left_out=both,
+        "left_out": both,
         # D4: a division; a constant below it, 1
-        expected_depth=(a.division + 1.0) * u,
-    )
+        "expected_depth": (a.division + 1.0) * u,
+    }

@@ -68,8 +68,8 @@ def outcomes(subjects: list[Claims], claims: int, seconds: float, seed: int) -> 
         verdict, float32, detail = None, False, {}
         if start < end:
             verdict, float32, detail = subject.settle(claim, min(start + share, end))
-        found = {"frame": subject.cells.index, **subject.place(claim), **detail} if verdict is False else {}
-        yield ClaimOutcome(verdict, float32, number % 2 == 0, found)
+        refutation = {"frame": subject.cells.index, **subject.place(claim), **detail} if verdict is False else {}
+        yield ClaimOutcome(verdict, float32, number % 2 == 0, refutation)
 
 
 def _opened(
@@ -94,11 +94,11 @@ def _opened(
         parts = read_verdicts(folder, report)
         model = moved.get("model") or file("loop").parent / report["loop"]["network"]
         return parts, [s for s in (LoopClaims(c, scene, report, model) for c in parts) if s.count]
-    path, given = file("camera_path_filename"), given_set(settings, moved.get("perturbation_filename"))
+    path, perturbation = file("camera_path_filename"), given_set(settings, moved.get("perturbation_filename"))
     certificate = (folder / "cells.sqlite").exists()
     parts, subjects = read_verdicts(folder, report) if certificate else _frames(folder, report), []
     for cells in parts:
-        poses, free = read_poses(path, given, cells.index, settings, scale)
+        poses, free = read_poses(path, perturbation, cells.index, settings, scale)
         size = (poses.camera.height, poses.camera.width)
         ranges = list(zip(cells.names, cells.lower.tolist(), cells.upper.tolist(), strict=True))
         if ranges != free or (not certificate and cells.arrays["lower"].shape[:2] != size):

@@ -120,8 +120,8 @@ class Claims(ABC):
             parts = [stack.pop() for _ in range(size)]
             first, last = (np.stack([part[k] for part in parts]) for k in (0, 1))
             near = np.unique(np.concatenate([part[2] for part in parts]))
-            found, middle = self.margins(claim, first, last, near, unit), 0.5 * (first + last)
-            open_ = np.flatnonzero(~(found.least >= 0.0))
+            bounds, middle = self.margins(claim, first, last, near, unit), 0.5 * (first + last)
+            open_ = np.flatnonzero(~(bounds.least >= 0.0))
             some = open_[: 1 + self.together // 8]
             some = [0] if fresh and not len(some) and self.floor(claim) > 0.0 else some
             if len(some):
@@ -134,8 +134,8 @@ class Claims(ABC):
                     return None, {}
             fresh = False
             for k in open_:
-                motion = np.ones(len(low)) if found.motion is None else found.motion[:, k]
-                inner = near if found.near is None else near[found.near[k]]
+                motion = np.ones(len(low)) if bounds.motion is None else bounds.motion[:, k]
+                inner = near if bounds.near is None else near[bounds.near[k]]
                 stack.extend((a, b, inner) for a, b in _divided(first[k], last[k], motion, high - low))
         return True, {}
 

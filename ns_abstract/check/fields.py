@@ -10,8 +10,9 @@ from ns_abstract.check.forms import Affine, Array, U, total
 from ns_abstract.check.poses import CameraForms, CheckedCamera
 from ns_abstract.check.splats import wide
 
+#: Room for numpy's exponential; by how much torch's softplus, which is its argument from 20 on, is below the function.
 #: Neurons of a layer and sample that keep a symbol of their own where they may bend; boxes that are looked at together.
-SYMBOLS, TOGETHER = 256, 4
+_LIBRARY, _SOFTPLUS_CUT, SYMBOLS, TOGETHER = 1e-12, 2.1e-9, 256, 4
 
 
 class CheckedField:
@@ -76,21 +77,21 @@ class CheckedField:
         low, high = raw.range()
         f, slope = np.logaddexp(0.0, raw.c), 1.0 / (1.0 + np.exp(-raw.c))
         # half the second derivative is at most 1/8, and half the exponential of its argument
-        bend = np.minimum(0.5 * np.exp(np.minimum(high, 0.0)) * (1.0 + 1e-12), 0.125)
+        bend = np.minimum(0.5 * np.exp(np.minimum(high, 0.0)) * (1.0 + _LIBRARY), 0.125)
         # torch's softplus is its argument from 20 on
-        density = raw.composed(f, slope, 0.0 * f, bend).wider(np.where(high > 19.0, 2.1e-9, 0.0))
+        density = raw.composed(f, slope, 0.0 * f, bend).wider(np.where(high > 19.0, _SOFTPLUS_CUT, 0.0))
         ends = [np.logaddexp(0.0, e) * (1.0 + s * 1e-9) for e, s in ((low, -1.0), (high, 1.0))]
         density = density.within(*ends)
         thin = (density * -lengths).exp()
         thick, thinned = (np.exp(-e * lengths) for e in ends)
-        thin = thin.within(thinned * (1.0 - 1e-12), thick * (1.0 + 1e-12))
+        thin = thin.within(thinned * (1.0 - _LIBRARY), thick * (1.0 + _LIBRARY))
         x = _Zonotope.of(direction).stretched(x).beside(x)
         for weight, bias in self.head:
             x = x.layer(weight, bias).bent()
         raw = x.layer(*self.color[0]).form(d)
         f = 1.0 / (1.0 + np.exp(-raw.c))
         color = raw.composed(f, f * (1.0 - f), -0.0482 + 0.0 * f, 0.0482 + 0.0 * f)
-        ends = zip(raw.range(), (-1e-12, 1e-12), strict=True)
+        ends = zip(raw.range(), (-_LIBRARY, _LIBRARY), strict=True)
         color = color.within(*(1.0 / (1.0 + np.exp(-e)) * (1.0 + room) for e, room in ends))
         alpha = -thin + 1.0
         return from_the_back(alpha, color, np.ones(alpha.c.shape, bool), np.array(self.background), 0.0)

@@ -180,10 +180,10 @@ def _read_ply(file: Path, settings: dict[str, Any]) -> tuple[Any, ...]:
         match = re.fullmatch(r"(splatrendermode|antialiased)\b[\s:=]*(.*)", line.strip(), re.IGNORECASE)
         if match:
             value = match[2].strip().strip("'\"").lower()
-            known = value in _MODES and (value in ("mip", "default")) == (match[1].lower() == "splatrendermode")
-            if not known and not settings.get("rasterize_mode"):
+            matches = value in _MODES and (value in ("mip", "default")) == (match[1].lower() == "splatrendermode")
+            if not matches and not settings.get("rasterize_mode"):
                 raise BadInput(f"found {value!r}", file, f"comment {match[1]}", "give a scene of 3D Gaussians")
-            mode = _MODES[value] if known else "classic"
+            mode = _MODES[value] if matches else "classic"
     # a file of degree 0 holds spherical harmonics, too
     return *stored, columns["opacity"], sh, mode, (0.0, 0.0, 0.0), False, math.isqrt(sh.shape[1]) - 1
 
@@ -199,17 +199,17 @@ def _read_field(model: dict[str, Any], state: dict[str, Any], file: Path, settin
         if not settings.get("background") and model.get("background_color", "white") != "random":
             background = _color(model.get("background_color", "white"))
         background = tuple(float(np.float32(v)) for v in background)
-        found = CheckedField({k: v.float().numpy() for k, v in state.items() if k.startswith("field_fine.")})
-        found.near, found.far, found.samples, found.background = near, far, int(renderer["samples"]), background
+        field = CheckedField({k: v.float().numpy() for k, v in state.items() if k.startswith("field_fine.")})
+        field.near, field.far, field.samples, field.background = near, far, int(renderer["samples"]), background
     except (KeyError, ValueError, TypeError, AttributeError):
         raise BadInput("holds no field of vanilla-nerf", file) from None
     digest = hashlib.sha256()
-    for array in found.arrays:
+    for array in field.arrays:
         digest.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
-    codes = ", ".join(f"Encoding(count={n}, least=0.0, most={m})" for n, m in found.counts)
-    sampling = f"near={near!r}, far={far!r}, samples={found.samples}, importance=0, background={background!r}"
+    codes = ", ".join(f"Encoding(count={n}, least=0.0, most={m})" for n, m in field.counts)
+    sampling = f"near={near!r}, far={far!r}, samples={field.samples}, importance=0, background={background!r}"
     digest.update(f"({codes}, Sampling(kind='uniform', {sampling}))".encode())
-    return found, digest
+    return field, digest
 
 
 def dataset_scale(config: Path) -> float:

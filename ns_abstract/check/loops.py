@@ -41,9 +41,9 @@ class LoopClaims(OfNetwork):
         self.seen = [k for k in range(len(self.names)) if any(row[k] for row in rows)]
 
     def _state(self, low: Array, high: Array) -> list[Affine]:
-        given = Poses(self.camera, self.cells.names).given(low, high)
+        coordinates = Poses(self.camera, self.cells.names).given(low, high)
         ends = {n: v if isinstance(v, (int, float)) else v[0] for n, v in self.loop["initial"].items()}
-        return [given[n] if n in given else given[""] + float(ends[n]) for n in self.names]
+        return [coordinates[n] if n in coordinates else coordinates[""] + float(ends[n]) for n in self.names]
 
     def _view(self, x: list[Affine]) -> CameraForms:
         rows = zip(self.position["matrix"], self.position["offset"], strict=True)
@@ -92,18 +92,18 @@ class LoopClaims(OfNetwork):
 
     def bounds(self, low: Array, high: Array, unit: float) -> tuple[Array, Array]:
         """Of how far all runs from boxes stay from going wrong; runs are not refuted."""
-        x, goal, found, inside = self._state(low, high), self.loop.get("goal"), [], []
+        x, goal, margins, inside = self._state(low, high), self.loop.get("goal"), [], []
         for step in range(self.steps + 1):
             x = self._next(x, unit) if step else x
-            found += [_outside(area, x, self.names) for area in self.loop.get("unsafe") or []]
+            margins += [_outside(area, x, self.names) for area in self.loop.get("unsafe") or []]
             if self.cells.index and goal:
                 inside.append(-_outside(goal, x, self.names, inner=True))
             lost = ~np.isfinite(np.stack([e.width for e in x])).all(axis=0)
-            if (lost | (np.min(found, axis=0, initial=np.inf) <= 0.0)).all():
+            if (lost | (np.min(margins, axis=0, initial=np.inf) <= 0.0)).all():
                 return np.full(len(low), -np.inf), np.full(len(low), np.inf)
         if inside:
-            found.append(inside[-1] if goal.get("when", "end") == "end" else np.max(inside, axis=0))
-        least = np.min(found, axis=0) if found else np.full(len(low), np.inf)
+            margins.append(inside[-1] if goal.get("when", "end") == "end" else np.max(inside, axis=0))
+        least = np.min(margins, axis=0) if margins else np.full(len(low), np.inf)
         return np.where(np.isnan(least) | lost, -np.inf, least), np.full(len(low), np.inf)
 
 

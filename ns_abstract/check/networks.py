@@ -76,9 +76,9 @@ class CheckedNetwork:
         Tensors are bounded from the picture on; neurons that may bend are bounded again by rows that go back to it.
         """
         c, g, r = (torch.from_numpy(np.ascontiguousarray(a, np.float64)) for a in (picture.c, picture.g, picture.r))
-        known, lines, deep = {self.input: _Known(c, g, r, c.abs() + g.abs().sum(0) + r)}, {}, set()
+        relaxed, lines, deep = {self.input: _Known(c, g, r, c.abs() + g.abs().sum(0) + r)}, {}, set()
         for layer in self.layers:
-            (c, g, r, size), *others = (known[name] for name in layer.inputs)
+            (c, g, r, size), *others = (relaxed[name] for name in layer.inputs)
             f, absolute = layer.map, layer.absolute
             if f is not None and absolute is not None:
                 slopes = f(g.flatten(0, 1)) if len(g) else g.new_zeros(0)
@@ -88,23 +88,23 @@ class CheckedNetwork:
             elif others:
                 c, g, r, size = (a + b for a, b in zip((c, g, r, size), others[0], strict=True))
             else:
-                low, high = known[layer.inputs[0]].ends()
+                low, high = relaxed[layer.inputs[0]].ends()
                 which, place = ((low < 0.0) & (high > 0.0)).flatten(1).nonzero().T
                 if layer.inputs[0] in deep and 0 < len(which) <= _MOST_ROWS * len(c):
                     own = functional.one_hot(place, c[0].numel()).double()
-                    least, most = map(torch.from_numpy, self._back(known, lines, layer.inputs[0], own, which).range())
+                    least, most = map(torch.from_numpy, self._back(relaxed, lines, layer.inputs[0], own, which).range())
                     low.flatten(1)[which, place] = low.flatten(1)[which, place].maximum(least)
                     high.flatten(1)[which, place] = high.flatten(1)[which, place].minimum(most)
                 slope, half = lines[layer.output] = _line(low, high)
                 c, g, r, size = slope * c + half, slope * g, slope * r + half, torch.maximum(high, -low).clamp(min=0.0)
             r = (r + self._charge(layer, c.shape) * size) * (1.0 + 8.0 * U)
-            known[layer.output] = _Known(c, g, r, size)
+            relaxed[layer.output] = _Known(c, g, r, size)
             # what lies behind a ReLU: before the first one rows say no more than this
             deep |= {layer.output} if layer.output in lines or deep.intersection(layer.inputs) else set()
-        count, size = len(picture.c), known[self.output].c[0].numel()
+        count, size = len(picture.c), relaxed[self.output].c[0].numel()
         rows = torch.eye(size, dtype=torch.float64) if rows is None else rows
         which, m = torch.arange(count).repeat_interleave(len(rows)), len(rows)
-        form = self._back(known, lines, self.output, rows.repeat(count, 1), which)
+        form = self._back(relaxed, lines, self.output, rows.repeat(count, 1), which)
         return form.of(lambda a: a.reshape(*a.shape[:-1], count, m))
 
     def _back(self, known: dict[str, _Known], lines: dict[str, Any], name: str, rows: Tensor, which: Tensor) -> Affine:

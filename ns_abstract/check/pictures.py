@@ -12,6 +12,9 @@ from ns_abstract.check.poses import Poses
 from ns_abstract.check.results import StoredCells
 from ns_abstract.check.splats import ActivatedScene, meeting, pixels, reaches, several
 
+#: Room for the float64 rounding of a claim's planes, relative to their terms.
+_ROUNDED = 1e-13
+
 
 class PixelClaim(NamedTuple):
     """A pixel's channel over a cell, and a pose [1, d] that may refute it."""
@@ -44,13 +47,13 @@ class ClaimedBounds(NamedTuple):
             slope = plane[:, None] * (half / span).T
             middle = constant + ((centre - 0.5 * (self.low + self.high)) / span) @ plane
             tilt, reach = np.abs(slope - form.g).sum(axis=0) + form.r, np.abs(slope).sum(axis=0)
-            room = 1e-13 * (np.abs(plane).sum() + tilt + np.abs(middle - c))
+            room = _ROUNDED * (np.abs(plane).sum() + tilt + np.abs(middle - c))
             # a bound beyond the end of [0, 1] holds, and one beyond the other end does not
-            holds = side * (middle - end) + reach + 1e-13 * (np.abs(plane).sum() + 1.0) <= 0.0
+            holds = side * (middle - end) + reach + _ROUNDED * (np.abs(plane).sum() + 1.0) <= 0.0
             past = side * (middle - 1.0 + end) + reach - 1e-9
             flat, holds_flat = side * (fixed - c), side * (fixed - end) <= 0.0
             for ends, a, b in (
-                (worst, np.maximum(side * (middle - c) + tilt + room, past), flat + moved * (1.0 + 1e-13)),
+                (worst, np.maximum(side * (middle - c) + tilt + room, past), flat + moved * (1.0 + _ROUNDED)),
                 (sure, side * (middle - c) - form.width - 8.0 * room, flat - form.width - 8.0 * room),
             ):
                 ends.append(np.maximum(np.where(holds, -1.0, a), -1.0 if holds_flat else b))
@@ -131,24 +134,24 @@ class Picture(Claims):
         bounds, middle = self.bounds(claim), 0.5 * (low + high)
         half, none = np.maximum(high - middle, middle - low), np.zeros(len(low))
         nothing = Affine(none, np.zeros((low.shape[1], len(low))), none + np.inf)
-        kept = motion = None
+        counted = motion = None
         if (worst := bounds.excess(middle, half, nothing)[0]).max() > 0.0:
-            form, kept, motion = self._forms(claim, low, high, near, unit)
+            form, counted, motion = self._forms(claim, low, high, near, unit)
             worst, sure = bounds.excess(middle, half, form)
-            return ClaimMargins(-worst.max(axis=0), -sure.max(axis=0), kept, motion)
+            return ClaimMargins(-worst.max(axis=0), -sure.max(axis=0), counted, motion)
         # the bounds [0, 1] or wider hold whatever is drawn
         return ClaimMargins(-worst.max(axis=0), none + 1.0)
 
     def _forms(self, claim: PixelClaim, low: Array, high: Array, near: Array, unit: float) -> Any:
         view = self.poses.view(low, high)
         pixel = np.full(len(low), claim.row), np.full(len(low), claim.column)
-        kept = motion = None
+        counted = motion = None
         if isinstance(self.scene, ActivatedScene):
             at = np.broadcast_to(near, (len(low), len(near)))
-            form, kept, motion = pixels(self.scene, self.poses.camera, view, at, pixel, unit)
+            form, counted, motion = pixels(self.scene, self.poses.camera, view, at, pixel, unit)
         else:
             form = self.scene.pixels(self.poses.camera, view, pixel)
-        return form.of(lambda a: a[..., claim.channel]), kept, motion
+        return form.of(lambda a: a[..., claim.channel]), counted, motion
 
     def detail(self, claim: PixelClaim, point: Array) -> dict[str, Any]:
         """The pose, the picture's value, its error, and by how much which bound is left."""

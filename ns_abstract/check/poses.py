@@ -50,8 +50,8 @@ class Poses:
         """The parameters by name over the boxes [B, d]."""
         middle = 0.5 * (low + high)
         free = parameters(middle, np.maximum(high - middle, middle - low) * (1.0 + 4.0 * U))
-        found = {"": Affine.constant(0.0, free[0])} | dict(zip(self.names, free, strict=False))
-        return found | {name: Affine.constant(v, free[0]) for name, v in self.values.items()}
+        coordinates = {"": Affine.constant(0.0, free[0])} | dict(zip(self.names, free, strict=False))
+        return coordinates | {name: Affine.constant(v, free[0]) for name, v in self.values.items()}
 
     def view(self, low: Array, high: Array) -> CameraForms:
         """The cameras over the boxes [B, d]."""

@@ -20,8 +20,9 @@ NEAR, FAR, BLUR, MARGIN, TILE = 0.01, 1e10, 0.3, 0.3, 16
 LEAST_ALPHA = 1.0 / 255.0
 #: Unit roundoff of float32.
 FLOAT = 2.0**-24
-#: Pixels times Gaussians that are looked at together.
-TOGETHER = 20_000
+#: Pixels times Gaussians that are looked at together. Room for what roots and sums of float64 are off by; what a
+#: product of tiny floats may lose when it is flushed.
+TOGETHER, _LIBRARY, _FLUSHED = 20_000, 1e-9, 1e-30
 
 
 class VersionRules(NamedTuple):
@@ -116,7 +117,7 @@ def _ends(p: ProjectedForms, unit: float) -> Array:
     longest = 3.4 * np.sqrt(spread[0] + spread[1]) + 2.0 * TILE
     ends = []
     for form, variance in zip(p.centre, spread, strict=True):
-        (low, high), room = form.range(), np.where(wild, longest, reach * np.sqrt(variance) * (1.0 + 1e-9)) + 1e-9
+        (low, high), room = form.range(), np.where(wild, longest, reach * np.sqrt(variance) * (1.0 + 1e-9)) + _LIBRARY
         open_ = ~(np.isfinite(low) & np.isfinite(high) & np.isfinite(room))
         ends += [np.where(open_, -np.inf, low - room), np.where(open_, np.inf, high + room)]
     hidden = (zh < NEAR * (1.0 - ROOM)) | (zl > FAR * (1.0 + ROOM)) | ((visible < 1.0) & ~wild)
@@ -215,7 +216,7 @@ def _fragments(
     near = total((n[k] * dx - m[k] * dy).square() for k in range(3))
     exponent = (near + (dx.square() + dy.square()) * BLUR) * 0.5 * p.inverse
     wild = ~((p.kappa < 0.125) & np.isfinite(exponent.r)) & (unit > 0.0)
-    exponent = exponent.wider(np.where(wild, 0.0, 1.2 * p.kappa) * exponent.size() + 1e-30 * (unit > 0.0))
+    exponent = exponent.wider(np.where(wild, 0.0, 1.2 * p.kappa) * exponent.size() + _FLUSHED * (unit > 0.0))
     elow, ehigh = exponent.range()
     olow, ohigh = opacity.range()
     room = ROOM + 80.0 * unit
@@ -235,8 +236,8 @@ def _fragments(
         maybe, certain = _tiles(cam, pixel, (mx, my), squares, unit)
         shows, surely = shows & maybe, surely & certain & ~wild
     elif unit:
-        kept, level = _kept(p, rules.ellipses)
-        surely = surely & kept & (least >= LEAST_ALPHA * level)
+        ellipse_kept, level = _kept(p, rules.ellipses)
+        surely = surely & ellipse_kept & (least >= LEAST_ALPHA * level)
     alow, ahigh = alpha.range()
     # the form must say no less than the interval, and stay below the cap
     rough = ~((ahigh - alow) <= 1.5 * (most - least)) | ~(ahigh <= rules.cap) | ~(alow >= 0.0) | ~surely
@@ -252,14 +253,14 @@ def _rounded(det: Affine, squares: Any, h: list[Array], sizes: Array) -> tuple[l
 
     Where kappa is not below 1/8 nothing is known of the exponent; docs/check.md derives the charges.
     """
-    square, (hx, hy) = (sizes * sizes).sum(axis=-1) * (1.0 + 1e-9), h
+    square, (hx, hy) = (sizes * sizes).sum(axis=-1) * (1.0 + _LIBRARY), h
     a, c = (e.size() + BLUR for e in squares)
     ends = ((hx, hx, a), (hy, hy, c), (hx, hy, 0.0))
     ea, ec, eb = (FLOAT * (330.0 * p * q * square + 3.0 * d) for p, q, d in ends)
     low = np.maximum(det.range()[0], BLUR * BLUR)
     eta = (c * ea + 2.0 * np.sqrt(a * c) * eb + a * ec) / low
     kappa = np.where(a * c < 1e30, 1.05 * (eta + 48.0 * FLOAT * a * c / low), np.inf)
-    error = a * ec + c * ea + 2.0 * np.sqrt(a * c) * eb + ea * ec + eb * eb + 8.0 * FLOAT * a * c + 1e-30
+    error = a * ec + c * ea + 2.0 * np.sqrt(a * c) * eb + ea * ec + eb * eb + 8.0 * FLOAT * a * c + _FLUSHED
     return [ea, ec, eb], kappa, error
 
 
@@ -295,7 +296,7 @@ def _tiles(cam: CheckedCamera, pixel: Any, centre: Any, squares: Any, unit: floa
         low, high = form.range()
         first = TILE * (place[:, None] // TILE)
         last = np.minimum(first + TILE, side)
-        slack = 1e-9 + 16.0 * unit * (np.abs(low) + np.abs(high) + rh)
+        slack = _LIBRARY + 16.0 * unit * (np.abs(low) + np.abs(high) + rh)
         certain = certain & (high - rl < last - slack) & (low + rl > first + slack)
         # the negations keep what is not a number
         maybe = maybe & ~(low - rh > last + slack) & ~(high + rh < first - slack)
@@ -315,9 +316,9 @@ def _kept(p: ProjectedForms, ellipses: bool) -> tuple[Array, Array]:
     kept, room = (p.kappa < 0.03) & (span < 4000.0), 2.0**10
     if ellipses:
         thin, room = 1.0 / (p.inverse.range()[1] * a * c), 2.0**19
-        kept &= (p.kappa < 2.0**-10) & (thin * thin > 2.0**10 * FLOAT)
-        kept &= thin * np.sqrt(BLUR) > 2.0**10 * FLOAT * span
-        kept &= span * np.sqrt(np.maximum(a, c) / BLUR) < 2.0**-6 / FLOAT
+        sharp = (p.kappa < 2.0**-10) & (thin * thin > 2.0**10 * FLOAT)
+        short = thin * np.sqrt(BLUR) > 2.0**10 * FLOAT * span
+        kept = kept & sharp & short & (span * np.sqrt(np.maximum(a, c) / BLUR) < 2.0**-6 / FLOAT)
     return kept, 1.0 + 16.0 * p.kappa + room * FLOAT
 
 
@@ -403,12 +404,12 @@ def pixels(
             [alpha, view.color, view.depth, shows], np.arange(len(index))[:, None], used[None]
         )
         form, keep = blended(alpha, color, depth, some, splats.background, unit)
-        kept, seen = np.zeros(shows.shape, bool), shows.any(axis=1)[:, None]
-        kept[:, used] = keep
+        counted, seen = np.zeros(shows.shape, bool), shows.any(axis=1)[:, None]
+        counted[:, used] = keep
         # where nothing shows the background is drawn, exactly
         c, r = np.where(seen, form.c, splats.background), np.where(seen, form.r, 0.0)
         form = Affine(c, np.where(seen, form.g, 0.0), r)
-        return form, kept[:, :count], motion
+        return form, counted[:, :count], motion
 
 
 def pictures(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit: float) -> Affine:
@@ -433,8 +434,8 @@ def several(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, numbe
     for start in range(0, len(lists), step):
         chosen = lists[start : start + step]
         index = np.full((len(chosen), longest), -1)
-        for place, found in zip(index, chosen, strict=True):
-            place[: len(found)] = np.searchsorted(every, found)
+        for place, gaussians in zip(index, chosen, strict=True):
+            place[: len(gaussians)] = np.searchsorted(every, gaussians)
         box, place = np.divmod(np.arange(start, start + len(chosen)), size)
         part = picked(whole, box[:, None], index)
         parts.append(pixels(splats, cam, part, index, np.divmod(numbers[place], cam.width), unit)[0].clamped(0.0, 1.0))

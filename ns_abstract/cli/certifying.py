@@ -29,13 +29,11 @@ _SECONDS = 1800.0
 
 def _introduce(console: Console, job: Certification, about: CertifiedRun) -> None:
     method = job.job.method
-    console.print(
-        f"{method.name}: {method.content}; {job.question.name}; {about.sentence}", markup=False, soft_wrap=True
-    )
+    console.print(f"{method.name}: {method.content}; {job.question.name}; {about.sentence}")
     for warning in job.job.warnings:
-        console.print(f"warning: {warning}", markup=False, soft_wrap=True)
+        console.print(f"warning: {warning}")
     for note in about.plan:
-        console.print(f"  {note}", markup=False, soft_wrap=True)
+        console.print(f"  {note}")
 
 
 def certify_path(options: Certify, stop: SignalStop) -> bool:
@@ -57,7 +55,7 @@ def certify_path(options: Certify, stop: SignalStop) -> bool:
     def opened(store: Store) -> None:
         if store.resumed:
             text = f"  {store.count} cells kept from before, {store.open_blocks} blocks still to be examined"
-            console.print(text, markup=False)
+            console.print(text)
         if options.where.engine == "local":
             # once, and not in every worker
             with stop.at_once():
@@ -74,21 +72,19 @@ def certify_path(options: Certify, stop: SignalStop) -> bool:
                 scene_margin=options.scene_margin,
                 on_open=opened,
                 on_progress=progress,
-                on_margin=lambda found: console.print(f"scene margin: {found.sentence}", markup=False, soft_wrap=True),
+                on_margin=lambda found: console.print(f"scene margin: {found.sentence}"),
             ),
         )
     covered = coverage(document["frames"])
     parts = ", ".join(f"{kind} {percent(covered[kind])}" for kind in ("certified", "falsified", "unknown"))
     left = f" (of it not examined {percent(covered['not_examined'])})" if covered["not_examined"] else ""
-    console.print(f"{document['verdict']}: {parts}{left}", markup=False, soft_wrap=True)
+    console.print(f"{document['verdict']}: {parts}{left}")
     if (proved := document["certified_of_sampled_right"]) is not None:
-        console.print(
-            f"of the sampled poses where the property holds, {percent(min(1.0, proved))} are proved", markup=False
-        )
+        console.print(f"of the sampled poses where the property holds, {percent(min(1.0, proved))} are proved")
     if document["partitions"]:
         both = document["partitions"]
         more = f", {percent(both['undecided'])} unknown (no finite margin)" if both["undecided"] else ""
         text = f"{percent(both['PCP-V'])} are proved (PCP-V), {percent(both['PCP-S'])} right at every sample (PCP-S)"
-        console.print(f"of {both['partitions']:,} fixed parts, {text}{more}", markup=False, soft_wrap=True)
-    console.print(f"report: {options.output_dir / 'report.html'}", markup=False, soft_wrap=True)
+        console.print(f"of {both['partitions']:,} fixed parts, {text}{more}")
+    console.print(f"report: {options.output_dir / 'report.html'}")
     return all(entry["sampled"]["poses"] for entry in document["frames"])

@@ -20,31 +20,42 @@ if TYPE_CHECKING:
     from ns_abstract.api.scenes import SceneSource
 
 
-@dataclass
-class Render(GivenSet):
+@dataclass(kw_only=True)
+class _PathCommand(GivenSet):
+    """Options of commands that look at the poses of a camera path."""
+
+    load_config: Path
+    """config.yml of a Splatfacto, vanilla-nerf or nerfacto run, or a file (.ply, .sog, .spz, .splat, .glb, .pt)."""
+    camera_path_filename: Path
+    """Camera path as Nerfstudio's viewer writes it; the set is around its entries."""
+    frames: tuple[int, ...] | None = None
+    """Entries of the camera path, counted from 0. Default: all."""
+    arithmetic: Literal["float32", "real"] | None = None
+    """float32: pictures of every float32 evaluation (splats, the default for them). real: the real-number renderer and
+    its float64 evaluation."""
+    memory_limit: float | None = None
+    """GiB that may be used. Default: 80 % of what is free."""
+    program: Program = field(default_factory=ProgramOptions)
+    where: Where = field(default_factory=EngineOptions)
+    overrides: SceneOverrides = field(default_factory=Overrides)
+
+
+@dataclass(kw_only=True)
+class Render(_PathCommand):
     """Bound every image that Nerfstudio would show, for every pose in a set around each keyframe.
 
     Writes frame_00000.npz and .png by keyframe, report.json and report.html. Exit codes: 0 done;
     2 bad input; 3 interrupted, or the time budget ended before every frame had a result.
     """
 
-    load_config: Path
-    """config.yml of a Splatfacto, vanilla-nerf or nerfacto run, or a file (.ply, .sog, .spz, .splat, .glb, .pt)."""
-    camera_path_filename: Path
-    """Camera path as Nerfstudio's viewer writes it."""
     output_dir: Path | None = None
     """Folder for the results; made if missing. Required, but for --describe and --explain."""
     time_budget: float | None = None
     """Seconds for all frames together. Default: 60 per frame."""
     target_ratio: float = 1.05
     """A frame is done when its mean pixel gap is at most this many times the one of real renders."""
-    frames: tuple[int, ...] | None = None
-    """Entries of the camera path, counted from 0. Default: all."""
     downscale_factor: float = 1.0
     """Images become this many times smaller."""
-    arithmetic: Literal["float32", "real"] | None = None
-    """float32: enclose every float32 evaluation (splats, the default for them). real: the real-number renderer and
-    its float64 evaluation."""
     outputs: tuple[Literal["rgb", "depth", "accumulation"], ...] = ("rgb",)
     """What is bounded. rgb is always; depth: gsplat's expected depth, normalised units (splats). accumulation: the part
     of the light that the scene takes."""
@@ -54,17 +65,12 @@ class Render(GivenSet):
     """Keep the frames that an interrupted run with the same inputs has finished."""
     save_cells: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Store every leaf cell's box and linear sets in the npz files."""
-    memory_limit: float | None = None
-    """GiB that may be used. Default: 80 % of what is free."""
     describe: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Only tell what cameras, units and set mean, in pixels and distances, and do nothing else; needs no
     --output-dir."""
     explain: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Splats: also tell why bounds are wider than renders, where, and what would help, in words and in the report.
     Without --output-dir nothing is written."""
-    program: Program = field(default_factory=ProgramOptions)
-    where: Where = field(default_factory=EngineOptions)
-    overrides: SceneOverrides = field(default_factory=Overrides)
 
     @property
     def settings(self) -> Settings:
@@ -73,11 +79,11 @@ class Render(GivenSet):
         Raises:
             InputError: Options do not go together.
         """
-        return _files(self, seed=self.seed, outputs=self.outputs)
+        return _files(self, downscale_factor=self.downscale_factor, seed=self.seed, outputs=self.outputs)
 
 
-@dataclass
-class Certify(GivenSet):
+@dataclass(kw_only=True)
+class Certify(_PathCommand):
     """Prove or break a property of a network, or of the picture, on every image of a set of poses.
 
     Splits the set into cells until each is certified, falsified or too small. Writes cells.sqlite,
@@ -87,26 +93,17 @@ class Certify(GivenSet):
     --model NET --explain alone prints the network's layers, and memory and time of a cell, and does nothing else.
     """
 
-    load_config: Path
-    """config.yml of a Splatfacto, vanilla-nerf or nerfacto run, or a file (.ply, .sog, .spz, .splat, .glb, .pt)."""
-    camera_path_filename: Path
-    """Camera path as Nerfstudio's viewer writes it."""
     property: Path
     """What is to hold (JSON): of a network classification, regression, detection or vnnlib, with the preprocessing; of
     the picture itself visible, clear, picture, or several as all or any."""
     output_dir: Path
     """Folder for the results; made if missing."""
-    model: Path | None = field(default=None, kw_only=True)
+    model: Path | None = None
     """Network: .onnx. Left out for a property of the picture."""
-    perturbation_filename: Path | None = field(default=None, kw_only=True)
+    perturbation_filename: Path | None = None
     """Set of poses (JSON). Default: the key "perturbation" of the camera path, or its poses alone."""
     time_budget: float | None = None
     """Seconds for all frames together. Default: 1800."""
-    frames: tuple[int, ...] | None = None
-    """Entries of the camera path, counted from 0. Default: all."""
-    arithmetic: Literal["float32", "real"] | None = None
-    """float32: images of every float32 evaluation (splats, the default for them). real: the real-number renderer and
-    its float64 evaluation."""
     network_arithmetic: Literal["float32", "real"] = "float32"
     """float32: every float32 evaluation of the network (the default). real: the exact function of its weights alone."""
     picture: Literal["float", "8-bit"] = "float"
@@ -117,11 +114,6 @@ class Certify(GivenSet):
     scene_margin: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Splats: in half of the time, look for the largest variation of all Gaussians' means, opacities and colours, of
     the camera's response and of the place of the whole scene for which everything that is certified holds."""
-    memory_limit: float | None = None
-    """GiB that may be used. Default: 80 % of what is free."""
-    program: Program = field(default_factory=ProgramOptions)
-    where: Where = field(default_factory=EngineOptions)
-    overrides: SceneOverrides = field(default_factory=Overrides)
 
     @cached_property
     def settings(self) -> CertifySettings:
@@ -132,24 +124,11 @@ class Certify(GivenSet):
         """
         from ns_abstract.api.certification import CertifySettings
 
-        return CertifySettings(
-            self.load_config,
-            self.camera_path_filename,
-            self.model,
-            self.property,
-            self.perturbation_filename,
-            arithmetic=self.arithmetic,
-            network_arithmetic=self.network_arithmetic,
-            picture=self.picture,
-            workers=self.where.ray_processes,
-            given_set=given_set(self),
-            program=self.program,
-            overrides=self.overrides,
-        )
+        return CertifySettings(_files(self), self.model, self.property, self.network_arithmetic, self.picture)
 
 
-@dataclass
-class Compare(GivenSet):
+@dataclass(kw_only=True)
+class Compare(_PathCommand):
     """Bound how far apart pictures of two scenes are at one pose, for every pose in a set around each keyframe.
 
     Writes frame_00000.npz and .png by keyframe, report.json and report.html. Exit codes: 0 done, whatever the verdict;
@@ -160,8 +139,6 @@ class Compare(GivenSet):
     """Scene A: config.yml of a run, or a scene file (.ply, .sog, .spz, .splat, .glb, .pt)."""
     other: Path
     """Scene B, in the same frame: a compressed, pruned or retrained version of A, or its export."""
-    camera_path_filename: Path
-    """Camera path as Nerfstudio's viewer writes it."""
     output_dir: Path
     """Folder for the results; made if missing."""
     tolerance: float | None = None
@@ -172,19 +149,12 @@ class Compare(GivenSet):
     target_ratio: float = 1.05
     """Without --tolerance, a frame is done when its largest bound is at most this many times the largest difference
     rendered."""
-    frames: tuple[int, ...] | None = None
-    """Entries of the camera path, counted from 0. Default: all."""
     downscale_factor: float = 1.0
     """Images become this many times smaller."""
-    arithmetic: Literal["float32", "real"] | None = None
-    """float32: enclose every float32 evaluation (splats, the default for them). real: the real-number renderer and
-    its float64 evaluation."""
     seed: int = 0
     """Seed of the random poses that are rendered."""
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Keep what an interrupted run with the same inputs has found."""
-    memory_limit: float | None = None
-    """GiB that may be used. Default: 80 % of what is free."""
     other_rasterize_mode: Literal["classic", "antialiased"] | None = None
     """Of B. Default: as --rasterize-mode."""
     other_background: tuple[float, float, float] | None = None
@@ -193,9 +163,6 @@ class Compare(GivenSet):
     """Of B. Default: as --gsplat-version."""
     other_load_step: int | None = None
     """Of B; --load-step is of A alone."""
-    program: Program = field(default_factory=ProgramOptions)
-    where: Where = field(default_factory=EngineOptions)
-    overrides: SceneOverrides = field(default_factory=Overrides)
 
     @property
     def settings(self) -> Settings:
@@ -204,7 +171,7 @@ class Compare(GivenSet):
         Raises:
             InputError: Options do not go together.
         """
-        return _files(self, seed=self.seed)
+        return _files(self, downscale_factor=self.downscale_factor, seed=self.seed)
 
     @property
     def other_source(self) -> SceneSource:
@@ -229,18 +196,14 @@ class Compare(GivenSet):
         return SceneSource(self.other, program, overrides)
 
 
-@dataclass
-class Locate(GivenSet):
+@dataclass(kw_only=True)
+class Locate(_PathCommand):
     """Find which poses of a set can have made a photo; what is excluded is proved.
 
     Writes cells.sqlite (excluded, possible and unknown boxes of poses), report.json and report.html. Exit codes: 0
     done, also where no pose explains the photo; 2 bad input; 3 interrupted.
     """
 
-    load_config: Path
-    """config.yml of a Splatfacto, vanilla-nerf or nerfacto run, or a file (.ply, .sog, .spz, .splat, .glb, .pt)."""
-    camera_path_filename: Path
-    """Camera path as Nerfstudio's viewer writes it; the set is around its entries."""
     output_dir: Path
     """Folder for the results; made if missing."""
     image: Path | None = None
@@ -265,20 +228,10 @@ class Locate(GivenSet):
     """Only halve cells; for comparisons."""
     time_budget: float | None = None
     """Seconds for all frames together, of every photo. Default: 600."""
-    frames: tuple[int, ...] | None = None
-    """Entries of the camera path, counted from 0. Default: all."""
     downscale_factor: float = 1.0
     """Pictures of the path become this many times smaller."""
-    arithmetic: Literal["float32", "real"] | None = None
-    """float32: pictures of every float32 evaluation (splats, the default for them). real: the real-number renderer and
-    its float64 evaluation."""
     resume: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
     """Go on with the cells that an interrupted run with the same inputs has stored."""
-    memory_limit: float | None = None
-    """GiB that may be used. Default: 80 % of what is free."""
-    program: Program = field(default_factory=ProgramOptions)
-    where: Where = field(default_factory=EngineOptions)
-    overrides: SceneOverrides = field(default_factory=Overrides)
 
     @property
     def settings(self) -> LocateSettings:
@@ -298,10 +251,12 @@ class Locate(GivenSet):
         )
         # the photos of a sequence are read one by one
         image = self.image or Path()
-        return LocateSettings(_files(self), image, self.mask, photo, self.calibrate)
+        return LocateSettings(
+            _files(self, downscale_factor=self.downscale_factor), image, self.mask, photo, self.calibrate
+        )
 
 
-def _files(options: Render | Compare | Locate, **more: Any) -> Settings:
+def _files(options: _PathCommand, **more: Any) -> Settings:
     """The files of a command, and what is bounded of them.
 
     Raises:
@@ -313,7 +268,6 @@ def _files(options: Render | Compare | Locate, **more: Any) -> Settings:
         options.load_config,
         options.camera_path_filename,
         options.perturbation_filename,
-        downscale_factor=options.downscale_factor,
         arithmetic=options.arithmetic,
         memory_limit=options.memory_limit,
         workers=options.where.ray_processes,

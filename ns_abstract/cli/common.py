@@ -180,12 +180,13 @@ def _named(lines: list[str]) -> list[str]:
 
 
 def plain_console() -> Any:
-    """A console on stderr whose texts hold no characters that a terminal acts upon."""
+    """A console on stderr that prints texts as they are, without characters that a terminal acts upon."""
     from rich.console import Console
 
     class Plain(Console):
         def print(self, *objects: Any, **more: Any) -> None:
-            super().print(*(visible(o) if isinstance(o, str) else o for o in objects), **more)
+            texts = (visible(o) if isinstance(o, str) else o for o in objects)
+            super().print(*texts, **{"markup": False, "soft_wrap": True, **more})
 
     return Plain(stderr=True, highlight=False)
 

@@ -68,35 +68,32 @@ def compare_path(options: Compare, stop: SignalStop) -> bool:
             document = report.finish("interrupted" if stop() else "budget" if report.missing else "done")
     tell_missing(console, report)
     if not report.missing and options.tolerance is not None:
-        console.print(f"{document['verdict']}: tolerance {number(options.tolerance)}", markup=False)
-    console.print(f"report: {folder / 'report.html'}", markup=False, soft_wrap=True)
+        console.print(f"{document['verdict']}: tolerance {number(options.tolerance)}")
+    console.print(f"report: {folder / 'report.html'}")
     return not report.missing
 
 
 def _introduce(console: Console, job: ComparisonJob, report: ComparisonReport) -> None:
     for letter, method in (("A", job.method), ("B", job.other.method)):
         program = method.program
-        console.print(
-            f"{letter}: {method.name}: {method.content}, {program['name']} {program['version']}", markup=False
-        )
+        console.print(f"{letter}: {method.name}: {method.content}, {program['name']} {program['version']}")
         for note in method.notes:
-            console.print(f"  {note}", markup=False, soft_wrap=True)
+            console.print(f"  {note}")
     for warning in job.warnings:
-        console.print(f"warning: {warning}", markup=False, soft_wrap=True)
+        console.print(f"warning: {warning}")
     for note in (*(note for note in job.notes if note not in job.warnings), *job.plan):
-        console.print(f"  {note}", markup=False, soft_wrap=True)
-    console.print(f"  frame: {job.frame_choice.origin}", markup=False, soft_wrap=True)
+        console.print(f"  {note}")
+    console.print(f"  frame: {job.frame_choice.origin}")
     if report.kept:
-        console.print(f"  kept from before: frames {listed(report.kept)}", markup=False, soft_wrap=True)
+        console.print(f"  kept from before: frames {listed(report.kept)}")
 
 
 def _tell(console: Console, entry: dict[str, Any]) -> None:
     if entry["status"] == "missing":
-        console.print(f"frame {entry['index']}: no bounds before the time was over", markup=False)
+        console.print(f"frame {entry['index']}: no bounds before the time was over")
         return
     console.print(
         f"frame {entry['index']}: largest difference at most {number(entry['largest_upper'])}, rendered "
         f"{number(entry['largest_lower'])}; mean at most {number(entry['mean_upper'])}, rendered "
-        f"{number(entry['mean_lower'])}; {entry['seconds']:.1f} s, {entry.get('verdict', entry['status'])}",
-        markup=False, soft_wrap=True,
+        f"{number(entry['mean_lower'])}; {entry['seconds']:.1f} s, {entry.get('verdict', entry['status'])}"
     )  # fmt: skip

@@ -315,6 +315,7 @@ def _occupancy(options: Occupancy) -> list[str]:
 
 def _vnnlib(options: ExportVnnLib) -> list[str]:
     from ns_abstract.api.certification import CertifySettings, open_certification
+    from ns_abstract.api.files import Settings
     from ns_abstract.api.job import check_frames
     from ns_abstract.api.verifier_instances import InstanceFolder
 
@@ -337,20 +338,17 @@ def _vnnlib(options: ExportVnnLib) -> list[str]:
         folder.keep_earlier()
     notes: list[str] = []
     properties = options.property * (1 if len(options.property) > 1 else len(options.model))
+    files = Settings(
+        options.load_config,
+        options.camera_path_filename,
+        options.perturbation_filename,
+        arithmetic=options.arithmetic,
+        given_set=given_set(options),
+        program=ProgramOptions(options.renderer, options.gsplat_version),
+        overrides=options.overrides,
+    )
     for name, model, prop in zip(names, options.model, properties, strict=True):
-        settings = CertifySettings(
-            options.load_config,
-            options.camera_path_filename,
-            model,
-            prop,
-            options.perturbation_filename,
-            arithmetic=options.arithmetic,
-            picture=options.picture,
-            given_set=given_set(options),
-            program=ProgramOptions(options.renderer, options.gsplat_version),
-            overrides=options.overrides,
-        )
-        job = open_certification(settings)
+        job = open_certification(CertifySettings(files, model, prop, picture=options.picture))
         for frame in check_frames(options.frames, job.job.frame_count):
             folder.add(job, frame, options.parts, name)
         notes += job.property.notes

@@ -46,14 +46,12 @@ def seconds_of(options: Render | Compare, pending: Sequence[int]) -> float:
 def tell_problems(console: Console, report: Report, problems: Sequence[str]) -> None:
     """Print why there is no guarantee, and what of an earlier run is not used."""
     for problem in problems:
-        console.print(f"warning: {problem}", markup=False)
+        console.print(f"warning: {problem}")
     for reason in report.ignored:
-        console.print(f"not used: {reason}", markup=False)
+        console.print(f"not used: {reason}")
 
 
 def tell_missing(console: Console, report: Report) -> None:
     """Print which frames have no bounds, if some have none."""
     if report.missing:
-        console.print(
-            f"no bounds yet for frames {listed(report.missing)}: raise --time-budget, --resume", soft_wrap=True
-        )
+        console.print(f"no bounds yet for frames {listed(report.missing)}: raise --time-budget, --resume")

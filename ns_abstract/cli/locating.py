@@ -53,28 +53,27 @@ def locate_photos(options: Locate, stop: SignalStop) -> None:
     _tell(console, photos.first)
 
     def search(location: Location, frames: tuple[int, ...], folder: Path) -> dict[str, Any]:
-        console.print(f"{location.file}", markup=False, soft_wrap=True)
+        console.print(f"{location.file}")
         return _search(options, stop, console, location, frames, folder)
 
     document = photos.follow(search)
     if document["not_examined"] and document["state"] == "done":
         text = f"none: no pose explains {document['images'][-1]['image']['name']}, {document['not_examined']} after it"
-        console.print(f"{text} not examined", markup=False, soft_wrap=True)
-    console.print(f"report: {options.output_dir / 'report.json'}", markup=False, soft_wrap=True)
+        console.print(f"{text} not examined")
+    console.print(f"report: {options.output_dir / 'report.json'}")
 
 
 def _tell(console: Any, location: Location) -> None:
     """Print what is looked for."""
-    method, photo, found = location.job.method, location.photo, location.calibration
-    if found is not None:
-        text = f"calibrated on {found.photos} training photos ({found.psnr:.1f} dB): noise {found.noise:.4f}, outliers"
-        console.print(f"{text} {found.outliers:g}", markup=False, soft_wrap=True)
+    method, photo, calibration = location.job.method, location.photo, location.calibration
+    if calibration is not None:
+        text = f"calibrated on {calibration.photos} training photos ({calibration.psnr:.1f} dB): noise"
+        console.print(f"{text} {calibration.noise:.4f}, outliers {calibration.outliers:g}")
     console.print(
-        f"{method.name}: {method.content}; {photo.allowed} of {int(photo.counted.sum())} pixels may show anything",
-        markup=False,
+        f"{method.name}: {method.content}; {photo.allowed} of {int(photo.counted.sum())} pixels may show anything"
     )
     for warning in location.job.warnings:
-        console.print(f"warning: {warning}", markup=False, soft_wrap=True)
+        console.print(f"warning: {warning}")
 
 
 def _search(
@@ -85,11 +84,11 @@ def _search(
     resume = options.resume and (options.image_sequence is None or (folder / "cells.sqlite").exists())
     question = LocationQuestion(location, frames, stated(options), ("ns-abstract-locate", *sys.argv[1:]))
     for note in question.about.plan:
-        console.print(f"  {note}", markup=False, soft_wrap=True)
+        console.print(f"  {note}")
 
     def opened(store: Store) -> None:
         if store.resumed:
-            console.print(f"  {store.open_blocks} cells still to be examined from before", markup=False)
+            console.print(f"  {store.open_blocks} cells still to be examined from before")
         if options.where.engine == "local":
             # once, and not in every worker
             with stop.at_once():
@@ -104,10 +103,10 @@ def _search(
             Request(options.time_budget or _SECONDS, resume, on_open=opened, on_progress=progress),
         )
     left = percent(document["possible_volume"])
-    console.print(f"{_ANSWERS[document['answer']]}; {left} of the set left", markup=False)
+    console.print(f"{_ANSWERS[document['answer']]}; {left} of the set left")
     if document["answer"] != "possible" and document["best"] is not None:
         missed = document["best"]["outliers"]
         text = f"  best pose misses {missed} pixels: --noise and --outliers must allow the scene's own error"
-        console.print(text, markup=False, soft_wrap=True)
-    console.print(f"report: {folder / 'report.html'}", markup=False, soft_wrap=True)
+        console.print(text)
+    console.print(f"report: {folder / 'report.html'}")
     return document

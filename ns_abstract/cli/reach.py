@@ -85,22 +85,16 @@ def reach(options: Reach) -> int:
                 scene_margin=options.scene_margin,
                 on_open=lambda store: compile_beside(job.job, 0) if options.where.engine == "local" else None,
                 on_progress=progress,
-                on_margin=lambda margin: console.print(
-                    f"scene margin: {margin.sentence}", markup=False, soft_wrap=True
-                ),
+                on_margin=lambda margin: console.print(f"scene margin: {margin.sentence}"),
             ),
         )
         progress.close()
         for name, entry in document["questions"].items():
             console.print(
                 f"{name}: certified {percent(entry['certified'])}, falsified {percent(entry['falsified'])}, "
-                f"unknown {percent(entry['unknown'])}; {runs_text(name, entry['simulated'])}",
-                markup=False,
-                soft_wrap=True,
+                f"unknown {percent(entry['unknown'])}; {runs_text(name, entry['simulated'])}"
             )
-        console.print(
-            f"{document['verdict']}; report: {options.output_dir / 'report.html'}", markup=False, soft_wrap=True
-        )
+        console.print(f"{document['verdict']}; report: {options.output_dir / 'report.html'}")
     return INTERRUPTED if stop() else DONE
 
 

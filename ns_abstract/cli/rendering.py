@@ -56,7 +56,7 @@ def render_path(options: Render, stop: SignalStop) -> bool:
         stack.enter_context(stop.last_words(report.interrupted))
         _fill(report, job, options, engine, stop, console)
     tell_missing(console, report)
-    console.print(f"report: {folder / 'report.html'}", markup=False, soft_wrap=True)
+    console.print(f"report: {folder / 'report.html'}")
     return not report.missing
 
 
@@ -88,7 +88,7 @@ def _fill(report: Report, job: Job, options: Render, engine: Engine, stop: Signa
                         lines = tuple(explain(job, result.index, result, options.seed).lines())
                     report.explain(result.index, lines)
                     for line in lines[1:]:
-                        console.print(line, markup=False, soft_wrap=True)
+                        console.print(line)
     finally:
         # also after a failure: what is finished is written
         report.finish("interrupted" if stop() else "budget" if report.missing else "done")
@@ -109,24 +109,23 @@ def _introduce(console: Console, job: Job, report: Report) -> None:
     method = job.method
     program = method.program
     about = f"{method.name}: {method.content}, {program['name']} {program['version']}"
-    console.print(about, markup=False, soft_wrap=True)
+    console.print(about)
     for warning in job.warnings:
-        console.print(f"warning: {warning}", markup=False, soft_wrap=True)
+        console.print(f"warning: {warning}")
     for note in (*method.notes, *(note for note in job.notes if note not in job.warnings), *job.plan):
-        console.print(f"  {note}", markup=False, soft_wrap=True)
+        console.print(f"  {note}")
     if report.kept:
-        console.print(f"  kept from before: frames {listed(report.kept)}", markup=False, soft_wrap=True)
+        console.print(f"  kept from before: frames {listed(report.kept)}")
 
 
 def _tell(console: Console, entry: dict[str, Any]) -> None:
     if entry["status"] == "missing":
-        console.print(f"frame {entry['index']}: no bounds before the time was over", markup=False)
+        console.print(f"frame {entry['index']}: no bounds before the time was over")
         return
     ratio = "" if entry["ratio"] is None else f", at most {entry['ratio']:.3f} times the true one"
     console.print(
         f"frame {entry['index']}: mean gap {entry['mpg']:.4f}{ratio}, {entry['cells']} cells, "
-        f"{entry['seconds']:.1f} s, {entry['status']}",
-        markup=False,
+        f"{entry['seconds']:.1f} s, {entry['status']}"
     )
     for sentence in entry["plan"]:
-        console.print(f"  {sentence}", markup=False, soft_wrap=True)
+        console.print(f"  {sentence}")

@@ -47,11 +47,11 @@ def sequence_photos(folder: Path, field: str = "--image-sequence") -> list[Path]
     """
     if not folder.is_dir():
         raise InputError("no such folder", file=folder, field=field, fix="give a folder of photos")
-    found = sorted(file for file in folder.iterdir() if file.suffix.lower() in _ENDINGS and file.is_file())
-    if not found:
+    photos = sorted(file for file in folder.iterdir() if file.suffix.lower() in _ENDINGS and file.is_file())
+    if not photos:
         fix = f"give a folder with files that end in {', '.join(_ENDINGS)}"
         raise InputError("holds no photos", file=folder, field=field, fix=fix)
-    return found
+    return photos
 
 
 def read_mask(file: Path, size: tuple[int, int], field: str = "--mask") -> np.ndarray:

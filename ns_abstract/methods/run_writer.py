@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
 import struct
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from string import Template
 from typing import Any, Protocol
@@ -18,6 +19,7 @@ from ns_abstract.geometry.transform import DataparserTransform
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
 
+_TEMPLATES = Path(__file__).with_name("config_templates")
 STEP = 29999  # the last of Splatfacto's 30,000 steps
 
 # Shapes of the LPIPS metric that a Splatfacto checkpoint carries; rendering does not use them.
@@ -50,7 +52,7 @@ def write_run(
     *,
     data: str,
     checkpoint: bytes,
-    config: str,
+    config: Mapping[str, Any],
     steps: str,
     views: Sequence[KeyframeCamera] | None,
     render: Callable[[KeyframeCamera], ArrayLike] | None,
@@ -64,7 +66,7 @@ def write_run(
         timestamp, experiment_name: Name of the run, and of its experiment.
         data: Name of the data set's folder.
         checkpoint: Content of the checkpoint.
-        config: What config.yml says between the parts that every method has; ``$dataparser`` stands for the parser.
+        config: What the method's part of config.yml leaves open.
         steps: Its last lines but those that every method has.
         views: Cameras of the data set, normalised frame, at least two of one size and field of view.
         render: Gives the image [H, W, 3] in [0, 1] of a view; without it images hold only the background colour.
@@ -82,11 +84,19 @@ def write_run(
     # Nerfstudio reads the step out of every name in nerfstudio_models: nothing else may stand there.
     write_file(run / "nerfstudio_models" / f"step-{STEP:09d}.ckpt", checkpoint, scratch=run)
     # JSON strings and lists are YAML as well, and keep a name made of digits a string.
-    head = _HEAD.substitute(experiment=json.dumps(experiment_name), data=json.dumps(data))
-    body = Template(config).substitute(dataparser=_DATAPARSER)
-    tail = _TAIL.substitute(steps=steps, timestamp=json.dumps(timestamp))
-    write_file(run / "config.yml", f"{head}\n{body}\n{tail}".encode())
+    names = {"experiment": experiment_name, "data": data, "timestamp": timestamp}
+    parts = {"dataparser": _template("dataparser"), "camera_optimizer": _template("camera_optimizer")}
+    parts["datamanager"] = _template("ray_datamanager", **parts)
+    body = _template(method, **parts, **config)
+    text = _template("trainer", body=body, steps=steps, **{key: json.dumps(name) for key, name in names.items()})
+    write_file(run / "config.yml", f"{text}\n".encode())
     return run / "config.yml"
+
+
+def _template(name: str, **values: Any) -> str:
+    """A part of config.yml, in which Python tags say how Nerfstudio rebuilds its configuration."""
+    text = (_TEMPLATES / f"{name}.yml").read_text(encoding="utf-8").rstrip("\n")
+    return Template(text).substitute(values)
 
 
 def _run_folder(folder: Path, method: str, timestamp: str, experiment_name: str) -> Path:
@@ -118,7 +128,68 @@ def background_name(colour: NDArray[np.float32]) -> str:
     return json.dumps([float(c) for c in colour])
 
 
-def lpips_state(prefix: str) -> dict[str, Any]:
+def optimizer_lines(kind: str, eps: str, groups: Mapping[str, tuple[str, tuple[str, str, int] | None]]) -> str:
+    """What config.yml says of the optimizers, from "optimizers:" to the line before "output_dir:".
+
+    Args:
+        kind: "Adam" or "RAdam".
+        eps: Of all of them.
+        groups: Learning rate of each group of parameters, and of its schedule the last rate, the first one and the
+            steps of warming up; numbers as YAML spells them.
+    """
+    lines = ["optimizers:"]
+    target = f"&id001 !!python/name:torch.optim.{kind.lower()}.{kind} ''"
+    schedule = "&id002 !!python/name:nerfstudio.engine.schedulers.ExponentialDecayScheduler ''"
+    for name, (rate, decay) in groups.items():
+        lines.append(f"""\
+  {name}:
+    optimizer: !!python/object:nerfstudio.engine.optimizers.{kind}OptimizerConfig
+      _target: {target}
+      eps: {eps}
+      lr: {rate}
+      max_norm: null
+      weight_decay: 0""")
+        target = "*id001"
+        if decay is None:
+            lines.append("    scheduler: null")
+            continue
+        last, first, warm_up = decay
+        lines.append(f"""\
+    scheduler: !!python/object:nerfstudio.engine.schedulers.ExponentialDecaySchedulerConfig
+      _target: {schedule}
+      lr_final: {last}
+      lr_pre_warmup: {first}
+      max_steps: 30000
+      ramp: cosine
+      warmup_steps: {warm_up}""")
+        schedule = "*id002"
+    return "\n".join(lines)
+
+
+def checkpoint_bytes(
+    model: Mapping[str, ArrayLike], optimizers: Mapping[str, Any], schedulers: Mapping[str, Any]
+) -> bytes:
+    """A checkpoint of plain tensors, numbers, lists and dictionaries: loads with weights_only.
+
+    Args:
+        model: Arrays of the model by name; equal objects are stored once.
+        optimizers, schedulers: States by group of parameters.
+    """
+    import torch
+
+    tensors = {id(array): torch.tensor(array) for array in model.values()}
+    pipeline = {"_model.device_indicator_param": torch.empty(0, dtype=torch.float32)}
+    pipeline |= {f"_model.{key}": tensors[id(array)] for key, array in model.items()}
+    pipeline |= _lpips_state("_model.lpips.net.")
+    state = {
+        "step": STEP, "pipeline": pipeline, "optimizers": optimizers, "schedulers": schedulers, "scalers": {},
+    }  # fmt: skip
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    return buffer.getvalue()
+
+
+def _lpips_state(prefix: str) -> dict[str, Any]:
     """Zeros in place of the LPIPS metric's tensors, whose names begin with ``prefix``."""
     import torch
 
@@ -197,93 +268,3 @@ def _png(image: NDArray[Any]) -> bytes:
         + chunk(b"IDAT", zlib.compress(rows.tobytes(), 6))
         + chunk(b"IEND", b"")
     )
-
-
-# config.yml of a run: the Python tags are those by which Nerfstudio rebuilds its configuration.
-_HEAD = Template(
-    """\
-!!python/object:nerfstudio.engine.trainer.TrainerConfig
-_target: !!python/name:nerfstudio.engine.trainer.Trainer ''
-data: &data !!python/object/apply:pathlib.PosixPath
-- $data
-experiment_name: $experiment
-gradient_accumulation_steps: {}
-load_checkpoint: null
-load_config: null
-load_dir: null
-load_scheduler: true
-load_step: null
-log_gradients: false
-logging: !!python/object:nerfstudio.configs.base_config.LoggingConfig
-  local_writer: !!python/object:nerfstudio.configs.base_config.LocalWriterConfig
-    _target: !!python/name:nerfstudio.utils.writer.LocalWriter ''
-    enable: true
-    max_log_size: 10
-    stats_to_track: !!python/tuple
-    - !!python/object/apply:nerfstudio.utils.writer.EventName
-      - Train Iter (time)
-    - !!python/object/apply:nerfstudio.utils.writer.EventName
-      - Train Rays / Sec
-    - !!python/object/apply:nerfstudio.utils.writer.EventName
-      - Test PSNR
-    - !!python/object/apply:nerfstudio.utils.writer.EventName
-      - Vis Rays / Sec
-    - !!python/object/apply:nerfstudio.utils.writer.EventName
-      - Test Rays / Sec
-    - !!python/object/apply:nerfstudio.utils.writer.EventName
-      - ETA (time)
-  max_buffer_size: 20
-  profiler: basic
-  relative_log_dir: !!python/object/apply:pathlib.PosixPath []
-  steps_per_log: 10
-machine: !!python/object:nerfstudio.configs.base_config.MachineConfig
-  device_type: cpu
-  dist_url: auto
-  machine_rank: 0
-  num_devices: 1
-  num_machines: 1
-  seed: 42"""
-)
-_DATAPARSER = """\
-    dataparser: !!python/object:nerfstudio.data.dataparsers.nerfstudio_dataparser.NerfstudioDataParserConfig
-      _target: !!python/name:nerfstudio.data.dataparsers.nerfstudio_dataparser.Nerfstudio ''
-      auto_scale_poses: false
-      center_method: none
-      data: *data
-      depth_unit_scale_factor: 0.001
-      downscale_factor: null
-      eval_interval: 8
-      eval_mode: interval
-      load_3D_points: false
-      mask_color: null
-      orientation_method: none
-      scale_factor: 1.0
-      scene_scale: 1.0
-      train_split_fraction: 0.9"""
-_TAIL = Template(
-    """\
-project_name: nerfstudio-project
-prompt: null
-relative_model_dir: !!python/object/apply:pathlib.PosixPath
-- nerfstudio_models
-save_only_latest_checkpoint: true
-start_paused: false
-$steps
-timestamp: $timestamp
-use_grad_scaler: false
-viewer: !!python/object:nerfstudio.configs.base_config.ViewerConfig
-  camera_frustum_scale: 0.1
-  default_composite_depth: true
-  image_format: jpeg
-  jpeg_quality: 75
-  make_share_url: false
-  max_num_display_images: 512
-  num_rays_per_chunk: 32768
-  quit_on_train_completion: false
-  relative_log_filename: viewer_log_filename.txt
-  websocket_host: 0.0.0.0
-  websocket_port: null
-  websocket_port_default: 7007
-vis: tensorboard
-"""
-)

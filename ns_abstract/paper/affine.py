@@ -273,28 +273,6 @@ class Enclosure:
         taylor = self.form.sqrt() if self.basis.order == 2 else None
         return self._curve(lines.SQRT, (self.range.lower >= 0.0) & (self.range.upper > 0.0), taylor)
 
-    def absolute(self) -> Enclosure:
-        """``|x|``."""
-        bounded = np.isfinite(self.range.lower) & np.isfinite(self.range.upper)
-        low, high = (np.where(bounded, end, sign) for end, sign in zip(self.range.bounds(), (-1.0, 1.0), strict=True))
-        with np.errstate(all="ignore"):
-            slope = np.clip((np.abs(high) - np.abs(low)) / (high - low), -1.0, 1.0)
-        slope = np.where(low >= 0.0, 1.0, np.where(high <= 0.0, -1.0, np.where(np.isfinite(slope), slope, 0.0)))
-        # |x| - s x for |s| <= 1 is convex, and 0 at x = 0
-        ends = [Interval(end).absolute() - Interval(end) * slope for end in (low, high)]
-        offset = Interval(np.zeros(self.shape), np.maximum(ends[0].upper, ends[1].upper))
-        whole = self.range.absolute()
-        form = self.form * slope + form_of(self.basis, offset)
-        return Enclosure(_merge(bounded, form, form_of(self.basis, whole)), whole)
-
-    def clip(self, low: float, high: float) -> Enclosure:
-        """``min(max(x, low), high)``, from ``max(t, 0) = (t + |t|) / 2``."""
-        above = self - low
-        raised = (above + above.absolute()) * 0.5 + low
-        below = high - raised
-        lowered = high - (below + below.absolute()) * 0.5
-        return lowered.meet(self.range.clip(low, high))
-
     def norm(self) -> Enclosure:
         """Frobenius norm over all elements, a scalar."""
         return self.square().reshape(-1).sum(0).sqrt().meet(self.range.norm())

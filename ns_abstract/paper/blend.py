@@ -11,8 +11,8 @@ import itertools
 import numpy as np
 
 from ns_abstract.paper.affine import Enclosure
+from ns_abstract.paper.faces import Face, constant_like, range_of
 from ns_abstract.paper.interval import Float64Array, Interval
-from ns_abstract.paper.linear import Face, LinearBounds, constant_like
 
 
 def blend(alphas: Float64Array, colors: Float64Array) -> Float64Array:
@@ -26,7 +26,7 @@ def cumulative_blend(alphas: Face, colors: Interval | Float64Array) -> Face:
 
     Args:
         alphas: Opacities [n, ...], of any face.
-        colors: Colours [n, ...]; numbers for `LinearBounds`.
+        colors: Colours [n, ...].
 
     Raises:
         IndexError: There are no layers.
@@ -59,24 +59,14 @@ def sumcumprod(alphas: Face, colors: Interval | Float64Array, behind: float = 0.
 
     Args:
         alphas: Opacities [n, ...], of any face.
-        colors: Colours [n, ...] that broadcast against them; numbers for `LinearBounds`.
+        colors: Colours [n, ...] that broadcast against them.
         behind: What shows through all layers.
 
     Returns:
         The blended value, of the same face, [...].
-
-    Raises:
-        TypeError: `LinearBounds` with intervals of colours.
     """
     n = alphas.shape[0]
-    if isinstance(alphas, LinearBounds):
-        if isinstance(colors, Interval):
-            raise TypeError("linear bounds are blended with numbers for colours")
-        result = LinearBounds.of(alphas.basis, np.full(alphas.shape[1:], behind))
-        for i in reversed(range(n)):
-            result = alphas[i].scale(colors[i]) + (1.0 - alphas[i]) * result
-        return result
-    ranges = alphas if isinstance(alphas, Interval) else alphas.range
+    ranges = range_of(alphas)
     colors = Interval.lift(colors)
     value = Interval(behind)
     form = None if isinstance(alphas, Interval) else Enclosure.of(alphas.basis, value)
@@ -87,36 +77,3 @@ def sumcumprod(alphas: Face, colors: Interval | Float64Array, behind: float = 0.
             alpha = alphas[i].broadcast_to(shape)
             form = (form + alpha * (colors[i] - form)).meet(value)
     return constant_like(alphas, value) if form is None else form
-
-
-def convex_combination(weights: Interval, values: Interval | Float64Array) -> Interval:
-    """Return bounds of ``sum_i w_i v_i`` for weights in boxes that add up to 1.
-
-    The greatest sum fills the largest values first; by duality it is at most
-    ``m + sum_i max over w_i of w_i (v_i - m)`` for every ``m``, and equal to it for the value at which
-    the filling stops. The bound is evaluated at that ``m``, found in floating point.
-
-    Args:
-        weights: [n, ...], non-negative.
-        values: [n, ...] that broadcast against them.
-
-    Returns:
-        [...]; the sum of the weights is taken to be 1 exactly.
-    """
-    values = Interval.lift(values)
-    shape = np.broadcast_shapes(weights.shape, values.shape)
-    weights, values = weights.broadcast_to(shape), values.broadcast_to(shape)
-    upper = _fill(weights, values.upper)
-    lower = _fill(weights, -values.lower)
-    return Interval(-lower, upper)
-
-
-def _fill(weights: Interval, values: Float64Array) -> Float64Array:
-    """Upper bound of the greatest sum with the numbers ``values``."""
-    order = np.argsort(-values, axis=0)
-    sorted_values = np.take_along_axis(values, order, axis=0)
-    room = np.take_along_axis(weights.upper - weights.lower, order, axis=0)
-    free = 1.0 - weights.lower.sum(axis=0)
-    stop = np.minimum((np.cumsum(room, axis=0) < free).sum(axis=0), values.shape[0] - 1)
-    level = np.take_along_axis(sorted_values, stop[None], axis=0)[0]
-    return (level + (weights * (Interval(values) - level)).sum(0)).upper

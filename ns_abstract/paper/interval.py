@@ -213,11 +213,6 @@ class Interval:
         """The last two axes swapped."""
         return self._map(lambda end: np.swapaxes(end, -1, -2))
 
-    def hull(self, other: Interval | ArrayLike) -> Interval:
-        """The smallest interval that holds both."""
-        other = Interval.lift(other)
-        return Interval(np.minimum(self.lower, other.lower), np.maximum(self.upper, other.upper))
-
     def intersect(self, other: Interval | ArrayLike) -> Interval:
         """The common part.
 
@@ -344,10 +339,6 @@ class Interval:
     def exp(self) -> Interval:
         """``exp(x)``."""
         return Interval(_exp_ends(self.lower)[0], _exp_ends(self.upper)[1])
-
-    def clip(self, low: float, high: float) -> Interval:
-        """``min(max(x, low), high)``."""
-        return self._map(lambda end: np.clip(end, low, high))
 
     def norm(self) -> Interval:
         """Frobenius norm over all elements, a scalar."""

@@ -142,8 +142,8 @@ class DifferenceFrame:
         some = slice(None) if tiles is None else tiles
         lower[~self._inside[some]] = 0.0
         self.greatest[some] = np.maximum(self.greatest[some], lower)
-        found = RenderedMaximum(float(lower.max(initial=0.0)), tuple(map(float, values)))
-        self.largest = greater(self.largest, found)
+        rendered = RenderedMaximum(float(lower.max(initial=0.0)), tuple(map(float, values)))
+        self.largest = greater(self.largest, rendered)
         return np.maximum(lower, self.floor)
 
     def scene_samples(self, seed: int) -> Iterator[SceneSample]:
@@ -169,13 +169,13 @@ class DifferenceFrame:
         first, second = (
             _bounds(frame, boxes, tiles, context, pixels) for frame, context in zip(self.both, contexts, strict=True)
         )
-        found = []
+        differences = []
         for box, a, b in zip(boxes, first, second, strict=True):
             difference = self._difference(a, b, pixels)
             if self._shared is not None and self.floor > 0.0:
                 self._share_order(box, tiles, difference, pixels)
-            found.append(difference)
-        return found
+            differences.append(difference)
+        return differences
 
     def _share_order(
         self, box: ParameterBox, tiles: np.ndarray, difference: DifferenceBounds, pixels: np.ndarray | None

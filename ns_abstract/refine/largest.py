@@ -76,8 +76,8 @@ def search_largest(frame: DifferenceFrame, seed: int, over: Callable[[], bool], 
             for values_near in _neighbours(values, step, low, high):
                 if over():
                     return
-                if (found := look(values_near)) > value:
-                    value, values = found, values_near
+                if (nearby := look(values_near)) > value:
+                    value, values = nearby, values_near
             step = 0.5 * step
 
 
@@ -217,7 +217,7 @@ class LargestDifference:
         cover = [(cell, np.maximum(l[some], least), np.maximum(u[some], least)) for cell, l, u in self._cover]
         upper, rendered = (assemble(np.maximum(p, least), camera) for p in (self.upper, self.rendered))
         lowest = np.full_like(upper, least)
-        known = FrameResult(self.index, self.frame.box, lowest, upper, lowest, rendered, rendered, 0.0, 0)
+        earlier = FrameResult(self.index, self.frame.box, lowest, upper, lowest, rendered, rendered, 0.0, 0)
         started = time.perf_counter()
 
         def told(point: TracePoint, covered: float) -> None:
@@ -233,7 +233,7 @@ class LargestDifference:
         frame = self.frame.above(floor)
         refinement = Refinement(
             frame, self.index, goal, seed=self.seed, stopped=lambda: self._late() or enough(refinement),
-            progress=told, tiles=here, known=known, initial=self._cover if first else cover,
+            progress=told, tiles=here, known=earlier, initial=self._cover if first else cover,
         )  # fmt: skip
         try:
             part = refinement.run_part()

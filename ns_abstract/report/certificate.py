@@ -10,7 +10,7 @@ from typing import Any
 
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.folder import unwritable
-from ns_abstract.report.run import Run, plain
+from ns_abstract.report.run import CommandRun, plain
 
 #: What the key ``scene_margin`` of report.json tells.
 SCENE_MARGIN = (
@@ -41,7 +41,7 @@ METRICS = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class CertifiedRun(Run):
+class CertifiedRun(CommandRun):
     """What a command certifies.
 
     Attributes:

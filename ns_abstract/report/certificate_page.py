@@ -82,9 +82,9 @@ def certificate_page(
         "unknown": ("fair", f"Unknown; certified on {covered} of the poses"),
     }[document["verdict"]]
     asked = [units.drawn(entry, cells.get(entry["index"], ())) for entry in document["frames"]]
-    shown, rows = [entry for entry, _ in asked], {entry["index"]: leaves for entry, leaves in asked}
-    maps, drawn = verdict_drawings(shown[:_MOST_ROWS], rows, numbers)
-    matrices, more_matrices = _matrices(shown, rows)
+    frames, rows = [entry for entry, _ in asked], {entry["index"]: leaves for entry, leaves in asked}
+    maps, drawn = verdict_drawings(frames[:_MOST_ROWS], rows, numbers)
+    matrices, more_matrices = _matrices(frames, rows)
     scripts = ["cells.js"] if numbers else []
     scripts += ["sliders.js", "walk.js"] if len(closer.stops) > 1 else []
     return whole_page(

@@ -18,7 +18,7 @@ from ns_abstract.report.figures import number, unit_of_axis
 from ns_abstract.report.html import uri, whole_page
 from ns_abstract.report.outside import SceneDrawing
 from ns_abstract.report.picture import heat, preview, to_bytes
-from ns_abstract.report.run import Run, plain
+from ns_abstract.report.run import CommandRun, plain
 from ns_abstract.report.svg import draw_svg
 from ns_abstract.report.verdict_maps import NONE, OPEN, pixels
 
@@ -48,7 +48,7 @@ _HEADINGS = {
 
 
 @dataclass(frozen=True, kw_only=True)
-class LocatedRun(Run):
+class LocatedRun(CommandRun):
     """What a command looked for.
 
     Attributes:

@@ -26,7 +26,7 @@ from ns_abstract.report.files import (
     load_frame,
     save_frame,
 )
-from ns_abstract.report.run import Run, differences, file_stamp, guarantee_text, plain
+from ns_abstract.report.run import CommandRun, differences, file_stamp, guarantee_text, plain
 
 Status = Literal["done", "partial", "missing"]
 Outcome = Literal["done", "budget", "interrupted"]
@@ -87,7 +87,7 @@ def failed_self_check(problem: str) -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunRecord(Run):
+class RunRecord(CommandRun):
     """A command's run.
 
     Attributes:

@@ -114,7 +114,7 @@ def now() -> str:
 
 
 @dataclass(frozen=True, kw_only=True)
-class Run:
+class CommandRun:
     """A command's run, as every report.json describes it; all mappings must have a JSON form (see `plain`).
 
     Attributes:

@@ -251,17 +251,17 @@ class _Examination:
         self.share = float(np.median(number)) / (search.tiled.allowed + 1)
         if left.all():
             return False
-        kept: list[Cell] = []
+        remaining: list[Cell] = []
         for cell, some in divided(self.cell, left, tuning.filled):
             if some:
-                kept.append(cell)
+                remaining.append(cell)
             else:
                 self.leaves.append(FinishedCell(cell, "certified", 1.0, 0.0))
-        if len(kept) == 1 and kept[0].volume > (1.0 - tuning.worth) * self.cell.volume:
-            self.cell = kept[0]
+        if len(remaining) == 1 and remaining[0].volume > (1.0 - tuning.worth) * self.cell.volume:
+            self.cell = remaining[0]
             self._cut()
         else:
-            self.children = kept
+            self.children = remaining
         return True
 
     def _exclude(self, margin: float) -> None:

@@ -48,9 +48,9 @@ class LocationStore(Store):
         if not super().close_block(block, findings, grid):
             return False
         if best is not None:
-            known = self.poses(block.frame)
-            better = not known or best.outliers < known[0].outliers
-            if better or (best.outliers <= self.allowed and len(known) < _POSES and best not in known):
+            stored = self.poses(block.frame)
+            better = not stored or best.outliers < stored[0].outliers
+            if better or (best.outliers <= self.allowed and len(stored) < _POSES and best not in stored):
                 with self._transaction():
                     ends = json.dumps(best.values), "[]"
                     self._keep((_POSE, float(best.outliers), int(block.frame), *ends, "", "", "[]"))
@@ -66,10 +66,10 @@ class LocationStore(Store):
 
     def left(self, frame: int) -> list[Cell]:
         """Cells of the search that are not excluded."""
-        kept = self._base.execute(
+        rows = self._base.execute(
             "SELECT lower, upper FROM search_settled WHERE kind = ? AND frame = ?", (_CELL, int(frame))
         ).fetchall()
-        cells = [Cell(tuple(json.loads(first)), tuple(json.loads(past))) for first, past in kept]
+        cells = [Cell(tuple(json.loads(first)), tuple(json.loads(past))) for first, past in rows]
         return cells + [cell for block in self._listed("ORDER BY id") if block.frame == frame for cell in block.cells]
 
     def finish(self, grids: Mapping[int, CellGrid]) -> None:
@@ -77,12 +77,12 @@ class LocationStore(Store):
         covers = {frame: self.cover(frame) for frame in grids}
         with self._transaction():
             rows = []
-            for frame, found in covers.items():
-                box = found.grid.box
+            for frame, cover in covers.items():
+                box = cover.grid.box
                 poses = [pose for pose in self.poses(frame) if pose.outliers <= self.allowed]
-                for cells, excluded in ((found.left, False), (found.excluded, True)):
+                for cells, excluded in ((cover.left, False), (cover.excluded, True)):
                     for cell in cells:
-                        part = found.grid.box_of(cell)
+                        part = cover.grid.box_of(cell)
                         pose = None if excluded else next((p for p in poses if part.contains(np.array(p.values))), None)
                         verdict = "excluded" if excluded else "unknown" if pose is None else "possible"
                         row = (

@@ -62,8 +62,8 @@ class Brightness:
         gain, offset = (min(max(value, ends[0]), ends[1]) for value, ends in ((1.0, self.gain), (0.0, self.offset)))
         best: np.ndarray | None = None
         for _ in range(_FITS):
-            shown = np.clip(gain * picture.astype(np.float64) + offset, 0.0, 1.0)
-            missed = counted & ~((shown >= low) & (shown <= high)).all(axis=-1)
+            displayed = np.clip(gain * picture.astype(np.float64) + offset, 0.0, 1.0)
+            missed = counted & ~((displayed >= low) & (displayed <= high)).all(axis=-1)
             best = missed if best is None or missed.sum() < best.sum() else best
             weight = 1.0 / np.maximum(np.abs(gain * values + offset - middle), room)
             rows = np.stack([values, np.ones_like(values)], axis=1) * weight[:, None]
@@ -121,9 +121,9 @@ class Photo:
     def tiled(self, side: int) -> TiledPhoto:
         """The photo in tiles of ``side`` pixels."""
         low, high = self.ends
-        shown = None if self.brightness.still else tuple(in_tiles(end, side) for end in self.shown)
+        ends = None if self.brightness.still else tuple(in_tiles(end, side) for end in self.shown)
         parts = in_tiles(low, side), in_tiles(high, side), in_tiles(self.counted, side)
-        return TiledPhoto(*parts, self.allowed, self.brightness, shown)
+        return TiledPhoto(*parts, self.allowed, self.brightness, ends)
 
 
 @dataclass(frozen=True, eq=False)

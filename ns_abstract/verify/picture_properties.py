@@ -123,10 +123,10 @@ def _joined(statement: Statement, margins: Iterator[Any], least: Callable[..., A
     if isinstance(statement, Leaf):
         return next(margins)
     parts = [_joined(part, margins, least, most) for part in statement.parts]
-    found = parts[0]
+    joined = parts[0]
     for part in parts[1:]:
-        found = (least if statement.all else most)(found, part)
-    return found
+        joined = (least if statement.all else most)(joined, part)
+    return joined
 
 
 @dataclass(frozen=True, eq=False)
@@ -361,18 +361,18 @@ def _visible(source: _PropertyObject) -> Leaf:
 
 def _clear(source: _PropertyObject) -> Leaf:
     root, prefix = source.root, source.prefix
-    given = source.number("distance", *MODERATE)
+    distance_given = source.number("distance", *MODERATE)
     scale = source.dataset_scale if source.choice("units", ("normalised", "dataset")) == "dataset" else 1.0
     unit = "units of the data set" if scale != 1.0 else "normalised units"
-    distance, region = given * scale, source.region()
+    distance, region = distance_given * scale, source.region()
     if source.choice("measure", ("weight", "expected")) == "expected":
         if "weight" in root:
             raise _raised(f"{prefix}weight", "given with the expected depth", "remove it, or measure")
-        sentence = f"the expected depth is above {given:g} {unit} everywhere in {region}"
+        sentence = f"the expected depth is above {distance_given:g} {unit} everywhere in {region}"
         # twice as far is as good as any
         return Leaf(sentence, "depth", "least", region, low=distance, cap=2.0 * distance)
     weight = source.number("weight", MODERATE[0], 1.0, 0.5)
-    sentence = f"no ray of {region} has collected a weight of {weight:g} nearer than {given:g} {unit}"
+    sentence = f"no ray of {region} has collected a weight of {weight:g} nearer than {distance_given:g} {unit}"
     return Leaf(sentence, WeightPlane(nearer=distance), "greatest", region, high=weight)
 
 

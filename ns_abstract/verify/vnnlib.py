@@ -156,9 +156,9 @@ def _check_declared(declared: set[str], kind: str, count: int) -> None:
         )
 
 
-def load_regions(
+def load_query(
     path: Path, input_shape: Shape, output_shape: Shape, text: str | None = None
-) -> tuple[InputRegion, ...]:
+) -> tuple[tuple[InputRegion, ...], Vnnlib2Query | None]:
     """Read a VNN-LIB file with its inputs: the property is violated if some region has an input with an unsafe output.
 
     Args:
@@ -166,16 +166,12 @@ def load_regions(
         input_shape, output_shape: Of the network.
         text: Its contents.
 
+    Returns:
+        The regions, and the query that a file of version 2 is; None for version 1.
+
     Raises:
         InputError: As `load_vnnlib`, or an input has no bounds.
     """
-    return load_query(path, input_shape, output_shape, text)[0]
-
-
-def load_query(
-    path: Path, input_shape: Shape, output_shape: Shape, text: str | None = None
-) -> tuple[tuple[InputRegion, ...], Vnnlib2Query | None]:
-    """`load_regions` with the query that a file of version 2 is; None for version 1."""
     text = _text(path) if text is None else text
     try:
         expressions, query = _read(text, input_shape, output_shape, True)
@@ -267,7 +263,7 @@ def _declares(expression: Any, declared: set[str]) -> bool:
 def _expressions(text: str, runs: bool = False) -> list[Any]:
     """Nested lists of tokens; ``runs``: and of `_Run` inside of conjunctions."""
     stack: list[list[Any]] = [[]]
-    known: dict[str, tuple[int, int, float]] = {}
+    places: dict[str, tuple[int, int, float]] = {}
     at, number = 0, 0
     while at < len(text):
         if number % _ASKED == 0:
@@ -276,7 +272,7 @@ def _expressions(text: str, runs: bool = False) -> list[Any]:
         run = _RUN.match(text, at) if runs and stack[-1][:1] == ["and"] else None
         if run:
             check_cancelled()
-            stack[-1].append(_Run([part.strip() for part in run[0].split(")")[:-1]], known))
+            stack[-1].append(_Run([part.strip() for part in run[0].split(")")[:-1]], places))
             at = run.end()
             continue
         match = _TOKEN.match(text, at)

@@ -28,6 +28,8 @@ from ns_abstract.refine.result import FrameResult
 from ns_abstract.report.figures import metrics
 from ns_abstract.report.files import check_frame
 
+#: Sets of one and of several parameters, for which kernels are compiled.
+_WARM_UP = ({"x": 1e-4}, {"x": 1e-4, "yaw": 1e-4})
 #: Longest sides of the pictures that come before the one asked for, and the seconds that each may take: of splats,
 #: and of NeRFs, whose rays are bounded one after the other.
 SPLAT_LADDER = {64: 0.25, 128: 0.6, 256: 1.5}
@@ -279,7 +281,7 @@ class SplatSource:
         pose[:, 3] = middle
         pose[2, 3] += distance
         camera = PinholeCamera(pose, 32.0, 32.0, 16.0, 16.0, 32, 32)
-        for radii in ({"x": 1e-4}, {"x": 1e-4, "yaw": 1e-4}):
+        for radii in _WARM_UP:
             self.frame(camera, perturbation_of(radii)).warm_up()
 
 
@@ -330,5 +332,5 @@ class NerfSource:
     def warm_up(self) -> None:
         """Compile the kernels for one and for several parameters."""
         camera = PinholeCamera(np.eye(3, 4), 2.0, 2.0, 1.0, 1.0, 2, 2)
-        for radii in ({"x": 1e-4}, {"x": 1e-4, "yaw": 1e-4}):
+        for radii in _WARM_UP:
             self.frame(camera, perturbation_of(radii)).warm_up()

@@ -7,8 +7,6 @@ import math
 import numpy as np
 
 from ns_abstract.arithmetic.outward import outward
-from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.nerf.division import ENDS, Division, division_for, regroup_parts
 from ns_abstract.methods.nerf.ray_bundle import RayBundle
 from ns_abstract.methods.nerf.ray_field import (
@@ -16,7 +14,6 @@ from ns_abstract.methods.nerf.ray_field import (
     RayBounds,
     RayField,
     RayRequest,
-    Shifts,
     typical_displacement,
 )
 from ns_abstract.methods.nerf.sample_cells import SampleCellBounds
@@ -43,29 +40,7 @@ _NUMBERS = 1 << 21
 class NerfBounds(RayField):
     """Bounds of a scene's rays; arguments as of `RayField`."""
 
-    def rays(
-        self,
-        pose_set: PoseBox,
-        box: ParameterBox,
-        pixels: np.ndarray,
-        tolerance: float,
-        known: np.ndarray | None = None,
-        aim: tuple[np.ndarray, np.ndarray] | None = None,
-        shifts: list[Shifts] | None = None,
-        division: Division | None = None,
-    ) -> RayBounds:
-        """Bounds of the colours of ``pixels`` [n, 2] over every pose of ``box``.
-
-        Args:
-            pose_set, box: The poses.
-            pixels: Rows and columns.
-            tolerance: What a sample's open opacity or colour may move a pixel by before its cells are halved.
-            known: [n, samples] upper bounds of opacities over a larger box.
-            aim: [n, 3] lower and upper colours; bounds between them are good enough (before the shifts).
-            shifts: Intervals of hue and saturation that are added to all colours; bounds hold over all of them.
-            division: The cells, in place of those that suit the rays; bounds are then kept by part.
-        """
-        request = RayRequest(pose_set, box, pixels, tolerance, known, aim, shifts or [])
+    def bounded(self, request: RayRequest, division: Division | None) -> RayBounds:
         if self.paths is None:
             return self._apart(request, division, division is not None, self.displacement)
         ray_bounds, alone = self._followed(self.paths, request, division)

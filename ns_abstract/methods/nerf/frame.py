@@ -112,7 +112,7 @@ _here: dict[bytes, NerfBounds] = {}
 
 
 def _bound_share(frame: bytes, bounds: tuple[Any, ...], displacement: float, arguments: Sequence[Any]) -> RayBounds:
-    """`NerfBounds.rays` in another process; ``bounds`` are the constructor's arguments."""
+    """`BoundedRays.rays` in another process; ``bounds`` are the constructor's arguments."""
     if frame not in _here:
         _here.clear()
         _here[frame] = NerfBounds(*bounds)
@@ -252,7 +252,7 @@ class FieldFrame(RayPictures):
         return [parts[i : i + each] for i in range(0, len(parts), each)]
 
     def _run(self, calls: Sequence[Sequence[Any]]) -> list[RayBounds]:
-        """`NerfBounds.rays` with the arguments of each call, side by side where there are several.
+        """`BoundedRays.rays` with the arguments of each call, side by side where there are several.
 
         Raises:
             WorkCancelledError: There is no time for all of them.

@@ -170,18 +170,18 @@ def _resolution_record(field: NerfactoField) -> Assumption:
 
 def _close_resolutions(grids: list[_Grid]) -> tuple[str, ...]:
     """A note on the resolutions that another machine's float32 power might round to another integer."""
-    found = []
+    close = []
     for one in dict.fromkeys((grid.levels, grid.least, grid.most) for grid in grids):
         for level, size in enumerate(resolutions(*one)):
             exact = one[1] * _growth(*one) ** level
             near = abs(exact - round(exact)) <= _CLOSE_ULPS * float(np.spacing(np.float32(exact)))
             if near and level > 0:
-                found.append(str(size))
-    if not found:
+                close.append(str(size))
+    if not close:
         return ()
     return (
         f"resolutions of grids that lie within {_CLOSE_ULPS:g} float32 roundings of an integer, as torch rounds them "
-        f"here: {', '.join(dict.fromkeys(found))}",
+        f"here: {', '.join(dict.fromkeys(close))}",
     )
 
 
@@ -258,7 +258,7 @@ def _proposal_arguments(run: runs.RunConfig) -> list[dict[str, int]]:
     if not entries or None in entries or (same and len(entries) != 1):
         fix = "write one mapping" if same else "write a list of mappings"
         raise InputError(f"found {show(value)}", file=run.file, field=name, fix=fix)
-    found = []
+    arguments = []
     for entry in entries:
         assert entry is not None
         if entry.get("use_linear", False) is not False:
@@ -274,11 +274,11 @@ def _proposal_arguments(run: runs.RunConfig) -> list[dict[str, int]]:
             raise InputError(f"unknown key {show(unknown[0])}", file=run.file, field=name, fix=_FIX)
         # numbers are checked as those of the model itself
         section = replace(run, model=entry)
-        found.append({key: _argument(section, name, key) for key in _PROPOSAL})
+        arguments.append({key: _argument(section, name, key) for key in _PROPOSAL})
     if same:
-        return found
+        return arguments
     rounds = run.integer("num_proposal_iterations", 2, 1, _ROUNDS_LIMIT)
-    return [found[min(i, len(found) - 1)] for i in range(rounds)]
+    return [arguments[min(i, len(arguments) - 1)] for i in range(rounds)]
 
 
 def _argument(section: runs.RunConfig, name: str, key: str) -> int:

@@ -86,8 +86,8 @@ class NerfactoRenderer:
         world = camera_rays(camera, pixels) @ pose[:, :3].T
         world /= np.linalg.norm(world, axis=1, keepdims=True)
         rays = np.stack([np.broadcast_to(pose[:, 3], world.shape), world], axis=1)
-        found = [np.zeros((0, 3))]
+        colors = [np.zeros((0, 3))]
         for start in range(0, len(rays), _CHUNK):
             check_cancelled()
-            found.append(self.rays(rays[start : start + _CHUNK], shift))
-        return np.concatenate(found)
+            colors.append(self.rays(rays[start : start + _CHUNK], shift))
+        return np.concatenate(colors)

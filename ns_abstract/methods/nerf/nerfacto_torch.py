@@ -29,14 +29,14 @@ def grid_features(encoding: HashEncoding, x: Tensor) -> Tensor:
     share = q - low
     table, level = torch.from_numpy(encoding.table), torch.arange(levels)
     ends = low.long(), torch.ceil(q).detach().long()
-    found: Tensor | float = 0.0
+    features: Tensor | float = 0.0
     for corner in np.ndindex(2, 2, 2):
         cx, cy, cz = (ends[high][..., axis] for axis, high in enumerate(corner))
         row = (cx ^ (cy * PRIME_Y) ^ (cz * PRIME_Z)) % rows
         weight = torch.stack([share[..., a] if h else 1.0 - share[..., a] for a, h in enumerate(corner)]).prod(dim=0)
-        found = found + weight[..., None] * table[level, row]
-    assert isinstance(found, Tensor)
-    return found.flatten(-2)
+        features = features + weight[..., None] * table[level, row]
+    assert isinstance(features, Tensor)
+    return features.flatten(-2)
 
 
 def evaluate_net(net: DenseNet, x: Tensor) -> Tensor:

@@ -4,15 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from string import Template
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ns_abstract.geometry.keyframe_cameras import KeyframeCamera
 from ns_abstract.methods.nerf.hash_field import DenseNet, HashEncoding, NerfactoScene
-from ns_abstract.methods.nerf.write import DATAMANAGER, STEPS, checkpoint_bytes
-from ns_abstract.methods.run_writer import background_name, write_run
+from ns_abstract.methods.nerf.write import STEPS, field_states
+from ns_abstract.methods.run_writer import (
+    background_name,
+    checkpoint_bytes,
+    optimizer_lines,
+    write_run,
+)
 
 
 def write_nerfacto_run(
@@ -42,8 +46,8 @@ def write_nerfacto_run(
         for one in field.proposals
     ]
     behind = field.background
-    config = _CONFIG.safe_substitute(
-        datamanager=DATAMANAGER,
+    config = dict(
+        optimizers=_OPTIMIZERS,
         background=behind if isinstance(behind, str) else background_name(behind.astype(np.float32)),
         far=repr(float(field.far)),
         density=repr(float(field.average_init_density)),
@@ -58,8 +62,8 @@ def write_nerfacto_run(
     )
     return write_run(
         _Shown(scene), Path(folder), "nerfacto", timestamp, experiment_name, data=f"data-{experiment_name}",
-        checkpoint=checkpoint_bytes(_arrays(scene), ("fields", "proposal_networks")), config=config, steps=STEPS,
-        views=views, render=render,
+        checkpoint=checkpoint_bytes(_arrays(scene), field_states(("fields", "proposal_networks")), {}), config=config,
+        steps=STEPS, views=views, render=render,
     )  # fmt: skip
 
 
@@ -92,106 +96,28 @@ def _grid(encoding: HashEncoding) -> dict[str, int]:
 def _arrays(scene: NerfactoScene) -> dict[str, ArrayLike]:
     """The arrays of the fields under Nerfstudio's names, float32."""
     field = scene.field
-    found: dict[str, ArrayLike] = {"field.aabb": np.array([[-1.0] * 3, [1.0] * 3], np.float32)}
+    arrays: dict[str, ArrayLike] = {"field.aabb": np.array([[-1.0] * 3, [1.0] * 3], np.float32)}
 
     def net(name: str, layers: DenseNet) -> None:
         for k, (weight, bias) in enumerate(zip(layers.weights, layers.biases, strict=True)):
-            found[f"{name}.layers.{k}.weight"] = weight.astype(np.float32)
-            found[f"{name}.layers.{k}.bias"] = bias.astype(np.float32)
+            arrays[f"{name}.layers.{k}.weight"] = weight.astype(np.float32)
+            arrays[f"{name}.layers.{k}.bias"] = bias.astype(np.float32)
 
     def grid(name: str, encoding: HashEncoding) -> np.ndarray:
         sizes = _grid(encoding)
         for key in ("max_res", "num_levels", "log2_hashmap_size"):
-            found[f"{name}.{key}"] = np.array(sizes[key])
+            arrays[f"{name}.{key}"] = np.array(sizes[key])
         return encoding.table.reshape(-1, encoding.table.shape[2]).astype(np.float32)
 
-    found["field.mlp_base.model.0.hash_table"] = grid("field", field.encoding)
+    arrays["field.mlp_base.model.0.hash_table"] = grid("field", field.encoding)
     net("field.mlp_base.model.1", field.density_net)
     net("field.mlp_head", field.color_net)
     for k, one in enumerate(field.proposals):
         name = f"proposal_networks.{k}"
-        found[f"{name}.aabb"] = found["field.aabb"]
-        found[f"{name}.encoding.hash_table"] = found[f"{name}.mlp_base.0.hash_table"] = grid(name, one.encoding)
+        arrays[f"{name}.aabb"] = arrays["field.aabb"]
+        arrays[f"{name}.encoding.hash_table"] = arrays[f"{name}.mlp_base.0.hash_table"] = grid(name, one.encoding)
         net(f"{name}.mlp_base.1", one.net)
-    return found
+    return arrays
 
 
-# what config.yml of nerfacto says
-_CONFIG = Template(
-    """\
-max_num_iterations: 30000
-method_name: nerfacto
-mixed_precision: false
-optimizers:
-  fields:
-    optimizer: !!python/object:nerfstudio.engine.optimizers.AdamOptimizerConfig
-      _target: &id001 !!python/name:torch.optim.adam.Adam ''
-      eps: 1.0e-15
-      lr: 0.01
-      max_norm: null
-      weight_decay: 0
-    scheduler: null
-  proposal_networks:
-    optimizer: !!python/object:nerfstudio.engine.optimizers.AdamOptimizerConfig
-      _target: *id001
-      eps: 1.0e-15
-      lr: 0.01
-      max_norm: null
-      weight_decay: 0
-    scheduler: null
-output_dir: !!python/object/apply:pathlib.PosixPath []
-$datamanager
-  model: !!python/object:nerfstudio.models.nerfacto.NerfactoModelConfig
-    _target: !!python/name:nerfstudio.models.nerfacto.NerfactoModel ''
-    appearance_embed_dim: 32
-    average_init_density: $density
-    background_color: $background
-    base_res: $base_res
-    camera_optimizer: !!python/object:nerfstudio.cameras.camera_optimizers.CameraOptimizerConfig
-      _target: !!python/name:nerfstudio.cameras.camera_optimizers.CameraOptimizer ''
-      mode: 'off'
-      optimizer: null
-      rot_l2_penalty: 0.001
-      scheduler: null
-      trans_l2_penalty: 0.01
-    collider_params:
-      far_plane: 6.0
-      near_plane: 2.0
-    disable_scene_contraction: false
-    distortion_loss_mult: 0.002
-    enable_collider: true
-    eval_num_rays_per_chunk: 4096
-    far_plane: $far
-    features_per_level: $features_per_level
-    hidden_dim: $hidden
-    hidden_dim_color: $color
-    hidden_dim_transient: 64
-    implementation: torch
-    interlevel_loss_mult: 1.0
-    log2_hashmap_size: $log2_hashmap_size
-    loss_coefficients:
-      rgb_loss_coarse: 1.0
-      rgb_loss_fine: 1.0
-    max_res: $max_res
-    near_plane: 0.05
-    num_levels: $num_levels
-    num_nerf_samples_per_ray: $nerf_samples
-    num_proposal_iterations: $rounds
-    num_proposal_samples_per_ray: !!python/tuple $samples
-    orientation_loss_mult: 0.0001
-    pred_normal_loss_mult: 0.001
-    predict_normals: false
-    prompt: null
-    proposal_initial_sampler: $spacing
-    proposal_net_args_list:$proposals
-    proposal_update_every: 5
-    proposal_warmup: 5000
-    proposal_weights_anneal_max_num_iters: 1000
-    proposal_weights_anneal_slope: 10.0
-    use_appearance_embedding: false
-    use_average_appearance_embedding: true
-    use_gradient_scaling: false
-    use_proposal_weight_anneal: true
-    use_same_proposal_network: false
-    use_single_jitter: true"""
-)
+_OPTIMIZERS = optimizer_lines("Adam", "1.0e-15", {"fields": ("0.01", None), "proposal_networks": ("0.01", None)})

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -12,6 +13,7 @@ import torch
 from ns_abstract.arithmetic.chebyshev import ChebyshevBasis
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseBox
+from ns_abstract.methods.nerf.division import Division
 from ns_abstract.methods.nerf.hsv import Range
 from ns_abstract.methods.nerf.ray_bundle import TAYLOR
 from ns_abstract.methods.nerf.render import Sampling
@@ -104,7 +106,7 @@ def typical_displacement(parts: Sequence[RayBounds]) -> float:
 
 @dataclass(frozen=True)
 class RayRequest:
-    """The arguments of `NerfBounds.rays`."""
+    """The arguments of `BoundedRays.rays`."""
 
     pose_set: PoseBox
     box: ParameterBox
@@ -121,7 +123,39 @@ class RayRequest:
         return replace(self, pixels=self.pixels[which], known=known_alpha, aim=aim)
 
 
-class RayField:
+class BoundedRays(ABC):
+    """What bounds rays over boxes of poses."""
+
+    def rays(
+        self,
+        pose_set: PoseBox,
+        box: ParameterBox,
+        pixels: np.ndarray,
+        tolerance: float,
+        known: np.ndarray | None = None,
+        aim: tuple[np.ndarray, np.ndarray] | None = None,
+        shifts: list[Shifts] | None = None,
+        division: Division | None = None,
+    ) -> RayBounds:
+        """Bounds of the colours of ``pixels`` [n, 2] over every pose of ``box``.
+
+        Args:
+            pose_set, box: The poses.
+            pixels: Rows and columns.
+            tolerance: What a sample's open opacity or colour may move a pixel by before its cells are halved.
+            known: [n, samples] upper bounds of opacities over a larger box.
+            aim: [n, 3] lower and upper colours; bounds between them are good enough (before the shifts).
+            shifts: Intervals of hue and saturation that are added to all colours; bounds hold over all of them.
+            division: The cells, in place of those that suit the rays; bounds are then kept by part.
+        """
+        return self.bounded(RayRequest(pose_set, box, pixels, tolerance, known, aim, shifts or []), division)
+
+    @abstractmethod
+    def bounded(self, request: RayRequest, division: Division | None) -> RayBounds:
+        """See `rays`."""
+
+
+class RayField(BoundedRays):
     """A scene's field along the rays of a sampling, and what bounds it.
 
     Args:

@@ -65,7 +65,7 @@ def join_sample_cells(parts: list[_SampleCells]) -> _SampleCells:
 
 
 class SampleCellBounds:
-    """The bounds of one pencil of rays; see `NerfBounds.rays`."""
+    """The bounds of one pencil of rays; see `BoundedRays.rays`."""
 
     def __init__(
         self,
@@ -77,7 +77,7 @@ class SampleCellBounds:
         displacement: float,
         edges: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> None:
-        self.edges, known = edges, request.known
+        self.edges, alphas = edges, request.known
         self.owner, self.pencil, self.division = owner, pencil, division
         self.tolerance, self.aim = request.tolerance * (_SWEPT if owner.swept else 1.0), request.aim
         self.basis, self.field = owner.basis, owner.field
@@ -96,10 +96,10 @@ class SampleCellBounds:
         # the first level whose cells are narrow enough for the sample
         self.start = division.first(moves, displacement)
         self.quiet = np.zeros((n, samples), bool)
-        if known is not None:
-            self.quiet = known <= RAY_TUNING.quiet * self.tolerance
+        if alphas is not None:
+            self.quiet = alphas <= RAY_TUNING.quiet * self.tolerance
             for i, k in np.argwhere(self.quiet):
-                self.alpha_high[k, i] = known[i, k]
+                self.alpha_high[k, i] = alphas[i, k]
         self._levels: dict[int, tuple[Tensor, Tensor, np.ndarray]] = {}
 
     def run(self, shifts: list[Shifts], by_part: bool = False) -> RayBounds:

@@ -47,7 +47,7 @@ _KEPT = 1 << 29
 #: Rays that are bounded to learn how long it takes and how wide cells may be.
 _TRIED, _ROUNDS = 8, 3
 
-#: Bounds of one group: arguments of `NerfBounds.rays` behind the poses, by group, to what it found.
+#: Bounds of one group: arguments of `BoundedRays.rays` behind the poses, by group, to what it found.
 BoundBatches = Callable[[Sequence[tuple]], list[RayBounds]]
 PixelWeightSource = Callable[[], "np.ndarray | None"]
 
@@ -104,7 +104,7 @@ class RayBounder(Protocol):
         known: np.ndarray | None = None, aim: tuple[np.ndarray, np.ndarray] | None = None,
         shifts: list[Shifts] | None = None, division: Division | None = None,
     ) -> RayBounds:  # fmt: skip
-        """Bounds of the colours of ``pixels``; see `NerfBounds.rays`."""
+        """Bounds of the colours of ``pixels``; see `BoundedRays.rays`."""
         ...
 
 

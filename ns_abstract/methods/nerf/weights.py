@@ -87,11 +87,11 @@ class NerfWeightFrame(NerfFrame):
 
     def sets(self, box: ParameterBox, weigh: Callable[[], np.ndarray | None] | None = None) -> RayCellBounds:
         """See `NerfFrame.sets`; rays that are not read have zeros."""
-        found = super().sets(box.without(COLOR_SHIFTS), weigh)
-        assert found.linear is not None
+        plain = super().sets(box.without(COLOR_SHIFTS), weigh)
+        assert plain.linear is not None
         d, more = self.box.dimensions, self._dimensions - self.box.dimensions
-        linear = list(found.linear)
+        linear = list(plain.linear)
         for k in (0, 2):
             linear[k] = np.concatenate([linear[k], np.zeros((*linear[k].shape[:-1], more), np.float32)], axis=-1)
-        slopes = np.concatenate([found.slopes[:d], np.zeros(more)])
-        return replace(found, linear=(linear[0], linear[1], linear[2], linear[3]), slopes=slopes)
+        slopes = np.concatenate([plain.slopes[:d], np.zeros(more)])
+        return replace(plain, linear=(linear[0], linear[1], linear[2], linear[3]), slopes=slopes)

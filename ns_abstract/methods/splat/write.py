@@ -7,17 +7,20 @@ commands in the folder given to ``write_splatfacto_run``. The whole folder can b
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ns_abstract.geometry.keyframe_cameras import KeyframeCamera
-from ns_abstract.methods.run_writer import STEP, background_name, lpips_state, write_run
+from ns_abstract.methods.run_writer import (
+    background_name,
+    checkpoint_bytes,
+    optimizer_lines,
+    write_run,
+)
 from ns_abstract.methods.splat.scene import SplatScene
 
 _REST_BANDS = 15  # features_rest of SH degree 3
@@ -63,12 +66,13 @@ def write_splatfacto_run(
     Raises:
         InputError: ``timestamp`` or ``experiment_name`` is not a plain folder name.
     """
-    config = _CONFIG.safe_substitute(
-        count=scene.count,
-        background=background_name(scene.background),
-        mode=scene.rasterize_mode,
-        degree=3 if scene.color_model == "sh" else 0,
-    )
+    config = {
+        "optimizers": _OPTIMIZERS,
+        "count": scene.count,
+        "background": background_name(scene.background),
+        "mode": scene.rasterize_mode,
+        "degree": 3 if scene.color_model == "sh" else 0,
+    }
     return write_run(
         scene, Path(folder), "splatfacto", timestamp, experiment_name, data="data", checkpoint=_checkpoint_bytes(scene),
         config=config, steps=_STEPS, views=views, render=render,
@@ -76,9 +80,6 @@ def write_splatfacto_run(
 
 
 def _checkpoint_bytes(scene: SplatScene) -> bytes:
-    """A checkpoint of plain tensors, numbers, lists and dictionaries: loads with weights_only."""
-    import torch
-
     n = scene.count
     rest = np.zeros((n, _REST_BANDS if scene.color_model == "sh" else 0, 3), np.float32)
     rest[:, : scene.sh.shape[1] - 1] = scene.sh[:, 1:]
@@ -90,22 +91,11 @@ def _checkpoint_bytes(scene: SplatScene) -> bytes:
         "quats": scene.quats,
         "scales": scene.log_scales,
     }
-
-    pipeline: dict[str, torch.Tensor] = {"_model.device_indicator_param": torch.empty(0, dtype=torch.float32)}
-    for name, value in gaussians.items():
-        pipeline[f"_model.gauss_params.{name}"] = torch.from_numpy(np.array(value, np.float32))
-    pipeline |= lpips_state("_model.lpips.net.")
-
-    state = {
-        "step": STEP,
-        "pipeline": pipeline,
-        "optimizers": {name: _adam_state(name, rate) for name, rate in _LEARNING_RATES.items()},
-        "schedulers": {"means": _scheduler_state(_LEARNING_RATES["means"])},
-        "scalers": {},
-    }
-    buffer = io.BytesIO()
-    torch.save(state, buffer)
-    return buffer.getvalue()
+    return checkpoint_bytes(
+        {f"gauss_params.{name}": np.array(value, np.float32) for name, value in gaussians.items()},
+        {name: _adam_state(name, rate) for name, rate in _LEARNING_RATES.items()},
+        {"means": _scheduler_state(_LEARNING_RATES["means"])},
+    )
 
 
 def _adam_state(name: str, rate: float) -> dict[str, Any]:
@@ -140,165 +130,19 @@ def _scheduler_state(rate: float) -> dict[str, Any]:
     }
 
 
-# what config.yml of Splatfacto says; $dataparser is for the writer
-_CONFIG = Template(
-    """\
-max_num_iterations: 30000
-method_name: splatfacto
-mixed_precision: false
-optimizers:
-  bilateral_grid:
-    optimizer: !!python/object:nerfstudio.engine.optimizers.AdamOptimizerConfig
-      _target: &id001 !!python/name:torch.optim.adam.Adam ''
-      eps: 1.0e-15
-      lr: 0.002
-      max_norm: null
-      weight_decay: 0
-    scheduler: !!python/object:nerfstudio.engine.schedulers.ExponentialDecaySchedulerConfig
-      _target: &id002 !!python/name:nerfstudio.engine.schedulers.ExponentialDecayScheduler ''
-      lr_final: 0.0001
-      lr_pre_warmup: 0
-      max_steps: 30000
-      ramp: cosine
-      warmup_steps: 1000
-  camera_opt:
-    optimizer: !!python/object:nerfstudio.engine.optimizers.AdamOptimizerConfig
-      _target: *id001
-      eps: 1.0e-15
-      lr: 0.0001
-      max_norm: null
-      weight_decay: 0
-    scheduler: !!python/object:nerfstudio.engine.schedulers.ExponentialDecaySchedulerConfig
-      _target: *id002
-      lr_final: 5.0e-07
-      lr_pre_warmup: 0
-      max_steps: 30000
-      ramp: cosine
-      warmup_steps: 1000
-  features_dc:
-    optimizer: !!python/object:nerfstudio.engine.optimizers.AdamOptimizerConfig
-      _target: *id001
-      eps: 1.0e-15
-      lr: 0.0025
-      max_norm: null
-      weight_decay: 0
-    scheduler: null
-  features_rest:
-    optimizer: !!python/object:nerfstudio.engine.optimizers.AdamOptimizerConfig
-      _target: *id001
-      eps: 1.0e-15
-      lr: 0.000125
-      max_norm: null
-      weight_decay: 0
-    scheduler: null
-  means:
-    optimizer: !!python/object:nerfstudio.engine.optimizers.AdamOptimizerConfig
-      _target: *id001
-      eps: 1.0e-15
-      lr: 0.00016
-      max_norm: null
-      weight_decay: 0
-    scheduler: !!python/object:nerfstudio.engine.schedulers.ExponentialDecaySchedulerConfig
-      _target: *id002
-      lr_final: 1.6e-06
-      lr_pre_warmup: 1.0e-08
-      max_steps: 30000
-      ramp: cosine
-      warmup_steps: 0
-  opacities:
-    optimizer: !!python/object:nerfstudio.engine.optimizers.AdamOptimizerConfig
-      _target: *id001
-      eps: 1.0e-15
-      lr: 0.05
-      max_norm: null
-      weight_decay: 0
-    scheduler: null
-  quats:
-    optimizer: !!python/object:nerfstudio.engine.optimizers.AdamOptimizerConfig
-      _target: *id001
-      eps: 1.0e-15
-      lr: 0.001
-      max_norm: null
-      weight_decay: 0
-    scheduler: null
-  scales:
-    optimizer: !!python/object:nerfstudio.engine.optimizers.AdamOptimizerConfig
-      _target: *id001
-      eps: 1.0e-15
-      lr: 0.005
-      max_norm: null
-      weight_decay: 0
-    scheduler: null
-output_dir: !!python/object/apply:pathlib.PosixPath []
-pipeline: !!python/object:nerfstudio.pipelines.base_pipeline.VanillaPipelineConfig
-  _target: !!python/name:nerfstudio.pipelines.base_pipeline.VanillaPipeline ''
-  datamanager: !!python/object:nerfstudio.data.datamanagers.full_images_datamanager.FullImageDatamanagerConfig
-    _target: !!python/name:nerfstudio.data.datamanagers.full_images_datamanager.FullImageDatamanager ''
-    cache_images: cpu
-    cache_images_type: uint8
-    camera_res_scale_factor: 1.0
-    data: *data
-$dataparser
-    eval_image_indices: !!python/tuple
-    - 0
-    eval_num_images_to_sample_from: -1
-    eval_num_times_to_repeat_images: -1
-    fps_reset_every: 100
-    images_on_gpu: false
-    masks_on_gpu: false
-    max_thread_workers: null
-    train_cameras_sampling_seed: 42
-    train_cameras_sampling_strategy: random
-  model: !!python/object:nerfstudio.models.splatfacto.SplatfactoModelConfig
-    _target: !!python/name:nerfstudio.models.splatfacto.SplatfactoModel ''
-    background_color: $background
-    camera_optimizer: !!python/object:nerfstudio.cameras.camera_optimizers.CameraOptimizerConfig
-      _target: !!python/name:nerfstudio.cameras.camera_optimizers.CameraOptimizer ''
-      mode: 'off'
-      optimizer: null
-      rot_l2_penalty: 0.001
-      scheduler: null
-      trans_l2_penalty: 0.01
-    collider_params:
-      far_plane: 6.0
-      near_plane: 2.0
-    color_corrected_metrics: false
-    cull_alpha_thresh: 0.1
-    cull_scale_thresh: 0.5
-    cull_screen_size: 0.15
-    densify_grad_thresh: 0.0008
-    densify_size_thresh: 0.01
-    enable_collider: true
-    eval_num_rays_per_chunk: 4096
-    grid_shape: !!python/tuple
-    - 16
-    - 16
-    - 8
-    loss_coefficients:
-      rgb_loss_coarse: 1.0
-      rgb_loss_fine: 1.0
-    max_gauss_ratio: 10.0
-    n_split_samples: 2
-    num_downscales: 2
-    num_random: $count
-    output_depth_during_training: false
-    prompt: null
-    random_init: true
-    random_scale: 10.0
-    rasterize_mode: $mode
-    refine_every: 100
-    reset_alpha_every: 30
-    resolution_schedule: 3000
-    sh_degree: $degree
-    sh_degree_interval: 1000
-    split_screen_size: 0.05
-    ssim_lambda: 0.2
-    stop_screen_size_at: 4000
-    stop_split_at: 15000
-    use_absgrad: true
-    use_bilateral_grid: false
-    use_scale_regularization: false
-    warmup_length: 500"""
+_OPTIMIZERS = optimizer_lines(
+    "Adam",
+    "1.0e-15",
+    {
+        "bilateral_grid": ("0.002", ("0.0001", "0", 1000)),
+        "camera_opt": ("0.0001", ("5.0e-07", "0", 1000)),
+        "features_dc": ("0.0025", None),
+        "features_rest": ("0.000125", None),
+        "means": ("0.00016", ("1.6e-06", "1.0e-08", 0)),
+        "opacities": ("0.05", None),
+        "quats": ("0.001", None),
+        "scales": ("0.005", None),
+    },
 )
 _STEPS = """\
 steps_per_eval_all_images: 1000

@@ -94,12 +94,12 @@ def branch(
         for steps in (0, intermediate_steps):
             if not (settled > 0.0).all():
                 check_cancelled()
-                found = bound_outputs(
+                branch_lower = bound_outputs(
                     network, images, dense, offset, memory=memory, arithmetic=arithmetic, slope_steps=steps,
                     intermediate_steps=steps,
                 ).lower[0]  # fmt: skip
                 count += 1
-                settled = np.fmax(settled, [found[list(group)].max() for group in groups])
+                settled = np.fmax(settled, [branch_lower[list(group)].max() for group in groups])
     for group, value in zip(groups, settled, strict=True):
         if value > 0.0:
             least = min(least, float(value))

@@ -15,13 +15,13 @@ from ns_abstract.verify.network.max_pooling import MaxPool
 def dependence(network: Network, rows: Float64) -> dict[int, Tensor]:
     """Return by node [*shape] bool whether ``rows`` [k, output_size] depend on a number; plays no part in soundness."""
     generator = np.random.default_rng(0)
-    last, found = len(network.nodes), {}
+    last, dependent = len(network.nodes), {}
     reached: dict[int, np.ndarray] = {last: (rows != 0.0).any(0)}
     for at in range(last, 0, -1):
         if at not in reached:
             continue
         node, used = network.nodes[at - 1], reached.pop(at)
-        found[at] = torch.from_numpy(used).reshape(network.shape(at))
+        dependent[at] = torch.from_numpy(used).reshape(network.shape(at))
         # weights cancel by chance alone
         value = (used * generator.uniform(0.5, 1.0, used.shape)).astype(np.float32)
         start = Coefficients.whole(value.reshape(1, *grid(network.shape(at))))
@@ -34,4 +34,4 @@ def dependence(network: Network, rows: Float64) -> dict[int, Tensor]:
             else:
                 own = used
             reached[source] = reached[source] | own if source in reached else own
-    return found
+    return dependent

@@ -233,10 +233,6 @@ class ElementwiseBuilder(NetworkBuilder):
             raise InputError(f"shapes {[item(self.shape(k)) for k in inputs]} mix the batch", fix="unsqueeze before")
         return tuple(self.spread(k, shape[1:]) for k in inputs)
 
-    def plus(self, inputs: Sequence[int], signs: Sequence[int]) -> int:
-        """A sum of values whose shapes may differ."""
-        return self.sum(self.common(*inputs), tuple(signs))
-
     def product(self, a: int, b: int) -> int:
         """``a b``; a value times a known function of it is one function (N10)."""
         gated = self._gated(a, b) or self._gated(b, a)

@@ -405,8 +405,8 @@ class Attributes:
 
 
 def _named(shapes: Mapping[str, Sequence[object]]) -> str:
-    shown = [f"{show(name)} {list(shape)}".replace("'", "") for name, shape in list(shapes.items())[:_NAMED]]
-    return ", ".join(shown) + (f" and {len(shapes) - _NAMED} more" if len(shapes) > _NAMED else "")
+    named = [f"{show(name)} {list(shape)}".replace("'", "") for name, shape in list(shapes.items())[:_NAMED]]
+    return ", ".join(named) + (f" and {len(shapes) - _NAMED} more" if len(shapes) > _NAMED else "")
 
 
 def _outer_names(node: onnx.NodeProto) -> set[str]:

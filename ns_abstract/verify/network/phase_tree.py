@@ -78,12 +78,12 @@ class _Branch:
     def halves(self, split: tuple[int, int]) -> list[_Branch]:
         """The same with either phase of a neuron assumed besides."""
         node, at = split
-        found = []
+        children = []
         for side in (1, -1):
             own = self.phases[node].copy()
             own[at] = side
-            found.append(replace(self, phases={**self.phases, node: own}))
-        return found
+            children.append(replace(self, phases={**self.phases, node: own}))
+        return children
 
 
 class PhaseTree:
@@ -184,10 +184,10 @@ class PhaseTree:
                 self.ascent.move(self.index, 0, chosen, bounds, ascent)
             open_ = ~(best > 0.0).any(1)
             if not open_.all():
-                kept = np.repeat(open_, g)
+                unsettled = np.repeat(open_, g)
                 left, best = left[open_], best[open_]
-                ascent.keep(kept)
-                chosen.trace = {k: v[kept] for k, v in chosen.trace.items()}
+                ascent.keep(unsettled)
+                chosen.trace = {k: v[unsettled] for k, v in chosen.trace.items()}
                 if not len(left):
                     return []
         at = np.arange(len(left)) * g + best.argmax(1)
@@ -195,13 +195,13 @@ class PhaseTree:
         multipliers = {k: np.zeros((len(left) * g, len(own.units.flat)), np.float32) for k, own in self.relus.items()}
         for source, (k, used) in places.items():
             multipliers[k][:, used] = ascent.multipliers[source]
-        found = []
+        climbed = []
         for place, number in enumerate(left.tolist()):
             own = slice(place * g, (place + 1) * g)
             parameters = {k: [v[own].astype(np.float32) for v in vs] for k, vs in ascent.parameters.items()}
             paid = {k: v[own] for k, v in multipliers.items()}
-            found.append(_Branch(branches[number].phases, best[place], parameters, paid, splits[place]))
-        return found
+            climbed.append(_Branch(branches[number].phases, best[place], parameters, paid, splits[place]))
+        return climbed
 
     def _candidates(self, chosen: OptimisedSlopes, at: Int64, phases: Sequence[Phases]) -> list[list[tuple[int, int]]]:
         """By branch: the neurons that cost row ``at`` most because they are unstable."""
@@ -232,8 +232,8 @@ class PhaseTree:
             check_cancelled()
             part = [half for pair in halves[first : first + step] for half in pair]
             ascent, _ = self._ascent(rows, part)
-            _, found = self.ascent.evaluate(self.index, rows.start(len(part)), 0, ascent)
-            bounds.append(rows.lower(found).reshape(-1, 2, g).max(2))
+            _, passed = self.ascent.evaluate(self.index, rows.start(len(part)), 0, ascent)
+            bounds.append(rows.lower(passed).reshape(-1, 2, g).max(2))
         # what is proved cannot become better
         ends = np.minimum(np.concatenate(bounds), 0.0)
         score = ends.min(1) + self.tuning.better_half * ends.max(1)

@@ -191,8 +191,8 @@ class ScalarFunction(Activation):
                 tangents = Tangents.of(self, cuts.z[0], cuts.z[-1], side)
                 middle = 0.5 * (cuts.z[0] + cuts.z[-1])
                 exact = tangents.line(torch.minimum(torch.maximum(middle, tangents.first), tangents.last))
-                known = tangents.known & torch.isfinite(exact[1])
-                slope, offset = (torch.where(known, *pair) for pair in zip(exact, (slope, offset), strict=True))
+                exists = tangents.known & torch.isfinite(exact[1])
+                slope, offset = (torch.where(exists, *pair) for pair in zip(exact, (slope, offset), strict=True))
             lines += [slope, offset]
         return LinearRelaxation(*lines)
 

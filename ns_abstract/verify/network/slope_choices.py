@@ -56,13 +56,13 @@ class UnstableNeurons:
         if isinstance(self.layer, LeakyRelu):
             return [ReluSlopes(units, self.layer.alpha)] if len(units.flat) else []
         assert isinstance(self.layer, ScalarFunction)
-        found: list[LineChoice] = []
+        chosen: list[LineChoice] = []
         for side in (-1.0, 1.0):
             tangents = Tangents.of(self.layer, torch.from_numpy(units.lower), torch.from_numpy(units.upper), side)
             at = (tangents.first < tangents.last).nonzero()[:, 0]
             if len(at):
-                found.append(TangentPoints(units[at.numpy()], tangents[at]))
-        return found
+                chosen.append(TangentPoints(units[at.numpy()], tangents[at]))
+        return chosen
 
     def shifted(
         self, slope: Float64, low: Float64, high: Float64, size: Float64 | float = 0.0
@@ -190,5 +190,5 @@ class TangentPoints:
 
 def ascending(units: dict[int, UnstableNeurons], cell: int) -> dict[int, Sequence[LineChoice]]:
     """By node: what rows of a cell may choose."""
-    found = {k: neurons.choices(cell) for k, neurons in units.items()}
-    return {k: choices for k, choices in found.items() if choices}
+    choices_of = {k: neurons.choices(cell) for k, neurons in units.items()}
+    return {k: choices for k, choices in choices_of.items() if choices}

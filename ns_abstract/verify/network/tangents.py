@@ -77,9 +77,9 @@ class Tangents:
                 parts = parts + here
         first = torch.where(parts == 1.0, first, math.nan)
         corners = torch.stack([edges[0], edges[-1], *edges[1:-1]])
-        found = Tangents(curve, side, first, last, lower, upper, corners, curve.function(corners))
+        tangents = Tangents(curve, side, first, last, lower, upper, corners, curve.function(corners))
         # functions without such parts may have no slope
-        return found._narrowed() if -side in curve.bends else found
+        return tangents._narrowed() if -side in curve.bends else tangents
 
     def _narrowed(self) -> Tangents:
         """With first and last points from which the interval's ends are on the right side."""

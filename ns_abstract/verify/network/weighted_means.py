@@ -28,7 +28,7 @@ def centred(network: Network, image: Tensor) -> Network:
         image: [1, *input_shape] float64.
     """
     builder = NetworkBuilder(network.source, network.input_shape)
-    values, numbers, found = [image], [0], False
+    values, numbers, changed = [image], [0], False
 
     def add(layer: Layer, *inputs: int, name: str = "", op: str = "") -> int:
         builder.nodes.append(Node(name, op, layer, inputs))
@@ -42,14 +42,14 @@ def centred(network: Network, image: Tensor) -> Network:
         if parts is None or moved is None:
             numbers.append(add(node.layer, *(numbers[i] for i in node.inputs), name=node.name, op=node.op))
             continue
-        found, (weight, mean) = True, moved
+        changed, (weight, mean) = True, moved
         shape, one = (len(mean),), network.shape(parts[1])
         numerator = builder.matrix(numbers[parts[0]], weight, None)
         index = torch.zeros(len(mean), dtype=torch.int64)
         inverse = add(Gather((one,), shape, 0, 0, index), numbers[parts[1]])
         quotient = add(Product(shape), numerator, inverse)
         numbers.append(builder.scale(quotient, np.ones(()), mean))
-    return builder.network(numbers[-1], network.output) if found else network
+    return builder.network(numbers[-1], network.output) if changed else network
 
 
 def _moved(layer: Layer, value: Tensor) -> tuple[np.ndarray, np.ndarray] | None:

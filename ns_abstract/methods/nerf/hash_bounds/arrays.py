@@ -56,8 +56,8 @@ def field_arrays(field: NerfactoField) -> FieldArrays:
 def _rooms(net: NetWeights, symbols: int, layers: int = 0) -> tuple[LayerZonotope, ...]:
     """Neurons of every layer, at least ``layers``; ``symbols`` rows before its first ReLU."""
     rows = symbols + int(net.sizes[1:-1].sum())
-    found = tuple(zonotope(rows, int(n)) for n in net.sizes[1:])
-    return found + (zonotope(1, 1),) * (layers - len(found))
+    rooms = tuple(zonotope(rows, int(n)) for n in net.sizes[1:])
+    return rooms + (zonotope(1, 1),) * (layers - len(rooms))
 
 
 def piece_room(field: NerfactoField, arrays: FieldArrays, dimensions: int) -> PieceRoom:

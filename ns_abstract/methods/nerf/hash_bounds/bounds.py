@@ -8,14 +8,12 @@ import numpy as np
 
 from ns_abstract.arithmetic.outward import outward
 from ns_abstract.execution.cancellation import check_cancelled
-from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.nerf.division import Division, division_for
 from ns_abstract.methods.nerf.hash_bounds import pieces
 from ns_abstract.methods.nerf.hash_bounds.arrays import field_arrays, piece_room
 from ns_abstract.methods.nerf.hash_field import NerfactoField
 from ns_abstract.methods.nerf.ray_bundle import TAYLOR, RayBundle
-from ns_abstract.methods.nerf.ray_field import RayBounds, Shifts
+from ns_abstract.methods.nerf.ray_field import BoundedRays, RayBounds, RayRequest
 
 
 @dataclass(frozen=True)
@@ -48,7 +46,7 @@ class HashTuning:
 _TUNING = HashTuning()
 
 
-class HashBounds:
+class HashBounds(BoundedRays):
     """Bounds of a hash-grid field's rays.
 
     Args:
@@ -74,43 +72,31 @@ class HashBounds:
         finer = _TUNING.finer if moves.shape[2] == 1 else 0
         return division_for(moves, self.displacement, most, 0, finer)
 
-    def rays(
-        self,
-        pose_set: PoseBox,
-        box: ParameterBox,
-        pixels: np.ndarray,
-        tolerance: float,
-        known: np.ndarray | None = None,
-        aim: tuple[np.ndarray, np.ndarray] | None = None,
-        shifts: list[Shifts] | None = None,
-        division: Division | None = None,
-    ) -> RayBounds:
-        """Bounds of the colours of ``pixels`` [n, 2] over every pose of ``box``; see `NerfBounds.rays`.
-
-        Opacities are not told, so those that are ``known`` are not looked at.
-        """
-        n, d, displacement = len(pixels), box.dimensions, self.displacement
-        bundle = RayBundle(pose_set, box, pixels, self.taylor)
+    def bounded(self, request: RayRequest, division: Division | None) -> RayBounds:
+        # opacities are not told, so those that are known are not looked at
+        n, d, displacement = len(request.pixels), request.box.dimensions, self.displacement
+        tolerance = request.tolerance
+        bundle = RayBundle(request.pose_set, request.box, request.pixels, self.taylor)
         moves = bundle.displacement(self.distances, self.lengths)[:, 0]
         counts = np.ones(d, np.int64) if division is None else np.array(division.parts, np.int64)
         alpha = np.ones((n, 1), np.float32)
         cells = self._first_cells(moves, displacement)
-        ranges = np.array(shifts or [], np.float64).reshape(-1, 2, 2)
+        ranges = np.array(request.shifts, np.float64).reshape(-1, 2, 2)
         bounds_by_part = np.zeros((n, max(1, len(ranges)), max(1, int(counts.prod())), 2, 3))
         bounds_by_part[..., 1, :] = 1.0
         bounded = np.zeros((n, 3), np.int64)
         if cells is not None and bundle.finite:
             goal = np.stack([np.full((n, 3), np.inf), np.full((n, 3), -np.inf), np.full((n, 3), tolerance)], axis=1)
-            if aim is not None:
+            if (aim := request.aim) is not None:
                 goal[:, 0], goal[:, 1], goal[:, 2] = aim[0], aim[1], _TUNING.rest * tolerance
             self._run(bundle, cells, goal, tolerance, ranges, counts, bounds_by_part, bounded)
             displacement = self._learned(displacement, bounded)
         low, high = bounds_by_part[..., 0, :], bounds_by_part[..., 1, :]
-        found = RayBounds(low.min(axis=(1, 2)), high.max(axis=(1, 2)), alpha, int(bounded[:, 1].sum()), displacement)
+        result = RayBounds(low.min(axis=(1, 2)), high.max(axis=(1, 2)), alpha, int(bounded[:, 1].sum()), displacement)
         if division is not None:
             shape = n, low.shape[1], *division.parts, 3
-            found.parts = np.stack(outward(low.reshape(shape), high.reshape(shape)))
-        return found
+            result.parts = np.stack(outward(low.reshape(shape), high.reshape(shape)))
+        return result
 
     def _first_cells(self, moves: np.ndarray, displacement: float) -> np.ndarray | None:
         """[n, d] pieces by axis on which points move by at most ``displacement``; None where these are too many."""
@@ -147,9 +133,9 @@ class HashBounds:
         """Where later rays had better begin."""
         if not self.dimensions:
             return displacement
-        first, kept = bounded[:, 0].sum(), bounded[:, 2].sum()
-        if kept == first == len(bounded):
+        first, finite = bounded[:, 0].sum(), bounded[:, 2].sum()
+        if finite == first == len(bounded):
             # the box is narrower than a piece may be
             return displacement
-        factor = _TUNING.wider * (first / max(kept, 1)) ** (1.0 / self.dimensions)
+        factor = _TUNING.wider * (first / max(finite, 1)) ** (1.0 / self.dimensions)
         return max(_TUNING.least_displacement, displacement * min(max(factor, 0.25), 2.0))

@@ -110,8 +110,8 @@ def add_depth(edges, i, density, bounds, shares, line, light, work):
     least = times(shortest, bounds[0]) * (1.0 - DEPTH_PRODUCT_ROUNDING)
     most = longest * bounds[1] * (1.0 + DEPTH_PRODUCT_ROUNDING)
     # where density may overflow, a concrete interval of length 0 is not a number
-    known = bounds[1] < np.inf or shortest > 0.0
-    if not known:
+    bounded = bounds[1] < np.inf or shortest > 0.0
+    if not bounded:
         return False
     if out[n + 3] < np.inf:
         pose_low, pose_high = pose_range(out, line, n)

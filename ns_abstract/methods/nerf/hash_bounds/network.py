@@ -121,12 +121,12 @@ def relu(z, count, n, live):
     for r in range(1, count):
         for j in range(n):
             size[j] += abs(rows[r, j])
-    known, alive = count, 0
+    terms, alive = count, 0
     for j in range(n):
         center, spread = rows[0, j], size[j]
         reach = (spread + radius[j]) * HASH_UP
         if center + reach <= 0.0:
-            for r in range(known):
+            for r in range(terms):
                 rows[r, j] = 0.0
             radius[j] = size[j] = 0.0
             continue
@@ -138,7 +138,7 @@ def relu(z, count, n, live):
         low, high = center - reach, center + reach
         slope = high / (high - low)
         error = -0.5 * slope * low
-        for r in range(known):
+        for r in range(terms):
             rows[r, j] *= slope
         rows[0, j] += error
         rounding = RELU_ROUNDING * (slope * size[j] + error)

@@ -229,8 +229,8 @@ def _round(field, edges, light, count, dark, line, rooms, room):
     """Depths of a round that places samples; returns whether something is known."""
     begin(light)
     for i in range(count):
-        known, _ = _sample(field, edges, light, i, line, rooms, room)
-        if not known:
+        bounded, _ = _sample(field, edges, light, i, line, rooms, room)
+        if not bounded:
             return False
         if light.left[i + 1, 1] < dark:
             give_up(light, i + 1, count)
@@ -303,8 +303,8 @@ def bound_piece(field, rays, ray, middle, half, limits, room, out, shown):
     bounds[0], bounds[1] = 0.0, 1.0
     begin(light)
     for i in range(count):
-        known, rows = _sample(field.density, edges, light, i, line, rooms, room)
-        if not known:
+        bounded, rows = _sample(field.density, edges, light, i, line, rooms, room)
+        if not bounded:
             return False
         whole = field.last and i == count - 1
         if rows > 0 and weight_bounds(light, i, whole)[1] > limits.dim:
@@ -430,57 +430,57 @@ def bound_ray(field, rays, ray, cells, deepest, most, goal, limits, shifts, room
     # place and cells by axis, and halvings
     stack = np.empty((first + deepest + 1, 2, d), np.int64)
     depth = np.zeros(first + deepest + 1, np.int64)
-    known = np.empty((first + deepest + 1, 2, 3))
-    found, middle, half = np.empty((2, 3)), np.empty(d), np.empty(d)
-    low, high, shown = np.empty(d), np.empty(d), np.empty((3, room.features.shape[1]))
+    outer = np.empty((first + deepest + 1, 2, 3))
+    piece, middle, half = np.empty((2, 3)), np.empty(d), np.empty(d)
+    low, high, lines = np.empty(d), np.empty(d), np.empty((3, room.features.shape[1]))
     for i in range(first):
         rest = i
         for k in range(d - 1, -1, -1):
             stack[i, 0, k], stack[i, 1, k] = rest % cells[k], cells[k]
             rest //= cells[k]
-        known[i, 0], known[i, 1] = 0.0, 1.0
+        outer[i, 0], outer[i, 1] = 0.0, 1.0
     out[:, :, 0], out[:, :, 1] = 1.0, 0.0
-    height, tried, kept = first, 0, 0
+    height, tried, leaves = first, 0, 0
     while height:
         height -= 1
         for k in range(d):
             place, count = stack[height, 0, k], stack[height, 1, k]
             middle[k] = (2.0 * place + 1.0) / count - 1.0
             half[k] = 1.0 / count + PIECE_END_ROUNDING
-        sampled = bound_piece(field, rays, ray, middle, half, limits, room, found, shown)
+        sampled = bound_piece(field, rays, ray, middle, half, limits, room, piece, lines)
         tried += 1
         good = True
         for c in range(3):
-            found[0, c], found[1, c] = max(found[0, c], known[height, 0, c]), min(found[1, c], known[height, 1, c])
-            if not found[0, c] <= found[1, c]:
-                found[0, c], found[1, c] = known[height, 0, c], known[height, 1, c]
-            inside = found[0, c] >= goal[0, c] and found[1, c] <= goal[1, c]
-            good &= inside or shown[c, -1] <= goal[2, c]
+            piece[0, c], piece[1, c] = max(piece[0, c], outer[height, 0, c]), min(piece[1, c], outer[height, 1, c])
+            if not piece[0, c] <= piece[1, c]:
+                piece[0, c], piece[1, c] = outer[height, 0, c], outer[height, 1, c]
+            inside = piece[0, c] >= goal[0, c] and piece[1, c] <= goal[1, c]
+            good &= inside or lines[c, -1] <= goal[2, c]
         if good or depth[height] >= deepest or tried + height >= most:
-            kept += 1
+            leaves += 1
             if not shifts.shape[0]:
-                _keep(out[0], counts, stack[height, 0], stack[height, 1], found, shown, d == 1, low, high)
+                _keep(out[0], counts, stack[height, 0], stack[height, 1], piece, lines, d == 1, low, high)
             for s in range(shifts.shape[0]):
-                found[0], found[1] = 0.0, 1.0
-                shown[:, -1] = np.inf
+                piece[0], piece[1] = 0.0, 1.0
+                lines[:, -1] = np.inf
                 if sampled:
                     shifted_interval_colors(
                         room.light[len(room.light) - 1], room.light[len(room.light) - 1].least.shape[0],
-                        room.colors[1], shifts[s], field.background, field.last, room.colors[2], found,
+                        room.colors[1], shifts[s], field.background, field.last, room.colors[2], piece,
                     )  # fmt: skip
-                _keep(out[s], counts, stack[height, 0], stack[height, 1], found, shown, d == 1, low, high)
+                _keep(out[s], counts, stack[height, 0], stack[height, 1], piece, lines, d == 1, low, high)
             continue
         axis = _longest_axis(rays, ray, half)
         stack[height, 0, axis] *= 2
         stack[height, 1, axis] *= 2
         depth[height] += 1
-        known[height] = found
+        outer[height] = piece
         stack[height + 1] = stack[height]
         stack[height + 1, 0, axis] += 1
         depth[height + 1] = depth[height]
-        known[height + 1] = found
+        outer[height + 1] = piece
         height += 2
-    return first, tried, kept
+    return first, tried, leaves
 
 
 @njit(cache=True, error_model="numpy", nogil=True, **COUNTED)

@@ -12,7 +12,9 @@ whose radius holds their own rounding.
 
 from __future__ import annotations
 
-from typing import Any, TypeVar
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -28,6 +30,24 @@ def _select(mask: BoolArray, form: FormArray, otherwise: Float64Array) -> FormAr
     """``form`` where ``mask``, else numbers."""
     constant = FormArray.constant(form.basis, otherwise)
     return FormArray(form.basis, np.where(mask.ravel(), form.data, constant.data), form.shape)
+
+
+#: Weights of McCormick's planes in the next products of two bounds; 1 where there are none left.
+_WEIGHTS: list[float] = []
+
+
+@contextmanager
+def weighted(*weights: float) -> Iterator[None]:
+    """Give the products of two `LinearBounds` made inside these weights, one after another."""
+    _WEIGHTS[:] = weights
+    try:
+        yield
+    finally:
+        _WEIGHTS.clear()
+
+
+def _next_weight(other: Any) -> float:
+    return _WEIGHTS.pop(0) if _WEIGHTS and isinstance(other, LinearBounds) else 1.0
 
 
 class LinearBounds:
@@ -159,7 +179,7 @@ class LinearBounds:
         return LinearBounds(lower, first * weight + second * (1.0 - weight))
 
     def __mul__(self, other: LinearBounds | Interval | ArrayLike) -> LinearBounds:
-        return self.multiply(other)
+        return self.multiply(other, _next_weight(other))
 
     __rmul__ = __mul__
 
@@ -178,7 +198,7 @@ class LinearBounds:
         return left.scale(np.asarray(other, np.float64)[None]).sum(1)
 
     def __matmul__(self, other: LinearBounds | NDArray[Any]) -> LinearBounds:
-        return self.matmul(other)
+        return self.matmul(other, _next_weight(other))
 
     def __rmatmul__(self, other: ArrayLike) -> LinearBounds:
         other = np.asarray(other, np.float64)
@@ -215,10 +235,9 @@ class LinearBounds:
         return self._curve(lines.EXP, np.abs(self.range.middle) < 600.0)
 
 
-#: The face of a rule: a result has that of its operands.
-Face = TypeVar("Face", Interval, Enclosure, LinearBounds)
-
-
-def constant_like(like: Face, values: Interval) -> Face:
-    """Return constants that enclose ``values``, in the arithmetic and basis of ``like``."""
-    return type(like).lift(values) if isinstance(like, Interval) else type(like).of(like.basis, values)
+def sumcumprod_lines(alphas: LinearBounds, colors: Float64Array, behind: float = 0.0) -> LinearBounds:
+    """SUMCUMPROD (Algorithm 5) as `sumcumprod` has it, between lines."""
+    result = LinearBounds.of(alphas.basis, np.full(alphas.shape[1:], behind))
+    for i in reversed(range(alphas.shape[0])):
+        result = alphas[i].scale(colors[i]) + (1.0 - alphas[i]) * result
+    return result

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -11,11 +12,13 @@ import numpy as np
 
 from ns_abstract.arithmetic.form_array import FormArray
 from ns_abstract.paper.affine import Enclosure
-from ns_abstract.paper.depth_order import permute, sort_by
+from ns_abstract.paper.depth_order import sort_by
 from ns_abstract.paper.interval import Float64Array, Interval
-from ns_abstract.paper.matrix_inverse import CORNER_LIMIT, corner_inverse, matrix_inverse
+from ns_abstract.paper.matrix_inverse import matrix_inverse
 
 _INVERSE_ORDER = 4
+#: Most entries of a matrix whose corners are enumerated.
+CORNER_LIMIT = 9
 
 
 @dataclass(frozen=True)
@@ -86,6 +89,70 @@ def _inverse(x: Interval | Enclosure) -> Interval | Enclosure:
 
 def _frobenius(x: Float64Array) -> Float64Array:
     return np.sqrt(np.sum(np.square(x)))
+
+
+def permute(x: Float64Array, y: Float64Array) -> Float64Array:
+    """``x`` reordered by ascending ``y``, equal ones in place."""
+    return np.asarray(x)[np.argsort(y, kind="stable")]
+
+
+def corner_inverse(x: Interval) -> Interval:
+    """The interval hull of ``X^-1``, exact up to rounding, for up to 3 x 3 independent entries.
+
+    The determinant and every cofactor are affine in each entry of X by itself, so each entry of the
+    inverse is a linear-fractional, hence monotone, function of each entry of X wherever the
+    determinant keeps its sign: its extremes lie on the 2^(n^2) corners of the box. The determinant,
+    multi-affine, keeps its sign if it has the same sign on all corners.
+
+    Args:
+        x: Matrices [n, n].
+
+    Returns:
+        [n, n]; unbounded where the set may hold a singular matrix.
+
+    Raises:
+        ValueError: Not square, or more than `CORNER_LIMIT` entries.
+    """
+    n = x.shape[0]
+    if x.shape != (n, n) or x.lower.size > CORNER_LIMIT:
+        raise ValueError(f"corners are enumerated for square matrices of up to 3 rows, got {x.shape}")
+    ends = [sorted({low, high}) for low, high in zip(x.lower.ravel(), x.upper.ravel(), strict=True)]
+    corners = Interval(np.array(list(itertools.product(*ends))).reshape(-1, n, n))
+    determinant, adjugate = _determinant(corners), _adjugate(corners)
+    if not (np.all(determinant.lower > 0.0) or np.all(determinant.upper < 0.0)):
+        return Interval.entire((n, n))
+    inverses = adjugate / determinant.reshape(-1, 1, 1)
+    return Interval(inverses.lower.min(axis=0), inverses.upper.max(axis=0))
+
+
+def _determinant(x: Interval) -> Interval:
+    """Determinants of [..., n, n], expanded along the first row."""
+    n = x.shape[-1]
+    if n == 1:
+        return x[..., 0, 0]
+    total = Interval(np.zeros(x.shape[:-2]))
+    for j in range(n):
+        term = x[..., 0, j] * _determinant(x[..., 1:, [k for k in range(n) if k != j]])
+        total = total - term if j % 2 else total + term
+    return total
+
+
+def _adjugate(x: Interval) -> Interval:
+    """Adjugates of [..., n, n]."""
+    n = x.shape[-1]
+    if n == 1:
+        return Interval(np.ones(x.shape))
+    rows = []
+    for i in range(n):
+        entries = []
+        for j in range(n):
+            # entry (i, j) is the cofactor of (j, i)
+            keep_rows, keep_columns = [k for k in range(n) if k != j], [k for k in range(n) if k != i]
+            minor = _determinant(x[..., keep_rows, :][..., keep_columns])
+            entries.append(-minor if (i + j) % 2 else minor)
+        rows.append(Interval.stack(entries))
+    stacked = Interval.stack(rows)
+    return Interval(*(np.moveaxis(end, (0, 1), (-2, -1)) for end in stacked.bounds()))
 
 
 _TABLE = "Abstract Rendering, Table 1"
