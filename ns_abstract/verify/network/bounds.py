@@ -25,6 +25,9 @@ from ns_abstract.verify.network.row_ascent import RowAscent
 from ns_abstract.verify.network.subnormals import subnormals_kept
 from ns_abstract.verify.network.work_budget import WorkBudget
 
+#: The first step's size of lines for intermediate bounds, for which there are few steps.
+_INNER_STEP = 0.6
+
 
 @subnormals_kept()
 def bound_outputs(
@@ -116,7 +119,7 @@ class NetworkBounds:
         )
         schedule = WorkBudget(network)
         backward = BackwardPass(intermediate, memory, schedule.deep)
-        inner = RowAscent(intermediate, backward, 0 if schedule.deep else intermediate_steps)
+        inner = RowAscent(intermediate, backward, 0 if schedule.deep else intermediate_steps, _INNER_STEP)
         neuron_bounds = NeuronBounds(intermediate, backward, schedule, sharing, inner)
         used = None if asked is None else dependence(network, asked)
         selection = NeuronSelection(intermediate, neuron_bounds, schedule, sharing, used)
