@@ -59,8 +59,8 @@ class BoxTuning:
     #: Part of the time that is left for lines of intermediate bounds. What a step towards these takes beside bounds
     #: with plain ones, and how many steps their first evaluation and those plain bounds amount to.
     lines: float = 0.6
-    dear: float = 1.0
-    before: int = 2
+    dear: float = 0.75
+    before: int = 3
     #: What a step, or the evaluation of an input, is taken to need at least.
     least_seconds: float = 1e-6
 
@@ -180,8 +180,8 @@ class _BoxSearch:
         self.together = min(_MOST, max(8, _TOGETHER // total))
         self.attacked = min(_TUNING.attacked, max(4, _ATTACKED // total))
         self.undecided = False
-        # seconds of an input in the first attack
-        self.by_input = _TUNING.least_seconds
+        # seconds of an input in the first attack, and of the latest bounds of all nodes
+        self.by_input, self.by_bounds = _TUNING.least_seconds, 0.0
         self.descended = 0
         self.found: tuple[np.ndarray, np.ndarray] = (np.zeros(0), np.zeros(0))
 
@@ -228,9 +228,8 @@ class _BoxSearch:
     def _assume(self, family: _Family, which: int) -> bool:
         """`settle` of one region by assuming phases of neurons (N16)."""
         images = self._images(*(v[which][None] for v in (family.lower, family.upper)))
-        start = self.deadline.left
         tree, left = self._tree(family, which, images, 0, family.unsafe.groups)
-        by_step = max(_TUNING.least_seconds, _TUNING.dear * (start - self.deadline.left))
+        by_step = max(_TUNING.least_seconds, _TUNING.dear * self.by_bounds)
         if left and self._attack(family, np.array([which]), *self._later(len(left)), left):
             return True
         allowed = _TUNING.lines * self.deadline.left
@@ -254,10 +253,12 @@ class _BoxSearch:
         self, family: _Family, which: int, images: ImageSets, steps: int, groups: Sequence[tuple[int, ...]]
     ) -> tuple[PhaseTree, list[tuple[int, ...]]]:
         """A tree over bounds with so many steps for intermediate ones, and the groups that its root leaves open."""
+        start = self.deadline.left
         cells = NetworkBounds(
             self.bounded, images, "everywhere", self.memory, self.arithmetic, 1, intermediate_steps=steps,
             asked=family.unsafe.rows, coarse=True,
         )  # fmt: skip
+        self.by_bounds = start - self.deadline.left
         tree, left = PhaseTree(cells, family.unsafe.rows, family.offset[which]), []
         for group in groups:
             result = tree.prove(group, 1)

@@ -56,7 +56,8 @@ def bound_outputs(
         arithmetic: Whether the bounds hold for every float32 evaluation and the exact network, or for that alone.
         slope_steps: Steps towards the best slopes below open ReLUs and the best tangents of curves, for every row of
             its own (N14); a bound never is worse for them, and each takes as long as two passes of the rows.
-        intermediate_steps: The same for intermediate bounds, but in deep networks.
+        intermediate_steps: The same for intermediate bounds, but in deep networks; of an unstable neuron for the end
+            that is nearer to zero.
         assumed: By cell: signs of inputs of (leaky) ReLUs, by node; bounds are of the images for which these numbers
             have them in the evaluation that is bounded (N16). ``slope_steps`` must be positive then.
     """

@@ -97,8 +97,8 @@ class NeuronBounds:
     def _climb(self, index: int, where: Int64, reference: Float64, bounds: BackwardBounds, decides: bool) -> None:
         """Raise and lower ends of ``bounds`` with lines of their own; planes stay.
 
-        ``decides``: only of numbers whose sign is open, and of these the end that is nearer to zero: with it the gap of
-        the lines shrinks, with the other hardly.
+        ``decides``: only of unstable neurons, and of these only the end that is nearer to zero. The gap of their
+        lines depends on it the most.
         """
         shape = grid(self.network.shape(index))
         for side, ends in ((1.0, bounds.lower), (-1.0, bounds.upper)):
