@@ -173,6 +173,52 @@ def test_functions_without_curved_parts_choose_nothing(tmp_path: Path) -> None:
     assert np.isfinite(plain).all() and (chosen.lower[0] >= plain).all()
 
 
+def test_ends_near_zero_gain_by_lines_of_their_own(tmp_path: Path) -> None:
+    """Of an unstable neuron the end that is nearer to zero is raised or lowered; the other stays, and both hold."""
+    f = OnnxFile((6,), 3)
+    for size, to in ((6, 24), (24, 24)):
+        f.gemm(size, to)
+        f.node("Relu")
+    f.gemm(24, 2)
+    network = load_network(f.write(tmp_path / "ends.onnx"))
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=6)
+    images = box(x - 0.5, x + 0.5)
+    plain, chosen = (
+        NetworkBounds(network, images, "everywhere", 1 << 30, "real", 1, intermediate_steps=steps).intermediate
+        for steps in (0, 4)
+    )
+    node = max(plain.unstable)
+    one, two = plain.unstable[node], chosen.unstable[node]
+    # others are stable now
+    at = np.searchsorted(one.flat, two.flat)
+    assert len(at) >= 5 and (one.flat[at] == two.flat).all()
+    below = one.upper[at] >= -one.lower[at]
+    assert (two.lower[~below] == one.lower[at][~below]).all() and (two.upper[below] == one.upper[at][below]).all()
+    gained = np.where(below, two.lower - one.lower[at], one.upper[at] - two.upper)
+    assert (gained >= 0.0).all() and (gained > 0.0).mean() > 0.5
+    points = torch.from_numpy(images.lower + rng.uniform(size=(4096, 6)) * (images.upper - images.lower))
+    for layer in network.nodes[: node - 1]:
+        points = layer.layer([points])
+    reached = points[:, torch.from_numpy(two.flat)].numpy()
+    assert (reached >= two.lower).all() and (reached <= two.upper).all()
+
+
+def test_the_later_attack_takes_a_part_of_the_time(tmp_path: Path) -> None:
+    network = load_network(small(tmp_path))
+    search = box_decisions._BoxSearch(network, session(tmp_path / "small.onnx"), Deadline(60.0), 1 << 30, "real")
+    tuning = box_decisions.BoxTuning()
+    search.by_input = 1e-6
+    assert search._later(3) == tuning.later
+    for groups in (1, 4):
+        search.by_input = 2e-3
+        starts, steps = search._later(groups)
+        assert tuning.least[0] <= starts < tuning.later[0] and tuning.least[1] <= steps < tuning.later[1]
+        assert groups * starts * steps * search.by_input <= tuning.attack * 60.0
+    search.by_input = 1e3
+    assert search._later(1) == tuning.least
+
+
 def test_deadlines_are_asked_often(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Between two questions whether time is up lies the work of a few layers, in attacks, bounds and branches."""
     network, file = load_network(leaky(tmp_path)), tmp_path / "leaky.onnx"

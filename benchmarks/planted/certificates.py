@@ -328,6 +328,21 @@ CERTIFICATES = (
         "test_phase_tree.py::test_what_is_not_known_is_not_proved",
     ),
     Fault(
+        "intermediate bounds: lines are chosen for the end far from zero",
+        "verify/network/neuron_bounds.py", "NeuronBounds._climb", "side * (high + low) >= 0.0",
+        "side * (high + low) <= 0.0", "test_phase_tree.py::test_ends_near_zero_gain_by_lines_of_their_own",
+    ),
+    Fault(
+        "intermediate bounds: a raised end is the negative one",
+        "verify/network/neuron_bounds.py", "NeuronBounds._climb", "ends[at] = side * best.lower",
+        "ends[at] = np.abs(best.lower) * side", "test_phase_tree.py::test_ends_near_zero_gain_by_lines_of_their_own",
+    ),
+    Fault(
+        "boxes: the later attack takes its part of the time for every group",
+        "verify/box_decisions.py", "_BoxSearch._later", "self.by_input * groups", "self.by_input",
+        "test_phase_tree.py::test_the_later_attack_takes_a_part_of_the_time",
+    ),
+    Fault(
         "weighted means: any sum is a mean's",
         "verify/network/weighted_means.py", "_mean", "bool((total.weight == 1.0).all())", "True",
         "test_weighted_means.py::test_numbers_that_are_no_shares_stay",

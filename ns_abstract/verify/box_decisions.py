@@ -47,17 +47,21 @@ class BoxTuning:
     steps: int = 25
     later: tuple[int, int] = (64, 60)
     near: float = 1e-5
+    #: Part of the time that is left for the later attack; it never has less starts and steps than these.
+    attack: float = 0.1
+    least: tuple[int, int] = (12, 20)
     #: Most inputs that are attacked at a time.
     attacked: int = 1024
     #: Inputs that vary up to which a box is cut; phases are assumed in boxes of more.
     cut: int = 6
     #: What the width of an input counts beside its slope.
     width: float = 1e-9
-    #: Part of the time that is left for lines of intermediate bounds, and what a step towards these takes beside bounds
-    #: with plain ones.
-    lines: float = 0.3
-    dear: float = 2.0
-    #: What a step is taken to need at least.
+    #: Part of the time that is left for lines of intermediate bounds. What a step towards these takes beside bounds
+    #: with plain ones, and how many steps their first evaluation and those plain bounds amount to.
+    lines: float = 0.6
+    dear: float = 0.75
+    before: int = 3
+    #: What a step, or the evaluation of an input, is taken to need at least.
     least_seconds: float = 1e-6
 
 
@@ -176,12 +180,17 @@ class _BoxSearch:
         self.together = min(_MOST, max(8, _TOGETHER // total))
         self.attacked = min(_TUNING.attacked, max(4, _ATTACKED // total))
         self.undecided = False
+        # seconds of an input in the first attack, and of the latest bounds of all nodes
+        self.by_input, self.by_bounds = _TUNING.least_seconds, 0.0
+        self.descended = 0
         self.found: tuple[np.ndarray, np.ndarray] = (np.zeros(0), np.zeros(0))
 
     def settle(self, family: _Family) -> bool:
         """Whether a region has a counterexample, which `found` then is; `undecided` if that is not known."""
+        start, self.descended = self.deadline.left, 0
         if self._attack(family, np.arange(len(family.regions)), _TUNING.starts, _TUNING.steps):
             return True
+        self.by_input = max(_TUNING.least_seconds, (start - self.deadline.left) / max(1, self.descended))
         if not all(family.unsafe.groups):
             # any output is unsafe, and no input could be shown to have one
             self.undecided = True
@@ -219,15 +228,13 @@ class _BoxSearch:
     def _assume(self, family: _Family, which: int) -> bool:
         """`settle` of one region by assuming phases of neurons (N16)."""
         images = self._images(*(v[which][None] for v in (family.lower, family.upper)))
-        start = self.deadline.left
         tree, left = self._tree(family, which, images, 0, family.unsafe.groups)
-        allowed = _TUNING.lines * self.deadline.left
-        steps = min(
-            _STEPS, int(min(1e6, allowed / max(_TUNING.least_seconds, _TUNING.dear * (start - self.deadline.left))))
-        )
-        if left and self._attack(family, np.array([which]), *_TUNING.later, left):
+        by_step = max(_TUNING.least_seconds, _TUNING.dear * self.by_bounds)
+        if left and self._attack(family, np.array([which]), *self._later(len(left)), left):
             return True
-        if left and steps:
+        allowed = _TUNING.lines * self.deadline.left
+        steps = min(_STEPS, int(min(1e6, allowed / by_step)) - _TUNING.before)
+        if left and steps > 0:
             try:
                 with self.deadline.within(allowed).enforced():
                     tree, left = self._tree(family, which, images, steps, left)
@@ -246,10 +253,12 @@ class _BoxSearch:
         self, family: _Family, which: int, images: ImageSets, steps: int, groups: Sequence[tuple[int, ...]]
     ) -> tuple[PhaseTree, list[tuple[int, ...]]]:
         """A tree over bounds with so many steps for intermediate ones, and the groups that its root leaves open."""
+        start = self.deadline.left
         cells = NetworkBounds(
             self.bounded, images, "everywhere", self.memory, self.arithmetic, 1, intermediate_steps=steps,
             asked=family.unsafe.rows, coarse=True,
         )  # fmt: skip
+        self.by_bounds = start - self.deadline.left
         tree, left = PhaseTree(cells, family.unsafe.rows, family.offset[which]), []
         for group in groups:
             result = tree.prove(group, 1)
@@ -343,6 +352,13 @@ class _BoxSearch:
                     return True
         return False
 
+    def _later(self, groups: int) -> tuple[int, int]:
+        """Starts and steps of the later attack: fewer where all would take too much of the time that is left."""
+        starts, steps = _TUNING.later
+        allowed = _TUNING.attack * self.deadline.left / (self.by_input * groups)
+        part = min(1.0, max(0.0, allowed) / (starts * steps)) ** 0.5
+        return max(_TUNING.least[0], int(part * starts)), max(_TUNING.least[1], int(part * steps))
+
     def _descend(
         self,
         family: _Family,
@@ -357,6 +373,7 @@ class _BoxSearch:
         size = 0.25
         for _ in range(steps):
             check_cancelled()
+            self.descended += len(x)
             x = x.detach().requires_grad_()
             value = self._value(family, x, which, group)
             if self._any(family, x.detach(), which, value.detach()):

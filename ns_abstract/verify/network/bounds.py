@@ -25,6 +25,9 @@ from ns_abstract.verify.network.row_ascent import RowAscent
 from ns_abstract.verify.network.subnormals import subnormals_kept
 from ns_abstract.verify.network.work_budget import WorkBudget
 
+#: The first step's size of lines for intermediate bounds, for which there are few steps.
+_INNER_STEP = 0.6
+
 
 @subnormals_kept()
 def bound_outputs(
@@ -53,7 +56,8 @@ def bound_outputs(
         arithmetic: Whether the bounds hold for every float32 evaluation and the exact network, or for that alone.
         slope_steps: Steps towards the best slopes below open ReLUs and the best tangents of curves, for every row of
             its own (N14); a bound never is worse for them, and each takes as long as two passes of the rows.
-        intermediate_steps: The same for intermediate bounds, but in deep networks.
+        intermediate_steps: The same for intermediate bounds, but in deep networks; of an unstable neuron for the end
+            that is nearer to zero.
         assumed: By cell: signs of inputs of (leaky) ReLUs, by node; bounds are of the images for which these numbers
             have them in the evaluation that is bounded (N16). ``slope_steps`` must be positive then.
     """
@@ -116,7 +120,7 @@ class NetworkBounds:
         )
         schedule = WorkBudget(network)
         backward = BackwardPass(intermediate, memory, schedule.deep)
-        inner = RowAscent(intermediate, backward, 0 if schedule.deep else intermediate_steps)
+        inner = RowAscent(intermediate, backward, 0 if schedule.deep else intermediate_steps, _INNER_STEP)
         neuron_bounds = NeuronBounds(intermediate, backward, schedule, sharing, inner)
         used = None if asked is None else dependence(network, asked)
         selection = NeuronSelection(intermediate, neuron_bounds, schedule, sharing, used)

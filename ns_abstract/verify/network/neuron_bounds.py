@@ -97,12 +97,14 @@ class NeuronBounds:
     def _climb(self, index: int, where: Int64, reference: Float64, bounds: BackwardBounds, decides: bool) -> None:
         """Raise and lower ends of ``bounds`` with lines of their own; planes stay.
 
-        ``decides``: only of numbers whose sign is open, as far as it is.
+        ``decides``: only of unstable neurons, and of these only the end that is nearer to zero. The gap of their
+        lines depends on it the most.
         """
         shape = grid(self.network.shape(index))
         for side, ends in ((1.0, bounds.lower), (-1.0, bounds.upper)):
             low, high = bounds.lower + reference, bounds.upper + reference
-            at = np.flatnonzero((low < 0.0) & (high > 0.0)) if decides else np.arange(len(where))
+            near = side * (high + low) >= 0.0
+            at = np.flatnonzero((low < 0.0) & (high > 0.0) & near) if decides else np.arange(len(where))
             if not len(at):
                 continue
             cell, channel, y, x = (np.ascontiguousarray(v) for v in where[at].T)

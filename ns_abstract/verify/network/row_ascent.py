@@ -15,7 +15,7 @@ from ns_abstract.verify.network.coefficients import Coefficients, Float64, Int64
 from ns_abstract.verify.network.intermediate_bounds import IntermediateBounds
 from ns_abstract.verify.network.max_pooling import MaxPool
 from ns_abstract.verify.network.slope_choices import LineChoice, ReluSlopes, ascending
-from ns_abstract.verify.network.slope_optimisation import DualAscent, OptimisedSlopes, slope_derivatives
+from ns_abstract.verify.network.slope_optimisation import FIRST_STEP, DualAscent, OptimisedSlopes, slope_derivatives
 from ns_abstract.verify.network.stopping import BackwardBounds
 
 #: Bytes of lines of rows' own that are worked on at a time.
@@ -29,11 +29,14 @@ class RowAscent:
         intermediate: What is known of the nodes.
         backward: Passes rows back over it.
         steps: Steps towards the best lines; 0: none. Rows are of the type that the outputs' are.
+        first: The first step's size.
     """
 
-    def __init__(self, intermediate: IntermediateBounds, backward: BackwardPass, steps: int) -> None:
+    def __init__(
+        self, intermediate: IntermediateBounds, backward: BackwardPass, steps: int, first: float = FIRST_STEP
+    ) -> None:
         self.intermediate, self.network, self.backward = intermediate, intermediate.network, backward
-        self.steps = steps
+        self.steps, self.first = steps, first
 
     def climb(self, index: int, rows: Coefficients, cell: Int64, best: BackwardBounds, need: Float64 | None) -> Int64:
         """Raise ``best.lower`` of rows on node ``index``, and planes with it, where lines of their own give more.
@@ -65,7 +68,7 @@ class RowAscent:
     ) -> Int64:
         """`climb` for rows ``own`` of cell k."""
         lines = {at: self.intermediate.relaxations[-1].lines[at][:, k] for at in choices}
-        ascent = DualAscent(choices, lines, len(own), self.intermediate.split[k])
+        ascent = DualAscent(choices, lines, len(own), self.intermediate.split[k], step=self.first)
         for number in range(self.steps + 1):
             if need is not None and bool((best.lower[own] > need).all()):
                 return np.full((len(own), 2), -1, np.int64)

@@ -24,7 +24,7 @@ Float32 = NDArray[np.float32]
 Int64 = NDArray[np.int64]
 
 #: First step of slopes, what each is of the one before, and Adam's parts of what was known before.
-_STEP, _DECAY, _FIRST, _SECOND = 0.3, 0.88, 0.8, 0.95
+FIRST_STEP, _DECAY, _FIRST, _SECOND = 0.3, 0.88, 0.8, 0.95
 #: A preference: added to divisors that may be zero.
 _NEXT_TO_NOTHING = 1e-30
 
@@ -119,7 +119,7 @@ class DualAscent:
         rows: int,
         held: Mapping[int, SplitNeurons] | None = None,
         phases: Mapping[int, NDArray[np.int8]] | None = None,
-        step: float = _STEP,
+        step: float = FIRST_STEP,
     ) -> None:
         self.choices, self.split, self.phases = choices, dict(held or {}), dict(phases or {})
         self._lines = {k: np.repeat(lines[k][:, None], rows, 1) for k in choices}
