@@ -153,7 +153,7 @@ def sampled(scene: nsa.Scene, poses: nsa.PoseSet, count: int) -> None:
 
 
 def searched(scene: nsa.Scene, poses: nsa.PoseSet, seed: int, options: argparse.Namespace) -> bool:
-    """Search with one thread, by processor time; returns whether the true pose is kept, or nothing of a photo elsewhere.
+    """Search with one thread; returns whether the true pose is kept, or nothing is of a photo from elsewhere.
 
     What is left is counted among random poses of the set, and no more than the cells' volume.
     """
@@ -165,7 +165,8 @@ def searched(scene: nsa.Scene, poses: nsa.PoseSet, seed: int, options: argparse.
     # shears keep volumes
     whole = np.prod(np.subtract(search.plain.box.upper, search.plain.box.lower))
     unit = np.prod(np.subtract(search.grid.box.upper, search.grid.box.lower)) / whole / search.grid.volume
-    queue, kept, number = [(0.0, 0, cell) for cell in search.grid.roots()], [], 0
+    queue: list[Any] = [(0.0, 0, cell) for cell in search.grid.roots()]
+    kept, number = [], 0
     bounds, outliers, begin, step = 0, float("inf"), time.process_time(), options.processor / 8.0
     while True:
         used = time.process_time() - begin
@@ -176,7 +177,8 @@ def searched(scene: nsa.Scene, poses: nsa.PoseSet, seed: int, options: argparse.
                 inside |= ((many >= cell.first) & (many < cell.past)).all(axis=1)
             share = min(float(inside.mean()), sum(cell.volume for cell in cells) * unit)
             print(f"{seed},{used:.1f},{share:.3g},{len(cells)},{bounds},{outliers}", flush=True)
-            begin, step = begin + (time.process_time() - begin - used), step * 2.0
+            # counting poses is no part of the search
+            begin, step = time.process_time() - used, step * 2.0
             if not queue or used >= options.processor:
                 break
         findings = search.examine([heapq.heappop(queue)[2]])
@@ -230,7 +232,8 @@ def main() -> None:
         use_threads(1)
         print("seed,processor seconds,left,cells,bounds,best outliers")
         seeds = range(options.first, options.first + options.photos)
-        sys.exit(0 if all([searched(scene, poses, seed, options) for seed in seeds]) else 1)
+        good = [searched(scene, poses, seed, options) for seed in seeds]
+        sys.exit(0 if all(good) else 1)
     if not options.follow:
         sys.exit(0 if located(scene, poses, options) else 1)
     use_threads(options.workers)
