@@ -4,17 +4,21 @@
     python benchmarks/locate.py CONFIG PATH --follow 1000
     python benchmarks/locate.py CONFIG PATH --elsewhere
     python benchmarks/locate.py CONFIG PATH --sample 20
+    python benchmarks/locate.py CONFIG PATH --processor 60 [--elsewhere]
 
 Photos are rendered at hidden poses, 64 x 64 pixels, with noise uniform within 2/255 and 2 % of the pixels at random.
 ``--follow`` examines the cells that hold a hidden pose alone, until ``--depth`` of them or none is left, and exits with
 1 where one of them is excluded. ``--elsewhere`` takes photos from outside of the set, whose answer has to be "none".
 ``--sample`` follows the cells that hold random poses of the set until these are excluded, and estimates from them what
-a whole search takes: a cell that a random pose lies in with probability v stands for 1 / v cells.
+a whole search takes: a cell that a random pose lies in with probability v stands for 1 / v cells. ``--processor``
+searches in this process with one thread, until so many processor seconds are used: what others do on the machine
+does not count.
 """
 
 from __future__ import annotations
 
 import argparse
+import heapq
 import sys
 import time
 from pathlib import Path
@@ -148,6 +152,48 @@ def sampled(scene: nsa.Scene, poses: nsa.PoseSet, count: int) -> None:
         print(f"{least:g},{cost:.0f},{rest:.3f}", flush=True)
 
 
+def searched(scene: nsa.Scene, poses: nsa.PoseSet, seed: int, options: argparse.Namespace) -> bool:
+    """Search with one thread; returns whether the true pose is kept, or nothing is of a photo from elsewhere.
+
+    What is left is counted among random poses of the set, and no more than the cells' volume.
+    """
+    values, levels = hidden(scene, poses, seed, options.elsewhere)
+    location = Location(Job(scene, [poses.of(scene)]), levels, None, PhotoOptions(NOISE, OUTLIERS))
+    search, generator = location.search(0), np.random.default_rng(1)
+    search.frame.warm_up()
+    many = in_units(search, search.plain.box.sample(100_000, generator))
+    # shears keep volumes
+    whole = np.prod(np.subtract(search.plain.box.upper, search.plain.box.lower))
+    unit = np.prod(np.subtract(search.grid.box.upper, search.grid.box.lower)) / whole / search.grid.volume
+    queue: list[Any] = [(0.0, 0, cell) for cell in search.grid.roots()]
+    kept, number = [], 0
+    bounds, outliers, begin, step = 0, float("inf"), time.process_time(), options.processor / 8.0
+    while True:
+        used = time.process_time() - begin
+        if used >= step or not queue:
+            cells = [*kept, *(entry[2] for entry in queue)]
+            inside = np.zeros(len(many), bool)
+            for cell in cells:
+                inside |= ((many >= cell.first) & (many < cell.past)).all(axis=1)
+            share = min(float(inside.mean()), sum(cell.volume for cell in cells) * unit)
+            print(f"{seed},{used:.1f},{share:.3g},{len(cells)},{bounds},{outliers}", flush=True)
+            # counting poses is no part of the search
+            begin, step = time.process_time() - used, step * 2.0
+            if not queue or used >= options.processor:
+                break
+        findings = search.examine([heapq.heappop(queue)[2]])
+        bounds += findings.bounded
+        if findings.best is not None:
+            outliers = min(outliers, findings.best.outliers)
+        kept += [leaf.cell for leaf in findings.leaves if leaf.verdict != "certified"]
+        for block, rank in zip(findings.blocks, findings.ranks, strict=True):
+            number += 1
+            heapq.heappush(queue, (rank, number, *block))
+    place = in_units(search, values[None])[0]
+    held = any(((place >= np.subtract(c.first, 1)) & (place <= np.add(c.past, 1))).all() for c in cells)
+    return not cells if options.elsewhere else held
+
+
 def in_units(search: Any, values: np.ndarray) -> np.ndarray:
     """Poses [n, d] of a set in units of the grid that is searched."""
     box, names = search.grid.box, search.frame.box.names
@@ -173,6 +219,7 @@ def main() -> None:
     parser.add_argument("--depth", type=int, default=40)
     parser.add_argument("--elsewhere", action="store_true")
     parser.add_argument("--sample", type=int, default=0)
+    parser.add_argument("--processor", type=float, default=0.0)
     options = parser.parse_args()
     scene = nsa.load_scene(options.config)
     source = nsa.load_camera_path(options.path).cameras[0]
@@ -181,6 +228,12 @@ def main() -> None:
     if options.sample:
         use_threads(1)
         return sampled(scene, poses, options.sample)
+    if options.processor:
+        use_threads(1)
+        print("seed,processor seconds,left,cells,bounds,best outliers")
+        seeds = range(options.first, options.first + options.photos)
+        good = [searched(scene, poses, seed, options) for seed in seeds]
+        sys.exit(0 if all(good) else 1)
     if not options.follow:
         sys.exit(0 if located(scene, poses, options) else 1)
     use_threads(options.workers)

@@ -3,7 +3,7 @@
 from planted.fault import Fault
 
 _PHOTO, _SEARCH, _COVER = "verify/photo.py", "verify/location.py", "verify/location_cover.py"
-_CELLS = "verify/cell_boxes.py"
+_CELLS, _ROUNDS = "verify/cell_boxes.py", "verify/pixel_rounds.py"
 _ENDS = "test_locate.py::test_a_photo_allows_its_noise_and_every_rounding"
 _BRIGHT = "test_locate_sequence.py::test_values_before_any_brightness_are_held"
 _REACH = "test_locate.py::test_contraction_keeps_every_pose_that_explains_the_photo"
@@ -76,7 +76,7 @@ LOCATION = (
     ),
     Fault(
         "location: sub-boxes whose bounds cross are excluded",
-        _PHOTO, "TiledPhoto.excluded", "(lower <= upper).all(axis=1)", "np.ones(lower.shape[::2], bool)", _NUMBERS,
+        _PHOTO, "TiledPhoto.excluding", "(lower <= upper).all(axis=1)", "np.ones(lower.shape[::2], bool)", _NUMBERS,
     ),
     Fault(
         "location: a sub-box that is left is called empty",
@@ -90,6 +90,29 @@ LOCATION = (
     Fault(
         "location: sub-boxes do not divide a cell's units",
         _CELLS, "sub_box_counts", "np.minimum(sizes & -sizes, most)", "np.minimum(sizes, most)", _LINES,
+    ),
+    Fault(
+        "location: a round counts a pixel twice",
+        _ROUNDS, "PixelRounds.count", "(pixels & ~self.bounded)[pixels]", "pixels[pixels]",
+        "test_pixel_rounds.py::test_a_pixel_counts_once",
+    ),
+    Fault(
+        "location: the outliers allowed are those of the pixels bounded",
+        _ROUNDS, "PixelRounds.left", "self.photo.allowed",
+        "self.photo.allowed * self.bounded.sum() // self.photo.counted.sum()",
+        "test_pixel_rounds.py::test_the_outliers_are_those_of_the_whole_photo",
+    ),
+    Fault(
+        "location: a pixel that was not bounded counts as outside",
+        _ROUNDS, "BoundedPixels.__init__",
+        "self.lower, self.upper = np.full(shape, np.nan), np.full(shape, np.nan)",
+        "self.lower, self.upper = np.zeros(shape), np.zeros(shape)",
+        "test_pixel_rounds.py::test_pixels_that_were_not_bounded_exclude_and_cut_nothing",
+    ),
+    Fault(
+        "location: pixels that do not count exclude sub-boxes",
+        _PHOTO, "TiledPhoto.excluding", "beyond & self.counted[pixels][:, None]", "beyond",
+        "test_pixel_rounds.py::test_pixels_that_do_not_count_exclude_nothing",
     ),
     Fault(
         "location: a shear moves the ends of boxes one way",

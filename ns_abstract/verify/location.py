@@ -23,6 +23,7 @@ from ns_abstract.refine.protocol import Bounds, Frame, LinearSets, PartsFrame, S
 from ns_abstract.verify.cell_boxes import aligned, divided, inner_cell, resolved, slabs, sub_box_counts
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.photo import Photo
+from ns_abstract.verify.pixel_rounds import BoundedPixels, PixelRounds, telling_order
 from ns_abstract.verify.search_results import BlockResult, FinishedCell
 
 #: Grid units along each parameter, as a power of two.
@@ -112,7 +113,6 @@ class LocationSearch:
         self.tiled = photo.tiled(frame.side)
         box = frame.box
         self.grid = CellGrid(box, (1 << UNITS,) * box.dimensions, (1,) * box.dimensions)
-        self.tiles = np.flatnonzero(self.tiled.counted.any(axis=(1, 2)))
         width = np.array(box.upper) - np.array(box.lower)
         motion = np.nan_to_num(np.asarray(frame.motion(box), np.float64), nan=0.0, posinf=0.0)
         # what moves nothing is cut for the bounds' sake now and then
@@ -148,6 +148,12 @@ class LocationSearch:
         gaps = least - assemble(bounds.lower, frame.camera), assemble(bounds.upper, frame.camera) - most
         below, above = (in_tiles(smoothed(np.maximum(gap, 0.0), _SMOOTH), frame.side) for gap in gaps)
         return below, above
+
+    @cached_property
+    def loose(self) -> np.ndarray:
+        """[T, side, side] `looseness` of the widest channel, above and below together."""
+        below, above = self.looseness
+        return (below + above).max(axis=-1)
 
     def examine(self, cells: Sequence[Cell]) -> LocationResult:
         """Exclude the cells, or cut them.
@@ -214,13 +220,7 @@ class _Examination:
                     return None
                 if some is False:
                     break
-            bounds = self._bounds(box, picture)
-            if bounds is None or self._settled(bounds):
-                break
-            assert bounds.linear is not None
-            if search.tiled.allowed < number < tuning.hopeful * search.photo.counted.sum():
-                self._approach(box, bounds.linear)
-            if not self._contracted(box, bounds) or self.cell.volume > (1.0 - tuning.worth) * before:
+            if not self._whole(box, picture, number) or self.cell.volume > (1.0 - tuning.worth) * before:
                 break
         if not self.done:
             self._cut()
@@ -237,18 +237,16 @@ class _Examination:
         counts = sub_box_counts(self.cell, search.along)
         if not isinstance(search.frame, SubBoxFrame) or not search.contract or not resolved(box, counts):
             return None
-        chosen = self._telling(picture)
-        if chosen.sum() <= search.tiled.allowed:
-            self.share = 0.0
-            return False
-        tiles = np.flatnonzero(chosen.any(axis=(1, 2)))
-        self.bounded += 1
-        ends = search.frame.sub_box_ends(box, counts, tiles, chosen[tiles])
-        if ends is None:
-            return None
-        number = search.tiled.excluded(*ends, chosen)
-        left = (number <= search.tiled.allowed).reshape(counts)
-        self.share = float(np.median(number)) / (search.tiled.allowed + 1)
+        rounds = self._rounds(box, picture, counts)
+        while (chosen := rounds.following()) is not None:
+            self.bounded += 1
+            tiles = np.flatnonzero(chosen.any(axis=(1, 2)))
+            ends = search.frame.sub_box_ends(box, counts, tiles, chosen[tiles])
+            if ends is None:
+                return None
+            rounds.count(*ends, chosen)
+            self.share = min(1.0, rounds.expected)
+        left = rounds.left.reshape(counts)
         if left.all():
             return False
         remaining: list[Cell] = []
@@ -290,60 +288,78 @@ class _Examination:
         """Whether a pose that was rendered explains the photo."""
         return self.best is not None and self.best.outliers <= self.search.tiled.allowed
 
-    def _bounds(self, box: ParameterBox, picture: np.ndarray) -> Bounds | None:
-        """Linear bounds of all tiles, for a contraction; None: the cell is excluded, or too wide for one."""
-        search, tiled = self.search, self.search.tiled
-        moved = float(np.linalg.norm(search.moved(box)))
-        chosen = self._promising(picture, moved)
-        if chosen.sum() > tiled.allowed:
+    def _whole(self, box: ParameterBox, picture: np.ndarray, number: int) -> bool:
+        """Bound the cell without sub-boxes, in rounds of pixels, and exclude it or contract it by these (U8).
+
+        Args:
+            box: The cell.
+            picture: Tiles of the render in its middle.
+            number: Pixels that this does not explain.
+
+        Returns:
+            Whether the cell was contracted.
+        """
+        search, tiled, tuning = self.search, self.search.tiled, self.search.tuning
+        before = self.cell.volume
+        linear = search.contract and float(np.linalg.norm(search.moved(box))) <= tuning.contracted
+        rounds, known = self._rounds(box, picture, np.ones(box.dimensions, np.int64)), None
+        while True:
+            chosen = rounds.following()
+            last = chosen is None
+            if chosen is None:
+                if not linear:
+                    return False
+                chosen = rounds.rest
             tiles = np.flatnonzero(chosen.any(axis=(1, 2)))
-            bounds = self._bound(box, tiles, False, chosen[tiles])
-            if self._excluded(bounds, tiles):
-                return None
-        if moved > search.tuning.contracted or not search.contract:
-            return None
-        bounds = self._bound(box, search.tiles, True)
-        return None if self._excluded(bounds, search.tiles) else bounds
+            bounds = self._bound(box, tiles, linear, chosen[tiles])
+            lower, upper = (end[chosen[tiles]][..., None] for end in (bounds.lower, bounds.upper))
+            rounds.count(lower, upper, chosen)
+            self.share = min(1.0, rounds.expected)
+            if not rounds.left.any():
+                self._exclude(float(rounds.numbers[0] - tiled.allowed))
+                return False
+            if not linear:
+                continue
+            known = known or BoundedPixels(tiled, box.dimensions)
+            known.add(bounds, tiles, chosen)
+            if last:
+                if self._settled(known):
+                    return False
+                if tiled.allowed < number < tuning.hopeful * search.photo.counted.sum():
+                    self._approach(box, known.linear)
+            if not self._contracted(box, known):
+                return False
+            if last or self.cell.volume <= (1.0 - tuning.worth) * before:
+                return True
 
-    def _excluded(self, bounds: Bounds, tiles: np.ndarray) -> bool:
-        """Whether more pixels than are allowed lie beyond the bounds of some tiles: the cell is excluded then."""
-        allowed = self.search.tiled.allowed
-        number = int(self.search.tiled.beyond(bounds.lower, bounds.upper, tiles).sum())
-        self.share = number / (allowed + 1)
-        if number > allowed:
-            self._exclude(float(number - allowed))
-        return self.done
+    def _rounds(self, box: ParameterBox, picture: np.ndarray, counts: np.ndarray) -> PixelRounds:
+        """Rounds of pixels for the sub-boxes [counts] of the cell; there are none where too few are likely to help."""
+        search, tiled, tuning = self.search, self.search.tiled, self.search.tuning
+        moved, needed = search.moved(box), tiled.allowed + 1
+        scale = float(np.linalg.norm(moved / counts)) / tuning.reference
+        radius = max(1, round(0.5 * float(np.linalg.norm(moved))))
+        order, sure = telling_order(
+            self._gaps(picture, 1, 0.0), self._gaps(picture, radius, scale), search.loose, tiled.counted,
+            round(tuning.surplus * needed),
+        )  # fmt: skip
+        alone = counts.prod() == 1
+        self.share = sure / needed if alone else 0.0
+        if alone and self.share < tuning.promise:
+            order = order[:0]
+        return PixelRounds(tiled, order, int(np.prod(counts)))
 
-    def _telling(self, picture: np.ndarray) -> np.ndarray:
-        """[T, side, side] counted pixels near which the picture explains the photo's least: a guess of work."""
-        search, tiled, side = self.search, self.search.tiled, self.search.frame.side
-        least, most = (in_tiles(end, side) for end in nearby(assemble(picture, search.frame.camera), 1))
-        gaps = np.where(tiled.counted, np.maximum(least - tiled.high, tiled.low - most).max(axis=-1), -np.inf)
-        return (gaps > 0.0) & self._largest(gaps)
+    def _gaps(self, picture: np.ndarray, radius: int, scale: float) -> Float64Array:
+        """[T, side, side] by how much the picture within ``radius`` pixels misses the photo, less expected looseness.
 
-    def _promising(self, picture: np.ndarray, moved: float) -> np.ndarray:
-        """[T, side, side] counted pixels that bounds are most likely to exclude: a guess of work.
-
-        None are chosen where too few are likely to be. The picture moves by ``moved`` pixels over the cell.
+        Args:
+            picture: Tiles of a render.
+            radius: Pixels.
+            scale: Part of `LocationSearch.looseness` that is expected of the bounds.
         """
         search, tiled, side = self.search, self.search.tiled, self.search.frame.side
-        least, most = nearby(assemble(picture, search.frame.camera), max(1, round(0.5 * moved)))
-        low, high = in_tiles(least, side), in_tiles(most, side)
-        scale = moved / search.tuning.reference
+        least, most = (in_tiles(end, side) for end in nearby(assemble(picture, search.frame.camera), radius))
         below, above = (part * scale for part in search.looseness)
-        gaps = np.maximum(low - tiled.high, tiled.low - high).max(axis=-1)
-        likely = np.maximum(low - below - tiled.high, tiled.low - high - above).max(axis=-1)
-        chosen = tiled.counted & (gaps > 0.0)
-        self.share = int((chosen & (likely > 0.0)).sum()) / (tiled.allowed + 1)
-        if self.share < search.tuning.promise:
-            return np.zeros_like(chosen)
-        likely = np.where(chosen, likely, -np.inf)
-        return chosen & self._largest(likely)
-
-    def _largest(self, values: np.ndarray) -> np.ndarray:
-        """Which of the values by pixel are among the largest, as many as pixels are bounded to exclude a cell."""
-        count = min(values.size, round(self.search.tuning.surplus * (self.search.tiled.allowed + 1)))
-        return values >= np.partition(values, values.size - count, axis=None)[values.size - count]
+        return np.maximum(least - below - tiled.high, tiled.low - most - above).max(axis=-1)
 
     def _bound(self, box: ParameterBox, tiles: np.ndarray, linear: bool, pixels: np.ndarray | None = None) -> Bounds:
         """Bounds of ``tiles``, or of some of their ``pixels`` alone where the frame can leave out the others."""
@@ -354,21 +370,17 @@ class _Examination:
             return frame.bound_parts([box], tiles, None, linear, pixels)[0]
         return frame.bound(box, tiles, None, linear)
 
-    def _settled(self, bounds: Bounds) -> bool:
+    def _settled(self, known: BoundedPixels) -> bool:
         """Whether every pose of the cell explains the photo: it is finished then."""
-        tiled, tiles = self.search.tiled, self.search.tiles
-        inside = tiled.explained(bounds.lower, bounds.upper, tiles)
-        if int(tiled.counted.sum()) - inside > tiled.allowed or not self.explained:
+        tiled = self.search.tiled
+        if int(tiled.counted.sum()) - known.explained > tiled.allowed or not self.explained:
             return False
         self._finish()
         return True
 
-    def _contracted(self, box: ParameterBox, bounds: Bounds) -> bool:
+    def _contracted(self, box: ParameterBox, known: BoundedPixels) -> bool:
         """Exclude what of the cell the pixels' linear bounds rule out; returns whether anything is left of it."""
-        tiled, tiles = self.search.tiled, self.search.tiles
-        assert bounds.linear is not None
-        beyond = tiled.beyond(bounds.lower, bounds.upper, tiles)
-        least, most = tiled.reach(bounds.linear, beyond, tiles)
+        least, most = known.reach
         if (least > most).any():
             self._exclude(1.0)
             return False
@@ -377,11 +389,10 @@ class _Examination:
 
     def _approach(self, box: ParameterBox, linear: LinearSets) -> None:
         """Render the pose at which the linear bounds' middle explains most (weighted least squares)."""
-        search, tiles = self.search, self.search.tiles
-        counted = search.tiled.counted[tiles]
+        search, counted = self.search, self.search.tiled.counted
         a = 0.5 * (linear[0].astype(np.float64) + linear[2])[counted].reshape(-1, box.dimensions)
         b = 0.5 * (linear[1].astype(np.float64) + linear[3])[counted].reshape(-1)
-        low, high = (end[tiles][counted].reshape(-1) for end in (search.tiled.low, search.tiled.high))
+        low, high = (end[counted].reshape(-1) for end in (search.tiled.low, search.tiled.high))
         target, room = 0.5 * (low + high) - b, 0.5 * (high - low)
         good = np.isfinite(a).all(axis=-1) & np.isfinite(target) & (np.abs(a).sum(axis=-1) > 0.0)
         if not good.any():

@@ -162,15 +162,16 @@ class TiledPhoto:
         sane = (lower <= upper).all(axis=-1)
         return sane & self.counted[tiles] & ((lower > self.high[tiles]) | (upper < self.low[tiles])).any(axis=-1)
 
-    def excluded(self, lower: np.ndarray, upper: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-        """[k] how many pixels each of ``k`` sub-boxes excludes: its bounds lie beyond what explains them (U2, U5).
+    def excluding(self, lower: np.ndarray, upper: np.ndarray, pixels: np.ndarray) -> np.ndarray:
+        """[n, k] which pixels exclude which of ``k`` sub-boxes: the bounds lie beyond what explains them (U2, U5).
 
         Args:
-            lower, upper: [n, 3, k] bounds of the pictures of each sub-box.
-            pixels: [T, side, side] the ``n`` pixels, all of them counted.
+            lower, upper: [n, 3, k] bounds of the pictures of each sub-box; NaN and crossed bounds exclude nothing.
+            pixels: [T, side, side] the ``n`` pixels; those that do not count exclude nothing.
         """
         high, low = self.high[pixels][:, :, None], self.low[pixels][:, :, None]
-        return ((lower <= upper).all(axis=1) & ((lower > high) | (upper < low)).any(axis=1)).sum(axis=0)
+        beyond = (lower <= upper).all(axis=1) & ((lower > high) | (upper < low)).any(axis=1)
+        return beyond & self.counted[pixels][:, None]
 
     def explained(self, lower: np.ndarray, upper: np.ndarray, tiles: np.ndarray) -> int:
         """How many counted pixels of ``tiles`` every picture between the bounds explains."""

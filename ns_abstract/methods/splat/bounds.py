@@ -55,8 +55,8 @@ from ns_abstract.methods.splat.variations import VariedSplats
 
 #: Most pairs of fragments whose depth order is examined in one block of pixels.
 PAIR_LIMIT = 30_000
-#: The same where bounds over many sub-boxes come of it.
-PART_PAIR_LIMIT = 100_000
+#: The same where bounds over many sub-boxes come of it: blocks with more pairs take longest and exclude least.
+PART_PAIR_LIMIT = 3_000
 
 
 class Stages(NamedTuple):

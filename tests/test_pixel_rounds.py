@@ -1,0 +1,132 @@
+"""Pixels that are bounded in rounds exclude what all of them would at once, and never the true pose."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from ns_abstract.verify.photo import TiledPhoto
+from ns_abstract.verify.pixel_rounds import BoundedPixels, PixelRounds, RoundTuning, telling_order
+
+T, SIDE = 3, 4
+
+
+def photo_of(values: np.ndarray, allowed: int, counted: np.ndarray | None = None) -> TiledPhoto:
+    """A photo that pictures within 0.01 of ``values`` [T, side, side, 3] explain."""
+    counted = np.ones(values.shape[:3], bool) if counted is None else counted
+    return TiledPhoto(values - 0.01, values + 0.01, counted, allowed)
+
+
+def bounds_of(lower: np.ndarray, upper: np.ndarray, linear: tuple[np.ndarray, ...]) -> Any:
+    return SimpleNamespace(lower=lower, upper=upper, linear=linear)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_rounds_exclude_what_all_pixels_do_and_never_the_true_pose(seed: int) -> None:
+    """Pictures are lines in one parameter, so that the ends over a sub-box are exact."""
+    generator = np.random.default_rng(seed)
+    a, b = generator.normal(size=(2, T, SIDE, SIDE, 3))
+    pose, allowed, parts = float(generator.random()), int(generator.integers(0, 8)), 16
+    values = a * pose + b
+    values.reshape(-1, 3)[generator.permutation(T * SIDE * SIDE)[:allowed]] += 5.0
+    counted = generator.random((T, SIDE, SIDE)) < 0.9
+    photo = photo_of(values, allowed, counted)
+    lines = np.linspace(0.0, 1.0, parts + 1)
+    ends = np.stack([a[..., None] * lines[:-1] + b[..., None], a[..., None] * lines[1:] + b[..., None]])
+    lower, upper = ends.min(axis=0) - 1e-9, ends.max(axis=0) + 1e-9
+    order = generator.permutation(np.flatnonzero(counted))
+    # rounds that go on as long as there are pixels
+    rounds = PixelRounds(photo, order, parts, RoundTuning(first=1.0, hopeless=0.0, few=0.0))
+    seen = np.zeros_like(counted)
+    while (chosen := rounds.following()) is not None:
+        assert not (chosen & seen).any()
+        seen |= chosen
+        rounds.count(lower[chosen], upper[chosen], chosen)
+        # what is excluded by the pixels so far, counted one by one
+        for part in range(parts):
+            out = (lower[..., part] > photo.high).any(axis=-1) | (upper[..., part] < photo.low).any(axis=-1)
+            assert rounds.numbers[part] == int((out & seen & counted).sum())
+            assert rounds.left[part] == (rounds.numbers[part] <= allowed)
+    assert rounds.left[min(int(pose * parts), parts - 1)]
+    # most others are excluded: lines as steep as these leave little
+    assert rounds.left.mean() < 0.5 and (seen == counted)[seen].all()
+
+
+def test_a_pixel_counts_once() -> None:
+    photo = photo_of(np.zeros((T, SIDE, SIDE, 3)), 20)
+    pixels = np.zeros((T, SIDE, SIDE), bool)
+    pixels[0] = True
+    rounds = PixelRounds(photo, np.arange(T * SIDE * SIDE), 2)
+    ends = np.full((16, 3, 2), 0.5)
+    for _ in range(2):
+        rounds.count(ends, ends, pixels)
+        assert rounds.numbers.tolist() == [16, 16] and rounds.left.all()
+    pixels[1] = True
+    rounds.count(np.full((32, 3, 2), 0.5), np.full((32, 3, 2), 0.5), pixels)
+    assert rounds.numbers.tolist() == [32, 32] and not rounds.left.any()
+
+
+def test_the_outliers_are_those_of_the_whole_photo() -> None:
+    """A few pixels are bounded; as many of these may be outliers as of the whole photo."""
+    photo = photo_of(np.zeros((T, SIDE, SIDE, 3)), 4)
+    order = np.arange(T * SIDE * SIDE)
+    for count in (4, 5):
+        pixels = np.zeros(T * SIDE * SIDE, bool)
+        pixels[:count] = True
+        rounds = PixelRounds(photo, order, 1)
+        ends = np.ones((count, 3, 1))
+        rounds.count(ends, ends, pixels.reshape(T, SIDE, SIDE))
+        assert rounds.left.tolist() == [count == 4]
+
+
+def test_pixels_that_do_not_count_exclude_nothing() -> None:
+    counted = np.zeros((T, SIDE, SIDE), bool)
+    counted[0, 0] = True
+    photo = photo_of(np.zeros((T, SIDE, SIDE, 3)), 0, counted)
+    rounds = PixelRounds(photo, np.arange(4), 1)
+    ends = np.ones((T * SIDE * SIDE - 4, 3, 1))
+    rounds.count(ends, ends, ~counted)
+    assert rounds.left.all() and rounds.rest.sum() == 4
+
+
+def test_pixels_that_were_not_bounded_exclude_and_cut_nothing() -> None:
+    """Five pixels are known of a cell, which cut it; of the others nothing is."""
+    photo = photo_of(np.full((T, SIDE, SIDE, 3), 0.5), 4)
+    a, b = np.full((1, SIDE, SIDE, 3, 1), 0.1), np.full((1, SIDE, SIDE, 3), 0.55)
+    pixels = np.zeros((T, SIDE, SIDE), bool)
+    for count in (4, 5):
+        pixels[1].reshape(-1)[:count] = True
+        known = BoundedPixels(photo, 1)
+        known.add(bounds_of(b - 0.1, b + 0.1, (a, b, a, b)), np.array([1]), pixels)
+        assert known.explained == 0
+        assert not photo.beyond(known.lower, known.upper, np.arange(T)).any()
+        least, most = known.reach
+        # more pixels than may show anything ask for 0.55 + 0.1 p from 0.49 to 0.51
+        wanted = (-1.0, 1.0) if count == 4 else (-0.6, -0.4)
+        assert (least[0], most[0]) == pytest.approx(wanted, abs=1e-6)
+        assert least[0] <= wanted[0] and most[0] >= wanted[1]
+
+
+def test_likely_and_tight_pixels_come_first() -> None:
+    gaps = np.array([[[0.3, 0.2, -0.1, 0.4], [0.5, 0.1, 0.6, 0.2]]])
+    likely = np.array([[[0.2, -0.1, -0.2, 0.3], [0.3, -0.3, 0.1, -0.1]]])
+    loose = np.array([[[0.0, 0.0, 0.0, 0.0], [0.2, 0.0, 0.0, 0.0]]])
+    counted = np.ones((1, 2, 4), bool)
+    counted[0, 1, 2] = False
+    order, sure = telling_order(gaps, likely, loose, counted, 5)
+    assert order.tolist() == [3, 0, 4, 1, 7] and sure == 3
+
+
+def test_rounds_stop_where_pixels_do_not_help() -> None:
+    """One round is enough where its pixels exclude everything, and where they exclude nothing."""
+    photo = photo_of(np.zeros((T, SIDE, SIDE, 3)), 4)
+    for value, left in ((1.0, False), (0.0, True)):
+        rounds = PixelRounds(photo, np.arange(T * SIDE * SIDE), 8)
+        chosen = rounds.following()
+        assert chosen is not None and chosen.sum() == 7
+        ends = np.full((7, 3, 8), value)
+        rounds.count(ends, ends, chosen)
+        assert rounds.following() is None and rounds.left.all() == left
+    # too few pixels for any verdict
+    assert PixelRounds(photo, np.arange(4), 8).following() is None
