@@ -26,7 +26,7 @@ from ns_abstract.io.atomic import write_json
 from ns_abstract.io.errors import InputError
 from ns_abstract.refine.protocol import WeightPlane
 from ns_abstract.verify.network import OutputBounds
-from ns_abstract.verify.picture_measures import CellParts, Measure, PlaneSets
+from ns_abstract.verify.picture_measures import CellParts, Measure, PlaneSets, ranked
 from ns_abstract.verify.picture_properties import FARTHEST, PictureClaim, parse_picture_property
 
 SWEEP = {"version": 1, "translation": {"x": 0.15}}
@@ -96,6 +96,17 @@ def test_measures_stay_inside(d: int) -> None:
                 assert shown == pytest.approx(float(value), abs=1e-12)
         widths.append(float((high - low).mean()))
     assert np.median(widths) < 3.0
+
+
+def test_ranks_are_those_of_whole_rows() -> None:
+    rng = np.random.default_rng(0)
+    for k in range(200):
+        rows, n = int(rng.integers(1, 6)), int(rng.integers(1, 12))
+        values = np.tile(rng.integers(0, 6, n).astype(np.float64), (rows, 1))
+        some = rng.random(n) < k % 4 / 3.0
+        values[:, some] = rng.integers(0, 6, (rows, int(some.sum())))
+        for place in range(n):
+            np.testing.assert_array_equal(ranked(values, place), np.sort(values, axis=1)[:, place])
 
 
 def test_parts_follow_the_pose() -> None:

@@ -246,6 +246,27 @@ def test_rays_that_are_not_read_are_not_bounded() -> None:
         assert ((lower <= image) & (image <= upper))[some].all()
 
 
+def test_the_brightest_rays_are_bounded_first() -> None:
+    """Of few rays the others may have any weight; those that are bounded have the bounds that they always have."""
+    around = poses({"translation": {"x": 0.02}})
+    method = NerfMethod(tiny_scene(), num_samples=12)
+    frame = method.weight_frame(around, [WeightPlane(nearer=2.0)], np.ones((3, 4), bool))
+    middle = assemble(frame.of_sample(frame.box.middle, None), frame.camera)[..., 0].reshape(-1)
+    assert sorted(frame.rays.tolist()) == list(range(12)) and (np.diff(middle[frame.rays]) <= 0.0).all()
+    every, some = frame.sets(frame.box), frame.sets(frame.box, None, 8)
+    first = np.zeros(12, bool)
+    first[frame.rays[:8]] = True
+    assert every.linear is not None and some.linear is not None
+    arrays = [(found.lower, found.upper, *(found.linear or ())) for found in (every, some)]
+    for whole, part, rest in zip(*arrays, (0.0, 1.0, 0.0, 0.0, 0.0, 1.0), strict=True):
+        np.testing.assert_array_equal(part[first], whole[first])
+        assert (part[~first] == rest).all()
+    for point in frame.box.sample(5, np.random.default_rng(0)):
+        image = frame.of_sample(point, None)
+        assert ((every.lower <= image) & (image <= every.upper)).all()
+        assert ((some.lower <= image) & (image <= some.upper)).all()
+
+
 def test_fields_have_no_gaussians_and_no_places_of_their_own() -> None:
     around, every = poses({}), np.ones((3, 4), bool)
     with pytest.raises(InputError, match="a NeRF has no Gaussians"):

@@ -11,6 +11,12 @@ _SAMPLES = "test_picture_weights.py::test_weights_of_samples_stay_inside[spec0]"
 _INSIDE = "test_picture_properties.py::test_measures_stay_inside[2]"
 _TREES = "test_picture_properties.py::test_claims_are_trees"
 _DEPTHS = "test_picture_properties.py::test_depths_where_nothing_may_be_drawn"
+_SETTLED, _ENCLOSING, _NEARBY = (
+    "verify/settled_pixels.py", "verify/enclosing_boxes.py", "api/nearby_pictures.py",
+)  # fmt: skip
+_CHANGE = "test_nearby_pictures.py::test_settled_pixels_change_no_verdict"
+_NEAR = "test_nearby_pictures.py::test_pictures_near_a_cell_are_those_of_the_set"
+_RAYS = "test_picture_weights.py::test_the_brightest_rays_are_bounded_first"
 
 PICTURES = (
     Fault(
@@ -58,6 +64,58 @@ PICTURES = (
     Fault(
         "measures: means of the upper planes from below", _MEASURES, "Measure._mean",
         "0 if sign * weight > 0.0 else 2", "2 if sign * weight > 0.0 else 0", _INSIDE,
+    ),
+    Fault(
+        "measures: what all rows share is not sorted", _MEASURES, "ranked", "np.sort(values[0, ~varies])",
+        "values[0, ~varies]", "test_picture_properties.py::test_ranks_are_those_of_whole_rows",
+    ),
+    Fault(
+        "settled pixels: one bright pixel too few is enough", _SETTLED, "unsettled",
+        "int(above.sum()) < needed <= total - int(below.sum())",
+        "int(above.sum()) < needed - 1 < total - int(below.sum())", _CHANGE,
+    ),
+    Fault(
+        "settled pixels: too few may be bright where one more may", _SETTLED, "unsettled",
+        "int(above.sum()) < needed <= total - int(below.sum())",
+        "int(above.sum()) < needed < total - int(below.sum())", _CHANGE,
+    ),
+    Fault(
+        "settled pixels: what may be bright is dark", _SETTLED, "unsettled", "ends[1] < limit - _TUNING.room",
+        "ends[0] < limit - _TUNING.room", _CHANGE,
+    ),
+    Fault(
+        "enclosing boxes: lines of the grid cut cells", _ENCLOSING, "enclosing_box",
+        "min(high, max(upper, cell.upper[axis]))", "min(high, upper)",
+        "test_nearby_pictures.py::test_enclosing_boxes_hold_cells_and_are_shared",
+    ),
+    Fault(
+        "near cells: settled pixels have their lower bounds", _NEARBY, "NearbyPictures.sets",
+        "known.upper.copy()", "known.lower.copy()", _NEAR,
+    ),
+    Fault(
+        "near cells: enclosing boxes are believed", _NEARBY, "KnownBoxes._attack",
+        "inside[self._wanted][:, self._channels].all()", "inside.size",
+        "test_nearby_pictures.py::test_bounds_of_enclosing_boxes_are_attacked",
+    ),
+    Fault(
+        "near cells: a Gaussian is not drawn", _WEIGHTS, "SplatWeightFrame.drawn_alone",
+        "np.sort(some)", "np.sort(some)[1:]", _NEAR,
+    ),
+    Fault(
+        "renders: neighbours of the pixels that are wanted are drawn", "methods/splat/render.py", "_blend_block",
+        "pixels >> q", "pixels >> (q ^ 1)", "test_nearby_pictures.py::test_pixels_that_are_not_wanted_take_no_light",
+    ),
+    Fault(
+        "rays: those that are left out are dark", "methods/nerf/frame.py", "FieldFrame.sets",
+        "np.pad(upper, missing[:2], constant_values=1)", "np.pad(upper, missing[:2])", _RAYS,
+    ),
+    Fault(
+        "rays: planes of those that are left out are dark", "methods/nerf/frame.py", "FieldFrame.sets",
+        "k == 3", "k < 0", _RAYS,
+    ),
+    Fault(
+        "rays: the brightest are put back in order", "methods/nerf/frame.py", "FieldFrame._every",
+        "whole[self.rays] = part", "whole[np.sort(self.rays)] = part", _RAYS,
     ),
     Fault(
         "claims: any part of a cell will do", _PROPERTIES, "PictureClaim.proved",

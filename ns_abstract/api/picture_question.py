@@ -18,6 +18,7 @@ from ns_abstract.api.assumptions import choice
 from ns_abstract.api.files import resized
 from ns_abstract.api.frame_pictures import FramePictures, PropertySource
 from ns_abstract.api.job import Job
+from ns_abstract.api.nearby_pictures import KnownBoxes
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble, in_tiles
@@ -28,6 +29,7 @@ from ns_abstract.refine.protocol import (
     DEPTH,
     MOST_PLANES,
     Bounds,
+    ElementFrame,
     Frame,
     Method,
     PartsFrame,
@@ -43,6 +45,11 @@ from ns_abstract.verify.camera_response import CameraResponse
 from ns_abstract.verify.eight_bit import Picture
 from ns_abstract.verify.network import NetworkArithmetic
 from ns_abstract.verify.picture_properties import FARTHEST, MeasureModel, PictureProperty, parse_picture_property
+from ns_abstract.verify.protocol import FrameImages
+from ns_abstract.verify.settled_pixels import LimitedMeasure, unsettled
+
+#: Rays that are bounded before it is asked whether these say enough.
+_FEW_RAYS = 8
 
 
 @dataclass(frozen=True)
@@ -103,7 +110,7 @@ class PlanePictures(FramePictures):
         self.wanted = self.wanted.reshape(height, width)
         weights = [(k, plane) for k, plane in enumerate(self._planes) if isinstance(plane, WeightPlane)]
         #: Frames of weights, with the channels that their planes have here.
-        self._weights: list[tuple[WeightFrame, list[int]]] = []
+        self.weights: list[tuple[WeightFrame, list[int]]] = []
         for first in range(0, len(weights), MOST_PLANES):
             some = weights[first : first + MOST_PLANES]
             if not isinstance(method, WeightMethod):
@@ -111,7 +118,7 @@ class PlanePictures(FramePictures):
                     f"blending weights of {method.content} are not bounded", field="type", fix="use picture"
                 )
             frame = method.weight_frame(poses, [plane for _, plane in some], self.wanted)
-            self._weights.append((frame, [COLORS + k for k, _ in some]))
+            self.weights.append((frame, [COLORS + k for k, _ in some]))
         self._depth = COLORS + self._planes.index("depth") if "depth" in self._planes else None
 
     @property
@@ -128,10 +135,16 @@ class PlanePictures(FramePictures):
         return weights and next(iter(self.frame.scene_samples(0)), None) is None
 
     @property
+    def _few_rays(self) -> bool:
+        """Whether a few rays may say enough: nothing else is read."""
+        return self._dark and len(self.weights) == 1 and self.weights[0][0].tilewise
+
+    @property
     def effort(self) -> tuple[Frame, int]:
         if "colors" in self._read:
             return super().effort
-        return self._weights[0][0], int(self.wanted.sum())
+        rays = int(self.wanted.sum())
+        return self.weights[0][0], min(_FEW_RAYS, rays) if self._few_rays else rays
 
     def _frame(self, method: Method, poses: PoseBox, sheared: bool) -> Frame:
         try:
@@ -152,7 +165,7 @@ class PlanePictures(FramePictures):
         whole = None if self._dark else super().image(values, base)
         if whole is not None:
             image[..., :COLORS] = whole[..., :COLORS]
-        for frame, channels in self._weights:
+        for frame, channels in self.weights:
             tiles = frame.of_sample(values, base)
             image[..., channels] = assemble(tiles, frame.camera)[..., : len(channels)]
         if self._depth is not None:
@@ -166,7 +179,10 @@ class PlanePictures(FramePictures):
         return (PlaneSample(sample, steps) for sample in self.frame.scene_samples(seed))
 
     def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
-        """Sets of the planes [H, W, C]; pixels and channels that no measure reads have none: all zeros."""
+        """Sets of the planes [H, W, C]; pixels and channels that no measure reads have none: all zeros.
+
+        Of rays only as many are bounded as decide what is claimed (Q6).
+        """
         shape, d = (*self.wanted.shape, self.channels), box.dimensions
         linear = tuple(np.zeros((*shape, d) if k % 2 == 0 else shape, np.float32) for k in range(4))
         lower, upper, slopes = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(d)
@@ -194,14 +210,22 @@ class PlanePictures(FramePictures):
                 low, high = np.where(self.wanted, low, 0.0), np.where(self.wanted, high, 0.0)
                 for side, value in ((lower, low), (linear[1], low), (upper, high), (linear[3], high)):
                     side[..., self._depth] = value
-        for frame, channels in self._weights:
-            bounds, tiles = self._bounded(frame, box, channels)
+        rays = int(self.wanted.sum())
+        for frame, channels in self.weights:
+            most = _FEW_RAYS if self._few_rays else rays
+            while True:
+                bounds, tiles = self._bounded(frame, box, channels, most if most < rays else None)
+                put(frame, bounds, tiles, list(range(len(channels))), channels)
+                if most >= rays or not unsettled(self._limited, lower, upper).any():
+                    break
+                most *= 2
             slopes = slopes + bounds.slopes
-            put(frame, bounds, tiles, list(range(len(channels))), channels)
         return linear, lower, upper, slopes
 
-    def _bounded(self, frame: Frame, box: ParameterBox, channels: list[int]) -> tuple[Bounds, np.ndarray]:
-        """Bounds of the tiles that hold pixels which are read, and their numbers."""
+    def _bounded(
+        self, frame: Frame, box: ParameterBox, channels: list[int], most: int | None = None
+    ) -> tuple[Bounds, np.ndarray]:
+        """Bounds of the tiles that hold pixels which are read, and their numbers; ``most``: see `RayFrame.sets`."""
         if frame.tilewise:
 
             def weigh() -> np.ndarray | None:
@@ -211,12 +235,30 @@ class PlanePictures(FramePictures):
                     costs[..., : len(channels)] = weights[..., channels]
                 return None if weights is None else costs
 
-            return cast("RayFrame", frame).sets(box, weigh), np.arange(frame.tile_count)
+            return cast("RayFrame", frame).sets(box, weigh, most), np.arange(frame.tile_count)
         pixels = in_tiles(self.wanted, frame.side)
         tiles = np.flatnonzero(pixels.any(axis=(1, 2)))
         if isinstance(frame, PartsFrame):
             return frame.bound_parts([box], tiles, None, True, pixels[tiles])[0], tiles
         return frame.bound(box, tiles, keep_linear=True), tiles
+
+    @cached_property
+    def _limited(self) -> tuple[LimitedMeasure, ...]:
+        """What is read."""
+        return self._property.limited(*self.wanted.shape)
+
+    @cached_property
+    def _boxes(self) -> KnownBoxes | None:
+        """What is known of boxes around cells; None where more than weights of one scene is read, or rays are drawn."""
+        weights = [(frame, channels) for frame, channels in self.weights if isinstance(frame, ElementFrame)]
+        if not self._dark or len(weights) < len(self.weights):
+            return None
+        return KnownBoxes(self, weights, self.wanted, self._limited)
+
+    def near(self, cell: ParameterBox) -> FrameImages:
+        """See `ns_abstract.verify.protocol.NearImages`."""
+        found = None if self._boxes is None else self._boxes.near(cell)
+        return self if found is None else found
 
     def differentiable(self, values: torch.Tensor) -> torch.Tensor:
         """Picture [H, W, C] at parameter values [d]; depths have no slope."""
@@ -224,7 +266,7 @@ class PlanePictures(FramePictures):
         if "colors" in self._read:
             colors = super().differentiable(values)
             planes[:COLORS] = list(colors.split(1, dim=-1))
-        for frame, channels in self._weights:
+        for frame, channels in self.weights:
             for channel, plane in zip(channels, frame.differentiable(values).split(1, dim=-1), strict=False):
                 planes[channel] = plane
         if self._depth is not None:

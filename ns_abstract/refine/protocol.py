@@ -318,7 +318,9 @@ class PreciseFrame(Protocol):
 class RayFrame(Frame, Protocol):
     """A frame whose pictures are made ray by ray (`ns_abstract.methods.representation.Representation.rays`)."""
 
-    def sets(self, box: ParameterBox, weigh: Callable[[], np.ndarray | None] | None = None) -> Bounds:
+    def sets(
+        self, box: ParameterBox, weigh: Callable[[], np.ndarray | None] | None = None, most: int | None = None
+    ) -> Bounds:
         """Bounds of all tiles over a cell with linear bounds, for certificates.
 
         What is found depends on the cell and on ``weigh`` alone, whatever was bounded before.
@@ -327,6 +329,7 @@ class RayFrame(Frame, Protocol):
             box: The cell.
             weigh: [H, W, 3] what part of a margin a unit of each pixel's width may cost, or None; asked at most once,
                 where rays could be refined.
+            most: Rays that are bounded, about, those that matter most first; others are left at [0, 1]. All if None.
 
         Raises:
             WorkCancelledError: There is no time for it.
@@ -368,6 +371,21 @@ class WeightFrame(Frame, Protocol):
 
     def differentiable(self, values: torch.Tensor) -> torch.Tensor:
         """Weights [H, W, 3] at parameter values [d], differentiable where elements are chosen."""
+        ...
+
+
+@runtime_checkable
+class ElementFrame(WeightFrame, PartsFrame, Protocol):
+    """An optional interface of a `WeightFrame`: pictures of few pixels, drawn by the elements that show there alone."""
+
+    def drawn_alone(self, context: Any, tiles: np.ndarray, pixels: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+        """What draws the ``tiles`` [t, side, side, 3] at parameter values [d] of a box; right at ``pixels`` alone.
+
+        Args:
+            context: Of these pixels and the box.
+            tiles: [t] numbers.
+            pixels: [t, side, side] which pixels will be read.
+        """
         ...
 
 

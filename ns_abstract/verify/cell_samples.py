@@ -8,9 +8,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.refine.protocol import SceneSample
 from ns_abstract.verify.cells import Cell
+from ns_abstract.verify.protocol import FrameImages
 
 #: A pose, and the scene of the set that is shown; None: the stored one, or the nearest to it.
 Sample = tuple[np.ndarray, "SceneSample | None"]
@@ -18,10 +20,17 @@ Sample = tuple[np.ndarray, "SceneSample | None"]
 
 @dataclass
 class CellSamples:
-    """Concrete pictures of one cell, with their margins."""
+    """Concrete pictures of one cell, with their margins.
+
+    Attributes:
+        cell, box: The cell.
+        scene: Draws and bounds its pictures.
+        samples, margins: What was looked at so far.
+    """
 
     cell: Cell
     box: ParameterBox
+    scene: FrameImages
     samples: list[Sample] = field(default_factory=list)
     margins: list[float] = field(default_factory=list)
 
@@ -81,3 +90,10 @@ def sample_key(sample: Sample) -> tuple[bytes, int]:
     """Return a key that is equal for equal pictures; scene samples are distinguished by identity."""
     pose, member = sample
     return pose.tobytes(), id(member)
+
+
+def drawn(scene: FrameImages, sample: Sample) -> np.ndarray:
+    """Return the picture of a sample."""
+    check_cancelled()
+    values, member = sample
+    return scene.image(values) if member is None else scene.image(values, member)

@@ -154,7 +154,7 @@ class Measure:
                 low, high = np.maximum(low, mean[0]), np.minimum(high, mean[1])
             return low, high
         place = self.rank - 1 if self.least else len(pixels) - self.rank
-        return tuple(np.partition(side, place, axis=1)[:, place] for side in (low, high))  # pyright: ignore[reportReturnType]
+        return ranked(low, place), ranked(high, place)
 
     def _mean(
         self, planes: PlaneSets, first: int, parts: CellParts, regions: list[tuple[np.ndarray, float]]
@@ -175,6 +175,17 @@ class Measure:
             center, half = parts.middles @ slope + value, parts.halves @ np.abs(slope)
             ends.append(center - sign * (half + (count + parts.dimensions) * OWN_MARGIN * size))
         return ends[0], ends[1]
+
+
+def ranked(values: np.ndarray, place: int) -> np.ndarray:
+    """Return [s] the entry number ``place`` of each row of ``values`` [s, n], counted from the least, from 0 on."""
+    varies = (values != values[0]).any(axis=0)
+    count = int(varies.sum())
+    # of what is the same in all rows, only as many can be meant as there are others
+    same = np.sort(values[0, ~varies])
+    first = max(0, place - count)
+    some = np.concatenate([values[:, varies], np.tile(same[first : place + 1], (len(values), 1))], axis=1)
+    return np.partition(some, place - first, axis=1)[:, place - first]
 
 
 @dataclass(frozen=True)

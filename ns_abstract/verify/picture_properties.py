@@ -36,6 +36,7 @@ from ns_abstract.verify.picture_measures import (
 from ns_abstract.verify.preprocess import Preprocess, parse_preprocess
 from ns_abstract.verify.properties import Claim, Property, Query
 from ns_abstract.verify.property_reading import parse_partitions
+from ns_abstract.verify.settled_pixels import LimitedMeasure
 
 _TUNING = MeasureTuning()
 STATISTICS = ("mean", "least", "greatest")
@@ -196,6 +197,19 @@ class PictureProperty(Property):
         measures = self.measures(height, width)
         places = [0 if m.plane == "colors" else COLORS + others.index(m.plane) for m in measures]
         return MeasureModel(measures, places, COLORS + len(others))
+
+    def limited(self, height: int, width: int) -> tuple[LimitedMeasure, ...]:
+        """The measures of pictures of this size with their limits, by leaf.
+
+        Raises:
+            InputError: A region does not lie in them.
+        """
+        model = self.model(height, width)
+        found = zip(model.measures, model.places, leaves(self.statement), strict=True)
+        return tuple(
+            LimitedMeasure(measure, place, tuple(end for end in (leaf.low, leaf.high) if math.isfinite(end)))
+            for measure, place, leaf in found
+        )
 
     def measures(self, height: int, width: int) -> tuple[Measure, ...]:
         """The measures of pictures of this size, by leaf.

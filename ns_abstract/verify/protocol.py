@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 import torch
@@ -33,6 +33,18 @@ class FrameImages(Protocol):
 
     def differentiable(self, values: torch.Tensor) -> torch.Tensor:
         """Picture [H, W, 3] at parameter values [d], differentiable."""
+        ...
+
+
+@runtime_checkable
+class NearImages(Protocol):
+    """An optional interface of `FrameImages`: what is known around a cell makes its pictures cheaper."""
+
+    def near(self, cell: ParameterBox) -> FrameImages:
+        """Pictures and sets for poses of ``cell`` and boxes inside it.
+
+        Every margin has the sign of that of the picture as it is, though pixels may have other values.
+        """
         ...
 
 

@@ -17,13 +17,15 @@ import numpy as np
 import torch
 
 from ns_abstract.execution.cancellation import check_cancelled
+from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.refine.protocol import SceneSample
-from ns_abstract.verify.cell_samples import CellSamples, Sample, sample_key
+from ns_abstract.verify.cell_samples import CellSamples, Sample, drawn, sample_key
 from ns_abstract.verify.cells import Cell, CellGrid
+from ns_abstract.verify.margin_descent import descend
 from ns_abstract.verify.picture_sets import PictureSets
 from ns_abstract.verify.properties import Claim, LinearClaim
-from ns_abstract.verify.protocol import FrameImages, Model
+from ns_abstract.verify.protocol import FrameImages, Model, NearImages
 from ns_abstract.verify.search_results import FAILURES, BlockResult, ContradictionError, FinishedCell, failure_text
 from ns_abstract.verify.subboxes import PixelWeights, SubBoxProof
 
@@ -42,11 +44,11 @@ RANK_FIRST = 1e3
 _RANK_UNKNOWN, _RANK_BROKEN = 1e6, 2e3
 #: A cell is cut into four where its bound misses by more than so many times the margin that samples show.
 _FAR = 4.0
+#: Of a model without cost: the part of the margin that bounds of a cell's parts may miss it by, the least that cells
+#: are narrowed by at once, and how many times the margin a bound is taken to miss where the property fails in places.
+_LEFT, _NARROWEST, _AWAY = 0.7, 0.125, 4.0
 #: Corners sampled before and after a cell's bounds are known, and random poses besides.
 _EARLY, _LATE, _RANDOM = 2, 4, 2
-#: Steps of the ascent to a counterexample.
-_STEPS = 6
-_FIRST_STEP = 0.25
 #: Scenes of a set tried in a cell without a proof.
 _MEMBERS = 4
 #: Why a cell is unknown where a sample's margin decides nothing.
@@ -70,7 +72,8 @@ class Search:
         block: Most cells examined together.
         cuts: Whether cells without a verdict are cut; else they are done with.
         cover: Proves cells that are too wide part by part; None: they are cut.
-        costly: Whether bounds of the model cost so much that cells whose sets are wide are cut without them.
+        costly: Whether bounds of the model cost so much that cells whose sets are wide are cut without them, and that
+            slopes of the margin are worth their time.
     """
 
     def __init__(
@@ -93,18 +96,26 @@ class Search:
         self._latest: dict[tuple[bytes, int], np.ndarray] = {}
         self.varies = next(iter(scene.scene_samples(0)), None) is not None
 
-    def margins(self, samples: Sequence[Sample]) -> tuple[np.ndarray, np.ndarray]:
-        """[s] concrete margins and [s, n] outputs at poses, each of a scene of the set."""
-        images = np.stack([self._image(*sample) for sample in samples])
+    def _near(self, box: ParameterBox) -> FrameImages:
+        """Pictures of a cell."""
+        return self.scene.near(box) if isinstance(self.scene, NearImages) else self.scene
+
+    def margins(
+        self, samples: Sequence[Sample], scenes: Sequence[FrameImages] | None = None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """[s] concrete margins and [s, n] outputs at poses, each of a scene of the set.
+
+        Args:
+            samples: The poses.
+            scenes: What draws each of them; None: the set's pictures.
+        """
+        drawn_by = [self.scene] * len(samples) if scenes is None else scenes
+        images = np.stack([drawn(scene, sample) for scene, sample in zip(drawn_by, samples, strict=True)])
         self._latest = {sample_key(sample): image for sample, image in zip(samples, images, strict=True)}
         outputs = np.asarray(self.model.outputs(images), np.float64)
         with torch.no_grad():
             margin = self.claim.margin(torch.from_numpy(outputs), torch.from_numpy(np.stack([p for p, _ in samples])))
         return margin.numpy(), outputs
-
-    def _image(self, values: np.ndarray, member: SceneSample | None) -> np.ndarray:
-        check_cancelled()
-        return self.scene.image(values) if member is None else self.scene.image(values, member)
 
     def examine(self, block: Sequence[Cell]) -> BlockResult:
         """Examine the cells.
@@ -114,7 +125,8 @@ class Search:
             WorkCancelledError: There is no time for it (`ns_abstract.execution.cancellation`).
         """
         begin = time.perf_counter()
-        samples = [CellSamples(cell, self.grid.box_of(cell)) for cell in block]
+        boxes = [self.grid.box_of(cell) for cell in block]
+        samples = [CellSamples(cell, box, self._near(box)) for cell, box in zip(block, boxes, strict=True)]
         outputs = self._sample(samples, self._early)
         bounded: dict[int, float] = {}
         reasons: dict[int, str] = {}
@@ -182,10 +194,14 @@ class Search:
         """Add samples to the cells; returns the outputs at each cell's first new one."""
         chosen = [choose(cell) for cell in cells]
         # neighbours share corners
-        unique = {sample_key(sample): sample for samples in chosen for sample in samples}
+        unique = {
+            sample_key(sample): (sample, cell.scene)
+            for cell, samples in zip(cells, chosen, strict=True)
+            for sample in samples
+        }
         if not unique:
             return []
-        margins, outputs = self.margins(list(unique.values()))
+        margins, outputs = self.margins(*zip(*unique.values(), strict=True))
         place = {key: k for k, key in enumerate(unique)}
         for cell, samples in zip(cells, chosen, strict=True):
             cell.samples += samples
@@ -229,46 +245,20 @@ class Search:
     def _descend_worst_cell(self, cells: Sequence[CellSamples]) -> None:
         """Projected gradient descent of the margin in the cell that came closest to a counterexample.
 
-        With one parameter, samples do better than gradients.
+        With one parameter, and where a slope costs far more than bounds do, samples do better than gradients.
         """
-        d = self.grid.box.dimensions
         hopeful = [cell for cell in cells if not cell.broken and cell.wavers]
-        if d < 2 or not hopeful:
+        if not self.costly or self.grid.box.dimensions < 2 or not hopeful:
             return
         cell = min(hopeful, key=lambda c: c.margins[c.worst])
-        step = self._descend(cell)
+        step = descend(cell.box, cell.samples[cell.worst][0], self._slope)
         if step is not None:
             self._sample([cell], lambda c: [(step, None)])
 
-    def _descend(self, cell: CellSamples) -> np.ndarray | None:
-        low, high = (torch.tensor(v, dtype=torch.float64) for v in (cell.box.lower, cell.box.upper))
-
-        def evaluate(scaled: torch.Tensor) -> tuple[float, torch.Tensor]:
-            scaled = scaled.detach().requires_grad_(True)
-            values = low + 0.5 * (scaled + 1.0) * (high - low)
-            outputs = self.model.differentiable(self.scene.differentiable(values)[None])
-            margin = self.claim.margin(outputs, values[None])[0]
-            slope = torch.zeros_like(scaled)
-            if margin.requires_grad:
-                (slope,) = torch.autograd.grad(margin, scaled)
-            return float(margin.detach()), slope
-
-        start = torch.from_numpy(cell.samples[cell.worst][0])
-        scaled = (2.0 * (start - low) / (high - low) - 1.0).clamp(-1.0, 1.0)
-        best, slope = evaluate(scaled)
-        step, moved = _FIRST_STEP, False
-        for _ in range(_STEPS):
-            free = torch.where(((scaled <= -1.0) & (slope > 0)) | ((scaled >= 1.0) & (slope < 0)), 0.0, slope)
-            length = float(free.norm())
-            if not 0.0 < length < math.inf or best <= 0.0:
-                break
-            trial = (scaled - step * free / length).clamp(-1.0, 1.0)
-            value, trial_slope = evaluate(trial)
-            if value < best:
-                scaled, best, slope, step, moved = trial, value, trial_slope, min(2.0 * step, 1.0), True
-            else:
-                step *= 0.25
-        return cell.box.at(scaled.detach().numpy()) if moved else None
+    def _slope(self, values: torch.Tensor) -> torch.Tensor:
+        """The margin at parameter values [d], differentiable."""
+        outputs = self.model.differentiable(self.scene.differentiable(values)[None])
+        return self.claim.margin(outputs, values[None])[0]
 
     # ---------------------------------------------------------------- bounds
 
@@ -290,7 +280,7 @@ class Search:
         for number, cell in cells_by_number.items():
             check_cancelled()
             try:
-                linear, lower, upper, slope = self.scene.sets(cell.box)
+                linear, lower, upper, slope = cell.scene.sets(cell.box)
             except InputError:
                 raise
             except FAILURES as error:
@@ -378,7 +368,7 @@ class Search:
         """The margin's gradient at the middle, as a part of the margin; None where one of them is no number."""
         values = cell.box.middle
         image = self._latest.get(sample_key((values, None)))
-        image = self._image(values, None) if image is None else image
+        image = drawn(self.scene, (values, None)) if image is None else image
         try:
             picture = torch.from_numpy(image.astype(np.float64)).requires_grad_(True)
             margin = self.claim.margin(self.model.differentiable(picture[None]), torch.from_numpy(values)[None])[0]
@@ -450,6 +440,12 @@ class Search:
         first go deep at once, and come back from where the property is about to fail.
         """
         share = cell.cell.volume / self.grid.volume
+        if not self.costly:
+            margin, away = cell.margins[cell.worst], _AWAY
+            if bound is not None and 0.0 < margin < math.inf and not cell.broken:
+                away = max(1.0, (margin - bound) / margin)
+            # the cells that it takes for a part of the set, about; first cells rank as if they were nearly proved
+            return RANK_FIRST * away / (share * math.prod(self.grid.coarse))
         if cell.broken:
             return _RANK_BROKEN - math.log2(share)
         margin = cell.margins[cell.worst]
@@ -467,12 +463,15 @@ class Search:
         if bound is None:
             return ((_AIM / cost) ** (1.0 / _POWER), _MOST_PARTS) if cost > _COSTLY else (0.25, 4)
         margin = cell.margins[cell.worst]
-        return (0.25, 4) if margin - bound > _FAR * margin else (0.5, 2)
+        if self.costly:
+            return (0.25, 4) if margin - bound > _FAR * margin else (0.5, 2)
+        # bounds between here and a proof would be wasted
+        return max(_NARROWEST, min(0.5, (_LEFT * margin / (margin - bound)) ** (1.0 / _POWER))), _MOST_PARTS
 
     def _counterexample(self, cell: CellSamples) -> FinishedCell:
         """The worst pose, rendered and classified once more."""
         values, member = cell.samples[cell.worst]
-        image = self._image(values, member)
+        image = drawn(self.scene, (values, member))
         margins, outputs = self.margins([(values, member)])
         margin = float(margins[0])
         if not -math.inf < margin <= 0.0 or not cell.box.contains(values):

@@ -274,11 +274,14 @@ class FieldFrame(RayPictures):
     def _strips(self) -> PoseStrips:
         return PoseStrips(self.bounds, self.pose_set, self._pixels(self.rays), self._run)
 
-    def sets(self, box: ParameterBox, weigh: Callable[[], np.ndarray | None] | None = None) -> RayCellBounds:
+    def sets(
+        self, box: ParameterBox, weigh: Callable[[], np.ndarray | None] | None = None, most: int | None = None
+    ) -> RayCellBounds:
         """All rays over a cell ``box`` with linear bounds, from strips of the set that are kept.
 
         Args:
             box: Part of the frame's set.
+            most: Rays that are bounded, about, the first of `rays`; the others are left at [0, 1]. All if None.
             weigh: Gives [H, W, 3] what part of the margin a unit of each pixel's width may cost, or None; asked only
                 where rays could be refined.
 
@@ -292,7 +295,11 @@ class FieldFrame(RayPictures):
                 return None
             return np.asarray(pixel_weights, np.float64).reshape(self.tile_count, 3)[self.rays]
 
-        linear, lower, upper = self._strips.sets(box, weights)
+        linear, lower, upper = self._strips.sets(box, weights, most)
+        if len(lower) < self.rays.size:
+            missing = [(0, self.rays.size - len(lower)), *[(0, 0)] * 2]
+            linear = [np.pad(part, missing[: part.ndim], constant_values=k == 3) for k, part in enumerate(linear)]
+            lower, upper = np.pad(lower, missing[:2]), np.pad(upper, missing[:2], constant_values=1)
         shape = (self.tile_count, 1, 1, 3)
         a_lower, b_lower, a_upper, b_upper, lower, upper = (self._every(part) for part in (*linear, lower, upper))
         d = box.dimensions
@@ -302,8 +309,6 @@ class FieldFrame(RayPictures):
 
     def _every(self, part: np.ndarray) -> np.ndarray:
         """Bounds of all rays, of those of `rays`."""
-        if self.rays.size == self.tile_count:
-            return part
         whole = np.zeros((self.tile_count, *part.shape[1:]), part.dtype)
         whole[self.rays] = part
         return whole

@@ -280,25 +280,28 @@ class PoseStrips:
         return len(TOLERANCES)
 
     def sets(
-        self, box: ParameterBox, weigh: PixelWeightSource | None
+        self, box: ParameterBox, weigh: PixelWeightSource | None, most: int | None = None
     ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
         """Linear bounds (A_lower, b_lower, A_upper, b_upper) [t, 3, d] and [t, 3], and lower and upper [t, 3].
 
+        Of the first rays alone where not all are asked for: ``t`` is then ``most``, or a few more.
+
         Args:
             box: A cell of the frame's set.
+            most: How many rays are asked for; all if None.
             weigh: Gives [t, 3] which part of the margin a unit of each pixel's width may cost, about; None there, or
                 in its place: nothing is worth refining.
         """
-        everything = np.arange(len(self.groups))
-        linear, lower, upper = self._level_sets(box, 0, everything)
+        groups = [group for group in self.groups if most is None or group.start < most]
+        linear, lower, upper = self._level_sets(box, 0, np.arange(len(groups)))
         weights, levels = None, self.levels(box)
         for level in range(1, levels):
             if weights is None:
                 weights = None if weigh is None else weigh()
                 if weights is None:
                     break
-            starts = [group.start for group in self.groups]
-            cost = np.add.reduceat((weights * _widths(linear)).sum(axis=1), starts)
+            starts = [group.start for group in groups]
+            cost = np.add.reduceat((weights[: len(lower)] * _widths(linear)).sum(axis=1), starts)
             # what no level can make good is not begun
             if not _ENOUGH < cost.sum() < TOLERANCES[level - 1] / TOLERANCES[levels - 1]:
                 break
@@ -306,7 +309,7 @@ class PoseStrips:
             left = cost.sum() - np.cumsum(cost[order])
             chosen = np.sort(order[: 1 + int(np.searchsorted(-left, -_AIM))])
             finer, finer_lower, finer_upper = self._level_sets(box, level, chosen)
-            rays = np.concatenate([np.arange(len(self.pixels))[self.groups[k]] for k in chosen])
+            rays = np.concatenate([np.arange(len(self.pixels))[groups[k]] for k in chosen])
             for whole, part in zip((*linear, lower, upper), (*finer, finer_lower, finer_upper), strict=True):
                 whole[rays] = part
         return linear, lower, upper

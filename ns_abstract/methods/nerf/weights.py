@@ -72,7 +72,10 @@ class NerfWeightFrame(NerfFrame):
         self.renderer = NerfRenderer(scene, self._recipe[1], device=device, white=white)
         self._recipe = (*self._recipe, None, white)
         self.bounds = NerfBounds(*self._recipe)
-        self.rays = np.flatnonzero(pixels)
+        # the brightest first, so that few of them may say enough
+        rays, weights = np.flatnonzero(pixels), np.zeros(pixels.size)
+        weights[rays] = self.render(self.box.middle, rays).max(axis=(1, 2, 3))
+        self.rays = rays[np.argsort(-weights[rays], kind="stable")]
         self._dimensions = pose_set.box.dimensions
 
     def of_sample(self, values: np.ndarray, sample: SceneSample | None) -> np.ndarray:
@@ -85,9 +88,11 @@ class NerfWeightFrame(NerfFrame):
         """See `ns_abstract.refine.protocol.WeightFrame`."""
         return self.renderer.picture(self.camera, differentiable_pose(self.pose_set)(values[: self.box.dimensions]))
 
-    def sets(self, box: ParameterBox, weigh: Callable[[], np.ndarray | None] | None = None) -> RayCellBounds:
+    def sets(
+        self, box: ParameterBox, weigh: Callable[[], np.ndarray | None] | None = None, most: int | None = None
+    ) -> RayCellBounds:
         """See `NerfFrame.sets`; rays that are not read have zeros."""
-        plain = super().sets(box.without(COLOR_SHIFTS), weigh)
+        plain = super().sets(box.without(COLOR_SHIFTS), weigh, most)
         assert plain.linear is not None
         d, more = self.box.dimensions, self._dimensions - self.box.dimensions
         linear = list(plain.linear)

@@ -28,6 +28,7 @@ from ns_abstract.methods.splat.lists import (
     block_lists,
     depth_order,
     longest_first,
+    pixel_sets,
     summed_area,
     tile_lists,
     tile_mask,
@@ -274,14 +275,17 @@ def _add_gaussian(record, i, ox, oy, n, state, rules):
 
 
 @njit(cache=True, error_model="numpy")
-def _blend_block(numbers, x0, y0, record, box, rules, state):
-    """Blend the Gaussians ``numbers``, nearest first, into a block's ``state`` [5, PIXELS], flat."""
+def _blend_block(numbers, pixels, x0, y0, record, box, rules, state):
+    """Blend the Gaussians ``numbers``, nearest first, into a block's ``state`` [5, PIXELS], flat.
+
+    Of ``pixels``, a set of 64 bits: the others take no light.
+    """
     for q in range(PIXELS):
         state[_LIGHT + q] = 1.0
         state[_R + q] = 0.0
         state[_G + q] = 0.0
         state[_B + q] = 0.0
-        state[_LIVE + q] = 1.0
+        state[_LIVE + q] = float((pixels >> q) & 1)
     since = 0
     for i in numbers:
         # only the rows of pixels that the Gaussian reaches
@@ -302,12 +306,13 @@ def _blend_block(numbers, x0, y0, record, box, rules, state):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def _rasterise_worker(share, lists, record_, box_, camera, rules, background, image_):
+def _rasterise_worker(share, lists, sets_, record_, box_, camera, rules, background, image_):
     """Blend one thread's tiles of ``lists.wanted``.
 
     Args:
         share: `ThreadShare`.
         lists: `TileLists`.
+        sets_: [t, blocks] int64, of each block the pixels that are wanted; the others show the background.
         record_, box_: Of `_Projected`.
         camera: `Intrinsics`.
         rules: `RasterRules`.
@@ -315,7 +320,7 @@ def _rasterise_worker(share, lists, record_, box_, camera, rules, background, im
         image_: [t, side, side, 3] output, in [0, 1].
     """
     sequence, counter = borrowed(share.sequence), pointer(share.counter)
-    record, box, image = borrowed(record_), borrowed(box_), borrowed(image_)
+    record, box, image, sets = borrowed(record_), borrowed(box_), borrowed(image_), borrowed(sets_)
     tile = image.shape[1]
     tiles_x = int(math.ceil(camera.width / tile))
     blocks = tile // BLOCK
@@ -338,7 +343,8 @@ def _rasterise_worker(share, lists, record_, box_, camera, rules, background, im
             y0 = above + (b // blocks) * BLOCK
             if x0 >= camera.width or y0 >= camera.height:
                 continue
-            _blend_block(block_entries[block_offsets[b] : block_offsets[b + 1]], x0, y0, record, box, rules, state)
+            some = block_entries[block_offsets[b] : block_offsets[b + 1]]
+            _blend_block(some, sets[number, b], x0, y0, record, box, rules, state)
             for q in range(PIXELS):
                 row = y0 - above + q // BLOCK
                 column = x0 - left + q % BLOCK
@@ -378,6 +384,7 @@ class Renderer:
         position: np.ndarray,
         wanted: np.ndarray | None = None,
         member: Splats | None = None,
+        pixels: np.ndarray | None = None,
     ) -> np.ndarray:
         """The tiles ``wanted`` (numbers, row-major; all if None) as float64 [t, side, side, 3].
 
@@ -385,14 +392,16 @@ class Renderer:
             camera: Intrinsics and size; its own pose is not used.
             rotation: [3, 3] world to camera, OpenCV axes.
             position: [3] camera position, world.
+            wanted: See above.
             member: What to show in place of the scene: as many Gaussians, of the same degree.
+            pixels: [t, side, side] which of the tiles' pixels to draw, others show the background; all if None.
         """
         splats = self.splats if member is None else member
         across, down = tile_grid(camera, self.side)
         if wanted is None:
             wanted = np.arange(across * down)
         lists = self.lists(splats, camera, rotation, position, wanted)
-        return self._blend(camera, lists, self._projected.record, splats.background)
+        return self._blend(camera, lists, self._projected.record, splats.background, pixels)
 
     def lists(
         self, splats: Splats, camera: PinholeCamera, rotation: np.ndarray, position: np.ndarray, wanted: np.ndarray
@@ -423,12 +432,16 @@ class Renderer:
         offsets, entries = tile_lists(depth_order(visible, projected.depth), projected.tiles, mask, across)
         return TileLists(np.asarray(wanted, np.int64), offsets, entries)
 
-    def _blend(self, camera: PinholeCamera, lists: TileLists, record: np.ndarray, background: np.ndarray) -> np.ndarray:
+    def _blend(
+        self, camera: PinholeCamera, lists: TileLists, record: np.ndarray, background: np.ndarray,
+        pixels: np.ndarray | None = None,
+    ) -> np.ndarray:  # fmt: skip
         image = np.zeros((lists.wanted.size, self.side, self.side, 3))
+        sets = pixel_sets(np.broadcast_to(True, image.shape[:3]) if pixels is None else pixels)
         box = self._projected.box
         run_by_tiles(
             _rasterise_worker, longest_first(lists.wanted, lists.offsets), threads(),
-            lists, record, box, camera.intrinsics, self.rules, background, image,
+            lists, sets, record, box, camera.intrinsics, self.rules, background, image,
         )  # fmt: skip
         return image
 

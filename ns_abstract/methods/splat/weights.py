@@ -13,12 +13,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, Arithmetic
+from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.poses import PoseBox, PoseForms
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.bounds import SceneSums, SplatBounds
 from ns_abstract.methods.splat.constants import Rasteriser
-from ns_abstract.methods.splat.frame import SplatFrame, SplatSample
+from ns_abstract.methods.splat.frame import SplatFrame, SplatSample, VisibleContext
+from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.scene import Float64Array, SplatScene
 from ns_abstract.methods.splat.stage_data import CellPoses
 from ns_abstract.methods.splat.variations import VariedSplats, selected
@@ -147,7 +149,7 @@ class SplatWeightFrame(SplatFrame):
         super().__init__(black, rasteriser, arithmetic, pose_set, varied=varied, sums=sums)
         self.bounds = WeightBounds(black, rasteriser, arithmetic, varied, sums)
         self.bounds.white = white
-        self._black = black
+        self._black, self._rasteriser = black, rasteriser
 
     def precise(self, values: np.ndarray, tiles: np.ndarray | None = None, member: Splats | None = None) -> np.ndarray:
         """What `drawn` rounds: float64 tiles of the weights at parameter values [d]."""
@@ -163,6 +165,30 @@ class SplatWeightFrame(SplatFrame):
             return self.render(values)
         assert isinstance(sample, SplatSample)
         return self.drawn(values, None, sample.splats)
+
+    def drawn_alone(
+        self, context: VisibleContext, tiles: np.ndarray, pixels: np.ndarray
+    ) -> Callable[[np.ndarray], np.ndarray]:
+        """See `ns_abstract.refine.protocol.ElementFrame`; one scene, the nearest."""
+        some = self.candidates(tiles, context, pixels)
+        assert some is not None
+        some = np.sort(some)
+        scene = self.varied.nearest
+        shown = replace(
+            self._black, means=scene.means[some], axes=scene.axes[some], opacity=scene.opacity[some],
+            sh=self._black.sh[some],
+        )  # fmt: skip
+        white = WhiteGaussians(self.white.selected[some], self.white.nearer)
+        renderer = Renderer(shown, self._rasteriser)
+
+        def draw(values: np.ndarray) -> np.ndarray:
+            check_cancelled()
+            rotation, position = self.pose_set.world_to_camera(values)
+            colors = white.at((shown.means - position) @ rotation[2])
+            member = replace(shown, sh=colors[:, None])
+            return renderer.tiles(self.camera, rotation, position, tiles, member, pixels).astype(np.float32)
+
+        return draw
 
     def differentiable(self, values: torch.Tensor) -> torch.Tensor:
         """See `ns_abstract.refine.protocol.WeightFrame`, by the reference renderer."""

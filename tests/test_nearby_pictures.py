@@ -1,0 +1,241 @@
+"""Small cells from what is known of boxes around them: settled pixels, enclosing boxes, pictures of few pixels."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from conftest import Inputs
+from test_picture_properties import Case
+
+from ns_abstract.api.nearby_pictures import KnownBoxes, NearbyPictures
+from ns_abstract.api.picture_question import PlanePictures
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.tiles import assemble
+from ns_abstract.methods.splat.weights import SplatWeightFrame
+from ns_abstract.verify.enclosing_boxes import enclosing_box
+from ns_abstract.verify.picture_measures import Measure
+from ns_abstract.verify.protocol import NearImages
+from ns_abstract.verify.search_results import ContradictionError
+from ns_abstract.verify.settled_pixels import LimitedMeasure, unsettled
+
+SPEC = {"version": 1, "translation": {"x": 0.05, "y": 0.05}, "rotation": {"yaw": 0.02}}
+ONE = {"type": "visible", "select": {"box": [[-1, -1, -1], [1, 1, 0]]}, "weight": 0.5, "pixels": 60}
+#: A quarter of the pixels.
+SMALL = {**ONE, "pixels": 15, "preprocess": {"resize": [16, 16]}}
+CLEAR = {"type": "clear", "distance": 1.45, "weight": 0.55, "region": [4, 4, 28, 28]}
+OTHER = {"type": "visible", "select": {"box": [[-1, -1, 0], [1, 1, 1]]}, "weight": 0.4, "fraction": 0.1}
+
+
+# ---------------------------------------------------------------- settled pixels
+
+
+def _verdicts(one: LimitedMeasure, pictures: np.ndarray) -> np.ndarray:
+    """On which side of every limit the value of each picture [B, n] lies."""
+    value = one.measure.value(torch.from_numpy(pictures)[:, None, :, None], one.place).numpy()
+    return np.stack([value > limit for limit in one.limits], axis=1)
+
+
+def test_settled_pixels_change_no_verdict() -> None:
+    rng, n = np.random.default_rng(0), 12
+    settled = 0
+    for k in range(300):
+        low = rng.uniform(-0.2, 1.0, n)
+        high = low + rng.uniform(0.0, 0.3, n)
+        rank, least = int(rng.integers(1, n + 1)), bool(k % 2)
+        limits = tuple(rng.uniform(0.1, 0.9, 1 + k % 2).tolist())
+        one = LimitedMeasure(Measure("depth", (1.0,), rank, np.arange(n), least), 0, limits)
+        (open_,) = unsettled([one], low[None, :, None], high[None, :, None])
+        ends = np.where(rng.random((16, n)) < 0.5, low, high)
+        inside = np.concatenate([ends, low + rng.uniform(size=(16, n)) * (high - low), [low, high]])
+        # the pixels that are not settled are the same in all of them, of several kinds
+        for kept in (low, high, low + rng.uniform(size=n) * (high - low)):
+            verdicts = _verdicts(one, np.where(open_, kept, inside))
+            assert (verdicts == verdicts[0]).all()
+        settled += int((~open_).sum())
+    # more than half of all; a rule that settles none would pass
+    assert settled > 0.5 * 300 * n
+
+
+def test_only_pixels_that_may_decide_are_open() -> None:
+    low, high = np.array([0.9, 0.8, 0.4, 0.4, 0.0, 0.0]), np.array([1.0, 0.9, 0.6, 0.6, 0.1, 0.1])
+
+    def of(rank: int | None, **more: Any) -> list[int]:
+        measure = Measure("depth", (1.0,), rank, np.arange(6), **more)
+        found = unsettled([LimitedMeasure(measure, 0, (0.5,))], low[None, :, None], high[None, :, None])
+        return np.flatnonzero(found).tolist()
+
+    # two are surely bright, and four at most
+    assert [of(rank) for rank in (1, 2, 3, 4, 5, 6)] == [[], [], [2, 3], [2, 3], [], []]
+    assert [of(rank, least=True) for rank in (1, 2, 3, 4, 5, 6)] == [[], [], [2, 3], [2, 3], [], []]
+    # by how much pixels are beyond a limit matters to means, differences and depths that are capped
+    every = list(range(6))
+    assert of(None) == every and of(2, minus=np.arange(3)) == every and of(2, cap=0.7) == every
+    assert not unsettled([], low[None, :, None], high[None, :, None]).any()
+
+
+# ---------------------------------------------------------------- enclosing boxes
+
+
+def test_enclosing_boxes_hold_cells_and_are_shared() -> None:
+    rng = np.random.default_rng(0)
+    whole = ParameterBox(("x", "y"), ("", ""), (-0.7, 2.0), (1.9, 2.3))
+    shared = set()
+    for _ in range(2000):
+        width = 2.0 ** -rng.uniform(4.0, 12.0, 2) * (np.array(whole.upper) - whole.lower)
+        low = np.array(whole.lower) + rng.uniform(size=2) * (np.array(whole.upper) - whole.lower - width)
+        cell = ParameterBox(whole.names, whole.units, tuple(low.tolist()), tuple((low + width).tolist()))
+        box = enclosing_box(cell, whole, np.ones(2))
+        assert box is not None
+        assert all(a >= b for a, b in zip(cell.lower, box.lower, strict=True))
+        assert all(a <= b for a, b in zip(cell.upper, box.upper, strict=True))
+        shares = (np.array(box.upper) - box.lower) / width
+        assert (shares >= 1.99).all() and (shares <= 8.01).all()
+        inner = enclosing_box(box, whole, np.ones(2))
+        assert inner is None or inner != box
+        shared.add(box)
+    # of a cell that ends a rounding behind a line of the grid, too
+    for end in (0.6, np.nextafter(0.6, 1.0), 0.6 + 1e-9):
+        cell = whole.replace(0, 0.6 - 2.6 / 64.0, float(end)).replace(1, 2.0, 2.01)
+        box = enclosing_box(cell, whole, np.ones(2))
+        assert box is not None and box.contains(np.array(cell.upper)) and box.contains(np.array(cell.lower))
+    # neighbours have the same one
+    cells = [part for half in whole.split(0, 64) for part in half.split(1, 64)]
+    assert len({enclosing_box(cell, whole, np.ones(2)) for cell in cells}) == 32 * 32
+    # pictures that move far, or of which this is not known, have none
+    assert enclosing_box(cells[0], whole, np.full(2, 1e3)) is None
+    assert enclosing_box(cells[0], whole, np.full(2, math.inf)) is None
+    assert enclosing_box(whole, whole, np.zeros(2)) is None
+
+
+# ---------------------------------------------------------------- pictures
+
+
+def _pictures(folder: Path, blobs: Inputs, prop: Any) -> tuple[Any, PlanePictures]:
+    return Case(folder, blobs, prop, SPEC).pictures
+
+
+def _frame(pictures: PlanePictures) -> tuple[SplatWeightFrame, list[int]]:
+    frame, channels = pictures.weights[0]
+    assert isinstance(frame, SplatWeightFrame)
+    return frame, channels
+
+
+def _tight(folder: Path, blobs: Inputs, props: list[Any]) -> Any:
+    """A property whose limits are what the middle of the set has: it holds at some poses nearby and fails at others."""
+    found = []
+    for k, prop in enumerate(props):
+        job, pictures = _pictures(folder / str(k), blobs, prop)
+        value = job.model.outputs(pictures.image(pictures.box.middle)[None])[0, 0]
+        found.append({**prop, "weight": float(value)})
+    return {"all": [found[0], {"any": found[1:]}]} if found[1:] else found[0]
+
+
+def _cells(whole: ParameterBox, count: int, rng: np.random.Generator) -> list[ParameterBox]:
+    found = []
+    for _ in range(count):
+        width = 2.0 ** -rng.uniform(4.0, 8.0, whole.dimensions) * (np.array(whole.upper) - whole.lower)
+        low = np.array(whole.lower) + rng.uniform(size=width.size) * (np.array(whole.upper) - whole.lower - width)
+        found.append(ParameterBox(whole.names, whole.units, tuple(low.tolist()), tuple((low + width).tolist())))
+    return found
+
+
+def _attack(job: Any, pictures: PlanePictures, cells: list[ParameterBox], poses: int) -> list[int]:
+    """Compare pictures and sets near each cell with whole pictures; returns how many pixels are open by cell."""
+    rng, count = np.random.default_rng(5), []
+    claim = job.claim(pictures)
+    channels = [channel for _, some in pictures.weights for channel in some]
+    for cell in cells:
+        near = pictures.near(cell)
+        assert isinstance(near, NearbyPictures)
+        open_ = near._known.open
+        (a_low, b_low, a_high, b_high), lower, upper, _ = near.sets(cell)
+        assert (lower <= upper).all()
+        middle, half = cell.middle, 0.5 * (np.array(cell.upper) - cell.lower)
+        for pose in (middle, *cell.corners(), *cell.sample(poses, rng)):
+            whole, shown = pictures.image(pose), near.image(pose)
+            np.testing.assert_array_equal(shown[open_][:, channels], whole[open_][:, channels])
+            values, scaled = whole[..., channels].astype(np.float64), (pose - middle) / half
+            assert ((lower[..., channels] <= values) & (values <= upper[..., channels])).all()
+            low, high = (
+                a[..., channels, :].astype(np.float64) @ scaled + b[..., channels]
+                for a, b in ((a_low, b_low), (a_high, b_high))
+            )
+            assert ((low <= values) & (values <= high)).all()
+            margins = claim.margin(
+                torch.from_numpy(job.model.outputs(np.stack([whole, shown]))), torch.from_numpy(np.stack([pose, pose]))
+            )
+            assert bool(margins[0] > 0.0) == bool(margins[1] > 0.0)
+        count.append(int(open_.sum()))
+    return count
+
+
+def test_pictures_near_a_cell_are_those_of_the_set(blobs: Inputs, tmp_path: Path) -> None:
+    job, pictures = _pictures(tmp_path, blobs, _tight(tmp_path, blobs, [SMALL]))
+    assert isinstance(pictures, NearImages)
+    count = _attack(job, pictures, _cells(pictures.box, 3, np.random.default_rng(1)), 1)
+    # few pixels are left of 256
+    assert 0 < np.mean(count) < 64
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("several", [False, True])
+def test_many_pictures_near_cells_are_those_of_the_set(several: bool, blobs: Inputs, tmp_path: Path) -> None:
+    job, pictures = _pictures(tmp_path, blobs, _tight(tmp_path, blobs, [ONE, CLEAR, OTHER] if several else [ONE]))
+    count = _attack(job, pictures, _cells(pictures.box, 40, np.random.default_rng(2)), 120)
+    assert 0 < np.mean(count) < 400
+
+
+def test_wide_cells_and_other_planes_are_bounded_as_they_are(blobs: Inputs, tmp_path: Path) -> None:
+    _, pictures = _pictures(tmp_path / "a", blobs, ONE)
+    assert pictures.near(pictures.box) is pictures
+    (cell,) = _cells(pictures.box, 1, np.random.default_rng(1))
+    mean = {"type": "picture", "statistic": "mean", "channel": "luminance", "max": 0.4}
+    for k, prop in enumerate((mean, {"all": [ONE, mean]})):
+        _, others = _pictures(tmp_path / str(k), blobs, prop)
+        assert others.near(cell) is others
+
+
+def test_bounds_of_enclosing_boxes_are_attacked(blobs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Settled pixels are not drawn again for the cells inside: a wrong bound of one must not stay."""
+    _, pictures = _pictures(tmp_path, blobs, SMALL)
+    frame, _ = _frame(pictures)
+    bound_parts = type(frame).bound_parts
+
+    def dark(*arguments: Any) -> Any:
+        return [replace(found, lower=0.0 * found.lower, upper=0.0 * found.upper) for found in bound_parts(*arguments)]
+
+    monkeypatch.setattr(type(frame), "bound_parts", dark)
+    with pytest.raises(ContradictionError, match="outside of its bounds"):
+        pictures.near(_cells(pictures.box, 1, np.random.default_rng(1))[0])
+
+
+def test_few_boxes_are_kept(blobs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What is known of a cell is the same after its box was dropped."""
+    job, pictures = _pictures(tmp_path, blobs, _tight(tmp_path, blobs, [SMALL]))
+    monkeypatch.setattr("ns_abstract.api.nearby_pictures._KEPT", 0)
+    boxes = KnownBoxes(pictures, [_frame(pictures)], pictures.wanted, job.property.limited(16, 16))
+    cells = _cells(pictures.box, 4, np.random.default_rng(3))
+    first = [boxes.near(cell) for cell in cells]
+    again = [boxes.near(cell) for cell in cells]
+    for one, other, cell in zip(first, again, cells, strict=True):
+        assert one is not None and other is not None
+        np.testing.assert_array_equal(one.image(cell.middle), other.image(cell.middle))
+    assert len(boxes._known) == 1
+
+
+def test_pixels_that_are_not_wanted_take_no_light(blobs: Inputs, tmp_path: Path) -> None:
+    _, pictures = _pictures(tmp_path, blobs, SMALL)
+    frame, _ = _frame(pictures)
+    chosen = np.random.default_rng(0).random((frame.tile_count, frame.side, frame.side)) < 0.2
+    tiles = np.arange(frame.tile_count)
+    context = frame.bound(pictures.box.split(0, 64)[9], tiles).context
+    pose = pictures.box.split(0, 64)[9].middle
+    found, whole = frame.drawn_alone(context, tiles, chosen)(pose), frame.render(pose)
+    np.testing.assert_array_equal(found[chosen], whole[chosen])
+    assert not found[~chosen].any() and assemble(whole, frame.camera)[..., 0].any()
