@@ -10,7 +10,9 @@ The arithmetic is the same: without ``fastmath`` no optimisation changes what is
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import gc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -77,7 +79,8 @@ def install(done: Callable[[], object]) -> None:
             return compiled(compiler, args, return_type)
         _compilation.depth += 1
         try:
-            result = compiled(compiler, args, return_type)
+            with _uncollected():
+                result = compiled(compiler, args, return_type)
         finally:
             _compilation.depth -= 1
         _compilation.done()
@@ -126,6 +129,18 @@ def install(done: Callable[[], object]) -> None:
     _Library.linked_only = False
     for (owner, name), function in zip(_NEEDED, replaced, strict=True):
         setattr(owner, name, function)
+
+
+@contextmanager
+def _uncollected() -> Iterator[None]:
+    """No search for garbage inside: a compilation makes millions of objects and keeps them until it ends."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 def _all_linked(library: Any) -> list[Any]:
