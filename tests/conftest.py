@@ -77,13 +77,13 @@ _RECORDS = {"program": ProgramOptions, "where": EngineOptions, "overrides": Over
 T = TypeVar("T")
 
 
-def command_options(command: Callable[..., T], *given: Any, **values: Any) -> T:
+def command_options(command: Callable[..., T], **values: Any) -> T:
     """Options of a command by name, whichever record declares them."""
     for record, kind in _RECORDS.items():
         names = {entry.name for entry in fields(kind)} & set(values)
         if names:
             values[record] = kind(**{name: values.pop(name) for name in names})
-    return command(*given, **values)
+    return command(**values)
 
 
 #: A command's ``main`` and its options to exit code, stdout and stderr.

@@ -272,7 +272,8 @@ class Machines:
 
 
 def options(blobs: Inputs, folder: Path, **more: Any) -> Render:
-    return command_options(Render, blobs.config, blobs.path, folder, perturbation_filename=blobs.spec, **more)
+    files = {"load_config": blobs.config, "camera_path_filename": blobs.path, "output_dir": folder}
+    return command_options(Render, **files, perturbation_filename=blobs.spec, **more)
 
 
 def test_frames_are_divided_where_threads_are_many(blobs: Inputs, monkeypatch: pytest.MonkeyPatch) -> None:
