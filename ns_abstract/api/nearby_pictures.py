@@ -127,13 +127,13 @@ class KnownBoxes:
         still = unsettled(self._measures, lower, upper) & asked
         if not still.any():
             return KnownBox(lower, upper, still, None)
-        found = []
+        drawn_elements = []
         for (frame, _), bounds in zip(self._weights, bounds_by_frame, strict=True):
             pixels = in_tiles(still, frame.side)
             tiles = np.flatnonzero(pixels.any(axis=(1, 2)))
             draw = frame.drawn_alone(bounds.context, tiles, pixels[tiles])
-            found.append(DrawnElements(tiles, pixels[tiles], bounds.context, draw))
-        return KnownBox(lower, upper, still, tuple(found))
+            drawn_elements.append(DrawnElements(tiles, pixels[tiles], bounds.context, draw))
+        return KnownBox(lower, upper, still, tuple(drawn_elements))
 
     def _attack(self, box: ParameterBox, lower: np.ndarray, upper: np.ndarray) -> None:
         """Draw the whole picture at the box's middle: what is settled is not drawn again for the cells inside.
@@ -210,6 +210,6 @@ def place(
     every = np.zeros((frame.tile_count, *part.shape[1:]), np.float32)
     every[tiles] = part
     rows, columns = np.nonzero(pixels)
-    found = assemble(every, frame.camera)[rows, columns]
+    values = assemble(every, frame.camera)[rows, columns]
     for source, target in enumerate(channels):
-        whole[rows, columns, target] = found[:, source]
+        whole[rows, columns, target] = values[:, source]

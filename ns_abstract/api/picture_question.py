@@ -257,8 +257,8 @@ class PlanePictures(FramePictures):
 
     def near(self, cell: ParameterBox) -> FrameImages:
         """See `ns_abstract.verify.protocol.NearImages`."""
-        found = None if self._boxes is None else self._boxes.near(cell)
-        return self if found is None else found
+        pictures = None if self._boxes is None else self._boxes.near(cell)
+        return self if pictures is None else pictures
 
     def differentiable(self, values: torch.Tensor) -> torch.Tensor:
         """Picture [H, W, C] at parameter values [d]; depths have no slope."""

@@ -81,8 +81,8 @@ def certificate_page(
         "falsified": ("bad", f"Falsified; certified on {covered} of the poses"),
         "unknown": ("fair", f"Unknown; certified on {covered} of the poses"),
     }[document["verdict"]]
-    asked = [units.drawn(entry, cells.get(entry["index"], ())) for entry in document["frames"]]
-    frames, rows = [entry for entry, _ in asked], {entry["index"]: leaves for entry, leaves in asked}
+    with_leaves = [units.drawn(entry, cells.get(entry["index"], ())) for entry in document["frames"]]
+    frames, rows = [entry for entry, _ in with_leaves], {entry["index"]: leaves for entry, leaves in with_leaves}
     maps, drawn = verdict_drawings(frames[:_MOST_ROWS], rows, numbers)
     matrices, more_matrices = _matrices(frames, rows)
     scripts = ["cells.js"] if numbers else []

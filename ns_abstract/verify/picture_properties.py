@@ -205,10 +205,10 @@ class PictureProperty(Property):
             InputError: A region does not lie in them.
         """
         model = self.model(height, width)
-        found = zip(model.measures, model.places, leaves(self.statement), strict=True)
+        by_leaf = zip(model.measures, model.places, leaves(self.statement), strict=True)
         return tuple(
             LimitedMeasure(measure, place, tuple(end for end in (leaf.low, leaf.high) if math.isfinite(end)))
-            for measure, place, leaf in found
+            for measure, place, leaf in by_leaf
         )
 
     def measures(self, height: int, width: int) -> tuple[Measure, ...]:

@@ -53,8 +53,8 @@ def unsettled(measures: Sequence[LimitedMeasure], lower: np.ndarray, upper: np.n
         measures: All that the claim reads.
         lower, upper: [H, W, C] bounds of pictures.
     """
-    found = np.zeros(lower.shape[:2], bool)
-    flat, low, high = found.reshape(-1), lower.reshape(-1, lower.shape[-1]), upper.reshape(-1, upper.shape[-1])
+    still_open = np.zeros(lower.shape[:2], bool)
+    flat, low, high = still_open.reshape(-1), lower.reshape(-1, lower.shape[-1]), upper.reshape(-1, upper.shape[-1])
     for one in measures:
         measure = one.measure
         if not one.counts:
@@ -71,4 +71,4 @@ def unsettled(measures: Sequence[LimitedMeasure], lower: np.ndarray, upper: np.n
             # as many surely above as it takes, or so few that may be
             if int(above.sum()) < needed <= total - int(below.sum()):
                 flat[measure.pixels[~(above | below)]] = True
-    return found
+    return still_open
