@@ -280,7 +280,7 @@ class SplatBounds:
             shape,
             cell_parts(np.ones(shape.dimensions, np.int64) if parts is None else parts, SUB_BOX_OVERLAP * keep_parts),
         )
-        sets = pixel_sets(np.broadcast_to(True, bounds.lower.shape[:3]) if pixels is None else pixels)
+        sets = pixel_sets(pixels, wanted.size, self.side)
         self.stages.pixel_stage(TileLists(wanted, offsets, entries), sets, inputs, bounds)
         return CellBounds(
             wanted, bounds.lower, bounds.upper,

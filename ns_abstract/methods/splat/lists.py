@@ -51,10 +51,14 @@ def tile_mask(wanted, count):
     return mask
 
 
-def pixel_sets(chosen):
-    """[t, blocks] int64 sets of each block's pixels that are ``chosen`` [t, side, side], blocks row by row."""
-    count, side, _ = chosen.shape
+def pixel_sets(chosen, count, side):
+    """[t, blocks] int64 sets of each block's pixels that are ``chosen`` [t, side, side], blocks row by row.
+
+    None: all of ``count`` tiles of ``side`` pixels.
+    """
     along = side // BLOCK
+    if chosen is None:
+        return np.full((count, along * along), -1, np.int64)
     by_block = chosen.reshape(count, along, BLOCK, along, BLOCK).swapaxes(2, 3).reshape(count, along * along, PIXELS)
     return np.packbits(by_block, axis=-1, bitorder="little").view("<i8")[..., 0]
 

@@ -437,7 +437,7 @@ class Renderer:
         pixels: np.ndarray | None = None,
     ) -> np.ndarray:  # fmt: skip
         image = np.zeros((lists.wanted.size, self.side, self.side, 3))
-        sets = pixel_sets(np.broadcast_to(True, image.shape[:3]) if pixels is None else pixels)
+        sets = pixel_sets(pixels, lists.wanted.size, self.side)
         box = self._projected.box
         run_by_tiles(
             _rasterise_worker, longest_first(lists.wanted, lists.offsets), threads(),
