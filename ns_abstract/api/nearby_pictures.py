@@ -16,7 +16,7 @@ import torch
 
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.tiles import assemble, in_tiles
-from ns_abstract.refine.protocol import Bounds, ElementFrame, SceneSample
+from ns_abstract.refine.protocol import Bounds, ElementFrame, Frame, SceneSample
 from ns_abstract.verify.enclosing_boxes import enclosing_box
 from ns_abstract.verify.protocol import FrameImages
 from ns_abstract.verify.search_results import ContradictionError
@@ -121,8 +121,7 @@ class KnownBoxes:
             context = None if elements is None else elements[k].context
             bounds = frame.bound_parts([box], tiles, context, False, pixels[tiles])[0]
             bounds_by_frame.append(bounds)
-            for side, part in ((lower, bounds.lower), (upper, bounds.upper)):
-                place(side, part, frame, tiles, asked, channels)
+            place((lower, upper), (bounds.lower, bounds.upper), frame, tiles, channels, asked)
         self._attack(box, lower, upper)
         still = unsettled(self._measures, lower, upper) & asked
         if not still.any():
@@ -169,7 +168,8 @@ class NearbyPictures:
         image = 0.5 * (known.lower + known.upper)
         if known.elements is not None:
             for (frame, channels), shown in zip(self._weights, known.elements, strict=True):
-                place(image, shown.draw(np.asarray(values, np.float64)), frame, shown.tiles, known.open, channels)
+                drawn = shown.draw(np.asarray(values, np.float64))
+                place((image,), (drawn,), frame, shown.tiles, channels, known.open)
         return image
 
     def scene_samples(self, seed: int) -> Iterator[SceneSample]:
@@ -190,26 +190,40 @@ class NearbyPictures:
             return linear, lower, upper, slopes
         for (frame, channels), shown in zip(self._weights, known.elements, strict=True):
             bounds = frame.bound_parts([box], shown.tiles, shown.context, True, shown.pixels)[0]
-            assert bounds.linear is not None
+            place_sets((*linear, lower, upper), bounds, frame, shown.tiles, channels, known.open)
             slopes = slopes + bounds.slopes
-            arrays = zip((*linear, lower, upper), (*bounds.linear, bounds.lower, bounds.upper), strict=True)
-            for whole, part in arrays:
-                place(whole, part, frame, shown.tiles, known.open, channels)
         return linear, lower, upper, slopes
 
 
 def place(
-    whole: np.ndarray,
-    part: np.ndarray,
-    frame: ElementFrame,
+    wholes: Sequence[np.ndarray],
+    parts: Sequence[np.ndarray],
+    frame: Frame,
     tiles: np.ndarray,
-    pixels: np.ndarray,
     channels: Sequence[int],
+    pixels: np.ndarray | None = None,
 ) -> None:
-    """Write ``tiles`` [t, side, side, 3, ...] to the ``pixels`` [H, W] of some ``channels`` of ``whole``."""
-    every = np.zeros((frame.tile_count, *part.shape[1:]), np.float32)
-    every[tiles] = part
-    rows, columns = np.nonzero(pixels)
-    values = assemble(every, frame.camera)[rows, columns]
-    for source, target in enumerate(channels):
-        whole[rows, columns, target] = values[:, source]
+    """Write each of the parts, ``tiles`` [t, side, side, 3, ...], to some ``channels`` of its picture [H, W, C, ...].
+
+    To the ``pixels`` [H, W] alone; all if None.
+    """
+    rows, columns = np.nonzero(np.ones((frame.camera.height, frame.camera.width), bool) if pixels is None else pixels)
+    for whole, part in zip(wholes, parts, strict=True):
+        every = np.zeros((frame.tile_count, *part.shape[1:]), np.float32)
+        every[tiles] = part
+        values = assemble(every, frame.camera)[rows, columns]
+        for source, target in enumerate(channels):
+            whole[rows, columns, target] = values[:, source]
+
+
+def place_sets(
+    wholes: Sequence[np.ndarray],
+    bounds: Bounds,
+    frame: Frame,
+    tiles: np.ndarray,
+    channels: Sequence[int],
+    pixels: np.ndarray | None = None,
+) -> None:
+    """`place` for the four arrays of a picture's linear bounds, its lower and its upper bounds."""
+    assert bounds.linear is not None
+    place(wholes, (*bounds.linear, bounds.lower, bounds.upper), frame, tiles, channels, pixels)

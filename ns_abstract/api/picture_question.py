@@ -18,7 +18,7 @@ from ns_abstract.api.assumptions import choice
 from ns_abstract.api.files import resized
 from ns_abstract.api.frame_pictures import FramePictures, PropertySource
 from ns_abstract.api.job import Job
-from ns_abstract.api.nearby_pictures import KnownBoxes
+from ns_abstract.api.nearby_pictures import KnownBoxes, place_sets
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble, in_tiles
@@ -186,20 +186,11 @@ class PlanePictures(FramePictures):
         shape, d = (*self.wanted.shape, self.channels), box.dimensions
         linear = tuple(np.zeros((*shape, d) if k % 2 == 0 else shape, np.float32) for k in range(4))
         lower, upper, slopes = np.zeros(shape, np.float32), np.zeros(shape, np.float32), np.zeros(d)
-
-        def put(frame: Frame, bounds: Bounds, tiles: np.ndarray, source: list[int], target: list[int]) -> None:
-            assert bounds.linear is not None
-            arrays = zip((*linear, lower, upper), (*bounds.linear, bounds.lower, bounds.upper), strict=True)
-            for whole, part in arrays:
-                every = np.zeros((frame.tile_count, *part.shape[1:]), np.float32)
-                every[tiles] = part
-                whole[:, :, target] = assemble(every, frame.camera)[:, :, source]
-
         if "colors" in self._read or self._depth is not None:
             bounds, tiles = self._bounded(self.frame, box, [0, 1, 2])
             slopes = slopes + bounds.slopes
             if "colors" in self._read:
-                put(self.frame, bounds, tiles, [0, 1, 2], [0, 1, 2])
+                place_sets((*linear, lower, upper), bounds, self.frame, tiles, range(COLORS))
             if self._depth is not None:
                 whole = np.zeros((self.frame.tile_count, *bounds.lower.shape[1:]), np.float32)
                 ends = []
@@ -215,7 +206,7 @@ class PlanePictures(FramePictures):
             most = _FEW_RAYS if self._few_rays else rays
             while True:
                 bounds, tiles = self._bounded(frame, box, channels, most if most < rays else None)
-                put(frame, bounds, tiles, list(range(len(channels))), channels)
+                place_sets((*linear, lower, upper), bounds, frame, tiles, channels)
                 if most >= rays or not unsettled(self._limited, lower, upper).any():
                     break
                 most *= 2
