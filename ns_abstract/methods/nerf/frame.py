@@ -20,11 +20,11 @@ from ns_abstract.execution.engines import Processes
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseBox
 from ns_abstract.methods.nerf.bounds import NerfBounds
-from ns_abstract.methods.nerf.ray_field import RayBounds, Shifts, typical_displacement
+from ns_abstract.methods.nerf.ray_field import BoundedRays, RayBounds, Shifts, typical_displacement
 from ns_abstract.methods.nerf.ray_pictures import PixelRenderer, RayPictures
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
-from ns_abstract.methods.nerf.strips import PoseStrips, RayBounder
+from ns_abstract.methods.nerf.strips import PoseStrips
 from ns_abstract.refine.protocol import LinearSets
 
 
@@ -135,7 +135,7 @@ class FieldFrame(RayPictures):
     """
 
     def __init__(
-        self, pose_set: PoseBox, renderer: PixelRenderer, bounds: RayBounder, share: int, at_once: int, workers: int
+        self, pose_set: PoseBox, renderer: PixelRenderer, bounds: BoundedRays, share: int, at_once: int, workers: int
     ) -> None:
         super().__init__(pose_set, renderer)
         self._geometry = pose_set.geometry

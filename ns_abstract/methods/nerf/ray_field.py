@@ -124,7 +124,33 @@ class RayRequest:
 
 
 class BoundedRays(ABC):
-    """What bounds rays over boxes of poses."""
+    """Bounds of a field's rays over boxes of poses.
+
+    Attributes:
+        displacement: Half the way of a sample over a first cell, as learned from earlier rays.
+        distances, lengths: [samples] distances, and lengths of bins around them.
+        taylor: Degree of the Taylor models of poses.
+    """
+
+    displacement: float
+    distances: np.ndarray
+    lengths: np.ndarray
+    taylor: int
+
+    @property
+    @abstractmethod
+    def compiled(self) -> bool:
+        """Whether kernels for a processor bound rays, a few at a time."""
+
+    @abstractmethod
+    def division(self, moves: np.ndarray, most: int = ..., deeper: int | None = None) -> Division | None:
+        """The cells of a box, as wide as bounds of the field bear; None: the box is too wide.
+
+        Args:
+            moves: [n, samples, d] by how much samples move along each parameter.
+            most: Most of them.
+            deeper: Halvings of the first cells; None: as usual.
+        """
 
     def rays(
         self,

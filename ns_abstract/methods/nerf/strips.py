@@ -13,7 +13,6 @@ import time
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
@@ -23,7 +22,7 @@ from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseBox
 from ns_abstract.methods.nerf.division import Division
 from ns_abstract.methods.nerf.planes import fit_planes
 from ns_abstract.methods.nerf.ray_bundle import RayBundle
-from ns_abstract.methods.nerf.ray_field import RayBounds, Shifts
+from ns_abstract.methods.nerf.ray_field import BoundedRays, RayBounds, Shifts
 
 #: Rays that are bounded together by compiled kernels, and by torch alone, which wants many cells at a time.
 _GROUP, _GROUP_ON_DEVICE = 8, 64
@@ -79,35 +78,6 @@ class StripLayout:
     displacement: float
 
 
-class RayBounder(Protocol):
-    """Bounds of a field's rays over boxes of poses."""
-
-    #: Half the way of a sample over a first cell, as learned from earlier rays.
-    displacement: float
-    #: [samples] distances, and lengths of bins around them.
-    distances: np.ndarray
-    lengths: np.ndarray
-    #: Degree of the Taylor models of poses.
-    taylor: int
-
-    @property
-    def compiled(self) -> bool:
-        """Whether kernels for a processor bound rays, a few at a time."""
-        ...
-
-    def division(self, moves: np.ndarray, most: int = ..., deeper: int | None = None) -> Division | None:
-        """The cells of a box, as wide as the network's bounds bear; see `NerfBounds.division`."""
-        ...
-
-    def rays(
-        self, pose_set: PoseBox, box: ParameterBox, pixels: np.ndarray, tolerance: float,
-        known: np.ndarray | None = None, aim: tuple[np.ndarray, np.ndarray] | None = None,
-        shifts: list[Shifts] | None = None, division: Division | None = None,
-    ) -> RayBounds:  # fmt: skip
-        """Bounds of the colours of ``pixels``; see `BoundedRays.rays`."""
-        ...
-
-
 class PoseStrips:
     """Bounds of all rays of a frame over strips of its set (design.md, F13).
 
@@ -118,7 +88,7 @@ class PoseStrips:
         run: Bounds groups of rays, here or in other processes.
     """
 
-    def __init__(self, bounds: RayBounder, pose_set: PoseBox, pixels: np.ndarray, run: BoundBatches) -> None:
+    def __init__(self, bounds: BoundedRays, pose_set: PoseBox, pixels: np.ndarray, run: BoundBatches) -> None:
         self.bounds, self.pose_set, self.geometry = bounds, pose_set, pose_set.geometry
         self.pixels, self.run = pixels, run
         self.poses = self.geometry.box

@@ -54,9 +54,6 @@ class HashBounds(BoundedRays):
         dimensions: Number of parameters.
     """
 
-    #: Rays are bounded one after another by compiled kernels.
-    compiled = True
-
     def __init__(self, field: NerfactoField, dimensions: int) -> None:
         self.source, self.dimensions = field, dimensions
         self.arrays = field_arrays(field)
@@ -66,6 +63,11 @@ class HashBounds(BoundedRays):
         #: Where to begin to look for `RayBounds.displacement`.
         self.displacement = _TUNING.displacement
         self._rooms: list[pieces.PieceRoom] = []
+
+    @property
+    def compiled(self) -> bool:
+        """Rays are bounded one after another by compiled kernels."""
+        return True
 
     def division(self, moves: np.ndarray, most: int = _TUNING.most_first, deeper: int | None = None) -> Division | None:
         """The parts for which bounds over a box are kept; None: the box is too wide. ``moves`` [n, samples, d]."""
