@@ -26,6 +26,8 @@ class RoundTuning:
         typical: The quantile of sub-boxes that is to be excluded before rounds end.
         hopeless: Part of the needed pixels that has to be expected of the remaining ones for another round.
         few: Part of the sub-boxes of which no more are left when rounds end: a narrower cell holds them.
+        least_missing: Part of the needed pixels that a later round looks for at least.
+        least_rate: Part of a round's pixels that is taken to exclude at least.
     """
 
     first: float = 1.35
@@ -33,6 +35,8 @@ class RoundTuning:
     typical: float = 0.1
     hopeless: float = 0.6
     few: float = 0.25
+    least_missing: float = 0.1
+    least_rate: float = 0.1
 
 
 class PixelRounds:
@@ -86,8 +90,8 @@ class PixelRounds:
         elif self.expected < self.tuning.hopeless:
             return None
         else:
-            missing = max(needed - self.typical, 0.1 * needed)
-            count = self.tuning.spare * missing / max(self._rate, 0.1)
+            missing = max(needed - self.typical, self.tuning.least_missing * needed)
+            count = self.tuning.spare * missing / max(self._rate, self.tuning.least_rate)
         past = min(self.taken + max(1, math.ceil(count)), self.order.size)
         chosen = np.zeros(self.bounded.shape, bool)
         chosen.reshape(-1)[self.order[self.taken : past]] = True
