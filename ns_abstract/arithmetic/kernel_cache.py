@@ -392,21 +392,29 @@ def store() -> KernelStore:
     return opened_store
 
 
+@cache
+def _kernel_module(file: str) -> tuple[str, str] | None:
+    """Name and source stamp of one of the package's modules that hold kernels; None: it is another file."""
+    path = Path(file).resolve()
+    if not any(PACKAGE / folder in path.parents for folder in (*FOLDERS, OUTER)):
+        return None
+    outer = hashlib.sha256(path.read_bytes()).hexdigest() if PACKAGE / OUTER in path.parents else ""
+    return path.relative_to(PACKAGE).with_suffix("").as_posix(), source_key() + outer
+
+
 class KernelLocator:
     """Tells numba where the kernels of this package are kept (its interface of cache locators)."""
 
-    def __init__(self, py_func: Any, path: Path) -> None:
+    def __init__(self, py_func: Any, place: str, stamp: str) -> None:
         self._line = py_func.__code__.co_firstlineno
-        self._stamp = source_key()
-        if PACKAGE / OUTER in path.parents:
-            self._stamp += hashlib.sha256(path.read_bytes()).hexdigest()
-        self._path = store().fetch(path.relative_to(PACKAGE).with_suffix("").as_posix(), self._stamp)
+        self._stamp = stamp
+        self._path = store().fetch(place, stamp)
 
     @classmethod
     def from_function(cls, py_func: Any, py_file: str) -> KernelLocator | None:
         """The locator of a kernel of this package, else None."""
-        path = Path(py_file).resolve()
-        return cls(py_func, path) if any(PACKAGE / folder in path.parents for folder in (*FOLDERS, OUTER)) else None
+        module = _kernel_module(py_file)
+        return None if module is None else cls(py_func, *module)
 
     def get_cache_path(self) -> str:
         """Folder of the function's files."""

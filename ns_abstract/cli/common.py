@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import atexit
+import gc
 import io
 import logging
 import os
@@ -29,6 +31,8 @@ _LEAST_ADDRESS_SPACE = 4 << 30
 _SHORTAGE = (
     "can't allocate memory", "cannot allocate memory", "bad_alloc", "failed to allocate memory", "out of memory",
 )  # fmt: skip
+#: New objects after which garbage is collected: imports make many that stay.
+_GARBAGE = 50_000
 #: Most characters of a complaint about options, which may repeat long options.
 _COMPLAINT = 600
 
@@ -206,6 +210,9 @@ def run(
             # names of files need not be text
             stream.reconfigure(errors="backslashreplace")
     show_log()
+    gc.set_threshold(_GARBAGE)
+    # memory goes back with the process
+    atexit.register(gc.freeze)
     over = False
 
     def leave(number: int, frame: FrameType | None) -> None:

@@ -291,7 +291,7 @@ def color_table() -> str:
 def png(image: Image) -> bytes:
     """The file of a picture."""
     buffer = io.BytesIO()
-    image.save(buffer, "png", optimize=True)
+    image.save(buffer, "png")
     return buffer.getvalue()
 
 

@@ -97,7 +97,7 @@ def load_scene(path: str | os.PathLike[str], overrides: Overrides | None = None)
             raise InputError(what, file=path, fix=fix)
         if path.suffix.lower() in (".ckpt", ".pt", ".pth"):
             raise InputError(f"a {path.suffix} file is not a scene", file=path, fix=_FIX)
-    return _load_run(runs.read_config(path), overrides)
+    return load_run(runs.read_config(path), overrides)
 
 
 def scene_from_parameters(
@@ -144,7 +144,8 @@ def scene_from_parameters(
     )
 
 
-def _load_run(run: runs.RunConfig, overrides: Overrides) -> SplatScene:
+def load_run(run: runs.RunConfig, overrides: Overrides) -> SplatScene:
+    """The scene of a run whose configuration has been read, as `load_scene` returns it."""
     degree_stored = run.integer("sh_degree", _MODEL_DEFAULTS["sh_degree"], 0, _MAX_DEGREE_STORED)
     interval = run.integer("sh_degree_interval", _MODEL_DEFAULTS["sh_degree_interval"], 1)
     choices, background = _picture(run, overrides)

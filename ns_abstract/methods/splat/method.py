@@ -21,7 +21,7 @@ from ns_abstract.methods.splat.activate import SH_C0, Splats, activate
 from ns_abstract.methods.splat.bounds import SceneSums
 from ns_abstract.methods.splat.constants import VERSIONS, Rasteriser, raster_rules, rasteriser_named
 from ns_abstract.methods.splat.frame import SplatFrame
-from ns_abstract.methods.splat.load import load_scene
+from ns_abstract.methods.splat.load import load_run, load_scene
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.methods.splat.variations import VariedSplats, vary
 from ns_abstract.methods.splat.weights import SplatWeightFrame, WhiteGaussians, plane_mask
@@ -238,7 +238,7 @@ class SplatMethod:
 
 
 def _load(source: RunConfig | Path, overrides: Overrides) -> SplatScene:
-    return load_scene(source.file if isinstance(source, RunConfig) else source, overrides)
+    return load_run(source, overrides) if isinstance(source, RunConfig) else load_scene(source, overrides)
 
 
 def _method(scene: SplatScene, options: ProgramOptions, arithmetic: str | None, workers: int) -> SplatMethod:
