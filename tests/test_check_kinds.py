@@ -276,6 +276,7 @@ def test_a_forged_table_is_found(name: str, copy: Path, in_process: InProcess) -
     assert code == expected and words in out + err and len(err.splitlines()) == (expected == 2)
 
 
+@pytest.mark.slow
 def test_an_edited_table_is_refused(copy: Path, in_process: InProcess) -> None:
     with sqlite3.connect(copy / "cells.sqlite") as base:
         base.execute("UPDATE cells SET margin = 100")

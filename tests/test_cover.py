@@ -298,6 +298,7 @@ def test_a_cell_without_bounds_helps_nothing(tmp_path: Path) -> None:
     assert np.array_equal(family.others(parts, rows, offset).lower, bound_outputs(net, parts, rows, offset).lower)
 
 
+@pytest.mark.slow
 def test_rows_that_take_too_much_memory_are_not_kept(tmp_path: Path) -> None:
     """What is not known is not used, and bounds hold."""
     net, run = network(tmp_path, 0)

@@ -78,6 +78,7 @@ def programs(scene: SplatScene, around: PoseBox, version: str, exact: bool) -> l
     return found
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize(
     ("name", "mode", "version"),
     [*((name, "classic", "1.4.0") for name in ALL), ("six", "antialiased", "1.4.0"), ("yaw", "classic", "1.6.0"),

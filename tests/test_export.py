@@ -75,6 +75,7 @@ def test_archive_holds_every_frame(call: Call, bounded: Path, tmp_path: Path) ->
             np.testing.assert_array_equal(archive[name], np.stack([getattr(f, name) for f in frames(bounded)]))
 
 
+@pytest.mark.slow
 def test_pictures_round_outward(call: Call, bounded: Path, tmp_path: Path) -> None:  # noqa: F811
     code, _ = run(call, "png", "--input-dir", bounded, "--output-dir", tmp_path, "--pictures", "lower", "upper", "gap")
     assert code == 0

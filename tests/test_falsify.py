@@ -148,6 +148,7 @@ def test_narrow_range() -> None:
     assert attack.amount == worst.amount == worst.value - worst.bound
 
 
+@pytest.mark.slow
 def test_needs_ascent() -> None:
     # the ball's centre meets the pixel's centre on a thin tube in six dimensions
     scene = scene_of(ball(0.5, 0.5, deviation=2.0, opacity=0.8, color=1.0))

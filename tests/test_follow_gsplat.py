@@ -45,6 +45,7 @@ CHANGES: dict[str, tuple[str, Callable[[str], str], int]] = {
 }
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("name", CHANGES)
 def test_changes_are_noticed(name: str, trees: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
     follow = script("follow_gsplat")

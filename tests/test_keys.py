@@ -441,6 +441,7 @@ def test_values_that_switch_a_refused_key_off_are_taken(tmp_path: Path) -> None:
         assert load_any(write_config(tmp_path / line[:12], "vanilla-nerf", line)).notes == ()
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("method", MODELS)
 def test_unknown_keys_elsewhere_are_named_in_the_notes(tmp_path: Path, method: str) -> None:
     usual = load_any(write_config(tmp_path / "usual", method)).notes

@@ -827,6 +827,7 @@ def test_another_byte_order_is_refused(run: Run) -> None:
     refused(run.config, "byte order")
 
 
+@pytest.mark.slow
 def test_splats_are_opened_without_torch(run: Run) -> None:
     """It takes seconds to load."""
     code = "import sys, ns_abstract; ns_abstract.load_scene(sys.argv[1]).method(); sys.exit('torch' in sys.modules)"

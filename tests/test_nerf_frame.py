@@ -133,6 +133,7 @@ def test_a_tolerance_is_not_finer_than_bounds_are_kept() -> None:
         assert least <= frame._tolerance(part) <= most
 
 
+@pytest.mark.slow
 def test_the_whole_set_costs_nothing_and_rays_come_in_batches() -> None:
     scene, pose_set = tiny_scene(0), poses(SETS["yaw"])
     frame = NerfFrame(scene, UNIFORM, pose_set)
@@ -146,6 +147,7 @@ def test_the_whole_set_costs_nothing_and_rays_come_in_batches() -> None:
     assert sizes[0] == 12 and max(sizes[1:]) <= 5
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("density", [8.0, 1e4])
 def test_colours_of_samples_that_add_nothing_are_not_needed(density: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same pictures as where slopes are asked for and every colour is, but for the order of sums of fewer rows."""
@@ -193,6 +195,7 @@ def test_what_is_known_is_not_begun_anew(parts: int) -> None:
         assert (results[-1].lower <= picture).all() and (picture <= results[-1].upper).all()
 
 
+@pytest.mark.slow
 def test_what_is_known_holds_of_a_frame_that_is_stopped_at_once() -> None:
     frame = NerfFrame(tiny_scene(2), UNIFORM, poses(SETS["yaw"]))
     before = Refinement(frame, 0, RefinementGoal(ratio=1.0, seconds=120.0, cells=12)).run()
@@ -294,6 +297,7 @@ def test_planted_faults_are_found(monkeypatch: pytest.MonkeyPatch, target, name:
     assert attack(scene, pose_set, bounded(scene, pose_set))[1] > 0
 
 
+@pytest.mark.slow
 def test_bounds_that_are_no_numbers_are_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
     def broken(value, bernstein):
         low, high, error = original_parts(value, bernstein)

@@ -163,6 +163,7 @@ def test_other_methods_are_refused(nerfstudio: SimpleNamespace, folder: Path, tm
         nerfstudio.viewing.open_run(file)
 
 
+@pytest.mark.slow
 def test_options_of_the_scene_reach_the_viewer(nerfstudio: SimpleNamespace, folder: Path) -> None:
     file = folder / "blobs" / "splatfacto" / STAMP / "config.yml"
     overrides = Overrides(rasterize_mode="antialiased", background=(1.0, 0.5, 0.0), load_step=29999)

@@ -229,6 +229,7 @@ def _row(kind: str) -> Any:
     return next(row for row in ROWS if row.kind == kind)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["layer of sums: fully connected, (transposed) convolution, mean, average pooling"])
 def test_the_ledger_sees_what_is_not_charged(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Bounds without a float32 charge are left by float32 programs."""

@@ -61,6 +61,7 @@ def test_bounds_hold_for_onnxruntime(name: str, d: int) -> None:
     assert (found["everywhere"] >= found["end"] - 1e-3 * np.abs(found["end"])).all()
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("name", NAMES)
 def test_network_agrees_with_onnxruntime(name: str) -> None:
     file = model(name)

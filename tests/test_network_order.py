@@ -200,6 +200,7 @@ def _sequential(x: Array) -> Array:
     return total
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("name", sensing())
 def test_networks_that_sense_their_program(name: str, tmp_path: Path) -> None:
     """Every program and the exact network are within the bounds, and they are far from each other."""

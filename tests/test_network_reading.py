@@ -316,6 +316,7 @@ def test_published_cases(name: str, arithmetic: str) -> None:
 # ---------------------------------------------------------------- functions
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("shift", [0.0, 1.0, -3.0, 200.0])
 def test_gelu_keeps_the_files_constants(shift: float, tmp_path: Path) -> None:
     f = OnnxFile((1,))
@@ -363,6 +364,7 @@ def test_hard_sigmoid_gates_keep_the_files_constants(alpha: float, tmp_path: Pat
         assert Fraction(float(low[0])) <= exact <= Fraction(float(high[0])) and high[0] - low[0] < 1e-11
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("beta", [1.0, 1.3, 7.0])
 @pytest.mark.parametrize("limit", [17.0, 20.0])
 def test_softplus_switches_where_the_file_says(beta: float, limit: float, tmp_path: Path) -> None:

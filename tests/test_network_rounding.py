@@ -293,7 +293,7 @@ def test_units_that_may_be_on_are_terms(tmp_path: Path) -> None:
     assert (found.a[0, :, 0] + found.b[0] <= -y).all()
 
 
-@pytest.mark.slow_cases
+@pytest.mark.slow
 @pytest.mark.parametrize("double", [False, True])
 def test_rounding_of_rows_over_sets(double: bool, tmp_path: Path) -> None:
     """Of a linear network, the least value in exact arithmetic is not exceeded, whatever rows of outputs are."""

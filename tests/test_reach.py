@@ -99,6 +99,7 @@ def law_file(file: Path, kind: str, n: int = 3, m: int = 2) -> Path:
     return f.write(file)
 
 
+@pytest.mark.slow_cases
 @pytest.mark.parametrize("kind", ["tanh", "relu", "vector", "selection"])
 def test_a_step_of_a_file_is_enclosed(tmp_path: Path, kind: str) -> None:
     """More than 2500 steps by kind as onnxruntime computes them, of states and controls in a set, exactly."""
@@ -285,6 +286,7 @@ def test_tubes_hold_every_run(tmp_path: Path, kind: str) -> None:
     assert last["kept"] < last.get("step", np.inf) and last["kept"] < part * last.get("none", np.inf)
 
 
+@pytest.mark.slow
 def test_a_file_of_an_affine_law_gives_tubes_as_tight(tmp_path: Path) -> None:
     value = specification("affine")
     a, b, c = (np.array(value["dynamics"][key]) for key in "ABc")
@@ -302,6 +304,7 @@ def test_a_file_of_an_affine_law_gives_tubes_as_tight(tmp_path: Path) -> None:
     assert (wide[1] <= 1.001 * wide[0]).all()
 
 
+@pytest.mark.slow
 def test_tubes_hold_runs_in_a_scene_that_stands_elsewhere(tmp_path: Path) -> None:
     found = replace(reacher(tmp_path, specification("affine")), registration=0.05)
     loop, box, rng = found.loop, found.loop.box, np.random.default_rng(9)
@@ -368,6 +371,7 @@ def examined(search: LoopSearch, number: int, most: int = 60) -> list[Any]:
     return leaves
 
 
+@pytest.mark.slow
 def test_a_good_controller_is_certified_and_a_bad_one_falsified(tmp_path: Path) -> None:
     value = specification("affine")
     value["initial"] = {"p": [-0.02, 0.02], "q": 0.0, "r": 0.0}

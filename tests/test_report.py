@@ -278,6 +278,7 @@ def test_numbers_for_people():
 # pictures
 
 
+@pytest.mark.slow
 def test_matplotlib_is_imported_late(tmp_path):
     code = (
         "import sys\nfrom ns_abstract.report import files, page, picture, record\n"

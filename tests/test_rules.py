@@ -742,6 +742,7 @@ def test_swapped_blend_ends_are_caught() -> None:
     assert outside(mutant, _scalar(blended(alphas.upper, np.arange(4), colors))) == 1
 
 
+@pytest.mark.slow
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0, 1))
 def test_linear_bounds_contain(seed: int, weight: float) -> None:

@@ -366,6 +366,7 @@ def test_the_guarantee_says_of_the_gaussians_alone(plain: Path) -> None:
     assert "alone" not in guarantee_text(method.guarantee, "gsplat", None)
 
 
+@pytest.mark.slow
 def test_the_report_says_of_the_gaussians_alone(
     plain: Path, tmp_path: Path, in_process: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -173,6 +173,7 @@ def proved(file: Path, condition: str, asks: int = 400) -> str:
     ).word
 
 
+@pytest.mark.slow
 def test_proofs_alone_never_decide_unsafe_instances(tmp_path: Path) -> None:
     """Without any attack, what is unsafe in one corner of the box or by one of two cases is not proved."""
     for seed in range(2):
