@@ -16,6 +16,7 @@ from onnx_files import OnnxFile, attack, image_sets, session
 from ns_abstract.verify.network import ImageSets, bound_outputs, composite_activations, load_network
 from ns_abstract.verify.network.bilinear import Product, ProductPlanes
 from ns_abstract.verify.network.coefficients import Coefficients, grid
+from ns_abstract.verify.network.layers import Gather
 from ns_abstract.verify.network.scalar_function import ScalarFunction
 from ns_abstract.verify.network.sparse_layers import PairwiseDifferences, SparseMatrix, TransposedConvolution
 
@@ -418,6 +419,25 @@ def test_attack_catches(mutant: str, tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert hold()
     mutate(monkeypatch)
     assert not hold()
+
+
+@pytest.mark.parametrize("window", [(1, 1), (2, 3), (4, 5)])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_rows_of_gathered_numbers_are_those_of_the_matrix(window: tuple[int, int], dtype: type) -> None:
+    """Windows that lie partly outside, numbers that are taken twice and constants."""
+    rng = np.random.default_rng(0)
+    shape, before = (3, 4, 5), (2, 7)
+    index = rng.integers(-1, 14, int(np.prod(shape)))
+    layer = Gather((before,), shape, 14, 1, torch.from_numpy(index), 0.5)
+    value = rng.integers(-9, 9, (6, 3, *window)).astype(dtype)
+    y, x = (rng.integers(1 - side, size, 6) for side, size in zip(window, shape[1:], strict=True))
+    matrix = (index[:, None] == np.arange(14)).astype(dtype)
+    whole = np.zeros((6, *shape), dtype)
+    for r, c, i, j in np.ndindex(6, 3, *window):
+        if 0 <= y[r] + i < 4 and 0 <= x[r] + j < 5:
+            whole[r, c, y[r] + i, x[r] + j] = value[r, c, i, j]
+    (rows,) = layer.backward(Coefficients(value, y, x))
+    assert rows.value.dtype == dtype and (rows.value.reshape(6, -1) == whole.reshape(6, -1) @ matrix).all()
 
 
 @pytest.mark.parametrize(("shape", "axis"), [((4,), 0), ((3, 2), 0), ((3, 2), 1), ((2, 3, 4), 1), ((5, 1), 1)])

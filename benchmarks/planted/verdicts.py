@@ -204,6 +204,14 @@ VERDICTS = (
         "test_network_bounds.py::test_transposed_strides[3-2]",
     ),
     Fault(
+        "network: rows through a gather lose their window's place",
+        "verify/network/coefficients.py",
+        "add_gathered",
+        "(c * height + y[r] + i) * width + x[r]",
+        "(c * height + y[r] + i) * width",
+        "test_network_operators.py::test_rows_of_gathered_numbers_are_those_of_the_matrix[float32-window0]",
+    ),
+    Fault(
         "network: rows are asked for where forms are good, and not where they are loose",
         _SELECTION,
         "NeuronSelection._bent",

@@ -124,6 +124,24 @@ def _place(value, y, x, target):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
+def add_gathered(value, y, x, height, width, index, target):
+    """Add windows of a map [C, height, width] to ``target`` [R, M], each number where ``index`` [C height width] says.
+
+    A number whose index is -1 is left out.
+    """
+    count, channels, h, w = value.shape
+    for r in range(count):
+        first, past = max(0, -x[r]), min(w, width - x[r])
+        for c in range(channels):
+            for i in range(max(0, -y[r]), min(h, height - y[r])):
+                row = (c * height + y[r] + i) * width + x[r]
+                for j in range(first, past):
+                    at = index[row + j]
+                    if at >= 0:
+                        target[r, at] += value[r, c, i, j]
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
 def interleave(parts, s, t, whole):
     """Put the ``s t`` parts of a transposed stride together.
 

@@ -27,7 +27,7 @@ from ns_abstract.arithmetic.network_charges import (
     FUNCTION_FLUSHES,
     OWN_LINE,
 )
-from ns_abstract.verify.network.coefficients import Coefficients, full, grid, interleave, unflatten
+from ns_abstract.verify.network.coefficients import Coefficients, add_gathered, full, grid, interleave, unflatten
 
 Shape = tuple[int, ...]
 
@@ -371,13 +371,10 @@ class Gather(LinearLayer):
         return (chosen * (self.index >= 0).to(chosen.dtype)).reshape(-1, *self.shape)
 
     def backward(self, rows: Coefficients) -> list[Coefficients]:
-        whole = full(rows, self.shape, force=True)
-        count = whole.value.shape[0]
-        flat = torch.from_numpy(whole.value).reshape(count, -1)
-        value = torch.zeros((count, int(np.prod(self.input_shapes[0]))), dtype=flat.dtype)
-        used = self.index >= 0
-        value.index_add_(1, self.index[used], flat[:, used])
-        return [Coefficients.whole(value.numpy().reshape(count, *grid(self.input_shapes[0])))]
+        count, (_, height, width), before = len(rows.value), grid(self.shape), grid(self.input_shapes[0])
+        value = np.zeros((count, int(np.prod(before))), rows.value.dtype)
+        add_gathered(rows.value, rows.y, rows.x, height, width, self.index.numpy(), value)
+        return [Coefficients.whole(value.reshape(count, *before))]
 
 
 @dataclass(frozen=True)
