@@ -23,7 +23,7 @@ class OnnxFile:
         self.rng = np.random.default_rng(seed)
         self.nodes: list[onnx.NodeProto] = []
         self.constants: list[onnx.TensorProto] = []
-        self.last = "image"
+        self.last, self.kind = "image", TensorProto.FLOAT
 
     def constant(self, value: Any, kind: Any = np.float32) -> str:
         name = f"c{len(self.constants)}"
@@ -55,7 +55,7 @@ class OnnxFile:
         graph = helper.make_graph(
             self.nodes,
             "network",
-            [helper.make_tensor_value_info("image", TensorProto.FLOAT, sizes)],
+            [helper.make_tensor_value_info("image", self.kind, sizes)],
             [helper.make_tensor_value_info(self.last, TensorProto.FLOAT, None)],
             self.constants,
         )

@@ -78,7 +78,14 @@ class Question:
             )
 
     def searched(self, memory: int, arithmetic: NetworkArithmetic, picture: Picture) -> NetworkModel:
-        """The network, as the search bounds it with so many bytes; ``picture`` is any."""
+        """The network, as the search bounds it with so many bytes.
+
+        Raises:
+            InputError: It takes whole numbers, and pictures are not of 8 bits.
+        """
+        if self.network.whole_numbers and picture != "8-bit":
+            fix = "give --picture 8-bit"
+            raise InputError("takes whole numbers from 0 to 255", file=self.model, field="input", fix=fix)
         return NetworkModel(self.network, self.property.preprocess, memory, arithmetic)
 
     def pictures(

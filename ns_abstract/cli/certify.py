@@ -59,7 +59,8 @@ def explain(options: ExplainNetwork) -> int:
 
     if not 0 <= options.parameters <= 64:
         raise InputError(f"found {options.parameters}", field="--parameters", fix="give a number from 0 to 64")
-    print("\n".join(explained(load_network(options.model, output=options.output), options.parameters)))
+    network = load_network(options.model, output=options.output, whole_numbers=True)
+    print("\n".join(explained(network, options.parameters)))
     return DONE
 
 

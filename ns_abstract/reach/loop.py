@@ -208,7 +208,8 @@ class Loop:
     @property
     def loading(self) -> dict[str, Any]:
         """Keywords of `load_network`."""
-        return self.preprocess.loading(self.value.get("output"))
+        # pictures of loops are the renderer's floats
+        return {**self.preprocess.loading(self.value.get("output")), "whole_numbers": False}
 
     @property
     def box(self) -> ParameterBox:

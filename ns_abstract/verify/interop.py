@@ -65,6 +65,8 @@ def write_vnnlib(
     model = network.source
     if model.suffix.lower() != ".onnx":
         raise InputError("only .onnx networks can be extended", file=model, fix="export the network to ONNX")
+    if network.whole_numbers:
+        raise InputError("takes uint8 numbers", file=model, fix="export the network with a float input")
     if images.count != 1 or images.a_lower.shape[1] != network.input_size:
         raise ValueError(f"one cell of {network.input_size} numbers expected")
     matrix = np.asarray(rows.toarray() if hasattr(rows, "toarray") else rows, np.float64)

@@ -65,9 +65,20 @@ class Preprocess:
             )
         return size
 
+    @property
+    def whole_numbers(self) -> bool:
+        """Whether pictures of 8 bits become their whole numbers from 0 to 255."""
+        return self.range == (0.0, 255.0) and not any(self.mean) and all(part == 1.0 for part in self.std)
+
     def loading(self, output: str | None) -> dict[str, Any]:
         """Keywords of `load_network`: the output, the size of pictures where it is free, and what they look like."""
-        return {"output": output, "picture": self.resize, "layout": self.layout, "shown": self._samples}
+        return {
+            "output": output,
+            "picture": self.resize,
+            "layout": self.layout,
+            "whole_numbers": self.whole_numbers,
+            "shown": self._samples,
+        }
 
     def _samples(self, input_shape: tuple[int, ...]) -> Iterator[np.ndarray]:
         """Inputs [1, *input_shape] of dark, bright and random pictures; none if the network takes no pictures."""

@@ -63,7 +63,7 @@ class NetworkBuilder:
                 break
             self.nodes[k - 1] = replace(self.nodes[k - 1], name=name, op=op)
 
-    def network(self, output: int, name: str = "") -> Network:
+    def network(self, output: int, name: str = "", whole_numbers: bool = False) -> Network:
         """The network whose output is node ``output``, called ``name``, without nodes that it does not need."""
         needed = {output}
         for k in range(output, 0, -1):
@@ -84,7 +84,7 @@ class NetworkBuilder:
             nodes_kept.pop()
             if len(shape) == 1 and len(before) == 3:
                 shape = before
-        return Network(self.path, self.input_shape, nodes_kept, shape, name)
+        return Network(self.path, self.input_shape, nodes_kept, shape, name, whole_numbers)
 
     def _check_size(self, shape: Sequence[int]) -> None:
         if any(v < 1 for v in shape) or int(np.prod([float(v) for v in shape])) > _LARGEST:

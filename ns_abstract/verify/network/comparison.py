@@ -34,6 +34,11 @@ _SECONDS, _STEPS, _PATIENCE = 1.0, 24, 8
 _BOUNDED, _UNITS = 32, 1 << 16
 
 
+def levels(image: np.ndarray) -> np.ndarray:
+    """The nearest whole numbers from 0 to 255, of the same type."""
+    return np.clip(np.rint(image), 0.0, 255.0)
+
+
 def compare(network: Network, run: Evaluate, images: Iterable[np.ndarray], *, usual: bool = True) -> None:
     """Raise InputError if the network as read and the runtime of its file give different outputs.
 
@@ -48,7 +53,7 @@ def compare(network: Network, run: Evaluate, images: Iterable[np.ndarray], *, us
     """
     path = network.source
     for image in images:
-        image = image.astype(np.float32)
+        image = levels(image).astype(np.float32) if network.whole_numbers else image.astype(np.float32)
         try:
             expected = run(image).reshape(-1).astype(np.float64)
         except Exception as error:  # the other program's own
@@ -109,8 +114,9 @@ def probes(network: Network) -> tuple[Iterator[np.ndarray], Iterator[np.ndarray]
 
 def _usual(network: Network) -> Iterator[np.ndarray]:
     generator = np.random.default_rng(0)
+    top = 255.0 if network.whole_numbers else 1.0
     for k in range(3):
-        yield generator.uniform(0.0, 1.0 + k, (1, *network.input_shape))
+        yield generator.uniform(0.0, top * (1.0 + k), (1, *network.input_shape))
 
 
 def _strange(network: Network) -> Iterator[np.ndarray]:

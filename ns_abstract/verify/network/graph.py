@@ -68,19 +68,27 @@ class Network:
         nodes: In an order in which every node's inputs come before it; node k is ``nodes[k - 1]``.
         output_shape: One item of the last node, as the file says it.
         output: The output's name in the file.
+        whole_numbers: Whether it takes whole numbers from 0 to 255 alone.
     """
 
     def __init__(
-        self, source: Path, input_shape: Shape, nodes: Sequence[Node], output_shape: Shape, output: str = ""
+        self,
+        source: Path,
+        input_shape: Shape,
+        nodes: Sequence[Node],
+        output_shape: Shape,
+        output: str = "",
+        whole_numbers: bool = False,
     ) -> None:
         self.source = source
         self.input_shape = tuple(input_shape)
         self.nodes = tuple(nodes)
         self.output_shape = tuple(output_shape)
         self.output = output
+        self.whole_numbers = whole_numbers
 
     def __getstate__(self) -> dict[str, Any]:
-        fields = ("source", "input_shape", "nodes", "output_shape", "output")
+        fields = ("source", "input_shape", "nodes", "output_shape", "output", "whole_numbers")
         return {name: self.__dict__[name] for name in fields}
 
     @property

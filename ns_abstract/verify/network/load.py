@@ -11,12 +11,15 @@ import onnxruntime
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import file_size, show
-from ns_abstract.verify.network.comparison import Evaluate, compare, probes
+from ns_abstract.verify.network.comparison import Evaluate, compare, levels, probes
 from ns_abstract.verify.network.graph import Network
 from ns_abstract.verify.network.onnx_file import read_onnx
 from ns_abstract.verify.network.onnx_graph import ReadRequest
 from ns_abstract.verify.network.onnx_tensors import PACKED, unpacked_model
 from ns_abstract.verify.network.subnormals import subnormals_kept
+
+#: Types of inputs beside float32.
+_KINDS: dict[str, type] = {"tensor(double)": np.float64, "tensor(uint8)": np.uint8}
 
 
 @subnormals_kept()
@@ -27,6 +30,7 @@ def load_network(
     output: str | None = None,
     picture: tuple[int, int] | None = None,
     layout: str = "NCHW",
+    whole_numbers: bool = False,
     shown: Callable[[tuple[int, ...]], Iterable[np.ndarray]] | None = None,
 ) -> Network:
     """The network in an .onnx or .onnx.gz file, compared with onnxruntime.
@@ -37,6 +41,7 @@ def load_network(
         output: Name of the output that is read; None: the only one.
         picture: Height and width of pictures, used where the file leaves them free.
         layout: "NCHW" or "NHWC", of such pictures.
+        whole_numbers: Whether the input may be uint8, for whole numbers from 0 to 255.
         shown: Inputs [1, *input_shape] to compare besides, for an input shape: what the network will be given.
 
     Raises:
@@ -47,13 +52,13 @@ def load_network(
     name = path.name.lower()
     if not name.endswith((".onnx", PACKED)):
         raise InputError(f"has the ending {path.suffix!r}", file=path, fix=_instead(path))
-    network = read_onnx(path, ReadRequest(output, vector, picture, layout == "NHWC"))
+    network = read_onnx(path, ReadRequest(output, vector, picture, layout == "NHWC", whole_numbers))
     run = onnx_runner(path, network.output, network.input_shape)
     usual, strange = probes(network)
     compare(network, run, usual)
-    compare(
-        network, run, strange if shown is None else itertools.chain(shown(network.input_shape), strange), usual=False
-    )
+    if shown is not None:
+        strange = itertools.chain(shown(network.input_shape), strange)
+    compare(network, run, strange, usual=False)
     return network
 
 
@@ -100,14 +105,15 @@ def onnx_runner(path: Path, output: str = "", shape: Sequence[int] | None = None
     """
     session = onnx_session(path)
     wanted = session.get_inputs()[0]
-    kind = np.float64 if wanted.type == "tensor(double)" else np.float32
+    kind = _KINDS.get(wanted.type, np.float32)
     names = [output or session.get_outputs()[0].name]
     alone = len(wanted.shape) == (1 if shape is None else len(shape))
     first = wanted.shape[0] if wanted.shape else 1
     copies = first if not alone and isinstance(first, int) and first > 1 else 1
 
     def run(image: np.ndarray) -> np.ndarray:
-        image = (image[0] if alone else np.repeat(image, copies, 0)).astype(kind)
+        image = image[0] if alone else np.repeat(image, copies, 0)
+        image = (levels(image) if kind is np.uint8 else image).astype(kind)
         output = np.asarray(session.run(names, {wanted.name: image})[0])
         return (output[0] if copies > 1 else output).reshape(-1)
 

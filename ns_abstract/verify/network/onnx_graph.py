@@ -108,16 +108,21 @@ class ReadRequest(NamedTuple):
         vector: Whether the input may be a vector [n], without a batch.
         picture: Height and width where the file leaves them free.
         last: Whether channels come last in such a picture.
+        whole_numbers: Whether the input may be uint8.
     """
 
     output: str | None = None
     vector: bool = False
     picture: tuple[int, int] | None = None
     last: bool = False
+    whole_numbers: bool = False
 
 
 #: What picks among scores, at the end of many networks.
 _PICKS = frozenset(("ArgMax", "ArgMin", "TopK"))
+
+#: What moves numbers, whatever they are.
+_MOVES = frozenset(("Flatten", "Identity", "Reshape", "Squeeze", "Transpose", "Unsqueeze"))
 
 
 class TensorValue(NamedTuple):
@@ -154,6 +159,8 @@ class OnnxReader:
             raise InputError("sparse constants are not supported", file=path, fix="store them as dense tensors")
         #: items that the file's batch always holds; all are the same picture
         self.batch = 1
+        #: whether the input is uint8
+        self.whole_numbers = False
         self.input_name, image = self._input(asked)
         self.output = self._chosen(asked.output)
         self.builder = CompositeBuilder(path, image.item)
@@ -176,7 +183,10 @@ class OnnxReader:
         value = inputs[0]
         field = f"input {value.name}"
         kind = value.type.tensor_type
-        if kind.elem_type not in (onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE):
+        if kind.elem_type == onnx.TensorProto.UINT8:
+            self._check_levels(value.name, field, asked)
+            self.whole_numbers = True
+        elif kind.elem_type not in (onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE):
             raise InputError("is not a float32 tensor", file=self.path, field=field, fix="export with a float input")
         # some exporters write -1 for what is free
         sizes = [max(0, d.dim_value) if d.HasField("dim_value") else 0 for d in kind.shape.dim]
@@ -202,6 +212,25 @@ class OnnxReader:
                 fix="export with all sizes but the batch fixed, or say height and width in preprocess.resize",
             )
         return value.name, TensorValue(0, (1, *sizes[1:]))
+
+    def _check_levels(self, name: str, field: str, asked: ReadRequest) -> None:
+        """Arithmetic of integers wraps around and cuts off: a uint8 input may be moved, and then made a float.
+
+        Raises:
+            InputError: Something else is done with it, or no whole numbers are given.
+        """
+        if not asked.whole_numbers:
+            fix = 'for pictures: write "range": [0, 255] alone in preprocess; else export with a float input'
+            raise InputError("is a uint8 tensor", file=self.path, field=field, fix=fix)
+        waiting = [name]
+        while waiting:
+            held = waiting.pop()
+            for node in self.graph.node:
+                if node.op_type == "Cast" or held not in {*node.input, *_outer_names(node)}:
+                    continue
+                if node.op_type not in _MOVES or node.input[0] != held:
+                    raise self._fail(node, "computes with uint8 numbers", "cast the input to float before it")
+                waiting += node.output
 
     def network(self) -> Network:
         """The network up to the chosen output; nodes that it does not depend on are not read."""
@@ -231,7 +260,7 @@ class OnnxReader:
             raise InputError(f"output {name!r} holds integers", file=self.path, field="graph.output")
         if name in self.dropped:
             raise InputError(f"output {name!r} holds minus infinity", file=self.path, field="graph.output")
-        return self.builder.network(self.values[name].index, name)
+        return self.builder.network(self.values[name].index, name, self.whole_numbers)
 
     def _chosen(self, asked: str | None) -> str:
         """The name of the output that is read: the one asked for, or the only one.
