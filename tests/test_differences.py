@@ -483,6 +483,14 @@ def test_a_run_and_its_export(blobs: Inputs, tmp_path: Path, in_process: InProce
     assert code == 0 and "certified: tolerance 0.3" in said and "states none" in said, said
     document = json.loads((tmp_path / "out" / "report.json").read_text())
     assert document["verdict"] == "certified" and document["largest_lower"] <= 1e-6
+    # behind A is another colour than black, and so behind B
+    alone = blobs.options(tmp_path / "alone", other=other, tolerance=0.3, frames=[1], time_budget=20)
+    code, _, said = in_process(main, alone)
+    document = json.loads((tmp_path / "alone" / "report.json").read_text())
+    behind = {entry["name"]: entry for entry in document["assumptions"]}
+    assert behind["other background"]["value"] == behind["background"]["value"]
+    assert "A's, the file of B states none" in behind["other background"]["origin"] and "background: " in said
+    assert code == 0 and document["largest_lower"] <= 1e-6, said
     # behind B is another colour now
     code, _, said = in_process(main, [*options, "--other-background", "0.9", "0.9", "0.9"])
     assert code == 0 and "falsified" in said, said

@@ -269,6 +269,15 @@ def test_moved_folder(run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert equal(scene, load_scene("."))
 
 
+def test_a_folder_of_runs_names_them(run: Run, tmp_path: Path) -> None:
+    shutil.move(run.folder, tmp_path / "outputs" / "scene" / "splatfacto" / "date")
+    for folder in ("outputs", "outputs/scene", "outputs/scene/splatfacto"):
+        with pytest.raises(InputError, match=r"no such run configuration; give a run below it: .*date.config\.yml$"):
+            load_scene(tmp_path / folder)
+    with pytest.raises(InputError, match="give a folder that ns-train wrote"):
+        load_scene(tmp_path / "outputs" / "scene" / "splatfacto" / "date" / "nerfstudio_models")
+
+
 def test_newest_checkpoint_wins(run: Run) -> None:
     later = parameters(count=2)
     torch.save(checkpoint_of(later), run.checkpoint.with_name("step-000100000.ckpt"))

@@ -265,8 +265,8 @@ class Job:
         floor = max(part.floor for part in parts)
         if floor > 0.0:
             plan.append(
-                f"dim light: layers that contribute at most {floor:.2%} of a pixel are left out of the first cells, "
-                "and bounded by the range of their colours"
+                f"faint Gaussians: those that contribute at most {floor:.2%} of a pixel are left out of the first "
+                "cells, and the range of their colours is added to the bounds"
             )
         if len(parts) > 1:
             plan.append(

@@ -18,7 +18,7 @@ from ns_abstract.io.arguments import file_path
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.load import open_scene
-from ns_abstract.methods.overrides import Overrides
+from ns_abstract.methods.overrides import UNSAID, Overrides
 from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.refine.protocol import Method, PreciseFrame
@@ -106,6 +106,13 @@ class Scene:
         if self.source.file.is_file() and self.source.file.suffix.lower() not in (".yml", ".yaml"):
             return None
         return self._content.dataparser
+
+    @property
+    def background(self) -> tuple[float, ...] | None:
+        """RGB behind the scene; None where its file says nothing of it."""
+        unsaid = any(entry.name == "background" and entry.origin == UNSAID for entry in self.assumptions)
+        color = self._content.background
+        return None if unsaid or isinstance(color, str) else tuple(map(float, color))
 
     @property
     def assumptions(self) -> tuple[Assumption, ...]:

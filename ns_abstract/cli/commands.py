@@ -158,7 +158,7 @@ class Compare(_PathCommand):
     other_rasterize_mode: Literal["classic", "antialiased"] | None = None
     """Of B. Default: as --rasterize-mode."""
     other_background: tuple[float, float, float] | None = None
-    """Of B. Default: as --background."""
+    """Of B. Default: as --background, else what its file states, else A's."""
     other_gsplat_version: Literal["1.4.0", "1.5.3", "1.6.0"] | None = None
     """Of B. Default: as --gsplat-version."""
     other_load_step: int | None = None

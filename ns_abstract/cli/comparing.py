@@ -84,6 +84,8 @@ def _introduce(console: Console, job: ComparisonJob, report: ComparisonReport) -
     for note in (*(note for note in job.notes if note not in job.warnings), *job.plan):
         console.print(f"  {note}")
     console.print(f"  frame: {job.frame_choice.origin}")
+    if job.background_choice is not None:
+        console.print(f"  background: {job.background_choice.value}, {job.background_choice.origin}")
     if report.kept:
         console.print(f"  kept from before: frames {listed(report.kept)}")
 

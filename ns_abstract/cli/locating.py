@@ -14,7 +14,7 @@ from ns_abstract.api.location import Location, open_location
 from ns_abstract.api.sequence import open_sequence
 from ns_abstract.cli.common import SignalStop, plain_console
 from ns_abstract.cli.options import stated
-from ns_abstract.report.figures import percent
+from ns_abstract.report.figures import listed, percent
 from ns_abstract.report.progress import ProgressBar
 from ns_abstract.verify.store import Store
 
@@ -104,7 +104,10 @@ def _search(
         )
     left = percent(document["possible_volume"])
     console.print(f"{_ANSWERS[document['answer']]}; {left} of the set left")
-    if document["answer"] != "possible" and document["best"] is not None:
+    late = [entry["index"] for entry in document["frames"] if entry["best"] is None and entry["possible_volume"] > 0.0]
+    if document["state"] != "done" and late:
+        console.print(f"  not examined before the time was over: frames {listed(late)}; give more --time-budget")
+    elif document["answer"] != "possible" and document["best"] is not None and document["state"] == "done":
         missed = document["best"]["outliers"]
         text = f"  best pose misses {missed} pixels: --noise and --outliers must allow the scene's own error"
         console.print(text)

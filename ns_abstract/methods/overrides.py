@@ -57,6 +57,10 @@ class Overrides:
                 raise InputError(problem, field="--" + name.replace("_", "-"), fix="leave it out")
 
 
+#: Origin of a choice that a file leaves open.
+UNSAID = "default: the file says nothing"
+
+
 def assumption_of(name: str, given: object, flag: str, stored: object, origin: str) -> Assumption:
     """Return the record of a choice: an option wins, and the record names what it replaces.
 

@@ -12,6 +12,7 @@ import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, cast
 
@@ -43,7 +44,7 @@ _PYTHON_TAG = "tag:yaml.org,2002:python/"
 _MERGE_TAG = "tag:yaml.org,2002:merge"
 _NUMBER_TAGS = {f"tag:yaml.org,2002:{python}{kind}" for python in ("", "python/") for kind in ("int", "long", "float")}
 #: Steps that an error lists.
-_STEPS_SHOWN = 12
+_STEPS_SHOWN, _RUNS_SHOWN = 12, 4
 _CHECKPOINT_NAME = re.compile(r"step-(\d{1,18})\.ckpt")
 
 
@@ -126,7 +127,7 @@ def read_config(path: str | os.PathLike[str]) -> RunConfig:
     file = Path(path)
     if os.path.isdir(file):
         file = file / CONFIG_NAME
-        file_size(file, "run configuration", fix="give a folder that ns-train wrote, or its config.yml")
+        file_size(file, "run configuration", fix=None if file.exists() else _which_run(file.parent))
     root = read_mapping(file, "run configuration")
     pipeline = _section(root, "pipeline", "pipeline", file)
     model = _section(pipeline, "model", "pipeline.model", file)
@@ -140,6 +141,15 @@ def read_config(path: str | os.PathLike[str]) -> RunConfig:
         model_folder=folder / _model_folder(root, file),
         root=root,
     )
+
+
+def _which_run(folder: Path) -> str:
+    """What to give in place of a folder without a config.yml: a run below it, such as those of an experiment."""
+    below = (file for depth in (1, 2, 3) for file in folder.glob("*/" * depth + CONFIG_NAME))
+    runs = sorted(islice(below, _RUNS_SHOWN))
+    if not runs:
+        return "give a folder that ns-train wrote, or its config.yml"
+    return f"give a run below it: {', '.join(visible(str(run)) for run in runs)}"
 
 
 def read_mapping(file: Path, what: str) -> dict[str, Any]:

@@ -28,7 +28,8 @@ METRICS = {
     "unknown": "the rest: neither proved nor broken on the finest cells, or not examined before the end",
     "not_examined": "part of unknown whose cells were still to be examined",
     "sampled_right": "part of evenly spread poses at whose images the property holds; says nothing about others",
-    "margin": "how far the property is from failing; proved from below in certified cells",
+    "margin": "how far the property is from failing, in the unit of what is measured (a network's output, blending "
+    "weight, distance, colour); proved from below in certified cells",
     "scene_margin": SCENE_MARGIN,
     "cameras": "where the camera of a cell's middle pose stands and where it looks, a unit vector, in the normalised "
     "frame, for the cells that are the largest parts of their sets; left_out: number of the others",

@@ -202,7 +202,7 @@ def verdict_drawings(
         if rows and len(free) == 1:
             spans, marks = _spans(rows, free[0], entry["index"], numbers), [e[free[0]] for e in _broken(rows)]
             if is_ring(parameters[free[0]]):
-                maps.append((_ring(spans, parameters[free[0]], marks), entry, "seen from the axis's tip"))
+                maps.append((_ring(spans, parameters[free[0]], marks), entry, "seen along the axis, from above"))
             else:
                 maps.append((_strip(spans, parameters[free[0]], marks), entry, ""))
         elif rows and len(free) == 2:

@@ -21,8 +21,8 @@ _OPEN_FRAMES = 4
 
 _STATS = (
     ("mpg", "MPG", "mean pixel gap: how wide the bounds are, over all pixels"),
-    ("mpg_witness", "witness MPG", "the same of images really rendered; the true one is at least this"),
-    ("ratio", "ratio", "MPG / witness MPG: 1 would be exact"),
+    ("mpg_witness", "MPG of renders", "the same of images really rendered; the true one is at least this"),
+    ("ratio", "ratio", "MPG / MPG of renders: 1 would be exact"),
     ("xpg", "XPG", "gap of the widest pixel (at most √3 = 1.732)"),
     ("xpg_witness", "witness XPG", "the same of images really rendered"),
     ("seconds", "seconds", "time spent on this frame"),
@@ -158,7 +158,7 @@ def _captions(entry: Mapping[str, Any], sampled: bool) -> Sequence[tuple[str, st
         ("upper", "upper image", "largest values of the samples") if sampled else
         ("upper", "upper bound", "no image of the set is brighter"),
         ("gap", "gap", "length over RGB of upper − lower"),
-        ("witness", "witness gap", "what rendering has shown, same scale"),
+        ("witness", "gap of renders", "what rendering has shown, same scale"),
         ("image", "one render", "at the middle of the set"),
     )  # fmt: skip
     for name, figures in entry.get("layers", {}).items():
@@ -203,7 +203,7 @@ def _curve(entry: Mapping[str, Any]) -> Markup | None:
     if len(points) <= 25:
         marks += draw_line([(x(t), y(v)) for t, v in outer], "outer", True, joined=False)
         marks += draw_line([(x(t), y(v)) for t, v in inner], "inner", True, joined=False)
-    marks += draw_legend((("outer", "bounds (MPG)"), ("inner", "witness MPG")), 408)
+    marks += draw_legend((("outer", "bounds (MPG)"), ("inner", "MPG of renders")), 408)
     labels = ("seconds of work (log)", "mean pixel gap (log)")
     return draw_plot(x, y, labels, marks, size=(420, 256), title="Mean pixel gap against run time")
 
@@ -243,7 +243,7 @@ def _path_curve(frames: Sequence[Mapping[str, Any]]) -> Markup | None:
             points = [(t, v) for t, v in zip(times, values, strict=True) if v > 0.0]
             if points:
                 marks += draw_line([(x(t), y(v)) for t, v in stairs(points, end)], f"{kind}{strength}", False)
-    marks += draw_legend((("outer", "bounds (MPG)"), ("inner", "witness MPG")), 988)
+    marks += draw_legend((("outer", "bounds (MPG)"), ("inner", "MPG of renders")), 988)
     labels = ("seconds of work on each frame (log)", "mean pixel gap (log)")
     return draw_plot(x, y, labels, marks, size=(1000, 276), title="Mean pixel gap of the path against run time")
 
@@ -280,7 +280,7 @@ def _overview(frames: Sequence[Mapping[str, Any]]) -> Markup | None:
         )
         if k % every == 0:
             marks += f'<text x="{at:.1f}" y="{y.start + 15:.1f}" text-anchor="middle">{entry["index"]}</text>'
-    marks += draw_legend((("outer", "bounds (MPG)"), ("inner", "witness MPG")), 988)
+    marks += draw_legend((("outer", "bounds (MPG)"), ("inner", "MPG of renders")), 988)
     return draw_plot(
         None, y, ("frame", "mean pixel gap"), marks, size=(1000, 216), title="Mean pixel gap of every frame"
     )

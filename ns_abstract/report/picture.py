@@ -150,7 +150,7 @@ def _metric_items(result: FrameResult) -> list[str]:
     return [
         f"MPG {number(figures['mpg'])}",
         f"XPG {number(figures['xpg'])}",
-        f"witness MPG {number(figures['mpg_witness'])}",
+        f"MPG of renders {number(figures['mpg_witness'])}",
         f"ratio {number(figures['ratio'])}",
         f"{result.cells} cells",
         f"{number(result.seconds, 3)} s",
@@ -306,7 +306,7 @@ def preview(image: NDArray[np.uint8], side: int) -> bytes:
 
 
 def previews(result: FrameResult, side: int) -> Mapping[str, bytes]:
-    """PNGs of a frame for the page: lower, upper, gap, witness gap (same scale) and render; those of further outputs.
+    """PNGs of a frame for the page: lower, upper, gap, gap of renders (same scale), render, and further outputs.
 
     The latter are named ``depth_lower`` and so on, and share the scale of the largest value that is known.
     """

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError, visible
 from ns_abstract.io.memory import check_memory
-from ns_abstract.methods.overrides import Overrides, assumption_of
+from ns_abstract.methods.overrides import UNSAID, Overrides, assumption_of
 from ns_abstract.methods.splat.drawable import StoredGaussians, coordinates_note, drawable
 from ns_abstract.methods.splat.scene import DataparserTransform, SplatScene
 
@@ -74,9 +74,9 @@ def scene_of(decoded: DecodedSplats, overrides: Overrides) -> SplatScene:
     """
     file = decoded.files[0]
     rows, dropped = drawable(decoded.rows, file, decoded.fields, overrides.drop_nan_gaussians)
-    mode, origin = decoded.mode or "classic", decoded.mode_origin or "default: the file says nothing"
+    mode, origin = decoded.mode or "classic", decoded.mode_origin or UNSAID
     background = decoded.background or (0.0, 0.0, 0.0)
-    behind = decoded.background_origin or "default: the file says nothing"
+    behind = decoded.background_origin or UNSAID
     notes = list(decoded.notes)
     if decoded.mode is None and overrides.rasterize_mode is None:
         notes.append("assumed classic: nothing in the file says how it was rasterised (--rasterize-mode says it)")
