@@ -13,7 +13,7 @@ CAPACITY = 64
 
 
 @njit(error_model="numpy")
-def blended(values_, lists_, colors_, background_, shape, forms, count, t, jumps, split):
+def blended(values_, lists_, colors_, background_, shape, forms, count, t, crossings, split):
     """The fragments of arrays, and their blend; ``t`` is a pointer and receives the polynomials."""
     values, lists, colors, background = pointer(values_), pointer(lists_), pointer(colors_), pointer(background_)
     fragments = Fragments(
@@ -30,5 +30,5 @@ def blended(values_, lists_, colors_, background_, shape, forms, count, t, jumps
     )
     palette = Palette(colors, forms, background, background)
     if shape.order == 2:
-        return fragments, blend_quadratic(0, count, fragments, palette, values, t, jumps, split)
-    return fragments, blend_several(0, count, fragments, palette, values, t, shape.monomials, jumps, split)
+        return fragments, blend_quadratic(0, count, fragments, palette, values, t, crossings, split)
+    return fragments, blend_several(0, count, fragments, palette, values, t, shape.monomials, crossings, split)

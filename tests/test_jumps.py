@@ -35,19 +35,19 @@ THRESHOLD = 2.0**-8
 
 
 @njit(error_model="numpy")
-def _bounds(values, lists, colors, background, shape, count, limit, jumps_, t_, out_):
-    """Bounds of three channels by parts into the first 8 of ``out_``, then by constants; the number of jumps last."""
+def _bounds(values, lists, colors, background, shape, count, limit, crossings_, t_, out_):
+    """Three channels by parts into the first 8 of ``out_``, then by constants; last the number of crossings."""
     t, out = pointer(t_), pointer(out_)
-    entries, distances, rows = jumps_
-    jumps = ThresholdCrossings(pointer(entries), pointer(distances), pointer(rows), rows.shape[1])
+    entries, distances, rows = crossings_
+    crossings = ThresholdCrossings(pointer(entries), pointer(distances), pointer(rows), rows.shape[1])
     d, m = shape.dimensions, shape.monomials
     u = advanced(t, 4 * (m + bends_of(shape)))
-    fragments, blend = blended(values, lists, colors, background, shape, 1, count, t, jumps, True)
+    fragments, blend = blended(values, lists, colors, background, shape, 1, count, t, crossings, True)
     up = 1.0 + 2.0**-40
     store(out, 0, blend.radius * up)
-    set_blend(t, out, jumps, d)
+    set_blend(t, out, crossings, d)
     store(out, 20, blend.since)
-    gather_crossings(0, count, blend.jumps, advanced(out, 20), fragments, jumps, out, shape)
+    gather_crossings(0, count, blend.crossings, advanced(out, 20), fragments, crossings, out, shape)
     falls, rises = load4(out, 0), load4(out, 4)
     r = blend.radius
     if shape.order == 1:
@@ -59,8 +59,8 @@ def _bounds(values, lists, colors, background, shape, count, limit, jumps_, t_, 
     store(out, 12, load4(t, 0) + reach + rises)
     store(out, 0, falls)
     store(out, 4, rises)
-    bound_by_parts(blend.jumps, limit, jumps, out, d)
-    out[24] = blend.jumps
+    bound_by_parts(blend.crossings, limit, crossings, out, d)
+    out[24] = blend.crossings
 
 
 def _fragments(shape, alphas, radii, colors):
@@ -73,12 +73,12 @@ def _fragments(shape, alphas, radii, colors):
         spread = np.abs(alpha[1:]).sum() + radius
         low, high = max(0.0, alpha[0] - spread), min(1.0, alpha[0] + spread)
         skips = low < THRESHOLD
-        jump = min(THRESHOLD, high) if skips else 0.0
+        crossing = min(THRESHOLD, high) if skips else 0.0
         values[e, int(crossing_column(shape))] = THRESHOLD if skips else 0.0
         values[e, ALPHA_LOW], values[e, ALPHA_HIGH] = 0.0 if skips else low, high
         values[e, FORM : FORM + 1 + d] = alpha[: 1 + d]
-        values[e, FORM] -= 0.5 * jump
-        values[e, FORM + m] = (radius + 0.5 * jump) * (1.0 + 2.0**-46)
+        values[e, FORM] -= 0.5 * crossing
+        values[e, FORM + m] = (radius + 0.5 * crossing) * (1.0 + 2.0**-46)
         if shape.order == 2:
             values[e, FORM + 2] = alpha[2]
         else:
@@ -129,11 +129,11 @@ def _case(d, count, generator, size=0.8, radius=0.0):
 def _bounded(d, order, alphas, radii, colors, background):
     shape = FormShape(d, order, 3 if order == 2 else d + 1)
     values, palette, lists = _fragments(shape, alphas, radii, colors)
-    jumps = np.zeros(CAPACITY, np.int64), np.zeros(8 * CAPACITY), np.zeros((int(crossing_rows(shape)), 272))
+    crossings = np.zeros(CAPACITY, np.int64), np.zeros(8 * CAPACITY), np.zeros((int(crossing_rows(shape)), 272))
     t, out = np.zeros(4 * (3 * shape.monomials + 5 + d * (d + 1) // 2)), np.zeros(25)
     _bounds(
         values.ravel(), lists.ravel(), palette.ravel(), background, shape, len(alphas), THRESHOLD * (1.0 - 2.0**-52),
-        jumps, t, out,
+        crossings, t, out,
     )  # fmt: skip
     low, high = out[0:3], out[4:7]
     return low, high, out[8:11], out[12:15], int(out[24])
@@ -149,8 +149,8 @@ def test_skipped_fragments(d, order, radius):
     for count in (1, 3, 12, 40):
         alphas, radii, colors = _case(d, count, generator, radius=radius)
         background = np.array([*generator.random(3), 0.0])
-        low, high, flat_low, flat_high, jumps = _bounded(d, order, alphas, radii, colors, background)
-        assert jumps > 0
+        low, high, flat_low, flat_high, crossings = _bounded(d, order, alphas, radii, colors, background)
+        assert crossings > 0
         least, most = np.full(3, np.inf), np.full(3, -np.inf)
         places = [*generator.choice([-1.0, 1.0], (40, d)), *generator.uniform(-1.0, 1.0, (100, d)), np.zeros(d)]
         for place in places:
@@ -181,8 +181,8 @@ def test_skipped_fragments_over_what_moves(d, order):
         front = np.array([1.5 * THRESHOLD, *(0.9 * THRESHOLD / d * toward), *pairs])
         behind = np.array([0.5, *(0.4 / d * -toward * generator.choice([-1.0, 1.0])), *pairs])
         colors, background = np.array([[0.5, 0.2, 0.9], [1.0, 0.0, 0.3]]), np.array([0.0, 1.0, 0.8, 0.0])
-        low, high, flat_low, flat_high, jumps = _bounded(d, order, [front, behind], np.zeros(2), colors, background)
-        assert jumps == 1
+        low, high, flat_low, flat_high, crossings = _bounded(d, order, [front, behind], np.zeros(2), colors, background)
+        assert crossings == 1
         for place in [*generator.choice([-1.0, 1.0], (30, d)), *generator.uniform(-1.0, 1.0, (30, d))]:
             shown = _picture([front, behind], [0.0, 0.0], colors, background[:3], place, d)
             for channel in range(3):

@@ -65,7 +65,7 @@ class Exponent(NamedTuple):
 
 
 class Alpha(NamedTuple):
-    """Alphas of eight pixels: bounds, the form's centre and radius, and `ThresholdedAlpha.jump`.
+    """Alphas of eight pixels: bounds, the form's centre and radius, and `ThresholdedAlpha.crossing`.
 
     The form's coefficients are ``weight`` times the exponent's, and ``curve`` times those of its linear part squared.
     """
@@ -74,7 +74,7 @@ class Alpha(NamedTuple):
     high: Any
     center: Any
     radius: Any
-    jump: Any
+    crossing: Any
     weight: Any
     curve: Any
 
@@ -110,7 +110,7 @@ class ThresholdedAlpha(NamedTuple):
         low, high: Bounds.
         center, radius: Of the form.
         keep: 1 unless it is constant.
-        jump: Alpha up to which the fragment may be skipped; 0 where it is not, or the form is constant.
+        crossing: Alpha up to which the fragment may be skipped; 0 where it is not, or the form is constant.
     """
 
     low: Any
@@ -118,7 +118,7 @@ class ThresholdedAlpha(NamedTuple):
     center: Any
     radius: Any
     keep: Any
-    jump: Any
+    crossing: Any
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -220,7 +220,7 @@ def fitted_exponential(exponent, limits, charges):
     weight = fma(k2, turn, weight)
     alpha = thresholded(middle, error, sigma, limits, charges)
     return Alpha(
-        alpha.low, alpha.high, alpha.center, alpha.radius, alpha.jump,
+        alpha.low, alpha.high, alpha.center, alpha.radius, alpha.crossing,
         alpha.keep * (sigma.scale * weight), alpha.keep * (sigma.scale * k2),
     )  # fmt: skip
 
@@ -242,9 +242,9 @@ def thresholded(middle, error, sigma, limits, charges):
     a_low = minimum(a_low, alpha_max * (1.0 - charges.threshold))
     # alpha_min: below it the fragment is skipped
     skips = a_low < limits.alpha_min_high
-    jump = where(skips, minimum(limits.alpha_min_high, a_high), 0.0)
-    center = center - 0.5 * (excess + jump)
-    radius = fma(0.5, excess + jump, radius) * UP
+    crossing = where(skips, minimum(limits.alpha_min_high, a_high), 0.0)
+    center = center - 0.5 * (excess + crossing)
+    radius = fma(0.5, excess + crossing, radius) * UP
     a_low = where(skips, 0.0, limits.sure * a_low)
     # gone where it cannot reach the threshold
     gone = (a_high < limits.alpha_min) | (sigma.low > limits.sigma_max)

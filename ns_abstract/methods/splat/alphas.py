@@ -159,7 +159,7 @@ def _quadratic_alphas(record, begin, n, given, block, limits, charges, antialias
         # one parameter's forms hold its curvature: nothing reads the second column of its range
         store_columns(
             values, given + 8 * q, 8,
-            (alpha.low, alpha.high, alpha.jump, alpha.high, alpha.center, tilt, bent, alpha.radius),
+            (alpha.low, alpha.high, alpha.crossing, alpha.high, alpha.center, tilt, bent, alpha.radius),
         )  # fmt: skip
         drawn_lanes |= (_ALL - bits(alpha.high < limits.alpha_min)) << q
     return drawn_lanes
@@ -198,7 +198,7 @@ def _affine_forms(record, m, antialiased):
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _store_fragments(rows, alpha, fragments, at, m):
     """Write eight fragments from their ``alpha``; ``rows`` [., 8] hold the exponent's slopes and alpha's curvature."""
-    store(rows, 8 * fragments.jump, alpha.jump)
+    store(rows, 8 * fragments.crossing, alpha.crossing)
     store(rows, 8 * ALPHA_LOW, alpha.low)
     store(rows, 8 * ALPHA_HIGH, alpha.high)
     store(rows, 8 * FORM, alpha.center)

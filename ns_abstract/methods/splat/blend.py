@@ -44,7 +44,7 @@ from ns_abstract.methods.splat.threshold_crossings import bound_by_parts, gather
 class BlendTuning:
     """When skipped fragments are looked at together. None of them decides whether a bound holds."""
 
-    #: Jumps are looked at together where they may widen a pixel by more than this part.
+    #: Crossings are looked at together where they may widen a pixel by more than this part.
     jumps_matter: float = 2.0**-4
 
 
@@ -73,31 +73,31 @@ class _Blend(NamedTuple):
     Attributes:
         radius: Of the polynomials.
         ends: The intervals.
-        jumps: Fragments that some poses skip, which the polynomials count as drawn.
+        crossings: Fragments that some poses skip, which the polynomials count as drawn.
         since: The first of these that count.
     """
 
     radius: Any
     ends: Any
-    jumps: int
+    crossings: int
     since: Any
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _keep_distances(number, entry, nearest, farthest, size, jumps):
+def _keep_distances(number, entry, nearest, farthest, size, crossings):
     """Keep what a fragment's colour is beyond what lies behind, up to rounding of ``size``, for its skipping (B11)."""
     room = FRAGMENT_ROUNDING * size
-    jumps.entries[number] = entry
-    store(jumps.distances, 8 * number, nearest - room)
-    store(jumps.distances, 8 * number + 4, farthest + room)
+    crossings.entries[number] = entry
+    store(crossings.distances, 8 * number, nearest - room)
+    store(crossings.distances, 8 * number + 4, farthest + room)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def blend_quadratic(begin, end, fragments, palette, moves, t, jumps, split):
+def blend_quadratic(begin, end, fragments, palette, moves, t, crossings, split):
     """Blend the list entries [begin, end) of a pixel back to front, as forms and as intervals (design.md, B7).
 
     For one parameter and order 2. ``t`` [m, 4] receives the polynomials; returns a `_Blend` whose radii are not yet
-    rounded up. If ``split``, fragments that some poses skip are drawn and kept in ``jumps`` (B11); else their forms
+    rounded up. If ``split``, fragments that some poses skip are drawn and kept in ``crossings`` (B11); else their forms
     hold both.
     """
     values, colors, forms = fragments.values, palette.values, palette.forms
@@ -111,10 +111,10 @@ def blend_quadratic(begin, end, fragments, palette, moves, t, jumps, split):
     for entry in range(end - 1, begin - 1, -1):
         at, key, move = listed_fragment(fragments, entry, forms)
         a0, a1, a2 = values[at + FORM], values[at + FORM + 1], values[at + FORM + 2]
-        jump = 0.0
+        crossing = 0.0
         if split:
-            jump = 0.5 * crossing_of(fragments, at)
-            a0 += jump
+            crossing = 0.5 * crossing_of(fragments, at)
+            a0 += crossing
         # colour - P, a form without radius
         v0 = load4(colors, key) - p0
         if moving:
@@ -125,8 +125,8 @@ def blend_quadratic(begin, end, fragments, palette, moves, t, jumps, split):
             v2 = -p2
         moved = abs(v1) + abs(v2)
         size = abs(v0) + moved
-        if jump > 0.0:
-            _keep_distances(number, entry, v0 - moved, v0 + moved, size, jumps)
+        if crossing > 0.0:
+            _keep_distances(number, entry, v0 - moved, v0 + moved, size, crossings)
             number += 1
         # p^3 = 3/4 p + T3/4 and p^4 = p^2 - 1/8 + T4/8
         cubic = fma(a1, v2, a2 * v1)
@@ -140,7 +140,7 @@ def blend_quadratic(begin, end, fragments, palette, moves, t, jumps, split):
         dropped = fma(0.25, abs(cubic), 0.125 * abs(quartic))
         added = fma(values[at + ALPHA_HIGH], load4(colors, key + 4 * forms), dropped)
         added = fma(
-            values[at + FORM + 3] - jump, size, fma(FRAGMENT_ROUNDING, fma(1.0 + a1 + a2, size, abs(p0)), added)
+            values[at + FORM + 3] - crossing, size, fma(FRAGMENT_ROUNDING, fma(1.0 + a1 + a2, size, abs(p0)), added)
         )
         r = fma(1.0 - values[at + ALPHA_LOW], r, added)
         ends = blend_interval(ends, values, at, colors, key + color_ends(forms))
@@ -181,8 +181,8 @@ def _curve_range(t, u, m):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _step_of_several(r, at, key, jump, fragments, palette, t, u, m):
-    """One fragment over polynomials and radii ``r``, drawn also where it may be skipped by 2 ``jump`` (B7, B10, B11).
+def _step_of_several(r, at, key, crossing, fragments, palette, t, u, m):
+    """One fragment over polynomials and radii ``r``, drawn also up to 2 ``crossing`` of skipped alpha (B7, B10, B11).
 
     Returns the new radii, and the least and greatest of its colour beyond what lies behind, up to rounding of a size.
     ``t`` [m + bends, 4] holds the coefficients of order 0 and 1, then those of products of two parameters; ``u`` [m, 4]
@@ -196,7 +196,7 @@ def _step_of_several(r, at, key, jump, fragments, palette, t, u, m):
     about, bent = values[at + BEND], values[at + BEND_SPREAD]
     sunk, risen = _curve_range(t, u, m)
     middle_curve, wound, curved = 0.5 * (sunk + risen), 0.5 * (risen - sunk), maximum(risen, -sunk)
-    a0 = form[0] + jump
+    a0 = form[0] + crossing
     remaining = a0 + about
     p0 = load4(t, 0)
     value = load4(colors, key) - p0
@@ -229,7 +229,7 @@ def _step_of_several(r, at, key, jump, fragments, palette, t, u, m):
     dropped = fma(steep, wound, bent * (change_size + wound)) * UP
     added = fma(values[at + ALPHA_HIGH], load4(colors, key + 4 * forms), dropped)
     rounding = fma(1.0 + steep + 2.0 * bent, size + 2.0 * curved, abs(middle))
-    added = fma(form[m] - jump, size * UP, fma(FRAGMENT_ROUNDING, rounding, added))
+    added = fma(form[m] - crossing, size * UP, fma(FRAGMENT_ROUNDING, rounding, added))
     return fma(1.0 - values[at + ALPHA_LOW], r, added), nearest, farthest, size
 
 
@@ -242,7 +242,7 @@ def flattened(t, r, u, m):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def blend_several(begin, end, fragments, palette, moves, t, m, jumps, split):
+def blend_several(begin, end, fragments, palette, moves, t, m, crossings, split):
     """`blend_quadratic` for several parameters, or none (design.md, B7, B10).
 
     ``t`` [m + bends, 4] receives the polynomials with their curvature (see `flattened`).
@@ -261,12 +261,12 @@ def blend_several(begin, end, fragments, palette, moves, t, m, jumps, split):
         for byte in range(0, 8 * fragments.width, LINE):
             prefetch(values, ahead, byte)
         at, key, move = listed_fragment(fragments, entry, forms)
-        jump = 0.0
+        crossing = 0.0
         if split:
-            jump = 0.5 * crossing_of(fragments, at)
-        r, nearest, farthest, size = _step_of_several(r, at, key, jump, fragments, palette, t, u, m)
-        if jump > 0.0:
-            _keep_distances(number, entry, nearest, farthest, size, jumps)
+            crossing = 0.5 * crossing_of(fragments, at)
+        r, nearest, farthest, size = _step_of_several(r, at, key, crossing, fragments, palette, t, u, m)
+        if crossing > 0.0:
+            _keep_distances(number, entry, nearest, farthest, size, crossings)
             number += 1
         ends = blend_interval(ends, values, at, colors, key + color_ends(forms))
         if move != 0:
@@ -338,23 +338,23 @@ def _form_bounds(begin, end, block, inputs, linear):
 
     The block's sums receive the polynomials, scratch behind them; ``linear`` tells whether their sets are asked for.
     """
-    fragments, palette, moves, jumps = block.fragments, block.palette, block.reordering.moves, block.jumps
+    fragments, palette, moves, crossings = block.fragments, block.palette, block.reordering.moves, block.crossings
     t, limit = block.sums, inputs.rules.alpha_min * (1.0 - inputs.charges.threshold)
     d, order, m = inputs.shape.dimensions, inputs.shape.order, inputs.shape.monomials
     u = advanced(t, 4 * (m + fragments.bends))
     if order == 2:
-        blended = blend_quadratic(begin, end, fragments, palette, moves, t, jumps, True)
+        blended = blend_quadratic(begin, end, fragments, palette, moves, t, crossings, True)
     else:
-        blended = blend_several(begin, end, fragments, palette, moves, t, m, jumps, True)
+        blended = blend_several(begin, end, fragments, palette, moves, t, m, crossings, True)
     radius, ends = blended.radius, blended.ends
     # the radius' own rounding: three for every fragment
     up = UP + LAYER_ROUNDING * (end - begin)
     falls, rises = 0.0 * radius, 0.0 * radius
-    if blended.jumps > 0:
+    if blended.crossings > 0:
         store(u, 0, radius * up)
-        set_blend(t, u, jumps, d)
+        set_blend(t, u, crossings, d)
         store(u, 16, blended.since)
-        gather_crossings(begin, end, blended.jumps, advanced(u, 16), fragments, jumps, u, inputs.shape)
+        gather_crossings(begin, end, blended.crossings, advanced(u, 16), fragments, crossings, u, inputs.shape)
         falls, rises = load4(u, 0), load4(u, 4)
     if order == 1:
         radius = flattened(t, radius, u, m)
@@ -366,18 +366,18 @@ def _form_bounds(begin, end, block, inputs, linear):
     # what skipping adds to bounds without it
     drawn_low, drawn_high = maximum(ends.low, drawn_low), minimum(ends.high, drawn_high)
     added = (minimum(ends.high, high) - drawn_high) + (drawn_low - maximum(ends.low, low))
-    if blended.jumps == 0 or d == 0 or bits(added > _CROSSINGS_MATTER * (drawn_high - drawn_low)) & 7 == 0:
+    if blended.crossings == 0 or d == 0 or bits(added > _CROSSINGS_MATTER * (drawn_high - drawn_low)) & 7 == 0:
         return _PixelResult(low, high, ends, center, radius)
     store(u, 0, falls)
     store(u, 4, rises)
-    bound_by_parts(blended.jumps, limit, jumps, u, d)
+    bound_by_parts(blended.crossings, limit, crossings, u, d)
     low, high = maximum(low, load4(u, 0)), minimum(high, load4(u, 4))
     if linear:
         # what is off the slopes alone
-        set_straight(jumps, d, order)
+        set_straight(crossings, d, order)
         store(u, 0, falls)
         store(u, 4, rises)
-        bound_by_parts(blended.jumps, limit, jumps, u, d)
+        bound_by_parts(blended.crossings, limit, crossings, u, d)
         least, most = load4(u, 0), load4(u, 4)
         half = 0.5 * (most - least) + FRAGMENT_ROUNDING * (abs(least) + abs(most))
         center = where(half < radius, 0.5 * (least + most), center)

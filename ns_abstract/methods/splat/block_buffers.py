@@ -66,7 +66,7 @@ class Buffers(NamedTuple):
     pairs: np.ndarray
     skipped: np.ndarray
     distances: np.ndarray
-    jumps: np.ndarray
+    crossings: np.ndarray
 
 
 @njit(cache=True, error_model="numpy")
@@ -123,7 +123,7 @@ def new_buffers(shape, forms, pair_limit, background):
         pairs=np.empty((pair_limit, 2), np.int64),
         skipped=np.empty(_CAPACITY, np.int64),
         distances=np.empty(8 * _CAPACITY),
-        jumps=np.zeros((crossing_rows(shape), _crossing_columns(shape, _CAPACITY))),
+        crossings=np.zeros((crossing_rows(shape), _crossing_columns(shape, _CAPACITY))),
     )
 
 
@@ -138,7 +138,7 @@ def resized(old, positions, capacity, shape, forms):
     values, lists, light, drawn, of_slots, moves = (
         old.values, old.lists, old.light, old.drawn, old.places, old.moves,
     )  # fmt: skip
-    skipped, distances, jumps, part_ends = old.skipped, old.distances, old.jumps, old.part_ends
+    skipped, distances, crossings, part_ends = old.skipped, old.distances, old.crossings, old.part_ends
     if capacity > lists.shape[1]:
         values = _aligned(capacity * PIXELS * fragment_width(shape))
         lists = np.empty((PIXELS, capacity, LISTED), np.uint32)
@@ -147,7 +147,7 @@ def resized(old, positions, capacity, shape, forms):
         of_slots = np.empty((2 * capacity, PIXELS), np.uint32)
         moves = np.empty((32 * capacity, MOVES))
         skipped, distances = np.empty(capacity, np.int64), np.empty(8 * capacity)
-        jumps = np.zeros((crossing_rows(shape), _crossing_columns(shape, capacity)))
+        crossings = np.zeros((crossing_rows(shape), _crossing_columns(shape, capacity)))
         part_ends = _part_ends(shape, capacity)
     return Buffers(
         per_pixel=old.per_pixel,
@@ -175,7 +175,7 @@ def resized(old, positions, capacity, shape, forms):
         pairs=old.pairs,
         skipped=skipped,
         distances=distances,
-        jumps=jumps,
+        crossings=crossings,
     )
 
 
@@ -224,8 +224,8 @@ def block_of(buffers, shape, forms):
         pointer(buffers.batch[1]),
         pointer(buffers.rows),
     )
-    jumps = ThresholdCrossings(
-        pointer(buffers.skipped), pointer(buffers.distances), pointer(buffers.jumps), buffers.jumps.shape[1]
+    crossings = ThresholdCrossings(
+        pointer(buffers.skipped), pointer(buffers.distances), pointer(buffers.crossings), buffers.crossings.shape[1]
     )
     return PixelBlock(
         fragments,
@@ -234,7 +234,7 @@ def block_of(buffers, shape, forms):
         entries,
         reordering,
         batch,
-        jumps,
+        crossings,
         pointer(buffers.part_ends),
         pointer(buffers.sums),
         pointer(buffers.ray),

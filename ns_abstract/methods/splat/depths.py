@@ -145,10 +145,10 @@ def _blend_depths(begin, end, block, t, by_lane, order, m):
     """Blend a pixel's shifted depths and accumulation: polynomials in ``t``, then ends and radii by lane."""
     fragments, moves = block.fragments, block.reordering.moves
     if order == 2:
-        blended = blend_quadratic(begin, end, fragments, block.shifted, moves, t, block.jumps, False)
+        blended = blend_quadratic(begin, end, fragments, block.shifted, moves, t, block.crossings, False)
         r = blended.radius
     else:
-        blended = blend_several(begin, end, fragments, block.shifted, moves, t, m, block.jumps, False)
+        blended = blend_several(begin, end, fragments, block.shifted, moves, t, m, block.crossings, False)
         r = flattened(t, blended.radius, advanced(t, 4 * (m + fragments.bends)), m)
     ends = blended.ends
     r = r * (UP + LAYER_ROUNDING * (end - begin))

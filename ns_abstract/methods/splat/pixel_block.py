@@ -72,7 +72,7 @@ class Fragments(NamedTuple):
             ``bends`` more.
         width: Numbers of a fragment.
         bends: Coefficients of products of two parameters that are kept beside forms of order 1.
-        jump: See `crossing_column`.
+        crossing: See `crossing_column`.
         parts: Parts of the cell that pixels are bounded over; 0: fragments have forms.
         lists: [PIXELS, capacity, LISTED] each pixel's fragments, nearest first.
         light: [PIXELS, capacity, 2] the light at each: see `LEFT`.
@@ -84,7 +84,7 @@ class Fragments(NamedTuple):
     values: np.ndarray
     width: int
     bends: int
-    jump: int
+    crossing: int
     parts: int
     lists: np.ndarray
     light: np.ndarray
@@ -204,7 +204,7 @@ class PixelBlock(NamedTuple):
     entries: ListEntries
     reordering: Reordering
     batch: FragmentBatch
-    jumps: ThresholdCrossings
+    crossings: ThresholdCrossings
     part_ends: np.ndarray
     sums: np.ndarray
     ray: np.ndarray
@@ -282,7 +282,7 @@ def set_unknown(fragments, at, high, m):
         values[at + k] = 0.0
     values[at + BEND] = 0.0
     values[at + BEND_SPREAD] = 0.0
-    values[at + fragments.jump] = 0.0
+    values[at + fragments.crossing] = 0.0
     values[at + FORM] = 0.5 * high
     for k in range(1, m):
         values[at + FORM + k] = 0.0
@@ -292,7 +292,7 @@ def set_unknown(fragments, at, high, m):
 @njit(cache=True, error_model="numpy", forceinline=True)
 def crossing_of(fragments, at):
     """By how much alpha of the fragment at ``at`` may fall where it is skipped; half of it is in its form (B4, B11)."""
-    return min(fragments.values[at + fragments.jump], fragments.values[at + ALPHA_HIGH])
+    return min(fragments.values[at + fragments.crossing], fragments.values[at + ALPHA_HIGH])
 
 
 @njit(cache=True, error_model="numpy", inline="always")

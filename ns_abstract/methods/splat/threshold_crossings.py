@@ -79,13 +79,13 @@ def _columns(count):
 
 
 @njit(cache=True, error_model="numpy")
-def gather_crossings(begin, end, count, since, fragments, jumps, out, shape):
+def gather_crossings(begin, end, count, since, fragments, crossings, out, shape):
     """Fill the rows of ``count`` fragments of the list entries [begin, end), and bound what skipping changes (B11).
 
     By channel, only those from number ``since`` [4] on count. ``out`` [16] receives by how much it lowers and raises
     the channels at most, without regard to where; the rest is scratch.
     """
-    values, rows, room, d = fragments.values, jumps.rows, jumps.room, shape.dimensions
+    values, rows, room, d = fragments.values, crossings.rows, crossings.room, shape.dimensions
     bends = d * (d + 1) // 2
     products = FORM + 1 + d if shape.order == 2 else FORM + d + 2
     first = load4(since, 0)
@@ -102,15 +102,15 @@ def gather_crossings(begin, end, count, since, fragments, jumps, out, shape):
         if number < 0:
             break
         at = int(fragments.lists[LISTED * entry]) * fragments.width
-        if jumps.entries[number] == entry:
+        if crossings.entries[number] == entry:
             # raised by what is darker than what lies behind; surely lowered where surely skipped, if brighter
-            nearest, farthest = load4(jumps.distances, 8 * number), load4(jumps.distances, 8 * number + 4)
+            nearest, farthest = load4(crossings.distances, 8 * number), load4(crossings.distances, 8 * number + 4)
             counts = first <= float(number)
             up = where(counts, where(nearest < 0.0, -most * grow, -least * (2.0 - grow)) * nearest, 0.0)
             down = where(counts, where(farthest > 0.0, most * grow, least * (2.0 - grow)) * farthest, 0.0)
-            jump = crossing_of(fragments, at)
-            rises = fma(maximum(0.0, up), jump, rises)
-            falls = fma(maximum(0.0, down), jump, falls)
+            crossing = crossing_of(fragments, at)
+            rises = fma(maximum(0.0, up), crossing, rises)
+            falls = fma(maximum(0.0, down), crossing, falls)
             store(out, 8, up)
             store(out, 12, down)
             column = CROSSING_LANES + number
@@ -120,7 +120,7 @@ def gather_crossings(begin, end, count, since, fragments, jumps, out, shape):
                 rows[(_WEIGHTS + 3 + channel) * room + column] = out[12 + channel]
                 weights += abs(out[8 + channel]) + abs(out[12 + channel])
             rows[_SIZES * room + column] = weights * UP
-            center = values[at + FORM] + 0.5 * jump
+            center = values[at + FORM] + 0.5 * crossing
             size = abs(center)
             rows[CROSSING_FORM * room + column] = center
             for k in range(d):
@@ -131,10 +131,10 @@ def gather_crossings(begin, end, count, since, fragments, jumps, out, shape):
                 bend = values[at + products + pair]
                 rows[(CROSSING_FORM + 1 + d + pair) * room + column] = bend
                 size += abs(bend)
-            radius = (values[at + FORM + shape.monomials] - 0.5 * jump + PART_ROUNDING * size) * UP
+            radius = (values[at + FORM + shape.monomials] - 0.5 * crossing + PART_ROUNDING * size) * UP
             rows[_RADIUS * room + column] = radius
             rows[_TOP * room + column] = values[at + ALPHA_HIGH]
-            rows[_THRESHOLD * room + column] = values[at + fragments.jump]
+            rows[_THRESHOLD * room + column] = values[at + fragments.crossing]
             rows[_SIZE * room + column] = (size + radius) * UP
             number -= 1
         most *= 1.0 - values[at + ALPHA_LOW]
@@ -144,9 +144,9 @@ def gather_crossings(begin, end, count, since, fragments, jumps, out, shape):
 
 
 @njit(cache=True, error_model="numpy")
-def set_blend(t, radii, jumps, d):
+def set_blend(t, radii, crossings, d):
     """Write the polynomials ``t`` [., 4] and ``radii`` [4] of the three channels before the fragments' forms."""
-    rows, room = jumps.rows, jumps.room
+    rows, room = crossings.rows, crossings.room
     for channel in range(CROSSING_LANES):
         size = 0.0
         for row in range(1 + d + d * (d + 1) // 2):
@@ -158,18 +158,18 @@ def set_blend(t, radii, jumps, d):
 
 
 @njit(cache=True, error_model="numpy")
-def set_straight(jumps, d, order):
+def set_straight(crossings, d, order):
     """Take out of the blends what linear sets follow: slopes, and of one parameter and order 2 the curvature (B11)."""
-    rows, room = jumps.rows, jumps.room
+    rows, room = crossings.rows, crossings.room
     for row in range(1, 1 + d + (1 if order == 2 else 0)):
         for channel in range(3):
             rows[(CROSSING_FORM + row) * room + channel] = 0.0
 
 
 @njit(cache=True, error_model="numpy")
-def _restrict(columns, middle, half, jumps, d):
+def _restrict(columns, middle, half, crossings, d):
     """The first ``columns`` forms over the part of the box about ``middle`` [d] of the half-widths ``half`` [d]."""
-    rows, room = jumps.rows, jumps.room
+    rows, room = crossings.rows, crossings.room
     part = _restricted_rows(d)
     behind = part + d
     shared = advanced(rows, (behind + _SCRATCH) * room)
@@ -212,12 +212,12 @@ def _restrict(columns, middle, half, jumps, d):
 
 
 @njit(cache=True, error_model="numpy")
-def _set_planes(columns, limit, jumps, d):
+def _set_planes(columns, limit, crossings, d):
     """Planes above and below what skipping takes of each fragment over a part, from what `_restrict` left (B11).
 
     A fragment surely is skipped below alpha ``limit``.
     """
-    rows, room = jumps.rows, jumps.room
+    rows, room = crossings.rows, crossings.room
     part = _restricted_rows(d)
     behind = part + d
     for column in range(CROSSING_LANES, columns, CROSSING_LANES):
@@ -257,12 +257,12 @@ def _weighted(weight, above, below, above_at_0, below_at_0, before):
 
 
 @njit(cache=True, error_model="numpy")
-def _by_planes(columns, side, place, bounds, jumps, d):
+def _by_planes(columns, side, place, bounds, crossings, d):
     """Upper bounds over a part of ``side`` (1 or -1) times each channel, by planes chosen at ``place`` [d] of it.
 
     ``bounds`` [4 + 4 d] receives those of three channels, and behind the slopes of each parameter.
     """
-    rows, room = jumps.rows, jumps.room
+    rows, room = crossings.rows, crossings.room
     part = _restricted_rows(d)
     behind = part + d
     weights, products = (_WEIGHTS if side > 0.0 else _WEIGHTS + 3) * room, (behind + _PRODUCTS) * room
@@ -319,14 +319,14 @@ def _by_planes(columns, side, place, bounds, jumps, d):
 
 
 @njit(cache=True, error_model="numpy")
-def _part_bounds(columns, side, place, bounds, jumps, d):
+def _part_bounds(columns, side, place, bounds, crossings, d):
     """`_by_planes` at the corner that the blends point to, or between where the planes point back; the better."""
-    rows, room = jumps.rows, jumps.room
+    rows, room = crossings.rows, crossings.room
     part = _restricted_rows(d)
     for k in range(d):
         at = (part + 1 + k) * room
         place[k] = math.copysign(1.0, side * (rows[at] + rows[at + 1] + rows[at + 2]))
-    _by_planes(columns, side, place, bounds, jumps, d)
+    _by_planes(columns, side, place, bounds, crossings, d)
     turned = False
     for k in range(d):
         slopes = advanced(bounds, 4 + 4 * k)
@@ -335,14 +335,14 @@ def _part_bounds(columns, side, place, bounds, jumps, d):
             turned = True
     if turned:
         first, second, third = bounds[0], bounds[1], bounds[2]
-        _by_planes(columns, side, place, bounds, jumps, d)
+        _by_planes(columns, side, place, bounds, crossings, d)
         bounds[0], bounds[1], bounds[2] = min(first, bounds[0]), min(second, bounds[1]), min(third, bounds[2])
 
 
 @njit(cache=True, error_model="numpy")
-def _choose_parts(columns, pieces, jumps, d):
+def _choose_parts(columns, pieces, crossings, d):
     """Write into how many ``pieces`` [d] each axis is cut: the one along which what is taken varies most, in turn."""
-    rows, room = jumps.rows, jumps.room
+    rows, room = crossings.rows, crossings.room
     steepness = advanced(pieces, d)
     for k in range(d):
         varies = 0.0 * load8(rows, 0)
@@ -389,13 +389,13 @@ def _foremost(foretold, left):
 
 
 @njit(cache=True, error_model="numpy")
-def bound_by_parts(count, limit, jumps, out, d):
+def bound_by_parts(count, limit, crossings, out, d):
     """Bounds of three channels, whose blends `set_blend` wrote, with ``count`` fragments that may be skipped (B11).
 
     ``out`` [8] holds by how much skipping lowers the channels at most, then by how much it raises them; it receives
     lower bounds, then upper ones, each of three channels and one of none. ``d`` is positive.
     """
-    rows, room = jumps.rows, jumps.room
+    rows, room = crossings.rows, crossings.room
     columns, part = _columns(count), _restricted_rows(d)
     # behind what `_restrict` shares
     pieces = advanced(rows, (part + d + _SCRATCH) * room + CROSSING_LANES * d)
@@ -404,11 +404,11 @@ def bound_by_parts(count, limit, jumps, out, d):
     place = advanced(half, d)
     bounds = advanced(place, d)
     foretold = advanced(bounds, 4 + 4 * d)
-    _choose_parts(columns, pieces, jumps, d)
+    _choose_parts(columns, pieces, crossings, d)
     # what a part may reach at most, wherever fragments are skipped
     for number in range(_PARTS):
         _place_part(number, pieces, middle, half, d)
-        _restrict(CROSSING_LANES, middle, half, jumps, d)
+        _restrict(CROSSING_LANES, middle, half, crossings, d)
         for channel in range(3):
             reach = 0.0
             for k in range(d):
@@ -431,12 +431,12 @@ def bound_by_parts(count, limit, jumps, out, d):
         if wanted == 0:
             continue
         _place_part(number, pieces, middle, half, d)
-        _restrict(columns, middle, half, jumps, d)
-        _set_planes(columns, limit, jumps, d)
+        _restrict(columns, middle, half, crossings, d)
+        _set_planes(columns, limit, crossings, d)
         for side in range(2):
             if (wanted >> 4 * side) & 15 == 0:
                 continue
-            _part_bounds(columns, 1.0 if side == 1 else -1.0, place, bounds, jumps, d)
+            _part_bounds(columns, 1.0 if side == 1 else -1.0, place, bounds, crossings, d)
             for channel in range(3):
                 k = 4 * side + channel
                 bound = min(foretold[8 * number + k], bounds[channel])
