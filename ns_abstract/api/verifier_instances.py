@@ -91,10 +91,10 @@ class InstanceFolder:
             self.lines.append([*(file.name for file in written), str(self.seconds)])
             sides = zip(one.names, one.units, one.lower, one.upper, strict=True)
             self.boxes[full] = [dict(zip(("name", "unit", "lower", "upper"), side, strict=True)) for side in sides]
-            self.origins[full] = self._origin(job, frame, one, full)
+            self.origins[full] = self._provenance(job, frame, one, full)
 
-    def _origin(self, job: Certification, frame: int, box: ParameterBox, name: str) -> dict[str, Any]:
-        """Scene, property, pose and picture by which an instance can be traced."""
+    def _provenance(self, job: Certification, frame: int, box: ParameterBox, name: str) -> dict[str, Any]:
+        """Where an instance comes from: scene, property and pose, and its picture, which it writes."""
         middle = np.array([0.5 * (low + high) for low, high in zip(box.lower, box.upper, strict=True)])
         poses, camera = job.job.pose_sets[frame], job.pictures(frame).frame.camera
         origin: dict[str, Any] = {

@@ -148,8 +148,8 @@ def _seen(
     dashed = {"unsafe": "red, dashed: unsafe sets", "goal": "green, dashed: the goal"}
     extra = "".join(f"; {text}" for kind, text in dashed.items() if kind in legend)
     title = f"Seen {view.title}"
-    plot = draw_plane(outside, window, view.nearest, marks + _drawn(view.marks, x, y), title)
-    scene = behind(outside, view.nearest, "tubes alone")
+    plot = draw_plane(outside, window, view.clip, marks + _drawn(view.marks, x, y), title)
+    scene = behind(outside, view.clip, "tubes alone")
     text = (
         f"Where the camera is, in the run's normalised frame. {_MARKS_TEXT} boxes of all positions at a step, for a "
         f"few certified cells{extra}.{asked} {scene}"

@@ -85,38 +85,38 @@ def plane_marks(
 
 
 def region(
-    faces: Sequence[HalfSpace], loop: Loop, axes: tuple[int, int], window: PlotWindow, sign: float
+    half_spaces: Sequence[HalfSpace], loop: Loop, axes: tuple[int, int], window: PlotWindow, sign: float
 ) -> list[tuple[float, float]]:
-    """Corners of the part of a window where all faces are on one side, seen by where the camera is.
+    """The polygon, in the camera's coordinates of a plane, of the states in a window that lie within all half-spaces.
 
-    Empty where the set is not one of the two coordinates alone: a face that speaks of other states cannot be drawn. Of
-    a box, ends along the axis that is looked along are left out.
+    Empty where the set does not depend on the two coordinates alone: a half-space of other states cannot be drawn.
+    Those of the axis that is looked along are left out.
 
     Args:
-        faces: Of the set.
+        half_spaces: Of the set.
         loop: The loop.
         axes: The plane's axes of the world.
         window: The plane.
-        sign: 1: inside where all faces are above 0; -1: where all are below.
+        sign: 1: within where all half-spaces hold; -1: where all of their complements do.
     """
     matrix, offset = loop.camera.place
-    moved = [np.flatnonzero(row) for row in matrix]
-    if any(len(moved[axis]) != 1 for axis in axes) or moved[axes[0]][0] == moved[axes[1]][0]:
+    states_of_axis = [np.flatnonzero(row) for row in matrix]
+    if any(len(states_of_axis[axis]) != 1 for axis in axes) or states_of_axis[axes[0]][0] == states_of_axis[axes[1]][0]:
         return []
-    states = [int(moved[axis][0]) for axis in axes]
-    third = moved[3 - sum(axes)]
+    states = [int(states_of_axis[axis][0]) for axis in axes]
+    third = states_of_axis[3 - sum(axes)]
     (left, bottom), (right, top) = window.low, window.high
     corners = [(left, bottom), (right, bottom), (right, top), (left, top)]
     used = 0
-    for face in faces:
-        of = set(np.flatnonzero(face.normal).tolist())
-        if len(third) == 1 and of == {int(third[0])}:
+    for half_space in half_spaces:
+        depends_on = set(np.flatnonzero(half_space.normal).tolist())
+        if len(third) == 1 and depends_on == {int(third[0])}:
             continue
-        if not of <= set(states):
+        if not depends_on <= set(states):
             return []
         used += 1
-        slopes = [face.normal[k] / matrix[axis, k] for axis, k in zip(axes, states, strict=True)]
-        level = face.offset + sum(s * offset[axis] for s, axis in zip(slopes, axes, strict=True))
+        slopes = [half_space.normal[k] / matrix[axis, k] for axis, k in zip(axes, states, strict=True)]
+        level = half_space.offset + sum(s * offset[axis] for s, axis in zip(slopes, axes, strict=True))
         corners = _clipped(corners, sign * slopes[0], sign * slopes[1], sign * level)
     return corners if used else []
 
@@ -141,14 +141,14 @@ class LoopPlot:
     Attributes:
         title: In words.
         axes: The world's axes to the right and up.
-        nearest: As `ns_abstract.report.outside.SceneDrawing.picture` has it.
+        clip: The scene above it, towards the viewer, is left out; the world's unit.
         marks: What is drawn over the scene.
         window: What is shown.
     """
 
     title: str
     axes: tuple[int, int]
-    nearest: float
+    clip: float
     marks: Marks
     window: PlotWindow
 
@@ -156,22 +156,22 @@ class LoopPlot:
 def views(
     document: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], loop: Loop, outside: SceneDrawing | None, width: int
 ) -> list[LoopPlot]:
-    """From above and from the side, where the camera's position moves; pictures are ``width`` pixels wide."""
+    """Plots from above and from the side, ``width`` pixels wide; none where the camera's position does not move."""
     matrix, offset = loop.camera.place
     if not matrix.any():
         return []
-    whole = plane_marks(document, rows, loop, matrix[:2], offset[:2], ABOVE).ends
-    if whole is None:
+    extent = plane_marks(document, rows, loop, matrix[:2], offset[:2], ABOVE).ends
+    if extent is None:
         return []
     plots = []
-    for axes, title in ((ABOVE, "from above"), (sideways(*whole), "from the side")):
+    for axes, title in ((ABOVE, "from above"), (sideways(*extent), "from the side")):
         marks = plane_marks(document, rows, loop, matrix[list(axes)], offset[list(axes)], axes)
-        ends, nearest = marks.ends, np.inf
+        ends, clip = marks.ends, np.inf
         assert ends is not None
         if axes == ABOVE:
             # a ceiling would hide everything
             up = plane_marks(document, rows, loop, matrix[[0, 2]], offset[[0, 2]], (0, 2)).ends
             assert up is not None
-            nearest = float(up[1][1])
-        plots.append(LoopPlot(title, axes, nearest, marks, about(outside, axes, *ends, nearest, width)))
+            clip = float(up[1][1])
+        plots.append(LoopPlot(title, axes, clip, marks, about(outside, axes, *ends, clip, width)))
     return plots

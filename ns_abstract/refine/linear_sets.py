@@ -44,21 +44,24 @@ class LeafSets:
             self.bytes += sum(a.nbytes for a in entry)
 
     def leaves(self) -> Leaves:
-        """All of them, ordered by box and tile."""
+        """The linear bounds of all leaves, ordered by box and tile."""
         frame = self.tiles.frame
         d, side = frame.box.dimensions, frame.side
-        entries = sorted(self._sets.items(), key=lambda item: (item[1][0].lower, item[1][0].upper, item[0][1]))
+        entries = sorted(
+            ((box, tile, linear) for (_, tile), (box, linear) in self._sets.items()),
+            key=lambda entry: (entry[0].lower, entry[0].upper, entry[1]),
+        )
         n = len(entries)
-        tiles = self.tiles.numbers(np.array([e[0][1] for e in entries], np.int64))
+        tiles = self.tiles.numbers(np.array([tile for _, tile, _ in entries], np.int64))
 
         def stack(part: int, shape: tuple[int, ...]) -> np.ndarray:
-            rows = [entry[1][1][part] for entry in entries]
-            return np.stack(rows) if rows else np.zeros((0, *shape), np.float32)
+            arrays = [linear[part] for _, _, linear in entries]
+            return np.stack(arrays) if arrays else np.zeros((0, *shape), np.float32)
 
         slopes, offsets = (side, side, 3, d), (side, side, 3)
         return Leaves(
-            np.array([e[1][0].lower for e in entries], np.float64).reshape(n, d),
-            np.array([e[1][0].upper for e in entries], np.float64).reshape(n, d),
+            np.array([box.lower for box, _, _ in entries], np.float64).reshape(n, d),
+            np.array([box.upper for box, _, _ in entries], np.float64).reshape(n, d),
             np.stack([tiles // frame.across * side, tiles % frame.across * side], axis=1).astype(np.int32),
             stack(0, slopes),
             stack(1, offsets),
