@@ -316,10 +316,10 @@ def _stop_slack(q, darkest, brightest, room, block, inputs, u):
     fragments, palette, charges = block.fragments, block.palette, inputs.charges
     values, per_pixel, forms = fragments.values, fragments.per_pixel, palette.forms
     background, rho, lost_up = load4(palette.background, 0), per_pixel[RHO + q], 1.0 + charges.lost_light
+    store(u, 0, rho * lost_up * maximum(0.0, brightest - background))
+    store(u, 4, rho * lost_up * maximum(0.0, background - darkest))
     if per_pixel[HIDDEN + q] > 0.0:
         # what lies behind the stop depends on the order
-        store(u, 0, rho * lost_up * maximum(0.0, brightest - background))
-        store(u, 4, rho * lost_up * maximum(0.0, background - darkest))
         return
     stop = inputs.rules.transmittance_min * (1.0 + charges.transmittance)
     begin = q * fragments.capacity
@@ -336,8 +336,8 @@ def _stop_slack(q, darkest, brightest, room, block, inputs, u):
         lost = lost_up * min(rho, fragments.light[2 * entry + LIGHT], stop / (1.0 - values[at + ALPHA_HIGH]))
         falls = maximum(falls, lost * (maximum(0.0, value.high - background) + room))
         rises = maximum(rises, lost * (maximum(0.0, background - value.low) + room))
-    store(u, 0, falls)
-    store(u, 4, rises)
+    store(u, 0, minimum(load4(u, 0), falls))
+    store(u, 4, minimum(load4(u, 4), rises))
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
