@@ -1,6 +1,6 @@
 """How tight bounds of differences of two scenes are: compressed and pruned versions of runs against themselves.
 
-    python benchmarks/differences.py RUNS [--seconds 300] [--arithmetic float32] [--only quantised/x ...]
+    python benchmarks/differences.py RUNS [--seconds 300] [--until 1.1] [--arithmetic float32] [--only quantised/x ...]
 
 prints a table in Markdown, a row a pair of scenes and a set of poses: largest and mean difference, bound and rendered,
 and whether the largest bound is at most 1.3 times what was rendered, or 0.01 above it. RUNS holds the folders of two
@@ -12,6 +12,7 @@ from __future__ import annotations
 import argparse
 import sys
 import tempfile
+import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -26,8 +27,8 @@ from ns_abstract.methods.splat.write import write_splatfacto_run
 
 #: Columns of the table.
 COLUMNS = (
-    "pair", "set", "largest, bound", "largest, rendered", "ratio", "mean, bound", "mean, rendered", "seconds", "cells",
-    "reached",
+    "pair", "set", "largest, bound", "largest, rendered", "ratio", "mean, bound", "mean, rendered", "seconds",
+    "processor s", "cells", "reached",
 )  # fmt: skip
 #: Ratio, or difference, of the largest bound to the largest rendered difference that is asked for.
 RATIO, ROOM = 1.3, 0.01
@@ -82,13 +83,13 @@ def config(runs: Path, name: str) -> Path:
     return next((runs / name / "splatfacto").glob("*/config.yml"))
 
 
-def row(name: str, kind: str, change: nsa.Comparison) -> str:
+def row(name: str, kind: str, change: nsa.Comparison, processor: float) -> str:
     ratio = change.largest_upper / change.largest_lower if change.largest_lower > 0.0 else float("inf")
     reached = change.largest_upper <= max(RATIO * change.largest_lower, change.largest_lower + ROOM)
     return (
         f"| {name} | {kind} | {change.largest_upper:.4f} | {change.largest_lower:.4f} | {ratio:.3f} "
-        f"| {change.mean_upper:.5f} | {change.mean_lower:.5f} | {change.seconds:.0f} | {change.cell_count} "
-        f"| {'yes' if reached else 'no'} |"
+        f"| {change.mean_upper:.5f} | {change.mean_lower:.5f} | {change.seconds:.0f} | {processor:.0f} "
+        f"| {change.cell_count} | {'yes' if reached else 'no'} |"
     )
 
 
@@ -96,6 +97,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("runs", type=Path)
     parser.add_argument("--seconds", type=float, default=300.0, help="budget of each row")
+    parser.add_argument("--until", type=float, default=1.0, help="end a row at this ratio of its largest bound")
     parser.add_argument("--arithmetic", choices=("float32", "real"))
     parser.add_argument("--downscale-factor", type=float, default=1.0)
     parser.add_argument("--only", nargs="+", help="rows such as quantised/x")
@@ -122,8 +124,12 @@ def main() -> int:
                 if options.only and f"{name}/{kind}" not in options.only:
                     continue
                 poses = nsa.PoseSet(camera, **keywords)
-                found = nsa.compare(first, second, poses, time_budget=options.seconds, arithmetic=options.arithmetic)
-                print(row(name, kind, found), flush=True)
+                begun = time.process_time()
+                found = nsa.compare(
+                    first, second, poses, time_budget=options.seconds, arithmetic=options.arithmetic,
+                    on_progress=lambda now: now.covered < 1.0 or now.mpg > options.until * now.mpg_witness,
+                )  # fmt: skip
+                print(row(name, kind, found, time.process_time() - begun), flush=True)
     return 0
 
 

@@ -357,6 +357,44 @@ def test_stop_and_swap(order):
         case.check(order, parts=1, count=25, floor=floor)
 
 
+@both_orders
+def test_a_stop_hides_no_more_than_lies_behind_it(order):
+    """The brightest layer lies in front of the two that end the light."""
+    splats = scene(
+        {"mean": (0.0, 0.1, -4.0), "scale": 2.0, "opacity": 0.3, "color": (2.0, 2.0, 2.0)},
+        {"mean": (0.1, 0.0, -5.0), "scale": 2.0, "opacity": 0.992, "color": (0.1, 0.0, 0.0)},
+        {"mean": (0.1, 0.0, -6.0), "scale": 2.0, "opacity": 0.992, "color": (0.4, 0.2, 0.6)},
+        {"mean": (0.0, 0.1, -7.0), "scale": 2.0, "opacity": 0.9, "color": (0.3, 0.9, 0.1)},
+        background=(0.0, 0.5, 0.1),
+    )
+    case = Case(splats, moves(x=0.05))
+    middle = [case.image(v)[8, 8] for v in case.samples(case.poses.box, 15)]
+    assert np.abs(np.diff(middle, axis=0)).max() > 1e-3
+    for arithmetic in (REAL, FLOAT32):
+        width, sampled = case.check(order, parts=1, count=21, arithmetic=arithmetic)
+        # a stop leaves up to 0.012 of the light, and the brightest layer is 1.5 brighter than the background
+        assert (width[8, 8] < 1.7 * sampled[8, 8]).all() and sampled[8, 8].max() < 0.005
+        case.check(order, parts=4, count=5, arithmetic=arithmetic, floor=0.003)
+
+
+@both_orders
+@pytest.mark.parametrize("seed", range(4))
+def test_stops_in_random_stacks(order, seed):
+    random = np.random.default_rng(seed)
+    stack = [
+        {
+            "mean": (*random.uniform(-0.2, 0.2, 2), -5.0 - 0.05 * k), "scale": random.uniform(1.0, 3.0),
+            "opacity": random.uniform(0.9, 0.995), "color": random.uniform(0.0, 1.5, 3),
+        }
+        for k in range(7)
+    ]  # fmt: skip
+    splats = scene(*stack, background=random.uniform(0.0, 1.0, 3))
+    for limits in ({"x": 0.1}, {"yaw": 0.1}):
+        case = Case(splats, moves(**limits), camera(8, 8, 8.0))
+        for parts in (1, 8, 64):
+            case.check(order, parts=parts, count=5)
+
+
 def dim_case(background: float, moving: bool) -> Case:
     """A stack of layers that dims the light to 1e-3 half of the way."""
     places = [(0.02 * k, -0.01 * k, -4.0 - 0.3 * k) for k in range(20)]

@@ -34,7 +34,7 @@ from ns_abstract.methods.splat.write import write_splatfacto_run
 from ns_abstract.perturbation.specification import parse_perturbation
 from ns_abstract.refine.difference import DifferenceFrame, _polynomial_upper, linear_upper
 from ns_abstract.refine.goal import RefinementGoal
-from ns_abstract.refine.largest import LargestDifference
+from ns_abstract.refine.largest import TUNING, GainWatch, LargestDifference, LargestTuning
 from ns_abstract.refine.result import PartResult
 from ns_abstract.report.comparison import overall, verdict
 
@@ -88,6 +88,7 @@ class Parabolas:
     across: int = 2
     down: int = 2
     broken: bool = False
+    unsure: float = 0.0
     pose_set: Any = None
     tilewise: bool = False
     tiles_at_once: int | None = None
@@ -131,6 +132,11 @@ class Parabolas:
             linear = linear_sets(forms, low, high, 1)
             if self.broken and 0 in tiles:
                 forms[0, 0, 0] = np.nan
+            if self.unsure and tiles[0] == 0:
+                # as where rounding decides whether a threshold is met: no cell is narrow enough
+                forms[0, 0, 0, :, -1] += self.unsure
+                low[0, 0, 0], high[0, 0, 0] = 0.0, 1.0
+                linear = linear_sets(forms, low, high, 1)
             context = SimpleNamespace(nbytes=0)
             slopes = np.array([steep.mean()])
             found.append(
@@ -346,9 +352,9 @@ def test_what_is_no_number_is_no_bound() -> None:
     assert (found.upper[0, 0, 0] == 1.0).all() and found.upper[0, 0, 1].max() < 0.1
 
 
-def check_passes(whole: DifferenceFrame, goal: RefinementGoal) -> PartResult:
+def check_passes(whole: DifferenceFrame, goal: RefinementGoal, tuning: LargestTuning = TUNING) -> PartResult:
     """All passes over a frame: bounds hold renders, and what is told as rendered was rendered."""
-    found = LargestDifference(whole, whole, 0, goal).run()
+    found = LargestDifference(whole, whole, 0, goal, tuning=tuning).run()
     assert found.bounded and found.largest is not None
     assert (found.witness_upper <= found.upper).all() and (found.lower == 0.0).all()
     inside = whole._inside
@@ -366,6 +372,31 @@ def test_floors_leave_nothing_out(change: float) -> None:
     assert found.upper.max() <= 1.051 * found.largest.value
     # a floor is never taken for something rendered
     assert (found.witness_upper < found.largest.value).mean() > 0.5
+
+
+def test_a_pass_ends_where_narrower_cells_gain_nothing() -> None:
+    whole = parabolas(change=0.1, unsure=0.9)
+    found = check_passes(whole, RefinementGoal(1.05, 600.0, 4000), LargestTuning(patience=(2.0, 30)))
+    assert found.largest is not None
+    # one pixel stays open however narrow cells are; the others are as tight as without it
+    most = np.sort(found.upper.max(axis=-1).ravel())
+    assert most[-1] > 0.5 and most[-2] <= 1.051 * found.largest.value
+    # the last pass, which has no floor, has all of its cells; those before it give up soon
+    assert found.cells < 4000 + 300
+
+
+def test_what_gains_goes_on() -> None:
+    watch = GainWatch(LargestTuning(gain=0.01, patience=(2.0, 10)))
+    left_open = 1.0
+    for cells in range(0, 100, 5):
+        left_open *= 0.98
+        watch.look(cells, left_open)
+        assert not watch.idle
+    for cells in range(100, 201, 5):
+        watch.look(cells, 0.995 * left_open)
+        assert not watch.idle
+    watch.look(205, 0.995 * left_open)
+    assert watch.idle
 
 
 @pytest.mark.slow

@@ -35,6 +35,8 @@ class LargestTuning:
             that the goal asks for.
         room: What a pass leaves open at least beyond the largest rendered value.
         pass_share: Part of the time left that a pass may take, where others follow.
+        gain: Part of what a pass leaves open that it has to take away before it has had `patience` more cells.
+        patience: Multiple of the cells that the pass had when it last gained as much, and so many cells beside.
     """
 
     poses: int = 48
@@ -47,9 +49,30 @@ class LargestTuning:
     floors: tuple[float, ...] = (1.3,)
     room: float = 1e-3
     pass_share: float = 0.7
+    gain: float = 0.01
+    patience: tuple[float, int] = (2.0, 512)
 
 
 TUNING = LargestTuning()
+
+
+class GainWatch:
+    """Watches whether a pass still gains: what stays open in the narrowest cells takes ever more cells for nothing.
+
+    Attributes:
+        idle: Whether it gains no more.
+    """
+
+    def __init__(self, tuning: LargestTuning = TUNING) -> None:
+        self.tuning, self.idle = tuning, False
+        self._open, self._cells = float("inf"), 0
+
+    def look(self, cells: int, left_open: float) -> None:
+        """Take the number of cells so far, and what they leave open on average."""
+        multiple, more = self.tuning.patience
+        if left_open < (1.0 - self.tuning.gain) * self._open:
+            self._open, self._cells = left_open, cells
+        self.idle = cells > multiple * self._cells + more
 
 
 def search_largest(frame: DifferenceFrame, seed: int, over: Callable[[], bool], tuning: LargestTuning = TUNING) -> None:
@@ -221,18 +244,21 @@ class LargestDifference:
         started = time.perf_counter()
 
         def told(point: TracePoint, covered: float) -> None:
+            watch.look(point.cells, point.mpg)
             most = float(refinement.leaves.upper[refinement.tiles.inside].max(initial=0.0))
             most = min(self._most(self.upper), max(most, others))
             seconds = started - self.begin + point.seconds
             now = TracePoint(seconds, self.cells + point.cells, most, self._largest_rendered, covered)
             self.progress(now, 1.0 if self.bounded else covered)
 
+        watch = GainWatch(self.tuning)
         others = self._most(np.where(np.isin(np.arange(len(self.upper)), here)[:, None, None, None], 0.0, self.upper))
         # nothing above the floor is to be left open; without a floor, means are measured
         goal = replace(self.goal, ratio=self.goal.ratio if floor == 0.0 else 1.0, seconds=share * self._left())
         frame = self.frame.above(floor)
         refinement = Refinement(
-            frame, self.index, goal, seed=self.seed, stopped=lambda: self._late() or enough(refinement),
+            frame, self.index, goal, seed=self.seed,
+            stopped=lambda: self._late() or enough(refinement) or (share < 1.0 and refinement.covered and watch.idle),
             progress=told, tiles=here, known=earlier, initial=self._cover if first else cover,
         )  # fmt: skip
         try:

@@ -29,6 +29,9 @@ from ns_abstract.methods.splat.pixel_block import (
     BEND,
     BEND_SPREAD,
     FORM,
+    HIDDEN,
+    LEFT,
+    LIGHT,
     OPEN,
     RHO,
     color_ends,
@@ -303,6 +306,40 @@ def form_range(t, r, order, m):
     return bottom - room, top + room
 
 
+@njit(cache=True, error_model="numpy")
+def _stop_slack(q, darkest, brightest, room, block, inputs, u):
+    """By how much a stop that the fragments of pixel q ignore may lower and raise the picture (design.md, B6, iii).
+
+    ``darkest`` and ``brightest`` bound all colours of the list, ``room`` the rounding of its blend. The two go to the
+    first 8 numbers of ``u``, channels in lanes.
+    """
+    fragments, palette, charges = block.fragments, block.palette, inputs.charges
+    values, per_pixel, forms = fragments.values, fragments.per_pixel, palette.forms
+    background, rho, lost_up = load4(palette.background, 0), per_pixel[RHO + q], 1.0 + charges.lost_light
+    store(u, 0, rho * lost_up * maximum(0.0, brightest - background))
+    store(u, 4, rho * lost_up * maximum(0.0, background - darkest))
+    if per_pixel[HIDDEN + q] > 0.0:
+        # what lies behind the stop depends on the order
+        return
+    stop = inputs.rules.transmittance_min * (1.0 + charges.transmittance)
+    begin = q * fragments.capacity
+    value = BlendBounds(background, background, background, background)
+    falls = 0.0 * background
+    rises = falls
+    for entry in range(begin + int(fragments.lengths[q]) - 1, begin - 1, -1):
+        if fragments.light[2 * entry + LEFT] > stop:
+            # the program stops neither here nor before
+            break
+        at, key, _ = listed_fragment(fragments, entry, forms)
+        value = blend_interval(value, values, at, palette.values, key + color_ends(forms))
+        # a stop at this fragment shows the background in place of it and all behind it
+        lost = lost_up * min(rho, fragments.light[2 * entry + LIGHT], stop / (1.0 - values[at + ALPHA_HIGH]))
+        falls = maximum(falls, lost * (maximum(0.0, value.high - background) + room))
+        rises = maximum(rises, lost * (maximum(0.0, background - value.low) + room))
+    store(u, 0, minimum(load4(u, 0), falls))
+    store(u, 4, minimum(load4(u, 4), rises))
+
+
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _slack(q, ends, block, inputs, u):
     """By how much the bounds of pixel q are widened below and above beside what blending knows (design.md, B6, B8).
@@ -319,10 +356,11 @@ def _slack(q, ends, block, inputs, u):
     bright = max(1.0, light, -dark)
     rounding = charges.blend_fragment * block.fragments.lengths[q] + charges.blend_pixel
     slack = rounding * bright * SECOND_ORDER + inputs.colors.error + cutoffs.negligible * bright
-    # a stop that was ignored shows the background in place of what lies behind
-    rho = per_pixel[RHO + q] * (1.0 + charges.lost_light)
-    fall = rho * maximum(0.0, light - behind)
-    rise = rho * maximum(0.0, behind - dark)
+    fall = 0.0 * behind
+    rise = fall
+    if per_pixel[RHO + q] > 0.0:
+        _stop_slack(q, dark, light, rounding * bright, block, inputs, u)
+        fall, rise = load4(u, 0), load4(u, 4)
     # or else fragments that are missing show in place of the background
     passed = per_pixel[OPEN + q] * (1.0 + charges.lost_light)
     if passed > 0.0:
@@ -434,8 +472,9 @@ def shade(pixels, left, above, reordered, block, inputs, bounds):
         if bounds.parts.shape[0] > 0:
             write_parts(fall, rise, block.part_ends, bounds.parts[0, row, column], u)
         if linear.shape[0] > 0:
-            store(t, 0, pixel_bounds.center)
-            store(u, 0, (pixel_bounds.radius + maximum(fall, rise)) * UP)
+            center = pixel_bounds.center + 0.5 * (rise - fall)
+            store(t, 0, center)
+            store(u, 0, (pixel_bounds.radius + 0.5 * (rise + fall)) * UP + FRAGMENT_ROUNDING * abs(center))
             for channel in range(3):
                 for k in range(m):
                     linear[0, row, column, channel, k] = t[4 * k + channel]

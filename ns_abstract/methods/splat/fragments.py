@@ -67,6 +67,7 @@ def _start(numbers, inputs, block):
         per_pixel[RHO + q] = 0.0
         per_pixel[LOST + q] = 0.0
         per_pixel[OPEN + q] = 0.0
+        per_pixel[HIDDEN + q] = 0.0
         lengths[q] = 0
     room, largest = depth_radii(
         numbers, inputs.gaussians, inputs.axes.depth, block.ray, inputs.shape.monomials, entries
@@ -417,7 +418,6 @@ def apply_stops(slots, block, inputs):
     # the stop is out of reach of most pixels
     dark = 0
     for q in range(PIXELS):
-        per_pixel[HIDDEN + q] = 0.0
         if not per_pixel[TLO + q] > stop_high:
             dark |= 1 << q
     if dark == 0:
@@ -448,16 +448,15 @@ def apply_stops(slots, block, inputs):
             # the most light that a stop at this fragment may leave
             high = values[at + ALPHA_HIGH]
             lost = min(light, stop_high / (1.0 - high))
+            per_pixel[HIDDEN + q] = max(per_pixel[HIDDEN + q], lost)
             if t_high <= stop_low:
-                per_pixel[HIDDEN + q] = max(per_pixel[HIDDEN + q], lost)
                 set_unknown(fragments, at, 0.0, m)
             elif lost < light:
                 # kept; what the stop may leave of the light is added at the end
                 per_pixel[RHO + q] = max(per_pixel[RHO + q], lost, per_pixel[LOST + q])
             else:
-                per_pixel[HIDDEN + q] = max(per_pixel[HIDDEN + q], lost)
                 set_unknown(fragments, at, high, m)
-    # a stop at a dropped or weakened fragment also hides the kept fragments behind it
+    # a stop at one of these also hides the kept fragments behind it
     for q in range(PIXELS):
         if per_pixel[RHO + q] > 0.0:
             per_pixel[RHO + q] = max(per_pixel[RHO + q], per_pixel[HIDDEN + q])
