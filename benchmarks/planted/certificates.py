@@ -319,8 +319,8 @@ CERTIFICATES = (
     ),
     Fault(
         "chosen lines: many rows are those of the first thread",
-        "verify/network/row_ascent.py", "RowAscent._climb_cell", "part = own[first : first + step]",
-        "part = own[:step]", "test_phase_tree.py::test_several_threads_bound_the_same_rows",
+        "verify/network/row_ascent.py", "RowAscent._climb_cell", "rows[part]", "rows[own[: len(part)]]",
+        "test_phase_tree.py::test_several_threads_bound_the_same_rows",
     ),
     Fault(
         "phase tree: a branch that fails by little is proved",
