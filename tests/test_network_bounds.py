@@ -27,6 +27,7 @@ from ns_abstract.verify.network import (
     cost_model,
     forward,
     intermediate_bounds,
+    layers,
     load_network,
     max_pool_propagation,
     neuron_bounds,
@@ -35,7 +36,7 @@ from ns_abstract.verify.network import (
     work_budget,
 )
 from ns_abstract.verify.network.bounds import NetworkBounds
-from ns_abstract.verify.network.coefficients import columns_of, concretize
+from ns_abstract.verify.network.coefficients import Coefficients, columns_of, concretize, full
 from ns_abstract.verify.network.forward import ForwardPass
 from ns_abstract.verify.network.intermediate_bounds import IntermediateBounds
 from ns_abstract.verify.network.layers import Convolution
@@ -894,3 +895,27 @@ def test_transposed_strides(size: int, stride: int, tmp_path: Path) -> None:
     weight = torch.from_numpy(rng.integers(-8, 9, tuple(layer.weight.shape)).astype(np.float64))
     found = replace(layer, weight=weight)._transposed(value)
     assert torch.equal(found, torch.nn.functional.conv_transpose2d(value, weight.float(), stride=stride))
+
+
+def test_whole_maps_pass_strides_back(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the padding, and where inputs are read by no window: exact for small whole numbers."""
+    rng = np.random.default_rng(0)
+    joined = layers.interleave
+
+    def onto_used_memory(*given: Any) -> None:
+        given[-1].fill(np.nan)
+        joined(*given)
+
+    monkeypatch.setattr(layers, "interleave", onto_used_memory)
+    for _ in range(60):
+        (kh, kw), (s, t) = rng.integers(1, 6, 2).tolist(), rng.integers(1, 4, 2).tolist()
+        pads, (height, width) = tuple(rng.integers(0, 3, 4).tolist()), rng.integers(6, 12, 2).tolist()
+        h, w = (height + pads[0] + pads[2] - kh) // s + 1, (width + pads[1] + pads[3] - kw) // t + 1
+        weight = torch.from_numpy(rng.integers(-8, 9, (3, 2, kh, kw)).astype(np.float64))
+        layer = Convolution(((2, height, width),), (3, h, w), weight=weight, stride=(s, t), pads=pads)
+        value = rng.integers(-8, 9, (2, 3, h, w)).astype(np.float32)
+        found = full(layer.backward(Coefficients.whole(value.copy()))[0], layer.input_shapes[0], force=True).value
+        x = torch.zeros((2, 2, height, width), requires_grad=True)
+        (layer.apply([x]) * torch.from_numpy(value)).sum().backward()
+        assert x.grad is not None
+        assert torch.equal(torch.from_numpy(found), x.grad), (kh, kw, s, t, pads)

@@ -16,13 +16,16 @@ from onnx_files import OnnxFile, session
 from test_network_bounds import exact_least, mlp, residual
 from test_network_branching import line
 
+from ns_abstract.arithmetic.network_charges import UNIT
 from ns_abstract.execution.cancellation import Deadline
 from ns_abstract.verify import box_decisions
 from ns_abstract.verify.network import ImageSets, Network, NetworkArithmetic, bound_outputs, load_network
 from ns_abstract.verify.network.bounds import NetworkBounds
 from ns_abstract.verify.network.coefficients import grid
 from ns_abstract.verify.network.layers import Convolution, LeakyRelu, Matrix
-from ns_abstract.verify.network.phase_tree import PhaseTree, _Branch, _GroupRows
+from ns_abstract.verify.network.phase_tree import PhaseTree, _Branch, _GroupRows, _Half
+from ns_abstract.verify.network.relaxations import Relaxations
+from ns_abstract.verify.network.slope_choices import ReluSlopes, UnstableNeurons
 from ns_abstract.verify.network.stopping import BackwardBounds
 from ns_abstract.verify.vnnlib_sets import InputRegion, UnsafeSet
 
@@ -140,6 +143,76 @@ def test_branches_hold_for_the_images_in_them(name: str, radius: float, tmp_path
     tree = tree_of(network, images, rows, np.zeros(4))
     assert sum(len(own.units.flat) for own in tree.relus.values()) >= 5
     assert least_excess(network, tree, images, rows, 40 if name == "small" else 4) >= 0.0
+
+
+def test_halves_are_bounded_as_the_branches_that_they_become(tmp_path: Path) -> None:
+    """Halves of several branches together, each with what its own branch has chosen and assumes."""
+    network = load_network(small(tmp_path))
+    rng = np.random.default_rng(5)
+    tree = tree_of(network, box(np.full(3, -1.0), np.full(3, 1.0)), np.array([[1.0, -1.0]]), np.zeros(1))
+    group = _GroupRows.of(tree.shifted, [0], (1, 1, 2))
+    sizes = {k: len(own.units.flat) for k, own in tree.relus.items()}
+    branches, halves = [], []
+    for number in range(2):
+        phases = {k: rng.integers(-1, 2, size).astype(np.int8) for k, size in sizes.items()}
+        parameters = {k: [rng.uniform(size=(1, size)).astype(np.float32)] for k, size in sizes.items()}
+        multipliers = {k: rng.exponential(size=(1, size)).astype(np.float32) for k, size in sizes.items()}
+        branches.append(_Branch(phases, np.full(1, -np.inf), parameters, multipliers))
+        halves += [_Half(number, (min(sizes), 1), side) for side in (1, -1)]
+    together, _ = tree._ascent(group, branches, halves)
+    _, found = tree.ascent.evaluate(tree.index, group.start(len(halves)), 0, together)
+    children = [half for branch in branches for half in branch.halves((min(sizes), 1))]
+    alone, _ = tree._ascent(group, children)
+    _, wanted = tree.ascent.evaluate(tree.index, group.start(len(children)), 0, alone)
+    assert (group.lower(found) == group.lower(wanted)).all() and len(set(group.lower(found))) == 4
+
+
+@pytest.mark.parametrize("number", ["float32", "float64"])
+def test_lines_of_assumed_phases_enclose_the_piece(number: str) -> None:
+    """With a slope that the rows' type cannot hold, about references, on both sides of a row; tolerance zero."""
+    alpha, dtype = 0.3, {"float32": torch.float32, "float64": torch.float64}[number]
+    rng, count = np.random.default_rng(2), 40
+    lower, upper = -rng.exponential(1e3, count), rng.exponential(1e3, count)
+    # references that neither hide what a slope misses nor round it away
+    none, reference = np.zeros(count), np.round(rng.uniform(lower, upper))
+    units = UnstableNeurons(
+        none.astype(int), np.arange(count), lower, upper, reference, none, none, none,
+        LeakyRelu((count,), alpha), Relaxations(dtype, UNIT, 2.0**-45),
+    )  # fmt: skip
+    sides = np.stack([np.full(count, side, np.int8) for side in (1, -1)])
+    lines = np.full((6, 2, count), np.nan, np.float32 if number == "float32" else np.float64)
+    ReluSlopes(units, alpha).put(np.full((2, count), 0.5), lines, sides)
+    for r, exact in enumerate((Fraction(1), Fraction(alpha))):
+        for u in range(count):
+            slope, below, above = (Fraction(float(v)) for v in lines[:3, r, u])
+            assert [Fraction(float(v)) for v in lines[3:, r, u]] == [slope, above, below]
+            for z in (Fraction(0), Fraction(float((upper, lower)[r][u]))):
+                value = exact * z - slope * (z - Fraction(float(reference[u])))
+                assert below <= value <= above
+                # nor is much more charged than a float32 slope misses
+                assert above - below <= Fraction(2.0**-20) * Fraction(float(upper[u] - lower[u] + 1.0))
+
+
+def test_several_threads_bound_the_same_rows(tmp_path: Path) -> None:
+    """Rows that threads share are each bounded once: intermediate bounds with chosen lines are those of one thread."""
+    f = OnnxFile((8,), 3)
+    for size, to in ((8, 96), (96, 96)):
+        f.gemm(size, to)
+        f.node("Relu")
+    f.gemm(96, 2)
+    network = load_network(f.write(tmp_path / "threads.onnx"))
+    images, threads = box(np.full(8, -0.4), np.full(8, 0.6)), torch.get_num_threads()
+    found = []
+    try:
+        for count in (1, 2):
+            torch.set_num_threads(count)
+            cells = NetworkBounds(network, images, "everywhere", 1 << 30, "real", 1, intermediate_steps=3, coarse=True)
+            found.append(cells.intermediate.unstable[max(cells.intermediate.unstable)])
+    finally:
+        torch.set_num_threads(threads)
+    one, two = found
+    assert len(one.flat) >= 64 and (one.flat == two.flat).all()
+    assert np.allclose(one.lower, two.lower, rtol=1e-5) and np.allclose(one.upper, two.upper, rtol=1e-5)
 
 
 def test_what_is_not_known_is_not_proved(tmp_path: Path) -> None:

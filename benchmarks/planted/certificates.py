@@ -28,7 +28,7 @@ _BOXES = "verify/box_decisions.py"
 _EITHER = "test_vnnlib_runner.py::test_proofs_alone_never_decide_unsafe_instances"
 _BRANCHING, _SLOPES = "verify/network/branching.py", "verify/network/slope_optimisation.py"
 _BRANCHES = "test_network_branching.py::test_claims_next_to_the_exact_minimum"
-_TREE = "verify/network/phase_tree.py"
+_TREE, _LINES = "verify/network/phase_tree.py", "verify/network/relu_lines.py"
 _HELD = "test_phase_tree.py::test_branches_hold_for_the_images_in_them[small-1.0]"
 _LEVELS = "test_eight_bit.py::test_sets_hold_rounded_pictures"
 
@@ -304,8 +304,23 @@ CERTIFICATES = (
     ),
     Fault(
         "phase tree: lines of the other phase",
-        "verify/network/slope_choices.py", "ReluSlopes.fix", "np.nonzero(phases == side)",
-        "np.nonzero(phases == -side)", _HELD,
+        _LINES, "write_relu_lines", "phases[r, u] if len(phases) else 0", "-phases[r, u] if len(phases) else 0", _HELD,
+    ),
+    Fault(
+        "phase tree: what a stored slope of an assumed phase misses is left out",
+        _LINES, "write_relu_lines", "(exact - slope) * (upper if side > 0 else lower)", "0.0 * upper",
+        "test_phase_tree.py::test_lines_of_assumed_phases_enclose_the_piece[float32]",
+    ),
+    Fault(
+        "phase tree: a half is bounded from what another branch has chosen",
+        _TREE, "PhaseTree._ascent", "np.repeat(owner, g)",
+        "np.repeat(0 * owner, g)",
+        "test_phase_tree.py::test_halves_are_bounded_as_the_branches_that_they_become",
+    ),
+    Fault(
+        "chosen lines: many rows are those of the first thread",
+        "verify/network/row_ascent.py", "RowAscent._climb_cell", "rows[part]", "rows[own[: len(part)]]",
+        "test_phase_tree.py::test_several_threads_bound_the_same_rows",
     ),
     Fault(
         "phase tree: a branch that fails by little is proved",

@@ -152,6 +152,9 @@ MAGNITUDES_UP = 1.0 + 2.0**25 * DOUBLE_UNIT
 #: Rows on images: sums of at most 2^24 products of two roundings each, a middle and a half; what they have gathered
 #: on the way is moved by up to 2^4 roundings, twice.
 OWN_ROWS, OWN_GATHERED = 2.0**25 * DOUBLE_UNIT, 2.0**5 * DOUBLE_UNIT
+#: An offset that is moved out in float64 before it is stored in float32: the rounding (1), what sums of up to 2^26
+#: offsets lose (at most half a unit), and half a unit to spare; `FLUSH` besides, for offsets that are not normal.
+OWN_STORED = 2.0 * UNIT
 #: Ends of images: an offset and a reference, one difference of them, 1 each; 2 to spare.
 OWN_IMAGE = 4.0 * DOUBLE_UNIT
 

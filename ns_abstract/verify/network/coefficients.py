@@ -142,14 +142,15 @@ def add_gathered(value, y, x, height, width, index, target):
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def interleave(parts, s, t, whole):
-    """Put the ``s t`` parts of a transposed stride together.
+def interleave(parts, s, t, top, left, whole):
+    """Put the ``s t`` parts of a transposed stride together, and cut off what lies outside of ``whole``.
 
     Args:
-        parts: [R, s t C, h', w'], part by part; row ``s i + a`` and column ``t j + b`` of the whole is number i, j of
-            part ``t a + b``.
+        parts: [R, s t C, h', w'], part by part; row ``s i + a`` and column ``t j + b`` of the map that they make is
+            number i, j of part ``t a + b``.
         s, t: The stride.
-        whole: [R, C, h, w], h <= s h' and w <= t w'.
+        top, left: The row and the column of that map that ``whole`` begins with.
+        whole: [R, C, h, w]; zero where it is past the map.
     """
     count, channels, h, w = whole.shape
     high, wide = parts.shape[2:]
@@ -157,12 +158,21 @@ def interleave(parts, s, t, whole):
     for r in range(count):
         for c in range(channels):
             for y in range(h):
-                i, a = y // s, y % s
+                i, a = (y + top) // s, (y + top) % s
                 here = ((r * channels + c) * h + y) * w
+                if i >= high:
+                    for j in range(w):
+                        target[here + j] = 0.0
+                    continue
                 for b in range(t):
                     at = ((r * s * t * channels + (a * t + b) * channels + c) * high + i) * wide
-                    for j in range(-(-(w - b) // t)):
-                        target[here + b + t * j] = source[at + j]
+                    first = -(-(left - b) // t)
+                    # column t j + b of the map is column t j + b - left of the whole
+                    past = -(-(w + left - b) // t)
+                    for j in range(first, min(past, wide)):
+                        target[here + b - left + t * j] = source[at + j]
+                    for j in range(max(first, wide), past):
+                        target[here + b - left + t * j] = 0.0
 
 
 @njit(cache=True, error_model="numpy", nogil=True)

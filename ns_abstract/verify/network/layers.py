@@ -157,29 +157,35 @@ class Convolution(Weighted):
         parts = whole.reshape(out, into, high // s, s, wide // t, t).permute(3, 5, 1, 0, 2, 4)
         return parts.reshape(s * t * into, out, high // s, wide // t).flip(2, 3).contiguous()
 
+    def _phases_for(self, value: Tensor) -> Tensor | None:
+        """`_parts` in the type of ``value``."""
+        if value.dtype not in self._phases:
+            self._phases[value.dtype] = self._parts(self.weight_for(value))
+        return self._phases[value.dtype]
+
+    def _joined(self, value: Tensor, phases: Tensor, size: tuple[int, int], corner: tuple[int, int]) -> Tensor:
+        """[R, Cout, h, w] back to a window of ``size`` of the transposed convolution's map, from its ``corner`` on."""
+        high, wide = phases.shape[2:]
+        result = functional.conv2d(value, phases, padding=(high - 1, wide - 1)).numpy()
+        window = np.empty((len(value), self.weight.shape[1], *size), result.dtype)
+        interleave(result, *self.stride, *corner, window)
+        return torch.from_numpy(window)
+
     def _transposed(self, value: Tensor) -> Tensor:
         """[R, Cout, h, w] back to [R, Cin, (h - 1) s + kh, (w - 1) t + kw]."""
-        weight = self.weight_for(value)
-        if value.dtype not in self._phases:
-            self._phases[value.dtype] = self._parts(weight)
-        phases = self._phases[value.dtype]
+        phases = self._phases_for(value)
         if phases is None:
             return functional.conv_transpose2d(
-                value, weight, stride=self.stride, groups=self.groups, dilation=self.dilation
+                value, self.weight_for(value), stride=self.stride, groups=self.groups, dilation=self.dilation
             )
         (s, t), (kh, kw) = self.stride, self.weight.shape[2:]
+        size = (value.shape[2] - 1) * s + kh, (value.shape[3] - 1) * t + kw
         if kh == kw == 1:
-            near = functional.conv2d(value, weight.transpose(0, 1))
-            size = (near.shape[2] - 1) * s + 1, (near.shape[3] - 1) * t + 1
+            near = functional.conv2d(value, self.weight_for(value).transpose(0, 1))
             result = torch.zeros((*near.shape[:2], *size), dtype=value.dtype)
             result[:, :, ::s, ::t] = near
             return result
-        high, wide = phases.shape[2:]
-        result = functional.conv2d(value, phases, padding=(high - 1, wide - 1)).numpy()
-        size = (value.shape[2] - 1) * s + kh, (value.shape[3] - 1) * t + kw
-        whole = np.empty((len(value), self.weight.shape[1], *size), result.dtype)
-        interleave(result, s, t, whole)
-        return torch.from_numpy(whole)
+        return self._joined(value, phases, size, (0, 0))
 
     def roundings(self, active: Sequence[Tensor]) -> Tensor | int:
         out, taps = self.weight.shape[0] // self.groups, self.weight[0].numel()
@@ -210,18 +216,20 @@ class Convolution(Weighted):
         return self.stride == (1, 1) and spread == (height + 2 * top, width + 2 * left)
 
     def backward(self, rows: Coefficients) -> list[Coefficients]:
-        if self._trims and rows.covers(self.shape):
-            # nothing outside of the map is computed
-            value = torch.from_numpy(rows.value)
-            whole = functional.conv_transpose2d(
-                value,
-                self.weight_for(value),
-                padding=(self.pads[0], self.pads[1]),
-                groups=self.groups,
-                dilation=self.dilation,
-            )
-            return [Coefficients.whole(whole.numpy())]
-        value = self._transposed(torch.from_numpy(rows.value)).numpy()
+        value = torch.from_numpy(rows.value)
+        if rows.covers(self.shape):
+            # nothing outside of the map is kept
+            top, left = self.pads[:2]
+            if self._trims:
+                weight, groups, dilation = self.weight_for(value), self.groups, self.dilation
+                whole = functional.conv_transpose2d(
+                    value, weight, padding=(top, left), groups=groups, dilation=dilation
+                )
+                return [Coefficients.whole(whole.numpy())]
+            phases, (_, height, width) = self._phases_for(value), self.input_shapes[0]
+            if phases is not None and self.weight[0, 0].numel() > 1 and min(top, left) >= 0:
+                return [Coefficients.whole(self._joined(value, phases, (height, width), (top, left)).numpy())]
+        value = self._transposed(value).numpy()
         y, x = rows.y * self.stride[0] - self.pads[0], rows.x * self.stride[1] - self.pads[1]
         return [full(Coefficients(value, y, x), self.input_shapes[0])]
 

@@ -15,6 +15,9 @@ from ns_abstract.verify.network.row_ascent import RowAscent
 from ns_abstract.verify.network.stopping import BackwardBounds, BackwardTrace, NeuronTarget, StoppingCriterion
 from ns_abstract.verify.network.work_budget import WorkBudget
 
+#: Rows of a network that is not deep from which on several threads share them.
+_ROWS_OF_A_THREAD = 128
+
 
 class NeuronBounds:
     """Bounds chosen neurons of a node by backward passes of their own.
@@ -122,7 +125,7 @@ class NeuronBounds:
         channels = grid(self.network.shape(index))[0]
         bounds = BackwardBounds.unknown(len(where), self.intermediate.d)
         step = min(self.sharing.most_rows, max(1, ROWS_AT_ONCE // (16 * channels)))
-        threads = torch.get_num_threads() if self.schedule.deep else 1
+        threads = torch.get_num_threads() if self.schedule.deep or len(where) >= _ROWS_OF_A_THREAD else 1
         if threads > 1:
             # as many rows as stay together to the image
             step = min(step, max(16, -(-len(where) // (4 * threads))))

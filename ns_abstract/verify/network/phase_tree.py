@@ -36,12 +36,12 @@ class TreeTuning:
         waiting: Most branches that wait.
     """
 
-    together: int = 64
+    together: int = 128
     root_steps: int = 20
-    steps: int = 4
+    steps: int = 3
     last_steps: int = 60
     first: float = 0.2
-    tried: int = 10
+    tried: int = 20
     better_half: float = 1.0
     waiting: int = 1 << 14
 
@@ -84,6 +84,14 @@ class _Branch:
             own[at] = side
             children.append(replace(self, phases={**self.phases, node: own}))
         return children
+
+
+class _Half(NamedTuple):
+    """A branch by its number, and a neuron whose phase, 1 or -1, is assumed besides: its activation and its number."""
+
+    branch: int
+    split: tuple[int, int]
+    side: int
 
 
 class PhaseTree:
@@ -139,19 +147,29 @@ class PhaseTree:
                 heapq.heappush(waiting, (float(branch.lower.max()), next(number), branch))
         return TreeResult(True, count, 0.0)
 
-    def _ascent(self, rows: _GroupRows, branches: Sequence[_Branch]) -> tuple[DualAscent, dict[int, tuple[int, Int64]]]:
-        """The rows of all branches, ready to choose, from what these have chosen before; and `_held`'s places."""
+    def _ascent(
+        self, rows: _GroupRows, branches: Sequence[_Branch], halves: Sequence[_Half] = ()
+    ) -> tuple[DualAscent, dict[int, tuple[int, Int64]]]:
+        """The rows of all branches, or of ``halves`` of them, ready to choose, from what the branches have chosen.
+
+        Returns `_held`'s places besides.
+        """
         g = len(rows.offset)
-        phases = {k: np.repeat(np.stack([b.phases[k] for b in branches]), g, 0) for k in self.relus}
+        owner = np.array([half.branch for half in halves]) if halves else np.arange(len(branches))
+        number = (owner[:, None] * g + np.arange(g)).reshape(-1)
+        phases = {k: np.stack([b.phases[k] for b in branches])[np.repeat(owner, g)] for k in self.relus}
+        for place, (_, (node, at), side) in enumerate(halves):
+            phases[node][place * g : (place + 1) * g, at] = side
         held, places = self._held(phases)
         lines = {k: self.intermediate.relaxations[-1].lines[k][:, 0] for k in self.choices}
-        ascent = DualAscent(self.choices, lines, len(branches) * g, held, phases, self.tuning.first)
+        ascent = DualAscent(self.choices, lines, len(number), held, phases, self.tuning.first)
         if branches[0].parameters:
             for k, own in ascent.parameters.items():
-                for number in range(len(own)):
-                    own[number] = np.concatenate([b.parameters[k][number] for b in branches]).astype(np.float64)
+                for choice in range(len(own)):
+                    stored = np.concatenate([b.parameters[k][choice] for b in branches])
+                    own[choice] = stored[number].astype(np.float64)
             for source, (k, used) in places.items():
-                ascent.multipliers[source] = np.concatenate([b.multipliers[k][:, used] for b in branches])
+                ascent.multipliers[source] = np.concatenate([b.multipliers[k][:, used] for b in branches])[number]
         return ascent, places
 
     def _held(self, phases: Phases) -> tuple[dict[int, SplitNeurons], dict[int, tuple[int, Int64]]]:
@@ -221,27 +239,26 @@ class PhaseTree:
 
     def _halves(self, rows: _GroupRows, branches: Sequence[_Branch]) -> list[_Branch]:
         """Both halves of each branch, of the candidates the one whose worse half is bounded best."""
-        g, halves, owner = len(rows.offset), [], []
-        for number, branch in enumerate(branches):
-            for split in branch.splits:
-                halves.append(branch.halves(split))
-                owner.append(number)
+        g = len(rows.offset)
+        splits = [(number, split) for number, branch in enumerate(branches) for split in branch.splits]
         bounds = []
         step = max(1, self.tuning.together // (2 * g))
-        for first in range(0, len(halves), step):
+        for first in range(0, len(splits), step):
             check_cancelled()
-            part = [half for pair in halves[first : first + step] for half in pair]
-            ascent, _ = self._ascent(rows, part)
-            _, passed = self.ascent.evaluate(self.index, rows.start(len(part)), 0, ascent)
+            part = splits[first : first + step]
+            parents = branches[part[0][0] : part[-1][0] + 1]
+            halves = [_Half(number - part[0][0], split, side) for number, split in part for side in (1, -1)]
+            ascent, _ = self._ascent(rows, parents, halves)
+            _, passed = self.ascent.evaluate(self.index, rows.start(len(halves)), 0, ascent)
             bounds.append(rows.lower(passed).reshape(-1, 2, g).max(2))
         # what is proved cannot become better
         ends = np.minimum(np.concatenate(bounds), 0.0)
         score = ends.min(1) + self.tuning.better_half * ends.max(1)
         chosen: dict[int, int] = {}
-        for k, number in enumerate(owner):
+        for k, (number, _) in enumerate(splits):
             if number not in chosen or score[k] > score[chosen[number]]:
                 chosen[number] = k
-        return [half for k in chosen.values() for half in halves[k]]
+        return [half for number, k in chosen.items() for half in branches[number].halves(splits[k][1])]
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ns_abstract.arithmetic.network_charges import FLUSH, OWN_STORED
 from ns_abstract.verify.network.coefficients import Coefficients, Float64, Int64, pass_maximum
 from ns_abstract.verify.network.max_pooling import MaxPool
 from ns_abstract.verify.network.rounding import outward
@@ -95,6 +96,11 @@ class Relaxations:
     def takes(self, rows: Coefficients) -> bool:
         """Whether rows are of this type."""
         return rows.value.dtype == self.number
+
+    @property
+    def moved_out(self) -> tuple[float, float]:
+        """By what part of itself, and by how much besides, a float64 offset is moved out before it is stored."""
+        return (OWN_STORED, FLUSH) if self.dtype == torch.float32 else (self.sums, 0.0)
 
     def outward(self, value: Tensor, side: float) -> Tensor:
         """An offset as rows take it, farther out by what their sums of offsets may lose."""

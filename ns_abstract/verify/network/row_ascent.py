@@ -12,6 +12,7 @@ from torch import Tensor
 
 from ns_abstract.verify.network.backward import BackwardPass, CoefficientBatch
 from ns_abstract.verify.network.coefficients import Coefficients, Float64, Int64, grid
+from ns_abstract.verify.network.cost_model import on_threads
 from ns_abstract.verify.network.intermediate_bounds import IntermediateBounds
 from ns_abstract.verify.network.max_pooling import MaxPool
 from ns_abstract.verify.network.slope_choices import LineChoice, ReluSlopes, ascending
@@ -20,6 +21,8 @@ from ns_abstract.verify.network.stopping import BackwardBounds
 
 #: Bytes of lines of rows' own that are worked on at a time.
 _LINES_AT_ONCE = 32 << 20
+#: Rows of a cell from which on several threads share them.
+_ROWS_OF_A_THREAD = 32
 
 
 class RowAscent:
@@ -48,13 +51,31 @@ class RowAscent:
             choices, own = ascending(self.intermediate.unstable, k), np.flatnonzero(cell == k)
             if not (choices or self.intermediate.split[k]) or not self.intermediate.good[k]:
                 continue
-            size = sum(6 * rows.value.itemsize * int(np.prod(self.network.shape(at))) for at in choices)
-            step = max(1, _LINES_AT_ONCE // max(1, size))
-            for first in range(0, len(own), step):
-                part = own[first : first + step]
-                target = None if need is None else need[part]
-                loosest[part] = self._climb(index, rows[part], k, part, best, target, choices)
+            loosest[own] = self._climb_cell(index, rows, k, own, best, need, choices)
         return loosest
+
+    def _climb_cell(
+        self,
+        index: int,
+        rows: Coefficients,
+        k: int,
+        own: Int64,
+        best: BackwardBounds,
+        need: Float64 | None,
+        choices: Mapping[int, Sequence[LineChoice]],
+    ) -> Int64:
+        """`climb` for rows ``own`` of cell k: some at a time, of many on several threads."""
+        size = sum(6 * rows.value.itemsize * int(np.prod(self.network.shape(at))) for at in choices)
+        step = max(1, _LINES_AT_ONCE // max(1, size))
+        threads = torch.get_num_threads() if len(own) >= _ROWS_OF_A_THREAD else 1
+        if threads > 1:
+            step = min(step, -(-len(own) // threads))
+
+        def climbed(first: int) -> Int64:
+            part = own[first : first + step]
+            return self._climb(index, rows[part], k, part, best, None if need is None else need[part], choices)
+
+        return np.concatenate(list(on_threads(climbed, range(0, len(own), step), threads)))
 
     def _climb(
         self,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from functools import cached_property
 from typing import Protocol
 
 import numpy as np
@@ -14,6 +15,7 @@ from ns_abstract.arithmetic.network_charges import OWN_SUMS
 from ns_abstract.verify.network.coefficients import Floats
 from ns_abstract.verify.network.layers import Activation, LeakyRelu
 from ns_abstract.verify.network.relaxations import Relaxations
+from ns_abstract.verify.network.relu_lines import write_relu_lines
 from ns_abstract.verify.network.scalar_function import ScalarFunction
 from ns_abstract.verify.network.tangents import Tangents
 
@@ -64,17 +66,12 @@ class UnstableNeurons:
                 chosen.append(TangentPoints(units[at.numpy()], tangents[at]))
         return chosen
 
-    def shifted(
-        self, slope: Float64, low: Float64, high: Float64, size: Float64 | float = 0.0
-    ) -> tuple[Floats, Floats]:
-        """Offsets below and above, relative to the references, of lines with stored ``slope`` [R, U] (N4).
-
-        ``size``: [U] of the numbers that ``low`` and ``high`` are sums of, where these are not charged for it.
-        """
+    def shifted(self, slope: Float64, low: Float64, high: Float64) -> tuple[Floats, Floats]:
+        """Offsets below and above, relative to the references, of lines with stored ``slope`` [R, U] (N4)."""
         base = slope * self.reference - self.image
         own = np.abs(self.reference) + np.abs(self.lower) + np.abs(self.upper)
         give = np.abs(slope) * self.loose + self.room + OWN_SUMS * (np.abs(self.image) + np.abs(low) + np.abs(high))
-        give = give + OWN_SUMS * (size + np.abs(slope) * own)
+        give = give + OWN_SUMS * np.abs(slope) * own
         ends = ((low + base - give, -1.0), (high + base + give, 1.0))
         below, above = (self.relaxations.outward(torch.from_numpy(v), side).numpy() for v, side in ends)
         return below, above
@@ -125,27 +122,21 @@ class ReluSlopes:
     def within(self, parameter: Float64) -> Float64:
         return np.clip(parameter, self.alpha, 1.0)
 
-    def put(self, parameter: Float64, lines: Floats) -> None:
-        slope = parameter.astype(self.units.relaxations.number).astype(np.float64)
-        lower, upper, flat = self.units.lower, self.units.upper, self.units.flat
-        # the function is convex: above a line by most at an end, below it at the kink or, past the limits, at an end
-        ends = self.alpha * lower - slope * lower, upper - slope * upper
-        below, above = self.units.shifted(slope, np.minimum(np.minimum(*ends), 0.0), np.maximum(*ends), upper - lower)
-        lines[0][:, flat], lines[1][:, flat], lines[2][:, flat] = slope, below, above
+    @cached_property
+    def _units(self) -> Float64:
+        """[6, U] as `write_relu_lines` takes them."""
+        units = self.units
+        return np.stack([units.lower, units.upper, units.reference, units.image, units.loose, units.room])
 
-    def fix(self, phases: NDArray[np.int8], lines: Floats) -> None:
-        """Write the function's own piece into ``lines`` [6, R, N] where rows assume the neuron's phase [R, U] (N16)."""
-        for side, exact in ((1, 1.0), (-1, self.alpha)):
-            row, unit = np.nonzero(phases == side)
-            units = self.units[unit]
-            slope = np.full(len(row), exact).astype(units.relaxations.number).astype(np.float64)
-            # between 0 and the end on that side
-            end = (exact - slope) * (units.upper if side > 0 else units.lower)
-            size = units.upper - units.lower
-            below, above = units.shifted(slope, np.minimum(end, 0.0), np.maximum(end, 0.0), size)
-            for first, low, high in ((0, below, above), (3, above, below)):
-                for place, value in enumerate((slope, low, high), first):
-                    lines[place][row, units.flat] = value
+    def put(self, parameter: Float64, lines: Floats, phases: NDArray[np.int8] | None = None) -> None:
+        """`LineChoice.put`; where rows assume the neuron's phase [R, U]: the function's own piece (N16)."""
+        relaxations = self.units.relaxations
+        stored = np.empty(parameter.shape, relaxations.number)
+        phases = np.zeros((0, 0), np.int8) if phases is None else np.ascontiguousarray(phases)
+        write_relu_lines(
+            np.ascontiguousarray(parameter), phases, self.alpha, self.units.flat, self._units, relaxations.moved_out,
+            stored, lines,
+        )  # fmt: skip
 
     def derivative(self, parameter: Float64, coefficient: Float64, value: Float64) -> Float64:
         return np.maximum(coefficient, 0.0) * value

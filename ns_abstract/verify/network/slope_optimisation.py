@@ -17,6 +17,7 @@ from ns_abstract.verify.network.bilinear import Product
 from ns_abstract.verify.network.graph import Network
 from ns_abstract.verify.network.layers import Activation, LinearLayer
 from ns_abstract.verify.network.max_pooling import MaxPool
+from ns_abstract.verify.network.relu_lines import along_lines
 from ns_abstract.verify.network.slope_choices import LineChoice, ReluSlopes
 
 Float64 = NDArray[np.float64]
@@ -148,10 +149,10 @@ class DualAscent:
             # the others stay as they are
             lines = self._lines[k].reshape(6, len(self.parameters[k][0]), -1)
             for choice, parameter in zip(own, self.parameters[k], strict=True):
-                choice.put(parameter, lines)
-            if k in self.phases:
-                assert isinstance(own[0], ReluSlopes)
-                own[0].fix(self.phases[k], lines)
+                if isinstance(choice, ReluSlopes):
+                    choice.put(parameter, lines, self.phases.get(k))
+                else:
+                    choice.put(parameter, lines)
         return OptimisedSlopes(
             self._lines, {k: (held.flat, *held.pay(self.multipliers[k])) for k, held in self.split.items()}
         )
@@ -216,18 +217,19 @@ def slope_derivatives(
             values.append(others[k](torch.from_numpy(rows), inputs).to(image.dtype).reshape(count, *node.layer.shape))
         else:
             assert isinstance(node.layer, Activation)
-            own = torch.from_numpy(lines(k)).to(image.dtype).reshape(6, -1, *node.layer.shape)
-            a, u = torch.from_numpy(rows).reshape(inputs[0].shape), inputs[0]
-            slope, offset = torch.where(a >= 0.0, own[0], own[3]), torch.where(a >= 0.0, own[1], own[4])
+            u = inputs[0].flatten(1).contiguous().numpy()
+            result = np.empty(u.shape, np.float32)
+            own = np.ascontiguousarray(lines(k)).reshape(6, -1, u.shape[1])
+            along_lines(rows.reshape(count, -1), u, own, result)
             source = node.inputs[0]
             if source in held:
                 here = held[source]
-                forces[source] = -here.side * (u.flatten(1).numpy()[:, here.flat] + here.reference)
-            values.append(slope * u + offset)
+                forces[source] = -here.side * (u[:, here.flat] + here.reference)
+            values.append(torch.from_numpy(result).reshape(inputs[0].shape))
             for number, choice in enumerate(ascent.choices.get(k, ())):
                 at = choice.units
                 coefficient = rows.reshape(count, -1)[:, at.flat].astype(np.float64)
-                value = u.flatten(1).numpy()[:, at.flat] + at.reference
+                value = u[:, at.flat] + at.reference
                 by_node[k][number] = choice.derivative(ascent.parameters[k][number], coefficient, value)
         for i in node.inputs:
             left[i] -= 1
