@@ -30,6 +30,14 @@ POT = {
     "type": "visible", "select": {"box": [[-0.15, -0.15, -0.45], [0.15, 0.15, -0.2]]}, "weight": 0.46, "pixels": 390,
     "preprocess": {"resize": [64, 64]},
 }  # fmt: skip
+#: Within 0.02 of the way, along x and y, the whole picture shows 379 to 401 pixels of the pot at every pose. They
+#: differ by how pixels fall on the pot's edge, so margins of POT lie within 0.05 of its limit nearly everywhere, and so
+#: would those of other numbers of pixels. Where the pot lies in the picture does differ. It fills 60 % of the middle
+#: 20 x 20 pixels at about 72 % of the poses, and 12 % of these margins lie within 0.1. POT's row is a marginal case.
+MIDDLE = {
+    "type": "visible", "select": POT["select"], "weight": 0.5, "fraction": 0.6, "region": [22, 22, 42, 42],
+    "preprocess": {"resize": [64, 64]},
+}  # fmt: skip
 FUSELAGE = {
     "type": "visible", "select": {"box": [[-0.1, -0.1, 0.0], [0.1, 0.1, 0.3]]}, "weight": 0.5, "pixels": 60,
     "preprocess": {"resize": [64, 64]},
@@ -68,7 +76,8 @@ ROWS = (
     Row("airplane, orbit, clear 0.75", "airplane", "camera_path_orbit.json", None, clear(0.75), 120),
     Row("plant, path, pot visible", "plant", "camera_path.json", ALONG, POT, 120),
     Row("plant, path, clear 0.8", "plant", "camera_path.json", ALONG, clear(0.8, 64), 120),
-    Row("plant, path and x, y, pot visible", "plant", "camera_path.json", AROUND, POT, 600),
+    Row("plant, path and x, y, pot in the middle", "plant", "camera_path.json", AROUND, MIDDLE, 600),
+    Row("plant, path and x, y, pot at the edge", "plant", "camera_path.json", AROUND, POT, 600),
     Row("plant, path and x, y, clear 0.8", "plant", "camera_path.json", AROUND, clear(0.8, 64), 600),
     Row("demo, path, fuselage visible", "demo/airfield", "camera_path.json", ALONG, FUSELAGE, 120),
     Row("demo, path, clear 0.7", "demo/airfield", "camera_path.json", ALONG, clear(0.7, 64), 120),

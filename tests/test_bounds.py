@@ -161,6 +161,39 @@ def test_depth_swap(order):
 
 
 @both_orders
+def test_order_of_layers_that_differ_in_one_channel(order):
+    """Layers of one colour keep no order, and two that share a channel are not of one colour (O5)."""
+    case = Case(
+        scene(
+            {"mean": (-0.4, 0.0, -5.0), "scale": 0.8, "opacity": 0.9, "color": (0.5, 0.1, 0.3)},
+            {"mean": (0.4, 0.1, -5.0), "scale": 0.8, "opacity": 0.8, "color": (0.5, 0.1, 1.0)},
+        ),
+        moves(yaw=0.05),
+    )
+    near, far = case.image(np.array([-1e-9])), case.image(np.array([1e-9]))
+    assert np.abs(near - far)[..., 2].max() > 0.1
+    assert np.abs(near - far)[..., :2].max() < 1e-6
+    case.check(order, parts=1)
+
+
+@both_orders
+def test_layers_of_one_color_are_no_pairs(order, monkeypatch):
+    """Where no two colours differ, any number of layers may change places (O5)."""
+    near, far = (
+        {"mean": (x, 0.1 * x, -5.0), "scale": 0.8, "opacity": 0.7, "color": (0.9, 0.2, 0.0)} for x in (-0.4, 0.4)
+    )
+    case = Case(scene(near, far, {**far, "mean": (0.0, 0.1, -5.0)}, background=(0.2, 0.3, 0.4)), moves(yaw=0.05))
+    width, sampled = case.check(order, parts=1)
+    assert width.mean() < 2.0 * sampled.mean()
+    monkeypatch.setattr("ns_abstract.methods.splat.bounds.PAIR_LIMIT", 0)
+    again, _ = case.check(order, parts=1)
+    assert (again == width).all()
+    # any other pair is one too many
+    swapped, _ = swap_case().check(order, parts=1)
+    assert swapped.max() == 1.0
+
+
+@both_orders
 def test_three_layers_swap(order):
     """Three layers that all change places, the middle one much brighter than 1."""
     case = Case(
@@ -671,7 +704,7 @@ def test_coincident(order, name):
 def test_nearly_coincident():
     """Means that differ by less than their differences to the camera can tell have no certain order."""
     near = {"scale": 0.5, "opacity": 0.9, "color": (1.0, 0.0, 0.0)}
-    splats = scene({"mean": (0.0, 0.0, -4.0), **near}, {"mean": (0.0, 1e-30, -4.0), **near})
+    splats = scene({"mean": (0.0, 0.0, -4.0), **near}, {**near, "mean": (0.0, 1e-30, -4.0), "color": (0.0, 1.0, 0.0)})
     case = Case(splats, moves(x=0.01), camera(position=(0.0, 0.125, 0.0)))
     assert case.bounds(case.poses.box, 2).statistics[2] > 0
 
@@ -679,11 +712,12 @@ def test_nearly_coincident():
 @both_orders
 def test_layers_apart_have_no_order(order):
     """Gaussians of one block and one depth count as a pair where they share a pixel, and only there."""
-    dot = {"scale": 0.05, "opacity": 0.9, "color": (1.0, 0.5, 0.0)}
+    dot, colors = {"scale": 0.05, "opacity": 0.9}, ((1.0, 0.5, 0.0), (0.0, 0.5, 1.0))
     for column, pairs in ((6.5, 0), (2.5, 1)):
         # pixel = 8 + 16 x / 5
         places = [((1.5 - 8.0) * 5.0 / 16.0, 2.0, -5.0), ((column - 8.0) * 5.0 / 16.0, 2.0, -5.0)]
-        case = Case(scene(*(dot | {"mean": place} for place in places)), moves(yaw=0.01))
+        dots = (dot | {"mean": place, "color": color} for place, color in zip(places, colors, strict=True))
+        case = Case(scene(*dots), moves(yaw=0.01))
         assert case.bounds(case.poses.box, order).statistics[2] == pairs
         case.check(order, parts=1)
 

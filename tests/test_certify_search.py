@@ -149,6 +149,21 @@ def test_verdicts_are_the_truth(threshold: float, d: int) -> None:
         assert volume(leaves) <= whole
 
 
+def test_cells_of_cheap_models_fail_as_a_whole_only_after_a_second_look() -> None:
+    """The middle and two corners fail, another corner does not: the cell is cut."""
+    scene = Ramp(2)
+    scene.gains = np.array([0.2, -0.2])
+    search = search_of(scene, Threshold(0.52), (1, 1), costly=False)
+    first = search.examine(search.grid.roots())
+    assert not first.leaves and first.blocks
+    leaves, _ = drive(search, 60)
+    for leaf in leaves:
+        ends = [float(0.5 + scene.gains @ corner) - 0.52 for corner in search.grid.box_of(leaf.cell).corners()]
+        assert leaf.verdict != "certified" or min(ends) > 0.0
+        assert leaf.verdict != "falsified" or min(ends) <= 1e-7
+    assert volume(leaves, "certified") > 0 and volume(leaves, "falsified") > 0
+
+
 def test_order_of_blocks_does_not_matter() -> None:
     first, count = drive(search_of())
     for seed in range(3):

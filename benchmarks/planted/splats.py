@@ -308,6 +308,22 @@ SPLATS = (
         "test_bounds.py::test_depth_swap[2]",
     ),
     Fault(
+        "colours are one where their first channels are",
+        _DEPTH_PAIRS,
+        "_same_color",
+        "range(listed.color_columns)",
+        "range(listed.color_rows)",
+        "test_bounds.py::test_order_of_layers_that_differ_in_one_channel[1]",
+    ),
+    Fault(
+        "layers of one colour are pairs",
+        _DEPTH_PAIRS,
+        "find_pairs",
+        "_same_color(i, listed.numbers[other], listed)",
+        "False",
+        "test_bounds.py::test_layers_of_one_color_are_no_pairs[1]",
+    ),
+    Fault(
         "order swap counts at the first pixel only",
         _REORDERING,
         "swap_bounds",

@@ -16,8 +16,8 @@ class EnclosingTuning:
 
     #: An enclosing box is at least this power of two wider than the cell, along every parameter.
     halvings: int = 1
-    #: Most pixels that the picture moves by over an enclosing box; of wider ones too little is known.
-    motion: float = 2.0
+    #: Most pixels that the picture moves by over an enclosing box; bounds of wider ones say too little.
+    motion: float = 8.0
     #: Halvings of the set that cells are told apart by, and parts of a box that ends of cells may miss a line of the
     #: grid by, as they are rounded; and parts of a box that it reaches beyond its lines, so that these ends lie inside.
     spare: float = 1e-6

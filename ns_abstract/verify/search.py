@@ -139,7 +139,12 @@ class Search:
         proved = {k for k in open_cells if bounded.get(k, -math.inf) > 0.0}
         self._sample([samples[k] for k in sorted(proved)], self._attack)
         failing = [samples[k] for k in open_cells if k not in proved]
-        self._sample(failing, self._late)
+        if self.costly:
+            self._sample(failing, self._late)
+        else:
+            self._sample([cell for k, cell in enumerate(samples) if k not in proved], self._corners)
+            # a cell is falsified as a whole where nothing else is seen
+            self._sample([cell for cell in samples if cell.broken and cell.hopeless], self._late)
         self._descend_worst_cell(failing)
         if self.varies:
             self._vary(failing)
@@ -161,11 +166,14 @@ class Search:
     # ---------------------------------------------------------------- concrete poses
 
     def _early(self, cell: CellSamples) -> list[Sample]:
-        """The middle and two opposite corners."""
+        """The middle; and two opposite corners, if they cost less than bounds."""
+        corners = self._corners(cell) if self.costly else []
+        return [(cell.box.middle, None), *corners]
+
+    def _corners(self, cell: CellSamples) -> list[Sample]:
+        """Two opposite corners."""
         box = cell.box
-        if not box.dimensions:
-            return [(box.middle, None)]
-        return [(pose, None) for pose in (box.middle, np.array(box.lower), np.array(box.upper))[: 1 + _EARLY]]
+        return [(pose, None) for pose in (np.array(box.lower), np.array(box.upper))[: _EARLY if box.dimensions else 0]]
 
     def _attack(self, cell: CellSamples) -> list[Sample]:
         """A random pose and scene: no proof is believed without."""

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from ns_abstract.arithmetic.rounding import ORDER_ROUNDING, TURN_ROOM, UP, WINDOW_ROUNDING
-from ns_abstract.arithmetic.simd.intrinsics import prefetch
+from ns_abstract.arithmetic.simd.intrinsics import advanced, prefetch
 from ns_abstract.methods.splat.lists import AHEAD
 from ns_abstract.methods.splat.reached_pixels import pixels_at, pixels_once
 
@@ -21,6 +21,8 @@ class BlockList(NamedTuple):
         columns: Columns of ``record``.
         slope: [rows, 3] see `ViewingAxes.depth`.
         tied: See `ViewingAxes.tied`.
+        colors: Of Gaussians, see `Colors.values`.
+        color_columns, color_rows: Columns of ``colors``, of which each channel has so many.
         x0, y0: The block's first pixel.
         m: Coefficients of a form.
     """
@@ -35,6 +37,9 @@ class BlockList(NamedTuple):
     depth_error: np.ndarray
     slope: np.ndarray
     tied: bool
+    colors: np.ndarray
+    color_columns: int
+    color_rows: int
     x0: int
     y0: int
     m: int
@@ -78,6 +83,18 @@ def _uncertain(i, j, listed):
     rounding = ORDER_ROUNDING * size
     radius = slope[3 * m] * abs(x) + slope[3 * m + 1] * abs(y) + slope[3 * m + 2] * abs(z)
     return not (abs(center) > (spread + radius) * UP + rounding + depth_error[i] + depth_error[j])
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _same_color(i, j, listed):
+    """Whether Gaussians i and j surely have the same colour, so that their order changes nothing (design.md, O5)."""
+    first, second = advanced(listed.colors, i * listed.color_columns), advanced(listed.colors, j * listed.color_columns)
+    for column in range(listed.color_columns):
+        # a colour that moves or has a radius is not one number
+        varies = column % listed.color_rows != 0 and first[column] != 0.0
+        if varies or first[column] != second[column]:
+            return False
+    return True
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -139,7 +156,8 @@ def depth_radii(numbers, gaussians, slope, ray, m, entries):
 def find_pairs(k, found, pixels, listed, entries, per_pixel, window, reordering, count):
     """Append the pairs (k, later entry) that share a pixel and are of uncertain order; widen ``first``, ``last``.
 
-    ``pixels`` in the lanes ``found`` are k's. Returns the number of pairs, or -1 where there is no room for them.
+    Pairs of one colour are not appended (O5). ``pixels`` in the lanes ``found`` are those of k. Returns the number of
+    pairs, or -1 where there is no room for them.
     """
     radii, deep, far, pairs = entries.depth_radius, entries.depth, entries.far, reordering.pairs
     i = listed.numbers[k]
@@ -173,11 +191,13 @@ def find_pairs(k, found, pixels, listed, entries, per_pixel, window, reordering,
         theirs = pixels_once(other, listed, entries, per_pixel)
         if pixel_set & int(theirs) == 0 or not _uncertain(i, listed.numbers[other], listed):
             continue
+        entries.last[k] = max(entries.last[k], other)
+        entries.first[other] = min(entries.first[other], k)
+        if _same_color(i, listed.numbers[other], listed):
+            continue
         if count >= reordering.pair_limit:
             return -1
         pairs[2 * count] = k
         pairs[2 * count + 1] = other
-        entries.last[k] = max(entries.last[k], other)
-        entries.first[other] = min(entries.first[other], k)
         count += 1
     return count

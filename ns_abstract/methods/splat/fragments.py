@@ -346,7 +346,8 @@ def collect_fragments(numbers, place, inputs, block, marks_):
     listed = BlockList(
         pointer(numbers), numbers.size, pointer(gaussians.record), gaussians.record.shape[1], pointer(gaussians.box),
         pointer(gaussians.tiles), pointer(gaussians.delta), pointer(gaussians.depth_error),
-        pointer(inputs.axes.depth), inputs.axes.tied, place.x0, place.y0, m,
+        pointer(inputs.axes.depth), inputs.axes.tied, pointer(colors), colors.shape[1], colors.shape[1] // channels,
+        place.x0, place.y0, m,
     )  # fmt: skip
     length, capacity, color_columns = listed.length, fragments.capacity, colors.shape[1]
     stop_light, step = inputs.rules.transmittance_min, charges.transmittance
