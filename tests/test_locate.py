@@ -1,7 +1,9 @@
 """Where a photo was taken: what is excluded never holds the pose that made it."""
 
+import itertools
 import json
 import sqlite3
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -18,10 +20,12 @@ from ns_abstract.cli.locate import main
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import load_camera_path
 from ns_abstract.geometry.tiles import assemble
-from ns_abstract.verify.cell_boxes import divided, inner_cell, resolved, slabs, sub_box_counts
+from ns_abstract.verify.cell_boxes import divided, inner_cell, meeting, resolved, slabs, sub_box_counts
 from ns_abstract.verify.cells import Cell, CellGrid
-from ns_abstract.verify.location import between, nearby
+from ns_abstract.verify.location import between
 from ns_abstract.verify.location_cover import ShearedBoxes, cover
+from ns_abstract.verify.location_store import LocationStore
+from ns_abstract.verify.neighbouring_pixels import nearby
 from ns_abstract.verify.photo import Photo, TiledPhoto
 
 #: Half a step of 8 bits.
@@ -163,6 +167,35 @@ def test_sub_boxes_that_are_left_are_kept() -> None:
             assert holding and (not left[place] or holding == [True]), (trial, place)
 
 
+def test_sub_boxes_that_meet_a_part_are_those_that_hold_one_of_its_units() -> None:
+    generator = np.random.default_rng(5)
+    for _ in range(200):
+        counts = 1 << generator.integers(0, 3, 3)
+        first = generator.integers(-9, 9, 3)
+        units = counts * generator.integers(1, 4, 3)
+        cell = Cell(tuple(first.tolist()), tuple((first + units).tolist()))
+        a = generator.integers(0, units)
+        b = generator.integers(a, units) + 1
+        chosen = np.zeros(counts, bool)
+        for unit in np.ndindex(*(b - a).tolist()):
+            chosen[tuple((a + unit) * counts // units)] = True
+        part = Cell(tuple((first + a).tolist()), tuple((first + b).tolist()))
+        assert (meeting(cell, counts, part) == chosen).all()
+
+
+def test_known_outliers_are_stored_with_their_cell(tmp_path: Path) -> None:
+    """What a block results in depends on the block alone, wherever and whenever it is examined."""
+    grid = CellGrid(box_of([0.0, 0.0], [1.0, 1.0]), (8, 8), (1, 1))
+    cells = [Cell((0, 0), (4, 8), outliers=(3, 70)), Cell((4, 0), (8, 8))]
+    photo = Photo(np.zeros((8, 12, 3), np.uint8), 0.0, 0.5, np.ones((8, 12), bool)).tiled(4)
+    store = LocationStore(tmp_path, {}, [("x", ""), ("y", "")], {0: {}}, resume=False)
+    store.begin(0, grid, [cells[:1], cells[1:]])
+    stored = {cell.first: cell for block in store.pending(set(), 2) for cell in block.cells}
+    assert {cell.first: cell.outliers for cell in cells} == {first: cell.outliers for first, cell in stored.items()}
+    assert set(stored.values()) == set(cells)
+    assert np.flatnonzero(photo.chosen(stored[(0, 0)].outliers)).tolist() == [3, 70]
+
+
 def test_numbers_of_sub_boxes_divide_the_units() -> None:
     cell = Cell((0, 3, 7), (1 << 10, 3 + 12, 7 + 5))
     assert sub_box_counts(cell, np.array([8, 8, 8])).tolist() == [8, 4, 1]
@@ -211,10 +244,14 @@ def test_nearby_values() -> None:
 def followed(location: Location, pose: np.ndarray, most: int) -> tuple[int, float]:
     """Examine the cells that hold a pose alone; how many there were, and the part of the set that is left."""
     search = location.search(0)
-    sheared = pose.copy()
+    # others, too: what is known of cells has to hold at every pose
+    poses = np.concatenate([pose[None], search.plain.box.sample(60, np.random.default_rng(0))])
+    missed = [np.flatnonzero(search.tiled.outside(search.plain.render(values))) for values in poses]
+    places = poses.copy()
     for name, factors in search.frame.pose_set.shear.items():
         names = search.frame.box.names
-        sheared[names.index(name)] -= sum(f * pose[names.index(other)] for other, f in factors.items())
+        places[:, names.index(name)] -= sum(f * poses[:, names.index(other)] for other, f in factors.items())
+    sheared = places[0]
     cells = search.grid.roots()
     for count in range(most):
         if not cells:
@@ -223,6 +260,9 @@ def followed(location: Location, pose: np.ndarray, most: int) -> tuple[int, floa
         for leaf in findings.leaves:
             assert leaf.verdict != "certified" or not holds(search.grid.box_of(leaf.cell), sheared)
         parts = [cell for block in findings.blocks for cell in block]
+        for cell, (place, outliers) in itertools.product(parts, zip(places, missed, strict=True)):
+            if holds(search.grid.box_of(cell), place):
+                assert set(cell.outliers) <= set(outliers.tolist())
         kept = [leaf.cell for leaf in findings.leaves if leaf.verdict != "certified"]
         cells = [*cells[1:], *(cell for cell in parts if search.grid.box_of(cell).contains(sheared))]
         assert cells or any(search.grid.box_of(cell).contains(sheared) for cell in kept)
@@ -233,6 +273,19 @@ def holds(box: ParameterBox, values: np.ndarray) -> bool:
     """Whether values lie inside a box, farther from its ends than they are rounded."""
     room = 1e-13
     return bool(np.all((values > np.array(box.lower) + room) & (values < np.array(box.upper) - room)))
+
+
+def test_known_outliers_exclude_a_cell_without_bounds(blobs: Inputs) -> None:
+    scene, camera = nsa.load_scene(blobs.config), nsa.load_camera_path(blobs.path).cameras[0]
+    job = Job(scene, [nsa.PoseSet(camera, translation={"x": 0.001}).of(scene)])
+    search = Location(job, np.zeros((32, 32, 3), np.uint8), None, PhotoOptions(1.0 - 1e-9, 0.01)).search(0)
+    (root,) = search.grid.roots()
+    numbers = np.flatnonzero(search.tiled.counted)[: search.tiled.allowed + 1].tolist()
+    findings = search.examine([replace(root, outliers=tuple(numbers))])
+    assert [(leaf.cell, leaf.verdict) for leaf in findings.leaves] == [(root, "certified")] and not findings.bounded
+    # any picture explains this photo
+    findings = search.examine([replace(root, outliers=tuple(numbers[:-1]))])
+    assert not any(leaf.verdict == "certified" for leaf in findings.leaves)
 
 
 @pytest.mark.slow_cases(every=4)

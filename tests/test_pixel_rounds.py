@@ -6,6 +6,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from ns_abstract.verify.cell_boxes import meeting
+from ns_abstract.verify.cells import Cell
 from ns_abstract.verify.photo import TiledPhoto
 from ns_abstract.verify.pixel_rounds import BoundedPixels, PixelRounds, RoundTuning, telling_order
 
@@ -37,7 +39,7 @@ def test_rounds_exclude_what_all_pixels_do_and_never_the_true_pose(seed: int) ->
     lower, upper = ends.min(axis=0) - 1e-9, ends.max(axis=0) + 1e-9
     order = generator.permutation(np.flatnonzero(counted))
     # rounds that go on as long as there are pixels
-    rounds = PixelRounds(photo, order, parts, RoundTuning(first=1.0, hopeless=0.0, few=0.0))
+    rounds = PixelRounds(photo, order, parts, tuning=RoundTuning(first=1.0, hopeless=0.0, few=0.0))
     seen = np.zeros_like(counted)
     while (chosen := rounds.following()) is not None:
         assert not (chosen & seen).any()
@@ -65,6 +67,66 @@ def test_a_pixel_counts_once() -> None:
     pixels[1] = True
     rounds.count(np.full((32, 3, 2), 0.5), np.full((32, 3, 2), 0.5), pixels)
     assert rounds.numbers.tolist() == [32, 32] and not rounds.left.any()
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_part_inherits_what_excludes_all_of_it(seed: int) -> None:
+    """Pictures are lines in one parameter; a part of the cell begins and ends within sub-boxes."""
+    generator = np.random.default_rng(seed)
+    a, b = generator.normal(size=(2, T, SIDE, SIDE, 3))
+    values, counted = a * generator.random() + b, generator.random((T, SIDE, SIDE)) < 0.9
+    photo = photo_of(values, 12, counted)
+    lines = np.linspace(0.0, 1.0, 17)
+    ends = np.stack([a[..., None] * lines[:-1] + b[..., None], a[..., None] * lines[1:] + b[..., None]])
+    lower, upper = ends.min(axis=0) - 1e-9, ends.max(axis=0) + 1e-9
+    known = generator.random((T, SIDE, SIDE)) < 0.7
+    rounds = PixelRounds(photo, np.flatnonzero(counted), 16)
+    rounds.count(lower[known], upper[known], known)
+    cell, most = Cell((64,), (128,)), 0
+    for first in range(64, 128, 3):
+        part = Cell((first,), (int(generator.integers(first + 1, min(first + 12, 128) + 1)),))
+        place = np.linspace(first - 64, part.past[0] - 64, 9) / 64.0
+        picture = a[..., None] * place + b[..., None]
+        outlier = ((picture < photo.low[..., None]) | (picture > photo.high[..., None])).any(axis=-2) & counted[
+            ..., None
+        ]
+        inherited = rounds.excluded(meeting(cell, np.array([16]), part))
+        # every one is an outlier at every pose of the part, and so is each that was bounded over little more
+        assert not (inherited & ~(known & outlier.all(axis=-1))).any()
+        beyond = (lower > photo.high[..., None]) | (upper < photo.low[..., None])
+        met = slice((first - 64) // 4, (part.past[0] - 64 + 3) // 4)
+        assert (inherited == known & counted & beyond.any(axis=-2)[..., met].all(axis=-1)).all()
+        most = max(most, int(inherited.sum()))
+        # they count once, whether they are bounded again or not
+        heir = PixelRounds(photo, np.flatnonzero(counted), 1, inherited)
+        assert not inherited.reshape(-1)[heir.order].any()
+        assert heir.order.size == int((counted & ~inherited).sum())
+        ends = np.stack([picture[..., 0], picture[..., -1]])
+        tight = ends.min(axis=0)[..., None], ends.max(axis=0)[..., None]
+        everywhere = np.ones_like(counted)
+        heir.count(tight[0][everywhere], tight[1][everywhere], everywhere)
+        out = (tight[0][..., 0] > photo.high).any(axis=-1) | (tight[1][..., 0] < photo.low).any(axis=-1)
+        assert heir.numbers.tolist() == [int((inherited | (out & counted)).sum())]
+        assert (heir.excluded(np.ones(1, bool)) == inherited | (out & counted)).all()
+    assert most >= 6
+
+
+def test_heirs_are_excluded_by_fewer_pixels() -> None:
+    """Three of the five pixels that exclude a cell are known, so that its first round looks for two."""
+    photo = photo_of(np.zeros((T, SIDE, SIDE, 3)), 4)
+    inherited = np.zeros((T, SIDE, SIDE), bool)
+    inherited[1, 0, :3] = True
+    rounds = PixelRounds(photo, np.arange(T * SIDE * SIDE), 8, inherited)
+    chosen = rounds.following()
+    assert chosen is not None and chosen.sum() == 3 and not (chosen & inherited).any() and rounds.left.all()
+    rounds.count(np.ones((3, 3, 8)), np.ones((3, 3, 8)), chosen)
+    assert rounds.numbers.tolist() == [6] * 8 and not rounds.left.any()
+    # what is inherited cuts, too
+    known = BoundedPixels(photo, 1)
+    known.outliers = inherited
+    assert known.reach[0] <= known.reach[1]
+    known.outliers = np.ones_like(inherited)
+    assert known.reach[0] > known.reach[1]
 
 
 def test_the_outliers_are_those_of_the_whole_photo() -> None:

@@ -11,6 +11,8 @@ _NUMBERS = "test_locate.py::test_what_is_no_number_explains_and_excludes_nothing
 _SLABS = "test_locate.py::test_slabs_and_the_inner_cell_tile_a_cell"
 _EMPTY = "test_locate.py::test_sub_boxes_that_are_left_are_kept"
 _LINES = "test_locate.py::test_numbers_of_sub_boxes_divide_the_units"
+_HEIRS = "test_pixel_rounds.py::test_a_part_inherits_what_excludes_all_of_it"
+_KNOWN = "test_locate.py::test_known_outliers_exclude_a_cell_without_bounds"
 _BOXES = "test_locate.py::test_a_cover_holds_every_pose_of_sheared_boxes"
 
 LOCATION = (
@@ -95,6 +97,25 @@ LOCATION = (
         "location: a round counts a pixel twice",
         _ROUNDS, "PixelRounds.count", "(pixels & ~self.bounded)[pixels]", "pixels[pixels]",
         "test_pixel_rounds.py::test_a_pixel_counts_once",
+    ),
+    Fault(
+        "location: a pixel that is inherited counts again",
+        _ROUNDS, "PixelRounds.__init__", "self.bounded = self.inherited.copy()",
+        "self.bounded = np.zeros_like(self.inherited)", _HEIRS,
+    ),
+    Fault(
+        "location: a pixel that excludes one sub-box of a part is inherited",
+        _ROUNDS, "PixelRounds.excluded", "excluding[:, sub_boxes].all(axis=1)",
+        "excluding[:, sub_boxes].any(axis=1)", _HEIRS,
+    ),
+    Fault(
+        "location: the last sub-box that meets a part is left out",
+        _CELLS, "meeting", "-((first - b) // unit)", "max((b - first) // unit, (a - first) // unit + 1)", _HEIRS,
+    ),
+    Fault(
+        "location: as many known outliers as are allowed exclude a cell",
+        _SEARCH, "_Examination.run", "self.inherited.sum() > search.tiled.allowed",
+        "self.inherited.sum() >= search.tiled.allowed", _KNOWN,
     ),
     Fault(
         "location: the outliers allowed are those of the pixels bounded",

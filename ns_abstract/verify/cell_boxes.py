@@ -56,6 +56,17 @@ def sub_box_counts(cell: Cell, most: np.ndarray) -> np.ndarray:
     return np.minimum(sizes & -sizes, most)
 
 
+def meeting(cell: Cell, counts: np.ndarray, part: Cell) -> np.ndarray:
+    """[counts] which sub-boxes of a cell, whose units ``counts`` divide, meet a ``part`` of it (U9)."""
+    chosen = np.zeros(counts, bool)
+    spans = []
+    for first, past, n, a, b in zip(cell.first, cell.past, counts.tolist(), part.first, part.past, strict=True):
+        unit = (past - first) // n
+        spans.append(slice((a - first) // unit, -((first - b) // unit)))
+    chosen[tuple(spans)] = True
+    return chosen
+
+
 def resolved(box: ParameterBox, counts: np.ndarray) -> bool:
     """Whether the overlap of a cell's sub-boxes covers what grid lines are rounded by (B12, U5)."""
     low, high = np.array(box.lower), np.array(box.upper)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -30,10 +30,16 @@ class CutTuning:
 
 @dataclass(frozen=True)
 class Cell:
-    """Units ``first[k]`` to ``past[k]`` (exclusive) of the grid along each parameter; empty for a single pose."""
+    """Units ``first[k]`` to ``past[k]`` (exclusive) of the grid along each parameter; empty for a single pose.
+
+    Attributes:
+        outliers: Numbers of a photo's pixels that are known to be outliers at every pose of the cell (U9), which does
+            not tell cells apart.
+    """
 
     first: tuple[int, ...]
     past: tuple[int, ...]
+    outliers: tuple[int, ...] = field(default=(), compare=False, repr=False)
 
     @property
     def volume(self) -> int:

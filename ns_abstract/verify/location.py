@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -20,8 +20,9 @@ from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import Float64Array, ParameterBox
 from ns_abstract.geometry.tiles import assemble, in_tiles
 from ns_abstract.refine.protocol import Bounds, Frame, LinearSets, PartsFrame, SubBoxFrame
-from ns_abstract.verify.cell_boxes import aligned, divided, inner_cell, resolved, slabs, sub_box_counts
+from ns_abstract.verify.cell_boxes import aligned, divided, inner_cell, meeting, resolved, slabs, sub_box_counts
 from ns_abstract.verify.cells import Cell, CellGrid
+from ns_abstract.verify.neighbouring_pixels import nearby, smoothed
 from ns_abstract.verify.photo import Photo
 from ns_abstract.verify.pixel_rounds import BoundedPixels, PixelRounds, telling_order
 from ns_abstract.verify.search_results import BlockResult, FinishedCell
@@ -162,10 +163,10 @@ class LocationSearch:
             WorkCancelledError: There is no time for it.
         """
         begin = time.perf_counter()
-        reports = [_Examination(self, cell) for cell in cells]
+        reports = [_Examination(self, cell, self.tiled.chosen(cell.outliers)) for cell in cells]
         for report in reports:
             report.run()
-        children = [part for report in reports for part in report.children]
+        children = [report.heir(part) for report in reports for part in report.children]
         poses = [report.best for report in reports if report.best is not None]
         return LocationResult(
             leaves=tuple(leaf for report in reports for leaf in report.leaves),
@@ -189,20 +190,29 @@ class LocationSearch:
 
 @dataclass
 class _Examination:
-    """What becomes of one cell."""
+    """What becomes of one cell.
+
+    Attributes:
+        inherited: [T, side, side] counted pixels that are outliers at every pose of the cell, by bounds over more (U9).
+    """
 
     search: LocationSearch
     cell: Cell
+    inherited: np.ndarray
     leaves: list[FinishedCell] = field(default_factory=list)
     children: list[Cell] = field(default_factory=list)
     best: FoundPose | None = None
     bounded: int = 0
     #: Pixels that were excluded, as a part of those that would have excluded the cell.
     share: float = 1.0
+    #: The last sub-boxes that were bounded: of which cell, their numbers along axes, and their pixels.
+    divisions: tuple[Cell, np.ndarray, PixelRounds] | None = None
 
     def run(self) -> None:
         """Exclude the cell, contract it and cut it."""
         search, tuning = self.search, self.search.tuning
+        if self.inherited.sum() > search.tiled.allowed:
+            return self._exclude(1.0)
         for _ in range(tuning.rounds):
             before = self.cell.volume
             feasible = search.frame.feasible(search.grid.box_of(self.cell))
@@ -246,6 +256,7 @@ class _Examination:
                 return None
             rounds.count(*ends, chosen)
             self.share = min(1.0, rounds.expected)
+        self.divisions = self.cell, counts, rounds
         left = rounds.left.reshape(counts)
         if left.all():
             return False
@@ -261,6 +272,14 @@ class _Examination:
         else:
             self.children = remaining
         return True
+
+    def heir(self, part: Cell) -> Cell:
+        """A part of the cell, with the pixels that are known to be outliers at all of its poses (U9)."""
+        pixels = self.inherited
+        if self.divisions is not None:
+            cell, counts, rounds = self.divisions
+            pixels = pixels | rounds.excluded(meeting(cell, counts, part).reshape(-1))
+        return replace(part, outliers=tuple(np.flatnonzero(pixels).tolist()))
 
     def _exclude(self, margin: float) -> None:
         self.leaves.append(FinishedCell(self.cell, "certified", margin, 0.0))
@@ -315,12 +334,14 @@ class _Examination:
             lower, upper = (end[chosen[tiles]][..., None] for end in (bounds.lower, bounds.upper))
             rounds.count(lower, upper, chosen)
             self.share = min(1.0, rounds.expected)
+            self.inherited = rounds.excluded(np.ones(1, bool))
             if not rounds.left.any():
                 self._exclude(float(rounds.numbers[0] - tiled.allowed))
                 return False
             if not linear:
                 continue
             known = known or BoundedPixels(tiled, box.dimensions)
+            known.outliers = self.inherited
             known.add(bounds, tiles, chosen)
             if last:
                 if self._settled(known):
@@ -335,18 +356,19 @@ class _Examination:
     def _rounds(self, box: ParameterBox, picture: np.ndarray, counts: np.ndarray) -> PixelRounds:
         """Rounds of pixels for the sub-boxes [counts] of the cell; there are none where too few are likely to help."""
         search, tiled, tuning = self.search, self.search.tiled, self.search.tuning
-        moved, needed = search.moved(box), tiled.allowed + 1
+        moved, known = search.moved(box), int(self.inherited.sum())
+        needed = tiled.allowed + 1 - known
         scale = float(np.linalg.norm(moved / counts)) / tuning.reference
         radius = max(1, round(0.5 * float(np.linalg.norm(moved))))
         order, sure = telling_order(
-            self._gaps(picture, 1, 0.0), self._gaps(picture, radius, scale), search.loose, tiled.counted,
-            round(tuning.surplus * needed),
+            self._gaps(picture, 1, 0.0), self._gaps(picture, radius, scale), search.loose,
+            tiled.counted & ~self.inherited, round(tuning.surplus * needed),
         )  # fmt: skip
         alone = counts.prod() == 1
-        self.share = sure / needed if alone else 0.0
+        self.share = (known + sure) / (known + needed) if alone else 0.0
         if alone and self.share < tuning.promise:
             order = order[:0]
-        return PixelRounds(tiled, order, int(np.prod(counts)))
+        return PixelRounds(tiled, order, int(np.prod(counts)), self.inherited)
 
     def _gaps(self, picture: np.ndarray, radius: int, scale: float) -> Float64Array:
         """[T, side, side] by how much the picture within ``radius`` pixels misses the photo, less expected looseness.
@@ -457,30 +479,3 @@ def between(box: ParameterBox, least: Float64Array, most: Float64Array) -> Param
         first, last = min(first, high), max(last, low)
         box = box.replace(k, first, last)
     return box
-
-
-def nearby(image: np.ndarray, radius: int) -> tuple[np.ndarray, np.ndarray]:
-    """Least and greatest values [H, W, ...] of an image within so many pixels along both axes."""
-    least, most = image.copy(), image.copy()
-    for axis in (0, 1):
-        low, high = least.copy(), most.copy()
-        for step in range(1, min(radius, image.shape[axis] - 1) + 1):
-            ahead = tuple(slice(step, None) if k == axis else slice(None) for k in range(image.ndim))
-            behind = tuple(slice(None, -step) if k == axis else slice(None) for k in range(image.ndim))
-            for here, there in ((ahead, behind), (behind, ahead)):
-                low[here] = np.minimum(low[here], least[there])
-                high[here] = np.maximum(high[here], most[there])
-        least, most = low, high
-    return least, most
-
-
-def smoothed(image: np.ndarray, radius: int) -> np.ndarray:
-    """Means of an image [H, W, ...] over squares of so many pixels to every side, repeated beyond its edges."""
-    for axis in (0, 1):
-        padding = [(radius + 1, radius) if k == axis else (0, 0) for k in range(image.ndim)]
-        sums = np.cumsum(np.pad(image.astype(np.float64), padding, mode="edge"), axis=axis)
-        count = 2 * radius + 1
-        ahead = tuple(slice(count, None) if k == axis else slice(None) for k in range(image.ndim))
-        behind = tuple(slice(None, -count) if k == axis else slice(None) for k in range(image.ndim))
-        image = (sums[ahead] - sums[behind]) / count
-    return image

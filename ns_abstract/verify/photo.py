@@ -6,6 +6,7 @@ A picture explains a photo where all but a few of the pixels lie within the nois
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -144,6 +145,12 @@ class TiledPhoto:
     allowed: int
     brightness: Brightness = Brightness()
     shown: tuple[Float64Array, ...] | None = None
+
+    def chosen(self, numbers: Sequence[int]) -> np.ndarray:
+        """[T, side, side] the pixels with these ``numbers``, in the order of ``counted`` flattened."""
+        pixels = np.zeros(self.counted.shape, bool)
+        pixels.reshape(-1)[list(numbers)] = True
+        return pixels
 
     def outside(self, picture: np.ndarray) -> np.ndarray:
         """[T, side, side] which counted pixels of a picture in tiles do not explain the photo."""

@@ -46,18 +46,30 @@ class PixelRounds:
         photo: The photo.
         order: [n] numbers of the pixels to bound, in the order of `TiledPhoto.counted` flattened, the first one first.
         sub_boxes: Number of sub-boxes; 1: the cell itself.
+        inherited: [T, side, side] counted pixels that exclude the whole cell by bounds over a larger one (U9); they are
+            not bounded again. None: there are none.
         tuning: Preferences.
 
     Attributes:
-        bounded: [T, side, side] pixels whose bounds were counted.
+        bounded: [T, side, side] pixels whose bounds were counted, and those inherited.
         numbers: [k] pixels so far that exclude each sub-box.
         taken: Number of pixels of the order that were taken.
     """
 
-    def __init__(self, photo: TiledPhoto, order: np.ndarray, sub_boxes: int, tuning: RoundTuning | None = None) -> None:
-        self.photo, self.order, self.tuning = photo, order, tuning or RoundTuning()
-        self.bounded = np.zeros(photo.counted.shape, bool)
-        self.numbers = np.zeros(sub_boxes, np.int64)
+    def __init__(
+        self,
+        photo: TiledPhoto,
+        order: np.ndarray,
+        sub_boxes: int,
+        inherited: np.ndarray | None = None,
+        tuning: RoundTuning | None = None,
+    ) -> None:
+        self.photo, self.tuning = photo, tuning or RoundTuning()
+        self.inherited = np.zeros(photo.counted.shape, bool) if inherited is None else inherited
+        self.bounded = self.inherited.copy()
+        self.order = order[~self.bounded.reshape(-1)[order]]
+        self.numbers = np.full(sub_boxes, int(self.inherited.sum()), np.int64)
+        self._excluding: list[tuple[np.ndarray, np.ndarray]] = []
         self.taken = 0
         self._rate = 1.0
 
@@ -84,9 +96,10 @@ class PixelRounds:
         if left <= (self.tuning.few if self.numbers.size > 1 else 0.0) or self.taken >= self.order.size:
             return None
         if not self.taken:
-            if self.order.size < needed:
+            missing = needed - int(self.inherited.sum())
+            if self.order.size < missing:
                 return None
-            count = self.tuning.first * needed
+            count = self.tuning.first * missing
         elif self.expected < self.tuning.hopeless:
             return None
         else:
@@ -114,9 +127,17 @@ class PixelRounds:
         excluding = self.photo.excluding(lower, upper, pixels)[fresh]
         before = float(np.median(self.numbers))
         self.numbers += excluding.sum(axis=0)
+        self._excluding.append((np.flatnonzero(pixels & ~self.bounded), excluding))
         self.bounded |= pixels
         if fresh.any():
             self._rate = (float(np.median(self.numbers)) - before) / int(fresh.sum())
+
+    def excluded(self, sub_boxes: np.ndarray) -> np.ndarray:
+        """[T, side, side] the pixels so far that exclude each of some ``sub_boxes`` [k], of which there is one (U9)."""
+        pixels = self.inherited.copy()
+        for numbers, excluding in self._excluding:
+            pixels.reshape(-1)[numbers[excluding[:, sub_boxes].all(axis=1)]] = True
+        return pixels
 
 
 class BoundedPixels:
@@ -127,6 +148,7 @@ class BoundedPixels:
         dimensions: Parameters of the cell.
 
     Attributes:
+        outliers: [T, side, side] counted pixels that nothing in the cell explains, as far as is known.
         lower, upper: [T, side, side, 3].
         linear: Linear bounds, likewise.
     """
@@ -135,6 +157,7 @@ class BoundedPixels:
         self.photo = photo
         shape = photo.low.shape
         self.lower, self.upper = np.full(shape, np.nan), np.full(shape, np.nan)
+        self.outliers: np.ndarray = np.zeros(shape[:-1], bool)
         slopes = (*shape, dimensions)
         self.linear: LinearSets = (
             np.full(slopes, np.nan), np.full(shape, np.nan), np.full(slopes, np.nan), np.full(shape, np.nan),
@@ -156,7 +179,7 @@ class BoundedPixels:
     @property
     def reach(self) -> tuple[Float64Array, Float64Array]:
         """What the bounded pixels leave of the cell's scaled parameters (U3); see `TiledPhoto.reach`."""
-        beyond = self.photo.beyond(self.lower, self.upper, self._tiles)
+        beyond = self.outliers | self.photo.beyond(self.lower, self.upper, self._tiles)
         return self.photo.reach(self.linear, beyond, self._tiles)
 
     @property

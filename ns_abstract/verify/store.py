@@ -125,7 +125,7 @@ class Store(StoreFile):
     def _open(self, frame: int, depth: int, grid: CellGrid, blocks: Iterable[tuple[Sequence[Cell], float]]) -> None:
         for cells, rank in blocks:
             volume = max(c.volume for c in cells) / grid.volume
-            row = frame, volume, float(rank), depth, json.dumps([[c.first, c.past] for c in cells])
+            row = frame, volume, float(rank), depth, json.dumps([[c.first, c.past, c.outliers] for c in cells])
             query = "INSERT INTO search_blocks(frame, volume, rank, depth, cells) VALUES (?, ?, ?, ?, ?)"
             self._seals.blocks.add((self._base.execute(query, row).lastrowid, *row))
 
@@ -146,7 +146,7 @@ class Store(StoreFile):
     def _listed(self, which: str) -> list[CellBlock]:
         rows = self._base.execute(f"SELECT id, frame, depth, cells FROM search_blocks {which}").fetchall()
         return [
-            CellBlock(number, frame, depth, tuple(Cell(tuple(a), tuple(b)) for a, b in json.loads(cells)))
+            CellBlock(number, frame, depth, tuple(Cell(*map(tuple, ends)) for ends in json.loads(cells)))
             for number, frame, depth, cells in rows
         ]
 
