@@ -190,7 +190,7 @@ def test_marks_are_places_of_the_camera(tmp_path: Path) -> None:
     assert [len(line) for _, line in marks.lines] == [3, 1]
     np.testing.assert_allclose(marks.lines[1][1], [[1.0, 2.1]])
     found = views(document(course, camera), cells, course, None, 300)
-    assert [view.axes for view in found] == [(0, 1), (0, 2)] and found[0].nearest == 0.5
+    assert [view.axes for view in found] == [(0, 1), (0, 2)] and found[0].clip == 0.5
 
 
 # ---------------------------------------------------------------- cameras of a certificate
