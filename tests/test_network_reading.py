@@ -195,6 +195,21 @@ def test_packed_models_and_local_functions(tmp_path: Path) -> None:
         load_network(tmp_path / "bomb.onnx")
 
 
+@pytest.mark.parametrize("domain", ["", "ai.onnx", "ai.onnx.ml", "com.microsoft", "com.ms.internal.nhwc"])
+def test_functions_that_replace_operators_are_refused(domain: str, tmp_path: Path) -> None:
+    """onnxruntime calls its own operator of that name, which differs from the function where no probe looks."""
+    f = OnnxFile((4,))
+    f.nodes.append(helper.make_node("Gelu", ["image"], ["y"], domain=domain))
+    f.last = "y"
+    model = f.model()
+    model.opset_import.extend([helper.make_opsetid(domain, 1)] * (domain != ""))
+    body = [helper.make_node("Relu", ["a"], ["b"])]
+    model.functions.append(helper.make_function(domain, "Gelu", ["a"], ["b"], body, [helper.make_opsetid("", 17)]))
+    (tmp_path / "net.onnx").write_bytes(model.SerializeToString())
+    with pytest.raises(InputError, match="operators of runtimes"):
+        load_network(tmp_path / "net.onnx")
+
+
 # ---------------------------------------------------------------- constants
 
 

@@ -29,6 +29,8 @@ _SHARED = 4
 _MOST_NODES = 1 << 18
 #: Ending of packed models.
 PACKED = ".onnx.gz"
+#: Domains of the operators that runtimes have themselves, with what begins so before a dot.
+_OWN = ("", "ai.onnx", "com.microsoft", "com.ms")
 _FIX = "export the network again"
 
 
@@ -74,6 +76,11 @@ def unpacked_model(path: Path) -> bytes:
 
 def _inlined(model: onnx.ModelProto, path: Path) -> onnx.ModelProto:
     """The model with the nodes of its local functions in place of their calls."""
+    for function in model.functions:
+        # runtimes call their own operator, or the function: the format leaves it to them
+        if any(function.domain == own or (own and function.domain.startswith(f"{own}.")) for own in _OWN):
+            problem = f"function {function.name} has the domain {show(function.domain)} of operators of runtimes"
+            raise InputError(problem, file=path, field="functions", fix="export it with a domain of its own")
     bodies = {(f.domain, f.name): [(n.domain, n.op_type) for n in f.node] for f in model.functions}
     counts: dict[tuple[str, str], float] = {}
 
