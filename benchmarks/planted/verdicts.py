@@ -228,6 +228,22 @@ VERDICTS = (
         "test_network_reading.py::test_functions_that_replace_operators_are_refused[ai.onnx.ml]",
     ),
     Fault(
+        "network: the last of an attribute's values is read",
+        "verify/network/onnx_tensors.py",
+        "_check_attributes",
+        "names.count(name) > 1",
+        "False",
+        "test_network_reading.py::test_attributes_that_are_given_twice_are_refused",
+    ),
+    Fault(
+        "network: default attributes of functions are forgotten",
+        "verify/network/onnx_tensors.py",
+        "_give_defaults",
+        "attribute.name not in given",
+        "False",
+        "test_network_reading.py::test_functions_have_default_attributes",
+    ),
+    Fault(
         "whole numbers: pictures of floats are taken",
         "api/network_question.py",
         "Question.searched",
