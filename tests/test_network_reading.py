@@ -195,6 +195,62 @@ def test_packed_models_and_local_functions(tmp_path: Path) -> None:
         load_network(tmp_path / "bomb.onnx")
 
 
+@pytest.mark.parametrize("domain", ["", "ai.onnx", "ai.onnx.ml", "com.microsoft", "com.ms.internal.nhwc"])
+def test_functions_that_replace_operators_are_refused(domain: str, tmp_path: Path) -> None:
+    """onnxruntime calls its own operator of that name, which differs from the function where no probe looks."""
+    f = OnnxFile((4,))
+    f.nodes.append(helper.make_node("Gelu", ["image"], ["y"], domain=domain))
+    f.last = "y"
+    model = f.model()
+    model.opset_import.extend([helper.make_opsetid(domain, 1)] * (domain != ""))
+    body = [helper.make_node("Relu", ["a"], ["b"])]
+    model.functions.append(helper.make_function(domain, "Gelu", ["a"], ["b"], body, [helper.make_opsetid("", 17)]))
+    (tmp_path / "net.onnx").write_bytes(model.SerializeToString())
+    with pytest.raises(InputError, match="operators of runtimes"):
+        load_network(tmp_path / "net.onnx")
+
+
+def test_attributes_that_are_given_twice_are_refused(tmp_path: Path) -> None:
+    """Of a constant onnxruntime takes the first value; the last one would be read."""
+    f = OnnxFile((4,))
+    f.nodes.append(
+        helper.make_node("Constant", [], ["scale"], value=numpy_helper.from_array(np.array(1.0, np.float32), ""))
+    )
+    f.node("Mul", "image", "scale")
+    model = f.model()
+    again = helper.make_attribute("value", numpy_helper.from_array(np.array(1.0001, np.float32), ""))
+    model.graph.node[0].attribute.append(again)
+    (tmp_path / "net.onnx").write_bytes(model.SerializeToString())
+    with pytest.raises(InputError, match="attribute value is given twice"):
+        load_network(tmp_path / "net.onnx")
+    model.graph.node[0].attribute[0].ref_attr_name = "of a function"
+    del model.graph.node[0].attribute[1]
+    (tmp_path / "net.onnx").write_bytes(model.SerializeToString())
+    with pytest.raises(InputError, match="refers to one of a function"):
+        load_network(tmp_path / "net.onnx")
+
+
+def test_functions_have_default_attributes(tmp_path: Path) -> None:
+    """A slope that a call leaves out, by way of another function, is the function's and not the operator's of 0.01."""
+    f = OnnxFile((4,))
+    f.nodes.append(helper.make_node("Outer", ["image"], ["y"], domain="own"))
+    f.last = "y"
+    model = f.model()
+    own, plain = helper.make_opsetid("own", 1), helper.make_opsetid("", 17)
+    model.opset_import.append(own)
+    leaky = helper.make_node("LeakyRelu", ["a"], ["b"])
+    leaky.attribute.append(onnx.AttributeProto(name="alpha", ref_attr_name="alpha", type=onnx.AttributeProto.FLOAT))
+    inner = helper.make_function("own", "Inner", ["a"], ["b"], [leaky], [plain])
+    inner.attribute_proto.append(helper.make_attribute("alpha", 0.010005))
+    call = helper.make_node("Inner", ["a"], ["b"], domain="own")
+    model.functions.extend([inner, helper.make_function("own", "Outer", ["a"], ["b"], [call], [own])])
+    file = tmp_path / "net.onnx"
+    file.write_bytes(model.SerializeToString())
+    x = np.array([-1.0, -0.5, 0.5, 1.0], np.float32)
+    low, high = at(file, x)
+    assert (low <= run(file, x)).all() and (run(file, x) <= high).all()
+
+
 # ---------------------------------------------------------------- constants
 
 

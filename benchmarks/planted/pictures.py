@@ -20,6 +20,11 @@ _RAYS = "test_picture_weights.py::test_the_brightest_rays_are_bounded_first"
 
 PICTURES = (
     Fault(
+        "properties of the picture: a rounded product asks for one more pixel",
+        "verify/pixel_parts.py", "fewest_reaching", "min(k for k in (near - 1, near, near + 1) if k / count >= part)",
+        "near", "test_pixel_parts.py::test_no_more_pixels_are_asked_for_than_is_said",
+    ),
+    Fault(
         "weights: what may be nearer is not", _WEIGHTS, "WhiteGaussians.between", "~(low[:, None] >= self.nearer)",
         "high[:, None] < self.nearer", _CROSS,
     ),

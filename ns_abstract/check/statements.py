@@ -83,7 +83,10 @@ def parsed(root: dict[str, Any], size: tuple[int, int], scale: float) -> Combine
         fix = "audit one of regions that are boxes, of Gaussians in a box, and of weights"
         raise BadInput("has a mask, a selection or a depth that is not checked", "report.json", "property", fix)
     if kind == "visible":
-        count = int(root.get("pixels", 1)) if "fraction" not in root else math.ceil(root["fraction"] * len(first))
+        count = int(root.get("pixels", 1))
+        if "fraction" in root:
+            # as many as are that part of the region, or more
+            count = 1 + int((np.arange(1, len(first)) / len(first) < root["fraction"]).sum())
         box = np.array(root["select"]["box"], np.float64)
         return Measured(box, (1.0, 0.0, 0.0), [first], count, below(weight), math.inf)
     if kind == "clear":

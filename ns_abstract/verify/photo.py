@@ -5,7 +5,6 @@ A picture explains a photo where all but a few of the pixels lie within the nois
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,6 +16,7 @@ from ns_abstract.arithmetic.rounding import BRIGHTNESS_ROUNDING, CUT_ROOM, PHOTO
 from ns_abstract.geometry.box import Float64Array
 from ns_abstract.geometry.tiles import in_tiles
 from ns_abstract.refine.protocol import LinearSets
+from ns_abstract.verify.pixel_parts import most_within
 
 _STEPS = 255.0
 #: Rounds in which gain and offset of a picture are fitted.
@@ -98,7 +98,7 @@ class Photo:
     @property
     def allowed(self) -> int:
         """Number of counted pixels that may show anything."""
-        return math.floor(self.outliers * int(self.counted.sum()))
+        return most_within(self.outliers, int(self.counted.sum()))
 
     @cached_property
     def shown(self) -> tuple[Float64Array, Float64Array]:

@@ -33,6 +33,7 @@ from ns_abstract.verify.picture_measures import (
     PlaneSets,
     Region,
 )
+from ns_abstract.verify.pixel_parts import fewest_reaching
 from ns_abstract.verify.preprocess import Preprocess, parse_preprocess
 from ns_abstract.verify.properties import Claim, Property, Query
 from ns_abstract.verify.property_reading import parse_partitions
@@ -84,7 +85,7 @@ class Leaf:
         if self.statistic == "mean":
             rank = None
         elif self.statistic == "rank":
-            rank = self.pixels if isinstance(self.pixels, int) else math.ceil(self.pixels * places.size)
+            rank = self.pixels if isinstance(self.pixels, int) else fewest_reaching(self.pixels, places.size)
             if not 1 <= rank <= places.size:
                 raise InputError(
                     f"found {self.pixels}, {self.region} has {places.size} pixels", field="pixels", fix="ask for fewer"

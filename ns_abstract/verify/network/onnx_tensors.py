@@ -29,6 +29,8 @@ _SHARED = 4
 _MOST_NODES = 1 << 18
 #: Ending of packed models.
 PACKED = ".onnx.gz"
+#: Domains of the operators that runtimes have themselves, with what begins so before a dot.
+_OWN = ("", "ai.onnx", "com.microsoft", "com.ms")
 _FIX = "export the network again"
 
 
@@ -55,7 +57,21 @@ def parse_model(path: Path) -> onnx.ModelProto:
         raise InputError(f"is not an ONNX model ({str(error) or type(error).__name__})", file=path, fix=_FIX) from None
     if not model.graph.node or not model.graph.output:
         raise InputError("holds no network", file=path, field="graph", fix=_FIX)
+    _check_attributes(model, path)
     return _inlined(model, path) if model.functions else model
+
+
+def _check_attributes(model: onnx.ModelProto, path: Path) -> None:
+    """Refuse attributes that are given twice, of which programs take one or the other, or that no function gives."""
+    for body in (model.graph, *model.functions):
+        for node in body.node:
+            names = [attribute.name for attribute in node.attribute]
+            wrong = {name: "is given twice" for name in names if names.count(name) > 1}
+            if body is model.graph:
+                wrong |= {a.name: "refers to one of a function" for a in node.attribute if a.ref_attr_name}
+            for name, problem in wrong.items():
+                field = f"node {node.name or ', '.join(node.output)} ({node.op_type})"
+                raise InputError(f"attribute {name} {problem}", file=path, field=field, fix=_FIX)
 
 
 def unpacked_model(path: Path) -> bytes:
@@ -74,6 +90,12 @@ def unpacked_model(path: Path) -> bytes:
 
 def _inlined(model: onnx.ModelProto, path: Path) -> onnx.ModelProto:
     """The model with the nodes of its local functions in place of their calls."""
+    for function in model.functions:
+        # runtimes call their own operator, or the function: the format leaves it to them
+        if any(function.domain == own or (own and function.domain.startswith(f"{own}.")) for own in _OWN):
+            problem = f"function {function.name} has the domain {show(function.domain)} of operators of runtimes"
+            raise InputError(problem, file=path, field="functions", fix="export it with a domain of its own")
+    _give_defaults(model)
     bodies = {(f.domain, f.name): [(n.domain, n.op_type) for n in f.node] for f in model.functions}
     counts: dict[tuple[str, str], float] = {}
 
@@ -96,6 +118,16 @@ def _inlined(model: onnx.ModelProto, path: Path) -> onnx.ModelProto:
         raise InputError(
             f"has functions that cannot be read ({error})", file=path, field="functions", fix=_FIX
         ) from None
+
+
+def _give_defaults(model: onnx.ModelProto) -> None:
+    """Write the functions' default attributes to the calls that leave them out: the inliner forgets these."""
+    defaults = {(f.domain, f.name, f.overload): f.attribute_proto for f in model.functions}
+    for body in (model.graph, *model.functions):
+        for node in body.node:
+            given = {attribute.name for attribute in node.attribute}
+            missing = defaults.get((node.domain, node.op_type, node.overload), ())
+            node.attribute.extend(attribute for attribute in missing if attribute.name not in given)
 
 
 class StoredTensors:
