@@ -83,12 +83,12 @@ def parsed(root: dict[str, Any], size: tuple[int, int], scale: float) -> Combine
         fix = "audit one of regions that are boxes, of Gaussians in a box, and of weights"
         raise BadInput("has a mask, a selection or a depth that is not checked", "report.json", "property", fix)
     if kind == "visible":
-        count = int(root.get("pixels", 1))
-        if "fraction" in root:
-            # as many as are that part of the region, or more
-            count = 1 + int((np.arange(1, len(first)) / len(first) < root["fraction"]).sum())
-        box = np.array(root["select"]["box"], np.float64)
-        return Measured(box, (1.0, 0.0, 0.0), [first], count, below(weight), math.inf)
+        # as many as are that part of the region, or more
+        part = 1 + int((np.arange(1, len(first)) / len(first) < root.get("fraction", 0.0)).sum())
+        count = part if "fraction" in root else int(root.get("pixels", 1))
+        return Measured(
+            np.array(root["select"]["box"], float), (1.0, 0.0, 0.0), [first], count, below(weight), math.inf
+        )
     if kind == "clear":
         distance = float(root["distance"]) * (scale if root.get("units") == "dataset" else 1.0)
         return Measured(distance, (1.0, 0.0, 0.0), [first], 1, -math.inf, weight)
