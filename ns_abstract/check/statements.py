@@ -85,10 +85,8 @@ def parsed(root: dict[str, Any], size: tuple[int, int], scale: float) -> Combine
     if kind == "visible":
         # as many as are that part of the region, or more
         part = 1 + int((np.arange(1, len(first)) / len(first) < root.get("fraction", 0.0)).sum())
-        count = part if "fraction" in root else int(root.get("pixels", 1))
-        return Measured(
-            np.array(root["select"]["box"], float), (1.0, 0.0, 0.0), [first], count, below(weight), math.inf
-        )
+        rank = part if "fraction" in root else int(root.get("pixels", 1))
+        return Measured(np.array(root["select"]["box"], float), (1.0, 0.0, 0.0), [first], rank, below(weight), math.inf)
     if kind == "clear":
         distance = float(root["distance"]) * (scale if root.get("units") == "dataset" else 1.0)
         return Measured(distance, (1.0, 0.0, 0.0), [first], 1, -math.inf, weight)
