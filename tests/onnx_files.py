@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -49,6 +50,13 @@ class OnnxFile:
 
     def gemm(self, n: int, out: int, scale: float = 1.0) -> str:
         return self.node("Gemm", self.last, self.weights(out, n, scale=scale), self.weights(out), transB=1)
+
+    def relu_layers(self, *sizes: int) -> None:
+        """Add fully connected layers of so many numbers, with ReLUs between."""
+        for before, after in itertools.pairwise(sizes[:-1]):
+            self.gemm(before, after)
+            self.node("Relu")
+        self.gemm(sizes[-2], sizes[-1])
 
     def model(self) -> onnx.ModelProto:
         sizes = [self.batch, *self.shape]

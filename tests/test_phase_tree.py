@@ -196,10 +196,7 @@ def test_lines_of_assumed_phases_enclose_the_piece(number: str) -> None:
 def test_several_threads_bound_the_same_rows(tmp_path: Path) -> None:
     """Rows that threads share are each bounded once: intermediate bounds with chosen lines are those of one thread."""
     f = OnnxFile((8,), 3)
-    for size, to in ((8, 96), (96, 96)):
-        f.gemm(size, to)
-        f.node("Relu")
-    f.gemm(96, 2)
+    f.relu_layers(8, 96, 96, 2)
     network = load_network(f.write(tmp_path / "threads.onnx"))
     images, threads = box(np.full(8, -0.4), np.full(8, 0.6)), torch.get_num_threads()
     found = []
@@ -249,10 +246,7 @@ def test_functions_without_curved_parts_choose_nothing(tmp_path: Path) -> None:
 def test_ends_near_zero_gain_by_lines_of_their_own(tmp_path: Path) -> None:
     """Of an unstable neuron the end that is nearer to zero is raised or lowered; the other stays, and both hold."""
     f = OnnxFile((6,), 3)
-    for size, to in ((6, 24), (24, 24)):
-        f.gemm(size, to)
-        f.node("Relu")
-    f.gemm(24, 2)
+    f.relu_layers(6, 24, 24, 2)
     network = load_network(f.write(tmp_path / "ends.onnx"))
     rng = np.random.default_rng(0)
     x = rng.normal(size=6)

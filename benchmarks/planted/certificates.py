@@ -319,7 +319,7 @@ CERTIFICATES = (
     ),
     Fault(
         "chosen lines: many rows are those of the first thread",
-        "verify/network/row_ascent.py", "RowAscent._climb_cell", "rows[part]", "rows[own[: len(part)]]",
+        "verify/network/row_ascent.py", "RowAscent._climb", "rows[own]", "rows[own - own[0]]",
         "test_phase_tree.py::test_several_threads_bound_the_same_rows",
     ),
     Fault(
@@ -440,7 +440,7 @@ CERTIFICATES = (
     ),
     Fault(
         "search: cells fail as a whole by three poses", "verify/search.py", "Search.examine",
-        "[cell for cell in samples if cell.broken and cell.hopeless]", "[]",
+        "[c for c in samples if c.broken and c.hopeless]", "[]",
         "test_certify_search.py::test_cells_of_cheap_models_fail_as_a_whole_only_after_a_second_look",
     ),
     Fault(

@@ -53,6 +53,10 @@ _ORDER = Assumption(
 )
 
 
+#: Origin of B's background where its file states none.
+_BACKGROUND_OF_A = f"{DEFAULT}: A's, the file of B states none"
+
+
 class ComparisonJob(Job):
     """Two scenes with one set of poses by frame; what is bounded is the absolute difference of their pictures.
 
@@ -62,7 +66,6 @@ class ComparisonJob(Job):
         pose_sets: One by frame.
         tolerance: Difference of which is asked whether any picture exceeds it; None: nothing is asked.
         path: The camera path of a command line.
-        background_choice: Where B's background is from, unless its file or an option says it.
         options: Those of `Job`.
 
     Raises:
@@ -77,11 +80,10 @@ class ComparisonJob(Job):
         *,
         tolerance: float | None = None,
         path: CameraPath | None = None,
-        background_choice: Assumption | None = None,
         **options: Any,
     ) -> None:
         _check_comparable(scene, other, pose_sets)
-        self.tolerance, self.path, self.background_choice = tolerance, path, background_choice
+        self.tolerance, self.path = tolerance, path
         shared = {name: value for name, value in options.items() if name not in ("notes", "set_choices")}
         with _named(other):
             self.other = Job(other, pose_sets, **shared)
@@ -151,12 +153,13 @@ class ComparisonJob(Job):
         return (*(f"A: {line}" for line in self.method.plan), *(f"B: {line}" for line in self.other.method.plan))
 
     @property
+    def background_choice(self) -> Assumption | None:
+        """B's background where it is A's, as B's file states none."""
+        return next((entry for entry in self.other._scene_choices if entry.origin == _BACKGROUND_OF_A), None)
+
+    @property
     def assumptions(self) -> tuple[Assumption, ...]:
-        others = [replace(entry, name=f"other {entry.name}") for entry in self.other._scene_choices]
-        if self.background_choice is not None:
-            others = [
-                self.background_choice if entry.name == self.background_choice.name else entry for entry in others
-            ]
+        others = (replace(entry, name=f"other {entry.name}") for entry in self.other._scene_choices)
         return (*self._scene_choices, *others, self.frame_choice, *self.order_choice, *self.set_choices)
 
     @property
@@ -235,17 +238,13 @@ def open_comparison(settings: Settings, other: SceneSource, tolerance: float | N
         InputError: A file, a field or an option cannot be used.
     """
     scene, second = settings.scene.open(), other.open()
-    background_choice = None
     if second.background is None and scene.background is not None:
-        second = replace(other, overrides=replace(other.overrides, background=scene.background)).open()
-        text = " ".join(f"{part:.9g}" for part in scene.background)
-        background_choice = Assumption("other background", text, f"{DEFAULT}: A's, the file of B states none")
+        second = second.on_background(scene.background, _BACKGROUND_OF_A)
     run_frame = second.run_frame if scene.run_frame is None else scene.run_frame
     path = load_camera_path(settings.camera_path_filename, settings.downscale_factor, run_frame)
     pose_sets = path_sets(settings, scene, path)
     return ComparisonJob(
-        scene, second, pose_sets, tolerance=tolerance, path=path, background_choice=background_choice,
-        arithmetic=settings.arithmetic, seed=settings.seed,
+        scene, second, pose_sets, tolerance=tolerance, path=path, arithmetic=settings.arithmetic, seed=settings.seed,
         memory_limit=settings.memory_limit, workers=settings.workers, notes=path.notes,
         set_choices=settings.set_choices(pose_sets, path),
     )  # fmt: skip

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -18,7 +19,7 @@ from ns_abstract.io.arguments import file_path
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.load import open_scene
-from ns_abstract.methods.overrides import UNSAID, Overrides
+from ns_abstract.methods.overrides import UNSAID, Overrides, assumption_of
 from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.refine.protocol import Method, PreciseFrame
@@ -113,6 +114,16 @@ class Scene:
         unsaid = any(entry.name == "background" and entry.origin == UNSAID for entry in self.assumptions)
         color = self._content.background
         return None if unsaid or isinstance(color, str) else tuple(map(float, color))
+
+    def on_background(self, color: tuple[float, ...], origin: str) -> Scene:
+        """The same splats, not read again, before an RGB ``color``; ``origin`` says where it is from."""
+        scene, (red, green, blue) = copy(self), color
+        overrides = replace(self.source.overrides, background=(red, green, blue))
+        scene.source, scene._methods = replace(self.source, overrides=overrides), {}
+        record = assumption_of("background", None, "", color, origin)
+        choices = tuple(record if entry.name == record.name else entry for entry in self.assumptions)
+        scene._content = replace(self._content, background=np.array(color, np.float32), assumptions=choices)
+        return scene
 
     @property
     def assumptions(self) -> tuple[Assumption, ...]:

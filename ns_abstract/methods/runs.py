@@ -43,8 +43,8 @@ TRANSFORMS_BYTES_LIMIT = 2**20
 _PYTHON_TAG = "tag:yaml.org,2002:python/"
 _MERGE_TAG = "tag:yaml.org,2002:merge"
 _NUMBER_TAGS = {f"tag:yaml.org,2002:{python}{kind}" for python in ("", "python/") for kind in ("int", "long", "float")}
-#: Steps that an error lists.
-_STEPS_SHOWN, _RUNS_SHOWN = 12, 4
+#: Steps and runs that an error lists; folders that are looked into for these.
+_STEPS_SHOWN, _RUNS_SHOWN, _FOLDERS_SEEN = 12, 4, 4096
 _CHECKPOINT_NAME = re.compile(r"step-(\d{1,18})\.ckpt")
 
 
@@ -145,8 +145,8 @@ def read_config(path: str | os.PathLike[str]) -> RunConfig:
 
 def _which_run(folder: Path) -> str:
     """What to give in place of a folder without a config.yml: a run below it, such as those of an experiment."""
-    below = (file for depth in (1, 2, 3) for file in folder.glob("*/" * depth + CONFIG_NAME))
-    runs = sorted(islice(below, _RUNS_SHOWN))
+    below = (inner / CONFIG_NAME for depth in (1, 2, 3) for inner in folder.glob("*/" * depth))
+    runs = sorted(islice((file for file in islice(below, _FOLDERS_SEEN) if file.is_file()), _RUNS_SHOWN))
     if not runs:
         return "give a folder that ns-train wrote, or its config.yml"
     return f"give a run below it: {', '.join(visible(str(run)) for run in runs)}"

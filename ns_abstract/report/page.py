@@ -24,7 +24,7 @@ _STATS = (
     ("mpg_witness", "MPG of renders", "the same of images really rendered; the true one is at least this"),
     ("ratio", "ratio", "MPG / MPG of renders: 1 would be exact"),
     ("xpg", "XPG", "gap of the widest pixel (at most √3 = 1.732)"),
-    ("xpg_witness", "witness XPG", "the same of images really rendered"),
+    ("xpg_witness", "XPG of renders", "the same of images really rendered"),
     ("seconds", "seconds", "time spent on this frame"),
     ("cells", "cells", "boxes of parameters that were bounded one by one"),
 )

@@ -52,9 +52,9 @@ class NetworkModel:
         """
         with torch.no_grad():
             inputs = self.preprocess.apply(torch.from_numpy(np.asarray(images, np.float32)))
-            if self.network.whole_numbers:
-                inputs = inputs.round()
             if self.arithmetic == "real":
+                # onnxruntime is given whole numbers by its runner
+                inputs = inputs.round() if self.network.whole_numbers else inputs
                 return np.concatenate([self.network(x[None].double()).numpy() for x in inputs])
         # one at a time: the same picture gives the same bits whatever stands beside it
         return np.stack([self._run(x[None].numpy()) for x in inputs])

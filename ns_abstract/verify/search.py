@@ -47,8 +47,8 @@ _FAR = 4.0
 #: Of a model without cost: the part of the margin that bounds of a cell's parts may miss it by, the least that cells
 #: are narrowed by at once, and how many times the margin a bound is taken to miss where the property fails in places.
 _LEFT, _NARROWEST, _AWAY = 0.7, 0.125, 4.0
-#: Corners sampled before and after a cell's bounds are known, and random poses besides.
-_EARLY, _LATE, _RANDOM = 2, 4, 2
+#: Corners sampled in a cell without a proof, beside its two ends, and random poses.
+_LATE, _RANDOM = 4, 2
 #: Scenes of a set tried in a cell without a proof.
 _MEMBERS = 4
 #: Why a cell is unknown where a sample's margin decides nothing.
@@ -139,12 +139,10 @@ class Search:
         proved = {k for k in open_cells if bounded.get(k, -math.inf) > 0.0}
         self._sample([samples[k] for k in sorted(proved)], self._attack)
         failing = [samples[k] for k in open_cells if k not in proved]
-        if self.costly:
-            self._sample(failing, self._late)
-        else:
+        if not self.costly:
             self._sample([cell for k, cell in enumerate(samples) if k not in proved], self._corners)
-            # a cell is falsified as a whole where nothing else is seen
-            self._sample([cell for cell in samples if cell.broken and cell.hopeless], self._late)
+        # a cell is falsified as a whole where nothing else is seen
+        self._sample(failing if self.costly else [c for c in samples if c.broken and c.hopeless], self._late)
         self._descend_worst_cell(failing)
         if self.varies:
             self._vary(failing)
@@ -153,9 +151,8 @@ class Search:
         # cells of one rank are examined together
         children.sort(key=lambda child: child[0])
         parts = [children[i : i + self.block] for i in range(0, len(children), self.block)]
-        share = seconds / len(samples)
         return BlockResult(
-            leaves=tuple(_timed(leaf, share) for leaf in leaves),
+            leaves=tuple(_timed(leaf, seconds / len(samples)) for leaf in leaves),
             blocks=tuple(tuple(cell for _, cell in part) for part in parts),
             ranks=tuple(part[0][0] for part in parts),
             samples=tuple((cell.cell, cell.holds) for cell in samples),
@@ -167,13 +164,11 @@ class Search:
 
     def _early(self, cell: CellSamples) -> list[Sample]:
         """The middle; and two opposite corners, if they cost less than bounds."""
-        corners = self._corners(cell) if self.costly else []
-        return [(cell.box.middle, None), *corners]
+        return [(cell.box.middle, None), *(self._corners(cell) if self.costly else ())]
 
     def _corners(self, cell: CellSamples) -> list[Sample]:
         """Two opposite corners."""
-        box = cell.box
-        return [(pose, None) for pose in (np.array(box.lower), np.array(box.upper))[: _EARLY if box.dimensions else 0]]
+        return [(np.array(end), None) for end in (cell.box.lower, cell.box.upper) if end]
 
     def _attack(self, cell: CellSamples) -> list[Sample]:
         """A random pose and scene: no proof is believed without."""
@@ -181,8 +176,7 @@ class Search:
         poses = list(cell.box.sample(1, generator)) if cell.box.dimensions else []
         if not self.varies:
             return [(pose, None) for pose in poses]
-        number = int(generator.integers(_ATTACKERS))
-        member = next(itertools.islice(self._members(cell), number, None))
+        member = next(itertools.islice(self._members(cell), int(generator.integers(_ATTACKERS)), None))
         return [(pose, member) for pose in poses or [cell.box.middle]]
 
     def _members(self, cell: CellSamples) -> Iterator[SceneSample]:

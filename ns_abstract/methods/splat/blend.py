@@ -48,10 +48,10 @@ class BlendTuning:
     """When skipped fragments are looked at together. None of them decides whether a bound holds."""
 
     #: Crossings are looked at together where they may widen a pixel by more than this part.
-    jumps_matter: float = 2.0**-4
+    crossings_matter: float = 2.0**-4
 
 
-_CROSSINGS_MATTER = BlendTuning.jumps_matter
+_CROSSINGS_MATTER = BlendTuning.crossings_matter
 
 
 class _PixelResult(NamedTuple):

@@ -53,7 +53,7 @@ def compare(network: Network, run: Evaluate, images: Iterable[np.ndarray], *, us
     """
     path = network.source
     for image in images:
-        image = levels(image).astype(np.float32) if network.whole_numbers else image.astype(np.float32)
+        image = (levels(image) if network.whole_numbers else image).astype(np.float32)
         try:
             expected = run(image).reshape(-1).astype(np.float64)
         except Exception as error:  # the other program's own

@@ -61,6 +61,7 @@ TRIALS = 32
 _WINDOWED = (Activation, ChannelEmbedding, Pad, Product, ScaleLayer, Sum)
 
 
+Share = TypeVar("Share")
 Part = TypeVar("Part")
 
 
@@ -399,7 +400,7 @@ def cost_model_of(network: Network) -> CostModel:
     return costs
 
 
-def on_threads(work: Callable[[int], Part], parts: Iterable[int], threads: int) -> Iterator[Part]:
+def on_threads(work: Callable[[Share], Part], parts: Iterable[Share], threads: int) -> Iterator[Part]:
     """Return ``work`` of every part, in order, computed by several threads."""
     if threads < 2:
         yield from map(work, parts)

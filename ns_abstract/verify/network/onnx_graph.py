@@ -222,15 +222,14 @@ class OnnxReader:
         if not asked.whole_numbers:
             fix = 'for pictures: write "range": [0, 255] alone in preprocess; else export with a float input'
             raise InputError("is a uint8 tensor", file=self.path, field=field, fix=fix)
-        waiting = [name]
-        while waiting:
-            held = waiting.pop()
-            for node in self.graph.node:
-                if node.op_type == "Cast" or held not in {*node.input, *_outer_names(node)}:
-                    continue
-                if node.op_type not in _MOVES or node.input[0] != held:
-                    raise self._fail(node, "computes with uint8 numbers", "cast the input to float before it")
-                waiting += node.output
+        integers = {name}
+        for node in self.graph.node:
+            read = integers.intersection((*node.input, *_outer_names(node)))
+            if node.op_type == "Cast" or not read:
+                continue
+            if node.op_type not in _MOVES or read != {node.input[0]}:
+                raise self._fail(node, "computes with uint8 numbers", "cast the input to float before it")
+            integers.update(node.output)
 
     def network(self) -> Network:
         """The network up to the chosen output; nodes that it does not depend on are not read."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
@@ -65,8 +66,8 @@ def _check_attributes(model: onnx.ModelProto, path: Path) -> None:
     """Refuse attributes that are given twice, of which programs take one or the other, or that no function gives."""
     for body in (model.graph, *model.functions):
         for node in body.node:
-            names = [attribute.name for attribute in node.attribute]
-            wrong = {name: "is given twice" for name in names if names.count(name) > 1}
+            names = Counter(attribute.name for attribute in node.attribute)
+            wrong = {name: "is given twice" for name, number in names.items() if number > 1}
             if body is model.graph:
                 wrong |= {a.name: "refers to one of a function" for a in node.attribute if a.ref_attr_name}
             for name, problem in wrong.items():

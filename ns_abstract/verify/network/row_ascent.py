@@ -51,47 +51,38 @@ class RowAscent:
             choices, own = ascending(self.intermediate.unstable, k), np.flatnonzero(cell == k)
             if not (choices or self.intermediate.split[k]) or not self.intermediate.good[k]:
                 continue
-            loosest[own] = self._climb_cell(index, rows, k, own, best, need, choices)
+            parts, threads = self._shares(own, choices, rows.value.itemsize)
+            climbed = functools.partial(self._climb, index, rows, k, choices, best, need)
+            loosest[own] = np.concatenate(list(on_threads(climbed, parts, threads)))
         return loosest
 
-    def _climb_cell(
-        self,
-        index: int,
-        rows: Coefficients,
-        k: int,
-        own: Int64,
-        best: BackwardBounds,
-        need: Float64 | None,
-        choices: Mapping[int, Sequence[LineChoice]],
-    ) -> Int64:
-        """`climb` for rows ``own`` of cell k: some at a time, of many on several threads."""
-        size = sum(6 * rows.value.itemsize * int(np.prod(self.network.shape(at))) for at in choices)
+    def _shares(
+        self, own: Int64, choices: Mapping[int, Sequence[LineChoice]], itemsize: int
+    ) -> tuple[list[Int64], int]:
+        """Rows ``own`` in parts whose lines there is memory for, and the number of threads that share them."""
+        size = sum(6 * itemsize * int(np.prod(self.network.shape(at))) for at in choices)
         step = max(1, _LINES_AT_ONCE // max(1, size))
         threads = torch.get_num_threads() if len(own) >= _ROWS_OF_A_THREAD else 1
         if threads > 1:
             step = min(step, -(-len(own) // threads))
-
-        def climbed(first: int) -> Int64:
-            part = own[first : first + step]
-            return self._climb(index, rows[part], k, part, best, None if need is None else need[part], choices)
-
-        return np.concatenate(list(on_threads(climbed, range(0, len(own), step), threads)))
+        return [own[first : first + step] for first in range(0, len(own), step)], threads
 
     def _climb(
         self,
         index: int,
-        start: Coefficients,
+        rows: Coefficients,
         k: int,
-        own: Int64,
+        choices: Mapping[int, Sequence[LineChoice]],
         best: BackwardBounds,
         need: Float64 | None,
-        choices: Mapping[int, Sequence[LineChoice]],
+        own: Int64,
     ) -> Int64:
         """`climb` for rows ``own`` of cell k."""
+        start = rows[own]
         lines = {at: self.intermediate.relaxations[-1].lines[at][:, k] for at in choices}
         ascent = DualAscent(choices, lines, len(own), self.intermediate.split[k], step=self.first)
         for number in range(self.steps + 1):
-            if need is not None and bool((best.lower[own] > need).all()):
+            if need is not None and bool((best.lower[own] > need[own]).all()):
                 return np.full((len(own), 2), -1, np.int64)
             chosen, bounds = self.evaluate(index, start, k, ascent)
             better = bounds.lower > best.lower[own]
