@@ -220,6 +220,20 @@ def test_first_cover_of_one_parameter_is_what_the_goal_asks_for(ratio: float, sl
     assert first.cells <= max(2 * least, pace * 8)
 
 
+def test_some_of_many_tiles_tell_how_many_cells_are_tried_first() -> None:
+    in_vain = {True: 0, False: 0}
+    for sampled, pace, ratio in itertools.product((True, False), (4.0, 40.0), (1.05, 1.1, 1.2)):
+        frame, goal = Waves(1, width=40, height=40, pace=pace), RefinementGoal(ratio, FOREVER)
+        result = refine(frame, goal, tuning=Tuning(sampled_tiles=100 if sampled else 101))
+        check(frame, result)
+        first = after_cover(result)
+        assert goal.met(first)
+        sizes = [len(tiles) for _, tiles, within in frame.calls if within is None]
+        assert sizes.count(100 // 8) == sampled
+        in_vain[sampled] += sizes.count(100) - first.cells
+    assert in_vain[True] <= 0.5 * in_vain[False]
+
+
 class Watched(Waves):
     """Notes what is rendered, and what the refinement allows, before the first cell is split."""
 

@@ -207,13 +207,11 @@ class Refinement:
     def _cover(self) -> bool:
         """Bound an initial partition of the set; False if the work was stopped first."""
         if self.initial:
-            self.leaves.begin(len(self.initial))
             for leaf in self.initial:
                 self.leaves.take(*leaf)
             return self._covered([cell for cell, _, _ in self.initial])
         partition = InitialPartition(self.tiles, self.splitter, self.inner, self.goal, self.tuning).choose()
         parts = partition.parts
-        self.leaves.begin(len(parts))
         cells: list[LeafCell] = []
         # bounds of all cells only where somebody keeps them
         kept: list[BoundedCell] = []
@@ -223,7 +221,7 @@ class Refinement:
                     return False
                 # slower than expected: one cell for the whole set is better than no bounds
                 self.leaf_sets.clear()
-                self.leaves.begin(1)
+                self.leaves.begin()
                 leaf = self._initial_cell(self.splitter.whole, None)
                 cells, kept = [leaf[0]], [leaf]
                 break
@@ -245,12 +243,12 @@ class Refinement:
 
     def _covered(self, cells: list[LeafCell]) -> bool:
         """Go on with ``cells`` that cover the set and whose bounds the leaves have; returns True."""
-        self.leaves.update(self.tiles.all)
+        self.leaves.cover()
         self.covered = True
         elements = [None if cell.context is None else cell.context.shown for cell in cells]
         numbered = [numbers for numbers in elements if numbers is not None]
         if len(numbered) == len(elements):
-            self.shown = np.unique(np.concatenate(numbered))
+            self.shown = np.flatnonzero(np.bincount(np.concatenate(numbered)))
         self._record(1.0)
         return True
 

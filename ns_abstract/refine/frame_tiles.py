@@ -89,9 +89,10 @@ class FrameTiles:
             return self.frame.bound_parts(boxes, numbers, within, self.keep_linear, pixels)
         return [self.frame.bound(box, numbers, within, self.keep_linear) for box in boxes]
 
-    def mean_gap(self, lower: np.ndarray, upper: np.ndarray) -> float:
-        """MPG between [t, side, side, channels] values of all tiles."""
-        return float(gap(lower[..., :COLORS], upper[..., :COLORS])[self.inside].mean())
+    def mean_gap(self, lower: np.ndarray, upper: np.ndarray, places: np.ndarray | None = None) -> float:
+        """MPG between [t, side, side, channels] values of the tiles at ``places`` [t]; None: all."""
+        inside = self.inside if places is None else self.inside[places]
+        return float(gap(lower[..., :COLORS], upper[..., :COLORS])[inside].mean())
 
 
 def pixels_inside(frame: Frame) -> np.ndarray:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ns_abstract.refine.frame_tiles import FrameTiles, context_bytes, usable
+from ns_abstract.refine.frame_tiles import FrameTiles, context_bytes
 from ns_abstract.refine.goal import RefinementGoal
 from ns_abstract.refine.inner import InnerBound
 from ns_abstract.refine.linear_sets import linear_bytes
@@ -100,6 +100,8 @@ class InitialPartition:
         # odd: the middle of the set, which is rendered, is that of a part
         count, before = 2 * int(min(motion / tuning.first_motion, tuning.most_initial_cells) / 2.0) + 1, np.inf
         goal = replace(self.goal, ratio=max(self.goal.ratio, tuning.aim_ratio))
+        if count > 1 and self.tiles.count >= tuning.sampled_tiles:
+            count = self._sampled_count(count, goal)
         finer: int | None = None
         while True:
             part = self.splitter.cut(whole, 0, count)[count // 2]
@@ -123,6 +125,18 @@ class InitialPartition:
                 return Partition(parts, part, probe)
             count, before = 2 * count + 1, excess
 
+    def _sampled_count(self, count: int, goal: RefinementGoal) -> int:
+        """Odd number of equal parts that some tiles ask for, where ``count`` seemed right; at most twice as many."""
+        tuning, inner = self.tuning, self.inner
+        random, tiles = np.random.default_rng(0), self.tiles
+        places = np.sort(random.choice(tiles.count, tiles.count // tuning.tiles_a_sample, replace=False))
+        part = self.splitter.cut(self.splitter.whole, 0, count)[count // 2]
+        bounds = tiles.frame.bound(part.box, tiles.numbers(places), None, False)
+        excess = inner.beyond(part, bounds.lower, bounds.upper, places)
+        aim = tuning.aim_share * goal.excess(tiles.mean_gap(inner.lower[places], inner.upper[places], places))
+        # it falls with the square of the width
+        return math.ceil(count * math.sqrt(min(excess / aim, 4.0))) | 1 if aim > 0.0 < excess else count
+
     def _helped(self, excess: float, before: float, share: float) -> bool:
         """Whether smaller cells left at most ``share`` of the excess ``before``, or that may have been cut off."""
         if excess <= share * before or before == math.inf:
@@ -132,7 +146,7 @@ class InitialPartition:
 
     def _beyond(self, found: Partition) -> float:
         """MPG of what was tried beyond that of pictures of it."""
-        return self.inner.beyond(found.tried, self.tiles.mean_gap(*usable(found.bounds.lower, found.bounds.upper)))
+        return self.inner.beyond(found.tried, found.bounds.lower, found.bounds.upper)
 
     def _probe(self, part: SubBox) -> tuple[Bounds, float]:
         """Bounds of ``part``, and how many such cells time and memory allow."""

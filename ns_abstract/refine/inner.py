@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.refine.frame_tiles import FrameTiles, LeafCell, pixels_inside
+from ns_abstract.refine.frame_tiles import FrameTiles, LeafCell, pixels_inside, usable
 from ns_abstract.refine.protocol import COLORS, DEPTH, Frame, Render
 from ns_abstract.refine.result import SampleImages, gap
 from ns_abstract.refine.sub_boxes import SubBox
@@ -103,11 +103,16 @@ class InnerBound:
         """Corners of the set [n, d] that are to be rendered, some of them where there are many."""
         return _some_corners(self.tiles.frame.box, self.random, self.tuning.most_corners)
 
-    def beyond(self, part: SubBox, gap_of_bounds: float) -> float:
-        """MPG of bounds of ``part`` beyond that of the pictures at its two ends and at the middle of the set."""
-        ends = [self.render(np.array(end)) for end in (part.box.lower, part.box.upper)]
-        low, high = np.minimum.reduce([self.image, *ends]), np.maximum.reduce([self.image, *ends])
-        return gap_of_bounds - self.tiles.mean_gap(low, high)
+    def beyond(self, part: SubBox, lower: np.ndarray, upper: np.ndarray, places: np.ndarray | None = None) -> float:
+        """MPG of bounds of ``part`` beyond that of the pictures at its two ends and at the middle of the set.
+
+        The bounds are those of the tiles at ``places``; None: all.
+        """
+        low = high = self.image if places is None else self.image[places]
+        for end in (part.box.lower, part.box.upper):
+            picture = self.render(np.array(end), places)
+            low, high = np.minimum(low, picture), np.maximum(high, picture)
+        return self.tiles.mean_gap(*usable(lower, upper), places) - self.tiles.mean_gap(low, high, places)
 
     def look_around(self, stopped: Callable[[], bool]) -> None:
         """Render poses across the set, for those who look at what linear sets say of them."""

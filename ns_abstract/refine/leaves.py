@@ -106,6 +106,8 @@ class LeafBounds:
         self.upper[~tiles.inside] = 0.0
         self._mean_gap: float | None = None
         self.bytes = 0
+        #: cells that cover the set, until their tiles are split one by one
+        self._taken: list[BoundedCell] = []
         #: what a leaf may leave open at a pixel that it is not bounded at any more; never falls
         self._closed_excess = 0.0
 
@@ -116,27 +118,49 @@ class LeafBounds:
             self._mean_gap = self.tiles.mean_gap(self.lower, self.upper)
         return self._mean_gap
 
-    def begin(self, count: int) -> None:
-        """Make room for ``count`` cells that cover the set; what was taken before is dropped."""
-        for tile in self.by_tile:
-            tile.cells = []
-            # memory is taken where it is written
-            tile.lower, tile.upper = (np.empty((count, *self.tiles.shape), np.float32) for _ in range(2))
+    def begin(self) -> None:
+        """Drop the cells that were taken."""
+        self._taken.clear()
 
     def take(self, cell: LeafCell, lower: np.ndarray, upper: np.ndarray) -> None:
-        """Copy the bounds of a cell in all tiles; `update` follows when all cells are there."""
-        for tile, low, high in zip(self.by_tile, lower, upper, strict=True):
-            assert tile.lower is not None and tile.upper is not None
-            tile.lower[len(tile.cells)], tile.upper[len(tile.cells)] = low, high
-            tile.cells.append(cell)
+        """Keep the bounds of a cell in all tiles; `cover` follows when all cells are there."""
+        self._taken.append((cell, lower, upper))
+
+    def cover(self) -> None:
+        """Make the outer bound that of the cells that were taken."""
+        _, lower, upper = self._taken[0]
+        self.lower[:], self.upper[:] = lower, upper
+        for _, lower, upper in self._taken[1:]:
+            np.minimum(self.lower, lower, out=self.lower)
+            np.maximum(self.upper, upper, out=self.upper)
+        self._bound(self.tiles.all)
 
     def update(self, places: np.ndarray, changes: dict[int, Change] | None = None) -> None:
         """Update the outer bound of the tiles at ``places``, given what has changed since the round began."""
         for t in places:
             self.lower[t], self.upper[t] = self.by_tile[t].outer(None if changes is None else changes[t])
+        self._bound(places)
+
+    def _bound(self, places: np.ndarray) -> None:
+        """Make the outer bound of tiles usable, with what was known before."""
         self._intersect(places)
         self.lower[places], self.upper[places] = usable(self.lower[places], self.upper[places])
         self._mean_gap = None
+
+    def _divide(self) -> None:
+        """Hand the cells that were taken to the tiles, each its part of their bounds."""
+        cells = [cell for cell, _, _ in self._taken]
+        for tile in self.by_tile:
+            tile.cells = list(cells)
+            # memory is taken where it is written
+            tile.lower, tile.upper = (np.empty((len(cells), *self.tiles.shape), np.float32) for _ in range(2))
+        while self._taken:
+            # what is copied may be given back before the next is
+            _, lower, upper = self._taken.pop()
+            row = len(self._taken)
+            for tile, low, high in zip(self.by_tile, lower, upper, strict=True):
+                assert tile.lower is not None and tile.upper is not None
+                tile.lower[row], tile.upper[row] = low, high
 
     def apply(self, changes: dict[int, Change]) -> None:
         """End a round with what has changed in it."""
@@ -170,6 +194,8 @@ class LeafBounds:
 
     def next_round(self, goal: RefinementGoal) -> tuple[list[tuple[LeafCell, dict[int, int]]], int]:
         """The cells to split in the next round, each with its row by tile, and into how many parts."""
+        if self._taken:
+            self._divide()
         while True:
             amounts, owner = self._excess()
             if not owner:

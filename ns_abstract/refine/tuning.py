@@ -21,6 +21,8 @@ class Tuning:
         helpful_halving: Halving an initial cell of several parameters helps if it leaves at most this part.
         patience: So many halvings together may help as little as one should, where two axes matter as much.
         patient_multiple: They may do so only from so many times the aim on.
+        sampled_tiles: From so many tiles on, some of them tell how many initial cells of one parameter are tried first.
+        tiles_a_sample: One of so many.
         initial_time_share: Part of the time budget that the initial partition may take.
         most_initial_cells: Most cells of the initial partition.
         round_share: Part of the whole excess that one round of splitting takes on.
@@ -50,6 +52,8 @@ class Tuning:
     helpful_halving: float = 0.8
     patience: int = 2
     patient_multiple: float = 1.6
+    sampled_tiles: int = 4096
+    tiles_a_sample: int = 8
     initial_time_share: float = 0.7
     most_initial_cells: int = 4096
     round_share: float = 0.8
