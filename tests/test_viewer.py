@@ -378,7 +378,7 @@ def test_bounds_of_a_nerf_ray_by_ray(background: Callable[..., Background]) -> N
     seen: list[Snapshot] = []
 
     def look() -> bool:
-        found = one.best(asked, 20.0)
+        found = one.best(asked, 300.0)
         if found is not None and (not seen or found is not seen[-1]):
             seen.append(found)
         assert one.status.state != "failed", one.status.detail
