@@ -75,6 +75,8 @@ KINDS: dict[str, tuple[str, ...]] = {
     "cube": (),
     "root": (),
     "inverse root": (),
+    "fractional power": (),
+    "local response": ("s",),
     "reciprocal": (),
     "norm": (),
     "spelled norm": (),
@@ -194,7 +196,14 @@ def layer(gene: Gene, n: int) -> Any:
         return extreme.clip(-float(v["s"]), float(v["s"]))
     if kind in ("norm", "spelled norm"):
         return extreme.layer_norm(n, op=kind == "norm")
-    powers = {"square": 2.0, "cube": 3.0, "root": 0.5, "inverse root": -0.5, "reciprocal": -1.0}
+    powers = {
+        "square": 2.0,
+        "cube": 3.0,
+        "root": 0.5,
+        "inverse root": -0.5,
+        "reciprocal": -1.0,
+        "fractional power": -0.75,
+    }
     if kind in powers:
         return extreme.power(powers[kind])
     if kind == "relu":
@@ -237,6 +246,10 @@ def joined(gene: Gene, n: int) -> Any:
             scores = f.node("Softmax", f.node("MatMul", f"v{len(f.nodes) - 2}", row), axis=-1)
             f.node("Squeeze", f.node("MatMul", scores, f.node("Unsqueeze", x, f.constant([-1], np.int64))),
                    f.constant([-1], np.int64))  # fmt: skip
+        elif kind == "local response":
+            f.node("Reshape", x, f.constant([0, n, 1, 1], np.int64))
+            f.node("LRN", f.last, size=3, alpha=min(s, 1e30), beta=0.75, bias=1.0)
+            f.node("Flatten")
         elif kind == "quantised":
             zero = f.constant(0, np.int8)
             f.node("DequantizeLinear", f.node("QuantizeLinear", x, c["s"], zero), c["s"], zero)
@@ -255,6 +268,9 @@ def joined(gene: Gene, n: int) -> Any:
             torch.softmax((x * t["a"])[..., None] @ x[:, None], -1) @ x[..., None]
         )[..., 0],
         "quantised": lambda x: (x / t["s"]).round().clamp(-128, 127) * t["s"],
+        "local response": lambda x: (
+            functional.local_response_norm(x[:, :, None, None], 3, min(s, 1e30), 0.75, 1.0).flatten(1)
+        ),
         "Gelu": functional.gelu,
     }  # fmt: skip
     return extreme.Layer(write, steps[kind], kind=kind)

@@ -60,6 +60,7 @@ MEASURED: dict[str, tuple[tuple[str, ...], ...]] = {
     "sum of nodes": (("mean",), ("gemm", "residual")),
     "flushed numbers of every linear layer": (("scale", "scale"), ("gemm", "scale", "scale")),
     "variance of a norm": (("norm",), ("spelled norm",)),
+    "sums over windows of channels": (("local response",),),
     "maximum, minimum": (("maximum",),),
     "product of two values, matrix product": (("product",), ("attention",)),
     "computed constants": (("computed",),),
@@ -76,6 +77,7 @@ MEASURED: dict[str, tuple[tuple[str, ...], ...]] = {
     "reciprocal, quotient": (("reciprocal",), ("quotient",)),
     "root": (("root",),),
     "reciprocal root": (("inverse root",),),
+    "power of positive numbers": (("fractional power",),),
     "exponential": (("Exp",),),
     "softmax's exponentials": (("softmax",),),
     "logarithm": (("Log",), ("log softmax",)),
@@ -137,6 +139,12 @@ def _batch_norm(v: dict[str, Any], x: Vector) -> Vector:
     return [
         (z - m) / mpmath.sqrt(s + eps) * a + t for z, a, t, m, s in zip(x, v["a"], v["t"], v["m"], v["v"], strict=True)
     ]
+
+
+def _local_response(v: dict[str, Any], x: Vector) -> Vector:
+    alpha = min(v["s"], _number(1e30))
+    sums = [mpmath.fsum(z * z for z in x[max(0, k - 1) : k + 2]) for k in range(len(x))]
+    return [z * (1 + alpha / 3 * total) ** mpmath.mpf(-0.75) for z, total in zip(x, sums, strict=True)]
 
 
 def _number(value: float) -> Number:
@@ -206,6 +214,8 @@ EXACT: dict[str, Callable[[dict[str, Any], Vector], Vector]] = {
     "cube": _each(lambda z: z**3),
     "root": _each(mpmath.sqrt),
     "inverse root": _each(lambda z: 1 / mpmath.sqrt(z)),
+    "fractional power": _each(lambda z: z ** mpmath.mpf(-0.75)),
+    "local response": _local_response,
     "reciprocal": _each(lambda z: 1 / z),
     "norm": lambda v, x: _norm(x),
     "spelled norm": lambda v, x: _norm(x),
@@ -295,7 +305,7 @@ def case(kinds: tuple[str, ...], flavour: str, seed: int, count: int, sizes: tup
         images = np.ldexp(images, rng.choice([0, grown[flavour] // 2, grown[flavour]], (count, 1)))
     if flavour == "constant":
         images = rng.normal(size=(count, 1)) * 10.0 + np.ldexp(images, -rng.integers(2, 22, (count, 1)))
-    if kinds[0] in ("root", "inverse root", "Log"):
+    if kinds[0] in ("root", "inverse root", "fractional power", "Log"):
         images = np.abs(images)
     with np.errstate(over="ignore"):
         images = np.clip(images, -1e37, 1e37).astype(np.float32)

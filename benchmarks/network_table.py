@@ -110,6 +110,13 @@ SUMS = (
         "N11",
     ),
     Row(
+        "sums over windows of channels",
+        ("ChannelWindows",),
+        "gamma(n) S + gamma(n) 2 w L + n FLUSHES FLUSH (1 + w), L what has left the window, n of all channels",
+        "sums of each window, or running ones that add a channel and subtract another",
+        "N11",
+    ),
+    Row(
         "resized map",
         ("Resize",),
         "POSITION (|place| + 1) times the interpolant's slope, POLYNOMIAL of cubic weights; OWN_POSITIONS of that with "
@@ -213,6 +220,13 @@ FUNCTIONS = (
         ("Root",),
         "ROOT / sqrt(lower) + FUNCTION_FLUSHES * FLUSH",
         "a root and a division, approximate reciprocal roots within 2 ulp; unknown below FLUSH",
+        "N10, N21",
+    ),
+    Row(
+        "power of positive numbers",
+        ("PositivePower",),
+        "LIBRARY * max(exp(exponent * log(lower)), exp(exponent * log(upper))) + FUNCTION_FLUSHES * FLUSH",
+        _LIBRARY + _FLUSHED + "; unknown below FLUSH",
         "N10, N21",
     ),
     Row(

@@ -126,6 +126,40 @@ def test_norms_of_maps_in_one_pass(op: str, tmp_path: Path) -> None:
         assert not outside(run(x[None].astype(np.float32)).astype(np.float64), low, high).any()
 
 
+@pytest.mark.parametrize("size", [1, 2, 3, 5])
+def test_running_sums_over_channels(size: int, tmp_path: Path) -> None:
+    """Channels that have left a window leave their rounding behind."""
+    rng = np.random.default_rng(size)
+    f = OnnxFile((40, 1, 2))
+    f.node("LRN", size=size, alpha=float(size), beta=0.5)
+    file = f.write(tmp_path / "net.onnx")
+    x = rng.normal(size=(40, 1, 2)) * np.where(np.arange(40) < 12, 20.0, 1.0)[:, None, None]
+    x = x.astype(np.float32)
+    low, high = bounds(read_onnx(file), x, x)
+    before, behind = (size - 1) // 2, size - 1 - (size - 1) // 2
+    square, scale = x * x, np.ones_like(x)
+    running = np.float32(1.0) + np.zeros((1, 2), np.float32)
+    for k in range(-behind, 40):
+        if k + behind < 40:
+            running = running + square[k + behind]
+        if k - before - 1 >= 0:
+            running = running - square[k - before - 1]
+        if k >= 0:
+            scale[k] = running
+    values = [(x / np.sqrt(scale)).reshape(1, -1)]
+    if size % 2:
+        # onnxruntime takes no other
+        values += [run(x[None]) for run in runs(file)]
+    squares = np.square(x, dtype=np.float64)
+    sums = np.array([squares[max(0, k - before) : k + behind + 1].sum(axis=0) for k in range(40)])
+    exact = (x / np.sqrt(1.0 + sums)).reshape(1, -1)
+    assert np.isfinite(low).all() and np.isfinite(high).all()
+    for y in (exact, *values):
+        assert not outside(y.astype(np.float64), low, high).any()
+    # what has left the window is seen in what comes long after it
+    assert size == 1 or all(np.abs(y - exact)[:, 60:].max() > 1e-5 for y in values)
+
+
 @pytest.mark.parametrize("op", [True, False])
 def test_norms_over_wide_sets_stay_bounded(op: bool, tmp_path: Path) -> None:
     """A set that holds constant features has bounds where the mean is small beside what epsilon leaves."""

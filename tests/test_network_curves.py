@@ -48,6 +48,9 @@ CURVES: dict[str, tuple[ScalarFunction, Exact, tuple[float, float]]] = {
     "negative reciprocal": (activations.Reciprocal((1,)), lambda z: 1 / z, (-50, -1e-3)),
     "root": (activations.Root((1,)), lambda z: z.sqrt(), (1e-6, 50)),
     "inverse root": (activations.Root((1,), inverse=True), lambda z: z.rsqrt(), (1e-5, 50)),
+    "power -0.75": (activations.PositivePower((1,)), lambda z: z ** arb(-0.75), (1e-5, 50)),
+    "power 0.3": (activations.PositivePower((1,), exponent=0.3), lambda z: z ** arb(0.3), (1e-6, 50)),
+    "power 2.5": (activations.PositivePower((1,), exponent=2.5), lambda z: z ** arb(2.5), (1e-4, 30)),
     "exp": (activations.Exp((1,)), lambda z: z.exp(), (-30, 30)),
     "capped exp": (
         composite_activations.CappedExp((1,)),
@@ -220,3 +223,5 @@ def test_what_lies_outside_a_domain_is_unknown() -> None:
         assert known.tolist() == [False, False, True]
         floored = type(curve)((3,), floor=0.25).band(lower, upper)
         assert torch.isfinite(floored.upper_offset).all()
+    band = activations.PositivePower((3,)).band(lower, upper)
+    assert torch.isfinite(band.upper_offset - band.lower_offset).tolist() == [False, False, True]

@@ -61,7 +61,7 @@ BAD: dict[str, tuple[Callable[[OnnxFile], object], tuple[str, ...]]] = {
         ("one or two values",),
     ),
     "softmax over the batch": (lambda f: f.node("Softmax", axis=0), ("axis = 0", "batch")),
-    "power": (lambda f: f.node("Pow", f.last, f.constant(1.7)), ("exponent 1.7", "0.5")),
+    "power": (lambda f: f.node("Pow", f.last, f.constant(9.5)), ("exponent 9.5", "from -8 to 8")),
     "half precision": (lambda f: f.node("Cast", to=TensorProto.FLOAT16), ("to = FLOAT16", "float32")),
     "cubic": (
         lambda f: f.node("Resize", f.last, "", f.constant([1, 1, 2, 2]), mode="cubic", exclude_outside=1),

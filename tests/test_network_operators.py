@@ -110,6 +110,24 @@ def _instance_norm(f: OnnxFile) -> None:
     f.conv(4, 2)
 
 
+def _local_response(f: OnnxFile) -> None:
+    f.conv(3, 7)
+    f.node("Relu")
+    f.node("LRN", size=3, alpha=0.3, beta=0.75, bias=0.9)
+    f.node("Conv", f.last, f.weights(4, 7, 1, 1))
+    # windows of more channels than there are
+    f.node("LRN", size=11, alpha=2.0, beta=0.5)
+    f.node("Conv", f.last, f.weights(2, 4, 1, 1))
+
+
+def _fractional_power(f: OnnxFile) -> None:
+    f.conv(3, 4)
+    f.node("Add", f.node("Relu"), f.constant(0.4))
+    f.node("Pow", f.last, f.constant(1.3))
+    f.node("Pow", f.last, f.constant(-0.2))
+    f.conv(4, 2)
+
+
 def _transposed(f: OnnxFile) -> None:
     f.conv(3, 4)
     f.node("Relu")

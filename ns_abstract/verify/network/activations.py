@@ -208,6 +208,30 @@ class Root(ScalarFunction):
         return ROOT * (lower.rsqrt() if self.inverse else upper.sqrt()) + FLUSHED
 
 
+@dataclass(frozen=True, eq=False)
+class PositivePower(ScalarFunction):
+    """``z^exponent`` for inputs above 0 and any exponent but 0 and 1."""
+
+    exponent: float = -0.75
+
+    @property
+    def bends(self) -> tuple[int, ...]:
+        return (-1,) if 0.0 < self.exponent < 1.0 else (1,)
+
+    def function(self, z: Tensor) -> Tensor:
+        return z**self.exponent
+
+    def slope(self, z: Tensor) -> Tensor:
+        return self.exponent * z ** (self.exponent - 1.0)
+
+    def _cuts(self, lower: Tensor, upper: Tensor) -> _SampledFunction:
+        # a number below may be flushed to zero, whose power is far from its own
+        return super()._cuts(*_unknown(lower, upper, ~(lower >= FLUSH)))
+
+    def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
+        return LIBRARY * torch.maximum(lower**self.exponent, upper**self.exponent) + FLUSHED
+
+
 # ---------------------------------------------------------------- with exponentials
 
 

@@ -31,6 +31,7 @@ from ns_abstract.verify.network.layers import (
     Sum,
 )
 from ns_abstract.verify.network.sparse_layers import (
+    ChannelWindows,
     PairwiseDifferences,
     Resize,
     SparseMatrix,
@@ -138,6 +139,23 @@ class CompositeBuilder(ElementwiseBuilder):
         while index and (type(self._node(index).layer) is LinearLayer or isinstance(self._node(index).layer, Gather)):
             index = self._node(index).inputs[0]
         return index
+
+    def local_response(self, x: int, size: int, alpha: float, beta: float, bias: float) -> int:
+        """``x / (bias + alpha / size * sum of squares)^beta``, the sum over windows of ``size`` channels (N11)."""
+        shape = self.shape(x)
+        channels, before = shape[0], (size - 1) // 2
+        place = self.positions(x, min(size, channels))
+        to, source = [], []
+        for step in range(max(-before, 1 - channels), min(size - before, channels)):
+            to.append(place[max(0, -step) : channels - max(0, step)].reshape(-1))
+            source.append(place[max(0, step) : channels + min(0, step)].reshape(-1))
+        offset = torch.full(shape, bias, dtype=torch.float64)
+        kind = partial(ChannelWindows, offset=offset, before=before)
+        # additions and subtractions of all channels, products, the weight's own
+        terms = 2 * channels + size + 4
+        squares = self.curve(x, activations.Power, exponent=2)
+        sums = self._sparse(squares, shape, np.concatenate(to), np.concatenate(source), alpha / size, terms, kind)
+        return self.product(x, self.power(sums, -beta))
 
     def greatest(self, x: int, axes: Sequence[int], keep: bool, most: bool = True) -> int:
         """Maximum or minimum over axes of the item."""

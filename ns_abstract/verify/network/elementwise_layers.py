@@ -160,7 +160,7 @@ class ElementwiseBuilder(NetworkBuilder):
         return self.sum((straight, self.scale(self.leaky_relu(x, 0.0), 1.0 - slope, None)), (1, 1))
 
     def power(self, x: int, exponent: float) -> int:
-        """``x^exponent`` for whole exponents and half ones."""
+        """``x^exponent``; but for whole exponents from 2 on, only where ``x`` is surely above 0, or not 0 for -1."""
         if exponent == 1.0:
             return x
         if exponent == int(exponent) and 2.0 <= exponent <= 8.0:
@@ -169,7 +169,9 @@ class ElementwiseBuilder(NetworkBuilder):
             return self.curve(x, activations.Root, floor=self._above(x), inverse=exponent < 0.0)
         if exponent == -1.0:
             return self.reciprocal(x)
-        raise InputError(f"exponent {exponent} is not supported", fix="use 2 to 8, 0.5, -0.5 or -1")
+        if not 0.0 < abs(exponent) <= 8.0:
+            raise InputError(f"exponent {exponent} is not supported", fix="use one from -8 to 8 other than 0")
+        return self.curve(x, activations.PositivePower, exponent=exponent)
 
     def _above(self, x: int) -> float:
         floor = self.floor(x)

@@ -59,7 +59,6 @@ _INSTEAD = {
     "Less": "use Max, Min or Clip instead of a choice",
     "LessOrEqual": "use Max, Min or Clip instead of a choice",
     "Loop": "export with fixed sizes",
-    "LRN": "use BatchNormalization",
     "LpPool": "use AveragePool",
     "LSTM": "use convolutions or attention",
     "GRU": "use convolutions or attention",

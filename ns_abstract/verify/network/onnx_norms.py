@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import onnx
 
+from ns_abstract.arithmetic.network_charges import LEAST_DIVISOR, OVERFLOW
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import activations
 from ns_abstract.verify.network.composite_layers import CompositeBuilder
@@ -123,12 +124,28 @@ def _group_norm(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     r.result(node, r.builder.shift(r.builder.scale(index, parts[0], None), parts[1]))
 
 
+#: What attributes of LRN are where a file leaves them out.
+_LOCAL_RESPONSE = {"alpha": 1e-4, "beta": 0.75, "bias": 1.0}
+
+
+def _local_response(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
+    x, size = r.source(node), int(a.get("size", 0))
+    alpha, beta, bias = (float(np.float32(a.get(name, default))) for name, default in _LOCAL_RESPONSE.items())
+    if size < 1 or not (0.0 <= alpha < OVERFLOW and 0.0 < beta <= 8.0 and LEAST_DIVISOR < bias < OVERFLOW):
+        raise InputError(
+            f"attributes size = {size}, alpha = {alpha}, beta = {beta}, bias = {bias} are not supported",
+            fix="a size, an alpha of 0 or more, a beta up to 8 and a bias above 0 expected",
+        )
+    r.result(node, r.builder.local_response(x, size, alpha, beta, bias))
+
+
 NORM_RULES: dict[str, Rule] = {
     "BatchNormalization": _batch_norm,
     "GlobalAveragePool": _global_average,
     "GlobalMaxPool": _global_max,
     "GroupNormalization": _group_norm,
     "InstanceNormalization": _group_norm,
+    "LRN": _local_response,
     "LayerNormalization": _layer_norm,
     "LogSoftmax": _softmax,
     "ReduceL1": _reduce,

@@ -137,6 +137,27 @@ class Variance(SparseMatrix):
 
 
 @dataclass(frozen=True, eq=False)
+class ChannelWindows(SparseMatrix):
+    """Weighted sums over windows of neighbouring channels, and an offset.
+
+    A program may go from channel to channel, add the one that enters the window and subtract the one that leaves it:
+    what that loses is relative to all channels that have left, too (N11).
+
+    Attributes:
+        before: Channels of a window before its middle.
+    """
+
+    before: int = 0
+
+    def spare(self, sizes: Sequence[Tensor]) -> Tensor | float:
+        left = torch.zeros_like(sizes[0])
+        passed = sizes[0].cumsum(1)[:, : max(0, sizes[0].shape[1] - self.before - 1)]
+        left[:, self.before + 1 :] = passed
+        weight = float(self.weight.abs().max())
+        return gamma(self.terms) * 2.0 * weight * left * UP + self.terms * FLUSHES * FLUSH * (1.0 + weight)
+
+
+@dataclass(frozen=True, eq=False)
 class Resize(SparseMatrix):
     """A resized map: rows and columns are interpolated; programs compute their positions in float32.
 
