@@ -169,7 +169,7 @@ def test_no_time_is_one_block(tmp_path: Path) -> None:
     for waits, count in ((True, 1), (False, 0)):
         examiner = Brightness()
         question = BrightnessQuestion(examiner)
-        question.waits = waits
+        question.finish_one = waits
         run(question, tmp_path / str(waits), budget=0.0)
         assert len(examiner.examined) == 2 * count and question.states[-1] == "budget"
         assert json.loads((tmp_path / str(waits) / "report.json").read_text())["state"] == "budget"

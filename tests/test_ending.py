@@ -647,7 +647,7 @@ def test_blocks_are_examined_while_workers_start(looks: int, tmp_path: Path) -> 
     arguments: Any = (told(there), None)
     search_blocks(
         store, Starting(looks), {0: search.grid}, told(here), arguments, deadline=Deadline(LONG),
-        stop=StopRequest(), keep=lambda block, findings: kept.append(block.number), between=lambda instant: None,
+        stop=StopRequest(), keep=lambda block, findings: kept.append(block.number), on_tick=lambda instant: None,
     )  # fmt: skip
     timeless = [[{**row, "seconds": 0.0} for row in rows] for rows in (store.leaves(0), expected[1])]
     assert store.tallies() == expected[0] and timeless[0] == timeless[1]
@@ -665,7 +665,7 @@ def test_blocks_are_examined_while_workers_start(looks: int, tmp_path: Path) -> 
 
     search_blocks(
         store, Starting(1000), {0: search.grid}, told(here), arguments, deadline=Deadline(LONG), stop=stop,
-        keep=keep, between=lambda instant: None,
+        keep=keep, on_tick=lambda instant: None,
     )  # fmt: skip
     assert len(kept) == 1
     store.close()

@@ -10,7 +10,7 @@ import pytest
 from blends import CAPACITY, blended
 from numba import njit
 
-from ns_abstract.arithmetic.simd.intrinsics import advanced, pointer
+from ns_abstract.arithmetic.simd.intrinsics import offset_by, pointer
 from ns_abstract.arithmetic.simd.lanes import load4, store
 from ns_abstract.methods.splat.blend import flattened
 from ns_abstract.methods.splat.pixel_block import (
@@ -41,13 +41,13 @@ def _bounds(values, lists, colors, background, shape, count, limit, crossings_, 
     entries, distances, rows = crossings_
     crossings = ThresholdCrossings(pointer(entries), pointer(distances), pointer(rows), rows.shape[1])
     d, m = shape.dimensions, shape.monomials
-    u = advanced(t, 4 * (m + bends_of(shape)))
+    u = offset_by(t, 4 * (m + bends_of(shape)))
     fragments, blend = blended(values, lists, colors, background, shape, 1, count, t, crossings, True)
     up = 1.0 + 2.0**-40
     store(out, 0, blend.radius * up)
     set_blend(t, out, crossings, d)
     store(out, 20, blend.since)
-    gather_crossings(0, count, blend.crossings, advanced(out, 20), fragments, crossings, out, shape)
+    gather_crossings(0, count, blend.crossings, offset_by(out, 20), fragments, crossings, out, shape)
     falls, rises = load4(out, 0), load4(out, 4)
     r = blend.radius
     if shape.order == 1:

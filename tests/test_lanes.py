@@ -12,7 +12,7 @@ from numba.core.errors import TypingError
 
 from ns_abstract.arithmetic.elementary import exp_kernel, fma
 from ns_abstract.arithmetic.outward import outward
-from ns_abstract.arithmetic.simd.intrinsics import advanced, pointer, signed
+from ns_abstract.arithmetic.simd.intrinsics import offset_by, pointer, signed
 from ns_abstract.arithmetic.simd.lanes import (
     LINE,
     bits,
@@ -171,7 +171,7 @@ def moved(x_, out_, four_):
         out, 3, 10, (load8(x, 0), load8(x, 8), load8(x, 16), load8(x, 24), load8(x, 32), load8(x, 40), load8(x, 48),
         load8(x, 56)),
     )  # fmt: skip
-    store(four, 1, load4(advanced(x, 5), 2))
+    store(four, 1, load4(offset_by(x, 5), 2))
     return bits(load8(x, 0) < load8(x, 8)), bits(load4(x, 0) >= 0.0)
 
 

@@ -179,7 +179,7 @@ def test_what_is_known_is_not_begun_anew(parts: int) -> None:
 
     def found(known: FrameResult | None) -> FrameResult:
         goal = RefinementGoal(ratio=1.0, seconds=120.0, cells=12 // parts)
-        some = [Refinement(frame, 0, goal, tiles=tiles, known=known).run_part() for tiles in groups(frame, parts)]
+        some = [Refinement(frame, 0, goal, tiles=tiles, earlier=known).run_part() for tiles in groups(frame, parts)]
         return joined(some, frame.camera)
 
     results = [found(None)]
@@ -199,7 +199,7 @@ def test_what_is_known_is_not_begun_anew(parts: int) -> None:
 def test_what_is_known_holds_of_a_frame_that_is_stopped_at_once() -> None:
     frame = NerfFrame(tiny_scene(2), UNIFORM, poses(SETS["yaw"]))
     before = Refinement(frame, 0, RefinementGoal(ratio=1.0, seconds=120.0, cells=12)).run()
-    now = Refinement(frame, 0, RefinementGoal(ratio=1.0, seconds=0.0), known=before).run()
+    now = Refinement(frame, 0, RefinementGoal(ratio=1.0, seconds=0.0), earlier=before).run()
     assert now.bounded and np.array_equal(now.lower, before.lower) and np.array_equal(now.upper, before.upper)
 
 

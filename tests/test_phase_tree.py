@@ -218,7 +218,7 @@ def test_what_is_not_known_is_not_proved(tmp_path: Path) -> None:
     x, rows = np.zeros(math.prod(network.input_shape)), np.ones((1, math.prod(network.output_shape)))
     tree = tree_of(network, box(x - 1.0, x + 1.0), rows, np.array([1e6]))
     assert tree.prove([0], MOST).proved
-    tree.intermediate.good[0] = False
+    tree.intermediate.usable[0] = False
     assert tree.prove([0], MOST) == (False, 0, -np.inf)
     group = _GroupRows.of(tree.shifted, [0], grid(network.shape(tree.index)))
     bounds = BackwardBounds.unknown(3, 1)

@@ -12,7 +12,7 @@ from blends import blended
 from numba import njit
 
 from ns_abstract.arithmetic.rounding import REAL, charges
-from ns_abstract.arithmetic.simd.intrinsics import advanced, pointer
+from ns_abstract.arithmetic.simd.intrinsics import offset_by, pointer
 from ns_abstract.arithmetic.simd.lanes import load8, store
 from ns_abstract.methods.splat.alpha_ranges import Exponent, Limits, cubic_exponential, fitted_exponential
 from ns_abstract.methods.splat.alphas import _affine_forms, _exponent_of_several, _set_curvature
@@ -247,7 +247,7 @@ def _blended(values, lists, colors, background, shape, forms, count, t_, out_):
     _, blend = blended(values, lists, colors, background, shape, forms, count, t, unused, False)
     radius, ends = blend.radius, blend.ends
     if shape.order == 1:
-        radius = flattened(t, radius, advanced(t, 4 * (m + bends_of(shape))), m)
+        radius = flattened(t, radius, offset_by(t, 4 * (m + bends_of(shape))), m)
     store(nothing, 0, radius)
     store(nothing, 4, ends.low)
     store(nothing, 8, ends.high)

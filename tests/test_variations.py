@@ -213,7 +213,7 @@ def test_planted(quantity: str) -> None:
     elif quantity == "opacity":
         mutant = replace(varied, opacity_low=case.splats.opacity, opacity_high=case.splats.opacity)
     else:
-        mutant = replace(varied, color_low=NONE, color_high=NONE)
+        mutant = replace(varied, shift_low=NONE, shift_high=NONE)
     found, _, _ = case.attack(SplatBounds(case.splats, GSPLAT_1_4_0, REAL, mutant))
     assert found.violations > 0 and found.amount > 1e-3
 
@@ -269,7 +269,7 @@ def test_nothing_varies(degree: int, dimensions: int) -> None:
     assert alone.lower.tobytes() == with_ranges.lower.tobytes() and alone.upper.tobytes() == with_ranges.upper.tobytes()
     # without the key no array is made for ranges
     fixed = VariedSplats.fixed(case.splats)
-    assert fixed.mean_radius.size == fixed.color_low.size == 0 and fixed.nearest is case.splats
+    assert fixed.mean_radius.size == fixed.shift_low.size == 0 and fixed.nearest is case.splats
     view = case.poses.world_to_camera(case.poses.box.middle)
     renderer = Renderer(case.splats, GSPLAT_1_4_0)
     assert np.array_equal(
@@ -344,7 +344,7 @@ def test_members_lie_in_the_set() -> None:
     for member, _ in zip(varied.scene_samples(generator), range(40), strict=False):
         assert ((varied.mean_low <= member.means) & (member.means <= varied.mean_high)).all()
         assert ((varied.opacity_low <= member.opacity) & (member.opacity <= varied.opacity_high)).all()
-        assert ((varied.color_low <= member.color_shift) & (member.color_shift <= varied.color_high)).all()
+        assert ((varied.shift_low <= member.color_shift) & (member.color_shift <= varied.shift_high)).all()
 
 
 @pytest.mark.parametrize(

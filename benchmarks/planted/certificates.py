@@ -294,8 +294,8 @@ CERTIFICATES = (
     ),
     Fault(
         "branching: what is not a number is proved",
-        _BRANCHING, "_branch_of", "np.where(np.isnan(found.lower[number]), -np.inf, found.lower[number])",
-        "np.where(np.isnan(found.lower[number]), np.inf, found.lower[number])",
+        _BRANCHING, "_branch_of", "np.where(np.isnan(bounds.lower[number]), -np.inf, bounds.lower[number])",
+        "np.where(np.isnan(bounds.lower[number]), np.inf, bounds.lower[number])",
         "test_network_branching.py::test_an_end_comes_soon",
     ),
     Fault(
@@ -319,7 +319,7 @@ CERTIFICATES = (
     ),
     Fault(
         "chosen lines: many rows are those of the first thread",
-        "verify/network/row_ascent.py", "RowAscent._climb", "rows[own]", "rows[own - own[0]]",
+        "verify/network/row_ascent.py", "RowAscent._climb", "coefficients[own]", "rows[own - own[0]]",
         "test_phase_tree.py::test_several_threads_bound_the_same_rows",
     ),
     Fault(
@@ -329,7 +329,7 @@ CERTIFICATES = (
     ),
     Fault(
         "phase tree: a cell that was given up is proved",
-        _TREE, "PhaseTree.prove", "not self.intermediate.good[0]", "False",
+        _TREE, "PhaseTree.prove", "not self.intermediate.usable[0]", "False",
         "test_phase_tree.py::test_what_is_not_known_is_not_proved",
     ),
     Fault(
@@ -369,7 +369,7 @@ CERTIFICATES = (
     ),
     Fault(
         "weighted means: float32 computes the same",
-        "verify/box_decisions.py", "_BoxSearch.settle", 'self.arithmetic == "real"', "True",
+        "verify/box_decisions.py", "_BoxSearch.decide", 'self.arithmetic == "real"', "True",
         "test_weighted_means.py::test_float32_computes_something_else",
     ),
     Fault(

@@ -268,8 +268,8 @@ FORMS = (
         "the cover that is kept for others lacks a part",
         _ENGINE,
         "Refinement._cover",
-        "self.initial.extend(kept)",
-        "self.initial.extend(kept[:-1])",
+        "self.initial.extend(bounded_leaves)",
+        "self.initial.extend(bounded_leaves[:-1])",
         "test_engine.py::test_a_cover_is_kept_for_others_whole_or_not_at_all",
     ),
     Fault(

@@ -95,7 +95,7 @@ PICTURES = (
     ),
     Fault(
         "near cells: settled pixels have their lower bounds", _NEARBY, "NearbyPictures.sets",
-        "known.upper.copy()", "known.lower.copy()", _NEAR,
+        "box_bounds.upper.copy()", "box_bounds.lower.copy()", _NEAR,
     ),
     Fault(
         "near cells: enclosing boxes are believed", _NEARBY, "KnownBoxes._attack",

@@ -57,7 +57,7 @@ RESULTS = (
         "what nobody said is told as an option",
         "api/assumptions.py",
         "choice",
-        "default if given is None else flag",
+        "default if requested is None else flag",
         "flag",
         "test_assumptions.py::test_defaults_and_options_of_a_run",
     ),

@@ -423,8 +423,8 @@ SPLATS = (
         "linear sets: skipping lowers nothing",
         _BLEND,
         "_form_bounds",
-        "load4(t, 0) + 0.5 * (rises - falls)",
-        "load4(t, 0) + 0.5 * (rises + falls)",
+        "load4(polynomials, 0) + 0.5 * (rises - falls)",
+        "load4(polynomials, 0) + 0.5 * (rises + falls)",
         "test_bounds.py::test_many_layers_at_the_threshold[one-classic]",
     ),
     Fault(

@@ -15,9 +15,9 @@ from ns_abstract.refine.protocol import Method
 DEFAULT = "default"
 
 
-def choice(name: str, value: object, given: object, flag: str, default: str = DEFAULT) -> Assumption:
-    """Return the record of an option: its origin is ``flag`` where ``given`` is set, else ``default``."""
-    return Assumption(name, str(value), default if given is None else flag)
+def choice(name: str, value: object, requested: object, flag: str, default: str = DEFAULT) -> Assumption:
+    """Return the record of an option: its origin is ``flag`` where ``requested`` is set, else ``default``."""
+    return Assumption(name, str(value), default if requested is None else flag)
 
 
 def scene_choices(scene: Scene, method: Method, arithmetic: str | None) -> tuple[Assumption, ...]:

@@ -111,7 +111,7 @@ def bound_part(
     goal: RefinementGoal,
     keep_leaves: bool,
     neighbours: int = 1,
-    known: FrameResult | None = None,
+    earlier: FrameResult | None = None,
 ) -> PartResult | None:
     """Bound one part of a frame on a worker, which keeps the scene open; None if the time ended before any result.
 
@@ -121,7 +121,7 @@ def bound_part(
         goal: When to stop.
         keep_leaves: Whether the result carries linear sets.
         neighbours: Tasks that share this machine's cores.
-        known: What was found of the frame before, where that saves work.
+        earlier: What was found of the frame before, where that saves work.
 
     Raises:
         InputError: The worker reads other files under the same names than the command did.
@@ -130,7 +130,7 @@ def bound_part(
     job = load(recipe)
     job.warm_up(part.index)
     try:
-        return job.bound_part(part.index, goal, part.tiles, keep_leaves=keep_leaves, known=known)
+        return job.bound_part(part.index, goal, part.tiles, keep_leaves=keep_leaves, earlier=earlier)
     except WorkCancelledError:
         return None
 
@@ -297,7 +297,7 @@ class _FrameSchedule:
         try:
             return self.job.bound_part(
                 part.index, goal, part.tiles, keep_leaves=self.keep_leaves, stopped=self.request, progress=report,
-                known=self._known(part.index),
+                earlier=self._known(part.index),
             )  # fmt: skip
         except WorkCancelledError:
             # over before there was anything to keep

@@ -116,7 +116,7 @@ class CellQuestion(ABC, Generic[P]):
     """
 
     #: Whether one block is waited for however late it is, so that resuming with any budget gets on.
-    waits = True
+    finish_one = True
     #: Where cells are kept.
     store: type[Store] = Store
 
@@ -300,7 +300,7 @@ class CellSearch(Generic[P]):
         searching = (1.0 - SHARE) * budget if request.scene_margin else budget
         self.whole = whole = Deadline(budget, stop)
         # where one block may take longer than there is time, all that is done counts
-        self.deadline = Deadline(request=stop) if question.waits else whole
+        self.deadline = Deadline(request=stop) if question.finish_one else whole
         with ExitStack() as stack:
             # a signal waits until there is a store to report on
             self.last.first_command = first_command(self.folder) if request.resume else None
@@ -311,7 +311,7 @@ class CellSearch(Generic[P]):
             try:
                 with stop.at_once():
                     question.prepare(self, request)
-                if question.waits:
+                if question.finish_one:
                     self.whole = whole = Deadline(budget, stop)
                 searched = whole.before(budget - searching)
                 end = searched.before(question.reserved(searching))
@@ -349,12 +349,12 @@ class CellSearch(Generic[P]):
             deadline=deadline,
             stop=stop,
             keep=self._keep_counterexamples,
-            between=periodic_report(
+            on_tick=periodic_report(
                 store,
                 self.tell_progress,
                 (lambda: self.report("running")) if request.report else lambda: None,
             ),
-            waits=question.waits,
+            finish_one=question.finish_one,
         )
         store.trace()
 
@@ -371,10 +371,10 @@ class CellSearch(Generic[P]):
         varied = question.varied_scenes()
         if varied is None:
             return
-        kinds, settle = varied
+        kinds, prover = varied
         certified = {tally.frame: store.leaves(tally.frame, "certified") for tally in store.tallies()}
         rows, about = question.margin_rows(certified)
-        margins = Margins(certified_cells(rows, self.box), settle, store, self.request.on_margin)
+        margins = Margins(certified_cells(rows, self.box), prover, store, self.request.on_margin)
         try:
             margins.find(deadline, kinds)
         finally:

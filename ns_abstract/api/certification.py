@@ -307,13 +307,13 @@ class Certification:
             pictures = self.question.pictures(method, self.job.varied(frame, kind.variation(radius)), self.picture)
         return pictures, pictures, model, self._cover(pictures, response)
 
-    def settle(self, kind: VariationKind) -> ProveCell:
+    def prover(self, kind: VariationKind) -> ProveCell:
         """Bounds and attacks cells for all scenes around the stored one (V13)."""
         searches: dict[
             tuple[float, int], tuple[FramePictures, SearchedScene, SearchedModel, SubBoxProof | None, Claim]
         ] = {}
 
-        def settle(radius: float, frame: int, box: ParameterBox) -> CellOutcome:
+        def prove(radius: float, frame: int, box: ParameterBox) -> CellOutcome:
             key = radius, frame
             if key not in searches:
                 # radii come one after the other
@@ -340,7 +340,7 @@ class Certification:
             example |= {f"scene_{name}": array for name, array in leaf.scene.items()}
             return CellOutcome("falsified", "a scene breaks it", np.zeros(box.dimensions), example)
 
-        return settle
+        return prove
 
     def foresee(self, index: int, seconds: float) -> None:
         """Refuse a frame of which not even the first part can be bounded, where pictures are made ray by ray.

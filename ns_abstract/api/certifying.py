@@ -55,13 +55,14 @@ def network_memory(limit: float | None, workers: int) -> int:
     return min(MEMORY, 1 << int(np.log2(max(2.0, 0.5 * allowed_memory(limit) / workers))))
 
 
-def check_network_memory(found: Certification, limit: float | None, workers: int) -> None:
+def check_network_memory(certification: Certification, limit: float | None, workers: int) -> None:
     """Refuse a network one cell of which takes more memory than a process may.
 
     Raises:
         InputError: It does, about.
     """
-    found.question.check_memory(len(found.job.parameters), allowed_memory(limit) / (1 if found.job.rays else workers))
+    job = certification.job
+    certification.question.check_memory(len(job.parameters), allowed_memory(limit) / (1 if job.rays else workers))
 
 
 @dataclass(frozen=True)
@@ -106,7 +107,7 @@ class CertificateQuestion(CellQuestion[CertifyProgress]):
     ) -> None:
         sets = {index: job.job.pose_sets[index].box for index in frames}
         super().__init__(job, job.job.parameters, sets, job.job.fixed)
-        self.job, self.waits = job, not job.job.rays
+        self.job, self.finish_one = job, not job.job.rays
         self.about = CertifiedRun(
             guarantee=job.job.method.guarantee,
             network_guarantee=job.question.guarantee(job.arithmetic),
@@ -180,7 +181,7 @@ class CertificateQuestion(CellQuestion[CertifyProgress]):
         search.deadline = search.deadline.extended(_LAST)
 
     def varied_scenes(self) -> tuple[Sequence[VariationKind], Callable[[VariationKind], ProveCell]]:
-        return self.job.kinds, self.job.settle
+        return self.job.kinds, self.job.prover
 
     def progress(self, store: Store) -> CertifyProgress:
         shares = [fractions(tally) for tally in store.tallies()]

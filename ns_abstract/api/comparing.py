@@ -132,13 +132,13 @@ class ComparisonJob(Job):
         keep_leaves: bool = False,
         stopped: Callable[[], bool] = lambda: False,
         progress: Callable[[TracePoint, float], None] = lambda point, share: None,
-        known: FrameResult | None = None,
+        earlier: FrameResult | None = None,
     ) -> PartResult:
         whole = self.frame(index)
         sheared = self.frame(index, sheared=True)
         work = LargestDifference(
             whole, sheared if sheared.pose_set.shear else whole, index, goal, seed=self.seed,
-            tolerance=self.tolerance, stopped=stopped, progress=progress, tiles=tiles, known=known,
+            tolerance=self.tolerance, stopped=stopped, progress=progress, tiles=tiles, earlier=earlier,
         )  # fmt: skip
         return replace(work.run(), problems=platform_problems())
 

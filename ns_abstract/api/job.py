@@ -227,7 +227,7 @@ class Job:
         keep_leaves: bool = False,
         stopped: Callable[[], bool] = lambda: False,
         progress: Callable[[TracePoint, float], None] = lambda point, share: None,
-        known: FrameResult | None = None,
+        earlier: FrameResult | None = None,
     ) -> PartResult:
         """Refine some tiles of frame ``index``, or all of them; ``known`` is what was found of it before.
 
@@ -244,7 +244,7 @@ class Job:
 
         refinement = Refinement(
             frame, index, replace(goal, keep_leaves=keep_leaves), seed=self.seed, stopped=over, progress=progress,
-            members=frame.scene_samples(self.seed), tiles=tiles, known=known,
+            members=frame.scene_samples(self.seed), tiles=tiles, earlier=earlier,
         )  # fmt: skip
         return replace(refinement.run_part(), problems=platform_problems())
 

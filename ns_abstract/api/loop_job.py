@@ -126,27 +126,27 @@ class LoopJob:
             view = Pictures(method, self.job.varied(0, kind.variation(radius)))
         return replace(self.reacher(), view=view)
 
-    def settle(self, kind: VariationKind) -> ProveCell:
+    def prover(self, kind: VariationKind) -> ProveCell:
         """Bounds and attacks cells for all scenes around the stored one (V13)."""
         searches: dict[float, LoopSearch] = {}
 
-        def settle(radius: float, number: int, box: ParameterBox) -> CellOutcome:
+        def prove(radius: float, number: int, box: ParameterBox) -> CellOutcome:
             if radius not in searches:
                 # radii come one after the other
                 searches.clear()
                 searches[radius] = LoopSearch(self._varied(kind, radius))
-            outcome = searches[radius].settle(QUESTIONS[number], box)
+            outcome = searches[radius].prove_cell(QUESTIONS[number], box)
             if outcome.example is None:
                 return outcome
             return replace(outcome, example={**outcome.example, "radius": np.array(radius)})
 
-        return settle
+        return prove
 
     @property
     def questions(self) -> list[int]:
         """Numbers of the questions that are asked."""
-        asked = self.loop.unsafe or self.loop.required, self.loop.goal
-        return [number for number, name in enumerate(QUESTIONS) if asked[name == "reaches"]]
+        wanted = self.loop.unsafe or self.loop.required, self.loop.goal
+        return [number for number, name in enumerate(QUESTIONS) if wanted[name == "reaches"]]
 
     @property
     def recipe(self) -> Recipe[LoopJob]:

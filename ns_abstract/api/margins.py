@@ -31,7 +31,7 @@ class Margins:
 
     Args:
         cells: What is certified.
-        settle: Bounds and attacks cells for scenes of a kind.
+        prover: Bounds and attacks cells for scenes of a kind.
         store: Keeps what is settled, for a command that goes on; what it holds is not settled again.
         on_progress: Told every margin as it is found.
     """
@@ -39,11 +39,11 @@ class Margins:
     def __init__(
         self,
         cells: Sequence[CertifiedBox],
-        settle: Callable[[VariationKind], ProveCell],
+        prover: Callable[[VariationKind], ProveCell],
         store: Store,
-        on_progress: Callable[[SceneMargin], object] = lambda found: None,
+        on_progress: Callable[[SceneMargin], object] = lambda margin: None,
     ) -> None:
-        self.cells, self._settle, self._store, self._told = cells, settle, store, on_progress
+        self.cells, self._prover, self._store, self._told = cells, prover, store, on_progress
         self.found: list[SceneMargin] = []
 
     def find(self, deadline: Deadline, kinds: Sequence[VariationKind]) -> None:
@@ -60,12 +60,12 @@ class Margins:
 
     def _remembered(self, kind: VariationKind) -> ProveCell:
         """Settles what the store does not hold yet."""
-        settle = self._settle(kind)
+        prove = self._prover(kind)
 
         def remembered(radius: float, frame: int, box: ParameterBox) -> CellOutcome:
             stored = self._store.settled(kind.name, radius, frame, box)
             if stored is None:
-                stored = settle(radius, frame, box)
+                stored = prove(radius, frame, box)
                 self._store.keep_settled(kind.name, radius, frame, box, stored)
             return stored
 

@@ -90,8 +90,8 @@ class KnownBoxes:
 
     def near(self, cell: ParameterBox) -> NearbyPictures | None:
         """Pictures of a cell, by what is known of a box around it; None: that box would be too wide."""
-        known = self._around(cell)
-        return None if known is None else NearbyPictures(self._pictures, self._weights, known)
+        box_bounds = self._around(cell)
+        return None if box_bounds is None else NearbyPictures(self._pictures, self._weights, box_bounds)
 
     def _around(self, cell: ParameterBox) -> KnownBox | None:
         box = enclosing_box(cell, self._pictures.box, self._motion)
@@ -100,7 +100,7 @@ class KnownBoxes:
         if box not in self._known:
             outer = self._around(box)
             self._known[box] = self._examined(box, outer)
-            while sum(known.size for known in self._known.values()) > _KEPT and len(self._known) > 1:
+            while sum(one.size for one in self._known.values()) > _KEPT and len(self._known) > 1:
                 self._known.popitem(last=False)
         self._known.move_to_end(box)
         return self._known[box]
@@ -109,21 +109,21 @@ class KnownBoxes:
         """Bounds over a box, itself inside of one of which ``outer`` is known."""
         shape = (*self._wanted.shape, 1 + max(self._channels))
         lower, upper = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-        asked, elements = self._wanted, None
+        wanted, elements = self._wanted, None
         if outer is not None:
-            lower, upper, asked, elements = outer.lower.copy(), outer.upper.copy(), outer.open, outer.elements
-        if not asked.any():
-            return KnownBox(lower, upper, asked, None)
+            lower, upper, wanted, elements = outer.lower.copy(), outer.upper.copy(), outer.open, outer.elements
+        if not wanted.any():
+            return KnownBox(lower, upper, wanted, None)
         bounds_by_frame: list[Bounds] = []
         for k, (frame, channels) in enumerate(self._weights):
-            pixels = in_tiles(asked, frame.side)
+            pixels = in_tiles(wanted, frame.side)
             tiles = np.flatnonzero(pixels.any(axis=(1, 2)))
             context = None if elements is None else elements[k].context
             bounds = frame.bound_parts([box], tiles, context, False, pixels[tiles])[0]
             bounds_by_frame.append(bounds)
-            place((lower, upper), (bounds.lower, bounds.upper), frame, tiles, channels, asked)
+            place((lower, upper), (bounds.lower, bounds.upper), frame, tiles, channels, wanted)
         self._attack(box, lower, upper)
-        still = unsettled(self._measures, lower, upper) & asked
+        still = unsettled(self._measures, lower, upper) & wanted
         if not still.any():
             return KnownBox(lower, upper, still, None)
         drawn_elements = []
@@ -155,21 +155,21 @@ class NearbyPictures:
     Args:
         pictures: The pictures of the set.
         weights: What bounds and draws them.
-        known: What is known of the box.
+        box_bounds: What is known of the box.
     """
 
-    def __init__(self, pictures: FrameImages, weights: Weights, known: KnownBox) -> None:
-        self._pictures, self._weights, self._known, self.box = pictures, weights, known, pictures.box
+    def __init__(self, pictures: FrameImages, weights: Weights, box_bounds: KnownBox) -> None:
+        self._pictures, self._weights, self._known, self.box = pictures, weights, box_bounds, pictures.box
 
     def image(self, values: np.ndarray, member: SceneSample | None = None) -> np.ndarray:
         """Picture at a pose of the box: pixels that are settled are in the middle of their bounds."""
         assert member is None
-        known = self._known
-        image = 0.5 * (known.lower + known.upper)
-        if known.elements is not None:
-            for (frame, channels), shown in zip(self._weights, known.elements, strict=True):
+        box_bounds = self._known
+        image = 0.5 * (box_bounds.lower + box_bounds.upper)
+        if box_bounds.elements is not None:
+            for (frame, channels), shown in zip(self._weights, box_bounds.elements, strict=True):
                 drawn = shown.draw(np.asarray(values, np.float64))
-                place((image,), (drawn,), frame, shown.tiles, channels, known.open)
+                place((image,), (drawn,), frame, shown.tiles, channels, box_bounds.open)
         return image
 
     def scene_samples(self, seed: int) -> Iterator[SceneSample]:
@@ -182,15 +182,15 @@ class NearbyPictures:
 
     def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
         """Sets over a cell: of settled pixels what holds over the box around it."""
-        known, d = self._known, box.dimensions
-        flat = [np.zeros((*known.lower.shape, d), np.float32) for _ in range(2)]
-        lower, upper, slopes = known.lower.copy(), known.upper.copy(), np.zeros(d)
+        box_bounds, d = self._known, box.dimensions
+        flat = [np.zeros((*box_bounds.lower.shape, d), np.float32) for _ in range(2)]
+        lower, upper, slopes = box_bounds.lower.copy(), box_bounds.upper.copy(), np.zeros(d)
         linear = (flat[0], lower.copy(), flat[1], upper.copy())
-        if known.elements is None:
+        if box_bounds.elements is None:
             return linear, lower, upper, slopes
-        for (frame, channels), shown in zip(self._weights, known.elements, strict=True):
+        for (frame, channels), shown in zip(self._weights, box_bounds.elements, strict=True):
             bounds = frame.bound_parts([box], shown.tiles, shown.context, True, shown.pixels)[0]
-            place_sets((*linear, lower, upper), bounds, frame, shown.tiles, channels, known.open)
+            place_sets((*linear, lower, upper), bounds, frame, shown.tiles, channels, box_bounds.open)
             slopes = slopes + bounds.slopes
         return linear, lower, upper, slopes
 

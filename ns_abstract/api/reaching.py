@@ -120,7 +120,7 @@ class LoopQuestion(CellQuestion[ReachProgress]):
     def varied_scenes(self) -> tuple[Sequence[VariationKind], Callable[[VariationKind], ProveCell]]:
         kinds = bounded_kinds(self.job.places)
         # scenes of a set are rendered for the network alone
-        return tuple(kind for kind in kinds if kind.place or not self.job.loop.views), self.job.settle
+        return tuple(kind for kind in kinds if kind.place or not self.job.loop.views), self.job.prover
 
     def margin_rows(self, rows: dict[int, list[Row]]) -> tuple[dict[int, list[Row]], dict[str, Any]]:
         # the strongest question of which anything is certified

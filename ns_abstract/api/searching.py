@@ -27,7 +27,7 @@ def periodic_report(
     """Return what a search does between results: often a point of the trace and ``on_progress``, rarely ``report``."""
     traced = reported = time.perf_counter()
 
-    def between(instant: float) -> None:
+    def tick(instant: float) -> None:
         nonlocal traced, reported
         if instant - traced >= _TRACE:
             traced = instant
@@ -37,21 +37,21 @@ def periodic_report(
             reported = instant
             report()
 
-    return between
+    return tick
 
 
 def search_blocks(
     store: Store,
     engine: Engine,
     grids: dict[int, CellGrid],
-    here: Examine,
-    there: tuple[Callable[..., BlockResult], Any],
+    examine: Examine,
+    on_workers: tuple[Callable[..., BlockResult], Any],
     *,
     deadline: Deadline,
     stop: StopRequest,
     keep: Callable[[CellBlock, Any], object],
-    between: Callable[[float], object],
-    waits: bool = True,
+    on_tick: Callable[[float], object],
+    finish_one: bool = True,
 ) -> None:
     """Examine open blocks until none is left, the time is over or ``stop`` says so.
 
@@ -61,18 +61,18 @@ def search_blocks(
         store: Where blocks come from and findings go.
         engine: Where blocks are examined; closed at the end.
         grids: By frame.
-        here: In this process.
-        there: For others: a function of a module, and what it takes before the arguments of ``here``.
+        examine: In this process.
+        on_workers: For others: a function of a module, and what it takes before the arguments of ``examine``.
         deadline: When to end.
         stop: Asked at least twice a second, and ends a block at once in this process.
         keep: Given every block and its findings before they are stored.
-        between: Told the reading of the clock after results, and twice a second where others work.
-        waits: Whether one block is waited for however late it is, so that resuming with any budget gets on.
+        on_tick: Told the reading of the clock after results, and twice a second where others work.
+        finish_one: Whether one block is waited for however late it is, so that resuming with any budget gets on.
     """
     # workers take the kernels that were compiled here
     kernels().publish()
     flying: dict[int, CellBlock] = {}
-    finished = 0 if waits else 1
+    finished = 0 if finish_one else 1
 
     def offer(room: int) -> Iterator[Task]:
         if deadline.late and (flying or finished):
@@ -83,7 +83,7 @@ def search_blocks(
             if engine.shares:
                 yield Task(block.number, examined, arguments)
             else:
-                yield Task(block.number, there[0], (there[1], *arguments))
+                yield Task(block.number, on_workers[0], (on_workers[1], *arguments))
 
     def over() -> bool:
         return stop() or (deadline.late and finished > 0)
@@ -92,7 +92,7 @@ def search_blocks(
         # in this process a block is given up at the deadline or a signal
         try:
             with stop.at_once(), cancel_when(lambda: deadline.late and finished > 0):
-                return here(index, grid, cells)
+                return examine(index, grid, cells)
         except (KeyboardInterrupt, WorkCancelledError):
             return None
 
@@ -110,4 +110,4 @@ def search_blocks(
         if engine.starting and not over():
             for block in store.pending(set(flying), 1):
                 take(block, examined(block.frame, grids[block.frame], block.cells))
-        between(time.perf_counter())
+        on_tick(time.perf_counter())

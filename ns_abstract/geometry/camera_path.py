@@ -186,10 +186,10 @@ def load_camera_path(
         raise error.within(path) from None
 
 
-def _photo_path(found: Iterable[FileCamera], source: str, downscale_factor: float) -> CameraPath:
+def _photo_path(file_cameras: Iterable[FileCamera], source: str, downscale_factor: float) -> CameraPath:
     """The path of the cameras of photos."""
     cameras = []
-    for entry in found:
+    for entry in file_cameras:
         camera = PinholeCamera(
             camera_to_world=checked_pose([*entry.camera_to_world, [0, 0, 0, 1]], entry.field),
             fx=focal_pixels(entry.fx, f"{entry.field}: focal length"),

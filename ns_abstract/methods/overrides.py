@@ -61,19 +61,19 @@ class Overrides:
 UNSAID = "default: the file says nothing"
 
 
-def assumption_of(name: str, given: object, flag: str, stored: object, origin: str) -> Assumption:
+def assumption_of(name: str, requested: object, flag: str, stored: object, origin: str) -> Assumption:
     """Return the record of a choice: an option wins, and the record names what it replaces.
 
     Args:
         name: Of the choice.
-        given: The value of the option ``flag``; None where it is not given.
+        requested: The value of the option ``flag``; None where it is not given.
         flag: The option.
         stored: The value that the scene's files, or a default, would give.
         origin: Where ``stored`` is from.
     """
-    if given is None:
+    if requested is None:
         return Assumption(name, _text(stored), origin)
-    return Assumption(name, _text(given), f"{flag} (in place of {_text(stored)}, {origin})")
+    return Assumption(name, _text(requested), f"{flag} (in place of {_text(stored)}, {origin})")
 
 
 def _text(value: object) -> str:

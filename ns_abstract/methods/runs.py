@@ -232,15 +232,15 @@ def load_step(run: RunConfig) -> int | None:
     return value
 
 
-def step_assumption(run: RunConfig, checkpoint: Path, given: int | None) -> Assumption:
+def step_assumption(run: RunConfig, checkpoint: Path, requested: int | None) -> Assumption:
     """Which training step is shown, and what decided it."""
     match = _CHECKPOINT_NAME.fullmatch(checkpoint.name)
     step = int(match[1]) if match else checkpoint.name
     stored = load_step(run)
     if stored is not None:
-        return assumption_of("load_step", given, "--load-step", stored, "config.yml: load_step")
-    default = step if given is None else "the highest one"
-    return assumption_of("load_step", given, "--load-step", default, "default: the highest step there is")
+        return assumption_of("load_step", requested, "--load-step", stored, "config.yml: load_step")
+    default = step if requested is None else "the highest one"
+    return assumption_of("load_step", requested, "--load-step", default, "default: the highest step there is")
 
 
 def target_class(run: RunConfig) -> str:

@@ -232,7 +232,7 @@ class LoopSearch:
         while True:
             yield None, generator.uniform(-1.0, 1.0, len(reach)) * reach
 
-    def settle(self, question: Question, box: ParameterBox) -> CellOutcome:
+    def prove_cell(self, question: Question, box: ParameterBox) -> CellOutcome:
         """A cell as it is, for all scenes of the view: its tube, and runs in some of them (V13).
 
         Raises:

@@ -37,18 +37,18 @@ Float64 = NDArray[np.float64]
 Dependence = Literal["kept", "step", "none"]
 
 #: Symbols beyond which the smallest ones are put together.
-_MOST_SYMBOLS = 64
+_MOST_GENERATORS = 64
 
 
 @dataclass(frozen=True)
 class AffineSet:
-    """All ``center + generators s + e`` with s in [-1, 1]^q and |e| <= radius (L2).
+    """A zonotope and a box: all ``center + generators s + e`` with s in [-1, 1]^q and |e| <= radius (L2).
 
     Attributes:
         center: [n].
-        generators: [n, q]; quantities of one step share their symbols s, the first of which are the initial state's.
+        generators: [n, q]; quantities of one step share ``s``; the first are the initial state's.
         radius: [n].
-        first: How many symbols are the initial state's.
+        first: How many generators are the initial state's.
     """
 
     center: Float64
@@ -58,7 +58,7 @@ class AffineSet:
 
     @classmethod
     def box(cls, lower: Float64, upper: Float64) -> AffineSet:
-        """A box [n], one symbol for every side that has a width."""
+        """A box [n], one generator for every side that has a width."""
         middle, half = middle_half(lower, upper)
         wide = np.flatnonzero(half > 0.0)
         return cls(middle, np.diag(half)[:, wide], np.zeros(len(middle)), len(wide))
@@ -86,7 +86,7 @@ class AffineSet:
         return np.where(still, self.center, low), np.where(still, self.center, high)
 
     def mapped(self, matrix: Float64, offset: Float64, radius: Float64 | float = 0.0) -> AffineSet:
-        """``matrix x + offset + e`` with |e| <= radius, in the same symbols.
+        """``matrix x + offset + e`` with |e| <= radius, in the same ``s``.
 
         Entries of ``matrix`` may carry relative errors of `SET_ROUNDINGS` units.
         """
@@ -102,19 +102,19 @@ class AffineSet:
         return AffineSet(*image, spread, self.first)
 
     def beside(self, other: AffineSet) -> AffineSet:
-        """Both one after the other; ``other`` is in the same symbols."""
+        """Both one after the other; ``other`` is in the same ``s``."""
         names = "center", "generators", "radius"
         parts = [np.concatenate([getattr(entry, name) for entry in (self, other)]) for name in names]
         return AffineSet(parts[0], parts[1], parts[2], self.first)
 
     def promoted(self) -> AffineSet:
-        """The same with a symbol of its own for every side of the remainder, so that it is followed as well.
+        """The same with a generator of its own for every side of the remainder, so that it is followed as well.
 
-        Where there are too many symbols the smallest become part of the remainder first: a box around their sum.
+        Where there are too many generators the smallest become part of the remainder first: a box around their sum.
         """
         generators, radius = self.generators, self.radius
         n = len(radius)
-        spare = generators.shape[1] + n - max(_MOST_SYMBOLS, self.first + n)
+        spare = generators.shape[1] + n - max(_MOST_GENERATORS, self.first + n)
         if spare > 0:
             weight = np.abs(generators).sum(axis=0)
             weight[: self.first] = np.inf
@@ -231,11 +231,11 @@ class ControlBounds:
             return None if raw is None else clipped(raw, control.lower, control.upper)
 
 
-def between(found: OutputBounds, count: int, shift: Float64, room: Float64) -> AffineBounds | None:
+def between(bounds: OutputBounds, count: int, shift: Float64, room: Float64) -> AffineBounds | None:
     """Return the affine set between planes: the first ``count`` rows and their negatives, of one cell (L3).
 
     Args:
-        found: Lower bounds [1, 2 count or more]; places are the parameters.
+        bounds: Lower bounds [1, 2 count or more]; places are the parameters.
         count: How many.
         shift: [count] what is taken off.
         room: [count] how far values may be off beside that.
@@ -243,11 +243,11 @@ def between(found: OutputBounds, count: int, shift: Float64, room: Float64) -> A
     Returns:
         None where a bound is not finite: what is not known to be finite need not be a number either.
     """
-    least = found.lower[0]
+    least = bounds.lower[0]
     if not np.isfinite(least).all():
         return None
-    usable = np.isfinite(found.b[0])
-    a, b = np.where(usable[:, None], found.a[0], 0.0), np.where(usable, found.b[0], least)
+    usable = np.isfinite(bounds.b[0])
+    a, b = np.where(usable[:, None], bounds.a[0], 0.0), np.where(usable, bounds.b[0], least)
     a, b, least = a[: 2 * count], b[: 2 * count], least[: 2 * count]
     with np.errstate(all="ignore"):
         slopes = 0.5 * (a[:count] - a[count:])
@@ -359,7 +359,7 @@ class TubeBuilder:
         """
         lower, upper = self.loop.initial(cell)
         state = AffineSet.box(lower, upper)
-        # which symbols are which parameters of the cell
+        # which generators are which parameters of the cell
         free = [k for k in range(len(lower)) if upper[k] > lower[k]]
         places = [cell.names.index(self.loop.names[k]) for k in free]
         slopes = np.zeros(cell.dimensions)
@@ -432,7 +432,7 @@ class TubeBuilder:
         return box, _scaled(pose, *middle_half(low, high))
 
     def _view_margins(self, state: AffineSet, step: int) -> tuple[Float64, Float64]:
-        """[properties] lower bounds of their margins at a step (L7), and how much the pictures move by symbol."""
+        """[properties] lower bounds of their margins at a step (L7), and how much the pictures move by generator."""
         margins, moved = np.full(len(self.views), -np.inf), np.zeros(state.generators.shape[1])
         poses, goal = self._pose_box(state), self.loop.goal
         for k, view in enumerate(self.views):
@@ -444,7 +444,7 @@ class TubeBuilder:
         return margins, moved
 
     def _advanced(self, state: AffineSet) -> tuple[AffineSet, Float64, Float64] | str:
-        """One step (L4): the next set, least and most controls [2, m], and how much the picture moves by symbol."""
+        """One step (L4): the next set, least and most controls [2, m], and how much the picture moves by generator."""
         poses = self._pose_box(state)
         if poses is None:
             return "the camera may leave the range of poses"

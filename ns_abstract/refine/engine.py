@@ -50,7 +50,7 @@ class Refinement:
         members: Where the scene varies too: other scenes of the set, each as a function like the frame's
             ``render``. They widen the inner bound; only poses are split.
         tiles: Numbers of the tiles that are looked at, ascending; None: all. Measures are those of its pixels (R6).
-        known: What was found of the same set before, with bounds: results are no looser, and work goes where it
+        earlier: What was found of the same set before, with bounds: results are no looser, and work goes where it
             leaves most open. Not where leaves are kept: these are to be as tight as the result.
         initial: Takes the cells of the initial partition with their bounds in these tiles; where it holds some, they
             are the initial partition.
@@ -74,7 +74,7 @@ class Refinement:
         progress: Callable[[TracePoint, float], None] = lambda point, share: None,
         members: Iterator[Render] | None = None,
         tiles: np.ndarray | None = None,
-        known: FrameResult | None = None,
+        earlier: FrameResult | None = None,
         initial: list[BoundedCell] | None = None,
         tuning: Tuning = TUNING,
     ) -> None:
@@ -84,8 +84,8 @@ class Refinement:
         scenes = iter(()) if members is None else members
         self.inner = InnerBound(self.tiles, np.random.default_rng([seed, index]), scenes, tuning)
         bounds: tuple[np.ndarray, np.ndarray] | None = None
-        if known is not None:
-            pictures = known.witness_lower, known.witness_upper, known.lower, known.upper
+        if earlier is not None:
+            pictures = earlier.witness_lower, earlier.witness_upper, earlier.lower, earlier.upper
             least, most, lower, upper = (
                 in_tiles(picture, frame.side)[self.tiles.numbers(None)] for picture in pictures
             )
@@ -214,7 +214,7 @@ class Refinement:
         parts = partition.parts
         cells: list[LeafCell] = []
         # bounds of all cells only where somebody keeps them
-        kept: list[BoundedCell] = []
+        bounded_leaves: list[BoundedCell] = []
         for number, part in enumerate(parts):
             if number and self._over():
                 if self.stopped():
@@ -223,12 +223,12 @@ class Refinement:
                 self.leaf_sets.clear()
                 self.leaves.begin()
                 leaf = self._initial_cell(self.splitter.whole, None)
-                cells, kept = [leaf[0]], [leaf]
+                cells, bounded_leaves = [leaf[0]], [leaf]
                 break
             leaf = self._initial_cell(part, partition)
             cells.append(leaf[0])
             if self.initial is not None:
-                kept.append(leaf)
+                bounded_leaves.append(leaf)
             if number % 2:
                 self.inner.render(part.box.middle)
             elif len(parts) > 1:
@@ -238,7 +238,7 @@ class Refinement:
                 due = int(share * points) > int(number / len(parts) * points)
                 self._record(share, keep=number < self.tuning.first_points or due)
         if self.initial is not None:
-            self.initial.extend(kept)
+            self.initial.extend(bounded_leaves)
         return self._covered(cells)
 
     def _covered(self, cells: list[LeafCell]) -> bool:
@@ -365,7 +365,7 @@ class Refinement:
             seconds=point.seconds,
             cells=self.cells,
             trace=tuple(self.trace),
-            bounded=self.covered or self.leaves.known is not None,
+            bounded=self.covered or self.leaves.earlier is not None,
             shown=self.shown,
             floor=self.floor,
             leaves=self.leaf_sets.leaves() if keeps else None,

@@ -144,9 +144,9 @@ class InitialPartition:
         most = self.tiles.mean_gap(np.zeros_like(self.inner.image), np.ones_like(self.inner.image))
         return before >= self.tuning.clipped_share * most
 
-    def _beyond(self, found: Partition) -> float:
+    def _beyond(self, partition: Partition) -> float:
         """MPG of what was tried beyond that of pictures of it."""
-        return self.inner.beyond(found.tried, found.bounds.lower, found.bounds.upper)
+        return self.inner.beyond(partition.tried, partition.bounds.lower, partition.bounds.upper)
 
     def _probe(self, part: SubBox) -> tuple[Bounds, float]:
         """Bounds of ``part``, and how many such cells time and memory allow."""

@@ -31,8 +31,8 @@ class LargestTuning:
         halvings: Times that the step is halved.
         search_share: Part of the time that the search may take.
         cover_share: Part of the time left that the first pass may take.
-        floors: Ratios to the largest rendered value up to which values are left open, one pass each, before the one
-            that the goal asks for.
+        accepted_ratios: Ratios to the largest rendered value up to which values are left open, one pass each, before
+            the one that the goal asks for.
         room: What a pass leaves open at least beyond the largest rendered value.
         pass_share: Part of the time left that a pass may take, where others follow.
         gain: Part of what a pass leaves open that it has to take away before it has had `patience` more cells.
@@ -46,7 +46,7 @@ class LargestTuning:
     halvings: int = 7
     search_share: float = 0.15
     cover_share: float = 0.7
-    floors: tuple[float, ...] = (1.3,)
+    accepted_ratios: tuple[float, ...] = (1.3,)
     room: float = 1e-3
     pass_share: float = 0.7
     gain: float = 0.01
@@ -115,8 +115,8 @@ def _neighbours(values: np.ndarray, step: np.ndarray, low: np.ndarray, high: np.
 class LargestDifference:
     """Bounds a difference's largest value and every pixel of it (design.md, Y4).
 
-    A pass is a `Refinement` that leaves values up to a floor open: cells and pixels below it cost nothing. Passes have
-    lower and lower floors; the last one has none. What each of them finds holds, so that the least is taken.
+    A pass is a `Refinement` that leaves accepted values open: cells and pixels up to that value cost nothing. Passes
+    accept less and less; the last one nothing. What each of them finds holds, so that the least is taken.
 
     Args:
         whole: The difference over the set, in the set's own parameters; its renders are searched for the worst pose.
@@ -129,7 +129,7 @@ class LargestDifference:
         progress: Called with (trace point, covered part of the set); ``mpg`` and ``mpg_witness`` of its points are
             the largest bound and the largest value rendered.
         tiles: Numbers of the tiles; None: all.
-        known: What was found before of the same set.
+        earlier: What was found before of the same set.
         tuning: How the time is divided.
     """
 
@@ -145,7 +145,7 @@ class LargestDifference:
         stopped: Callable[[], bool] = lambda: False,
         progress: Callable[[TracePoint, float], None] = lambda point, share: None,
         tiles: np.ndarray | None = None,
-        known: FrameResult | None = None,
+        earlier: FrameResult | None = None,
         tuning: LargestTuning = TUNING,
     ) -> None:
         self.whole, self.frame, self.index, self.goal, self.seed = whole, frame, index, goal, seed
@@ -155,10 +155,10 @@ class LargestDifference:
         self.upper, self.rendered = np.ones(shape, np.float32), np.zeros(shape, np.float32)
         self.inside = pixels_inside(frame)
         self.bounded = False
-        self.before = None if known is None else known.largest
-        if known is not None:
-            self.upper, self.rendered = (in_tiles(p, frame.side) for p in (known.upper, known.witness_upper))
-            self.bounded = known.bounded
+        self.before = None if earlier is None else earlier.largest
+        if earlier is not None:
+            self.upper, self.rendered = (in_tiles(p, frame.side) for p in (earlier.upper, earlier.witness_upper))
+            self.bounded = earlier.bounded
         self.cells, self.trace = 0, []
         #: the cells of the first pass, with bounds of all tiles in ``self.tiles``
         self._cover: list[BoundedCell] = []
@@ -201,23 +201,23 @@ class LargestDifference:
         self._record()
         # every pixel once, as a whole
         self._bound(0.0, self.tuning.cover_share, lambda refinement: refinement.covered)
-        for floor, share in self._passes():
+        for accepted, time_share in self._passes():
             if self._late():
                 break
-            self._bound(floor, share)
+            self._bound(accepted, time_share)
         return self._result(middle)
 
     def _passes(self) -> Iterator[tuple[float, float]]:
-        """Floors and parts of the time left, until the goal is reached."""
+        """The largest accepted value and the part of the time left of each pass, until the goal is reached."""
         if self.tolerance is not None:
             if not self._decided:
                 yield self.tolerance, 1.0
             return
-        ratios = (*(ratio for ratio in self.tuning.floors if ratio > self.goal.ratio), self.goal.ratio)
+        ratios = (*(ratio for ratio in self.tuning.accepted_ratios if ratio > self.goal.ratio), self.goal.ratio)
         for ratio in ratios:
-            floor = max(ratio * self._largest_rendered, self._largest_rendered + self.tuning.room)
-            if self._most(self.upper) > floor:
-                yield floor, self.tuning.pass_share
+            accepted = max(ratio * self._largest_rendered, self._largest_rendered + self.tuning.room)
+            if self._most(self.upper) > accepted:
+                yield accepted, self.tuning.pass_share
         yield 0.0, 1.0
 
     @property
@@ -227,23 +227,23 @@ class LargestDifference:
         return self._most(self.upper) <= self.tolerance or self._largest_rendered > self.tolerance
 
     def _bound(
-        self, floor: float, share: float, enough: Callable[[Refinement], bool] = lambda refinement: False
+        self, accepted: float, time_share: float, enough: Callable[[Refinement], bool] = lambda refinement: False
     ) -> None:
-        """One pass over the tiles with values above the floor, in a part of the time left, or until ``enough``."""
-        camera, least = self.frame.camera, np.float32(floor)
+        """One pass over the tiles above the accepted value, in a part of the time left, or until ``enough``."""
+        camera, least = self.frame.camera, np.float32(accepted)
         loose = self.upper > np.maximum(self.goal.ratio * self.rendered, least)
         some = (loose & self.inside[..., None])[self.tiles].any(axis=(1, 2, 3))
         first = not self._cover
-        here = self.tiles if first else self.tiles[some]
-        if not here.size:
+        tiles = self.tiles if first else self.tiles[some]
+        if not tiles.size:
             return
         cover = [(cell, np.maximum(l[some], least), np.maximum(u[some], least)) for cell, l, u in self._cover]
         upper, rendered = (assemble(np.maximum(p, least), camera) for p in (self.upper, self.rendered))
         lowest = np.full_like(upper, least)
-        earlier = FrameResult(self.index, self.frame.box, lowest, upper, lowest, rendered, rendered, 0.0, 0)
+        before = FrameResult(self.index, self.frame.box, lowest, upper, lowest, rendered, rendered, 0.0, 0)
         started = time.perf_counter()
 
-        def told(point: TracePoint, covered: float) -> None:
+        def report(point: TracePoint, covered: float) -> None:
             watch.look(point.cells, point.mpg)
             most = float(refinement.leaves.upper[refinement.tiles.inside].max(initial=0.0))
             most = min(self._most(self.upper), max(most, others))
@@ -252,14 +252,16 @@ class LargestDifference:
             self.progress(now, 1.0 if self.bounded else covered)
 
         watch = GainWatch(self.tuning)
-        others = self._most(np.where(np.isin(np.arange(len(self.upper)), here)[:, None, None, None], 0.0, self.upper))
-        # nothing above the floor is to be left open; without a floor, means are measured
-        goal = replace(self.goal, ratio=self.goal.ratio if floor == 0.0 else 1.0, seconds=share * self._left())
-        frame = self.frame.above(floor)
+        others = self._most(np.where(np.isin(np.arange(len(self.upper)), tiles)[:, None, None, None], 0.0, self.upper))
+        # nothing above the accepted value is to be left open; where it is 0, means are measured
+        goal = replace(self.goal, ratio=self.goal.ratio if accepted == 0.0 else 1.0, seconds=time_share * self._left())
+        frame = self.frame.above(accepted)
         refinement = Refinement(
             frame, self.index, goal, seed=self.seed,
-            stopped=lambda: self._late() or enough(refinement) or (share < 1.0 and refinement.covered and watch.idle),
-            progress=told, tiles=here, known=earlier, initial=self._cover if first else cover,
+            stopped=lambda: (
+                self._late() or enough(refinement) or (time_share < 1.0 and refinement.covered and watch.idle)
+            ),
+            progress=report, tiles=tiles, earlier=before, initial=self._cover if first else cover,
         )  # fmt: skip
         try:
             part = refinement.run_part()
@@ -272,8 +274,8 @@ class LargestDifference:
             self.whole.largest = greater(self.whole.largest, frame.largest)
         if not refinement.covered:
             return
-        self.bounded = self.bounded or here.size == self.tiles.size
-        self.upper[here] = np.minimum(self.upper[here], part.upper)
+        self.bounded = self.bounded or tiles.size == self.tiles.size
+        self.upper[tiles] = np.minimum(self.upper[tiles], part.upper)
         self._record()
 
     def _record(self) -> None:
@@ -283,20 +285,20 @@ class LargestDifference:
         )
 
     def _result(self, middle: np.ndarray) -> PartResult:
-        here = self.tiles
-        lower = np.zeros_like(self.upper[here])
+        tiles = self.tiles
+        lower = np.zeros_like(self.upper[tiles])
         # what lies beyond the image is 0 in every picture
-        upper, rendered = (np.where(self.inside[here][..., None], p[here], 0.0) for p in (self.upper, self.rendered))
+        upper, rendered = (np.where(self.inside[tiles][..., None], p[tiles], 0.0) for p in (self.upper, self.rendered))
         return PartResult(
             index=self.index,
             box=self.frame.box,
-            tiles=here,
+            tiles=tiles,
             lower=lower,
             upper=upper.astype(np.float32),
             witness_lower=lower,
             witness_upper=rendered.astype(np.float32),
-            image=middle[here],
-            pixels=int(self.inside[here].sum()),
+            image=middle[tiles],
+            pixels=int(self.inside[tiles].sum()),
             seconds=time.perf_counter() - self.begin,
             cells=self.cells,
             trace=tuple(self.trace),

@@ -80,7 +80,7 @@ class LeafBounds:
     Args:
         tiles: The tiles.
         inner: What leaves are measured against.
-        known: [t, side, side, 3] bounds of the same set that hold anyway; None: there are none.
+        earlier: [t, side, side, 3] bounds of the same set that hold anyway; None: there are none.
         tuning: How much a round of splitting takes on.
 
     Attributes:
@@ -92,10 +92,10 @@ class LeafBounds:
         self,
         tiles: FrameTiles,
         inner: InnerBound,
-        known: tuple[np.ndarray, np.ndarray] | None = None,
+        earlier: tuple[np.ndarray, np.ndarray] | None = None,
         tuning: Tuning = TUNING,
     ) -> None:
-        self.tiles, self.inner, self.known, self.tuning = tiles, inner, known, tuning
+        self.tiles, self.inner, self.earlier, self.tuning = tiles, inner, earlier, tuning
         self.by_tile = [
             TileLeaves(np.full(tiles.shape, np.inf, np.float32), np.full(tiles.shape, -np.inf, np.float32))
             for _ in range(tiles.count)
@@ -170,8 +170,8 @@ class LeafBounds:
 
     def _intersect(self, places: np.ndarray) -> None:
         """Take what was known before into the outer bound of tiles: both hold (design.md, R5)."""
-        if self.known is not None:
-            lower, upper = self.known
+        if self.earlier is not None:
+            lower, upper = self.earlier
             low, high = self.lower[..., :COLORS], self.upper[..., :COLORS]
             low[places], high[places] = np.maximum(low[places], lower[places]), np.minimum(high[places], upper[places])
 
@@ -253,8 +253,8 @@ class LeafBounds:
         """
         colors = np.s_[..., :COLORS]
         lower, upper = lower[colors], upper[colors]
-        if self.known is not None:
-            lower, upper = np.maximum(lower, self.known[0][t]), np.minimum(upper, self.known[1][t])
+        if self.earlier is not None:
+            lower, upper = np.maximum(lower, self.earlier[0][t]), np.minimum(upper, self.earlier[1][t])
         beyond = np.maximum(0.0, self.inner.lower[t][colors] - lower)
         beyond += np.maximum(0.0, upper - self.inner.upper[t][colors])
         beyond = beyond.sum(axis=-1)

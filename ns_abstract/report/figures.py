@@ -141,8 +141,8 @@ class ShownUnits:
 
     def value(self, name: str, unit: str, value: float) -> str:
         """A parameter's value for people: as it is stored, behind it in the unit that was asked for."""
-        asked, factor = self.axis(unit)
-        beside = "" if factor == 1.0 else f" ({number(value * factor, 6)} {asked})"
+        shown_unit, factor = self.axis(unit)
+        beside = "" if factor == 1.0 else f" ({number(value * factor, 6)} {shown_unit})"
         return f"{name} = {value!r}{beside}"
 
     def drawn(self, entry: Mapping[str, Any], rows: Sequence[Row]) -> tuple[dict[str, Any], list[Row]]:

@@ -114,6 +114,6 @@ def coarse_first(count: int) -> list[int]:
     return sorted(range(count), key=lambda k: int(f"{k:0{bits}b}"[::-1], 2))
 
 
-def walk_html(found: Sequence[tuple[WalkPose, PoseImage]]) -> Markup:
+def walk_html(poses: Sequence[tuple[WalkPose, PoseImage]]) -> Markup:
     """The page's part: all pictures; `walk.js` shows one at a time, as the slider stands."""
-    return fill("walk.html", stops=found) if len(found) > 1 else Markup()
+    return fill("walk.html", stops=poses) if len(poses) > 1 else Markup()

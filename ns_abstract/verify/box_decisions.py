@@ -109,7 +109,7 @@ def decide(
     try:
         with deadline.enforced():
             for family in _families(regions):
-                if search.settle(family):
+                if search.decide(family):
                     return Decision("sat", *search.found, search.boxes)
     except WorkCancelledError:
         return Decision("timeout", boxes=search.boxes)
@@ -185,7 +185,7 @@ class _BoxSearch:
         self.descended = 0
         self.found: tuple[np.ndarray, np.ndarray] = (np.zeros(0), np.zeros(0))
 
-    def settle(self, family: _Family) -> bool:
+    def decide(self, family: _Family) -> bool:
         """Whether a region has a counterexample, which `found` then is; `undecided` if that is not known."""
         start, self.descended = self.deadline.left, 0
         if self._attack(family, np.arange(len(family.regions)), _TUNING.starts, _TUNING.steps):
@@ -205,7 +205,7 @@ class _BoxSearch:
     # ------------------------------------------------------------ proofs
 
     def _bisect(self, family: _Family) -> bool:
-        """`settle` by cutting boxes in halves."""
+        """`decide` by cutting boxes in halves."""
         waiting: list[_Box] = list(zip(range(len(family.regions)), family.lower, family.upper, strict=True))
         most = _WAITING + len(waiting)
         while waiting:
@@ -226,7 +226,7 @@ class _BoxSearch:
         return False
 
     def _assume(self, family: _Family, which: int) -> bool:
-        """`settle` of one region by assuming phases of neurons (N16)."""
+        """`decide` of one region by assuming phases of neurons (N16)."""
         images = self._images(*(v[which][None] for v in (family.lower, family.upper)))
         tree, left = self._tree(family, which, images, 0, family.unsafe.groups)
         by_step = max(_TUNING.least_seconds, _TUNING.dear * self.by_bounds)

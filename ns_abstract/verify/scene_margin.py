@@ -249,19 +249,19 @@ class SceneMargin:
 
 
 def largest_radius(
-    kind: VariationKind, cells: Sequence[CertifiedBox], settle: ProveCell, over: Callable[[], bool]
+    kind: VariationKind, cells: Sequence[CertifiedBox], prove: ProveCell, over: Callable[[], bool]
 ) -> SceneMargin:
     """Return the largest radius, within a tenth, for which every cell is proved again (V13).
 
     Args:
         kind: What varies.
         cells: What is certified.
-        settle: Sound bounds and an attack of one cell.
+        prove: Sound bounds and an attack of one cell.
         over: Whether to end with what is known; asked about once a second.
     """
     begin = time.perf_counter()
     margin = SceneMargin(kind, len(cells))
-    work = _Bisection(margin, settle)
+    work = _Bisection(margin, prove)
     try:
         with cancel_when(over):
             # those that are nearest to failing decide
@@ -290,8 +290,8 @@ def three_digits(radius: float) -> float:
 class _Bisection:
     """The bisection of one kind of variation."""
 
-    def __init__(self, found: SceneMargin, settle: ProveCell) -> None:
-        self.found, self.kind, self.settle = found, found.kind, settle
+    def __init__(self, margin: SceneMargin, prove: ProveCell) -> None:
+        self.margin, self.kind, self.prove = margin, margin.kind, prove
 
     def largest(self, number: int, cell: CertifiedBox, ceiling: float | None) -> float:
         """The largest radius for one cell, of which more than ``ceiling`` is of no use; None: it is the first."""
@@ -320,7 +320,7 @@ class _Bisection:
                 return
             radius = min(three_digits(2.0 * radius), self.kind.most)
             self._try(failing.cell, cell, radius, cuts=False)
-            if self.found.trials[-1].outcome != "unknown":
+            if self.margin.trials[-1].outcome != "unknown":
                 return
 
     def _try(self, number: int, cell: CertifiedBox, radius: float, *, cuts: bool = True) -> bool:
@@ -328,10 +328,10 @@ class _Bisection:
         begin = time.perf_counter()
         outcome, reason, parts, example = self._examined(cell, radius, cuts)
         trial = Trial(number, radius, outcome, reason, parts, time.perf_counter() - begin)
-        least = self.found.falsified
-        self.found.trials.append(trial)
+        least = self.margin.falsified
+        self.margin.trials.append(trial)
         if outcome == "falsified" and (least is None or radius < least.radius):
-            self.found.example = example
+            self.margin.example = example
         return outcome == "holds"
 
     def _examined(
@@ -344,7 +344,7 @@ class _Bisection:
         while waiting:
             part, depth = waiting.pop()
             check_cancelled()
-            outcome = self.settle(radius, cell.frame, grid.box_of(part))
+            outcome = self.prove(radius, cell.frame, grid.box_of(part))
             count += 1
             if outcome.outcome == "falsified":
                 return "falsified", outcome.reason, count, outcome.example

@@ -129,14 +129,14 @@ class Store(StoreFile):
             query = "INSERT INTO search_blocks(frame, volume, rank, depth, cells) VALUES (?, ?, ?, ?, ?)"
             self._seals.blocks.add((self._base.execute(query, row).lastrowid, *row))
 
-    def pending(self, known: set[int], count: int) -> list[CellBlock]:
+    def pending(self, taken: set[int], count: int) -> list[CellBlock]:
         """Up to ``count`` open blocks that are not in ``known``: those nearest to a proof, now and then the largest."""
         blocks: list[CellBlock] = []
         for _ in range(count):
             self._turn += 1
             order = "volume DESC" if self._turn % _LARGEST_EVERY == 0 else "rank, volume"
-            for block in self._listed(f"ORDER BY {order}, id LIMIT {len(known) + len(blocks) + 1}"):
-                if block.number not in known and block not in blocks:
+            for block in self._listed(f"ORDER BY {order}, id LIMIT {len(taken) + len(blocks) + 1}"):
+                if block.number not in taken and block not in blocks:
                     blocks.append(block)
                     break
             else:
@@ -225,13 +225,13 @@ class Store(StoreFile):
         ).fetchone()
         return None if row is None else CellOutcome(row[0], row[1], np.array(json.loads(row[2]), np.float64))
 
-    def keep_settled(self, kind: str, radius: float, frame: int, box: ParameterBox, found: CellOutcome) -> None:
+    def keep_settled(self, kind: str, radius: float, frame: int, box: ParameterBox, outcome: CellOutcome) -> None:
         """Note what is known of a cell for all scenes of a radius; scenes that break it are found again."""
-        if found.outcome == "falsified":
+        if outcome.outcome == "falsified":
             return
         with self._transaction():
-            slopes = np.nan_to_num(np.asarray(found.slopes, np.float64)).tolist()
-            row = (*_settled_key(kind, radius, frame, box), found.outcome, found.reason, json.dumps(slopes))
+            slopes = np.nan_to_num(np.asarray(outcome.slopes, np.float64)).tolist()
+            row = (*_settled_key(kind, radius, frame, box), outcome.outcome, outcome.reason, json.dumps(slopes))
             self._base.execute(f"INSERT INTO search_settled VALUES ({', '.join('?' * len(row))})", row)
             self._seals.settled.add(row)
 

@@ -58,25 +58,25 @@ class _Run:
 
     Attributes:
         texts: One of them each, without the closing bracket.
-        known: Shared by all runs: the side (0 below, 1 above), the input and the limit of a text.
+        limits: Shared by all runs: the side (0 below, 1 above), the input and the limit of a text.
     """
 
     texts: list[str]
-    known: dict[str, tuple[int, int, float]]
+    limits: dict[str, tuple[int, int, float]]
 
     def read(self, declared: set[str], size: _VariableCounts) -> None:
         """Learn what the texts say."""
-        for text in set(self.texts).difference(self.known):
+        for text in set(self.texts).difference(self.limits):
             ((constraint,),) = _ways(_expressions(text + ")")[0], declared, size)
             assert not isinstance(constraint, _Run)
             ends = np.array([[-np.inf], [np.inf]]) * np.ones(size.inputs or 0)
             _bound(constraint, ends)
             ((side, index),) = np.argwhere(np.isfinite(ends))
-            self.known[text] = int(side), int(index), float(ends[side, index])
+            self.limits[text] = int(side), int(index), float(ends[side, index])
 
     def limit(self, ends: np.ndarray) -> None:
         """Make ``ends`` [2, n] obey them."""
-        side, index, value = (np.array(v) for v in zip(*map(self.known.__getitem__, self.texts), strict=True))
+        side, index, value = (np.array(v) for v in zip(*map(self.limits.__getitem__, self.texts), strict=True))
         np.maximum.at(ends[0], index[side == 0], value[side == 0])
         np.minimum.at(ends[1], index[side == 1], value[side == 1])
 

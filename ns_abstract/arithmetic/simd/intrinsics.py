@@ -81,7 +81,7 @@ def pointer(typingctx, array):  # pyright: ignore[reportRedeclaration]
 
 
 @intrinsic
-def advanced(typingctx, elements, count):  # pyright: ignore[reportRedeclaration]
+def offset_by(typingctx, elements, count):  # pyright: ignore[reportRedeclaration]
     """The `pointer` to the element ``count`` further on."""
 
     def codegen(context, builder, signature, args):
@@ -132,7 +132,7 @@ if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
         """The elements of an array."""
         return array.reshape(-1)
 
-    def advanced(elements, count):
+    def offset_by(elements, count):
         """The elements without the first ``count``."""
         return elements[count:]
 

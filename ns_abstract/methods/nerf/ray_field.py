@@ -112,15 +112,15 @@ class RayRequest:
     box: ParameterBox
     pixels: np.ndarray
     tolerance: float
-    known: np.ndarray | None
+    most_alpha: np.ndarray | None
     aim: tuple[np.ndarray, np.ndarray] | None
     shifts: list[Shifts]
 
     def take(self, which: np.ndarray) -> RayRequest:
         """Some of the rays."""
-        known_alpha = None if self.known is None else self.known[which]
+        most_alpha = None if self.most_alpha is None else self.most_alpha[which]
         aim = None if self.aim is None else (self.aim[0][which], self.aim[1][which])
-        return replace(self, pixels=self.pixels[which], known=known_alpha, aim=aim)
+        return replace(self, pixels=self.pixels[which], most_alpha=most_alpha, aim=aim)
 
 
 class BoundedRays(ABC):
@@ -158,7 +158,7 @@ class BoundedRays(ABC):
         box: ParameterBox,
         pixels: np.ndarray,
         tolerance: float,
-        known: np.ndarray | None = None,
+        most_alpha: np.ndarray | None = None,
         aim: tuple[np.ndarray, np.ndarray] | None = None,
         shifts: list[Shifts] | None = None,
         division: Division | None = None,
@@ -169,12 +169,12 @@ class BoundedRays(ABC):
             pose_set, box: The poses.
             pixels: Rows and columns.
             tolerance: What a sample's open opacity or colour may move a pixel by before its cells are halved.
-            known: [n, samples] upper bounds of opacities over a larger box.
+            most_alpha: [n, samples] upper bounds of opacities over a larger box.
             aim: [n, 3] lower and upper colours; bounds between them are good enough (before the shifts).
             shifts: Intervals of hue and saturation that are added to all colours; bounds hold over all of them.
             division: The cells, in place of those that suit the rays; bounds are then kept by part.
         """
-        return self.bounded(RayRequest(pose_set, box, pixels, tolerance, known, aim, shifts or []), division)
+        return self.bounded(RayRequest(pose_set, box, pixels, tolerance, most_alpha, aim, shifts or []), division)
 
     @abstractmethod
     def bounded(self, request: RayRequest, division: Division | None) -> RayBounds:

@@ -77,7 +77,7 @@ class SampleCellBounds:
         displacement: float,
         edges: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> None:
-        self.edges, alphas = edges, request.known
+        self.edges, alphas = edges, request.most_alpha
         self.owner, self.pencil, self.division = owner, pencil, division
         self.tolerance, self.aim = request.tolerance * (_SWEPT if owner.swept else 1.0), request.aim
         self.basis, self.field = owner.basis, owner.field

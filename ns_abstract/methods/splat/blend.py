@@ -19,7 +19,7 @@ from ns_abstract.arithmetic.rounding import (
     SECOND_ORDER,
     UP,
 )
-from ns_abstract.arithmetic.simd.intrinsics import advanced, lowest_bit, prefetch, signed
+from ns_abstract.arithmetic.simd.intrinsics import lowest_bit, offset_by, prefetch, signed
 from ns_abstract.arithmetic.simd.lanes import LINE, bits, load4, maximum, minimum, store, where
 from ns_abstract.methods.splat.intervals import AHEAD, BlendBounds, blend_interval, blend_parts, write_parts
 from ns_abstract.methods.splat.lists import BLOCK
@@ -40,7 +40,7 @@ from ns_abstract.methods.splat.pixel_block import (
     parabola,
 )
 from ns_abstract.methods.splat.reordering import ReorderScratch, sharpened
-from ns_abstract.methods.splat.threshold_crossings import bound_by_parts, gather_crossings, set_blend, set_straight
+from ns_abstract.methods.splat.threshold_crossings import bound_by_parts, clear_slopes, gather_crossings, set_blend
 
 
 @dataclass(frozen=True)
@@ -96,12 +96,11 @@ def _keep_distances(number, entry, nearest, farthest, size, crossings):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def blend_quadratic(begin, end, fragments, palette, moves, t, crossings, split):
+def blend_quadratic(begin, end, fragments, palette, moves, polynomials, crossings, split):
     """Blend the list entries [begin, end) of a pixel back to front, as forms and as intervals (design.md, B7).
 
-    For one parameter and order 2. ``t`` [m, 4] receives the polynomials; returns a `_Blend` whose radii are not yet
-    rounded up. If ``split``, fragments that some poses skip are drawn and kept in ``crossings`` (B11); else their forms
-    hold both.
+    For one parameter and order 2. Writes ``polynomials`` [m, 4]; returns a `_Blend` whose radii are not yet rounded up.
+    If ``split``, fragments that some poses skip are drawn and kept in ``crossings`` (B11); else their forms hold both.
     """
     values, colors, forms = fragments.values, palette.values, palette.forms
     moving = forms > 1
@@ -152,31 +151,28 @@ def blend_quadratic(begin, end, fragments, palette, moves, t, crossings, split):
             p0 = p0 + 0.5 * (rises - falls)
             r = r + 0.5 * (rises + falls)
             ends = BlendBounds(ends.low - falls, ends.high + rises, ends.darkest, ends.brightest)
-    store(t, 0, p0)
-    store(t, 4, p1)
-    store(t, 8, p2)
+    store(polynomials, 0, p0)
+    store(polynomials, 4, p1)
+    store(polynomials, 8, p2)
     return _Blend(r, ends, number, 0.0 * r)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _curve_range(t, u, m):
-    """Range of the quadratic parts of the polynomials ``t`` [m + bends, 4], at most 0 to at least 0 (design.md, B10).
-
-    ``u`` [m, 4] is scratch.
-    """
-    low = 0.0 * load4(t, 0)
+def _curve_range(polynomials, scratch, m):
+    """Range of the quadratic parts of ``polynomials`` [m + bends, 4], at most 0 to at least 0 (B10)."""
+    low = 0.0 * load4(polynomials, 0)
     high = low
     for k in range(1, m):
-        store(u, 4 * k, low)
+        store(scratch, 4 * k, low)
     pair = m
     for j in range(1, m):
-        own, shared = load4(t, 4 * pair), load4(u, 4 * j)
+        own, shared = load4(polynomials, 4 * pair), load4(scratch, 4 * j)
         pair += 1
         for k in range(j + 1, m):
             # |p_j p_k| is at most half the sum of their squares
-            half = 0.5 * abs(load4(t, 4 * pair))
+            half = 0.5 * abs(load4(polynomials, 4 * pair))
             shared = shared + half
-            store(u, 4 * k, load4(u, 4 * k) + half)
+            store(scratch, 4 * k, load4(scratch, 4 * k) + half)
             pair += 1
         low = low + minimum(0.0, own - shared)
         high = high + maximum(0.0, own + shared)
@@ -184,48 +180,48 @@ def _curve_range(t, u, m):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _step_of_several(r, at, key, crossing, fragments, palette, t, u, m):
+def _step_of_several(r, at, key, crossing, fragments, palette, polynomials, scratch, m):
     """One fragment over polynomials and radii ``r``, drawn also up to 2 ``crossing`` of skipped alpha (B7, B10, B11).
 
     Returns the new radii, and the least and greatest of its colour beyond what lies behind, up to rounding of a size.
-    ``t`` [m + bends, 4] holds the coefficients of order 0 and 1, then those of products of two parameters; ``u`` [m, 4]
-    is scratch.
+    ``polynomials`` [m + bends, 4]: coefficients of order 0 and 1, then those of products of two parameters; ``scratch``
+    [m, 4] is overwritten.
     """
     values, colors, forms = fragments.values, palette.values, palette.forms
     moving = forms > 1
-    form = advanced(values, at + FORM)
-    bends = advanced(form, m + 1)
+    form = offset_by(values, at + FORM)
+    bends = offset_by(form, m + 1)
     # alpha's curvature is about - bent to about + bent, that of what is behind likewise
     about, bent = values[at + BEND], values[at + BEND_SPREAD]
-    sunk, risen = _curve_range(t, u, m)
+    sunk, risen = _curve_range(polynomials, scratch, m)
     middle_curve, wound, curved = 0.5 * (sunk + risen), 0.5 * (risen - sunk), maximum(risen, -sunk)
     a0 = form[0] + crossing
     remaining = a0 + about
-    p0 = load4(t, 0)
+    p0 = load4(polynomials, 0)
     value = load4(colors, key) - p0
     visible_value = value - middle_curve
     steep = 0.0
     change_size = 0.0 * p0
     for k in range(1, m):
-        slope = load4(t, 4 * k)
+        slope = load4(polynomials, 4 * k)
         change = -slope
         if moving:
             change = load4(colors, key + 4 * k) - slope
-        store(u, 4 * k, change)
-        store(t, 4 * k, fma(remaining, change, fma(form[k], visible_value, slope)))
+        store(scratch, 4 * k, change)
+        store(polynomials, 4 * k, fma(remaining, change, fma(form[k], visible_value, slope)))
         steep += abs(form[k])
         change_size = change_size + abs(change)
     middle = fma(about, middle_curve, fma(a0, value, p0))
-    store(t, 0, middle)
+    store(polynomials, 0, middle)
     pair = 0
     for j in range(1, m):
-        change, a = load4(u, 4 * j), form[j]
+        change, a = load4(scratch, 4 * j), form[j]
         for k in range(j, m):
-            curve = load4(t, 4 * (m + pair))
-            product = a * load4(u, 4 * k)
+            curve = load4(polynomials, 4 * (m + pair))
+            product = a * load4(scratch, 4 * k)
             if j < k:
                 product = fma(form[k], change, product)
-            store(t, 4 * (m + pair), fma(-remaining, curve, fma(bends[pair], visible_value, curve + product)))
+            store(polynomials, 4 * (m + pair), fma(-remaining, curve, fma(bends[pair], visible_value, curve + product)))
             pair += 1
     nearest, farthest = value - change_size - risen, value + change_size - sunk
     size = abs(value) + change_size + curved
@@ -237,26 +233,26 @@ def _step_of_several(r, at, key, crossing, fragments, palette, t, u, m):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def flattened(t, r, u, m):
-    """Put the range of the curvature behind the polynomials ``t`` into their centres and the radii ``r`` (B10)."""
-    low, high = _curve_range(t, u, m)
-    store(t, 0, load4(t, 0) + 0.5 * (low + high))
-    return r + 0.5 * (high - low) + CURVE_ROUNDING * (abs(load4(t, 0)) + 2.0 * (high - low))
+def flattened(polynomials, r, scratch, m):
+    """Move the range of the curvature behind ``polynomials`` into their centres and radii; returns the radii (B10)."""
+    low, high = _curve_range(polynomials, scratch, m)
+    store(polynomials, 0, load4(polynomials, 0) + 0.5 * (low + high))
+    return r + 0.5 * (high - low) + CURVE_ROUNDING * (abs(load4(polynomials, 0)) + 2.0 * (high - low))
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def blend_several(begin, end, fragments, palette, moves, t, m, crossings, split):
+def blend_several(begin, end, fragments, palette, moves, polynomials, m, crossings, split):
     """`blend_quadratic` for several parameters, or none (design.md, B7, B10).
 
-    ``t`` [m + bends, 4] receives the polynomials with their curvature (see `flattened`).
+    Writes ``polynomials`` [m + bends, 4] with their curvature (see `flattened`).
     """
     values, colors, forms = fragments.values, palette.values, palette.forms
     p0 = load4(palette.background, 0)
     r = 0.0 * p0
-    store(t, 0, p0)
-    u = advanced(t, 4 * (m + fragments.bends))
+    store(polynomials, 0, p0)
+    scratch = offset_by(polynomials, 4 * (m + fragments.bends))
     for k in range(1, m + fragments.bends):
-        store(t, 4 * k, r)
+        store(polynomials, 4 * k, r)
     ends = BlendBounds(p0, p0, p0, p0)
     number, since = 0, r
     for entry in range(end - 1, begin - 1, -1):
@@ -267,57 +263,57 @@ def blend_several(begin, end, fragments, palette, moves, t, m, crossings, split)
         crossing = 0.0
         if split:
             crossing = 0.5 * crossing_of(fragments, at)
-        r, nearest, farthest, size = _step_of_several(r, at, key, crossing, fragments, palette, t, u, m)
+        r, nearest, farthest, size = _step_of_several(r, at, key, crossing, fragments, palette, polynomials, scratch, m)
         if crossing > 0.0:
             _keep_distances(number, entry, nearest, farthest, size, crossings)
             number += 1
         ends = blend_interval(ends, values, at, colors, key + color_ends(forms))
         if move != 0:
             falls, rises = load4(moves, move), load4(moves, move + 4)
-            store(t, 0, load4(t, 0) + 0.5 * (rises - falls))
+            store(polynomials, 0, load4(polynomials, 0) + 0.5 * (rises - falls))
             r = r + 0.5 * (rises + falls)
             ends = BlendBounds(ends.low - falls, ends.high + rises, ends.darkest, ends.brightest)
         # where the interval says more than the form, the form is the interval
         half = 0.5 * (ends.high - ends.low)
         wide = r > half
         if bits(wide) & 7 != 0:
-            store(t, 0, where(wide, 0.5 * (ends.low + ends.high), load4(t, 0)))
+            store(polynomials, 0, where(wide, 0.5 * (ends.low + ends.high), load4(polynomials, 0)))
             for k in range(1, m + fragments.bends):
-                store(t, 4 * k, where(wide, 0.0, load4(t, 4 * k)))
+                store(polynomials, 4 * k, where(wide, 0.0, load4(polynomials, 4 * k)))
             r = where(wide, half * UP + FRAGMENT_ROUNDING * (abs(ends.low) + abs(ends.high)), r)
             since = where(wide, float(number), since)
     return _Blend(r, ends, number, since)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def form_range(t, r, order, m):
-    """Range over the box of the polynomials ``t`` [m, 4] of radii ``r``, rounded outward (design.md, A4)."""
-    middle = load4(t, 0)
+def form_range(polynomials, r, order, m):
+    """Range over the box of ``polynomials`` [m, 4] of radii ``r``, rounded outward (design.md, A4)."""
+    middle = load4(polynomials, 0)
     bottom, top = middle, middle
     size = 0.0 * middle
     for k in range(1, m):
-        size = size + abs(load4(t, 4 * k))
+        size = size + abs(load4(polynomials, 4 * k))
     if order == 1:
         bottom, top = middle - size, middle + size
     else:
-        low, high = parabola(abs(load4(t, 4)), load4(t, 8))
+        low, high = parabola(abs(load4(polynomials, 4)), load4(polynomials, 8))
         bottom, top = bottom + low, top + high
     room = PIXEL_RANGE_ROUNDING * (abs(middle) + size) + r * UP
     return bottom - room, top + room
 
 
 @njit(cache=True, error_model="numpy")
-def _stop_slack(q, darkest, brightest, room, block, inputs, u):
+def _stop_slack(q, darkest, brightest, room, block, inputs, scratch):
     """By how much a stop that the fragments of pixel q ignore may lower and raise the picture (design.md, B6, iii).
 
     ``darkest`` and ``brightest`` bound all colours of the list, ``room`` the rounding of its blend. The two go to the
-    first 8 numbers of ``u``, channels in lanes.
+    first 8 numbers of ``scratch``, channels in lanes.
     """
     fragments, palette, charges = block.fragments, block.palette, inputs.charges
     values, per_pixel, forms = fragments.values, fragments.per_pixel, palette.forms
     background, rho, lost_up = load4(palette.background, 0), per_pixel[RHO + q], 1.0 + charges.lost_light
-    store(u, 0, rho * lost_up * maximum(0.0, brightest - background))
-    store(u, 4, rho * lost_up * maximum(0.0, background - darkest))
+    store(scratch, 0, rho * lost_up * maximum(0.0, brightest - background))
+    store(scratch, 4, rho * lost_up * maximum(0.0, background - darkest))
     if per_pixel[HIDDEN + q] > 0.0:
         # what lies behind the stop depends on the order
         return
@@ -336,22 +332,22 @@ def _stop_slack(q, darkest, brightest, room, block, inputs, u):
         lost = lost_up * min(rho, fragments.light[2 * entry + LIGHT], stop / (1.0 - values[at + ALPHA_HIGH]))
         falls = maximum(falls, lost * (maximum(0.0, value.high - background) + room))
         rises = maximum(rises, lost * (maximum(0.0, background - value.low) + room))
-    store(u, 0, minimum(load4(u, 0), falls))
-    store(u, 4, minimum(load4(u, 4), rises))
+    store(scratch, 0, minimum(load4(scratch, 0), falls))
+    store(scratch, 4, minimum(load4(scratch, 4), rises))
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _slack(q, ends, block, inputs, u):
+def _slack(q, ends, block, inputs, scratch):
     """By how much the bounds of pixel q are widened below and above beside what blending knows (design.md, B6, B8).
 
-    ``u`` is scratch for 8 numbers.
+    ``scratch`` is scratch for 8 numbers.
     """
     per_pixel, palette, cutoffs, charges = block.fragments.per_pixel, block.palette, inputs.cutoffs, inputs.charges
     unseen = palette.unseen
     behind = load4(palette.background, 0)
-    store(u, 0, ends.darkest)
-    store(u, 4, ends.brightest)
-    dark, light = min(u[0], u[1], u[2]), max(u[4], u[5], u[6])
+    store(scratch, 0, ends.darkest)
+    store(scratch, 4, ends.brightest)
+    dark, light = min(scratch[0], scratch[1], scratch[2]), max(scratch[4], scratch[5], scratch[6])
     # rounding of the program's own sums and products
     bright = max(1.0, light, -dark)
     rounding = charges.blend_fragment * block.fragments.lengths[q] + charges.blend_pixel
@@ -359,8 +355,8 @@ def _slack(q, ends, block, inputs, u):
     fall = 0.0 * behind
     rise = fall
     if per_pixel[RHO + q] > 0.0:
-        _stop_slack(q, dark, light, rounding * bright, block, inputs, u)
-        fall, rise = load4(u, 0), load4(u, 4)
+        _stop_slack(q, dark, light, rounding * bright, block, inputs, scratch)
+        fall, rise = load4(scratch, 0), load4(scratch, 4)
     # or else fragments that are missing show in place of the background
     passed = per_pixel[OPEN + q] * (1.0 + charges.lost_light)
     if passed > 0.0:
@@ -377,46 +373,48 @@ def _form_bounds(begin, end, block, inputs, linear):
     The block's sums receive the polynomials, scratch behind them; ``linear`` tells whether their sets are asked for.
     """
     fragments, palette, moves, crossings = block.fragments, block.palette, block.reordering.moves, block.crossings
-    t, limit = block.sums, inputs.rules.alpha_min * (1.0 - inputs.charges.threshold)
+    polynomials, limit = block.sums, inputs.rules.alpha_min * (1.0 - inputs.charges.threshold)
     d, order, m = inputs.shape.dimensions, inputs.shape.order, inputs.shape.monomials
-    u = advanced(t, 4 * (m + fragments.bends))
+    scratch = offset_by(polynomials, 4 * (m + fragments.bends))
     if order == 2:
-        blended = blend_quadratic(begin, end, fragments, palette, moves, t, crossings, True)
+        blended = blend_quadratic(begin, end, fragments, palette, moves, polynomials, crossings, True)
     else:
-        blended = blend_several(begin, end, fragments, palette, moves, t, m, crossings, True)
+        blended = blend_several(begin, end, fragments, palette, moves, polynomials, m, crossings, True)
     radius, ends = blended.radius, blended.ends
     # the radius' own rounding: three for every fragment
     up = UP + LAYER_ROUNDING * (end - begin)
     falls, rises = 0.0 * radius, 0.0 * radius
     if blended.crossings > 0:
-        store(u, 0, radius * up)
-        set_blend(t, u, crossings, d)
-        store(u, 16, blended.since)
-        gather_crossings(begin, end, blended.crossings, advanced(u, 16), fragments, crossings, u, inputs.shape)
-        falls, rises = load4(u, 0), load4(u, 4)
+        store(scratch, 0, radius * up)
+        set_blend(polynomials, scratch, crossings, d)
+        store(scratch, 16, blended.since)
+        gather_crossings(
+            begin, end, blended.crossings, offset_by(scratch, 16), fragments, crossings, scratch, inputs.shape
+        )
+        falls, rises = load4(scratch, 0), load4(scratch, 4)
     if order == 1:
-        radius = flattened(t, radius, u, m)
+        radius = flattened(polynomials, radius, scratch, m)
     radius = radius * up
-    drawn_low, drawn_high = form_range(t, radius, order, m)
+    drawn_low, drawn_high = form_range(polynomials, radius, order, m)
     low, high = drawn_low - falls, drawn_high + rises
     # skipping lowers by half of what it lowers and raises by half of what it raises, give or take as much
-    center, radius = load4(t, 0) + 0.5 * (rises - falls), (radius + 0.5 * (falls + rises)) * UP
+    center, radius = load4(polynomials, 0) + 0.5 * (rises - falls), (radius + 0.5 * (falls + rises)) * UP
     # what skipping adds to bounds without it
     drawn_low, drawn_high = maximum(ends.low, drawn_low), minimum(ends.high, drawn_high)
     added = (minimum(ends.high, high) - drawn_high) + (drawn_low - maximum(ends.low, low))
     if blended.crossings == 0 or d == 0 or bits(added > _CROSSINGS_MATTER * (drawn_high - drawn_low)) & 7 == 0:
         return _PixelResult(low, high, ends, center, radius)
-    store(u, 0, falls)
-    store(u, 4, rises)
-    bound_by_parts(blended.crossings, limit, crossings, u, d)
-    low, high = maximum(low, load4(u, 0)), minimum(high, load4(u, 4))
+    store(scratch, 0, falls)
+    store(scratch, 4, rises)
+    bound_by_parts(blended.crossings, limit, crossings, scratch, d)
+    low, high = maximum(low, load4(scratch, 0)), minimum(high, load4(scratch, 4))
     if linear:
         # what is off the slopes alone
-        set_straight(crossings, d, order)
-        store(u, 0, falls)
-        store(u, 4, rises)
-        bound_by_parts(blended.crossings, limit, crossings, u, d)
-        least, most = load4(u, 0), load4(u, 4)
+        clear_slopes(crossings, d, order)
+        store(scratch, 0, falls)
+        store(scratch, 4, rises)
+        bound_by_parts(blended.crossings, limit, crossings, scratch, d)
+        least, most = load4(scratch, 0), load4(scratch, 4)
         half = 0.5 * (most - least) + FRAGMENT_ROUNDING * (abs(least) + abs(most))
         center = where(half < radius, 0.5 * (least + most), center)
         radius = minimum(radius, half)
@@ -431,13 +429,13 @@ def shade(pixels, left, above, reordered, block, inputs, bounds):
     ``reordered`` tells whether fragments may move. Row OPEN of `Fragments.per_pixel` bounds the light that comes to
     fragments that are missing and have colours between the two of `Palette.unseen`.
     """
-    fragments, palette, t = block.fragments, block.palette, block.sums
+    fragments, palette, polynomials = block.fragments, block.palette, block.sums
     lower, upper, linear, slopes = bounds.lower, bounds.upper, bounds.linear, bounds.slopes
     d, m = inputs.shape.dimensions, inputs.shape.monomials
     # behind the polynomials: scratch, then sums of absolute linear coefficients
-    u = advanced(t, 4 * (m + fragments.bends))
-    sums = advanced(u, 4 * m + 20)
-    scratch = ReorderScratch(u, block.entries.depth_radius, block.entries.first)
+    scratch = offset_by(polynomials, 4 * (m + fragments.bends))
+    sums = offset_by(scratch, 4 * m + 20)
+    reorder_scratch = ReorderScratch(scratch, block.entries.depth_radius, block.entries.first)
     for k in range(d):
         store(sums, 4 * k, 0.0 * load4(palette.background, 0))
     while pixels != 0:
@@ -446,38 +444,38 @@ def shade(pixels, left, above, reordered, block, inputs, bounds):
         begin = q * fragments.capacity
         end = begin + int(fragments.lengths[q])
         if inputs.shape.parts > 0:
-            own = blend_parts(begin, end, reordered, block, inputs, advanced(t, 4))
+            own = blend_parts(begin, end, reordered, block, inputs, offset_by(polynomials, 4))
             pixel_bounds = _PixelResult(own.low, own.high, own, 0.5 * (own.low + own.high), 0.5 * (own.high - own.low))
         else:
             pixel_bounds = _form_bounds(begin, end, block, inputs, linear.shape[0] > 0)
         form_low, form_high, ends = pixel_bounds.low, pixel_bounds.high, pixel_bounds.ends
         low, high = ends.low, ends.high
         if reordered:
-            low, high = sharpened(begin, end, ends, form_low, form_high, block, scratch)
+            low, high = sharpened(begin, end, ends, form_low, form_high, block, reorder_scratch)
         for k in range(d):
-            store(sums, 4 * k, load4(sums, 4 * k) + abs(load4(t, 4 + 4 * k)))
-        fall, rise = _slack(q, ends, block, inputs, u)
+            store(sums, 4 * k, load4(sums, 4 * k) + abs(load4(polynomials, 4 + 4 * k)))
+        fall, rise = _slack(q, ends, block, inputs, scratch)
         bottom = maximum(low, form_low) - fall
         top = minimum(high, form_high) + rise
         # crossed or not a number: nothing is known
         consistent = bottom <= top
-        store(u, 0, minimum(1.0, maximum(0.0, where(consistent, bottom, 0.0))))
-        store(u, 4, maximum(0.0, minimum(1.0, where(consistent, top, 1.0))))
+        store(scratch, 0, minimum(1.0, maximum(0.0, where(consistent, bottom, 0.0))))
+        store(scratch, 4, maximum(0.0, minimum(1.0, where(consistent, top, 1.0))))
         if bits(consistent) != 15:
             bounds.statistics[4] += 1
         row, column = above + q // BLOCK, left + q % BLOCK
         for channel in range(3):
-            lower[row, column, channel] = u[channel]
-            upper[row, column, channel] = u[4 + channel]
+            lower[row, column, channel] = scratch[channel]
+            upper[row, column, channel] = scratch[4 + channel]
         if bounds.parts.shape[0] > 0:
-            write_parts(fall, rise, block.part_ends, bounds.parts[0, row, column], u)
+            write_parts(fall, rise, block.part_ends, bounds.parts[0, row, column], scratch)
         if linear.shape[0] > 0:
             center = pixel_bounds.center + 0.5 * (rise - fall)
-            store(t, 0, center)
-            store(u, 0, (pixel_bounds.radius + 0.5 * (rise + fall)) * UP + FRAGMENT_ROUNDING * abs(center))
+            store(polynomials, 0, center)
+            store(scratch, 0, (pixel_bounds.radius + 0.5 * (rise + fall)) * UP + FRAGMENT_ROUNDING * abs(center))
             for channel in range(3):
                 for k in range(m):
-                    linear[0, row, column, channel, k] = t[4 * k + channel]
-                linear[0, row, column, channel, m] = u[channel]
+                    linear[0, row, column, channel, k] = polynomials[4 * k + channel]
+                linear[0, row, column, channel, m] = scratch[channel]
     for k in range(d):
         slopes[k] += sums[4 * k] + sums[4 * k + 1] + sums[4 * k + 2]

@@ -390,7 +390,7 @@ class SplatBounds:
         if self.rasteriser.eye_from_view:
             position_error += _gram_deviation(forms) * float(camera_magnitude.sum())
         scene = SceneColors(
-            varied.mean_middle, varied.mean_radius, varied.color_low, varied.color_high, splats.sh,
+            varied.mean_middle, varied.mean_radius, varied.shift_low, varied.shift_high, splats.sh,
             self._sums.color_magnitudes, splats.degree,
         )  # fmt: skip
         position = forms.position
@@ -442,12 +442,12 @@ def _gram_deviation(forms: PoseForms) -> float:
 
 def _shifted_colors(varied: VariedSplats, charges: Charges) -> np.ndarray | None:
     """[N, 6] centre and radius by channel of view-independent colours (design.md, S4); None where none varies."""
-    if not varied.color_low.size:
+    if not varied.shift_low.size:
         return None
     color, top = varied.stored.sh[:, 0], varied.stored.color_max
-    low, high = (np.clip(color + end, 0.0, top) for end in (varied.color_low, varied.color_high))
-    moved = (varied.color_low != 0.0) | (varied.color_high != 0.0)
-    size = color + np.maximum(np.abs(varied.color_low), np.abs(varied.color_high))
+    low, high = (np.clip(color + end, 0.0, top) for end in (varied.shift_low, varied.shift_high))
+    moved = (varied.shift_low != 0.0) | (varied.shift_high != 0.0)
+    size = color + np.maximum(np.abs(varied.shift_low), np.abs(varied.shift_high))
     # one addition and the ends' own rounding
     radius = 0.5 * (high - low) + (charges.shifted_color + SHIFTED_ROUNDING) * size
     colors = np.stack([np.where(moved, 0.5 * (low + high), color), np.where(moved, radius, 0.0)], axis=-1)

@@ -10,7 +10,7 @@ from numba import njit
 
 from ns_abstract.arithmetic.forms import bounds, clamp_below, set_norms
 from ns_abstract.arithmetic.rounding import ARC_UP, MAGNITUDE_UP, SECOND_ORDER, SUM_ROUNDING, UP, Charges
-from ns_abstract.arithmetic.simd.intrinsics import advanced, borrowed, pointer, taken
+from ns_abstract.arithmetic.simd.intrinsics import borrowed, offset_by, pointer, taken
 from ns_abstract.arithmetic.simd.wide_forms import size
 from ns_abstract.methods.splat.form_colors import WORKSPACE, form_colors
 from ns_abstract.methods.splat.line_colors import accumulate_line, basis_line, directions_line
@@ -133,7 +133,7 @@ def _fixed_worker(counter_, scene, position, position_error, charges, colors):
     """One thread's Gaussians: the next chunk that none has taken yet; see `fixed_colors`."""
     counter, count = pointer(counter_), scene.means.shape[0]
     means, mean_radius, magnitudes = borrowed(scene.means), borrowed(scene.mean_radius), borrowed(scene.magnitudes)
-    color_low, color_high, sh = borrowed(scene.low), borrowed(scene.high), borrowed(scene.sh)
+    shift_low, shift_high, sh = borrowed(scene.low), borrowed(scene.high), borrowed(scene.sh)
     basis = np.empty(16)
     color = np.empty(3)
     direction = np.empty(3)
@@ -149,11 +149,11 @@ def _fixed_worker(counter_, scene, position, position_error, charges, colors):
             error = _direction_error(length, position_error, means, mean_radius, i, charges)
             for c in range(3):
                 radius = _color_error(magnitudes[i, c], magnitudes[i, 3 + c], charges, error)
-                if color_low.shape[0] > 0 and (color_low[i, c] != 0.0 or color_high[i, c] != 0.0):
-                    size = color[c] + radius + max(abs(color_low[i, c]), abs(color_high[i, c]))
+                if shift_low.shape[0] > 0 and (shift_low[i, c] != 0.0 or shift_high[i, c] != 0.0):
+                    size = color[c] + radius + max(abs(shift_low[i, c]), abs(shift_high[i, c]))
                     rounding = charges.shifted_color * size
-                    low = max(0.0, max(0.0, color[c] - radius) + color_low[i, c] - rounding)
-                    high = max(0.0, color[c] + radius + color_high[i, c] + rounding)
+                    low = max(0.0, max(0.0, color[c] - radius) + shift_low[i, c] - rounding)
+                    high = max(0.0, color[c] + radius + shift_high[i, c] + rounding)
                     color[c] = 0.5 * (low + high)
                     radius = 0.5 * (high - low) * UP + SUM_ROUNDING * high
                 colors[i, 2 * c] = color[c]
@@ -228,8 +228,8 @@ def _set_bands(work, numbers, filled, scratch, scene, shape):
         set_norms(work[axis], d, order, m)
     for q in range(0, filled, 8):
         form_colors(
-            pointer(scratch.wide), advanced(pointer(scratch.rows), q), advanced(pointer(low), q), sh, pointer(weights),
-            advanced(pointer(numbers), q), scene.degree, m,
+            pointer(scratch.wide), offset_by(pointer(scratch.rows), q), offset_by(pointer(low), q), sh,
+            pointer(weights), offset_by(pointer(numbers), q), scene.degree, m,
         )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from ns_abstract.arithmetic.rounding import ORDER_ROUNDING, TURN_ROOM, UP, WINDOW_ROUNDING
-from ns_abstract.arithmetic.simd.intrinsics import advanced, prefetch
+from ns_abstract.arithmetic.simd.intrinsics import offset_by, prefetch
 from ns_abstract.methods.splat.lists import AHEAD
 from ns_abstract.methods.splat.reached_pixels import pixels_at, pixels_once
 
@@ -88,7 +88,10 @@ def _uncertain(i, j, listed):
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _same_color(i, j, listed):
     """Whether Gaussians i and j surely have the same colour, so that their order changes nothing (design.md, O5)."""
-    first, second = advanced(listed.colors, i * listed.color_columns), advanced(listed.colors, j * listed.color_columns)
+    first, second = (
+        offset_by(listed.colors, i * listed.color_columns),
+        offset_by(listed.colors, j * listed.color_columns),
+    )
     for column in range(listed.color_columns):
         # a colour that moves or has a radius is not one number
         varies = column % listed.color_rows != 0 and first[column] != 0.0

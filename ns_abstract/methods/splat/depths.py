@@ -20,7 +20,7 @@ from ns_abstract.arithmetic.rounding import (
     SECOND_ORDER,
     UP,
 )
-from ns_abstract.arithmetic.simd.intrinsics import advanced, lowest_bit, signed
+from ns_abstract.arithmetic.simd.intrinsics import lowest_bit, offset_by, signed
 from ns_abstract.arithmetic.simd.lanes import maximum, minimum, store
 from ns_abstract.methods.splat.blend import blend_quadratic, blend_several, flattened, form_range
 from ns_abstract.methods.splat.lists import BLOCK
@@ -118,41 +118,41 @@ def _range(polynomial, order, m):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _weighted_mean(t, radius, low, high, total_low, total_high, order, m):
+def _weighted_mean(polynomials, radius, low, high, total_low, total_high, order, m):
     """Bounds of a sum over the accumulation, added to a polynomial (design.md, D3).
 
-    ``t`` [m] holds the polynomial and behind it [m] that of the sum, of ``radius`` beside its own; the sum lies between
-    ``low`` and ``high``, the accumulation, which is not 0, between ``total_low`` and ``total_high``. Overwrites ``t``.
+    ``polynomials`` [2 m] are that one, which is overwritten, and that of the sum, of ``radius`` beside its own. The sum
+    lies between ``low`` and ``high``, the accumulation, which is not 0, between ``total_low`` and ``total_high``.
     """
-    base_low, base_high = _range(t, order, m)
+    base_low, base_high = _range(polynomials, order, m)
     first_low = base_low + low / (total_low if low < 0.0 else total_high)
     first_high = base_high + high / (total_low if high > 0.0 else total_high)
     # to first order the sum is divided by one number
     factor = 2.0 / (total_low + total_high)
     for k in range(m):
-        t[k] += factor * t[m + k]
-    other_low, other_high = _range(t, order, m)
+        polynomials[k] += factor * polynomials[m + k]
+    other_low, other_high = _range(polynomials, order, m)
     off = max(abs(low), abs(high)) * max(abs(1.0 / total_low - factor), abs(factor - 1.0 / total_high))
     room = 0.0
     for k in range(m):
-        room += abs(t[k]) + 2.0 * factor * abs(t[m + k])
+        room += abs(polynomials[k]) + 2.0 * factor * abs(polynomials[m + k])
     off = (off + factor * radius) * UP + FRAGMENT_ROUNDING * (room + factor * max(abs(low), abs(high)))
     return max(first_low, other_low - off), min(first_high, other_high + off)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _blend_depths(begin, end, block, t, by_lane, order, m):
-    """Blend a pixel's shifted depths and accumulation: polynomials in ``t``, then ends and radii by lane."""
+def _blend_depths(begin, end, block, polynomials, by_lane, order, m):
+    """Blend a pixel's shifted depths and accumulation: polynomials in ``polynomials``, then ends and radii by lane."""
     fragments, moves = block.fragments, block.reordering.moves
     if order == 2:
-        blended = blend_quadratic(begin, end, fragments, block.shifted, moves, t, block.crossings, False)
+        blended = blend_quadratic(begin, end, fragments, block.shifted, moves, polynomials, block.crossings, False)
         r = blended.radius
     else:
-        blended = blend_several(begin, end, fragments, block.shifted, moves, t, m, block.crossings, False)
-        r = flattened(t, blended.radius, advanced(t, 4 * (m + fragments.bends)), m)
+        blended = blend_several(begin, end, fragments, block.shifted, moves, polynomials, m, block.crossings, False)
+        r = flattened(polynomials, blended.radius, offset_by(polynomials, 4 * (m + fragments.bends)), m)
     ends = blended.ends
     r = r * (UP + LAYER_ROUNDING * (end - begin))
-    bottom, top = form_range(t, r, order, m)
+    bottom, top = form_range(polynomials, r, order, m)
     store(by_lane, 0, maximum(ends.low, bottom))
     store(by_lane, 4, minimum(ends.high, top))
     store(by_lane, 8, r)
@@ -201,9 +201,9 @@ def shade_layers(pixels, left, above, block, inputs, bounds):
     order, m = inputs.shape.order, inputs.shape.monomials
     unseen = block.palette.unseen
     # behind what blending takes: ends and radii by lane, the reference, two polynomials of the result
-    by_lane = advanced(t, 4 * (2 * m + fragments.bends))
-    reference = advanced(by_lane, 16)
-    result = advanced(reference, m)
+    by_lane = offset_by(t, 4 * (2 * m + fragments.bends))
+    reference = offset_by(by_lane, 16)
+    result = offset_by(reference, m)
     # a fragment that is drawn has this alpha at least
     least = inputs.rules.alpha_min * (1.0 - 2.0 * charges.threshold)
     while pixels != 0:

@@ -12,7 +12,7 @@ import numpy as np
 from numba import njit
 
 from ns_abstract.arithmetic.rounding import UP
-from ns_abstract.arithmetic.simd.intrinsics import advanced, lowest_bit, pointer, prefetch, signed
+from ns_abstract.arithmetic.simd.intrinsics import lowest_bit, offset_by, pointer, prefetch, signed
 from ns_abstract.arithmetic.simd.lanes import load8, store
 from ns_abstract.methods.splat.alphas import alphas
 from ns_abstract.methods.splat.depth_pairs import BlockList, DepthWindow, depth_radii, find_pairs
@@ -78,7 +78,7 @@ def _start(numbers, inputs, block):
         entries.first[k] = k
         entries.last[k] = k
         block.reordering.slots[k] = -1
-        entries.asked[k] = 0
+        entries.has_pixels[k] = 0
         if entries.depth_radius[k] > largest:
             entries.far[far] = k
             far += 1
@@ -243,7 +243,7 @@ def _colors_behind(first, listed, colors, channels, palette, marks):
         i = listed.numbers[k]
         if marks[i] == 0:
             marks[i] = 1
-        color = advanced(values, i * color_columns)
+        color = offset_by(values, i * color_columns)
         for channel in range(channels):
             at = channel * color_rows
             spread = 0.0
@@ -272,7 +272,7 @@ def _place_batch(start, some, live, listed, inputs, block):
         pixels_once(start + b, listed, block.entries, block.fragments.per_pixel)
     end = 0
     for b in range(some):
-        row = advanced(listed.record, listed.numbers[start + b] * listed.columns)
+        row = offset_by(listed.record, listed.numbers[start + b] * listed.columns)
         ox, oy = listed.x0 + 0.5 - row[MEAN_X], listed.y0 + 0.5 - row[MEAN_Y]
         pixels = live & block.entries.pixels[start + b]
         batch.begins[b] = end
@@ -297,7 +297,7 @@ def _find_alphas(start, some, used, place, listed, inputs, block):
         n = batch.begins[b + 1] - begin
         batch.found[b] = 0
         if n > 0:
-            core = advanced(listed.tiles, 8 * i + 4)
+            core = offset_by(listed.tiles, 8 * i + 4)
             sure = (
                 core[0] <= place.tile_x
                 and place.tile_x < core[1]
@@ -305,7 +305,7 @@ def _find_alphas(start, some, used, place, listed, inputs, block):
                 and place.tile_y < core[3]
             )
             offset = (used + begin) * block.fragments.width
-            record = advanced(listed.record, i * listed.columns)
+            record = offset_by(listed.record, i * listed.columns)
             batch.found[b] = alphas(record, begin, n, offset, sure, block, inputs)
 
 
@@ -373,7 +373,7 @@ def collect_fragments(numbers, place, inputs, block, marks_):
         for b in range(some):
             lanes = batch.found[b]
             begin = batch.begins[b]
-            pixels = advanced(batch.pixels, begin)
+            pixels = offset_by(batch.pixels, begin)
             if live != begun:
                 lanes = _still_live(lanes, pixels, live)
             if lanes == 0:
@@ -386,7 +386,7 @@ def collect_fragments(numbers, place, inputs, block, marks_):
             # threads share these bytes: written no more than once each
             if marks[i] == 0:
                 marks[i] = 1
-            color = advanced(pointer(colors), i * color_columns)
+            color = offset_by(pointer(colors), i * color_columns)
             _set_colors(block.palette, k, color, color_columns // channels, channels)
             if entries.first[k] == k and entries.last[k] == k:
                 lanes = _keep_drawn(lanes, pixels, used + begin, k, fragments, stop)

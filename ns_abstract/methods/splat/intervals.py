@@ -11,7 +11,7 @@ from numba import njit
 
 from ns_abstract.arithmetic.elementary import exp_kernel, fma
 from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, MOVE_SHARE_UP, UP
-from ns_abstract.arithmetic.simd.intrinsics import advanced, prefetch
+from ns_abstract.arithmetic.simd.intrinsics import offset_by, prefetch
 from ns_abstract.arithmetic.simd.lanes import LINE, lane_sum, load4, load8, maximum, minimum, store, where
 from ns_abstract.methods.splat.pixel_block import (
     ALPHA_HIGH,
@@ -177,7 +177,7 @@ def _blend_eight(begin, end, part, reordered, block, inputs, slopes):
     """`blend_parts` of eight parts from ``part`` on; returns the darkest and the brightest colour."""
     fragments, palette, moves, out = block.fragments, block.palette, block.reordering.moves, block.part_ends
     values, colors, forms = fragments.values, palette.values, palette.forms
-    alphas = advanced(out, PART_ENDS + 6 * inputs.shape.parts)
+    alphas = offset_by(out, PART_ENDS + 6 * inputs.shape.parts)
     rules, charges = inputs.rules, inputs.charges
     thresholds = _Thresholds(rules.alpha_min * (1.0 - charges.threshold), rules.alpha_max * (1.0 - charges.threshold))
     darkest = load4(palette.background, 0)

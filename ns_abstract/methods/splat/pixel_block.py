@@ -113,8 +113,8 @@ class ListEntries(NamedTuple):
     """Properties of each position of a block's list; [entries] all.
 
     Attributes:
-        pixels: The set of the block's pixels that may be reached; valid where ``asked`` is 1.
-        asked: Whether ``pixels`` was found.
+        pixels: The set of the block's pixels that may be reached; valid where ``has_pixels`` is 1.
+        has_pixels: Whether ``pixels`` was found.
         depth_radius: How far in depth the Gaussian may move against the block's central ray (O1).
         depth: At the cell's middle.
         far: Positions that reach further than most, in order; later the group that a position belongs to (O4).
@@ -122,7 +122,7 @@ class ListEntries(NamedTuple):
     """
 
     pixels: np.ndarray
-    asked: np.ndarray
+    has_pixels: np.ndarray
     depth_radius: np.ndarray
     depth: np.ndarray
     far: np.ndarray

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from ns_abstract.arithmetic.rounding import REGION
-from ns_abstract.arithmetic.simd.intrinsics import advanced, lowest_bit, signed
+from ns_abstract.arithmetic.simd.intrinsics import lowest_bit, offset_by, signed
 from ns_abstract.arithmetic.simd.lanes import load8, maximum, minimum, root, spans, where
 from ns_abstract.methods.splat.lists import BLOCK
 from ns_abstract.methods.splat.pixel_block import NUMBERS
@@ -73,11 +73,11 @@ def _pixels_of(record, box, x0, y0, m, per_pixel):
 @njit(cache=True, error_model="numpy", forceinline=True)
 def pixels_once(k, listed, entries, per_pixel):
     """`_pixels_of` list position k, found when first asked for."""
-    if entries.asked[k] == 0:
-        entries.asked[k] = 1
+    if entries.has_pixels[k] == 0:
+        entries.has_pixels[k] = 1
         i = listed.numbers[k]
         entries.pixels[k] = _pixels_of(
-            advanced(listed.record, i * listed.columns), advanced(listed.box, 4 * i), listed.x0, listed.y0, listed.m,
+            offset_by(listed.record, i * listed.columns), offset_by(listed.box, 4 * i), listed.x0, listed.y0, listed.m,
             per_pixel,
         )  # fmt: skip
     return entries.pixels[k]

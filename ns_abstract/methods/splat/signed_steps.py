@@ -62,8 +62,8 @@ def signed_gradient_step(
         means = means + steps[1] * (varied.mean_high - varied.mean_low)
     opacity = member.opacity + steps[2] * (varied.opacity_high - varied.opacity_low)
     moved = member.color_shift
-    if varied.color_low.size:
-        moved = moved + steps[3] * (varied.color_high - varied.color_low)
+    if varied.shift_low.size:
+        moved = moved + steps[3] * (varied.shift_high - varied.shift_low)
     return values, varied.at(means, opacity, moved)
 
 

@@ -33,7 +33,7 @@ from ns_abstract.arithmetic.rounding import (
     UP,
     WEIGHT_LAYERS,
 )
-from ns_abstract.arithmetic.simd.intrinsics import advanced, lowest_bit
+from ns_abstract.arithmetic.simd.intrinsics import lowest_bit, offset_by
 from ns_abstract.arithmetic.simd.lanes import lane_sum, load4, load8, maximum, minimum, store, where
 from ns_abstract.methods.splat.pixel_block import (
     ALPHA_HIGH,
@@ -144,13 +144,13 @@ def gather_crossings(begin, end, count, since, fragments, crossings, out, shape)
 
 
 @njit(cache=True, error_model="numpy")
-def set_blend(t, radii, crossings, d):
-    """Write the polynomials ``t`` [., 4] and ``radii`` [4] of the three channels before the fragments' forms."""
+def set_blend(polynomials, radii, crossings, d):
+    """Write ``polynomials`` [., 4] and ``radii`` [4] of the three channels before the fragments' forms."""
     rows, room = crossings.rows, crossings.room
     for channel in range(CROSSING_LANES):
         size = 0.0
         for row in range(1 + d + d * (d + 1) // 2):
-            value = t[4 * row + channel] if channel < 3 else 0.0
+            value = polynomials[4 * row + channel] if channel < 3 else 0.0
             rows[(CROSSING_FORM + row) * room + channel] = value
             size += abs(value)
         rows[_RADIUS * room + channel] = (radii[channel] + PART_ROUNDING * size) * UP if channel < 3 else 0.0
@@ -158,7 +158,7 @@ def set_blend(t, radii, crossings, d):
 
 
 @njit(cache=True, error_model="numpy")
-def set_straight(crossings, d, order):
+def clear_slopes(crossings, d, order):
     """Take out of the blends what linear sets follow: slopes, and of one parameter and order 2 the curvature (B11)."""
     rows, room = crossings.rows, crossings.room
     for row in range(1, 1 + d + (1 if order == 2 else 0)):
@@ -172,7 +172,7 @@ def _restrict(columns, middle, half, crossings, d):
     rows, room = crossings.rows, crossings.room
     part = _restricted_rows(d)
     behind = part + d
-    shared = advanced(rows, (behind + _SCRATCH) * room)
+    shared = offset_by(rows, (behind + _SCRATCH) * room)
     for column in range(0, columns, CROSSING_LANES):
         center = load8(rows, CROSSING_FORM * room + column)
         low = 0.0 * center
@@ -311,7 +311,7 @@ def _by_planes(columns, side, place, bounds, crossings, d):
             first = fma(load8(rows, products + column), slope, first)
             second = fma(load8(rows, products + room + column), slope, second)
             third = fma(load8(rows, products + 2 * room + column), slope, third)
-        slopes = advanced(bounds, 4 + 4 * k)
+        slopes = offset_by(bounds, 4 + 4 * k)
         slopes[0], slopes[1], slopes[2] = lane_sum(first), lane_sum(second), lane_sum(third)
         for channel in range(3):
             slopes[channel] += side * rows[(part + 1 + k) * room + channel]
@@ -329,7 +329,7 @@ def _part_bounds(columns, side, place, bounds, crossings, d):
     _by_planes(columns, side, place, bounds, crossings, d)
     turned = False
     for k in range(d):
-        slopes = advanced(bounds, 4 + 4 * k)
+        slopes = offset_by(bounds, 4 + 4 * k)
         if place[k] * (slopes[0] + slopes[1] + slopes[2]) < 0.0:
             place[k] = 0.0
             turned = True
@@ -343,7 +343,7 @@ def _part_bounds(columns, side, place, bounds, crossings, d):
 def _choose_parts(columns, pieces, crossings, d):
     """Write into how many ``pieces`` [d] each axis is cut: the one along which what is taken varies most, in turn."""
     rows, room = crossings.rows, crossings.room
-    steepness = advanced(pieces, d)
+    steepness = offset_by(pieces, d)
     for k in range(d):
         varies = 0.0 * load8(rows, 0)
         for column in range(CROSSING_LANES, columns, CROSSING_LANES):
@@ -398,12 +398,12 @@ def bound_by_parts(count, limit, crossings, out, d):
     rows, room = crossings.rows, crossings.room
     columns, part = _columns(count), _restricted_rows(d)
     # behind what `_restrict` shares
-    pieces = advanced(rows, (part + d + _SCRATCH) * room + CROSSING_LANES * d)
-    middle = advanced(pieces, 2 * d)
-    half = advanced(middle, d)
-    place = advanced(half, d)
-    bounds = advanced(place, d)
-    foretold = advanced(bounds, 4 + 4 * d)
+    pieces = offset_by(rows, (part + d + _SCRATCH) * room + CROSSING_LANES * d)
+    middle = offset_by(pieces, 2 * d)
+    half = offset_by(middle, d)
+    place = offset_by(half, d)
+    bounds = offset_by(place, d)
+    foretold = offset_by(bounds, 4 + 4 * d)
     _choose_parts(columns, pieces, crossings, d)
     # what a part may reach at most, wherever fragments are skipped
     for number in range(_PARTS):

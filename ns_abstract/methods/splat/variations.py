@@ -26,7 +26,7 @@ class VariedSplats:
         stored: The scene as stored.
         mean_low, mean_high: [N, 3] world, or [0, 3] where no mean varies.
         opacity_low, opacity_high: [N] in [0, 1].
-        color_low, color_high: [N, 3] what is added to the activated colours, or [0, 3].
+        shift_low, shift_high: [N, 3] what is added to the activated colours, or [0, 3].
     """
 
     stored: Splats
@@ -34,8 +34,8 @@ class VariedSplats:
     mean_high: Float64Array
     opacity_low: Float64Array
     opacity_high: Float64Array
-    color_low: Float64Array
-    color_high: Float64Array
+    shift_low: Float64Array
+    shift_high: Float64Array
 
     @classmethod
     def fixed(cls, splats: Splats) -> VariedSplats:
@@ -64,7 +64,7 @@ class VariedSplats:
         return {
             "mean": int((self.mean_low != self.mean_high).any(axis=1).sum()),
             "opacity": int((self.opacity_low != self.opacity_high).sum()),
-            "color": int((self.color_low != self.color_high).any(axis=1).sum()),
+            "color": int((self.shift_low != self.shift_high).any(axis=1).sum()),
         }
 
     @property
@@ -77,7 +77,7 @@ class VariedSplats:
         return self.at(
             _between(self.mean_low, self.mean_high, mean) if self.mean_low.size else self.stored.means,
             _between(self.opacity_low, self.opacity_high, opacity),
-            _between(self.color_low, self.color_high, color) if self.color_low.size else _NONE,
+            _between(self.shift_low, self.shift_high, color) if self.shift_low.size else _NONE,
         )
 
     def at(self, means: Float64Array, opacity: Float64Array, shift: Float64Array) -> Splats:
@@ -86,15 +86,15 @@ class VariedSplats:
             self.stored,
             means=np.clip(means, self.mean_low, self.mean_high) if self.mean_low.size else self.stored.means,
             opacity=np.clip(opacity, self.opacity_low, self.opacity_high),
-            color_shift=np.clip(shift, self.color_low, self.color_high) if self.color_low.size else _NONE,
+            color_shift=np.clip(shift, self.shift_low, self.shift_high) if self.shift_low.size else _NONE,
         )
 
     @cached_property
     def nearest(self) -> Splats:
         """The member nearest to the stored scene: itself where the ranges contain 0."""
-        if not self.varies and not self.mean_low.size and not self.color_low.size:
+        if not self.varies and not self.mean_low.size and not self.shift_low.size:
             return self.stored
-        return self.at(self.stored.means, self.stored.opacity, np.zeros_like(self.color_low))
+        return self.at(self.stored.means, self.stored.opacity, np.zeros_like(self.shift_low))
 
     def scene_samples(self, generator: np.random.Generator) -> Iterator[Splats]:
         """Members without end: first all at the ends that make pictures bright or dark or shift them, then random.
@@ -198,5 +198,5 @@ def vary(scene: SplatScene, splats: Splats, variations: Sequence[SceneVariation]
         varied = replace(varied, opacity_low=low, opacity_high=high)
     if "color" in offsets:
         low, high = (np.repeat(end[:, None], 3, axis=1) for end in offsets["color"])
-        varied = replace(varied, color_low=low, color_high=high)
+        varied = replace(varied, shift_low=low, shift_high=high)
     return varied

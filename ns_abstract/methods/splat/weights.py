@@ -174,18 +174,18 @@ class SplatWeightFrame(SplatFrame):
         assert some is not None
         some = np.sort(some)
         scene = self.varied.nearest
-        shown = replace(
+        drawn = replace(
             self._black, means=scene.means[some], axes=scene.axes[some], opacity=scene.opacity[some],
             sh=self._black.sh[some],
         )  # fmt: skip
         white = WhiteGaussians(self.white.selected[some], self.white.nearer)
-        renderer = Renderer(shown, self._rasteriser)
+        renderer = Renderer(drawn, self._rasteriser)
 
         def draw(values: np.ndarray) -> np.ndarray:
             check_cancelled()
             rotation, position = self.pose_set.world_to_camera(values)
-            colors = white.at((shown.means - position) @ rotation[2])
-            member = replace(shown, sh=colors[:, None])
+            colors = white.at((drawn.means - position) @ rotation[2])
+            member = replace(drawn, sh=colors[:, None])
             return renderer.tiles(self.camera, rotation, position, tiles, member, pixels).astype(np.float32)
 
         return draw

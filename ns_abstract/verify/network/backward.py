@@ -82,7 +82,7 @@ class BackwardPass:
     def bound(
         self,
         index: int,
-        rows: Coefficients,
+        coefficients: Coefficients,
         cell: Int64,
         enough: StoppingCriterion | None = None,
         trace: BackwardTrace | None = None,
@@ -94,8 +94,12 @@ class BackwardPass:
         All of them end on the nodes up to ``cut`` (N18).
         """
         bounds = BackwardBounds.unknown(len(cell), self.intermediate.d)
-        relaxations = next(relaxations for relaxations in self.intermediate.relaxations if relaxations.takes(rows))
-        batch = CoefficientBatch({index: rows}, cell, np.zeros((len(cell), 2)), np.arange(len(cell)), relaxations)
+        relaxations = next(
+            relaxations for relaxations in self.intermediate.relaxations if relaxations.takes(coefficients)
+        )
+        batch = CoefficientBatch(
+            {index: coefficients}, cell, np.zeros((len(cell), 2)), np.arange(len(cell)), relaxations
+        )
         batch.trace = trace
         self.descend(index, index, batch, bounds, enough, cut)
         return bounds
@@ -105,7 +109,7 @@ class BackwardPass:
         start: int,
         at: int,
         batch: CoefficientBatch,
-        found: BackwardBounds,
+        bounds: BackwardBounds,
         enough: StoppingCriterion | None,
         cut: int = 0,
     ) -> None:
@@ -118,7 +122,7 @@ class BackwardPass:
             if batch.bytes > min(ROWS_AT_ONCE, self.memory // 16) and len(batch.cell) > 1:
                 half = len(batch.cell) // 2
                 for part in (slice(0, half), slice(half, None)):
-                    self.descend(start, at, batch[part], found, enough, cut)
+                    self.descend(start, at, batch[part], bounds, enough, cut)
                 return
             ends = enough is not None and (batch.trace is None or self.deep)
             if (
@@ -128,10 +132,10 @@ class BackwardPass:
                 and at in self.intermediate.stops
                 and len(batch.waiting) == 1
             ):
-                self._bound_rows(at, batch, self.intermediate.stops[at], found)
-                going_on = ~enough.done(found, batch.number)
+                self._bound_rows(at, batch, self.intermediate.stops[at], bounds)
+                going_on = ~enough.done(bounds, batch.number)
                 if going_on.mean() < 0.75:
-                    found.ended[batch.number[~going_on]] = at
+                    bounds.ended[batch.number[~going_on]] = at
                     batch = batch[going_on]
                 if not len(batch.cell):
                     return
@@ -144,7 +148,7 @@ class BackwardPass:
                 batch.total[:, 0] += offset[batch.number]
             if batch.chosen is not None and not isinstance(node.layer, LinearLayer):
                 here = full(here, node.layer.shape, force=True)
-                batch.chosen.keep(at, here.value, batch.number, len(found.lower))
+                batch.chosen.keep(at, here.value, batch.number, len(bounds.lower))
             gathered = batch.total.copy() if batch.trace is not None else batch.total
             if batch.trace is not None and not batch.trace.short and self._depends(start, at):
                 batch.trace.keep(at, here, node.layer.shape, batch.number)
@@ -156,16 +160,16 @@ class BackwardPass:
                 shape = self.network.shape(source)
                 batch.waiting[source] = full(part, shape) if there is None else join(there, part, shape)
         if cut:
-            self._rest_rows(batch, found)
+            self._rest_rows(batch, bounds)
             return
         if batch.chosen is not None and 0 in batch.waiting:
             whole = full(batch.waiting[0], self.network.input_shape, force=True)
-            batch.chosen.keep(0, whole.value, batch.number, len(found.lower))
+            batch.chosen.keep(0, whole.value, batch.number, len(bounds.lower))
         if batch.trace is not None:
             batch.trace.reached[batch.number] = True
             if 0 in batch.waiting:
                 batch.trace.keep(0, batch.waiting[0], self.network.input_shape, batch.number)
-        self._bound_rows(0, batch, self.intermediate.columns, found)
+        self._bound_rows(0, batch, self.intermediate.columns, bounds)
 
     def _inputs_of(self, start: int, at: int, batch: CoefficientBatch, here: Coefficients) -> list[Coefficients]:
         """Coefficients of the inputs of node ``at`` in place of its own ``here``; constants go to ``batch.total``."""
@@ -196,29 +200,29 @@ class BackwardPass:
         charged = isinstance(layer, LinearLayer) and at != start and at not in self.intermediate.folded
         return charged or isinstance(layer, Activation)
 
-    def _bound_rows(self, at: int, batch: CoefficientBatch, columns: NodeColumns, found: BackwardBounds) -> None:
+    def _bound_rows(self, at: int, batch: CoefficientBatch, columns: NodeColumns, bounds: BackwardBounds) -> None:
         """Bounds of a batch whose rows are all on node ``at``."""
         count = len(batch.cell)
         plane, box = np.zeros((count, 2, self.intermediate.d + 1)), np.zeros((count, 2))
-        rows = batch.waiting.get(at)
-        if rows is None:
+        coefficients = batch.waiting.get(at)
+        if coefficients is None:
             plane[:, :, -1] = box[:] = batch.total
         else:
-            concretize(rows.value, rows.y, rows.x, batch.cell, columns, batch.total, plane, box)
+            concretize(coefficients.value, coefficients.y, coefficients.x, batch.cell, columns, batch.total, plane, box)
         lost = self.intermediate.flush[batch.cell][:, None] * np.array([-1.0, 1.0])
         plane[:, :, -1] += lost
         box += lost
-        found.improve(batch.number, plane, box)
+        bounds.improve(batch.number, plane, box)
 
-    def _rest_rows(self, batch: CoefficientBatch, found: BackwardBounds) -> None:
+    def _rest_rows(self, batch: CoefficientBatch, bounds: BackwardBounds) -> None:
         """Bounds of a batch whose rows rest on several nodes, of which forms are known (N18)."""
         count, total = len(batch.cell), batch.total
         plane, box = np.zeros((count, 2, self.intermediate.d + 1)), np.zeros((count, 2))
         sizes = np.zeros(count)
-        for at, rows in batch.waiting.items():
+        for at, coefficients in batch.waiting.items():
             columns = self.intermediate.stops[at] if at else self.intermediate.columns
             one, two = np.zeros_like(plane), np.zeros_like(box)
-            concretize(rows.value, rows.y, rows.x, batch.cell, columns, total, one, two)
+            concretize(coefficients.value, coefficients.y, coefficients.x, batch.cell, columns, total, one, two)
             plane += one
             box += two
             sizes += np.abs(one).sum((1, 2)) + np.abs(two).sum(1)
@@ -227,4 +231,4 @@ class BackwardPass:
         lost = lost[:, None] * np.array([-1.0, 1.0])
         plane[:, :, -1] += lost
         box += lost
-        found.improve(batch.number, plane, box)
+        bounds.improve(batch.number, plane, box)

@@ -66,8 +66,8 @@ def bound_outputs(
         raise ValueError(f"images of {network.input_size} numbers expected, got {images.a_lower.shape[1]}")
     if rows.shape != (offset.shape[-1], network.output_size):
         raise ValueError(f"rows {(offset.shape[-1], network.output_size)} expected, got {rows.shape}")
-    numbers = 3 * images.dimensions + 14 + (7 if arithmetic == "real" else 0)
-    by_cell = sum(int(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1)) * 8 * numbers
+    arrays = 3 * images.dimensions + 14 + (7 if arithmetic == "real" else 0)
+    by_cell = network.neuron_count * 8 * arrays
     step = max(1, int(0.5 * memory) // by_cell)
     parts = []
     for first in range(0, images.count, step):
@@ -112,11 +112,11 @@ class NetworkBounds:
         coarse: bool = False,
     ) -> None:
         sharing = CoefficientSource() if sharing is None else sharing
-        fields, good = finite(images)
+        fields, usable = finite(images)
         middle = sharing.about(middle_of(fields))
         image = planes_of(fields, middle, network.input_shape, substitution)
         self.intermediate = intermediate = sharing.intermediate = IntermediateBounds(
-            network, image, middle, good, arithmetic, assumed, coarse
+            network, image, middle, usable, arithmetic, assumed, coarse
         )
         schedule = WorkBudget(network)
         backward = BackwardPass(intermediate, memory, schedule.deep)
@@ -128,7 +128,7 @@ class NetworkBounds:
         propagation = ForwardPropagation(intermediate, sharing, bool(slope_steps or inner.steps))
         self.last = ForwardPass(intermediate, propagation, pooling, selection, schedule).run()
         if substitution == "end":
-            intermediate.see(planes_of(fields, middle, network.input_shape, "everywhere"))
+            intermediate.set_image(planes_of(fields, middle, network.input_shape, "everywhere"))
         self.output_rows = OutputRows(intermediate, backward, RowAscent(intermediate, backward, slope_steps))
 
     def outputs(self, rows: Any, offset: Float64) -> OutputBounds:

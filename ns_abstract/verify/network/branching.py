@@ -125,10 +125,10 @@ def _repeat_cell(images: ImageSets, count: int) -> ImageSets:
     return ImageSets(*(np.repeat(getattr(images, name), count, axis=0) for name in ImageSets.__dataclass_fields__))
 
 
-def _branch_of(found: OutputBounds, number: int, phases: Mapping[int, ActivationPhases]) -> _PhaseBranch:
+def _branch_of(bounds: OutputBounds, number: int, phases: Mapping[int, ActivationPhases]) -> _PhaseBranch:
     """A branch by the bounds of its group's rows, of which one has to be positive; NaN is minus infinity."""
-    lower = np.where(np.isnan(found.lower[number]), -np.inf, found.lower[number])
+    lower = np.where(np.isnan(bounds.lower[number]), -np.inf, bounds.lower[number])
     best = int(lower.argmax())
-    assert found.loosest is not None
-    node, place = found.loosest[number, best].tolist()
+    assert bounds.loosest is not None
+    node, place = bounds.loosest[number, best].tolist()
     return _PhaseBranch(phases, float(lower[best]), (node, place))

@@ -69,12 +69,12 @@ class NetworkBuilder:
         for k in range(output, 0, -1):
             if k in needed:
                 needed.update(self.nodes[k - 1].inputs)
-        numbers = {0: 0}
+        new_number = {0: 0}
         nodes_kept = []
         for k, node in enumerate(self.nodes, 1):
             if k in needed:
-                nodes_kept.append(replace(node, inputs=tuple(numbers[i] for i in node.inputs)))
-                numbers[k] = len(nodes_kept)
+                nodes_kept.append(replace(node, inputs=tuple(new_number[i] for i in node.inputs)))
+                new_number[k] = len(nodes_kept)
         shape = self.shape(output)
         # the numbers are the same in the shape they had before
         while (

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ns_abstract.arithmetic.elementary import fma
 from ns_abstract.arithmetic.network_charges import OWN_GATHERED, OWN_ROWS
-from ns_abstract.arithmetic.simd.intrinsics import advanced, pointer
+from ns_abstract.arithmetic.simd.intrinsics import offset_by, pointer
 from ns_abstract.arithmetic.simd.lanes import load8, store, where
 
 Float64 = NDArray[np.float64]
@@ -85,28 +85,28 @@ def join(one: Coefficients, two: Coefficients, shape: tuple[int, ...]) -> Coeffi
     return full(Coefficients(target, one.y + top, one.x + left), shape)
 
 
-def shifted(rows: Coefficients, height: int, width: int) -> Coefficients:
+def shifted(coefficients: Coefficients, height: int, width: int) -> Coefficients:
     """Return the same coefficients on the whole map."""
-    value = np.zeros((*rows.value.shape[:2], height, width), rows.value.dtype)
-    _place(rows.value, rows.y, rows.x, value)
+    value = np.zeros((*coefficients.value.shape[:2], height, width), coefficients.value.dtype)
+    _place(coefficients.value, coefficients.y, coefficients.x, value)
     return Coefficients.whole(value)
 
 
-def full(rows: Coefficients, shape: tuple[int, ...], force: bool = False) -> Coefficients:
+def full(coefficients: Coefficients, shape: tuple[int, ...], force: bool = False) -> Coefficients:
     """Return the coefficients on the whole map of ``shape`` if their windows are no smaller (or always)."""
     _, height, width = grid(shape)
-    if rows.covers(shape):
-        return rows
-    if force or rows.value.shape[2] * rows.value.shape[3] >= height * width:
-        return shifted(rows, height, width)
-    return rows
+    if coefficients.covers(shape):
+        return coefficients
+    if force or coefficients.value.shape[2] * coefficients.value.shape[3] >= height * width:
+        return shifted(coefficients, height, width)
+    return coefficients
 
 
-def unflatten(rows: Coefficients, shape: tuple[int, ...], before: tuple[int, ...]) -> Coefficients:
+def unflatten(coefficients: Coefficients, shape: tuple[int, ...], before: tuple[int, ...]) -> Coefficients:
     """Rows on an item of ``before`` for rows on the same numbers seen as ``shape``."""
     if grid(shape) == grid(before):
-        return rows
-    whole = full(rows, shape, force=True)
+        return coefficients
+    whole = full(coefficients, shape, force=True)
     return Coefficients.whole(whole.value.reshape(whole.value.shape[0], *grid(before)))
 
 
@@ -188,9 +188,9 @@ def _scale(value, y, x, factor):
 
 
 @njit(cache=True, error_model="numpy", nogil=True, inline="always")
-def _through_activation(rows, at, line, here, plane):
+def _through_activation(coefficient, at, line, here, plane):
     """Return a coefficient on the activation's input, and what it adds to the lower and upper bound."""
-    a = rows[at]
+    a = coefficient[at]
     # all lines are read and one kept: signs are as good as random, and so several numbers go side by side
     s0, l0, m0 = line[here], line[here + plane], line[here + 2 * plane]
     s1, l1, m1 = line[here + 3 * plane], line[here + 4 * plane], line[here + 5 * plane]
@@ -201,23 +201,23 @@ def _through_activation(rows, at, line, here, plane):
 
 
 @njit(cache=True, error_model="numpy", nogil=True, inline="always")
-def _through_run(rows, at, line, here, plane, count):
+def _through_run(coefficient, at, line, here, plane, count):
     """Pass ``count`` numbers that lie together; returns what they add below and above."""
     l0, l1, l2, l3 = 0.0, 0.0, 0.0, 0.0
     m0, m1, m2, m3 = 0.0, 0.0, 0.0, 0.0
     for j in range(0, count - 3, 4):
         i, k = at + j, here + j
-        a0, p0, q0 = _through_activation(rows, i, line, k, plane)
-        a1, p1, q1 = _through_activation(rows, i + 1, line, k + 1, plane)
-        a2, p2, q2 = _through_activation(rows, i + 2, line, k + 2, plane)
-        a3, p3, q3 = _through_activation(rows, i + 3, line, k + 3, plane)
+        a0, p0, q0 = _through_activation(coefficient, i, line, k, plane)
+        a1, p1, q1 = _through_activation(coefficient, i + 1, line, k + 1, plane)
+        a2, p2, q2 = _through_activation(coefficient, i + 2, line, k + 2, plane)
+        a3, p3, q3 = _through_activation(coefficient, i + 3, line, k + 3, plane)
         # nothing is stored before all is read
-        rows[i], rows[i + 1], rows[i + 2], rows[i + 3] = a0, a1, a2, a3
+        coefficient[i], coefficient[i + 1], coefficient[i + 2], coefficient[i + 3] = a0, a1, a2, a3
         l0, l1, l2, l3 = l0 + p0, l1 + p1, l2 + p2, l3 + p3
         m0, m1, m2, m3 = m0 + q0, m1 + q1, m2 + q2, m3 + q3
     for j in range(count - count % 4, count):
-        a0, p0, q0 = _through_activation(rows, at + j, line, here + j, plane)
-        rows[at + j] = a0
+        a0, p0, q0 = _through_activation(coefficient, at + j, line, here + j, plane)
+        coefficient[at + j] = a0
         l0, m0 = l0 + p0, m0 + q0
     return (l0 + l1) + (l2 + l3), (m0 + m1) + (m2 + m3)
 
@@ -235,12 +235,12 @@ def pass_activation(value, y, x, cell, lines, total):
     count, channels, h, w = value.shape
     m, (H, W) = lines.shape[1], lines.shape[3:]
     plane = m * channels * H * W
-    rows, line = pointer(value), pointer(lines)
+    coefficient, line = pointer(value), pointer(lines)
     for r in range(count):
         top, left = y[r], x[r]
         if top == 0 and left == 0 and h == H and w == W:
             size = channels * H * W
-            below, above = _through_run(rows, r * size, line, cell[r] * size, plane, size)
+            below, above = _through_run(coefficient, r * size, line, cell[r] * size, plane, size)
             total[r, 0] += below
             total[r, 1] += above
             continue
@@ -251,14 +251,14 @@ def pass_activation(value, y, x, cell, lines, total):
                 at, Y = ((r * channels + c) * h + i) * w, top + i
                 if Y < 0 or Y >= H or past <= first:
                     for j in range(w):
-                        rows[at + j] = np.float32(0.0)
+                        coefficient[at + j] = np.float32(0.0)
                     continue
                 for j in range(first):
-                    rows[at + j] = np.float32(0.0)
+                    coefficient[at + j] = np.float32(0.0)
                 for j in range(past, w):
-                    rows[at + j] = np.float32(0.0)
+                    coefficient[at + j] = np.float32(0.0)
                 here = ((cell[r] * channels + c) * H + Y) * W + left
-                below, above = _through_run(rows, at + first, line, here + first, plane, past - first)
+                below, above = _through_run(coefficient, at + first, line, here + first, plane, past - first)
                 least += below
                 most += above
         total[r, 0] += least
@@ -281,7 +281,7 @@ def pass_maximum(value, y, x, cell, winner, which, slopes, offsets, steps, strid
     m, (H, W) = winner.shape[0], winner.shape[2:]
     high, wide = target.shape[2:]
     plane, taps = m * channels * H * W, steps.shape[0]
-    rows, targets, line = pointer(value), pointer(target), pointer(offsets)
+    coefficient, targets, line = pointer(value), pointer(target), pointer(offsets)
     first, chosen, slope = pointer(winner), pointer(which), pointer(slopes)
     ahead = steps[:, 0] * wide + steps[:, 1]
     for r in range(count):
@@ -292,7 +292,7 @@ def pass_maximum(value, y, x, cell, winner, which, slopes, offsets, steps, strid
                 here = ((cell[r] * channels + c) * H + y[r] + i) * W + x[r]
                 there = ((r * channels + c) * high + i * stride[0]) * wide
                 for j in range(max(0, -x[r]), min(w, W - x[r])):
-                    a = rows[at + j]
+                    a = coefficient[at + j]
                     if a == 0.0:
                         continue
                     b, k = np.float64(a), here + j + 2 * plane * np.int64(a < 0.0)
@@ -316,7 +316,7 @@ def charge(value, y, x, cell, noise, total):
     """Charge rows on a linear layer's output with its rounding and their own, ``noise`` [m, C, H, W] (N2)."""
     count, channels, h, w = value.shape
     H, W = noise.shape[2:]
-    rows, shake = pointer(value), pointer(noise)
+    coefficient, shake = pointer(value), pointer(noise)
     for r in range(count):
         top, left = y[r], x[r]
         first, past = min(w, max(0, -left)), max(0, min(w, W - left))
@@ -326,15 +326,15 @@ def charge(value, y, x, cell, noise, total):
                 at, Y = ((r * channels + c) * h + i) * w, top + i
                 if Y < 0 or Y >= H or past <= first:
                     for j in range(w):
-                        rows[at + j] = np.float32(0.0)
+                        coefficient[at + j] = np.float32(0.0)
                     continue
                 for j in range(first):
-                    rows[at + j] = np.float32(0.0)
+                    coefficient[at + j] = np.float32(0.0)
                 for j in range(past, w):
-                    rows[at + j] = np.float32(0.0)
+                    coefficient[at + j] = np.float32(0.0)
                 here = ((cell[r] * channels + c) * H + Y) * W + left
                 for j in range(first, past):
-                    shaken += abs(np.float64(rows[at + j])) * shake[here + j]
+                    shaken += abs(np.float64(coefficient[at + j])) * shake[here + j]
         total[r, 0] -= shaken
         total[r, 1] += shaken
 
@@ -416,18 +416,18 @@ def concretize(value, y, x, cell, intermediate, total, plane, box):
     count, channels, h, w = value.shape
     H, W, columns, d = intermediate.height, intermediate.width, intermediate.count, plane.shape[2] - 1
     size = channels * H * W
-    rows, column = pointer(value), pointer(intermediate.values)
+    coefficient, column = pointer(value), pointer(intermediate.values)
     whole = h == H and w == W
     # lanes by column, then coefficients of a run
     memory = np.empty(8 * columns + (size if whole else w) + 8)
     sums = pointer(memory)
-    tape = advanced(sums, 8 * columns)
+    tape = offset_by(sums, 8 * columns)
     for r in range(count):
         top, left, cells = y[r], x[r], cell[r] * columns * size
         memory[: 8 * columns] = 0.0
         if whole and top == 0 and left == 0:
             for j in range(size):
-                tape[j] = np.float64(rows[r * size + j])
+                tape[j] = np.float64(coefficient[r * size + j])
             for j in range(size, size + 8):
                 tape[j] = 0.0
             _add_run(tape, size, column, cells, size, columns, d + 2, sums)
@@ -438,7 +438,7 @@ def concretize(value, y, x, cell, intermediate, total, plane, box):
                 for i in range(max(0, -top), min(h, H - top)):
                     at = ((r * channels + c) * h + i) * w + first
                     for j in range(n):
-                        tape[j] = np.float64(rows[at + j])
+                        tape[j] = np.float64(coefficient[at + j])
                     for j in range(n, n + 8):
                         tape[j] = 0.0
                     here = cells + (c * H + top + i) * W + left + first

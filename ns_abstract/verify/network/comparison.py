@@ -79,8 +79,8 @@ def compare(network: Network, run: Evaluate, images: Iterable[np.ndarray], *, us
         if _within(network, image, expected):
             continue
         with torch.no_grad():
-            single = network(torch.from_numpy(image))[0].double().numpy()
-        rounded = float(np.abs(single - computed).max())
+            in_float32 = network(torch.from_numpy(image))[0].double().numpy()
+        rounded = float(np.abs(in_float32 - computed).max())
         if not difference <= _ROUNDED * rounded + (0.0 if usual else _STRANGE) and np.isfinite(rounded):
             raise InputError(
                 f"computes something else when run: outputs differ by {difference:.3g}",

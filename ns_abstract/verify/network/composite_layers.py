@@ -102,12 +102,12 @@ class CompositeBuilder(ElementwiseBuilder):
             index = self._sparse(x, reduced_shape, to, source, 1.0 / count if mean else 1.0)
         return index if keep else self.reshape(index, final or (1,))
 
-    def _variance(self, squares: int, x: int, kept: Shape, group: np.ndarray, count: int) -> int:
+    def _variance(self, squares: int, x: int, kept_shape: Shape, group: np.ndarray, count: int) -> int:
         """Means of ``squares`` of the centred numbers of ``x`` over groups [size]: one pass is charged (N11)."""
         size = int(np.prod(self.shape(x)))
         layer = Variance(
             (self.shape(squares), self.shape(x)),
-            tuple(kept),
+            tuple(kept_shape),
             count + 4,
             1,
             torch.from_numpy(group.reshape(-1).copy()),
@@ -363,10 +363,10 @@ class CompositeBuilder(ElementwiseBuilder):
         shares = self.curve(total, composite_activations.SoftmaxReciprocal, floor=least)
         return shares if dropped is None else self._selected(shares, ~dropped)
 
-    def _selected(self, x: int, kept: np.ndarray) -> int:
-        """The item with zeros where numbers are not kept; nothing is rounded."""
-        self.reserve(float(kept.size))
-        return self._add(ScaleLayer((kept.shape,), kept.shape, 0, 1, as_double(kept), None), x)
+    def _selected(self, x: int, mask: np.ndarray) -> int:
+        """The item with zeros where ``mask`` [shape] is 0; nothing is rounded."""
+        self.reserve(float(mask.size))
+        return self._add(ScaleLayer((mask.shape,), mask.shape, 0, 1, as_double(mask), None), x)
 
     def matmul(self, a: int, b: int) -> int:
         """A product of matrices that both depend on the image, with leading axes alike."""

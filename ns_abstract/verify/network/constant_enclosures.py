@@ -1,7 +1,7 @@
 """Enclosures of constants that programs compute from stored ones: exact values, and every float32 order.
 
 A folded constant is not the one number that one library returns (docs/dev/design.md, N23). Every result is enclosed
-twice: ``real`` holds the exact value, ``single`` what any evaluation in the constant's own type may give, with sums
+twice: ``real`` holds the exact value, ``evaluated`` what any evaluation in the constant's own type may give, with sums
 in any order, fused multiply-add and flushed subnormals. Where both are one number, the constant is exact.
 """
 
@@ -58,12 +58,12 @@ class EnclosedConstant(NamedTuple):
     Attributes:
         kind: The type that the file gives it.
         real: Ends of the exact value.
-        single: Ends of what evaluations in its type may give.
+        evaluated: Ends of what evaluations in its type may give.
     """
 
     kind: np.dtype
     real: Interval64
-    single: Interval64
+    evaluated: Interval64
 
     @property
     def value(self) -> np.ndarray:
@@ -73,34 +73,34 @@ class EnclosedConstant(NamedTuple):
 
     @property
     def doubts(self) -> Interval64:
-        """How far ``real`` and ``single`` may be from `value`; a sixteenth more for products with what is off."""
+        """How far ``real`` and ``evaluated`` may be from `value`; a sixteenth more for products with what is off."""
         value = self.value
-        far = [np.maximum(high - value, value - low) * DOUBTS_UP for low, high in (self.real, self.single)]
+        far = [np.maximum(high - value, value - low) * DOUBTS_UP for low, high in (self.real, self.evaluated)]
         return far[0], far[1]
 
     @property
     def exact(self) -> bool:
         """Whether every evaluation gives the same numbers."""
-        return all(np.array_equal(self.real[0], end) for end in (self.real[1], *self.single))
+        return all(np.array_equal(self.real[0], end) for end in (self.real[1], *self.evaluated))
 
     def inverse(self) -> EnclosedConstant:
         """``1 / c``, without what a division in its type rounds."""
-        if any(bool((low * high <= 0.0).any()) for low, high in (self.real, self.single)):
+        if any(bool((low * high <= 0.0).any()) for low, high in (self.real, self.evaluated)):
             raise InputError("divides by what may be zero", fix="check the constant")
         ends = [
             _widened((1.0 / high, 1.0 / low), OWN_CONSTANT * np.abs(1.0 / low))
-            for low, high in (self.real, self.single)
+            for low, high in (self.real, self.evaluated)
         ]
         return EnclosedConstant(self.kind, ends[0], ends[1])
 
     def turned(self) -> EnclosedConstant:
         """A matrix with rows and columns exchanged."""
-        real, single = ((low.T, high.T) for low, high in (self.real, self.single))
-        return EnclosedConstant(self.kind, real, single)
+        real, evaluated = ((low.T, high.T) for low, high in (self.real, self.evaluated))
+        return EnclosedConstant(self.kind, real, evaluated)
 
     def times(self, factor: np.ndarray | float) -> EnclosedConstant:
         """The constant multiplied by exact numbers."""
-        ends = [_product(pair, (np.asarray(factor), np.asarray(factor))) for pair in (self.real, self.single)]
+        ends = [_product(pair, (np.asarray(factor), np.asarray(factor))) for pair in (self.real, self.evaluated)]
         wide = [_widened(e, OWN_CONSTANT * np.maximum(np.abs(e[0]), np.abs(e[1]))) for e in ends]
         return EnclosedConstant(self.kind, wide[0], wide[1])
 
@@ -110,7 +110,7 @@ def scaled_integers(number: np.ndarray, scale: EnclosedConstant) -> np.ndarray |
     whole = number.astype(np.float64)
     ends = [
         _elementary("Mul", [(whole, whole), part], rounds)
-        for part, rounds in ((scale.real, EXACT), (scale.single, FORMATS[scale.kind.itemsize]))
+        for part, rounds in ((scale.real, EXACT), (scale.evaluated, FORMATS[scale.kind.itemsize]))
     ]
     product = EnclosedConstant(scale.kind, ends[0], ends[1])
     return product.value.astype(scale.kind) if product.exact else product
@@ -163,7 +163,7 @@ def fold_enclosed(
     kind = kinds[0]
 
     def run(side: str) -> list[Interval64]:
-        ends = [None if p is None else (p.real if side == "real" else p.single) for p in parts]
+        ends = [None if p is None else (p.real if side == "real" else p.evaluated) for p in parts]
         rounds = EXACT if side == "real" else FORMATS[kind.itemsize]
 
         def put(*numbers: np.ndarray | None) -> list[np.ndarray]:
@@ -177,9 +177,9 @@ def fold_enclosed(
         return [_computed(name, [e for e in ends if e is not None], lambda v: put(v)[0], rounds)]
 
     results: list[np.ndarray | EnclosedConstant] = []
-    for real, single in zip(run("real"), run("single"), strict=True):
-        folded = EnclosedConstant(kind, real, single)
-        for end in (*real, *single):
+    for real, evaluated in zip(run("real"), run("evaluated"), strict=True):
+        folded = EnclosedConstant(kind, real, evaluated)
+        for end in (*real, *evaluated):
             if not np.isfinite(end).all() or (end.size and np.abs(end).max() >= FORMATS[kind.itemsize].largest):
                 if name in _MOVES | _GROWS and not np.isnan(end).any():
                     continue
@@ -292,9 +292,9 @@ def _digits(value: np.ndarray) -> np.ndarray:
     return np.where(mantissa == 0, 0, 53 - np.log2(np.where(last > 0.0, last, 1.0))).astype(np.int64)
 
 
-def _power(given: Sequence[Interval64], rounds: FloatFormat) -> Interval64:
+def _power(operands: Sequence[Interval64], rounds: FloatFormat) -> Interval64:
     unit, tiny, _ = rounds
-    base, exponent = given
+    base, exponent = operands
     if not np.array_equal(*exponent):
         raise InputError("has an exponent that is computed", fix=_FIX)
     power = exponent[0]
@@ -315,23 +315,25 @@ def _power(given: Sequence[Interval64], rounds: FloatFormat) -> Interval64:
     return _widened((low, high), _library(unit) * high + tiny)
 
 
-def _reduced(name: str, given: Interval64, put: Callable[[np.ndarray], np.ndarray], rounds: FloatFormat) -> Interval64:
+def _reduced(
+    name: str, operand: Interval64, put: Callable[[np.ndarray], np.ndarray], rounds: FloatFormat
+) -> Interval64:
     """Sums in any order; small multiples of one number are summed without rounding."""
     unit, tiny, largest = rounds
-    still, size = np.array_equal(*given), _size(given)
-    count = max(1.0, float(given[0].size))
+    still, size = np.array_equal(*operand), _size(operand)
+    count = max(1.0, float(operand[0].size))
     if name == "ReduceProd":
-        low = put(given[0])
+        low = put(operand[0])
         if not still:
             raise InputError("multiplies constants that are computed", fix=_FIX)
-        if bool((given[0] == np.round(given[0])).all()) and bool((put(size[1]) < 2.0 ** _held(unit)).all()):
+        if bool((operand[0] == np.round(operand[0])).all()) and bool((put(size[1]) < 2.0 ** _held(unit)).all()):
             return low, low
         # partial products, of the large numbers alone or of the small ones, in any order
         most = put(np.maximum(size[1], 1.0))
         _check_bounded(most, largest)
         lost = ONCE_FLUSHES * count * tiny * most
         return _widened((low, low), gamma(count + CONSTANT_SUMS, unit + OWN_CONSTANT) * np.abs(low) + lost)
-    parts = count / max(1.0, float(put(given[0]).size))
+    parts = count / max(1.0, float(put(operand[0]).size))
     reach = gamma(parts + CONSTANT_SUMS, unit + OWN_CONSTANT)
     if name == "ReduceL2":
         low, high = put(size[0]), put(size[1])
@@ -339,10 +341,10 @@ def _reduced(name: str, given: Interval64, put: Callable[[np.ndarray], np.ndarra
         return _widened((low, high), reach * high + math.sqrt(parts * tiny))
     if name not in ("ReduceSum", "ReduceMean", "ReduceL1"):
         raise InputError("cannot be enclosed on constants that are computed", fix=_FIX)
-    low, high = (put(end) for end in (size if name == "ReduceL1" else given))
+    low, high = (put(end) for end in (size if name == "ReduceL1" else operand))
     mean, total = name == "ReduceMean", put(size[1])
     _check_bounded(total * (parts if mean else 1.0), largest)
-    held = total * (parts if mean else 1.0) <= 2.0 ** _held(unit) * _grain(given[0])
+    held = total * (parts if mean else 1.0) <= 2.0 ** _held(unit) * _grain(operand[0])
     large = not size[1].any() or float(size[1][size[1] > 0.0].min()) >= 2.0 * tiny * parts
     if still and large and bool(np.all(held)) and (not mean or math.frexp(parts)[0] == 0.5):
         return low, high
@@ -403,29 +405,29 @@ def _cast(
         raise InputError(f"casts a constant to {name}", fix="use float32")
     if isinstance(operand, EnclosedConstant):
         if kind.kind != "f":
-            ends = [np.asarray(end).astype(kind) for end in (*operand.real, *operand.single)]
+            ends = [np.asarray(end).astype(kind) for end in (*operand.real, *operand.evaluated)]
             if any(not np.array_equal(ends[0], other) for other in ends[1:]):
                 raise InputError("rounds a constant that may fall either way", fix=_FIX)
             return ends[0]
-        real, single = operand.real, operand.single
+        real, evaluated = operand.real, operand.evaluated
     else:
         array = np.asarray(operand)
         if kind.kind != "f":
             return array.astype(kind)
         number = array.astype(np.float64)
-        real = single = (number, number)
+        real = evaluated = (number, number)
         if array.dtype.kind in "iu" and array.size and bool((np.abs(number) * DOUBLE_UNIT > 1.0).any()):
-            real = single = _widened(real, OWN_CONSTANT * np.abs(number))
+            real = evaluated = _widened(real, OWN_CONSTANT * np.abs(number))
     unit, tiny, _ = FORMATS[kind.itemsize]
     with np.errstate(over="ignore"):
-        rounded = [end.astype(kind).astype(np.float64) for end in single]
-    same = (single[0] == single[1]) & (rounded[0] == single[0])
-    size = np.maximum(np.abs(single[0]), np.abs(single[1]))
+        rounded = [end.astype(kind).astype(np.float64) for end in evaluated]
+    same = (evaluated[0] == evaluated[1]) & (rounded[0] == evaluated[0])
+    size = np.maximum(np.abs(evaluated[0]), np.abs(evaluated[1]))
     finite = np.where(np.isfinite(size), size, 0.0)
     if bool((finite >= FORMATS[kind.itemsize].largest).any()) and not bool(np.all(same)):
         raise InputError("makes a constant that may overflow", fix="check its constants")
-    single = _widened(single, np.where(same, 0.0, ONCE * unit * finite + tiny))
-    ends = EnclosedConstant(kind, real, single)
+    evaluated = _widened(evaluated, np.where(same, 0.0, ONCE * unit * finite + tiny))
+    ends = EnclosedConstant(kind, real, evaluated)
     return ends.value.astype(kind) if ends.exact else ends
 
 

@@ -118,12 +118,12 @@ class CostEstimate(NamedTuple):
 
     Attributes:
         products: Of all rows.
-        numbers: How many numbers are bounded by rows that end by plan.
+        neurons: How many numbers are bounded by rows that end by plan.
         given_up: Whether rows are given up before the end.
     """
 
     products: float
-    numbers: float
+    neurons: float
     given_up: bool
 
 

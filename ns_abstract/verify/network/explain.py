@@ -54,12 +54,12 @@ def estimate(network: Network, dimensions: int) -> tuple[float, float, bool]:
     count = len(network.nodes)
     sizes = [float(np.prod(network.shape(k))) for k in range(count + 1)]
     costs = cost_model_of(network)
-    rows = costs.foreseen(_OPEN, _DEEP_OPEN)
-    many = costs.deep and not rows.given_up
+    foreseen = costs.foreseen(_OPEN, _DEEP_OPEN)
+    many = costs.deep and not foreseen.given_up
     memory = sum(sizes) * 8 * (3 * dimensions + _NUMBERS) + (_MANY_ROWS if many else _FEW_ROWS)
     speed = _PLANNED_SPEED if costs.planned else _MANY_SPEED if costs.deep else _FEW_SPEED
-    seconds = least_seconds(network, dimensions) + rows.products / speed + _PLANNED_EACH * rows.numbers
-    return memory, seconds, rows.given_up
+    seconds = least_seconds(network, dimensions) + foreseen.products / speed + _PLANNED_EACH * foreseen.neurons
+    return memory, seconds, foreseen.given_up
 
 
 def check_cell(
@@ -74,10 +74,9 @@ def check_cell(
     """
     needed, _, _ = estimate(network, dimensions)
     if needed > allowed:
-        numbers = sum(float(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1))
         raise InputError(
-            f"needs about {needed / 2**30:.1f} GiB for a cell in {dimensions} parameters ({numbers:,.0f} numbers), "
-            f"{allowed / 2**30:.1f} GiB are allowed",
+            f"needs about {needed / 2**30:.1f} GiB for a cell in {dimensions} parameters "
+            f"({network.neuron_count:,} numbers), {allowed / 2**30:.1f} GiB are allowed",
             file=network.source,
             fix=f"give {remedy}, or a smaller network or image",
         )
@@ -91,10 +90,9 @@ def explain(network: Network, dimensions: int = 2) -> Sequence[str]:
         kind = "Reshape" if type(node.layer) is LinearLayer else kind
         inputs = ", ".join(map(str, node.inputs))
         lines.append(f"{k:5d}  {kind:22s} {item(node.layer.shape):>14s}  of {inputs:12s} {node.op} {node.name}")
-    total = sum(float(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1))
     work = sum(multiplications(network, k) for k in range(1, len(network.nodes) + 1))
     memory, seconds, given_up = estimate(network, dimensions)
-    lines.append(f"{len(network.nodes)} layers, {total:,.0f} numbers, {work:,.0f} products an evaluation")
+    lines.append(f"{len(network.nodes)} layers, {network.neuron_count:,} numbers, {work:,.0f} products an evaluation")
     lines.append(
         f"one cell in {dimensions} parameters: about {memory / 2**30:.2f} GiB, and for the network, of one core, "
         f"{least_seconds(network, dimensions):.2g} s where hardly a unit is unstable, {seconds:.2g} s where one of "

@@ -121,7 +121,7 @@ class ForwardPass:
         least, most = (v.flatten(1).numpy() for v in z.interval)
         reference, width = z.reference.flatten(1), z.width.flatten(1).numpy()
         for cell, phases in enumerate(self.intermediate.assumed):
-            if source not in phases or not self.intermediate.good[cell]:
+            if source not in phases or not self.intermediate.usable[cell]:
                 continue
             flat, side = phases[source]
             if bool(np.where(side > 0.0, most[cell, flat] < 0.0, least[cell, flat] > 0.0).any()):

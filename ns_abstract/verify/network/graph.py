@@ -101,6 +101,11 @@ class Network:
         """Numbers of one output."""
         return int(np.prod(self.output_shape))
 
+    @property
+    def neuron_count(self) -> int:
+        """Numbers of all nodes together, with the image."""
+        return sum(int(np.prod(self.shape(k))) for k in range(len(self.nodes) + 1))
+
     def guarantee(self, arithmetic: NetworkArithmetic = "float32") -> tuple[str, ...]:
         """What certificates about this network cover, and what they do not."""
         if arithmetic == "real":

@@ -21,17 +21,17 @@ class InexactLayer(LinearLayer):
     """A linear layer with interval constants: charges their width times the input's magnitude.
 
     Attributes:
-        real, single: The layer with the doubts as weights and offset: of the exact value, and of float32 evaluations.
+        real, evaluated: The layer with the doubts as weights and offset: of the exact value, of float32 evaluations.
     """
 
     real: LinearLayer
-    single: LinearLayer
+    evaluated: LinearLayer
 
     def inexact(self, sizes: Sequence[Tensor]) -> Tensor | float:
         return self.real(sizes)
 
     def spare(self, sizes: Sequence[Tensor]) -> Tensor | float:
-        return super().spare(sizes) + self.single(sizes)
+        return super().spare(sizes) + self.evaluated(sizes)
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -78,4 +78,4 @@ def with_inexact_constants(
             parts[key] = as_double(np.broadcast_to(np.abs(end), tuple(own.shape)))
         sides.append(replace(layer, **parts))
     end = {f.name: getattr(layer, f.name) for f in fields(layer)}
-    return _KINDS[type(layer)](**end, real=sides[0], single=sides[1])
+    return _KINDS[type(layer)](**end, real=sides[0], evaluated=sides[1])

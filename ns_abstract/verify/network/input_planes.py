@@ -34,11 +34,11 @@ def finite(images: ImageSets) -> tuple[list[Float64], np.ndarray]:
     Cells with numbers past the limit of N22 are not among these.
     """
     fields = [np.asarray(getattr(images, name), np.float64) for name in images.__dataclass_fields__]
-    good = np.logical_and.reduce([np.isfinite(f).reshape(images.count, -1).all(axis=1) for f in fields])
-    good &= (fields[4] <= fields[5]).all(axis=1)
+    usable = np.logical_and.reduce([np.isfinite(f).reshape(images.count, -1).all(axis=1) for f in fields])
+    usable &= (fields[4] <= fields[5]).all(axis=1)
     # what float32 programs may not be able to compute with (N22)
-    good &= (np.maximum(np.abs(fields[4]), np.abs(fields[5])) < OVERFLOW).all(axis=1)
-    return [np.where(good.reshape(-1, *[1] * (f.ndim - 1)), f, 0.0) for f in fields], good
+    usable &= (np.maximum(np.abs(fields[4]), np.abs(fields[5])) < OVERFLOW).all(axis=1)
+    return [np.where(usable.reshape(-1, *[1] * (f.ndim - 1)), f, 0.0) for f in fields], usable
 
 
 def middle_of(fields: list[Float64]) -> Float64:

@@ -27,14 +27,14 @@ class IntermediateBounds:
         network: The network.
         image: What is known of the image.
         middle: [m, n] the images' reference.
-        good: [m] cells that are not given up; changed in place.
+        usable: [m] cells that are not given up; changed in place.
         arithmetic, assumed: As in `ns_abstract.verify.network.bound_outputs`.
         coarse: Whether rows are in float32, and charged for it, in real arithmetic, too: they take less than half the
             time.
 
     Attributes:
         count, d: Cells m and parameters d.
-        single: Whether the network's evaluation in float32 is bounded.
+        in_float32: Whether the network's evaluation in float32 is bounded.
         image, columns: The image as planes, and as rows are bounded on it.
         infeasible: [m] cells without an image that has the signs assumed.
         flush: [m] what flushes to zero may lose on the way of any row.
@@ -52,21 +52,20 @@ class IntermediateBounds:
         network: Network,
         image: ImagePlanes,
         middle: Float64,
-        good: np.ndarray,
+        usable: np.ndarray,
         arithmetic: NetworkArithmetic,
         assumed: Sequence[Mapping[int, ActivationPhases]] | None,
         coarse: bool = False,
     ) -> None:
-        self.network, self.middle, self.good, self.assumed = network, middle, good, assumed
+        self.network, self.middle, self.usable, self.assumed = network, middle, usable, assumed
         self.count, self.d = len(middle), image.slopes.shape[-1]
-        self.single = arithmetic == "float32"
+        self.in_float32 = arithmetic == "float32"
         self.infeasible, self.flush = np.zeros(self.count, bool), np.zeros(self.count)
-        self.see(image)
+        self.set_image(image)
         # every number is passed by a few times at most
-        numbers = sum(int(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1))
-        sums = 4.0 * DOUBLE_UNIT * (numbers + len(network.nodes))
+        sums = 4.0 * DOUBLE_UNIT * (network.neuron_count + len(network.nodes))
         self.relaxations = [Relaxations(torch.float32, UNIT, sums)]
-        if not (self.single or coarse):
+        if not (self.in_float32 or coarse):
             # beside the rounding of a float32 network that of rows is little
             self.relaxations.append(Relaxations(torch.float64, DOUBLE_UNIT, sums))
         self.folded: set[int] = set()
@@ -76,7 +75,7 @@ class IntermediateBounds:
         self.split: list[dict[int, SplitNeurons]] = [{} for _ in range(self.count)]
         self.reused_relaxations: dict[int, ReusedRelaxation] = {}
 
-    def see(self, image: ImagePlanes) -> None:
+    def set_image(self, image: ImagePlanes) -> None:
         """Take this for what is known of the image."""
         self.image, self.columns = image, columns_of(*image)
 
@@ -99,20 +98,20 @@ class IntermediateBounds:
             if not bool(torch.isfinite(part.sum())):
                 finite = torch.isfinite(part)
                 fine = fine & (finite.all(1) if part.ndim > fine.ndim else finite)
-        good = fine.reshape(self.count, -1).all(1)
-        if self.assumed is not None and not bool(good.all()):
+        consistent = fine.reshape(self.count, -1).all(1)
+        if self.assumed is not None and not bool(consistent.all()):
             # bounds that hold for all images with these signs contradict each other: there are none (N16)
             crossed = torch.isfinite(low) & torch.isfinite(high) & (low > high)
-            has_phases = np.array([len(phases) > 0 for phases in self.assumed]) & self.good
+            has_phases = np.array([len(phases) > 0 for phases in self.assumed]) & self.usable
             self.infeasible |= has_phases & crossed.reshape(self.count, -1).any(1).numpy()
-        self.good &= good.numpy()
+        self.usable &= consistent.numpy()
         form_within = NodeForm(form.reference, form.c, form.a, form.r, low, high, form.active)
-        if bool(good.all()):
+        if bool(consistent.all()):
             return form_within
 
         # what is given up must not slow the others down with NaN
         def clear(t: Tensor) -> Tensor:
-            return torch.where(good.reshape(-1, *[1] * (t.ndim - 1)), t, torch.zeros_like(t))
+            return torch.where(consistent.reshape(-1, *[1] * (t.ndim - 1)), t, torch.zeros_like(t))
 
         return NodeForm(*(clear(getattr(form_within, name)) for name in NodeForm.__dataclass_fields__))
 

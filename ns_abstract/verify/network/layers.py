@@ -4,7 +4,7 @@ See design.md, N3, N4.
 
 A layer is linear (`LinearLayer` and the classes built on it) or acts on every number by itself (`Activation`).
 A linear layer has three faces that share one matrix W: the concrete ``W x + bias``, its magnitude
-``|W| x`` (for radii and for rounding), and its transpose ``rows W`` on windows of rows
+``|W| x`` (for radii and for rounding), and its transpose ``coefficients W`` on windows of rows
 (`ns_abstract.verify.network.coefficients`). An activation has its concrete value and lines that enclose it over
 an interval. Labels N1, N2, ... are those of docs/dev/design.md.
 """
@@ -81,9 +81,9 @@ class LinearLayer:
         """What the network is off the layer's numbers in real arithmetic, too, for inputs of at most ``sizes``."""
         return 0.0
 
-    def backward(self, rows: Coefficients) -> list[Coefficients]:
-        """Rows on every input for rows on the output; may reuse their memory."""
-        return [unflatten(rows, self.shape, self.input_shapes[0])]
+    def backward(self, coefficients: Coefficients) -> list[Coefficients]:
+        """Coefficients on every input for coefficients on the output; may reuse their memory."""
+        return [unflatten(coefficients, self.shape, self.input_shapes[0])]
 
     def __call__(self, inputs: Sequence[Tensor]) -> Tensor:
         value = self.apply(inputs)
@@ -102,9 +102,9 @@ class Weighted(LinearLayer):
     def _single(self) -> Tensor:
         return self.weight.float()
 
-    def weight_for(self, rows: Tensor) -> Tensor:
-        """Weights in the rows' type."""
-        return self._single if rows.dtype == torch.float32 else self.weight
+    def weight_for(self, coefficients: Tensor) -> Tensor:
+        """Weights in the coefficients' type."""
+        return self._single if coefficients.dtype == torch.float32 else self.weight
 
     @cached_property
     def gain(self) -> float:
@@ -215,9 +215,9 @@ class Convolution(Weighted):
         spread = high + (kh - 1) * self.dilation[0], wide + (kw - 1) * self.dilation[1]
         return self.stride == (1, 1) and spread == (height + 2 * top, width + 2 * left)
 
-    def backward(self, rows: Coefficients) -> list[Coefficients]:
-        value = torch.from_numpy(rows.value)
-        if rows.covers(self.shape):
+    def backward(self, coefficients: Coefficients) -> list[Coefficients]:
+        value = torch.from_numpy(coefficients.value)
+        if coefficients.covers(self.shape):
             # nothing outside of the map is kept
             top, left = self.pads[:2]
             if self._trims:
@@ -230,7 +230,7 @@ class Convolution(Weighted):
             if phases is not None and self.weight[0, 0].numel() > 1 and min(top, left) >= 0:
                 return [Coefficients.whole(self._joined(value, phases, (height, width), (top, left)).numpy())]
         value = self._transposed(value).numpy()
-        y, x = rows.y * self.stride[0] - self.pads[0], rows.x * self.stride[1] - self.pads[1]
+        y, x = coefficients.y * self.stride[0] - self.pads[0], coefficients.x * self.stride[1] - self.pads[1]
         return [full(Coefficients(value, y, x), self.input_shapes[0])]
 
 
@@ -251,8 +251,8 @@ class Matrix(Weighted):
     def magnitude(self, inputs: Sequence[Tensor]) -> Tensor:
         return inputs[0] @ self.weight.abs().to(inputs[0].dtype).T
 
-    def backward(self, rows: Coefficients) -> list[Coefficients]:
-        whole = full(rows, self.shape, force=True)
+    def backward(self, coefficients: Coefficients) -> list[Coefficients]:
+        whole = full(coefficients, self.shape, force=True)
         count = whole.value.shape[0]
         value = torch.from_numpy(whole.value).reshape(count, *self.shape)
         value = value @ self.weight_for(value)
@@ -286,10 +286,10 @@ class ScaleLayer(LinearLayer):
     def magnitude(self, inputs: Sequence[Tensor]) -> Tensor:
         return inputs[0] * self.factor.abs().to(inputs[0].dtype)
 
-    def backward(self, rows: Coefficients) -> list[Coefficients]:
+    def backward(self, coefficients: Coefficients) -> list[Coefficients]:
         factor = self.factor.expand(self.shape).reshape(grid(self.shape)).numpy()
-        rows.scale(factor.astype(rows.value.dtype))
-        return [rows]
+        coefficients.scale(factor.astype(coefficients.value.dtype))
+        return [coefficients]
 
 
 @dataclass(frozen=True, eq=False)
@@ -311,12 +311,15 @@ class Sum(LinearLayer):
             total = total + value
         return total
 
-    def backward(self, rows: Coefficients) -> list[Coefficients]:
+    def backward(self, coefficients: Coefficients) -> list[Coefficients]:
         # rows are changed in place further on, so every input gets its own
-        copies = [Coefficients(rows.value * rows.value.dtype.type(sign), rows.y, rows.x) for sign in self.signs[1:]]
+        copies = [
+            Coefficients(coefficients.value * coefficients.value.dtype.type(sign), coefficients.y, coefficients.x)
+            for sign in self.signs[1:]
+        ]
         if self.signs[0] < 0:
-            np.negative(rows.value, out=rows.value)
-        return [rows, *copies]
+            np.negative(coefficients.value, out=coefficients.value)
+        return [coefficients, *copies]
 
 
 @dataclass(frozen=True, eq=False)
@@ -337,8 +340,13 @@ class Pad(LinearLayer):
         top, left, bottom, right = self.pads
         return functional.pad(inputs[0], (left, right, top, bottom))
 
-    def backward(self, rows: Coefficients) -> list[Coefficients]:
-        return [full(Coefficients(rows.value, rows.y - self.pads[0], rows.x - self.pads[1]), self.input_shapes[0])]
+    def backward(self, coefficients: Coefficients) -> list[Coefficients]:
+        return [
+            full(
+                Coefficients(coefficients.value, coefficients.y - self.pads[0], coefficients.x - self.pads[1]),
+                self.input_shapes[0],
+            )
+        ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -351,9 +359,9 @@ class ChannelEmbedding(LinearLayer):
         after = self.shape[0] - self.input_shapes[0][0] - self.first
         return functional.pad(inputs[0], (0, 0, 0, 0, self.first, after))
 
-    def backward(self, rows: Coefficients) -> list[Coefficients]:
-        part = rows.value[:, self.first : self.first + self.input_shapes[0][0]]
-        return [Coefficients(np.ascontiguousarray(part), rows.y, rows.x)]
+    def backward(self, coefficients: Coefficients) -> list[Coefficients]:
+        part = coefficients.value[:, self.first : self.first + self.input_shapes[0][0]]
+        return [Coefficients(np.ascontiguousarray(part), coefficients.y, coefficients.x)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -378,10 +386,10 @@ class Gather(LinearLayer):
         chosen = inputs[0].flatten(1)[:, self.index.clamp(min=0)]
         return (chosen * (self.index >= 0).to(chosen.dtype)).reshape(-1, *self.shape)
 
-    def backward(self, rows: Coefficients) -> list[Coefficients]:
-        count, (_, height, width), before = len(rows.value), grid(self.shape), grid(self.input_shapes[0])
-        value = np.zeros((count, int(np.prod(before))), rows.value.dtype)
-        add_gathered(rows.value, rows.y, rows.x, height, width, self.index.numpy(), value)
+    def backward(self, coefficients: Coefficients) -> list[Coefficients]:
+        count, (_, height, width), before = len(coefficients.value), grid(self.shape), grid(self.input_shapes[0])
+        value = np.zeros((count, int(np.prod(before))), coefficients.value.dtype)
+        add_gathered(coefficients.value, coefficients.y, coefficients.x, height, width, self.index.numpy(), value)
         return [Coefficients.whole(value.reshape(count, *before))]
 
 

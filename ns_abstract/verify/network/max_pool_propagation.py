@@ -73,7 +73,7 @@ class MaxPoolPropagation:
         count = SPARE + layer.overlaps + self.network.readers[source]
         units = [count * relaxations.unit for relaxations in self.intermediate.relaxations]
         # programs may flush what they compare
-        flushed = FLUSHES * FLUSH if self.intermediate.single else 0.0
+        flushed = FLUSHES * FLUSH if self.intermediate.in_float32 else 0.0
         gives = [unit * width + flushed for unit in units]
         offsets = [torch.stack([-give, give, give, -give], 0) for give in gives]
         rivals = upper.scatter(2, winner, -torch.inf).amax(2)
@@ -106,11 +106,11 @@ class MaxPoolPropagation:
             radius = (radius + OWN_SUMS * (planes.slopes * candidates.size).sum(1)) * UP
             own = r[at] + 0.5 * top
             better = radius < own
-            rows = (planes.slopes[:, :, None] * candidates.slopes).sum(1)
+            mixed = (planes.slopes[:, :, None] * candidates.slopes).sum(1)
             c[at] = torch.where(better, middle, c[at] + 0.5 * top)
             r[at] = torch.where(better, radius, own * UP + OWN_SUMS * c[at].abs())
             cells, channels, windows = at
-            a[cells, :, channels, windows] = torch.where(better[:, None], rows, a[cells, :, channels, windows])
+            a[cells, :, channels, windows] = torch.where(better[:, None], mixed, a[cells, :, channels, windows])
             most[at] = torch.minimum(most[at], own_upper[at] + top)
         grown = (m, *shape)
         chosen_slopes = torch.cat(slopes) if slopes else torch.zeros((0, len(layer.steps)))
@@ -225,9 +225,9 @@ class MaxPoolPropagation:
             near = candidates.reference[window, one], candidates.reference[window, other]
             ahead = (near[0] - near[1]).numpy()
             room = OWN_FEW * (near[0].abs() + near[1].abs()).numpy()
-            rows = Coefficients(value, y * layer.stride[0] - layer.pads[0], x * layer.stride[1] - layer.pads[1])
+            coefficients = Coefficients(value, y * layer.stride[0] - layer.pads[0], x * layer.stride[1] - layer.pads[1])
             enough = StoppingCriterion(NeuronTarget(), room - ahead, np.zeros(len(part), bool))
-            bounds = self.backward.bound(source, rows, np.ascontiguousarray(cell), enough, None, cut)
+            bounds = self.backward.bound(source, coefficients, np.ascontiguousarray(cell), enough, None, cut)
             above, below = torch.from_numpy(room - ahead - bounds.lower), torch.from_numpy(room + ahead + bounds.upper)
             apart[window, other, one] = torch.minimum(apart[window, other, one], above)
             apart[window, one, other] = torch.minimum(apart[window, one, other], below)

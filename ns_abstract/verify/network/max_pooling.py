@@ -62,8 +62,8 @@ class MaxPool:
 
     def taps(self, x: Tensor, padding: float) -> Tensor:
         """[m, C, K, windows] the numbers of every window, for maps [m, C, H, W]."""
-        numbers = x.flatten(2)[:, :, self.places.clamp(min=0)]
-        return torch.where(self.places >= 0, numbers, torch.full((), padding, dtype=x.dtype))
+        in_windows = x.flatten(2)[:, :, self.places.clamp(min=0)]
+        return torch.where(self.places >= 0, in_windows, torch.full((), padding, dtype=x.dtype))
 
     def __call__(self, inputs: Sequence[Tensor]) -> Tensor:
         top, left, bottom, right = self.pads

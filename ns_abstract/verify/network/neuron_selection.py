@@ -82,8 +82,8 @@ class NeuronSelection:
 
         Lines that are close beside the form's width may be far apart beside what rows leave of it.
         """
-        good = torch.from_numpy(self.intermediate.good).reshape(-1, *[1] * (unstable.ndim - 1))
-        likely = (apart > _STRAIGHT) & ~unstable & good
+        usable = torch.from_numpy(self.intermediate.usable).reshape(-1, *[1] * (unstable.ndim - 1))
+        likely = (apart > _STRAIGHT) & ~unstable & usable
         where = likely.reshape(self.intermediate.count, *grid(self.network.shape(index))).nonzero().numpy()
         if not len(where):
             return form, unstable
@@ -103,9 +103,9 @@ class NeuronSelection:
         """Better bounds of the numbers of node ``index`` that are open; a sign may be all that is asked (N6)."""
         item = self.network.shape(index)
         shape = grid(item)
-        unstable = unstable.reshape(self.intermediate.count, *shape) & torch.from_numpy(self.intermediate.good).reshape(
-            -1, 1, 1, 1
-        )
+        unstable = unstable.reshape(self.intermediate.count, *shape) & torch.from_numpy(
+            self.intermediate.usable
+        ).reshape(-1, 1, 1, 1)
         where = unstable.nonzero().numpy()
         if not len(where):
             return form
@@ -134,12 +134,12 @@ class NeuronSelection:
         that matter further on, so that forms start again from there.
         """
         shape = grid(self.network.shape(index))
-        unstable = unstable.reshape(self.intermediate.count, *shape) & torch.from_numpy(self.intermediate.good).reshape(
-            -1, 1, 1, 1
-        )
+        unstable = unstable.reshape(self.intermediate.count, *shape) & torch.from_numpy(
+            self.intermediate.usable
+        ).reshape(-1, 1, 1, 1)
         count = int(unstable.sum())
         decides = isinstance(layer, LeakyRelu)
-        matters = torch.from_numpy(self.intermediate.good).reshape(-1, 1, 1, 1) & torch.ones_like(unstable)
+        matters = torch.from_numpy(self.intermediate.usable).reshape(-1, 1, 1, 1) & torch.ones_like(unstable)
         if isinstance(layer, LeakyRelu) and layer.alpha == 0.0:
             # what is certainly cut off is exact behind the layer
             matters &= form.interval.upper.reshape(unstable.shape) > 0.0
@@ -181,7 +181,7 @@ class NeuronSelection:
         """Better bounds of all numbers of a node that matter, by rows as long as the network is worth (N18)."""
         shape = grid(self.network.shape(index))
         every = torch.ones((self.intermediate.count, *shape), dtype=torch.bool)
-        matters = torch.from_numpy(self.intermediate.good).reshape(-1, 1, 1, 1) & every
+        matters = torch.from_numpy(self.intermediate.usable).reshape(-1, 1, 1, 1) & every
         if isinstance(layer, LeakyRelu) and layer.alpha == 0.0:
             matters &= form.interval.upper.reshape(matters.shape) > 0.0
         chosen = matters.nonzero().numpy()

@@ -89,8 +89,8 @@ def intervals_of(constant: EnclosedConstant | None, shape: Shape | None = None) 
         return intervals
     if intervals[0].size == math.prod(shape):
         return intervals[0].reshape(shape), intervals[1].reshape(shape)
-    real, single = (np.broadcast_to(part, (1, *shape))[0] for part in intervals)
-    return real, single
+    real, evaluated = (np.broadcast_to(part, (1, *shape))[0] for part in intervals)
+    return real, evaluated
 
 
 def operand(r: OnnxReader, node: onnx.NodeProto, position: int, doubtful: bool = False) -> TensorValue | np.ndarray:

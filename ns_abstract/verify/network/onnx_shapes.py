@@ -74,10 +74,10 @@ def axes_of(r: OnnxReader, node: onnx.NodeProto, a: Attributes, rank: int) -> li
         axes = r.constant(node, 1)
     if axes is None:
         return None
-    numbers = [int(v) for v in np.atleast_1d(axes)]
-    if any(not -rank <= v < rank for v in numbers) or len({v % rank for v in numbers}) != len(numbers):
-        raise InputError(f"axes {numbers} of {rank}", fix="check the axes")
-    return sorted(v % rank for v in numbers)
+    chosen = [int(v) for v in np.atleast_1d(axes)]
+    if any(not -rank <= v < rank for v in chosen) or len({v % rank for v in chosen}) != len(chosen):
+        raise InputError(f"axes {chosen} of {rank}", fix="check the axes")
+    return sorted(v % rank for v in chosen)
 
 
 def _squeeze(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:

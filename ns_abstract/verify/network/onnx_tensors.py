@@ -126,9 +126,9 @@ def _give_defaults(model: onnx.ModelProto) -> None:
     defaults = {(f.domain, f.name, f.overload): f.attribute_proto for f in model.functions}
     for body in (model.graph, *model.functions):
         for node in body.node:
-            given = {attribute.name for attribute in node.attribute}
+            names = {attribute.name for attribute in node.attribute}
             missing = defaults.get((node.domain, node.op_type, node.overload), ())
-            node.attribute.extend(attribute for attribute in missing if attribute.name not in given)
+            node.attribute.extend(attribute for attribute in missing if attribute.name not in names)
 
 
 class StoredTensors:

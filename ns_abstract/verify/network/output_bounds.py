@@ -86,8 +86,8 @@ class OutputRows:
         room = shifted.room(plane)
         lower, b = lower + offset - room, plane[..., -1] + offset - room
         a = plane[..., :-1]
-        finite = self.intermediate.good[:, None] & np.isfinite(lower)
-        usable = self.intermediate.good[:, None] & np.isfinite(b) & np.isfinite(a).all(-1)
+        finite = self.intermediate.usable[:, None] & np.isfinite(lower)
+        usable = self.intermediate.usable[:, None] & np.isfinite(b) & np.isfinite(a).all(-1)
         lower = np.where(self.intermediate.infeasible[:, None], np.inf, np.where(finite, lower, -np.inf))
         return OutputBounds(lower, np.where(usable[..., None], a, 0.0), np.where(usable, b, -np.inf), loosest)
 

@@ -121,7 +121,7 @@ class PhaseTree:
             most: Branches after which it is given up.
             over: Asked between batches: whether to give up.
         """
-        if not self.intermediate.good[0]:
+        if not self.intermediate.usable[0]:
             return TreeResult(False, 0, -np.inf)
         rows = _GroupRows.of(self.shifted, list(group), grid(self.network.shape(self.index)))
         none = {k: np.zeros(len(own.units.flat), np.int8) for k, own in self.relus.items()}

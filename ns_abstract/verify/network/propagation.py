@@ -76,7 +76,7 @@ class ForwardPropagation:
             active = layer.magnitude([f.active.double() for f in inputs]) != 0.0
             if layer.bias is not None:
                 active = active | (layer.bias != 0.0)
-        elif self.intermediate.single:
+        elif self.intermediate.in_float32:
 
             def end(moves: Tensor = moves) -> Tensor:
                 return (reference + moved[:, 0]).abs() + moved[:, 1:].abs().sum(1) + radius + moves
@@ -84,11 +84,11 @@ class ForwardPropagation:
             moves = moves + self.rounding.charge(k, sources, layer, charged, size, end)
             moves = moves + layer.spare([f.interval.size for f in charged])
         extremes = self.rounding.groupings(k, sources, layer, sizes)
-        flushed = self.rounding.flushed(extremes, layer) if self.intermediate.single else 0.0
+        flushed = self.rounding.flushed(extremes, layer) if self.intermediate.in_float32 else 0.0
         moves = moves + flushed
         roundings = layer.row_terms + SPARE + max(self.network.readers[i] for i in sources)
         form = NodeForm.ranged(reference, moved[:, 0], moved[:, 1:], radius + moves, active)
-        self.intermediate.good &= self.rounding.bounded(extremes).numpy()
+        self.intermediate.usable &= self.rounding.bounded(extremes).numpy()
         tiny = torch.zeros((), dtype=torch.float64)
         for sized, shape in zip(charged, layer.input_shapes, strict=True):
             lost = int(np.prod(shape)) * (layer.row_terms + 2) * FLUSH
@@ -100,14 +100,14 @@ class ForwardPropagation:
         folded = alone if isinstance(layer, Sum) else []
         self.intermediate.folded.update(folded)
         for relaxations in self.intermediate.relaxations:
-            rows = gamma(roundings, relaxations.unit)
-            noise = ((moves + tiny + rows * width) * UP).expand(m, *layer.shape)
+            rows_rounding = gamma(roundings, relaxations.unit)
+            noise = ((moves + tiny + rows_rounding * width) * UP).expand(m, *layer.shape)
             for source in folded:
                 # one charge instead of several
                 noise = noise + relaxations.noise[source]
             relaxations.noise[k] = noise * (UP + relaxations.sums)
         if isinstance(layer, Variance):
-            least = layer.least(inputs[0], inputs[1], self.intermediate.single)
+            least = layer.least(inputs[0], inputs[1], self.intermediate.in_float32)
             least = least - flushed - own * size - FLUSH * (layer.terms + 1) - OWN_LINE * reference.abs()
             return self.intermediate.within(form, least - reference, form.upper)
         if isinstance(layer, ScaleLayer):
@@ -123,7 +123,7 @@ class ForwardPropagation:
         size = z.interval.size
         reference = self.sharing.reference(k, lambda: layer.function(z.reference))
         room = layer.missing(lower, upper) + OWN_LINE * reference.abs()
-        if self.intermediate.single:
+        if self.intermediate.in_float32:
             room = room + layer.error(lower, upper)
         band = layer.band(lower, upper)
         s = band.lower_slope
@@ -194,7 +194,7 @@ class ForwardPropagation:
     def _limit(self, size: Tensor) -> None:
         """Give up cells in which numbers of at most ``size`` [m, ...] may overflow (N22)."""
         if not float(size.amax()) < OVERFLOW:
-            self.intermediate.good &= (size.flatten(1).amax(1) < OVERFLOW).numpy()
+            self.intermediate.usable &= (size.flatten(1).amax(1) < OVERFLOW).numpy()
 
     def product(self, k: int, sources: tuple[int, ...], layer: Product, x: NodeForm, y: NodeForm) -> NodeForm:
         """A product of two nodes (N9)."""
@@ -207,7 +207,7 @@ class ForwardPropagation:
         # roundings of the plane relative to the references, and the network's
         own = alpha.abs() * x.reference.abs() + beta.abs() * y.reference.abs() + reference.abs()
         room = OWN_LINE * (own + plane.low.abs() + plane.high.abs()) + 2 * FLUSH
-        if self.intermediate.single:
+        if self.intermediate.in_float32:
             room = room + PRODUCT * size + FUNCTION_FLUSHES * FLUSH * (1.0 + first.size + second.size)
         shape = (6, m, *grid(layer.shape))
         for relaxations in self.intermediate.relaxations:
@@ -234,7 +234,7 @@ class ForwardPropagation:
             lost = int(np.prod(layer.shape)) * 2 * FLUSH
             self.intermediate.flush += lost * f.width.reshape(m, -1).amax(1).numpy()
         extremes = self.rounding.multiplied(k, sources, [first.size, second.size])
-        self.intermediate.good &= self.rounding.bounded(extremes).numpy()
+        self.intermediate.usable &= self.rounding.bounded(extremes).numpy()
         ends = torch.stack([u * v for u in first for v in second]) - reference
         room = room + OWN_FEW * (size + reference.abs())
         return self.intermediate.within(form, ends.amin(0) - room, ends.amax(0) + room)

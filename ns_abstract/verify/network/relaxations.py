@@ -31,27 +31,29 @@ class MaxPoolPlanes(NamedTuple):
     slopes: np.ndarray
     offsets: np.ndarray
 
-    def forward(self, layer: MaxPool, cell: int, rows: Tensor, inputs: list[Tensor]) -> Tensor:
-        """The planes that ``rows`` [R, C, H, W] take, of inputs [R, C, H', W'] of one cell."""
+    def forward(self, layer: MaxPool, cell: int, coefficients: Tensor, inputs: list[Tensor]) -> Tensor:
+        """The planes that ``coefficients`` [R, C, H, W] take, of inputs [R, C, H', W'] of one cell."""
         taps = layer.taps(inputs[0], 0.0)
         winner = torch.from_numpy(self.winner[cell].astype(np.int64)).flatten(1)[None, :, None]
         value = taps.gather(2, winner.expand(len(taps), -1, -1, -1))[:, :, 0]
         offsets = torch.from_numpy(self.offsets[:, cell]).flatten(2)
         which = torch.from_numpy(self.which[cell].astype(np.int64)).flatten(1)
-        a = rows.flatten(2)
+        a = coefficients.flatten(2)
         if len(self.slopes):
             slopes = torch.from_numpy(self.slopes)[which.clamp(min=0)].movedim(2, 1)
             value = torch.where((a >= 0.0) | (which < 0), value, (taps * slopes).sum(2))
         return value + torch.where(a >= 0.0, offsets[0], offsets[2])
 
-    def backward(self, rows: Coefficients, layer: MaxPool, cell: Int64, total: Float64) -> Coefficients:
+    def backward(self, coefficients: Coefficients, layer: MaxPool, cell: Int64, total: Float64) -> Coefficients:
         """Rows on the input; what they gather on the way goes to ``total`` [R, 2]."""
-        height, width = rows.value.shape[2:]
+        height, width = coefficients.value.shape[2:]
         (down, right), extent = layer.stride, layer.steps.max(0) + 1
         size = (height - 1) * down + int(extent[0]), (width - 1) * right + int(extent[1])
-        target = np.zeros((*rows.value.shape[:2], *size), rows.value.dtype)
-        pass_maximum(rows.value, rows.y, rows.x, cell, *self, layer.steps, layer.stride, total, target)
-        return Coefficients(target, rows.y * down - layer.pads[0], rows.x * right - layer.pads[1])
+        target = np.zeros((*coefficients.value.shape[:2], *size), coefficients.value.dtype)
+        pass_maximum(
+            coefficients.value, coefficients.y, coefficients.x, cell, *self, layer.steps, layer.stride, total, target
+        )
+        return Coefficients(target, coefficients.y * down - layer.pads[0], coefficients.x * right - layer.pads[1])
 
 
 class ReusedRelaxation(NamedTuple):
@@ -93,9 +95,9 @@ class Relaxations:
         """The type as numpy has it."""
         return np.float32 if self.dtype == torch.float32 else np.float64
 
-    def takes(self, rows: Coefficients) -> bool:
+    def takes(self, coefficients: Coefficients) -> bool:
         """Whether rows are of this type."""
-        return rows.value.dtype == self.number
+        return coefficients.value.dtype == self.number
 
     @property
     def moved_out(self) -> tuple[float, float]:

@@ -64,15 +64,15 @@ def write_relu_lines(parameter, phases, alpha, flat, units, outward, stored, lin
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
-def along_lines(rows, values, lines, result):
+def along_lines(coefficients, values, lines, result):
     """Values [R, N] of an activation's input become ``result`` along the lines that rows [R, N] took there.
 
     ``lines``: [6, R or 1, N] as `pass_activation` takes them.
     """
-    count, size = rows.shape
+    count, size = coefficients.shape
     own = lines.shape[1] > 1
     plane = lines.shape[1] * size
-    coefficient, value, line, target = pointer(rows), pointer(values), pointer(lines), pointer(result)
+    coefficient, value, line, target = pointer(coefficients), pointer(values), pointer(lines), pointer(result)
     for r in range(count):
         here, at = (r * size if own else 0), r * size
         for j in range(size):

@@ -41,7 +41,9 @@ class RowAscent:
         self.intermediate, self.network, self.backward = intermediate, intermediate.network, backward
         self.steps, self.first = steps, first
 
-    def climb(self, index: int, rows: Coefficients, cell: Int64, best: BackwardBounds, need: Float64 | None) -> Int64:
+    def climb(
+        self, index: int, coefficients: Coefficients, cell: Int64, best: BackwardBounds, need: Float64 | None
+    ) -> Int64:
         """Raise ``best.lower`` of rows on node ``index``, and planes with it, where lines of their own give more.
 
         A cell whose rows are all above ``need`` [R] is done. Returns `OutputBounds.loosest` of the rows.
@@ -49,10 +51,10 @@ class RowAscent:
         loosest = np.full((len(cell), 2), -1, np.int64)
         for k in np.unique(cell):
             choices, own = ascending(self.intermediate.unstable, k), np.flatnonzero(cell == k)
-            if not (choices or self.intermediate.split[k]) or not self.intermediate.good[k]:
+            if not (choices or self.intermediate.split[k]) or not self.intermediate.usable[k]:
                 continue
-            parts, threads = self._shares(own, choices, rows.value.itemsize)
-            climbed = functools.partial(self._climb, index, rows, k, choices, best, need)
+            parts, threads = self._shares(own, choices, coefficients.value.itemsize)
+            climbed = functools.partial(self._climb, index, coefficients, k, choices, best, need)
             loosest[own] = np.concatenate(list(on_threads(climbed, parts, threads)))
         return loosest
 
@@ -70,7 +72,7 @@ class RowAscent:
     def _climb(
         self,
         index: int,
-        rows: Coefficients,
+        coefficients: Coefficients,
         k: int,
         choices: Mapping[int, Sequence[LineChoice]],
         best: BackwardBounds,
@@ -78,7 +80,7 @@ class RowAscent:
         own: Int64,
     ) -> Int64:
         """`climb` for rows ``own`` of cell k."""
-        start = rows[own]
+        start = coefficients[own]
         lines = {at: self.intermediate.relaxations[-1].lines[at][:, k] for at in choices}
         ascent = DualAscent(choices, lines, len(own), self.intermediate.split[k], step=self.first)
         for number in range(self.steps + 1):
@@ -99,9 +101,9 @@ class RowAscent:
         chosen, bounds = ascent.lines(), BackwardBounds.unknown(count, self.intermediate.d)
         # rows are changed in place
         part = Coefficients(start.value.copy(), start.y, start.x)
-        total, numbers = np.zeros((count, 2)), np.arange(count)
+        total, number = np.zeros((count, 2)), np.arange(count)
         relaxations = self.intermediate.relaxations[-1]
-        batch = CoefficientBatch({index: part}, np.full(count, k), total, numbers, relaxations, chosen)
+        batch = CoefficientBatch({index: part}, np.full(count, k), total, number, relaxations, chosen)
         self.backward.descend(index, index, batch, bounds, None)
         return chosen, bounds
 
@@ -139,12 +141,12 @@ class RowAscent:
     ) -> tuple[dict[int, list[Float64]], dict[int, Float64]]:
         """How the bounds of a cell's rows change with parameters and with multipliers."""
         planes, relaxations = self.intermediate.image, self.intermediate.relaxations[-1]
-        rows = chosen.trace.get(0)
-        if rows is None:
-            rows = np.zeros((len(found.lower), *grid(self.network.input_shape)), np.float32)
+        on_image = chosen.trace.get(0)
+        if on_image is None:
+            on_image = np.zeros((len(found.lower), *grid(self.network.input_shape)), np.float32)
         p = -np.sign(np.nan_to_num(found.plane[:, 0, :-1]))
         ends = np.einsum("schwd,rd->srchw", planes.slopes[cell], p) + planes.offsets[cell][:, None]
-        image = np.where(rows >= 0.0, ends[0], ends[1]).astype(np.float32)
+        image = np.where(on_image >= 0.0, ends[0], ends[1]).astype(np.float32)
         others: dict[int, Any] = {}
         for k, (one, two) in relaxations.products.items():
             others[k] = functools.partial(_product, torch.from_numpy(one[:, cell]), torch.from_numpy(two[:, cell]))
@@ -160,8 +162,8 @@ class RowAscent:
         return slope_derivatives(self.network, shaped, chosen.trace, lines, ascent, others, index)
 
 
-def _product(one: Tensor, two: Tensor, rows: Tensor, inputs: list[Tensor]) -> Tensor:
-    """The planes that ``rows`` take of a product's factors."""
-    x, y = (v.reshape(rows.shape) for v in inputs)
-    offset = torch.where(rows >= 0.0, one[1] + two[1], one[4] + two[4])
+def _product(one: Tensor, two: Tensor, coefficients: Tensor, inputs: list[Tensor]) -> Tensor:
+    """The planes that ``coefficients`` take of a product's factors."""
+    x, y = (v.reshape(coefficients.shape) for v in inputs)
+    offset = torch.where(coefficients >= 0.0, one[1] + two[1], one[4] + two[4])
     return one[0] * x + two[0] * y + offset

@@ -42,12 +42,7 @@ def reusable_anywhere(network: Network) -> bool:
     be kept.
     """
     local = any(isinstance(node.layer, (MaxPool, Product)) for node in network.nodes)
-    return not local and _neuron_count(network) <= _MOST_TRACED
-
-
-def _neuron_count(network: Network) -> int:
-    """Return the number of neurons of all nodes."""
-    return sum(int(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1))
+    return not local and network.neuron_count <= _MOST_TRACED
 
 
 class SharedCoefficients:
@@ -86,9 +81,9 @@ class SharedCoefficients:
             fresh: Whether all that is open before the last activation or product has rows of the cell's own.
         """
         offset = np.asarray(offset, np.float64)
-        if not self._first.intermediate.good[0]:
+        if not self._first.intermediate.usable[0]:
             return bound_outputs(self.network, images, rows, offset, memory=self.memory, arithmetic=self.arithmetic)
-        by_cell = _neuron_count(self.network) * 8 * (3 * images.dimensions + 18)
+        by_cell = self.network.neuron_count * 8 * (3 * images.dimensions + 18)
         step = max(1, int(0.25 * self.memory) // by_cell)
         bounds = []
         for first in range(0, images.count, step):
@@ -104,22 +99,22 @@ class _StoredCoefficients:
     Attributes:
         flat: [R] which numbers; a number may have two rows.
         sign: [R] what the rows are of: 1, or -1 for the numbers' negatives.
-        rows: By node: [R, n] float32 as in `BackwardTrace`.
+        by_node: By node: [R, n] float32 as in `BackwardTrace`.
         fixed: [R, 2] as in `BackwardTrace`.
     """
 
     flat: Int64
     sign: Float64
-    rows: dict[int, NDArray[np.float32]]
+    by_node: dict[int, NDArray[np.float32]]
     fixed: Float64
 
     def joined(self, other: _StoredCoefficients) -> _StoredCoefficients:
         """With those of another."""
         rows = {}
-        for at in self.rows.keys() | other.rows.keys():
+        for at in self.by_node.keys() | other.by_node.keys():
             both = [
-                stored.rows[at] if at in stored.rows else np.zeros((len(stored.flat), width), np.float32)
-                for width in [(self.rows if at in self.rows else other.rows)[at].shape[1]]
+                stored.by_node[at] if at in stored.by_node else np.zeros((len(stored.flat), width), np.float32)
+                for width in [(self.by_node if at in self.by_node else other.by_node)[at].shape[1]]
                 for stored in (self, other)
             ]
             rows[at] = np.concatenate(both)
@@ -138,9 +133,9 @@ class _ReferenceCell(CoefficientSource):
         #: by node
         self.stored: dict[int, _StoredCoefficients] = {}
         self._left = _ROWS_SHARE * memory
-        size, numbers = images.lower.shape[1], _neuron_count(network)
-        self._short = numbers > _MOST_TRACED
-        self._by_row = 4 * (size if self._short else numbers)
+        size, neuron_count = images.lower.shape[1], network.neuron_count
+        self._short = neuron_count > _MOST_TRACED
+        self._by_row = 4 * (size if self._short else neuron_count)
         self._keeps = size <= _MOST_NUMBERS
         if self._keeps:
             self.most_rows = max(16, _TOGETHER // self._by_row)
@@ -176,18 +171,18 @@ class _ReferenceCell(CoefficientSource):
         return BackwardTrace(count, self._short) if self._keeps and count * self._by_row <= self._left else None
 
     def keep(self, index: int, where: Int64, sign: Float64, trace: BackwardTrace) -> None:
-        size = sum(rows.nbytes for rows in trace.rows.values())
+        size = sum(rows.nbytes for rows in trace.by_node.values())
         if not trace.reached.any():
             return
         self._left -= size
         flat = np.array(np.ravel_multi_index(tuple(where[:, 1:].T), grid(self.network.shape(index))), np.int64)
-        stored = _StoredCoefficients(flat, np.asarray(sign, np.float64), trace.rows, trace.fixed)
+        stored = _StoredCoefficients(flat, np.asarray(sign, np.float64), trace.by_node, trace.fixed)
         if not trace.reached.all():
             reaching = trace.reached
             stored = _StoredCoefficients(
                 flat[reaching],
                 stored.sign[reaching],
-                {at: rows[reaching] for at, rows in trace.rows.items()},
+                {at: rows[reaching] for at, rows in trace.by_node.items()},
                 trace.fixed[reaching],
             )
         self.stored[index] = self.stored[index].joined(stored) if index in self.stored else stored
@@ -292,7 +287,7 @@ class _ReusingCells(CoefficientSource):
         # what intervals alone say has no slopes but those of what is between an activation's offsets
         signed, tilted = np.zeros((count, d + 2, m)), np.zeros((count, d + 1, m))
         half, spread, lost = np.zeros((count, 2, m)), np.zeros((count, m)), np.zeros((count, m))
-        for at, rows in stored.rows.items():
+        for at, rows in stored.by_node.items():
             n = rows.shape[1]
             loses = gamma(n + 4)
             one, two = self._column(at)
@@ -367,10 +362,10 @@ class _ReusingCells(CoefficientSource):
         twice = flat[order[1:]] == flat[order[:-1]]
         one, two = order[:-1][twice], order[1:][twice]
         below, above = np.where(sign[one] > 0.0, one, two), np.where(sign[one] > 0.0, two, one)
-        single = np.setdiff1d(np.arange(len(flat)), np.concatenate([one, two]))
+        unpaired = np.setdiff1d(np.arange(len(flat)), np.concatenate([one, two]))
         low, high = middle - half, middle + half
         # each row is best on one side
-        for first, other in ((single, single), (below, above)):
+        for first, other in ((unpaired, unpaired), (below, above)):
             at, apart = flat[first], slopes[:, other] - slopes[:, first]
             center, tilt = 0.5 * (low[:, first] + high[:, other]), 0.5 * (slopes[:, first] + slopes[:, other])
             radius = 0.5 * (high[:, other] - low[:, first]) + 0.5 * np.abs(apart).sum(-1)

@@ -117,18 +117,18 @@ class DualAscent:
         self,
         choices: Mapping[int, Sequence[LineChoice]],
         lines: Mapping[int, Float32],
-        rows: int,
+        count: int,
         held: Mapping[int, SplitNeurons] | None = None,
         phases: Mapping[int, NDArray[np.int8]] | None = None,
         step: float = FIRST_STEP,
     ) -> None:
         self.choices, self.split, self.phases = choices, dict(held or {}), dict(phases or {})
-        self._lines = {k: np.repeat(lines[k][:, None], rows, 1) for k in choices}
+        self._lines = {k: np.repeat(lines[k][:, None], count, 1) for k in choices}
         self.parameters = {
-            k: [np.repeat(choice.start(lines[k].reshape(6, -1))[None], rows, 0) for choice in own]
+            k: [np.repeat(choice.start(lines[k].reshape(6, -1))[None], count, 0) for choice in own]
             for k, own in choices.items()
         }
-        self.multipliers = {k: np.zeros((rows, len(v.flat)), np.float32) for k, v in self.split.items()}
+        self.multipliers = {k: np.zeros((count, len(v.flat)), np.float32) for k, v in self.split.items()}
         self._steps = {k: [_Adam(v.shape) for v in own] for k, own in self.parameters.items()}
         self._multipliers = {k: _Adam(v.shape) for k, v in self.multipliers.items()}
         self._step = step
@@ -208,19 +208,21 @@ def slope_derivatives(
     for k, node in enumerate(network.nodes[:last], 1):
         check_cancelled()
         inputs = [v for v in (values[i] for i in node.inputs) if v is not None]
-        rows = trace.get(k)
+        coefficients = trace.get(k)
         if isinstance(node.layer, LinearLayer):
             values.append(node.layer.apply(inputs))
-        elif rows is None:
+        elif coefficients is None:
             values.append(torch.zeros((count, *node.layer.shape), dtype=image.dtype))
         elif isinstance(node.layer, (Product, MaxPool)):
-            values.append(others[k](torch.from_numpy(rows), inputs).to(image.dtype).reshape(count, *node.layer.shape))
+            values.append(
+                others[k](torch.from_numpy(coefficients), inputs).to(image.dtype).reshape(count, *node.layer.shape)
+            )
         else:
             assert isinstance(node.layer, Activation)
             u = inputs[0].flatten(1).contiguous().numpy()
             result = np.empty(u.shape, np.float32)
             own = np.ascontiguousarray(lines(k)).reshape(6, -1, u.shape[1])
-            along_lines(rows.reshape(count, -1), u, own, result)
+            along_lines(coefficients.reshape(count, -1), u, own, result)
             source = node.inputs[0]
             if source in held:
                 here = held[source]
@@ -228,7 +230,7 @@ def slope_derivatives(
             values.append(torch.from_numpy(result).reshape(inputs[0].shape))
             for number, choice in enumerate(ascent.choices.get(k, ())):
                 at = choice.units
-                coefficient = rows.reshape(count, -1)[:, at.flat].astype(np.float64)
+                coefficient = coefficients.reshape(count, -1)[:, at.flat].astype(np.float64)
                 value = u[:, at.flat] + at.reference
                 by_node[k][number] = choice.derivative(ascent.parameters[k][number], coefficient, value)
         for i in node.inputs:

@@ -75,9 +75,9 @@ class SparseMatrix(LinearLayer):
         """[in, out] float32, for rows."""
         return self._matrix.t().float().coalesce()
 
-    def weight_for(self, rows: Tensor) -> Tensor:
-        """[in, out] weights in the rows' type."""
-        return self._single if rows.dtype == torch.float32 else self._matrix.t()
+    def weight_for(self, coefficients: Tensor) -> Tensor:
+        """[in, out] weights in the coefficients' type."""
+        return self._single if coefficients.dtype == torch.float32 else self._matrix.t()
 
     def _rows(self, value: Tensor) -> Tensor:
         """Rows [R, in] for ``value`` [R, out]."""
@@ -94,8 +94,8 @@ class SparseMatrix(LinearLayer):
     def magnitude(self, inputs: Sequence[Tensor]) -> Tensor:
         return torch.sparse.mm(self._absolute.to(inputs[0].dtype), inputs[0].flatten(1).T).T.reshape(-1, *self.shape)
 
-    def backward(self, rows: Coefficients) -> list[Coefficients]:
-        whole = full(rows, self.shape, force=True)
+    def backward(self, coefficients: Coefficients) -> list[Coefficients]:
+        whole = full(coefficients, self.shape, force=True)
         count = whole.value.shape[0]
         value = self._rows(torch.from_numpy(whole.value).reshape(count, -1))
         return [Coefficients.whole(value.contiguous().numpy().reshape(count, *grid(self.input_shapes[0])))]
@@ -112,13 +112,13 @@ class Variance(SparseMatrix):
     def spare(self, sizes: Sequence[Tensor]) -> Tensor | float:
         return gamma(VARIANCE_PASSES * self.terms) * self._means(sizes[1].square()) * UP + FLUSHES * FLUSH
 
-    def least(self, squares: NodeForm, x: NodeForm, single: bool) -> Tensor:
-        """[m, *shape] what the variance is at least, with its rounding if ``single``, but for flushes (N11).
+    def least(self, squares: NodeForm, x: NodeForm, in_float32: bool) -> Tensor:
+        """[m, *shape] what the variance is at least, with its rounding if ``in_float32``, but for flushes (N11).
 
         Squares are not negative, and one pass loses a part of the variance itself and of the square of the mean.
         """
         low = self._means(squares.interval.lower.clamp(min=0.0)) * (2.0 - MAGNITUDES_UP)
-        if not single:
+        if not in_float32:
             return low
         reach = self._means(x.reference + x.c).abs() + self._means(x.r)
         reach = reach + self._means(x.a.flatten(0, 1)).unflatten(0, x.a.shape[:2]).abs().sum(1)
@@ -130,10 +130,10 @@ class Variance(SparseMatrix):
     def _means(self, value: Tensor) -> Tensor:
         return torch.sparse.mm(self._absolute, value.flatten(1).T).T.reshape(-1, *self.shape)
 
-    def backward(self, rows: Coefficients) -> list[Coefficients]:
-        coefficients = super().backward(rows)
-        shape = (coefficients[0].value.shape[0], *grid(self.input_shapes[1]))
-        return [*coefficients, Coefficients.whole(np.zeros(shape, rows.value.dtype))]
+    def backward(self, coefficients: Coefficients) -> list[Coefficients]:
+        both = super().backward(coefficients)
+        shape = (both[0].value.shape[0], *grid(self.input_shapes[1]))
+        return [*both, Coefficients.whole(np.zeros(shape, coefficients.value.dtype))]
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,8 +212,8 @@ class PairwiseDifferences(LinearLayer):
     def magnitude(self, inputs: Sequence[Tensor]) -> Tensor:
         return (self._others(inputs[0]) + inputs[0][..., None]) * self._apart.to(inputs[0].dtype)
 
-    def backward(self, rows: Coefficients) -> list[Coefficients]:
-        whole = full(rows, self.shape, force=True)
+    def backward(self, coefficients: Coefficients) -> list[Coefficients]:
+        whole = full(coefficients, self.shape, force=True)
         count = whole.value.shape[0]
         value = torch.from_numpy(whole.value).reshape(count, *self.shape)
         value = value * self._apart.to(value.dtype)
@@ -259,8 +259,8 @@ class TransposedConvolution(Weighted):
     def magnitude(self, inputs: Sequence[Tensor]) -> Tensor:
         return self._spread(inputs[0], self.weight.abs())
 
-    def backward(self, rows: Coefficients) -> list[Coefficients]:
-        value = torch.from_numpy(full(rows, self.shape, force=True).value)
+    def backward(self, coefficients: Coefficients) -> list[Coefficients]:
+        value = torch.from_numpy(full(coefficients, self.shape, force=True).value)
         _, height, width = self.input_shapes[0]
         need = [
             (n - 1) * s + (k - 1) * d + 1

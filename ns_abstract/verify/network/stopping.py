@@ -100,9 +100,9 @@ class StoppingCriterion:
     def __getitem__(self, chosen: Any) -> StoppingCriterion:
         return replace(self, zero=self.zero[chosen], negative=self.negative[chosen])
 
-    def done(self, found: BackwardBounds, number: Int64) -> np.ndarray:
+    def done(self, bounds: BackwardBounds, number: Int64) -> np.ndarray:
         """Which of the rows ``number`` are done."""
-        zero, lower, upper = self.zero[number], found.lower[number], found.upper[number]
+        zero, lower, upper = self.zero[number], bounds.lower[number], bounds.upper[number]
         if self.goal.width is None:
             # the other side is asked for by another row
             return lower >= zero
@@ -121,21 +121,21 @@ class BackwardTrace:
         short: Whether only what they are on the image is kept.
 
     Attributes:
-        rows: By node: [R, n] float32 rows on outputs of nodes at which they gather what depends on the cell's ranges,
-            and on the image (0).
+        by_node: [R, n] float32 rows on outputs of nodes at which they gather what depends on the cell's ranges, and on
+            the image (0).
         fixed: [R, 2] what they gather at nodes of which they are not kept, at least and at most.
         reached: [R] which of them reach the image.
     """
 
     def __init__(self, count: int, short: bool) -> None:
         self.short = short
-        self.rows: dict[int, NDArray[np.float32]] = {}
+        self.by_node: dict[int, NDArray[np.float32]] = {}
         self.fixed = np.zeros((count, 2))
         self.reached = np.zeros(count, bool)
 
-    def keep(self, at: int, rows: Coefficients, shape: tuple[int, ...], number: Int64) -> None:
+    def keep(self, at: int, coefficients: Coefficients, shape: tuple[int, ...], number: Int64) -> None:
         """Remember rows ``number`` on the output of node ``at``."""
-        if at not in self.rows:
-            self.rows[at] = np.zeros((len(self.fixed), int(np.prod(shape))), np.float32)
-        whole = full(rows, shape, force=True)
-        self.rows[at][number] = whole.value.reshape(len(number), -1)
+        if at not in self.by_node:
+            self.by_node[at] = np.zeros((len(self.fixed), int(np.prod(shape))), np.float32)
+        whole = full(coefficients, shape, force=True)
+        self.by_node[at][number] = whole.value.reshape(len(number), -1)

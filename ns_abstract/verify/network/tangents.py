@@ -92,13 +92,13 @@ class Tangents:
             point = start.clone()
             at = wrong & ~start.isnan()
             if bool(at.any()):
-                bad, good, end, value = start[at], stop[at], end[at], value[at]
-                none = ~self._clear(good, end, value)
+                failing, holding, end, value = start[at], stop[at], end[at], value[at]
+                none = ~self._clear(holding, end, value)
                 for _ in range(_HALVINGS):
-                    middle = 0.5 * (bad + good)
+                    middle = 0.5 * (failing + holding)
                     fine = self._clear(middle, end, value)
-                    bad, good = torch.where(fine, bad, middle), torch.where(fine, middle, good)
-                point[at] = torch.where(none, math.nan, good)
+                    failing, holding = torch.where(fine, failing, middle), torch.where(fine, middle, holding)
+                point[at] = torch.where(none, math.nan, holding)
             points.append(point)
         return replace(self, first=points[0], last=points[1])
 

@@ -28,7 +28,7 @@ def centred(network: Network, image: Tensor) -> Network:
         image: [1, *input_shape] float64.
     """
     builder = NetworkBuilder(network.source, network.input_shape)
-    values, numbers, changed = [image], [0], False
+    values, new_number, changed = [image], [0], False
 
     def add(layer: Layer, *inputs: int, name: str = "", op: str = "") -> int:
         builder.nodes.append(Node(name, op, layer, inputs))
@@ -40,16 +40,16 @@ def centred(network: Network, image: Tensor) -> Network:
         parts = _mean(network, k)
         moved = None if parts is None else _moved(node.layer, values[k])
         if parts is None or moved is None:
-            numbers.append(add(node.layer, *(numbers[i] for i in node.inputs), name=node.name, op=node.op))
+            new_number.append(add(node.layer, *(new_number[i] for i in node.inputs), name=node.name, op=node.op))
             continue
         changed, (weight, mean) = True, moved
         shape, one = (len(mean),), network.shape(parts[1])
-        numerator = builder.matrix(numbers[parts[0]], weight, None)
+        numerator = builder.matrix(new_number[parts[0]], weight, None)
         index = torch.zeros(len(mean), dtype=torch.int64)
-        inverse = add(Gather((one,), shape, 0, 0, index), numbers[parts[1]])
+        inverse = add(Gather((one,), shape, 0, 0, index), new_number[parts[1]])
         quotient = add(Product(shape), numerator, inverse)
-        numbers.append(builder.scale(quotient, np.ones(()), mean))
-    return builder.network(numbers[-1], network.output) if changed else network
+        new_number.append(builder.scale(quotient, np.ones(()), mean))
+    return builder.network(new_number[-1], network.output) if changed else network
 
 
 def _moved(layer: Layer, value: Tensor) -> tuple[np.ndarray, np.ndarray] | None:

@@ -102,16 +102,16 @@ class WorkBudget:
         """So many products were not taken after all."""
         self.left += products
 
-    def gains(self, kept: float, part: float) -> bool:
+    def gains(self, width_left: float, part: float) -> bool:
         """Whether rows for all numbers are worth it that leave so large a part of widths, if ``part`` is open."""
-        return part > _RENEW or kept < _WORTH
+        return part > _RENEW or width_left < _WORTH
 
-    def vain(self, kept: float, unstable: float, part: float) -> bool:
+    def vain(self, width_left: float, unstable: float, part: float) -> bool:
         """Leave a node as it is if rows leave so large a part of widths, or of signs not found out.
 
         Where most of it is open, ``part``, the nodes behind it are given up, too.
         """
-        hopeless = kept > _KEPT or unstable > _LOST
+        hopeless = width_left > _KEPT or unstable > _LOST
         if hopeless and part > _MOST:
             self.left = 0.0
         return hopeless
