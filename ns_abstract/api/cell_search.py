@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import io
 import math
-import os
-import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -18,17 +16,14 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from ns_abstract.api.bounding import listener
 from ns_abstract.api.margins import NOT_ASKED, SHARE, Margins, certified_cells
 from ns_abstract.api.searching import periodic_report, search_blocks
 from ns_abstract.execution.cancellation import Deadline
 from ns_abstract.execution.engines import Engine
-from ns_abstract.execution.stopping import StopRequest, interruptible
+from ns_abstract.execution.stopping import StopRequest
 from ns_abstract.execution.threads import use_threads
 from ns_abstract.execution.worker_cache import Recipe, load
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.io.arguments import positive, whole
-from ns_abstract.io.errors import InputError
 from ns_abstract.io.folder import first_command
 from ns_abstract.report.certificate import LastReport
 from ns_abstract.report.figures import percent
@@ -380,43 +375,6 @@ class CellSearch(Generic[P]):
         finally:
             margins.keep()
             self.scene_margin = {**about, **margins.entry}
-
-
-def check_arguments(request: Request, workers: int, output_dir: str | os.PathLike[str] | None) -> None:
-    """Refuse arguments of `ns_abstract.certify` and its kin that cannot be used.
-
-    Raises:
-        InputError: One of them.
-    """
-    positive(request.budget, "time_budget")
-    whole(workers, 1, "workers")
-    if request.resume and output_dir is None:
-        raise InputError("given without output_dir", field="resume", fix="give the folder to go on with")
-
-
-def answered(
-    question: CellQuestion[P],
-    request: Request,
-    on_progress: Callable[[P], object] | None,
-    engine: Callable[[ExitStack], Engine],
-    output_dir: str | os.PathLike[str] | None,
-) -> tuple[dict[int, list[Row]], dict[str, Any]]:
-    """The cells by number and the content of report.json, of a search that Ctrl-C or its listener may end.
-
-    Args:
-        question: What is claimed.
-        request: How much is to be done.
-        on_progress: Told about once a second.
-        engine: See `CellSearch.run`.
-        output_dir: Output folder; None: nothing is kept on disk.
-    """
-    with ExitStack() as stack:
-        if output_dir is None:
-            output_dir = stack.enter_context(tempfile.TemporaryDirectory(prefix="ns-abstract-"))
-        stop = stack.enter_context(interruptible())
-        search = CellSearch(question, Path(output_dir))
-        document = search.run(engine, stop, replace(request, on_progress=listener(stop, on_progress)))
-        return search.rows, document
 
 
 def result_cells(rows: Mapping[int, list[Row]], make: Callable[..., C], *columns: str) -> tuple[C, ...]:
