@@ -104,9 +104,7 @@ class CellQuestion(ABC, Generic[P]):
     """A claim with a margin about sets of poses, each under a number, and the report on it.
 
     Args:
-        examiner: Finds verdicts.
         parameters: Names and units of the parameters of all sets together.
-        sets: The set of every number that is asked about.
         fixed: By number, the values of parameters that do not vary in it.
     """
 
@@ -189,13 +187,9 @@ class Request:
 
     Attributes:
         budget: Seconds.
-        resume: Whether to go on with what the folder holds.
-        report: Whether to write a report.
         scene_margin: Whether to look for the largest variation of the scene for which what is certified holds, in half
             of the time.
         on_open: Called with the store before the search, when there is a report.
-        on_progress: Told about once a second where the search stands.
-        on_margin: Told the margins, kind by kind.
     """
 
     budget: float
@@ -211,19 +205,11 @@ class Request:
 class CellSearch(Generic[P]):
     """The search for verdicts on a question's cells.
 
-    Args:
-        question: What is claimed.
-        folder: Output folder.
-
     Attributes:
-        grids: By number, the cells of its set.
         store: ``cells.sqlite``, from `open` on.
-        stop: Asks the search to end.
-        rows: By number, the cells at the end.
         last: Writes the report, also when the process is ended.
         scene_margin: What report.json says of margins of the scene.
         deadline: When no more pictures are made for the report.
-        whole: When the time for the search is over.
     """
 
     question: CellQuestion[P]
@@ -284,7 +270,6 @@ class CellSearch(Generic[P]):
         Args:
             engine: Starts the engine, which ends with the stack.
             stop: Asked at least twice a second.
-            request: How much is to be done.
 
         Raises:
             InputError: The folder cannot be used, or the question cannot be asked.
@@ -381,9 +366,7 @@ def result_cells(rows: Mapping[int, list[Row]], make: Callable[..., C], *columns
     """Cells of a result.
 
     Args:
-        rows: Cells by number of their set.
         make: Takes the number, the ends of the box, the verdict, ``columns`` of the row and its counterexample or None.
-        columns: Names of what else a cell says.
     """
 
     def array(values: Any) -> np.ndarray | None:

@@ -94,14 +94,7 @@ class CertifyProgress(SearchProgress):
 
 
 class CertificateQuestion(CellQuestion[CertifyProgress]):
-    """What a network does on every picture of some frames' sets, and the report on it.
-
-    Args:
-        job: What is certified.
-        frames: Numbers of the frames.
-        settings: What the report says that was asked for.
-        command: The command line, or the call.
-    """
+    """What a network does on every picture of some frames' sets, and the report on it."""
 
     def __init__(
         self, job: Certification, frames: Sequence[int], settings: Mapping[str, Any], command: tuple[str, ...]

@@ -31,7 +31,6 @@ class PropertySource:
     """A property and the file that states it.
 
     Attributes:
-        value: Content of PROP.json.
         file: The file, or None.
     """
 
@@ -90,8 +89,6 @@ class FramePictures:
     """One frame's pictures, for `ns_abstract.verify.search.Search`.
 
     Args:
-        method: The scene and its program.
-        poses: The frame's set.
         picture: Whether the network is shown floats or rounded pictures.
         response: The cameras that may show them; None: one that shows what is rendered.
         sheared: Whether parameters may be counted otherwise than the set does, where that is tighter (P2).

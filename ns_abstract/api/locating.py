@@ -35,6 +35,9 @@ from ns_abstract.verify.store import Store
 if TYPE_CHECKING:
     from typing import Unpack  # pyright: ignore[reportAttributeAccessIssue]  # of Python 3.11
 
+#: How far 255 times a float may be from a whole number: float32 rounds numbers up to 1 by 2^-25, here at most 2^-17.
+_LEVEL_ERROR = 1e-3
+
 
 @dataclass(frozen=True)
 class LocateProgress(SearchProgress):
@@ -63,14 +66,7 @@ class LocateProgress(SearchProgress):
 
 
 class LocationQuestion(CellQuestion[LocateProgress]):
-    """Which poses of some frames' sets can have made a photo, and the report on it.
-
-    Args:
-        job: The photo and the sets.
-        frames: Numbers of the frames.
-        settings: What the report says that was asked for.
-        command: The command line, or the call.
-    """
+    """Which poses of some frames' sets can have made a photo, and the report on it."""
 
     store = LocationStore
 
@@ -280,7 +276,7 @@ def photo_levels(photo: ArrayLike) -> np.ndarray:
     with np.errstate(invalid="ignore"):
         exact = values.astype(np.float64) * 255.0
         levels = np.rint(exact)
-        fits = (levels >= 0.0) & (levels <= 255.0) & (np.abs(levels - exact) <= 1e-3)
+        fits = (levels >= 0.0) & (levels <= 255.0) & (np.abs(levels - exact) <= _LEVEL_ERROR)
     if values.dtype.kind == "u" or not fits.all():
         raise InputError(
             "has values that are no multiples of 1/255 in [0, 1]", field="photo",

@@ -153,7 +153,6 @@ class PoseSet:
         """The set of an object as it stands in a perturbation file; all that the file can say.
 
         Args:
-            camera: The camera.
             specification: The object; None: the camera's pose alone.
             following: The next keyframe, which ``"sweep": "segments"`` needs: ``path.following(k)`` of
                 `load_camera_path`; None after the last entry of an open path.

@@ -77,9 +77,6 @@ class LoopQuestion(CellQuestion[ReachProgress]):
     """What holds of every run of a loop, by the numbers of `QUESTIONS`, and the report on it.
 
     Args:
-        job: The loop.
-        settings: What the report says that was asked for.
-        command: The command line, or the call.
         film: Whether to make a film along the tube of a certified cell.
     """
 

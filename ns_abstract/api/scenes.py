@@ -29,13 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class SceneSource:
-    """Where a scene is read from.
-
-    Attributes:
-        file: config.yml of a run, or a scene file.
-        options: Which program draws it.
-        overrides: What the user says of the scene in place of its files.
-    """
+    """Where a scene is read from."""
 
     file: Path
     options: ProgramOptions = field(default_factory=ProgramOptions)
@@ -76,7 +70,6 @@ class Scene:
 
         Args:
             arithmetic: "float32" or "real"; None: the strongest that the representation has.
-            workers: Processes that it may use.
 
         Raises:
             InputError: An option does not go with the scene.

@@ -101,8 +101,6 @@ class _Description:
 
     Args:
         meta: What it holds, with plain names of pictures.
-        file: Where it is from, for messages.
-        read: The content of a picture by its name.
     """
 
     def __init__(self, meta: dict[str, Any], file: Path, read: Callable[[str], bytes]) -> None:
