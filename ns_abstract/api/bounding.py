@@ -94,11 +94,7 @@ OnProgress = Callable[[Progress], object]
 
 
 class TileTask(NamedTuple):
-    """One task.
-
-    Attributes:
-        tiles: Numbers of its tiles; None: all.
-    """
+    """One task; ``tiles``: numbers of its tiles; None: all."""
 
     index: int
     tiles: np.ndarray | None

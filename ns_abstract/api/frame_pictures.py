@@ -28,11 +28,7 @@ _IMAGES = 64
 
 @dataclass(frozen=True)
 class PropertySource:
-    """A property and the file that states it.
-
-    Attributes:
-        file: The file, or None.
-    """
+    """A property and the file that states it; ``file``: the file, or None."""
 
     value: Any
     file: Path | None = None

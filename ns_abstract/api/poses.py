@@ -193,11 +193,7 @@ class PoseSet:
         self.perturbation()
 
     def perturbation(self, dataset_scale: float = 1.0) -> Perturbation:
-        """What varies, in normalised units.
-
-        Args:
-            dataset_scale: Normalised units per unit of the data set.
-        """
+        """What varies, in normalised units; ``dataset_scale``: normalised units per unit of the data set."""
         return parse_perturbation(self.specification, dataset_scale=dataset_scale, field_prefix="", folder=self.folder)
 
     def of(self, scene: Scene) -> poses.PoseBox:

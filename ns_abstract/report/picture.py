@@ -63,11 +63,7 @@ def _box_items(box: ParameterBox, units: ShownUnits) -> list[str]:
 
 
 class _Sheet(NamedTuple):
-    """Sizes of a picture of four panels, in its own pixels.
-
-    Attributes:
-        dpi: Pixels by inch.
-    """
+    """Sizes of a picture of four panels, in its own pixels; ``dpi``: pixels by inch."""
 
     dpi: float
     panel: tuple[int, int]

@@ -153,11 +153,7 @@ class CommandRun:
         }
 
     def tail(self, state: str, metrics: Mapping[str, str]) -> dict[str, Any]:
-        """The last keys of report.json.
-
-        Args:
-            state: "running", "done", "budget" or "interrupted".
-        """
+        """The last keys of report.json; ``state``: "running", "done", "budget" or "interrupted"."""
         return {
             "plan": self.plan,
             "state": state,
