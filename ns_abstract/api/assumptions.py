@@ -68,7 +68,6 @@ def set_choices(pose_sets: Sequence[PoseBox], size: str, varied: str) -> tuple[A
     """Return the choices about the pictures' size and the varied parameters of the sets.
 
     Args:
-        pose_sets: One by frame.
         size: Origin of the size.
         varied: Origin of the sets.
     """
@@ -86,9 +85,6 @@ def file_choices(
     """The same for the files of a command line.
 
     Args:
-        pose_sets: One by entry of the camera path.
-        path: The camera path.
-        factor: By which pictures are made smaller.
         file: The perturbation file, or None.
         given: Whether options say what varies.
         inside: Whether the camera path says so.

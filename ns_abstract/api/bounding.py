@@ -94,12 +94,7 @@ OnProgress = Callable[[Progress], object]
 
 
 class TileTask(NamedTuple):
-    """One task.
-
-    Attributes:
-        index: The frame.
-        tiles: Numbers of its tiles; None: all.
-    """
+    """One task; ``tiles``: numbers of its tiles; None: all."""
 
     index: int
     tiles: np.ndarray | None
@@ -116,10 +111,6 @@ def bound_part(
     """Bound one part of a frame on a worker, which keeps the scene open; None if the time ended before any result.
 
     Args:
-        recipe: Of the job.
-        part: What to bound.
-        goal: When to stop.
-        keep_leaves: Whether the result carries linear sets.
         neighbours: Tasks that share this machine's cores.
         earlier: What was found of the frame before, where that saves work.
 
@@ -160,14 +151,8 @@ def bound_frames(
     first frame is always begun, and a frame that is begun is finished.
 
     Args:
-        job: What is bounded.
-        frames: Their numbers.
-        engine: Where; closed at the end.
         budget: Seconds for all of them, compiling at first use not counted.
-        target_ratio: Where a frame is good enough.
-        keep_leaves: Whether results carry linear sets.
         stop: Asked between cells in this process, and twice a second while others work.
-        on_progress: Told where the work of this process stands.
         found_before: Gives what an earlier command found of a frame. Rays go on from there, those first of which least
             is known.
 
@@ -196,11 +181,6 @@ class _FrameSchedule:
 
     Attributes:
         job, engine, target_ratio, keep_leaves, on_progress, found_before: As `bound_frames` has them.
-        frames: Their numbers.
-        request: Asked whether to stop.
-        budget: Seconds for all of them.
-        deadline: When they end.
-        goals: Of the frames that are begun.
     """
 
     job: Job

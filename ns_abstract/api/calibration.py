@@ -78,8 +78,6 @@ def calibrate(
         scene: A run of Nerfstudio whose data set lies where it was, or near it.
         height: Of the pictures that will be compared; photos that are higher are reduced to it.
         noise, outliers: The least that are chosen.
-        arithmetic: Of the pictures.
-        tuning: Preferences.
 
     Raises:
         InputError: The scene has no such photos, or they cannot be used.

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import io
 import math
-import os
-import tempfile
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -18,17 +16,14 @@ from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 
-from ns_abstract.api.bounding import listener
 from ns_abstract.api.margins import NOT_ASKED, SHARE, Margins, certified_cells
 from ns_abstract.api.searching import periodic_report, search_blocks
 from ns_abstract.execution.cancellation import Deadline
 from ns_abstract.execution.engines import Engine
-from ns_abstract.execution.stopping import StopRequest, interruptible
+from ns_abstract.execution.stopping import StopRequest
 from ns_abstract.execution.threads import use_threads
 from ns_abstract.execution.worker_cache import Recipe, load
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.io.arguments import positive, whole
-from ns_abstract.io.errors import InputError
 from ns_abstract.io.folder import first_command
 from ns_abstract.report.certificate import LastReport
 from ns_abstract.report.figures import percent
@@ -109,9 +104,7 @@ class CellQuestion(ABC, Generic[P]):
     """A claim with a margin about sets of poses, each under a number, and the report on it.
 
     Args:
-        examiner: Finds verdicts.
         parameters: Names and units of the parameters of all sets together.
-        sets: The set of every number that is asked about.
         fixed: By number, the values of parameters that do not vary in it.
     """
 
@@ -194,13 +187,9 @@ class Request:
 
     Attributes:
         budget: Seconds.
-        resume: Whether to go on with what the folder holds.
-        report: Whether to write a report.
         scene_margin: Whether to look for the largest variation of the scene for which what is certified holds, in half
             of the time.
         on_open: Called with the store before the search, when there is a report.
-        on_progress: Told about once a second where the search stands.
-        on_margin: Told the margins, kind by kind.
     """
 
     budget: float
@@ -216,19 +205,11 @@ class Request:
 class CellSearch(Generic[P]):
     """The search for verdicts on a question's cells.
 
-    Args:
-        question: What is claimed.
-        folder: Output folder.
-
     Attributes:
-        grids: By number, the cells of its set.
         store: ``cells.sqlite``, from `open` on.
-        stop: Asks the search to end.
-        rows: By number, the cells at the end.
         last: Writes the report, also when the process is ended.
         scene_margin: What report.json says of margins of the scene.
         deadline: When no more pictures are made for the report.
-        whole: When the time for the search is over.
     """
 
     question: CellQuestion[P]
@@ -289,7 +270,6 @@ class CellSearch(Generic[P]):
         Args:
             engine: Starts the engine, which ends with the stack.
             stop: Asked at least twice a second.
-            request: How much is to be done.
 
         Raises:
             InputError: The folder cannot be used, or the question cannot be asked.
@@ -382,50 +362,11 @@ class CellSearch(Generic[P]):
             self.scene_margin = {**about, **margins.entry}
 
 
-def check_arguments(request: Request, workers: int, output_dir: str | os.PathLike[str] | None) -> None:
-    """Refuse arguments of `ns_abstract.certify` and its kin that cannot be used.
-
-    Raises:
-        InputError: One of them.
-    """
-    positive(request.budget, "time_budget")
-    whole(workers, 1, "workers")
-    if request.resume and output_dir is None:
-        raise InputError("given without output_dir", field="resume", fix="give the folder to go on with")
-
-
-def answered(
-    question: CellQuestion[P],
-    request: Request,
-    on_progress: Callable[[P], object] | None,
-    engine: Callable[[ExitStack], Engine],
-    output_dir: str | os.PathLike[str] | None,
-) -> tuple[dict[int, list[Row]], dict[str, Any]]:
-    """The cells by number and the content of report.json, of a search that Ctrl-C or its listener may end.
-
-    Args:
-        question: What is claimed.
-        request: How much is to be done.
-        on_progress: Told about once a second.
-        engine: See `CellSearch.run`.
-        output_dir: Output folder; None: nothing is kept on disk.
-    """
-    with ExitStack() as stack:
-        if output_dir is None:
-            output_dir = stack.enter_context(tempfile.TemporaryDirectory(prefix="ns-abstract-"))
-        stop = stack.enter_context(interruptible())
-        search = CellSearch(question, Path(output_dir))
-        document = search.run(engine, stop, replace(request, on_progress=listener(stop, on_progress)))
-        return search.rows, document
-
-
 def result_cells(rows: Mapping[int, list[Row]], make: Callable[..., C], *columns: str) -> tuple[C, ...]:
     """Cells of a result.
 
     Args:
-        rows: Cells by number of their set.
         make: Takes the number, the ends of the box, the verdict, ``columns`` of the row and its counterexample or None.
-        columns: Names of what else a cell says.
     """
 
     def array(values: Any) -> np.ndarray | None:

@@ -32,13 +32,7 @@ _SEEN, _SEEN_PIXELS = 64, 96
 
 
 class CertificateReport:
-    """Writes report.json and report.html of a search.
-
-    Args:
-        job: What is certified.
-        about: What the report says of the command.
-        search: The search.
-    """
+    """Writes report.json and report.html of a search."""
 
     def __init__(self, job: Certification, about: CertifiedRun, search: CellSearch[Any]) -> None:
         self.job, self.about, self.search = job, about, search

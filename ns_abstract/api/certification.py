@@ -100,7 +100,6 @@ class Certification:
 
     Args:
         job: The scene and the sets, one by frame, as `Question.drawn` makes them.
-        question: The property, with its network if it has one.
         memory: Bytes for the network's bounds of one process.
         network_arithmetic: Whether every float32 evaluation of the network is meant, or the exact one alone.
         picture: Whether the network is shown floats or pictures of 8 bits.
@@ -191,7 +190,6 @@ class Certification:
         """What is to hold in a frame.
 
         Args:
-            pictures: Of the frame.
             poses: The frame's set, if its parameters are counted otherwise than the pictures have them.
 
         Raises:
@@ -254,12 +252,7 @@ class Certification:
         return self.search(number, grid).examine(cells)
 
     def _cover(self, pictures: FramePictures, response: CameraResponse | None = None) -> SubBoxProof | None:
-        """What proves cells of a frame part by part; None with one parameter, and where rays cost more than networks.
-
-        Args:
-            pictures: The frame's pictures.
-            response: The cameras that may show them.
-        """
+        """What proves a frame's cells part by part; None with one parameter, and where rays cost more than networks."""
         model = self.model
         if not isinstance(model, NetworkModel) or pictures.box.dimensions < 2 or pictures.frame.tilewise:
             return None
@@ -345,10 +338,6 @@ class Certification:
     def foresee(self, index: int, seconds: float) -> None:
         """Refuse a frame of which not even the first part can be bounded, where pictures are made ray by ray.
 
-        Args:
-            index: The frame.
-            seconds: Time that there is for it.
-
         Raises:
             InputError: What it would take.
         """
@@ -383,9 +372,6 @@ class Certification:
         """Write the abstract image of a cell, the network and the property for other verifiers.
 
         Args:
-            index: Entry of the camera path.
-            box: The cell.
-            target: Path without ending.
             form, version: As in `ns_abstract.verify.interop.write_vnnlib`.
 
         Returns:
@@ -431,9 +417,7 @@ class CertifySettings:
     """What to certify, as the command line says it.
 
     Attributes:
-        files: The scene and the sets of poses.
         model: Network, .onnx; None: the property is one of the picture.
-        property: PROP.json.
         network_arithmetic: "float32" or "real", of the network.
         picture: Whether the network is shown floats or pictures of 8 bits.
         memory: Bytes for the bounds of one process.

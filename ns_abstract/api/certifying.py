@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -16,9 +16,7 @@ from ns_abstract.api.cell_search import (
     Request,
     Row,
     SearchProgress,
-    answered,
     cell_place,
-    check_arguments,
     result_cells,
     shares_text,
 )
@@ -27,8 +25,8 @@ from ns_abstract.api.certification import MEMORY, Certification, PropertySource,
 from ns_abstract.api.job import Job
 from ns_abstract.api.poses import PoseSet, pose_sets
 from ns_abstract.api.scenes import Scene, checked_scene
+from ns_abstract.api.search_options import SearchKeywords, SearchOptions
 from ns_abstract.execution.cancellation import Deadline
-from ns_abstract.execution.starting import EngineName, started
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.io.arguments import file_path
@@ -44,6 +42,9 @@ from ns_abstract.verify.eight_bit import Picture
 from ns_abstract.verify.network import NetworkArithmetic
 from ns_abstract.verify.scene_margin import ProveCell, VariationKind, check_scenes
 from ns_abstract.verify.store import Store, fractions
+
+if TYPE_CHECKING:
+    from typing import Unpack  # pyright: ignore[reportAttributeAccessIssue]  # of Python 3.11
 
 #: Seconds that pictures for the last report may take beyond the budget, where they are made ray by ray.
 _LAST = 5.0
@@ -93,14 +94,7 @@ class CertifyProgress(SearchProgress):
 
 
 class CertificateQuestion(CellQuestion[CertifyProgress]):
-    """What a network does on every picture of some frames' sets, and the report on it.
-
-    Args:
-        job: What is certified.
-        frames: Numbers of the frames.
-        settings: What the report says that was asked for.
-        command: The command line, or the call.
-    """
+    """What a network does on every picture of some frames' sets, and the report on it."""
 
     def __init__(
         self, job: Certification, frames: Sequence[int], settings: Mapping[str, Any], command: tuple[str, ...]
@@ -278,18 +272,12 @@ def certify(
     model: str | os.PathLike[str] | None,
     property: Mapping[str, Any] | str | os.PathLike[str],
     *,
-    time_budget: float = 600.0,
-    output_dir: str | os.PathLike[str] | None = None,
-    arithmetic: str | None = None,
     network_arithmetic: NetworkArithmetic = "float32",
     picture: Picture = "float",
-    resume: bool = False,
     on_progress: Callable[[CertifyProgress], object] | None = None,
-    workers: int = 1,
-    engine: EngineName = "local",
-    scheduler_address: str | None = None,
     memory_limit: float | None = None,
     scene_margin: bool = False,
+    **search: Unpack[SearchKeywords],
 ) -> Certificate:
     """Prove, or break, a property of a network, or of the picture itself, on every picture over sets of poses.
 
@@ -300,49 +288,34 @@ def certify(
         poses: One set, or several; a camera is the set of its one pose.
         model: Network, .onnx; None: the property is one of the picture (visible, clear, picture, all, any).
         property: What is to hold, as the object of a property file, or that file.
-        time_budget: Seconds for all sets together.
-        output_dir: Folder for cells.sqlite, the report and counterexamples, as ns-abstract-certify writes them; None:
-            nothing is kept on disk.
-        arithmetic: "float32" or "real", of the pictures; None: float32.
         network_arithmetic: "float32": every float32 evaluation of the network; "real": the exact network alone.
         picture: "float": the renderer's floats; "8-bit": these rounded to multiples of 1/255, as files have them.
-        resume: Whether to go on with what ``output_dir`` holds.
         on_progress: Told about once a second.
-        workers: Processes (for a NeRF: that bound rays, which all cells share); with more than one, a script needs
-            ``if __name__ == "__main__":``.
-        engine: "dask" spreads the cells over a Dask cluster.
-        scheduler_address: HOST:PORT of its scheduler; None: a cluster on this machine.
         memory_limit: GiB; None: 80 % of what is free.
         scene_margin: Whether to look, in half of the time, for the largest variation of the Gaussians for which what is
             certified holds; see the report's key ``scene_margin``.
+        **search: Fields of `SearchOptions`: ``time_budget``, ``output_dir``, ``workers``, ...
 
     Raises:
         InputError: An argument cannot be used.
     """
-    request = Request(time_budget, resume, output_dir is not None, scene_margin)
-    check_arguments(request, workers, output_dir)
+    options = SearchOptions(**search)
     if picture not in ("float", "8-bit"):
         raise InputError(f"found {picture}", field="picture", fix="use float or 8-bit")
     source = property if isinstance(property, Mapping) else file_path(property, "property")
     question = asked(None if model is None else file_path(model, "model"), PropertySource.of(source))
     drawn = [question.drawn(entry.of(checked_scene(scene))) for entry in pose_sets(poses)]
-    memory = network_memory(memory_limit, workers)
-    job = Job(scene, drawn, arithmetic=arithmetic, workers=workers)
+    memory = network_memory(memory_limit, options.workers)
+    job = Job(scene, drawn, arithmetic=options.arithmetic, workers=options.workers)
     certification = Certification(job, question, memory, network_arithmetic=network_arithmetic, picture=picture)
-    check_network_memory(certification, memory_limit, workers)
-    settings = {
-        "time_budget": time_budget,
-        "arithmetic": arithmetic,
-        "picture": picture,
-        "workers": workers,
-        "engine": engine,
-    }
-    rows, document = answered(
+    check_network_memory(certification, memory_limit, options.workers)
+    settings = {**options.settings, "picture": picture}
+    rows, document = options.search(
         CertificateQuestion(certification, range(len(drawn)), settings, ("ns_abstract.certify",)),
-        request,
         on_progress,
-        lambda engines: engines.enter_context(started(engine, scheduler_address, 1 if scene.rays else workers)),
-        output_dir,
+        workers=1 if scene.rays else options.workers,
+        report=options.output_dir is not None,
+        scene_margin=scene_margin,
     )
     return certificate(certification, rows, document)
 

@@ -63,9 +63,7 @@ class ComparisonJob(Job):
     Args:
         scene: A, in whose frame cameras are given.
         other: B.
-        pose_sets: One by frame.
         tolerance: Difference of which is asked whether any picture exceeds it; None: nothing is asked.
-        path: The camera path of a command line.
         options: Those of `Job`.
 
     Raises:
@@ -230,7 +228,6 @@ def open_comparison(settings: Settings, other: SceneSource, tolerance: float | N
     """Open the files of a command line.
 
     Args:
-        settings: A, and the set of poses.
         other: B.
         tolerance: See `ComparisonJob`.
 

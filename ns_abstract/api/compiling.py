@@ -84,8 +84,6 @@ def compile_beside(job: Job, index: int, processes: int | None = None) -> None:
     What they cannot compile is left to this process.
 
     Args:
-        job: The scene with its sets.
-        index: Number of a frame.
         processes: How many; None: one for every core.
     """
     frame = job.frame(index)

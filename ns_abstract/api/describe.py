@@ -19,12 +19,7 @@ _METRES = "if a unit of the data set is a metre"
 
 
 def describe(job: PathJob, frames: Sequence[int]) -> list[str]:
-    """Return lines of text about the scene, its units, and the cameras and sets of some frames.
-
-    Args:
-        job: The scene with its sets.
-        frames: Numbers of the frames.
-    """
+    """Return lines of text about the scene, its units, and the cameras and sets of some frames."""
     return [*_scene(job), "", *_cameras(job, frames), "", *_sets(job, frames)]
 
 

@@ -34,7 +34,6 @@ class Explanation:
     """The explanation of a frame's gap: its causes, regions and scene elements.
 
     Attributes:
-        index: Number of the frame.
         gap, excess: Mean over pixels and channels of the bounds' width, and what of it no render reached.
         leaves: Leaf cells (one tile each) that were bounded again.
         causes: Part of these leaves' excess that goes away without each, taken one at a time.
@@ -84,14 +83,7 @@ def check_explained(job: Job) -> None:
 
 
 def explain(job: Job, index: int, result: FrameResult, seed: int = 0) -> Explanation:
-    """Return the explanation of a frame: bounds some leaf cells again without each cause of looseness in turn.
-
-    Args:
-        job: The scene with its sets.
-        index: Number of the frame.
-        result: What was found, with its leaves.
-        seed: Of the leaves that are looked at.
-    """
+    """Return the explanation of a frame: bounds some leaf cells again without each cause of looseness in turn."""
     # of colours alone: other layers have units of their own
     leaves, frame = result.leaves, job.method.frame(job.pose_sets[index])
     over = np.asarray(result.upper, np.float64) - result.lower

@@ -24,18 +24,11 @@ class Settings:
     """The options of a command line that say what to bound.
 
     Attributes:
-        load_config: config.yml of a run, or a scene file.
-        camera_path_filename: Camera path JSON.
         perturbation_filename: Perturbation JSON; None: the camera path holds it.
         given_set: The content of a perturbation file, in place of one; errors name its keys as options.
-        downscale_factor: Pictures become this many times smaller.
         arithmetic: "float32" or "real"; None: the strongest that the method has.
-        seed: Of the random witnesses.
         memory_limit: GiB.
-        workers: Processes that bound the rays of a NeRF.
         outputs: "rgb", and what is bounded beside it: "depth", "accumulation".
-        program: Which program draws the scene.
-        overrides: What the user says of the scene in place of its files.
     """
 
     load_config: Path
@@ -66,13 +59,7 @@ class Settings:
 
 
 class PathJob(Job):
-    """The job of a camera path.
-
-    Attributes:
-        path: The camera path.
-        scene: The scene.
-        settings: The files and options.
-    """
+    """The job of a camera path."""
 
     def __init__(self, settings: Settings, scene: Scene, path: CameraPath, pose_sets: tuple[PoseBox, ...]) -> None:
         self.settings, self.scene, self.path = settings, scene, path
@@ -123,7 +110,6 @@ def open_job(
     """Open the files of a command line.
 
     Args:
-        settings: What to bound.
         perturbation: For every entry of the path, in place of what the files say.
         default: For entries of which the files say nothing; without it they are an error.
         drawn: Gives each set the size of picture that is asked about; None: the path's.

@@ -28,12 +28,7 @@ _IMAGES = 64
 
 @dataclass(frozen=True)
 class PropertySource:
-    """A property and the file that states it.
-
-    Attributes:
-        value: Content of PROP.json.
-        file: The file, or None.
-    """
+    """A property and the file that states it; ``file``: the file, or None."""
 
     value: Any
     file: Path | None = None
@@ -90,8 +85,6 @@ class FramePictures:
     """One frame's pictures, for `ns_abstract.verify.search.Search`.
 
     Args:
-        method: The scene and its program.
-        poses: The frame's set.
         picture: Whether the network is shown floats or rounded pictures.
         response: The cameras that may show them; None: one that shows what is rendered.
         sheared: Whether parameters may be counted otherwise than the set does, where that is tighter (P2).

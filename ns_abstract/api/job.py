@@ -49,10 +49,7 @@ class Job:
     """A scene and its frames' sets of poses.
 
     Args:
-        scene: The scene.
-        pose_sets: One by frame.
         arithmetic: "float32" or "real"; None: the strongest that the scene has.
-        seed: Of the random witnesses.
         memory_limit: GiB; None: 80 % of what is free.
         workers: Processes that one frame may use, where pictures are made ray by ray.
         layers: What is bounded beside the colours, of `ns_abstract.refine.result.EXTRA_OUTPUTS`.
@@ -229,7 +226,7 @@ class Job:
         progress: Callable[[TracePoint, float], None] = lambda point, share: None,
         earlier: FrameResult | None = None,
     ) -> PartResult:
-        """Refine some tiles of frame ``index``, or all of them; ``known`` is what was found of it before.
+        """Refine some tiles of frame ``index``, or all of them; ``earlier`` is what was found of it before.
 
         Raises:
             WorkCancelledError: ``stopped`` was true, or the time was over, before a first picture was there.

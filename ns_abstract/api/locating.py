@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -17,15 +16,13 @@ from ns_abstract.api.cell_search import (
     Request,
     Row,
     SearchProgress,
-    answered,
-    check_arguments,
     result_cells,
 )
 from ns_abstract.api.job import Job
 from ns_abstract.api.location import Location, PhotoOptions, calibrated
 from ns_abstract.api.poses import PoseSet, pose_sets
 from ns_abstract.api.scenes import Scene, checked_scene
-from ns_abstract.execution.starting import EngineName, started
+from ns_abstract.api.search_options import SearchKeywords, SearchOptions
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.io.errors import InputError
 from ns_abstract.report.figures import percent, short_guarantee
@@ -34,6 +31,12 @@ from ns_abstract.report.notebook import verdicts_html
 from ns_abstract.verify.cells import CellGrid
 from ns_abstract.verify.location_store import LocationStore
 from ns_abstract.verify.store import Store
+
+if TYPE_CHECKING:
+    from typing import Unpack  # pyright: ignore[reportAttributeAccessIssue]  # of Python 3.11
+
+#: How far 255 times a float may be from a whole number: float32 rounds numbers up to 1 by 2^-25, here at most 2^-17.
+_LEVEL_ERROR = 1e-3
 
 
 @dataclass(frozen=True)
@@ -63,14 +66,7 @@ class LocateProgress(SearchProgress):
 
 
 class LocationQuestion(CellQuestion[LocateProgress]):
-    """Which poses of some frames' sets can have made a photo, and the report on it.
-
-    Args:
-        job: The photo and the sets.
-        frames: Numbers of the frames.
-        settings: What the report says that was asked for.
-        command: The command line, or the call.
-    """
+    """Which poses of some frames' sets can have made a photo, and the report on it."""
 
     store = LocationStore
 
@@ -213,15 +209,9 @@ def locate(
     calibrate: bool = False,
     brightness: Mapping[str, Sequence[float]] | None = None,
     contract: bool = True,
-    time_budget: float = 600.0,
-    output_dir: str | os.PathLike[str] | None = None,
-    arithmetic: str | None = None,
-    resume: bool = False,
     on_progress: Callable[[LocateProgress], object] | None = None,
-    workers: int = 1,
-    engine: EngineName = "local",
-    scheduler_address: str | None = None,
     memory_limit: float | None = None,
+    **search: Unpack[SearchKeywords],
 ) -> Located:
     """Find which poses of sets can have made a photo; what is excluded is proved.
 
@@ -237,22 +227,14 @@ def locate(
         calibrate: Whether noise and outliers are raised to what explains the run's training photos.
         brightness: ``{"gain": [low, high], "offset": [low, high]}``: the camera may show gain * picture + offset.
         contract: Whether cells are contracted by their pixels' linear bounds before they are cut.
-        time_budget: Seconds for all sets together.
-        output_dir: Folder for cells.sqlite and the report, as ns-abstract-locate writes them; None: nothing is kept.
-        arithmetic: "float32" or "real", of the pictures; None: float32.
-        resume: Whether to go on with what ``output_dir`` holds.
         on_progress: Told about once a second.
-        workers: Processes (for a NeRF: that bound rays); with more than one, a script needs
-            ``if __name__ == "__main__":``.
-        engine: "dask" spreads the cells over a Dask cluster.
-        scheduler_address: HOST:PORT of its scheduler; None: a cluster on this machine.
         memory_limit: GiB; None: 80 % of what is free.
+        **search: Fields of `SearchOptions`: ``time_budget``, ``output_dir``, ``workers``, ...
 
     Raises:
         InputError: An argument cannot be used.
     """
-    request = Request(time_budget, resume, output_dir is not None)
-    check_arguments(request, workers, output_dir)
+    search_options = SearchOptions(**search)
     sets = pose_sets(poses)
     if unknown := set(brightness or {}) - {"gain", "offset"}:
         raise InputError(f"found {sorted(unknown)[0]!r}", field="brightness", fix="give gain, offset or both")
@@ -260,20 +242,19 @@ def locate(
     job = Job(
         checked_scene(scene),
         [entry.of(scene) for entry in sets],
-        arithmetic=arithmetic,
-        workers=workers,
+        arithmetic=search_options.arithmetic,
+        workers=search_options.workers,
         memory_limit=memory_limit,
     )
     options, calibration = calibrated(scene, job, options) if calibrate else (options, None)
     counted = None if mask is None else _checked_mask(mask, job)
     location = Location(job, photo_levels(photo), counted, options, calibration=calibration)
-    settings = {"time_budget": time_budget, "arithmetic": arithmetic, "workers": workers, "engine": engine}
-    rows, document = answered(
-        LocationQuestion(location, range(len(sets)), {**settings, **vars(options)}, ("ns_abstract.locate",)),
-        request,
+    settings = {**search_options.settings, **vars(options)}
+    rows, document = search_options.search(
+        LocationQuestion(location, range(len(sets)), settings, ("ns_abstract.locate",)),
         on_progress,
-        lambda engines: engines.enter_context(started(engine, scheduler_address, 1 if scene.rays else workers)),
-        output_dir,
+        workers=1 if scene.rays else search_options.workers,
+        report=search_options.output_dir is not None,
     )
     return located(location, rows, document)
 
@@ -295,7 +276,7 @@ def photo_levels(photo: ArrayLike) -> np.ndarray:
     with np.errstate(invalid="ignore"):
         exact = values.astype(np.float64) * 255.0
         levels = np.rint(exact)
-        fits = (levels >= 0.0) & (levels <= 255.0) & (np.abs(levels - exact) <= 1e-3)
+        fits = (levels >= 0.0) & (levels <= 255.0) & (np.abs(levels - exact) <= _LEVEL_ERROR)
     if values.dtype.kind == "u" or not fits.all():
         raise InputError(
             "has values that are no multiples of 1/255 in [0, 1]", field="photo",

@@ -69,11 +69,8 @@ class Location:
     """Sets of poses, and the photo that one of them may have made.
 
     Args:
-        job: The scene and the sets.
         levels: [H, W, 3] uint8 photo.
         mask: [H, W] which pixels count; None: all.
-        options: What a picture may miss.
-        file: Of the photo, for errors.
         calibration: Where noise and outliers come from, if they were calibrated.
 
     Raises:
@@ -168,10 +165,7 @@ class LocateSettings:
     """What to locate, as the command line says it.
 
     Attributes:
-        files: The scene and the sets.
-        image: The photo.
         mask: Which of its pixels count, or None.
-        photo: What a picture may miss.
         calibrate: Whether the run's training photos may raise that.
     """
 

@@ -48,7 +48,6 @@ class LoopJob:
 
     Args:
         job: The scene, with the poses of the loop's camera as its only set.
-        loop: The loop.
         network_arithmetic: Whether every float32 evaluation of the network is meant, or the exact one alone.
 
     Raises:

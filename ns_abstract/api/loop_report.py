@@ -49,13 +49,7 @@ METRICS = {
 
 
 class LoopReport:
-    """Writes report.json and report.html of a search.
-
-    Args:
-        job: The loop.
-        settings: What the report says that was asked for.
-        command: The command line, or the call.
-    """
+    """Writes report.json and report.html of a search."""
 
     def __init__(self, job: LoopJob, settings: Mapping[str, Any], command: tuple[str, ...]) -> None:
         self.job = job
@@ -226,9 +220,7 @@ def shown_tube(job: LoopJob, lower: list[float], upper: list[float], runs: int) 
     """A tube beside the hull of simulated runs, and its widths with less dependence.
 
     Args:
-        job: The loop.
         lower, upper: [m] the cell.
-        runs: How many.
     """
     box = ParameterBox(job.loop.box.names, job.loop.box.units, tuple(lower), tuple(upper))
     builder = job.search.reacher

@@ -30,10 +30,8 @@ class Margins:
     """Finds the scene margins of a search's certified cells, kind by kind.
 
     Args:
-        cells: What is certified.
         prover: Bounds and attacks cells for scenes of a kind.
         store: Keeps what is settled, for a command that goes on; what it holds is not settled again.
-        on_progress: Told every margin as it is found.
     """
 
     def __init__(
@@ -47,12 +45,7 @@ class Margins:
         self.found: list[SceneMargin] = []
 
     def find(self, deadline: Deadline, kinds: Sequence[VariationKind]) -> None:
-        """Look for them; every kind has the same part of the time that is left then.
-
-        Args:
-            deadline: When to end.
-            kinds: What varies.
-        """
+        """Look for them; every kind has the same part of the time that is left then."""
         for number, kind in enumerate(kinds if self.cells else ()):
             part = deadline.within(deadline.left / (len(kinds) - number))
             self.found.append(largest_radius(kind, self.cells, self._remembered(kind), part))
@@ -90,12 +83,7 @@ class Margins:
 def certified_cells(
     rows: Mapping[int, Sequence[Mapping[str, Any]]], boxes: Callable[[int, Mapping[str, Any]], ParameterBox]
 ) -> list[CertifiedBox]:
-    """The certified cells of a store, with their parts of the volume.
-
-    Args:
-        rows: By frame, rows of ``cells``.
-        boxes: The box of a row.
-    """
+    """The certified cells of a store, with their parts of the volume; ``rows``: by frame, rows of ``cells``."""
     certified = [(frame, row, boxes(frame, row)) for frame, entries in rows.items() for row in entries]
     certified = [entry for entry in certified if entry[1]["verdict"] == "certified"]
     sizes = [float(np.prod(np.subtract(box.upper, box.lower))) for _, _, box in certified]

@@ -33,7 +33,6 @@ class DrawnElements:
     Attributes:
         tiles: [t] numbers of the tiles that hold these pixels.
         pixels: [t, side, side] these pixels.
-        context: Of the box, for bounds of cells inside.
         draw: Tiles [t, side, side, 3] of the picture at parameter values [d]; right at these pixels alone.
     """
 
@@ -72,10 +71,8 @@ class KnownBoxes:
     """What is known of boxes around cells (Q5).
 
     Args:
-        pictures: The pictures: blending weights alone.
         weights: What bounds and draws them.
         wanted: [H, W] the pixels that are read.
-        measures: All that the claim reads of them.
     """
 
     def __init__(
@@ -153,9 +150,7 @@ class NearbyPictures:
     """Pictures [H, W, C] of cells inside of a box; see `ns_abstract.verify.protocol.FrameImages`.
 
     Args:
-        pictures: The pictures of the set.
         weights: What bounds and draws them.
-        box_bounds: What is known of the box.
     """
 
     def __init__(self, pictures: FrameImages, weights: Weights, box_bounds: KnownBox) -> None:

@@ -31,10 +31,6 @@ if TYPE_CHECKING:
 class Question:
     """A network and the property to prove of it.
 
-    Args:
-        model: Network, .onnx.
-        source: What is to hold.
-
     Raises:
         InputError: A file or a field cannot be used.
     """

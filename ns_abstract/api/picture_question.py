@@ -88,11 +88,6 @@ class PlaneSample:
 class PlanePictures(FramePictures):
     """One frame's pictures [H, W, C]: colours, then the further planes of a property, in its order.
 
-    Args:
-        method: The scene and its program.
-        poses: The frame's set.
-        prop: What is read.
-
     Raises:
         InputError: A selection picks nothing, or the scene has no such planes.
     """
@@ -291,9 +286,6 @@ def depth_range(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.nd
 
 class PictureQuestion:
     """A property of the picture itself; see `ns_abstract.api.network_question.Question`, which has a network.
-
-    Args:
-        source: What is to hold.
 
     Raises:
         InputError: A field cannot be used.

@@ -153,7 +153,6 @@ class PoseSet:
         """The set of an object as it stands in a perturbation file; all that the file can say.
 
         Args:
-            camera: The camera.
             specification: The object; None: the camera's pose alone.
             following: The next keyframe, which ``"sweep": "segments"`` needs: ``path.following(k)`` of
                 `load_camera_path`; None after the last entry of an open path.
@@ -194,11 +193,7 @@ class PoseSet:
         self.perturbation()
 
     def perturbation(self, dataset_scale: float = 1.0) -> Perturbation:
-        """What varies, in normalised units.
-
-        Args:
-            dataset_scale: Normalised units per unit of the data set.
-        """
+        """What varies, in normalised units; ``dataset_scale``: normalised units per unit of the data set."""
         return parse_perturbation(self.specification, dataset_scale=dataset_scale, field_prefix="", folder=self.folder)
 
     def of(self, scene: Scene) -> poses.PoseBox:

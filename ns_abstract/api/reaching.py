@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -15,17 +15,15 @@ from ns_abstract.api.cell_search import (
     Request,
     Row,
     SearchProgress,
-    answered,
     cell_place,
-    check_arguments,
     result_cells,
     shares_text,
 )
 from ns_abstract.api.loop_job import LoopJob, open_loop
 from ns_abstract.api.loop_report import LoopReport
 from ns_abstract.api.scenes import Scene, checked_scene
+from ns_abstract.api.search_options import SearchKeywords, SearchOptions
 from ns_abstract.execution.cancellation import Deadline
-from ns_abstract.execution.starting import EngineName, started
 from ns_abstract.io.arguments import file_path
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.reach.search import QUESTIONS
@@ -34,6 +32,9 @@ from ns_abstract.verify.cells import CellGrid
 from ns_abstract.verify.network import NetworkArithmetic
 from ns_abstract.verify.scene_margin import ProveCell, VariationKind, bounded_kinds
 from ns_abstract.verify.store import Store, fractions
+
+if TYPE_CHECKING:
+    from typing import Unpack  # pyright: ignore[reportAttributeAccessIssue]  # of Python 3.11
 
 #: Parts of the time for random runs, for tubes that the report shows, and for a film.
 _RUNS_SHARE, _SHOWN_SHARE, _FILM_SHARE = 0.1, 0.1, 0.1
@@ -76,9 +77,6 @@ class LoopQuestion(CellQuestion[ReachProgress]):
     """What holds of every run of a loop, by the numbers of `QUESTIONS`, and the report on it.
 
     Args:
-        job: The loop.
-        settings: What the report says that was asked for.
-        command: The command line, or the call.
         film: Whether to make a film along the tube of a certified cell.
     """
 
@@ -196,17 +194,11 @@ def reach(
     scene: Scene,
     loop: str | os.PathLike[str],
     *,
-    time_budget: float = 600.0,
-    output_dir: str | os.PathLike[str] | None = None,
-    arithmetic: str | None = None,
     network_arithmetic: NetworkArithmetic = "float32",
-    resume: bool = False,
     on_progress: Callable[[ReachProgress], object] | None = None,
-    workers: int = 1,
-    engine: EngineName = "local",
-    scheduler_address: str | None = None,
     scene_margin: bool = False,
     film: bool = False,
+    **search: Unpack[SearchKeywords],
 ) -> ReachResult:
     """Prove of a network in the loop that no run from a box of initial states goes wrong, or find one that does.
 
@@ -215,34 +207,23 @@ def reach(
     Args:
         scene: The scene.
         loop: LOOP.json.
-        time_budget: Seconds.
-        output_dir: Folder for cells.sqlite, the report and falsifying runs; None: nothing is kept on disk.
-        arithmetic: "float32" or "real", of the pictures; None: float32.
         network_arithmetic: "float32": every float32 evaluation of the network; "real": the exact network alone.
-        resume: Whether to go on with what ``output_dir`` holds.
         on_progress: Told about once a second.
-        workers: Processes; with more than one, a script needs ``if __name__ == "__main__":``.
-        engine: "dask" spreads the cells over a Dask cluster.
-        scheduler_address: HOST:PORT of its scheduler; None: a cluster on this machine.
         scene_margin: Whether to look, in half of the time, for the largest variation of the Gaussians for which what is
             certified holds; see the report's key ``scene_margin``.
         film: Whether to write, in a tenth of the time, film.mp4 (film.gif without the package av) into ``output_dir``:
             the abstract image along the tube of the widest certified cell; see the report's key ``film``.
+        **search: Fields of `SearchOptions`: ``time_budget``, ``output_dir``, ``workers``, ...
 
     Raises:
         InputError: An argument cannot be used.
     """
-    request = Request(time_budget, resume, scene_margin=scene_margin)
-    check_arguments(request, workers, output_dir)
-    job = open_loop(checked_scene(scene), file_path(loop, "loop"), arithmetic, network_arithmetic, workers)
-    settings = {"time_budget": time_budget, "arithmetic": arithmetic, "workers": workers, "engine": engine}
-    rows, document = answered(
-        LoopQuestion(job, settings, ("ns_abstract.reach",), film=film),
-        request,
-        on_progress,
-        lambda engines: engines.enter_context(started(engine, scheduler_address, workers)),
-        output_dir,
+    options = SearchOptions(**search)
+    job = open_loop(
+        checked_scene(scene), file_path(loop, "loop"), options.arithmetic, network_arithmetic, options.workers
     )
+    question = LoopQuestion(job, options.settings, ("ns_abstract.reach",), film=film)
+    rows, document = options.search(question, on_progress, workers=options.workers, scene_margin=scene_margin)
     return result(job, rows, document)
 
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -19,21 +18,18 @@ from ns_abstract.io.arguments import file_path
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.load import open_scene
-from ns_abstract.methods.overrides import UNSAID, Overrides, assumption_of
+from ns_abstract.methods.overrides import UNSAID, OverrideKeywords, Overrides, assumption_of
 from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.refine.protocol import Method, PreciseFrame
 
+if TYPE_CHECKING:
+    from typing import Unpack  # pyright: ignore[reportAttributeAccessIssue]  # of Python 3.11
+
 
 @dataclass(frozen=True)
 class SceneSource:
-    """Where a scene is read from.
-
-    Attributes:
-        file: config.yml of a run, or a scene file.
-        options: Which program draws it.
-        overrides: What the user says of the scene in place of its files.
-    """
+    """Where a scene is read from."""
 
     file: Path
     options: ProgramOptions = field(default_factory=ProgramOptions)
@@ -74,7 +70,6 @@ class Scene:
 
         Args:
             arithmetic: "float32" or "real"; None: the strongest that the representation has.
-            workers: Processes that it may use.
 
         Raises:
             InputError: An option does not go with the scene.
@@ -163,11 +158,7 @@ def load_scene(
     occupancy_grid: str | os.PathLike[str] | None = None,
     gsplat_version: str | None = None,
     device: str | None = None,
-    rasterize_mode: str | None = None,
-    background: Sequence[float] | None = None,
-    load_step: int | None = None,
-    assume_splatfacto: bool = False,
-    drop_nan_gaussians: bool = False,
+    **overrides: Unpack[OverrideKeywords],
 ) -> Scene:
     """Read a scene; nothing in the files is executed.
 
@@ -181,11 +172,7 @@ def load_scene(
         occupancy_grid: NeRF: a grid outside of which the field is declared empty.
         gsplat_version: Splats: whose rules are bounded, "1.4.0" (default), "1.5.3" or "1.6.0".
         device: NeRF: where the field is bounded, "cpu" (default) or "cuda" (a GPU's float64).
-        rasterize_mode: Splats: "classic" or "antialiased", in place of what the files say.
-        background: RGB from 0 to 1 behind the scene, in place of what the files say; a .ply says nothing: black.
-        load_step: Training step of the checkpoint that is read; what config.yml says, or else the highest.
-        assume_splatfacto: Splats: bound the Gaussians alone of a run whose model may draw more.
-        drop_nan_gaussians: Splats: leave out Gaussians whose values are not finite.
+        **overrides: Fields of `Overrides`: what is said in place of the files.
 
     Raises:
         InputError: A file or an option cannot be used.
@@ -193,9 +180,7 @@ def load_scene(
     grid = None if occupancy_grid is None else file_path(occupancy_grid, "occupancy_grid")
     file = file_path(path, "path")
     options = ProgramOptions(renderer, gsplat_version, sampling, num_samples, near_plane, grid, device)  # pyright: ignore[reportArgumentType]
-    color = None if background is None else tuple(background)
-    overrides = Overrides(rasterize_mode, color, load_step, assume_splatfacto, drop_nan_gaussians)  # pyright: ignore[reportArgumentType]
-    scene = SceneSource(file, options, overrides).open()
+    scene = SceneSource(file, options, Overrides(**overrides)).open()  # pyright: ignore[reportArgumentType]
     # options that do not go with the scene are told at once
     scene.method()
     return scene

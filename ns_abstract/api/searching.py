@@ -58,12 +58,8 @@ def search_blocks(
     Until the engine's workers have started, this process examines blocks, too: a kill in the first seconds keeps those.
 
     Args:
-        store: Where blocks come from and findings go.
         engine: Where blocks are examined; closed at the end.
-        grids: By frame.
-        examine: In this process.
         on_workers: For others: a function of a module, and what it takes before the arguments of ``examine``.
-        deadline: When to end.
         stop: Asked at least twice a second, and ends a block at once in this process.
         keep: Given every block and its findings before they are stored.
         on_tick: Told the reading of the clock after results, and twice a second where others work.

@@ -55,8 +55,6 @@ def grown(poses: PoseBox, hull: Mapping[str, Range], motion: Mapping[str, Range]
     """All poses that a motion takes poses of ``hull`` to (U7).
 
     Args:
-        poses: A set around the same camera.
-        hull: Ends by parameter of what is left of it.
         motion: Ends of the changes; none where a translation or a rotation is not named. Other parameters, which no
             motion names, keep the whole range of ``poses``.
     """
@@ -75,7 +73,6 @@ class PhotoSequence:
 
     Args:
         settings: What is located; the photo is the first one.
-        images: The photos, in order.
         motion: File of the motion between two of them.
         folder: For the results: a folder by photo, and report.json.
         frames: Numbers of the sets that the first photo may come from.

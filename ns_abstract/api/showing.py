@@ -82,9 +82,6 @@ def look_closer(
     """Regions where the property fails, and poses along the sets, with pictures.
 
     Args:
-        job: What is certified.
-        entries: Frames of report.json.
-        rows: Cells by frame.
         cached: The stored image of a counterexample, by frame and pose.
         over: Whether no more pictures are to be rendered; `SECONDS` from now none are, either.
     """

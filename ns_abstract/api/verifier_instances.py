@@ -67,8 +67,6 @@ class InstanceFolder:
         """Cut the set of poses of ``frame`` into boxes and write an instance of each.
 
         Args:
-            job: Scene, path, network and property.
-            frame: Entry of the path.
             parts: Boxes along each parameter; empty: one.
             name: Of the network, in the names of the instances.
 

@@ -82,8 +82,6 @@ class KernelStore:
     """The kernels of one version of the sources, as one process sees them.
 
     Args:
-        root: Folder of all versions.
-        key: Names the version.
         session: That of the process that this one compiles for; None: one of its own.
 
     Raises:
@@ -126,12 +124,7 @@ class KernelStore:
         self._entries = _read_manifest(folder) | self._entries
 
     def fetch(self, place: str, stamp: str) -> str:
-        """The session's folder of one module, with what is kept of its functions; damaged files are left out.
-
-        Args:
-            place: Names the module.
-            stamp: Of the sources that its kernels belong to.
-        """
+        """The session's folder of one module, with what is kept of its functions; damaged files are left out."""
         folder = self.session / place
         if not folder.exists():
             with _locked(self.session / "lock"):

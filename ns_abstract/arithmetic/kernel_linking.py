@@ -47,7 +47,6 @@ class _Compilation:
 
     Attributes:
         depth: Functions that are being compiled, each for the one before it; the first is a kernel of this package.
-        done: Called after each function.
     """
 
     depth: int = 0

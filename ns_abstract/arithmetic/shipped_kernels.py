@@ -50,8 +50,6 @@ def adopt(folder: Path, function: str, stamp: str) -> None:
     """Put this processor in place of the level that a function's kernels in ``folder`` were compiled for.
 
     Args:
-        folder: Where numba reads the function's kernels.
-        function: Its files' name without ending.
         stamp: Of the sources; kernels of others are dropped.
     """
     index = IndexDataCacheFile(str(folder), function, stamp)

@@ -59,7 +59,6 @@ class TaylorArray:
     """An array of Taylor models over one box, with numpy-like operators.
 
     Attributes:
-        basis: The monomials.
         coefficients: [monomials, *shape].
         radius: [*shape].
     """

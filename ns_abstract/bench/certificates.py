@@ -45,9 +45,6 @@ def curve(
     """Search one set for ``seconds``.
 
     Args:
-        scene, camera, model, prop: What is certified.
-        name, specification: The set, and how a table calls it.
-        seconds, workers: Time and processes.
         marks: Times, in seconds from the call, at which the certified fraction is told; kernels have to be loaded, and
             compiled at the first time, within them.
         said: Told from time to time where the search stands.

@@ -27,7 +27,6 @@ class _Running:
     """A function that is being compiled.
 
     Attributes:
-        name: Module and name.
         wall, processor: Clocks when it began, seconds.
         inner: Processor seconds of the functions that were compiled for it.
     """
@@ -136,9 +135,7 @@ def compile_times(job: PathJob, name: str, frame: int) -> list[dict[str, Any]]:
     """Seconds that each kernel of a frame takes to compile in one new process, stage by stage, and all together.
 
     Args:
-        job: The scene.
         name: Of the set of poses; see `sets.SETS`.
-        frame: Entry of the camera path.
 
     Returns:
         By kernel: its stage, how many functions it is linked from, seconds by the clock, of the processor, and inside

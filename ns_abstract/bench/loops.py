@@ -45,13 +45,9 @@ def measure(
     """Search a loop, then attack its certified cells and compare one of them with simulated runs.
 
     Args:
-        scene, loop: What is searched.
-        seconds, workers: Time and processes.
         runs: Random runs from the whole initial box, each compared with the tube of its cell; and as many from one
             cell.
         marks: Seconds at which the certified fraction is told.
-        seed: Decides every random choice.
-        said: Told what is done next.
     """
     points: list[ReachProgress] = []
     said(f"searching for {seconds:g} s")

@@ -34,12 +34,7 @@ ARITHMETICS = ("float32", "real")
 
 @dataclass(frozen=True)
 class Outcome:
-    """A case that was bounded and attacked.
-
-    Attributes:
-        row: The figures of the table.
-        worst: The worst violations, largest first.
-    """
+    """A case that was bounded and attacked."""
 
     row: dict[str, Any]
     worst: tuple[Violation, ...]
@@ -115,14 +110,12 @@ def run_case(
     attacks "float32".
 
     Args:
-        case: What to bound.
         arithmetic: "real" or "float32".
         cells: Most cells bounded; the work ends there unless the bounds are as tight as the witnesses.
         seconds: Limit of the refinement and of each attack; reaching it makes the outcome depend on
             the machine.
         poses: Images by the compiled renderer.
         reference_poses: Images by each reference.
-        seed: Decides every random choice.
         frame: What bounds and renders: called like `SplatFrame`.
     """
     began = time.perf_counter()

@@ -78,7 +78,6 @@ def _scene(
         colors: [N, 3] or what broadcasts to it, logits for ``model`` "sigmoid"; random if None.
         quats: [N, 4] or one.
         bands: [N, K - 1, 3] coefficients beyond band 0.
-        background: Grey value.
         antialiased: Whether opacities are compensated for the blur.
         model: "sh" or "sigmoid".
     """

@@ -42,7 +42,6 @@ class Table:
 
     Attributes:
         folder, name, title: See `write`.
-        rows: All so far.
     """
 
     folder: Path

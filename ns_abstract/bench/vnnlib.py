@@ -45,12 +45,7 @@ _COMPARED = 4
 
 @dataclass(frozen=True)
 class Instance:
-    """One line of instances.csv.
-
-    Attributes:
-        network, property: As the line names them.
-        seconds: Time limit.
-    """
+    """One line of instances.csv."""
 
     network: str
     property: str
@@ -164,7 +159,6 @@ def run_folder(
 
     Args:
         folder: Holds instances.csv and what it names, also packed (.gz); or the folders 2.0 or 1.0 that do.
-        output_dir: Folder of the results.
         only: Parts of names of networks or properties; all if there are none.
         numbers: Places in the list, from 0; None: all.
         seconds: Limit beside those of the list; loading and checking count, compiling kernels cannot be interrupted.

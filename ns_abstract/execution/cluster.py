@@ -284,7 +284,6 @@ def connected(address: str | None, workers: int = 1, tls: Tls | None = None) -> 
     That cluster and its dashboard listen on the loopback interface alone.
 
     Args:
-        address: HOST:PORT.
         workers: Processes of the cluster on this machine, one thread each.
         tls: Encrypts the connection to ``address``, and both ends prove who they are.
 

@@ -116,11 +116,7 @@ class _WorkerProcess(NamedTuple):
 
 
 class Processes:
-    """Fresh processes of this machine, one thread each; one that dies is replaced and its task begun again.
-
-    Args:
-        count: Number of processes.
-    """
+    """Fresh processes of this machine, one thread each; one that dies is replaced and its task begun again."""
 
     shares = False
 

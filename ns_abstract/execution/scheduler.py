@@ -28,7 +28,6 @@ def work(
     the engine is closed.
 
     Args:
-        engine: Where the work is done.
         offer: The next tasks, at most so many; asked whenever there is room.
         stop: Asked at least every `PATIENCE` seconds while others work, and after every task in this process.
     """

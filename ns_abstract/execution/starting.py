@@ -19,7 +19,6 @@ def started(name: EngineName, address: str | None, workers: int, tls: Tls | None
     Args:
         name: "dask", or "local": this process if there is one worker, otherwise processes.
         address: HOST:PORT of a Dask scheduler; None: a cluster on this machine.
-        workers: Processes on this machine.
         tls: As for `connected`.
 
     Raises:

@@ -55,7 +55,6 @@ class Recipe(Generic[F]):
 
     Attributes:
         open: Opens it again; can be pickled.
-        fingerprint: Of what was opened here.
         file: Named by the error where the other process finds something else.
     """
 

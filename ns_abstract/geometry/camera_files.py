@@ -25,7 +25,6 @@ class FileCamera:
     """A camera as a file has it.
 
     Attributes:
-        field: Its entry, for messages.
         camera_to_world: 3x4 numbers, OpenGL axes.
         fx, fy, cx, cy: Pixels; numbers as the file has them, not checked but for being numbers.
         width, height: Pixels, as the file has them.
@@ -67,7 +66,6 @@ def transforms_cameras(root: Mapping[str, Any], frame: DataparserTransform | Non
     """The cameras of a data set's ``transforms.json``, in the frame of a run that was trained on it.
 
     Args:
-        root: The parsed file.
         frame: The run's; None: the scene is no run.
 
     Raises:

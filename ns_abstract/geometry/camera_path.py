@@ -234,7 +234,6 @@ def stated_intrinsics(
         own: ``fx``, ``fy``, ``cx``, ``cy``; what is None or missing follows from ``focal`` and from the middle.
         focal: The focal length where ``fx`` is not stated.
         height, width: Size of the pictures, pixels.
-        prefix: Of the names in errors.
 
     Raises:
         InputError: One of them is no moderate number, or a focal length is not above 0.

@@ -111,10 +111,8 @@ class PoseBox:
 
     Attributes:
         camera: Intrinsics and image size; the pose of the first keyframe.
-        perturbation: What may vary.
         box: Parameters of positive width, in the order x, y, z, yaw, pitch, roll, segment, azimuth, hue, saturation;
             behind them where the scene stands (`registered`).
-        fixed: Values of the parameters of zero width.
         target_camera: End of the segment, where the sweep is over segments.
         shear: [name][other] factors: ``box`` counts the rotation ``name`` from the sum of factor * other, so that its
             cells are slanted (`sheared`).

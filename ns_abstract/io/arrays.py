@@ -20,11 +20,7 @@ _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 
 
 class Archive:
-    """An open .npz.
-
-    Attributes:
-        declared: Shape and type of every array, as its header says; nothing is unpacked for it.
-    """
+    """An open .npz; ``declared``: shape and type of every array, as its header says; nothing is unpacked for it."""
 
     def __init__(self, archive: zipfile.ZipFile) -> None:
         self._archive = archive

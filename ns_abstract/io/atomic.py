@@ -19,8 +19,6 @@ def write_atomic(
     a loss of power between the two.
 
     Args:
-        path: The file.
-        write: Called with the open temporary file.
         scratch: Folder of the temporary file, on the same file system; the file's own by default.
 
     Raises:

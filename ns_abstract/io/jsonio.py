@@ -89,7 +89,6 @@ def file_size(path: Path, what: str, fix: str | None = None) -> int:
     """Size in bytes of a regular file.
 
     Args:
-        path: The file.
         what: What the file should be, for messages, such as "checkpoint".
         fix: What to do when it is absent.
 

@@ -45,12 +45,7 @@ def _plain(value: Any) -> Mapping[str, Any] | None:
 
 @dataclass(frozen=True)
 class KeyTable:
-    """The keys of a file or of a section of it. A key that is listed without keys below it covers all below it.
-
-    Attributes:
-        title: Of what these are the keys.
-        keys: One by key.
-    """
+    """The keys of a file or of a section of it. A key that is listed without keys below it covers all below it."""
 
     title: str
     keys: tuple[Key, ...]
@@ -82,8 +77,6 @@ class KeyTable:
         """The dotted names of keys of ``section`` that are not in the table.
 
         Args:
-            section: What the file holds.
-            prefix: What errors write before a key.
             mapping: The mapping that a value holds, or None.
 
         Raises:

@@ -57,11 +57,6 @@ def sequence_photos(folder: Path, field: str = "--image-sequence") -> list[Path]
 def read_mask(file: Path, size: tuple[int, int], field: str = "--mask") -> np.ndarray:
     """Which pixels [H, W] of a mask are white; it has to be black and white.
 
-    Args:
-        file: The mask.
-        size: Height and width that it has to have.
-        field: Option that names it.
-
     Raises:
         InputError: The file is missing, of another size, or holds other values.
     """

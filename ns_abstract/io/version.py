@@ -24,7 +24,6 @@ def stale(stored: Mapping[str, Any], current: Mapping[str, Any]) -> str | None:
     """Return a note if ``stored`` was computed by another version or other rules than ``current`` names.
 
     Args:
-        stored: Fingerprint of a result that was found.
         current: Fingerprint that it must agree with; keys that it lacks are not compared.
 
     Returns:

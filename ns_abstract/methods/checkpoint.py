@@ -67,7 +67,6 @@ class StoredTensor:
 
     Attributes:
         kind: torch's name of its type ("float32"), or what it is where it is not dense ("sparse").
-        shape: Its shape.
         strides: In elements.
         offset: Of its first element in ``storage``, in elements.
         storage: The values of the file that it is a view of; None where it is not dense.
@@ -83,8 +82,6 @@ class StoredTensor:
         """Its values, copied out of the file.
 
         Args:
-            file: The checkpoint, for messages.
-            field: Its name, for messages.
             finite: Whether values that are not finite are refused.
 
         Raises:

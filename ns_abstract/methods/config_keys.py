@@ -208,7 +208,6 @@ def check_keys(run: runs.RunConfig, model: KeyTable, refuse_unknown: bool = True
     """Notes on the keys of a run's config.yml that nothing is known of, and that are not used.
 
     Args:
-        run: The run.
         model: The keys of ``pipeline.model``: `SPLATFACTO`, `VANILLA_NERF` or `NERFACTO`.
         refuse_unknown: Whether a key of ``pipeline.model`` that is in no table is refused, or named in the notes.
 

@@ -21,10 +21,6 @@ REPRESENTATIONS: list[Representation] = [NERF, NERFACTO, SPLAT]
 def open_scene(path: str | os.PathLike[str], overrides: Overrides | None = None) -> tuple[Representation, Any]:
     """Read the scene of a run (by the method that its config.yml names) or of a 3DGS ``.ply``.
 
-    Args:
-        path: config.yml, its folder, or a scene file.
-        overrides: What the user says in place of the files.
-
     Returns:
         The representation, and its scene.
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypedDict
 
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
@@ -13,6 +13,16 @@ from ns_abstract.io.jsonio import is_number, show
 #: How Splatfacto can rasterise.
 MODES = ("classic", "antialiased")
 _STEP_LIMIT = 10**15
+
+
+class OverrideKeywords(TypedDict, total=False):
+    """The fields of `Overrides` as keyword arguments."""
+
+    rasterize_mode: str | None
+    background: Sequence[float] | None
+    load_step: int | None
+    assume_splatfacto: bool
+    drop_nan_gaussians: bool
 
 
 @dataclass(frozen=True)

@@ -60,12 +60,6 @@ def write_run(
     """Write a run and a small data set beside it; config.yml comes last, so a run with a config is complete.
 
     Args:
-        scene: What is shown.
-        folder: Nerfstudio's working directory for this run.
-        method: Name of the method.
-        timestamp, experiment_name: Name of the run, and of its experiment.
-        data: Name of the data set's folder.
-        checkpoint: Content of the checkpoint.
         config: What the method's part of config.yml leaves open.
         steps: Its last lines but those that every method has.
         views: Cameras of the data set, normalised frame, at least two of one size and field of view.
@@ -133,7 +127,6 @@ def optimizer_lines(kind: str, eps: str, groups: Mapping[str, tuple[str, tuple[s
 
     Args:
         kind: "Adam" or "RAdam".
-        eps: Of all of them.
         groups: Learning rate of each group of parameters, and of its schedule the last rate, the first one and the
             steps of warming up; numbers as YAML spells them.
     """
@@ -173,7 +166,6 @@ def checkpoint_bytes(
 
     Args:
         model: Arrays of the model by name; equal objects are stored once.
-        optimizers, schedulers: States by group of parameters.
     """
     import torch
 

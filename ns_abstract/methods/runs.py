@@ -61,13 +61,9 @@ class RunConfig:
     """The parts of ``config.yml`` that matter after training.
 
     Attributes:
-        file: The configuration file.
-        folder: The folder that holds it.
         method_name: Name given to ns-train, such as "splatfacto"; "unknown" if absent.
         experiment_name: Name of the experiment, or the folder's name if absent.
         model: ``pipeline.model`` as a mapping; Python objects in it are :class:`Tagged`.
-        model_folder: The folder of the checkpoints.
-        root: The whole file as a mapping.
     """
 
     file: Path
@@ -98,8 +94,6 @@ class RunConfig:
         """RGB field of ``pipeline.model`` as float32 [3] in [0, 1]; ``default`` if absent.
 
         Args:
-            name: Field name.
-            default: Colour name used if the field is absent.
             names: Colours of the names that the model shows, letter by letter; it stops at others.
         """
         value = self.model.get(name, default)
@@ -117,9 +111,6 @@ class RunConfig:
 
 def read_config(path: str | os.PathLike[str]) -> RunConfig:
     """Read ``config.yml``.
-
-    Args:
-        path: The file, or the folder that holds it.
 
     Raises:
         InputError: The file is absent, not YAML, too large, or lacks ``pipeline.model``.

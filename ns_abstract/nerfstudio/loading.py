@@ -81,7 +81,6 @@ def check_tags(value: Any, file: Path) -> None:
 
     Args:
         value: What `ns_abstract.methods.runs` has read, without running anything.
-        file: Where it is from.
 
     Raises:
         InputError: Names the first other object.

@@ -48,11 +48,8 @@ def view(
     """Open the run and serve the viewer until the process is interrupted.
 
     Args:
-        load_config: config.yml, its folder, or a scene file.
-        vis: Which of nerfstudio's viewers.
         options: Of its ``ViewerConfig``.
         abstract: Of splats' `AbstractConfig`.
-        overrides: What the user says of the scene in place of its files.
 
     Raises:
         InputError: The run cannot be opened.

@@ -44,11 +44,9 @@ class Enclosure:
     """An array of quantities over a box ``p in [-1, 1]^d``, as forms and as intervals at once.
 
     Attributes:
-        form: Forms of the quantity.
         range: Intervals that hold it over the whole box, never wider than the forms' bounds.
 
     Args:
-        form: Forms.
         range_: What else is known of the values over the whole box.
     """
 

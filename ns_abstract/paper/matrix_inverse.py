@@ -53,7 +53,6 @@ def matrix_inverse(
         x: Matrices [n, n], of any face.
         reference: [n, n] the expansion point; the middle of ``x`` if None.
         order: Taylor order k.
-        norm: The norm of the remainder.
 
     Returns:
         The same face; unbounded where ``|D| < 1`` cannot be shown (the paper's line 2 fails there).

@@ -76,7 +76,6 @@ def load_perturbation(path: str | Path, *, dataset_scale: float = 1.0) -> Pertur
     """Read a perturbation file; a camera path that holds a ``perturbation`` object also serves.
 
     Args:
-        path: The file.
         dataset_scale: Normalised units per unit of transforms.json (dataparser_transforms.json).
 
     Raises:
@@ -114,9 +113,7 @@ def parse_perturbation(
     """Check a parsed ``perturbation`` object and convert the camera's translations to the normalised frame.
 
     Args:
-        value: The object.
         dataset_scale: See `load_perturbation`.
-        field_prefix: What errors write before a field.
         folder: Index files are looked for here; None: in the working directory.
 
     Raises:

@@ -29,7 +29,6 @@ class Selection:
     Attributes:
         box: Corners (x, y, z) that the stored mean lies between, normalised frame.
         indices: Numbers in the source, counted from 0.
-        opacity: Range of the activated opacity.
         color_min, color_max: Range of the activated colour of band 0 (RGB).
     """
 
@@ -45,11 +44,9 @@ class SceneVariation:
     """Ranges around the stored values, for each selected Gaussian independently (design.md, S1).
 
     Attributes:
-        select: Which Gaussians.
         mean: Of every coordinate of the mean, world axes, normalised units; None: fixed.
         opacity: Of the activated opacity; the sum is clipped to [0, 1].
         color: Of every channel of the activated colour; the sum is clamped as the program clamps colours.
-        name: Where the entry stands in its file.
     """
 
     select: Selection

@@ -109,14 +109,7 @@ def middle_half(lower: Float64, upper: Float64) -> tuple[Float64, Float64]:
 
 @dataclass(frozen=True)
 class Dynamics:
-    """A law of motion.
-
-    Attributes:
-        name: As LOOP.json calls it.
-        states, controls: How many.
-        law: The law.
-        about: Its equations, for people.
-    """
+    """A law of motion."""
 
     name: str
     states: int
@@ -325,11 +318,7 @@ def parse_dynamics(value: Any, states: int, dt: float, folder: Path, fail: Fail)
     """The object under the key ``dynamics``.
 
     Args:
-        value: The object.
-        states: Number of states.
         dt: Sampling time, seconds.
-        folder: Where files lie.
-        fail: Makes errors.
 
     Raises:
         InputError: A key is unknown, or a value cannot be used.

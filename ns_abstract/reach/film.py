@@ -84,12 +84,6 @@ def along(reacher: TubeBuilder, method: Method, size: tuple[int, int], tube: Tub
 
     The bounds are those of one cell, as tubes have them.
 
-    Args:
-        reacher: The loop.
-        method: The scene and its program.
-        size: Height and width of the pictures.
-        tube: Of the loop.
-
     Raises:
         WorkCancelledError: There is no time for more.
     """

@@ -25,7 +25,6 @@ class LearnedDynamics:
     Args:
         file: One input of shape [1, n + m] or [n + m], the states and then the controls; outputs of n numbers together,
             the next state.
-        states: n.
 
     Raises:
         InputError: The file cannot be read, uses what is not supported, or its sizes do not fit.

@@ -51,7 +51,6 @@ class HalfSpace:
 
     Attributes:
         normal: [n].
-        offset: The plane's place.
     """
 
     normal: tuple[float, ...]
@@ -100,7 +99,6 @@ class CameraMount:
             camera's own axes, in this order).
         offset: [d] their values at state 0.
         factors: [d, n].
-        fixed: Values of the others.
     """
 
     rotation: Float64
@@ -167,18 +165,12 @@ class Loop:
     Attributes:
         names, units: Of the states [n].
         lower, upper: [n] initial box.
-        steps: How many.
         dt: Sampling time, seconds.
-        dynamics: The law of motion.
         disturbance: [2, n] least and most of what is added to every next state.
-        camera: Where pictures are taken.
-        network: File of the network.
-        preprocess: What comes before it.
         control: What comes behind it; None until the network's outputs are known.
         unsafe: Closed sets, each given by faces: outside where any of them is above 0.
         required: Properties of the picture: a state is unsafe where its picture lacks one of them.
         goal: Or None.
-        value: The file's content.
     """
 
     names: tuple[str, ...]
@@ -255,8 +247,6 @@ def parse_loop(value: Any, folder: Path, dataset_scale: float = 1.0) -> Loop:
     """Check the content of LOOP.json.
 
     Args:
-        value: The content.
-        folder: Where the files that it names lie.
         dataset_scale: Normalised units per unit of the data set, for distances in pictures.
 
     Raises:

@@ -37,9 +37,7 @@ def loop_page(
     """The page.
 
     Args:
-        document: Content of report.json.
         rows: By number of the question, the cells: lower, upper, verdict.
-        loop: The loop.
         outside: Draws the scene behind the tubes; None: it has no elements with a place of their own.
         strips: Steps of the film and their PNGs.
 

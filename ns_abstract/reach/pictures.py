@@ -48,7 +48,6 @@ class Pictures:
     """A scene's pictures.
 
     Args:
-        method: The scene and its program.
         poses: All poses that may be looked at; boxes of them are bounded.
         response: The cameras that may show them; None: one that shows what is rendered.
     """
@@ -80,9 +79,7 @@ class PropertyView:
     """The pictures that one property of a loop is read off (L7).
 
     Attributes:
-        prop: The property.
         pictures: Colours and the further planes that it reads.
-        model: Its measures.
     """
 
     prop: PictureProperty

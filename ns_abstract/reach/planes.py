@@ -48,9 +48,7 @@ def plane_marks(
     """Cells, tubes and runs of a report in a plane.
 
     Args:
-        document: Content of report.json.
         rows: Cells: lower, upper, verdict.
-        loop: The loop.
         matrix, offset: [2, n], [2]: states to the plane.
         axes: The world's axes that the plane has, for tubes of camera positions; None: others.
     """
@@ -94,7 +92,6 @@ def region(
 
     Args:
         half_spaces: Of the set.
-        loop: The loop.
         axes: The plane's axes of the world.
         window: The plane.
         sign: 1: within where all half-spaces hold; -1: where all of their complements do.
@@ -139,11 +136,9 @@ class LoopPlot:
     """A plot of a loop in a plane.
 
     Attributes:
-        title: In words.
         axes: The world's axes to the right and up.
         clip: The scene above it, towards the viewer, is left out; the world's unit.
         marks: What is drawn over the scene.
-        window: What is shown.
     """
 
     title: str

@@ -94,7 +94,6 @@ def simulate(
     """One run with the real renderer and the deployed network, in float64 but for these.
 
     Args:
-        reacher: The loop.
         start: [n] initial state.
         disturbances: [steps, n], added to every next state.
         member: The scene that is seen throughout; None: the stored one.
@@ -148,11 +147,7 @@ def sampled_disturbances(
 
 @dataclass(frozen=True)
 class LoopBlockResult(BlockResult):
-    """The result of a block of cells.
-
-    Attributes:
-        runs: The runs behind falsified cells.
-    """
+    """The result of a block of cells."""
 
     runs: tuple[tuple[Cell, SimulatedRun], ...] = ()
 
@@ -181,11 +176,7 @@ class _CellRuns:
 
 
 class LoopSearch:
-    """Examines cells of the initial box.
-
-    Args:
-        reacher: Computes tubes.
-    """
+    """Examines cells of the initial box."""
 
     def __init__(self, reacher: TubeBuilder) -> None:
         self.reacher, self.loop = reacher, reacher.loop

@@ -197,12 +197,7 @@ def clipped(raw: AffineBounds, lower: Float64, upper: Float64) -> AffineBounds:
 
 
 class ControlBounds:
-    """Bounds the controls that the network gives for a set of pictures.
-
-    Args:
-        model: The network with its preprocessing.
-        control: What comes behind it.
-    """
+    """Bounds the controls that the network gives for a set of pictures."""
 
     def __init__(self, model: NetworkModel, control: Control) -> None:
         self.model, self.control = model, control
@@ -236,7 +231,6 @@ def between(bounds: OutputBounds, count: int, shift: Float64, room: Float64) -> 
 
     Args:
         bounds: Lower bounds [1, 2 count or more]; places are the parameters.
-        count: How many.
         shift: [count] what is taken off.
         room: [count] how far values may be off beside that.
 
@@ -287,7 +281,6 @@ class Tube:
         controls: [steps, 2, m] least and most control of every step.
         slopes: [m] how much pictures moved by initial parameter, summed over the steps: what a cut may gain.
         views: [sets, properties] lower bounds of the margins of `Loop.views` (L7); minus infinity: nothing is known.
-        reason: Why it ends early, or "".
     """
 
     sets: tuple[AffineSet, ...]
@@ -311,10 +304,7 @@ class TubeBuilder:
     """Tubes of a loop.
 
     Attributes:
-        loop: The loop.
-        view: Its pictures.
         pilot: Its network and control.
-        dependence: What is kept from step to step.
         registration: How far the scene may stand from its place along every world axis, all of a run through; needs a
             camera that moves along all of them. Otherwise the view's set may tell where the scene stands
             (`PoseBox.registered`).
@@ -354,7 +344,6 @@ class TubeBuilder:
         """The tube of a cell of the initial box; it ends early where an unsafe set cannot be ruled out.
 
         Args:
-            cell: The cell.
             whole: Whether to go on although unsafe sets cannot be ruled out.
         """
         lower, upper = self.loop.initial(cell)

@@ -41,11 +41,6 @@ class Refinement:
     """Refines one frame.
 
     Args:
-        frame: Bounds and renders.
-        index: The frame's number.
-        goal: When to stop, and whether leaves are kept.
-        seed: Of the random poses that are rendered.
-        stopped: Asked between cells; true ends the work with what is known.
         progress: Called with (trace point, covered part of the set) after every initial cell and after every round.
         members: Where the scene varies too: other scenes of the set, each as a function like the frame's
             ``render``. They widen the inner bound; only poses are split.
@@ -54,11 +49,9 @@ class Refinement:
             leaves most open. Not where leaves are kept: these are to be as tight as the result.
         initial: Takes the cells of the initial partition with their bounds in these tiles; where it holds some, they
             are the initial partition.
-        tuning: How time and memory are divided.
 
     Attributes:
         covered: Whether the initial partition is bounded; nothing but [0, 1] is known before.
-        cells: Number of cells bounded.
         shown: Scene elements that some initial cell shows, if the frame tells.
         floor: What no more light comes to is left out of the initial cells.
     """

@@ -32,9 +32,7 @@ class FrameTiles:
     """Some tiles of a frame, numbered by their place in the list; measures are those of their pixels (R6).
 
     Args:
-        frame: Bounds and renders.
         tiles: The frame's numbers of the tiles, ascending; None: all.
-        keep_linear: Whether bounds carry linear sets.
     """
 
     def __init__(self, frame: Frame, tiles: np.ndarray | None = None, keep_linear: bool = False) -> None:

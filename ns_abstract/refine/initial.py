@@ -22,9 +22,7 @@ class Partition(NamedTuple):
     """Sub-boxes that cover the set, and the bounds of one, or of another sub-box, that was tried.
 
     Attributes:
-        parts: The sub-boxes, in order.
         tried: What was tried.
-        bounds: Its bounds in all tiles.
     """
 
     parts: list[SubBox]
@@ -33,15 +31,7 @@ class Partition(NamedTuple):
 
 
 class InitialPartition:
-    """Chooses as many initial cells as the goal takes, and time and memory allow.
-
-    Args:
-        tiles: What is bounded.
-        splitter: Cuts the set.
-        inner: What bounds are measured against.
-        goal: When to stop.
-        tuning: How fine the cells are.
-    """
+    """Chooses as many initial cells as the goal takes, and time and memory allow."""
 
     def __init__(
         self, tiles: FrameTiles, splitter: BoxSplitter, inner: InnerBound, goal: RefinementGoal, tuning: Tuning = TUNING

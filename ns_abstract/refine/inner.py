@@ -19,14 +19,10 @@ class InnerBound:
     """Least and largest values of rendered pictures of the set.
 
     Args:
-        tiles: What is rendered.
-        random: Chooses poses.
         scenes: Where the scene varies too: other scenes of the set, each as a function like `Frame.render`.
-        tuning: How many poses are rendered.
 
     Attributes:
         lower, upper: [t, side, side, channels] float32.
-        image: The picture at the middle of the set, alike.
     """
 
     def __init__(

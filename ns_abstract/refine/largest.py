@@ -121,16 +121,11 @@ class LargestDifference:
     Args:
         whole: The difference over the set, in the set's own parameters; its renders are searched for the worst pose.
         frame: The difference that is bounded: ``whole``, or one whose box counts parameters otherwise.
-        index: The frame's number.
         goal: When to stop: ``ratio`` is meant of the largest bound to the largest value rendered, then of the means.
-        seed: Of the random poses.
         tolerance: Value of which is asked whether all stay below it; the work ends once that is decided.
-        stopped: Asked between cells.
         progress: Called with (trace point, covered part of the set); ``mpg`` and ``mpg_witness`` of its points are
             the largest bound and the largest value rendered.
         tiles: Numbers of the tiles; None: all.
-        earlier: What was found before of the same set.
-        tuning: How the time is divided.
     """
 
     def __init__(

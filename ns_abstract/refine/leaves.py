@@ -78,10 +78,7 @@ class LeafBounds:
     """The leaves of all tiles, and which of them are split next.
 
     Args:
-        tiles: The tiles.
-        inner: What leaves are measured against.
         earlier: [t, side, side, 3] bounds of the same set that hold anyway; None: there are none.
-        tuning: How much a round of splitting takes on.
 
     Attributes:
         lower, upper: [t, side, side, channels] float32, the outer bound of the set.

@@ -66,7 +66,6 @@ class _Part:
 
     Attributes:
         scale, shift: Of the leaf's own parameters: on the common part they are ``shift + scale * t``, t in [-1, 1]^d.
-        box_scale, box_shift: The same of the box's parameters.
     """
 
     scale: Float64Array
@@ -146,7 +145,6 @@ def linear_image(leaves: Leaves, lower: Float32Array, upper: Float32Array, box: 
     """One linear map for a whole picture over a box (R7).
 
     Args:
-        leaves: Linear sets of cells.
         lower, upper: [H, W, 3] bounds that hold on the whole set; taken where no plane is better on average, and where
             leaves do not cover the box.
         box: A part of the set.

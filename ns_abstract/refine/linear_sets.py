@@ -15,9 +15,6 @@ class LeafSets:
 
     Args:
         tiles: What is bounded; nothing is kept unless its bounds carry linear sets.
-
-    Attributes:
-        bytes: Memory that the sets hold.
     """
 
     def __init__(self, tiles: FrameTiles) -> None:

@@ -62,7 +62,6 @@ class SceneSample(Protocol):
         """Parameter values in ``box`` and a scene a signed step on, along which the score of the picture should grow.
 
         Args:
-            box: Where the values have to stay.
             values: [d] where the step begins.
             score: What should grow.
             size: Length in half-widths of every range.
@@ -130,8 +129,6 @@ class Frame(Protocol):
 
     Attributes:
         pose_set: The poses; their parameters are those of ``box``.
-        box: The parameters of positive width.
-        camera: Size and intrinsics.
         channels: `COLORS`; or 5: behind the colours the accumulation in [0, 1], and the expected depth in world units
             where anything is drawn. A render's depth is NaN where nothing is, bounds are infinity before its negative
             where nothing can be.
@@ -252,7 +249,6 @@ class PartsFrame(Protocol):
             boxes: Cells, at most `MOST_PARTS`.
             tiles: [t] numbers.
             within: The context of these tiles, and at least of these pixels, from a box around all cells.
-            keep_linear: Whether linear bounds are asked for.
             pixels: [t, side, side] which pixels are wanted, others may be left at [0, 1]; all if None.
         """
         ...
@@ -268,7 +264,6 @@ class SubBoxFrame(Protocol):
         """Lower and upper bounds [n, 3, k] of ``n`` pixels over ``k`` sub-boxes; None: there are none for this set.
 
         Args:
-            box: The cell.
             counts: [d] sub-boxes along its axes, powers of two, at least 8 together; they are numbered like the
                 entries of an array of this shape. Each is widened by `SUB_BOX_OVERLAP` of the cell's half-widths.
             tiles: [t] numbers.
@@ -286,8 +281,6 @@ class SharedOrder(Protocol):
         """Bounds of both scenes with linear bounds, once for every order of elements that a pose of ``box`` may have.
 
         Args:
-            box: A cell.
-            tile: Number.
             pixels: [side, side] which pixels are wanted.
             contexts: Those of both scenes for this tile and cell, or one around it.
 
@@ -326,7 +319,6 @@ class RayFrame(Frame, Protocol):
         What is found depends on the cell and on ``weigh`` alone, whatever was bounded before.
 
         Args:
-            box: The cell.
             weigh: [H, W, 3] what part of a margin a unit of each pixel's width may cost, or None; asked at most once,
                 where rays could be refined.
             most: Rays that are bounded, about, those that matter most first; others are left at [0, 1]. All if None.
@@ -397,8 +389,6 @@ class WeightMethod(Protocol):
         """The frame whose first channels are ``planes``, at most `MOST_PLANES`.
 
         Args:
-            poses: Its set.
-            planes: The elements.
             pixels: [H, W] the pixels that will be read.
 
         Raises:
@@ -470,7 +460,6 @@ class Method(Protocol):
         """One frame.
 
         Args:
-            poses: Its set.
             sheared: Its box may count parameters otherwise than the set does, where that is tighter.
             layers: Whether accumulation and expected depth stand behind the colours.
 

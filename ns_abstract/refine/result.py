@@ -138,14 +138,9 @@ class FrameResult(ArrayRecord):
     """One frame's abstract image.
 
     Attributes:
-        index: Number of the camera path's entry.
-        box: The set's parameters.
         lower, upper: [H, W, 3] enclose every image of the set, after background and clamp to [0, 1].
         witness_lower, witness_upper: [H, W, 3] least and largest values that were really rendered.
         image: [H, W, 3] one concrete render, at the middle of the box.
-        seconds: Time spent on the frame.
-        cells: Number of cells bounded.
-        trace: Progress over time, first point first.
         plan: What was left out for this frame and why, one sentence each.
         bounded: False while no bound but [0, 1] is known (the budget ended first).
         leaves: The leaf cells' linear sets, if they were asked for.

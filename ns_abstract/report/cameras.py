@@ -47,9 +47,7 @@ class CellCamera:
     """The camera at the middle of a cell.
 
     Attributes:
-        frame: Number of the cell's set.
         row: Position of the cell in its frame.
-        verdict: Of the cell.
         pose: [3, 4] camera-to-world, normalised frame.
         rays: [4, 3] unit vectors through the picture's corners, in order around it, world axes.
     """
@@ -76,7 +74,6 @@ def cell_cameras(
     """Cameras at the middles of cells, the widest cells first.
 
     Args:
-        pose_sets: By frame.
         rows: By frame, cells: lower, upper, verdict.
         names: Of all parameters, in the order of the cells' ends.
 
@@ -159,9 +156,7 @@ class CameraPlot:
     """A drawing of cameras in a plane.
 
     Attributes:
-        title: From where one looks.
         nearest: As `ns_abstract.report.outside.SceneDrawing.picture` has it.
-        window: The part of the plane.
         shapes: Cameras and the corners of their frusta, normalised units, in the order in which they are drawn.
     """
 
@@ -176,8 +171,6 @@ class CameraDrawings:
     """The drawings of cameras on a page.
 
     Attributes:
-        cells: Cameras of cells.
-        left_out: Cells without one here.
         ends: [3], [3] ends of a box about where cameras stand, normalised units.
         outside: Draws the scene behind them; None: it has no elements with a place of their own.
         up: The axis from whose tip the plan is drawn; see `upward`.

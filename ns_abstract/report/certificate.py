@@ -48,7 +48,6 @@ class CertifiedRun(CommandRun):
     Attributes:
         network_guarantee: What holds of the network, one sentence each.
         model: The network: ``name``, ``sha256``, shapes.
-        property: Content of PROP.json.
         sentence: The property in words, as the end of "on every image ...".
         picture: "float" or "8-bit": what the network is shown.
     """
@@ -91,14 +90,10 @@ def certificate_document(
     """Content of report.json.
 
     Args:
-        run: What was certified.
         frames: One mapping by frame: index, parameters, coverage, cells, sampled, partition, least_margin,
             counterexamples.
         state: "running", "done", "budget" or "interrupted".
-        trace: Fractions over time.
         seconds: Wall time, earlier runs included.
-        effort: Figures of the work done.
-        reasons: Why cells are unknown, and how many.
         cells_seal: Number of rows of ``cells`` with a verdict, and the sum of their hashes.
         scene_margin: Largest variations of the scene for which what is certified holds.
         cameras: Where cameras of cells stand; None: of none.
@@ -143,11 +138,7 @@ def certificate_document(
 
 
 class LastReport:
-    """What a search has reported last, so that a command which is ended where it is can say so.
-
-    Args:
-        folder: Of report.json and report.html.
-    """
+    """What a search has reported last, so that a command which is ended where it is can say so."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -161,7 +152,6 @@ class LastReport:
 
         Args:
             document: Content of report.json; its keys ``state`` and ``first_command`` are set here.
-            page: Makes the content of report.html from it.
 
         Raises:
             InputError: The folder cannot be written.

@@ -39,9 +39,7 @@ class CertificateDetails:
     """Details that were computed when a search ended: regions of failure, poses with pictures.
 
     Attributes:
-        regions: Where the property fails.
         pictures: Of the first of them: a counterexample, and the nearest pose that was seen to be right.
-        stops: Poses along the sets, with pictures.
         why: Why there are no more pictures, as the end of a sentence; empty if there were not to be more.
     """
 
@@ -62,11 +60,9 @@ def certificate_page(
     """The page of a certificate.
 
     Args:
-        document: Content of report.json.
         cells: By frame, rows lower, upper, verdict in the order of ``document``'s parameters.
         pictures: ``title``, ``text`` and ``png`` of images to show, in order.
         seen: ``text`` and ``png`` of a pose in a cell, by frame and position of the cell in it.
-        cameras: Where cameras stand.
         closer: Regions and poses that were looked at more closely.
 
     Returns:
@@ -227,8 +223,6 @@ def path_spans(
     """Cells of a frame of a path: from and to where, verdict, and where the counterexample is.
 
     Args:
-        entry: The frame.
-        rows: Its cells.
         last: How wide a keyframe by itself is drawn.
     """
     free = free_parameters(entry["parameters"])

@@ -84,10 +84,7 @@ class ComparisonReport(Report):
 
     Args:
         output_dir: Made if it is absent.
-        run: What is computed.
-        pictures: Renders both scenes.
         tolerance: Difference of which is asked whether any picture exceeds it, or None.
-        keep_stored: Whether to go on with what the folder holds.
 
     Raises:
         InputError: The folder cannot be written, or holds other results that were to be kept.
@@ -231,7 +228,6 @@ def comparison_page(document: Mapping[str, Any], pictures: Mapping[int, Mapping[
     """The page: HTML, self-contained; every text of the document is escaped.
 
     Args:
-        document: Content of report.json.
         pictures: For the frames shown, by number: PNGs by title.
     """
     frames, scene = document["frames"], document["scene"]

@@ -38,9 +38,6 @@ _FIX_RESULTS = "give the folder that ns-abstract-render wrote"
 class Results:
     """The frames that a command left in a folder.
 
-    Args:
-        folder: The folder.
-
     Raises:
         InputError: There are no frames in it, one is damaged or not the one that was written, or their sizes differ.
 

@@ -188,8 +188,6 @@ def save_frame(
     ``difference_upper`` and ``difference_lower`` are ``upper`` and ``witness_upper`` by their meaning.
 
     Args:
-        path: The file; replaced if it exists.
-        result: The frame.
         status: "done", "partial" or "missing".
         about: What was bounded, for the reader of the single file; strict JSON.
 
@@ -242,7 +240,6 @@ class StoredFrame:
     """A frame file's content.
 
     Attributes:
-        result: The frame.
         status: "done", "partial" or "missing".
         about: What was bounded, as given to `save_frame`.
         has_leaves: Whether the file has leaf cells, read or not.

@@ -84,15 +84,10 @@ def location_document(
     """Content of report.json.
 
     Args:
-        run: What was looked for.
         parameters: Names and units of the table ``parameters``.
-        sets: By frame.
-        rows: Cells by frame.
         poses: Rendered poses by frame, the best first, with ``values`` and ``outliers``.
         state: "done", "budget" or "interrupted".
         seconds: Wall time, earlier runs included.
-        effort: Figures of the work done.
-        trace: Points of the search over time.
     """
     frames = [_frame(run, parameters, frame, sets[frame], rows[frame], poses[frame]) for frame in sorted(rows)]
     hulls = [entry["hull"] for entry in frames if entry["hull"] is not None]

@@ -69,11 +69,7 @@ def _remembered(cached: dict[K, V], key: K, find: Callable[[], V]) -> V:
 
 @dataclass
 class SceneDrawing:
-    """Draws a scene from outside.
-
-    Args:
-        elements: What is drawn.
-    """
+    """Draws a scene from outside."""
 
     elements: SceneElements
     # reports are written again and again, mostly of the same windows
@@ -122,7 +118,6 @@ class SceneDrawing:
         """PNG of the elements in a window.
 
         Args:
-            window: The window.
             nearest: Coordinate towards who looks beyond which elements are left out: those in front.
         """
         return _remembered(self._pictures, (window, nearest), lambda: self._picture(window, nearest))
@@ -201,10 +196,8 @@ def draw_plane(outside: SceneDrawing | None, window: PlotWindow, nearest: float,
 
     Args:
         outside: Draws the scene.
-        window: What is shown.
         nearest: As `SceneDrawing.picture` has it.
         marks: SVG, in the coordinates of `plane_axes`.
-        title: Of the plot.
     """
     (left, right, above, below), (width, height) = _ROOM, window.size
     if outside is not None:

@@ -63,14 +63,7 @@ def _box_items(box: ParameterBox, units: ShownUnits) -> list[str]:
 
 
 class _Sheet(NamedTuple):
-    """Sizes of a picture of four panels, in its own pixels.
-
-    Attributes:
-        dpi: Pixels by inch.
-        panel: Width and height of a panel.
-        width: Of the whole picture.
-        characters: Of a line of text.
-    """
+    """Sizes of a picture of four panels, in its own pixels; ``dpi``: pixels by inch."""
 
     dpi: float
     panel: tuple[int, int]
@@ -111,10 +104,8 @@ def frame_figure(
     Panels show whole pixels, several screen pixels each for small images.
 
     Args:
-        result: The frame.
         guarantee: Shown in the title; see `ns_abstract.report.figures.short_guarantee`.
         about: More for the title, such as the scene's name.
-        units: Those that the set's ranges are written in.
     """
     from matplotlib.figure import Figure
 
@@ -189,7 +180,6 @@ def layer_figure(result: FrameResult, name: str) -> Figure:
     """The picture of one further output: lower | upper | gap | one render, of one colour scale but for the gap.
 
     Args:
-        result: The frame.
         name: Of `ns_abstract.refine.result.EXTRA_OUTPUTS`; its colour scale ends where what is known ends.
     """
     from matplotlib.figure import Figure

@@ -47,10 +47,6 @@ def play_data(result: FrameResult, most: int) -> str | None:
     """A frame for the page: a zlib stream of a JSON line and arrays, in base64.
 
     With the leaves' linear sets, as finely as they fit; else without them; None where nothing fits.
-
-    Args:
-        result: The frame.
-        most: Characters that it may take.
     """
     # one pose has nothing to move
     moves = result.leaves is not None and result.leaves.tile.shape[0] and result.box.dimensions

@@ -110,7 +110,6 @@ class Report:
 
     Args:
         output_dir: Made if it is absent.
-        run: What is computed.
         keep_stored: See `resume`.
 
     Attributes:
@@ -287,7 +286,6 @@ class Report:
         frames of an earlier command too; its time and trace are put in front.
 
         Args:
-            result: The frame.
             status: "done", or "partial" where the work ended before its target; decided by
                 ``target_ratio`` if None. A frame without bounds is always "missing".
             picture: Whether to draw the PNG now; otherwise `draw` or `finish` does.

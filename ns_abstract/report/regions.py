@@ -24,7 +24,6 @@ class FailureRegion:
     """A connected region of falsified cells of a frame.
 
     Attributes:
-        frame: Number of the set.
         cells: Positions of the cells in their frame.
         share: Part of the set's volume.
         lower, upper: [n] ends of the box around them, all parameters.
@@ -46,9 +45,7 @@ class PoseImage:
     """A picture with the network's outputs for it.
 
     Attributes:
-        title: What it is.
         values: [n] all parameters.
-        png: The picture.
         outputs: [m] the network's.
         margin: The property's; None where that is no number.
     """
@@ -144,11 +141,8 @@ def nearest(
     """The cells of a verdict that are nearest to a pose, and the nearest pose of each; the nearest first.
 
     Args:
-        rows: Cells of a frame.
-        verdict: Theirs.
         pose: [n] all parameters.
         parameters: Names and ends of all parameters; distances are in units of their ranges.
-        count: Most cells.
     """
     some = [k for k, row in enumerate(rows) if row["verdict"] == verdict]
     if not some:

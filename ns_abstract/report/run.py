@@ -34,7 +34,6 @@ def guarantee_text(guarantee: str, renderer: str = "gsplat", bounded: str | None
 
     Args:
         guarantee: "float32-sound", "real-sound" or "sampled".
-        renderer: Name of the bounded renderer.
         bounded: What of the scene is bounded, such as "of the Gaussians alone"; None: all of it.
 
     Raises:
@@ -124,8 +123,6 @@ class CommandRun:
         fingerprint: Whatever changes the results: scene file (`file_stamp`), camera path, perturbation, renderer,
             arithmetic, network. Results are mixed only where it is the same. Effort (time budget, target ratio,
             seed) does not belong here.
-        settings: The command's options.
-        command: The command line.
         plan: What was left out for this scene and why, one sentence each.
         limits: Further conditions on the guarantee, one sentence each.
         assumptions: What the results rest on, and where each choice came from.
@@ -156,12 +153,7 @@ class CommandRun:
         }
 
     def tail(self, state: str, metrics: Mapping[str, str]) -> dict[str, Any]:
-        """The last keys of report.json.
-
-        Args:
-            state: "running", "done", "budget" or "interrupted".
-            metrics: What the report's figures mean.
-        """
+        """The last keys of report.json; ``state``: "running", "done", "budget" or "interrupted"."""
         return {
             "plan": self.plan,
             "state": state,

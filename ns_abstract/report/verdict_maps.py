@@ -75,8 +75,6 @@ def pair_maps(
         lower, upper: [n, d] ends of cells that do not overlap.
         verdicts: [n] "certified", "falsified" or anything else.
         ends: [d], [d] ends of the set; every one has a width.
-        complete: Whether the cells are all of the set.
-        bins: Places along a parameter.
 
     Returns:
         Parts rounded downward, but exactly 1 where the cells of one verdict are all of a place.

@@ -86,12 +86,6 @@ def write_pictures(
 ) -> list[str]:
     """Write the pictures of a certificate, each whole or not at all; returns their names.
 
-    Args:
-        folder: Where.
-        document: Content of report.json.
-        rows: Cells by frame.
-        cameras: Where cameras stand.
-
     Raises:
         InputError: The folder cannot be written.
     """

@@ -23,11 +23,9 @@ class WalkPose:
     """A pose that the slider shows, with its verdict.
 
     Attributes:
-        frame: Number of its set.
         values: [n] all parameters.
         verdict: Of the cell that it lies in; "unknown" where there is none.
         proven: The proved lower bound of the margin, where it is certified.
-        at: Where it is, in words.
     """
 
     frame: int
@@ -54,8 +52,6 @@ def stops(
 
     Args:
         entries: Frames of report.json: index and parameters (name, unit, lower, upper).
-        rows: By frame, its cells.
-        units: Those that places are written in.
         most: Most poses; of more frames some, evenly spread.
     """
     if len(entries) > most:

@@ -73,9 +73,7 @@ class Decision:
     """The answer to an instance.
 
     Attributes:
-        word: The verdict.
         x, y: With "sat": the input [n] float64 inside a region and the outputs [k] for it in float32.
-        boxes: Boxes that were bounded.
     """
 
     word: Verdict
@@ -97,11 +95,8 @@ def decide(
     """Search the regions for an input with an unsafe output and for a proof that there is none (V11).
 
     Args:
-        network: The network.
         run: The program that counts: outputs [k] for one image [1, *input_shape] float32. Only what it
             computes is a counterexample.
-        regions: Boxes of inputs, and what is unsafe there.
-        deadline: When to end.
         memory: Bytes that bounds may take.
         arithmetic: What a proof covers.
     """
@@ -121,7 +116,6 @@ class _Family:
     """Regions of which the same functions of the outputs are asked.
 
     Attributes:
-        regions: With an input each.
         lower, upper: [m, n].
         offset: [m, k].
     """

@@ -102,8 +102,6 @@ class ResponseSample:
     """One camera response of a set; see `ns_abstract.refine.protocol.SceneSample`.
 
     Attributes:
-        frame: What is rendered.
-        response: The set.
         values: [3] factors or powers by channel.
     """
 

@@ -78,7 +78,6 @@ def divided(cell: Cell, left: np.ndarray, filled: float) -> Iterator[tuple[Cell,
     """Cells that tile ``cell``, each with whether some of its sub-boxes are left (U5).
 
     Args:
-        cell: The cell.
         left: [counts] which of its equal sub-boxes are left; counts divide the cell's units.
         filled: Part of a box that has to be left for it to become one cell.
     """

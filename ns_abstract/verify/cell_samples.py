@@ -20,13 +20,7 @@ Sample = tuple[np.ndarray, "SceneSample | None"]
 
 @dataclass
 class CellSamples:
-    """Concrete pictures of one cell, with their margins.
-
-    Attributes:
-        cell, box: The cell.
-        scene: Draws and bounds its pictures.
-        samples, margins: What was looked at so far.
-    """
+    """Concrete pictures of one cell, with their margins."""
 
     cell: Cell
     box: ParameterBox

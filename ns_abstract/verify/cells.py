@@ -52,7 +52,6 @@ class CellGrid:
     """The grid of a frame: each parameter cut into ``units[k]`` equal units, of which cells consist.
 
     Attributes:
-        box: The set.
         units: Parts along each parameter: the finest cells there are.
         coarse: Parts along each parameter that the search begins with.
     """
@@ -110,10 +109,8 @@ class CellGrid:
         """The cell halved along the parameter with the largest slope, and so on; empty if it is one unit.
 
         Args:
-            cell: What to cut.
             slopes: [d] what a cut along each parameter may gain.
             shrink: Until the slopes' sum is so many times smaller; there is one halving at least.
-            most: Most parts.
         """
         gains = np.where(np.isfinite(slopes), slopes, 0.0)
         sizes = np.array(cell.past, np.int64) - np.array(cell.first, np.int64)

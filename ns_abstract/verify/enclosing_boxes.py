@@ -35,7 +35,6 @@ def enclosing_box(cell: ParameterBox, whole: ParameterBox, motion: np.ndarray) -
 
     Args:
         cell: A box inside of ``whole``.
-        whole: The set.
         motion: [d] pixels that the picture moves by over each parameter's range.
     """
     box, moved = cell, 0.0

@@ -49,10 +49,8 @@ def write_vnnlib(
 
     Args:
         model: The network, or its .onnx file, with its weights inside.
-        images: One cell.
         rows, offset: [k, output_size] and [k], both rounded to float32; the property is that in every group
             some row of ``rows @ y + offset`` is above 0.
-        target: Path without ending.
         form: "slice" needs n (d + 2) numbers for an image of n; "gemm" n (n + d), and no operator but Gemm
             and Reshape, for verifiers that know little.
         groups: Row numbers of each group; None: every row is one.

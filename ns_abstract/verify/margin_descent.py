@@ -19,8 +19,6 @@ def descend(box: ParameterBox, start: np.ndarray, margin: Callable[[torch.Tensor
     """Return a pose [d] of the cell whose margin is smaller than at ``start`` [d]; None: no step found one.
 
     Args:
-        box: The cell.
-        start: A pose of it.
         margin: Of parameter values [d]; differentiable.
     """
     low, high = (torch.tensor(v, dtype=torch.float64) for v in (box.lower, box.upper))

@@ -28,8 +28,6 @@ class NetworkModel:
     """A network with its preprocessing, for `ns_abstract.verify.search.Search`.
 
     Args:
-        network: The network.
-        preprocess: What comes before it.
         memory: Bytes that its bounds may take.
         arithmetic: Whether every float32 evaluation is meant, or the exact network alone.
     """

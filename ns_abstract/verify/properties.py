@@ -45,7 +45,6 @@ class Query:
     Attributes:
         rows: [k, output_size].
         offset: [k].
-        about: What the claim needs to read the bounds.
     """
 
     rows: np.ndarray
@@ -331,7 +330,6 @@ class DetectionClaim(Claim):
         iou: Threshold of the overlap with ``box``, or None: anywhere.
         box: x0, y0, x1, y1 in pixels, or None.
         stride: Pixels by grid cell.
-        grid: Grid cells on a side.
     """
 
     label: int | None

@@ -29,7 +29,6 @@ class RegisteredImages:
 
     Args:
         scene: Pictures of a set of `PoseBox.registered`: its last parameters tell where the scene stands.
-        frame: The frame behind them.
     """
 
     def __init__(self, scene: FrameImages, frame: Frame) -> None:
@@ -71,7 +70,6 @@ class RegisteredSample:
     """One position of the scene; see `ns_abstract.refine.protocol.SceneSample`.
 
     Attributes:
-        scene: The pictures.
         offset: [3] where the scene stands.
     """
 
@@ -108,11 +106,7 @@ def _sign(leaf: torch.Tensor) -> np.ndarray:
 
 
 class RegisteredModel:
-    """A network behind such pictures; see `ns_abstract.verify.protocol.Model`.
-
-    Args:
-        model: The network.
-    """
+    """A network behind such pictures; see `ns_abstract.verify.protocol.Model`."""
 
     def __init__(self, model: Model) -> None:
         self.model = model

@@ -54,9 +54,6 @@ class VariationKind:
     Attributes:
         name: Key of a scene variation, of `KINDS`.
         text, unit: For people.
-        first: Radius that is tried first.
-        most: Radius beyond which none is tried.
-        response: What of the camera varies, if it is not the scene.
         place: Parameters of where the scene as a whole stands, if these vary (`PoseBox.registered`).
     """
 
@@ -118,7 +115,6 @@ class CellOutcome:
 
     Attributes:
         outcome: "holds": proved; "falsified": a scene was found, and rendered again, that breaks it; "unknown".
-        reason: Why it is not proved.
         slopes: [d] what a cut along each parameter may gain.
         example: Arrays that tell a scene that breaks it, or None.
     """
@@ -138,8 +134,6 @@ class CertifiedBox:
     """A certified cell.
 
     Attributes:
-        frame: Number of its set.
-        box: The cell.
         margin: What was proved; cells with little of it come first.
         part: Of all that is certified, by volume.
     """
@@ -167,13 +161,11 @@ class SceneMargin:
     """The result of a bisection.
 
     Attributes:
-        kind: What varies.
         radius: All that was certified holds for all scenes this far from the stored one; 0: nothing more is known.
         reached, part: Radius at which the part of the certified volume holds that was looked at.
         state: "done", or "ended": by the time, or by a request to stop.
         trials: Runs, in order.
         cells: How many are certified.
-        seconds: Time spent.
         example: Arrays that tell the scene of the smallest falsified radius, or None.
     """
 
@@ -254,8 +246,6 @@ def largest_radius(
     """Return the largest radius, within a tenth, for which every cell is proved again (V13).
 
     Args:
-        kind: What varies.
-        cells: What is certified.
         prove: Sound bounds and an attack of one cell.
         over: Whether to end with what is known; asked about once a second.
     """
@@ -366,7 +356,6 @@ def check_scenes(varied: bool, rays: bool) -> None:
 
     Args:
         varied: Whether the sets hold several scenes already.
-        rays: Whether the scene is one of rays.
 
     Raises:
         InputError: There are no Gaussians, or they vary already.

@@ -64,12 +64,7 @@ class Search:
     """Examines blocks of one frame.
 
     Args:
-        scene: The frame's pictures.
-        model: The network.
-        claim: What is to hold.
-        grid: The frame's cells.
         every_unit: Whether each unit of the grid needs a verdict of its own where the property fails (PCP-S).
-        block: Most cells examined together.
         cuts: Whether cells without a verdict are cut; else they are done with.
         cover: Proves cells that are too wide part by part; None: they are cut.
         costly: Whether bounds of the model cost so much that cells whose sets are wide are cut without them, and that
@@ -106,7 +101,6 @@ class Search:
         """[s] concrete margins and [s, n] outputs at poses, each of a scene of the set.
 
         Args:
-            samples: The poses.
             scenes: What draws each of them; None: the set's pictures.
         """
         drawn_by = [self.scene] * len(samples) if scenes is None else scenes

@@ -18,10 +18,8 @@ class FinishedCell:
     """A finished cell with its verdict.
 
     Attributes:
-        cell: The cell.
         verdict: "certified", "falsified" or "unknown".
         margin: Proven lower bound of the margin; that of the counterexample; or the best bound, or None.
-        seconds: Time spent on it.
         counterexample: Parameter values, or None.
         image: [H, W, 3] float32 picture of the counterexample, or None.
         outputs: [n] what the network says about it, or None.
@@ -52,7 +50,6 @@ class BlockResult:
         ranks: How far off a proof of each block is, about (see `Search._rank`); the nearest are best examined first.
         samples: Whether the property was seen to hold at the middle of each cell.
         bounded: Cells whose network bounds were computed.
-        seconds: Time spent.
     """
 
     leaves: tuple[FinishedCell, ...]

@@ -46,7 +46,6 @@ class Tally:
     """Parts of a frame's parameter volume (V7); what is left is open.
 
     Attributes:
-        frame: Entry of the camera path.
         units, certified, falsified, unknown: Volumes in grid units.
         undecided: The part of unknown in cells with a picture that neither holds nor breaks the property.
         poses: First cells whose middle was rendered, evenly spread over the set.
@@ -72,7 +71,6 @@ class Store(StoreFile):
     """An open ``cells.sqlite``.
 
     Args:
-        folder: Output folder.
         fingerprint: What a stored search must agree with to be continued.
         parameters: Names and units of the parameters of all frames together.
         fixed: By frame, the values of parameters that do not vary in it.

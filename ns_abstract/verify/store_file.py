@@ -99,7 +99,6 @@ class StoreFile:
     """An open ``cells.sqlite`` whose rows are those that were written.
 
     Args:
-        folder: Output folder.
         fingerprint: What a stored search must agree with to be continued.
         parameters: Names and units of the parameters of all frames together.
         resume: Whether to go on with what is there; otherwise it is replaced.

@@ -104,7 +104,6 @@ def load_vnnlib(path: Path, output_shape: Shape, input_shape: Shape | None = Non
     """Read a VNN-LIB file, packed (.gz) or not.
 
     Args:
-        path: The file.
         output_shape: Of the network; as many outputs must be declared.
         input_shape: Of the network; as many inputs must be declared, or none. None: not compared.
 
@@ -163,8 +162,6 @@ def load_query(
 
     Args:
         path: The file; only named in errors if ``text`` is given.
-        input_shape, output_shape: Of the network.
-        text: Its contents.
 
     Returns:
         The regions, and the query that a file of version 2 is; None for version 1.

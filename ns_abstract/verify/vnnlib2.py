@@ -36,7 +36,6 @@ class Tensor:
     """A declared tensor.
 
     Attributes:
-        name: As the query has it.
         kind: Element type, "real" or "float32".
         shape: Empty: a scalar.
     """
@@ -62,8 +61,6 @@ class Vnnlib2Query:
     """A query as assertions of version 1 about ``X_0, ...`` and ``Y_0, ...``, elements in rows.
 
     Attributes:
-        network: Its name.
-        input, output: The tensors.
         expressions: Declarations and assertions of version 1, as nested lists of tokens.
     """
 
@@ -282,9 +279,6 @@ def write_query(d: int, n: int, groups: Sequence[Sequence[int]], k: int, notes: 
     """The query whose input is ``d`` parameters and ``n`` slacks in [-1, 1], violated where a group of outputs is <= 0.
 
     Args:
-        d, n: Numbers of parameters and slacks.
-        groups: Numbers of the outputs of each group.
-        k: Number of outputs.
         notes: Lines of comment.
     """
     lines = ["(vnnlib-version <2.0>)", *(f"; {note}" for note in notes)]
@@ -298,8 +292,6 @@ def violation(source: str, result: str, count: int, groups: Sequence[Sequence[in
 
     Args:
         source, result: Names of an input and of an output, with {} for the number.
-        count: Of the inputs.
-        groups: Numbers of the outputs of each group.
     """
     lines = []
     for name in map(source.format, range(count)):

@@ -14,7 +14,6 @@ class UnsafeSet:
     Attributes:
         rows: [k, n].
         offset: [k].
-        groups: Row numbers of each group.
         inputs: Number of assertions on inputs that were set aside.
     """
 

@@ -142,7 +142,6 @@ class Background:
         """The best that is known of ``view``; what is missing is asked for.
 
         Args:
-            view: What is shown.
             seconds: Time that the work on the view's own size may take.
         """
         with self._lock:

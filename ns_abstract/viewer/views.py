@@ -105,9 +105,6 @@ class Snapshot:
         lower, upper: [h, w, 3] float32 bounds.
         witness_lower, witness_upper: [h, w, 3] float32 extremes of real renders.
         figures: As `ns_abstract.report.figures.metrics`.
-        seconds: Time spent at this size.
-        cells: Cells bounded at this size.
-        final: Whether the work at this size has ended.
         guarantee: "float32-sound", "real-sound" or "sampled".
         depth: [2, h, w] float32 bounds of the expected depth, normalised units, if it was bounded.
     """
@@ -223,7 +220,6 @@ class SplatSource:
         renderer: "gsplat" or "paper".
         version: gsplat's; None: 1.4.0.
         arithmetic: "float32" or "real".
-        layers: Whether the expected depth is bounded, too.
     """
 
     splats: Splats
@@ -287,11 +283,7 @@ class SplatSource:
 
 @dataclass(frozen=True, eq=False)
 class NerfSource:
-    """A vanilla NeRF as it is bounded: its fine field at uniform samples, in small pictures.
-
-    Attributes:
-        scene: The fields.
-    """
+    """A vanilla NeRF as it is bounded: its fine field at uniform samples, in small pictures."""
 
     scene: NerfScene
 

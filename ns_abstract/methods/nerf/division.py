@@ -18,7 +18,6 @@ class Division:
 
     Attributes:
         axes: Axis that is halved from each level to the next; of a line, to that with twice as many cells.
-        dimensions: Of the box.
         finer: Halvings of the deepest level's cells into parts, by axis.
     """
 
@@ -104,7 +103,6 @@ def division_for(
     """Return the subdivision whose cells keep samples within ``displacement``; ``moves`` [n, samples, d] over the box.
 
     Args:
-        deeper: Levels that are for refinement.
         finer: See `Division`.
         swept: Whether the last axis is a sample's own interval, which is as wide in any box.
 

@@ -22,9 +22,7 @@ class Field:
     """A field on one device.
 
     Args:
-        weights: Its parameters.
         dtype: Of all arithmetic. The bounds are those of float64 and of real numbers.
-        device: Where it is evaluated.
     """
 
     def __init__(

@@ -126,9 +126,6 @@ class FieldFrame(RayPictures):
     The set as a whole is bounded by [0, 1] without work, so that refinement can take ray after ray.
 
     Args:
-        pose_set: The poses.
-        renderer: Draws the field.
-        bounds: Of its rays.
         share: Rays that are bounded together.
         at_once: Rays between two looks at the goal.
         workers: Shares that are bounded side by side.
@@ -280,7 +277,6 @@ class FieldFrame(RayPictures):
         """All rays over a cell ``box`` with linear bounds, from strips of the set that are kept.
 
         Args:
-            box: Part of the frame's set.
             most: Rays that are bounded, about, the first of `rays`; the others are left at [0, 1]. All if None.
             weigh: Gives [H, W, 3] what part of the margin a unit of each pixel's width may cost, or None; asked only
                 where rays could be refined.
@@ -401,10 +397,6 @@ class NerfFrame(FieldFrame):
     """Bounds and renders one frame's set of poses of a vanilla NeRF.
 
     Args:
-        scene: The fields.
-        sampling: Where they are evaluated.
-        pose_set: The poses.
-        device: Where the network is bounded.
         workers: Processes that bound rays side by side, one core each: the matrices are too small to be shared
             among cores. Results do not depend on where a ray is bounded, but on what is bounded together.
     """

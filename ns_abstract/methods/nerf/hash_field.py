@@ -66,8 +66,6 @@ class ProposalField:
     """Densities that place samples: ``average_init_density * exp(net(encoding(position)))``.
 
     Attributes:
-        encoding: Of positions.
-        net: One output.
         average_init_density: Factor of the density, above 0.
     """
 
@@ -85,7 +83,6 @@ class NerfactoField:
     the middles of its intervals and places the edges of the next round's by the weights.
 
     Attributes:
-        encoding: Of positions.
         density_net: Outputs are the logarithm of density over ``average_init_density``, then geometric features.
         color_net: From 16 harmonics of ``(direction + 1) / 2``, as nerfstudio's torch implementation evaluates them,
             then the geometric features; its outputs are before the sigmoid. The appearance embedding is part of the
@@ -136,10 +133,7 @@ class NerfactoScene:
     """A nerfacto.
 
     Attributes:
-        field: What is evaluated.
         dataparser: Units of the training data against the normalised frame.
-        name: Short name for reports.
-        source: The file the parameters were read from.
         notes: What was assumed where the source says nothing, one sentence each.
         assumptions: What was decided of the picture, and where each choice came from.
     """

@@ -198,9 +198,7 @@ def linear(z, encoded, remainder, weights, out):
     """A linear layer, piece by piece (design.md, F4); returns the number of columns behind it.
 
     Args:
-        z: `LayerInput`.
         encoded, remainder: [B, m, k] and [B, k] polynomials and remainders of an encoded vector, if the layer sees it.
-        weights: `LayerWeights`.
         out: `LayerOutput`, filled; its columns and owners may have room for more.
     """
     inputs, n = weights.absolute.shape

@@ -46,10 +46,6 @@ def holds_nerf(run: runs.RunConfig) -> bool:
 def load_nerf(run: runs.RunConfig, overrides: Overrides | None = None) -> NerfScene:
     """Read the fields and what evaluation needs besides.
 
-    Args:
-        run: The run's configuration.
-        overrides: What the user says in place of the files.
-
     Raises:
         InputError: For any content of the files, or an override, that cannot be used.
     """
@@ -149,9 +145,7 @@ def field_weights(
     """One field of a model's state.
 
     Args:
-        state: Tensors by name.
         name: "field_coarse" or "field_fine".
-        file: Where the state is from, for messages.
         exponents: Highest exponents of the frequencies of positions and directions; the lowest are 0.
         counts: Numbers of these frequencies; None: what the layers' widths say.
 

@@ -38,7 +38,6 @@ class NerfMethod(FieldMethod):
     """A vanilla NeRF and the program that is bounded: the fine field at N uniform samples.
 
     Args:
-        scene: The scene.
         renderer: "paper" (black behind the last sample) or None.
         arithmetic: "real" or None: float32 evaluations of a network are not enclosed.
         sampling: "uniform" (None: the same), or "hierarchical": Nerfstudio's own picture (design.md, F16).

@@ -69,11 +69,6 @@ def read_linear(
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Weight [out, in] and bias [out] of a linear layer.
 
-    Args:
-        state: Tensors by name.
-        key: The layer's name there.
-        file, fix: For messages.
-
     Raises:
         InputError: One is missing, or their shapes are not those of a linear layer.
     """
@@ -111,7 +106,6 @@ def background(run: runs.RunConfig, overrides: Overrides, default: str) -> tuple
     Args:
         run: Its ``background_color`` is read.
         overrides: ``background`` takes its place.
-        default: Name of the model's own default.
 
     Raises:
         InputError: No such background.
@@ -142,12 +136,7 @@ def records(
     """Which step, class, modules and units are taken, and where each choice came from.
 
     Args:
-        run: The configuration.
-        state: What the checkpoint holds.
-        checkpoint: Its file.
-        overrides: What the user says.
         stock: Nerfstudio's own class, where config.yml names none.
-        transform: Units of the data set.
         assumed_units: Whether ``transform`` is a default.
     """
     target = runs.target_class(run)

@@ -86,10 +86,6 @@ def holds_nerfacto(run: runs.RunConfig) -> bool:
 def load_nerfacto(run: runs.RunConfig, overrides: Overrides | None = None) -> NerfactoScene:
     """Read the fields and what evaluation needs besides.
 
-    Args:
-        run: The run's configuration.
-        overrides: What the user says in place of the files.
-
     Raises:
         InputError: For any content of the files, or an override, that cannot be used.
     """

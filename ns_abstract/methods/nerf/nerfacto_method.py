@@ -35,10 +35,7 @@ class NerfactoMethod(FieldMethod):
     """A nerfacto and Nerfstudio's own picture of it, in real numbers and in float64.
 
     Args:
-        scene: The scene.
-        options: Which program is bounded: there is one.
         arithmetic: "real" or None: float32 evaluations are not enclosed.
-        workers: Processes that bound rays.
 
     Raises:
         InputError: An option does not go with nerfacto.

@@ -31,11 +31,7 @@ def quantiles(count: int) -> NDArray[np.float64]:
 
 
 class NerfactoRenderer:
-    """Renders rays of a nerfacto.
-
-    Args:
-        field: What is evaluated.
-    """
+    """Renders rays of a nerfacto."""
 
     def __init__(self, field: NerfactoField) -> None:
         self.field = field

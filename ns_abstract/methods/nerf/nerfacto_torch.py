@@ -64,11 +64,7 @@ def harmonics(direction: Tensor) -> Tensor:
 
 
 class DifferentiableNerfacto:
-    """Renders rays of a nerfacto in float64; slopes go through the samples' places as well.
-
-    Args:
-        field: What is evaluated.
-    """
+    """Renders rays of a nerfacto in float64; slopes go through the samples' places as well."""
 
     def __init__(self, field: NerfactoField) -> None:
         self.field = field

@@ -148,7 +148,6 @@ class BoundedRays(ABC):
 
         Args:
             moves: [n, samples, d] by how much samples move along each parameter.
-            most: Most of them.
             deeper: Halvings of the first cells; None: as usual.
         """
 
@@ -166,8 +165,6 @@ class BoundedRays(ABC):
         """Bounds of the colours of ``pixels`` [n, 2] over every pose of ``box``.
 
         Args:
-            pose_set, box: The poses.
-            pixels: Rows and columns.
             tolerance: What a sample's open opacity or colour may move a pixel by before its cells are halved.
             most_alpha: [n, samples] upper bounds of opacities over a larger box.
             aim: [n, 3] lower and upper colours; bounds between them are good enough (before the shifts).
@@ -185,11 +182,8 @@ class RayField(BoundedRays):
     """A scene's field along the rays of a sampling, and what bounds it.
 
     Args:
-        scene: The scene.
         sampling: Uniform, or hierarchical: bounded where the coarse pass puts samples (design.md, F16), or wherever
             they may be (F10, F14).
-        dimensions: Number of parameters.
-        device: Where the network is bounded.
         compiled: Whether by kernels compiled for a processor; None: where ``device`` is one.
         white: Which samples are white, the others black, in place of the field's colours; None: these. Of uniform
             samples alone.

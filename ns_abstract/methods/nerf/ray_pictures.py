@@ -48,12 +48,7 @@ class PixelRenderer(Protocol):
 
 
 class RayPictures:
-    """Renders one frame's set of poses. Every ray is a tile of its own.
-
-    Args:
-        pose_set: The poses.
-        renderer: Draws the field.
-    """
+    """Renders one frame's set of poses. Every ray is a tile of its own."""
 
     #: Every ray is work of its own.
     tilewise = True
@@ -136,11 +131,7 @@ class FieldScene(Protocol):
 
 
 class FieldMethod:
-    """What `ns_abstract.refine.protocol.Method` says of any field.
-
-    Args:
-        scene: The scene.
-    """
+    """What `ns_abstract.refine.protocol.Method` says of any field."""
 
     #: What bounds of this program are called.
     guarantee = "real-sound"

@@ -368,8 +368,6 @@ def relu(z, grid, limit, out):
     """max(0, z) in place (design.md, F5); returns the number of new error terms.
 
     Args:
-        z: `ReluInput`.
-        grid: `FitGrid`.
         limit: Error terms of a piece beyond which it fails.
         out: `ReluOutput`, filled.
     """

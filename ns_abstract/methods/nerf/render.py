@@ -40,7 +40,6 @@ class Sampling:
         near, far: Ends of the rays, normalised units.
         samples: Bins of equal length; of the coarse pass where the sampling is hierarchical.
         importance: Samples that the coarse weights place (hierarchical only).
-        background: RGB behind the last sample.
     """
 
     kind: Literal["uniform", "hierarchical"]
@@ -75,10 +74,6 @@ class NerfRenderer:
     """Renders rays of a scene.
 
     Args:
-        scene: The fields.
-        sampling: Where they are evaluated.
-        dtype: Of all arithmetic.
-        device: Where.
         white: Which uniform samples are white, the others black, in place of the field's colours; None: these.
     """
 

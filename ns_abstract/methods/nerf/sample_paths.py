@@ -119,7 +119,6 @@ class SamplePaths:
         fine: The fine field, by pose and one more parameter.
         sampling: Hierarchical.
         occupancy: Where density is declared 0.
-        batch: Pieces bounded at once.
     """
 
     def __init__(
@@ -221,11 +220,9 @@ class BundleBounds:
     """The bounds of one pencil of rays, cell after cell, halved where they are too wide.
 
     Args:
-        owner: Bounds of the scene.
         pencil: The rays over a box of poses; not swept.
         division: Cells of the box, and the parts that are kept.
         start: [n] the level of each ray's first cells.
-        tolerance: What may be left open.
         aim: [n, 3] lower and upper colours; bounds between them are good enough (before the shifts).
         shifts: Intervals of hue and saturation that are added to all colours.
     """
@@ -322,12 +319,10 @@ class FollowedSamples:
     """Bounds of the samples of several cells: densities and colours by part.
 
     Args:
-        owner: Bounds of the scene.
         rays: Origins and directions [k, nodes, 3] at the fine field's nodes.
         radii: What they are off by.
         low, high: [k, parts, S + 1] the samples' edges.
         counts: Parts by axis.
-        tolerance: What may be left open.
     """
 
     def __init__(

@@ -83,7 +83,6 @@ class FieldWeights:
         density: One output, softplus.
         head: ReLU after every layer; the first takes the encoded direction, then the base's output.
         color: Three outputs, sigmoid.
-        position, direction: Encodings.
     """
 
     base: tuple[Layer, ...]
@@ -141,13 +140,9 @@ class NerfScene:
     """A vanilla NeRF.
 
     Attributes:
-        coarse, fine: The two fields.
         near, far: Distances of the rays' ends in evaluation, units of the normalised frame.
-        coarse_samples, importance_samples: Numbers of the hierarchical sampler.
         background: [3] float32 RGB behind the last sample.
         dataparser: Units of the training data against the normalised frame.
-        name: Short name for reports.
-        source: The file the parameters were read from.
         occupancy: Declared by the user: density is 0 outside of its occupied voxels.
         notes: What was assumed where the source says nothing, one sentence each.
         assumptions: What was decided of the picture, and where each choice came from.

@@ -69,7 +69,6 @@ class StripLayout:
 
     Attributes:
         counts: Strips of the first level along each parameter of the poses.
-        division: Cells and parts of every strip.
         displacement: Where the bounds of every strip begin (`NerfBounds.displacement`).
     """
 
@@ -82,7 +81,6 @@ class PoseStrips:
     """Bounds of all rays of a frame over strips of its set (design.md, F13).
 
     Args:
-        bounds: Of the scene.
         pose_set: The frame's set; parameters that shift colours come last in its box.
         pixels: [t, 2] rows and columns of the rays.
         run: Bounds groups of rays, here or in other processes.
@@ -257,7 +255,6 @@ class PoseStrips:
         Of the first rays alone where not all are asked for: ``t`` is then ``most``, or a few more.
 
         Args:
-            box: A cell of the frame's set.
             most: How many rays are asked for; all if None.
             weigh: Gives [t, 3] which part of the margin a unit of each pixel's width may cost, about; None there, or
                 in its place: nothing is worth refining.

@@ -49,7 +49,6 @@ class NerfWeightFrame(NerfFrame):
 
     Args:
         scene, sampling, pose_set, device, workers: As `NerfFrame` takes them.
-        planes: What is white in each channel.
         pixels: [H, W] the rays that are read; nothing is said of others.
 
     Raises:

@@ -102,10 +102,7 @@ class FieldBounds:
     """Bounds of one field.
 
     Args:
-        weights: The field.
-        basis: Polynomials of the pose.
         limit: Error terms by piece beyond which it is given up.
-        device: Where the work is done.
         compiled: Whether by kernels compiled for a processor; None: where ``device`` is one.
     """
 

@@ -52,14 +52,7 @@ class _OrderedBounds(SplatBounds):
 def ablations(
     scene: SplatScene, rasteriser: Rasteriser, arithmetic: Arithmetic, poses: PoseBox, varied: VariedSplats
 ) -> Iterator[tuple[str, SplatFrame]]:
-    """Return the causes of looseness that the scene has, each with the frame without it.
-
-    Args:
-        scene: The stored scene.
-        rasteriser, arithmetic: What is bounded.
-        poses: The frame's poses.
-        varied: The scenes of the set.
-    """
+    """Return the causes of looseness that the scene has, each with the frame without it."""
 
     def frame(rules: Rasteriser = rasteriser, computed: Arithmetic = arithmetic, fixed: bool = False) -> SplatFrame:
         splats = activate(scene, rules)
@@ -93,12 +86,6 @@ def attribution(frame: SplatFrame, box: ParameterBox, tile: int, count: int) -> 
 
     Groups are left out in turn, and those that matter are looked at closer, so Gaussians that matter only together
     may be missed.
-
-    Args:
-        frame: The frame.
-        box: The cell.
-        tile: The tile's number.
-        count: How many to look for, at most.
     """
     forms, tiles = frame.pose_set.enclosure(box, frame.order), np.array([tile])
 

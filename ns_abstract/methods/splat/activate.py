@@ -72,8 +72,6 @@ def activate(scene: SplatScene, rasteriser: Rasteriser, every_band: bool = False
     """Apply Splatfacto's activations (splatfacto.py:590-606) in float64.
 
     Args:
-        scene: The stored parameters.
-        rasteriser: The rules.
         every_band: Keep the harmonics that are zero for every Gaussian, too.
     """
     axes = rotation_matrices(scene.quats.astype(np.float64)) * np.exp(scene.log_scales.astype(np.float64))[:, None]

@@ -144,7 +144,6 @@ class RasterRules(NamedTuple):
         tile_size: 0: every Gaussian reaches every pixel.
         alpha_min: The threshold, or the numerical cut-off where there is none.
         work_tile: Side of the tiles that pictures are computed in.
-        compensation_min: Least factor of the opacity.
         tile_room, ellipse_tiles: See `Rasteriser`.
         antialiased: Whether opacity is compensated for the blur.
     """

@@ -51,8 +51,6 @@ def drawable(
     exactly 0).
 
     Args:
-        rows: The stored parameters.
-        file: Where they are from, for messages.
         fields: Names in the file of means, scales, quats, opacities and colours.
         drop_nan: Whether Gaussians that would be drawn with values that are not finite are left out.
 

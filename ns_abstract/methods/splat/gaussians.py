@@ -46,7 +46,6 @@ def covariance_noise(axes: np.ndarray, charges: Charges) -> np.ndarray:
 
     Args:
         axes: [N, 3, 3] scaled principal axes.
-        charges: For the program's rounding.
 
     Returns:
         [N, 12]: the error bounds and the absolute values of the entries 00, 11, 22, 01, 02, 12.
@@ -144,12 +143,6 @@ def gaussian_stage(
 
     Args:
         candidates: [n] int32 indices into the scene's arrays.
-        scene: The Gaussians.
-        poses: The cell's.
-        camera: Intrinsics.
-        rules: The rasteriser's.
-        charges: For the program's rounding.
-        shape: Of the poses' forms.
         out: The output; ``out.record`` has `projection_errors.columns`.
         state: [n] uint8 output: 1 if visible; else the candidate's row of ``out`` is not set.
     """

@@ -115,7 +115,6 @@ def scene_from_parameters(
     Args:
         parameters: means [N, 3], scales [N, 3], quats [N, 4], features_dc [N, 3], features_rest
             [N, K - 1, 3] and opacities [N, 1], arrays.
-        source: Where they are from, for messages.
         name, color_model, sh_degree, rasterize_mode, background: As in `SplatScene`.
 
     Raises:

@@ -48,7 +48,6 @@ class SplatMethod:
     """A splat scene and the program that is bounded.
 
     Args:
-        scene: The scene.
         renderer: "gsplat" or "paper"; None: gsplat.
         version: gsplat's, of `VERSIONS`; None: 1.4.0.
         arithmetic: "float32" or "real"; None: float32.

@@ -83,10 +83,8 @@ class PlyHeader:
     """What a checked header says.
 
     Attributes:
-        vertex: The element of the Gaussians.
         bands: K, bands of spherical harmonics.
         mode: "classic" or "antialiased" where a comment says it.
-        comment: That comment.
         unused: Columns and elements that change nothing here.
     """
 
@@ -102,9 +100,7 @@ class PlyDeclaration:
     """What a header declares, checked against the size of the file.
 
     Attributes:
-        elements: The elements, each of scalar properties.
         mode: "classic" or "antialiased" where a comment says it.
-        comment: That comment.
     """
 
     elements: list[PlyElement]
@@ -116,7 +112,6 @@ def read_declaration(path: Path, mode_given: bool) -> PlyDeclaration:
     """What the header of ``path`` declares.
 
     Args:
-        path: The file.
         mode_given: Whether the user says how to rasterise, so that a comment that cannot be understood does not
             matter.
 

@@ -107,8 +107,6 @@ class Reference:
     """Renders one scene.
 
     Args:
-        scene: The stored parameters.
-        rasteriser: The rules.
         dtype: What to compute with. ``torch.float32`` gives one of the pictures that a float32
             rasteriser may output.
     """

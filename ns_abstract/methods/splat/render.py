@@ -356,12 +356,7 @@ def _rasterise_worker(share, lists, sets_, record_, box_, camera, rules, backgro
 
 
 class Renderer:
-    """Renders one scene; keeps its buffers between calls.
-
-    Args:
-        splats: The activated scene.
-        rasteriser: The rules.
-    """
+    """Renders one scene; keeps its buffers between calls."""
 
     def __init__(self, splats: Splats, rasteriser: Rasteriser) -> None:
         n = splats.count
@@ -392,7 +387,6 @@ class Renderer:
             camera: Intrinsics and size; its own pose is not used.
             rotation: [3, 3] world to camera, OpenCV axes.
             position: [3] camera position, world.
-            wanted: See above.
             member: What to show in place of the scene: as many Gaussians, of the same degree.
             pixels: [t, side, side] which of the tiles' pixels to draw, others show the background; all if None.
         """

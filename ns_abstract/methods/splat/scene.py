@@ -35,8 +35,6 @@ class SplatScene:
         rasterize_mode: "classic" or "antialiased" (opacity compensation).
         background: [3] float32 RGB shown where nothing is opaque.
         dataparser: Units of the training data against the normalised frame.
-        name: Short name for reports.
-        source: The file the parameters were read from.
         dropped: Count of stored Gaussians that gsplat can never draw, by reason.
         stored: [N] numbers of the Gaussians in the source, ascending, where some were dropped; else None.
         notes: What was assumed where the source says nothing, one sentence each.

@@ -114,7 +114,6 @@ class SplatOrder:
     """The order that two scenes share; see `ns_abstract.refine.protocol.SharedOrder` (design.md, Y5).
 
     Args:
-        first, second: Frames of the same poses.
         names: [M] names of the second scene's Gaussians; those of the first one's are their numbers, see `matched`.
     """
 

@@ -32,7 +32,6 @@ def signed_gradient_step(
     """Return a pose of ``box`` and a scene of the set one signed-gradient step uphill (design.md, V12).
 
     Args:
-        reference: Renders with gradients.
         poses, varied, box: The set of poses, the set of scenes, the parameters that the pose may have.
         values, member: Where the step begins.
         score: What is to grow, of a picture or of pixels and of the pose's parameters.

@@ -23,7 +23,6 @@ class VariedSplats:
     """Every scene whose Gaussians lie in their own ranges, independently of each other.
 
     Attributes:
-        stored: The scene as stored.
         mean_low, mean_high: [N, 3] world, or [0, 3] where no mean varies.
         opacity_low, opacity_high: [N] in [0, 1].
         shift_low, shift_high: [N, 3] what is added to the activated colours, or [0, 3].

@@ -122,7 +122,6 @@ class SplatWeightFrame(SplatFrame):
 
     Args:
         white: Which Gaussians are white.
-        splats: The scene, in its own colours.
         rasteriser, arithmetic, pose_set, varied, sums, reference: As `SplatFrame` takes them.
     """
 

@@ -55,7 +55,6 @@ def write_splatfacto_run(
         scene: SH is stored padded with zeros to degree 3.
         folder: Nerfstudio's working directory for this run; made if missing.
         timestamp: Name of the run, as in "2026-11-21_120000".
-        experiment_name: Name of the experiment.
         views: Cameras of the data set, normalised frame, at least two of one size and field of view.
         render: Gives the image [H, W, 3] in [0, 1] of a view; without it the images hold only the
             background colour.

@@ -340,7 +340,6 @@ def falsify(
 
     Args:
         lower, upper: [H, W, 3]; compared as they are.
-        box: The parameters.
         render: Parameter values [d] to an image [H, W, 3]. Its images are what must lie inside.
         twin: Differentiable with respect to the values; it guides the ascent and is not compared.
             Without it there is no ascent.
@@ -349,7 +348,6 @@ def falsify(
         poses: Most images rendered.
         seconds: Most time spent; reaching it ends the attack after the image in progress. A limit
             makes the outcome depend on the machine.
-        seed: Decides every random choice.
         starts: [n, d] poses to try first, clipped into the box.
         strategies: Which of `STRATEGIES` to use. Poses that one does not need go to the next.
 

@@ -19,8 +19,6 @@ class Violation:
 
     Attributes:
         values: The pose's parameters, in the box's order and units.
-        row, column, channel: Where.
-        value: What was rendered.
         bound: The bound it breaks: the lower one if ``value`` is less, else the upper one.
         amount: Their distance; NaN where one is not a number.
     """
@@ -41,7 +39,6 @@ class Attack:
     Attributes:
         poses: Images rendered in full.
         probes: Single pixels rendered besides (their values are compared as well).
-        steps: Evaluations of the twin.
         comparisons: Pixel channels compared with their bounds.
         violations: Comparisons that failed, and bounds that are not finite.
         not_finite: Of those, the values and bounds that are not finite numbers.
@@ -50,7 +47,6 @@ class Attack:
             image was NaN.
         tried: Poses by strategy.
         closest: [n, d] poses at which a pixel came closest to a bound relative to the gap, at most 8.
-        seconds: Time spent.
     """
 
     poses: int

@@ -184,7 +184,7 @@ class BackwardPass:
             return [batch.passage.maxima[at].backward(here, layer, batch.cell, batch.total)]
         if isinstance(layer, Product):
             # every reader changes its rows in place
-            parts = [here, Coefficients(here.value.copy(), here.y, here.x)]
+            parts = [here, here.replaced(here.value.copy())]
             for part, lines in zip(parts, batch.passage.products[at], strict=True):
                 pass_activation(part.value, part.y, part.x, batch.cell, lines, batch.total)
             return parts

@@ -55,6 +55,10 @@ class Coefficients:
         zero = np.zeros(value.shape[0], np.int64)
         return Coefficients(np.ascontiguousarray(value), zero, zero)
 
+    def replaced(self, value: Floats) -> Coefficients:
+        """Other coefficients [R, C, h, w] on the same windows."""
+        return Coefficients(value, self.y, self.x)
+
     def covers(self, shape: tuple[int, ...]) -> bool:
         """Whether the rows are those of the whole map of ``shape``."""
         return self.value.shape[1:] == grid(shape) and not (self.y.any() or self.x.any())

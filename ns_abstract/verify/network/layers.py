@@ -313,12 +313,10 @@ class Sum(LinearLayer):
 
     def backward(self, coefficients: Coefficients) -> list[Coefficients]:
         # rows are changed in place further on, so every input gets its own
-        copies = [
-            Coefficients(coefficients.value * coefficients.value.dtype.type(sign), coefficients.y, coefficients.x)
-            for sign in self.signs[1:]
-        ]
+        value = coefficients.value
+        copies = [coefficients.replaced(value * value.dtype.type(sign)) for sign in self.signs[1:]]
         if self.signs[0] < 0:
-            np.negative(coefficients.value, out=coefficients.value)
+            np.negative(value, out=value)
         return [coefficients, *copies]
 
 
@@ -341,12 +339,9 @@ class Pad(LinearLayer):
         return functional.pad(inputs[0], (left, right, top, bottom))
 
     def backward(self, coefficients: Coefficients) -> list[Coefficients]:
-        return [
-            full(
-                Coefficients(coefficients.value, coefficients.y - self.pads[0], coefficients.x - self.pads[1]),
-                self.input_shapes[0],
-            )
-        ]
+        top, left = self.pads[:2]
+        padded = Coefficients(coefficients.value, coefficients.y - top, coefficients.x - left)
+        return [full(padded, self.input_shapes[0])]
 
 
 @dataclass(frozen=True, eq=False)
@@ -361,7 +356,7 @@ class ChannelEmbedding(LinearLayer):
 
     def backward(self, coefficients: Coefficients) -> list[Coefficients]:
         part = coefficients.value[:, self.first : self.first + self.input_shapes[0][0]]
-        return [Coefficients(np.ascontiguousarray(part), coefficients.y, coefficients.x)]
+        return [coefficients.replaced(np.ascontiguousarray(part))]
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,6 +15,9 @@ from ns_abstract.verify.network.graph import item
 from ns_abstract.verify.network.onnx_graph import Attributes, OnnxReader, Rule
 from ns_abstract.verify.network.onnx_shapes import axes_of
 
+#: What ONNX adds to variances where the node says nothing.
+_EPSILON = 1e-5
+
 
 def _global_average(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x = r.source(node)
@@ -27,7 +30,7 @@ def _batch_norm(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     a.only("spatial", 1)
     a.ignore("momentum")
     scale, shift, mean, variance = (r.weight(node, k) for k in range(1, 5))
-    r.result(node, r.builder.batch_norm(x, scale, shift, mean, variance, float(a.get("epsilon", 1e-5))))
+    r.result(node, r.builder.batch_norm(x, scale, shift, mean, variance, float(a.get("epsilon", _EPSILON))))
 
 
 def _squared(b: CompositeBuilder, x: int) -> int:
@@ -97,7 +100,7 @@ def _layer_norm(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     if axis < x.batched or any(node.output[1:]):
         raise InputError(f"attribute axis = {axis} is not supported", fix="normalise over axes of the item alone")
     inner = list(range(axis - x.batched, rank - x.batched))
-    index = r.builder.normalise(x.index, inner, float(a.get("epsilon", 1e-5)))
+    index = r.builder.normalise(x.index, inner, float(a.get("epsilon", _EPSILON)))
     index = r.builder.scale(index, np.asarray(r.weight(node, 1), np.float64), None)
     r.result(node, r.builder.shift(index, r.constant(node, 2)), x.whole)
 
@@ -111,7 +114,9 @@ def _group_norm(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     if groups < 1 or channels % groups or len(shape) < 2:
         raise InputError(f"attribute num_groups = {groups} of {channels} channels", fix="it must divide them")
     split = (groups, channels // groups, *shape[1:])
-    index = r.builder.normalise(r.builder.reshape(x, split), list(range(1, len(split))), float(a.get("epsilon", 1e-5)))
+    index = r.builder.normalise(
+        r.builder.reshape(x, split), list(range(1, len(split))), float(a.get("epsilon", _EPSILON))
+    )
     index = r.builder.reshape(index, shape)
     parts = []
     for k in (1, 2):

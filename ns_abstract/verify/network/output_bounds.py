@@ -78,7 +78,7 @@ class OutputRows:
                 rows = Coefficients(
                     np.ascontiguousarray(part[row]), np.full(len(which), top), np.full(len(which), left)
                 )
-                bounds = self.backward.bound(index, Coefficients(rows.value.copy(), rows.y, rows.x), cell)
+                bounds = self.backward.bound(index, rows.replaced(rows.value.copy()), cell)
                 if self.ascent.steps:
                     wanted = None if self.intermediate.assumed is None else need[cell, row]
                     loosest[cell, row] = self.ascent.climb(index, rows, cell, bounds, wanted)

@@ -100,7 +100,7 @@ class RowAscent:
         count = len(start.value)
         chosen, bounds = ascent.lines(), BackwardBounds.unknown(count, self.intermediate.d)
         # rows are changed in place
-        part = Coefficients(start.value.copy(), start.y, start.x)
+        part = start.replaced(start.value.copy())
         total, number = np.zeros((count, 2)), np.arange(count)
         relaxations = self.intermediate.relaxations[-1]
         batch = CoefficientBatch({index: part}, np.full(count, k), total, number, relaxations, chosen)

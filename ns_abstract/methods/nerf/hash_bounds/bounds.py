@@ -47,12 +47,7 @@ _TUNING = HashTuning()
 
 
 class HashBounds(BoundedRays):
-    """Bounds of a hash-grid field's rays.
-
-    Args:
-        field: What is evaluated.
-        dimensions: Number of parameters.
-    """
+    """Bounds of a hash-grid field's rays."""
 
     def __init__(self, field: NerfactoField, dimensions: int) -> None:
         self.source, self.dimensions = field, dimensions

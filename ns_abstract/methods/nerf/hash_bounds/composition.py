@@ -1,4 +1,7 @@
-"""Colours of rays from light and colours of their samples: intervals and forms, intersected (design.md, F8, H7)."""
+"""Colours of rays from light and colours of their samples: intervals and forms, intersected (design.md, F8, H7).
+
+``light`` is a `Light`, ``count`` the number N of its intervals, ``line`` as in `forms`.
+"""
 
 from __future__ import annotations
 
@@ -20,8 +23,6 @@ def interval_colors(light, count, low, high, background, last, out):
     """Bounds ``out`` [2, 3] of a ray's colour from those of its samples alone (design.md, F8).
 
     Args:
-        light: `Light`.
-        count: N.
         low, high: [N, 3] bounds of colours.
         background: [3] behind the last sample; not looked at with ``last``.
         last: Whether the last sample's colour stands behind it.
@@ -80,10 +81,8 @@ def _products(light, count, i, whole, color, line):
 
     Args:
         light, count: `Light` and N.
-        i: The sample.
         whole: Whether all light that reaches it is its weight.
         color: [n + 4] the deviation of its colour: symbols and radius.
-        line: See `forms`.
     """
     n = color.shape[0] - 4
     here, there = light.light[i], light.light[i + 1]
@@ -112,12 +111,9 @@ def form_color(light, count, colors, background, last, line, out):
     """One channel of a ray's colour as a form (design.md, H7).
 
     Args:
-        light: `Light`.
-        count: N.
         colors: [N, n + 4] forms with the symbols of the samples' starts and ends, and radii.
         background: Behind the last sample; not looked at with ``last``.
         last: Whether the last sample's colour stands behind it.
-        line: See `forms`.
         out: [n + 3] centre, pose symbols, and the radius in the last place; overwritten.
     """
     n = colors.shape[1] - 4

@@ -1,4 +1,7 @@
-"""Places of the samples of the next round: quantiles of the light that each interval takes (design.md, H6)."""
+"""Places of the samples of the next round: quantiles of the light that each interval takes (design.md, H6).
+
+``light`` is a `Light`, ``count`` the number N of its intervals, ``line`` as in `forms`.
+"""
 
 from __future__ import annotations
 
@@ -24,11 +27,8 @@ def _excess(light, count, k, share, line, out):
     """``share D - 1 + A_k - a k``: how far the share of the distribution is beyond edge k, times D (design.md, H6).
 
     Args:
-        light: `Light`.
-        count: N.
         k: An edge.
         share: In (0, 1).
-        line: See `forms`.
         out: [n + 3] centre and pose symbols; overwritten.
 
     Returns:
@@ -188,7 +188,6 @@ def follow(light, count, edges, wanted, line, out, work):
         count: Its intervals.
         edges: Theirs.
         wanted: Edges of the next round.
-        line: See `forms`.
         out: `Edges`; places alone are filled in.
         work: [3, n + 3].
 

@@ -49,10 +49,7 @@ def space(edges, j, spacing, line, work):
     """Fill in the distance of edge ``j`` (design.md, H2).
 
     Args:
-        edges: `Edges`.
-        j: The edge.
         spacing: Whether it is piecewise; the ray's ends in its units.
-        line: See `forms`.
         work: [4, n + 3].
     """
     piecewise, first, last = spacing

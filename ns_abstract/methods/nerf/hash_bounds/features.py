@@ -85,7 +85,6 @@ def _slopes(nodes, counts, place, low, high, f, kept, slopes):
         nodes: [6, 6, 6, F] values.
         counts: [3] nodes by axis, at least 2.
         place, low, high: [3] in cells from the first node on.
-        f: The feature.
         kept: [2, 6, 6, 6] scratch.
         slopes: [2, 3] least and largest; overwritten.
     """
@@ -148,7 +147,6 @@ def level_features(table, resolution, point, ranges, out, room):
         point: [3, n + 3] forms in [0, 1].
         ranges: [2, F] least and largest value of the level.
         out: [F, n + 3].
-        room: `FeatureRoom`.
     """
     features, width = out.shape
     first, counts = room.cells[0], room.cells[1]

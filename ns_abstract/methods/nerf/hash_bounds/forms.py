@@ -149,10 +149,8 @@ def compose(a, derivatives, line, out, scratch):
     """``out = f(a)`` by Taylor's formula of order 2 about the centre (design.md, A3).
 
     Args:
-        a: A form.
         derivatives: f, f', f'' / 2 at the centre, and a bound of ``|f'''| / 6`` over the range.
         line: Whether the pose symbols are those of one parameter.
-        out: A form.
         scratch: [2, n + 3].
     """
     k = a.shape[0] - 1

@@ -22,8 +22,6 @@ class NerfactoFrame(FieldFrame):
     """Bounds and renders one frame's set of poses of a nerfacto.
 
     Args:
-        scene: The scene.
-        pose_set: The poses.
         workers: Threads that bound rays side by side; results do not depend on their number.
     """
 

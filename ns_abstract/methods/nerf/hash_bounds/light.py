@@ -75,13 +75,10 @@ def add_depth(edges, i, density, bounds, shares, line, light, work):
     """Fill in interval ``i`` and its end from the form of its ``density`` (design.md, H6).
 
     Args:
-        edges: `Edges`.
         i: The interval; those before it are filled in.
         density: [n + 3] with the place symbol of the interval's middle.
         bounds: Least and largest density.
         shares: Those of `middle_of`.
-        line: See `forms`.
-        light: `Light`.
         work: [2, n + 4].
 
     Returns:
@@ -210,8 +207,6 @@ def depths_functional(light, count, k, at_end, at_start, behind, own, scale):
     dS is what a sum of depths deviates by, without its pose symbols (design.md, H6).
 
     Args:
-        light: `Light`.
-        count: N.
         k: An edge below N.
         at_end, at_start, behind: Factors; 0 where the light is an interval.
         own: Coefficients of the symbols of the edges k and k + 1 that are added.

@@ -27,7 +27,6 @@ class NetWeights(NamedTuple):
     Attributes:
         sizes: [layers + 1] widths from inputs to outputs.
         weight: [layers, most inputs, most outputs to whole pairs of lines], transposed.
-        absolute: The same of absolute values.
         bias: [layers, most outputs].
         rounding: [layers] relative error of a layer's sums, here and in a concrete evaluation (design.md, F4).
     """
@@ -108,7 +107,6 @@ def relu(z, count, n, live):
     """max(0, z) of ``n`` neurons in ``count`` rows, in place (design.md, H4).
 
     Args:
-        z: `LayerZonotope`.
         count, n: Rows and neurons.
         live: [n] numbers of the neurons that may be above 0; overwritten.
 
@@ -192,7 +190,6 @@ def finish(rooms, count, weights, live, rest):
     Args:
         rooms: `LayerZonotope` of every layer, and more.
         count: Rows of the first.
-        weights: `NetWeights`.
         live: [most neurons] scratch.
         rest: [ROWS, two lines] scratch.
     """
@@ -224,7 +221,6 @@ class HeadWeights(NamedTuple):
     """The network of colours.
 
     Attributes:
-        net: All layers.
         direction: [16, n] the part of the first layer that looks at harmonics, and
         geometry, absolute: [outputs of the density's network, n and more] that which looks at the others.
     """
@@ -271,7 +267,6 @@ def colors(z, count, seen, head, rooms, live, rest):
     Args:
         z: `LayerZonotope` of the density's network, ``count`` rows.
         seen: What `look_at_direction` made: rows and radius.
-        head: `HeadWeights`.
         rooms: `LayerZonotope` of every layer.
         live: [most neurons] scratch.
         rest: [ROWS, two lines] scratch.

@@ -72,7 +72,6 @@ class FieldArrays(NamedTuple):
 
     Attributes:
         proposals: `DensityArrays` of every round that places samples.
-        density: Of the picture's samples.
         head: Their colours.
         background: [3] behind the last sample.
         last: Whether the last sample's colour stands there instead.
@@ -149,11 +148,8 @@ def density_of(field, place, line, rooms, room, out):
     """The form of a density's logarithm at contracted ``place`` [3, n + 3]; returns the rows of its network.
 
     Args:
-        field: `DensityArrays`.
         place: Forms.
-        line: See `forms`.
         rooms: `LayerZonotope` of every layer.
-        room: `PieceRoom`.
         out: [n + 3].
     """
     levels, features = field.table.shape[0], field.table.shape[2]
@@ -266,12 +262,8 @@ def bound_piece(field, rays, ray, middle, half, limits, room, out, shown):
     """Bounds ``out`` [2, 3] of a ray's colour over the box ``middle`` +- ``half`` [d] (design.md, H6, H7).
 
     Args:
-        field: `FieldArrays`.
-        rays: `RayPolynomials`.
         ray: Number of the ray.
         middle, half: [d] in [-1, 1].
-        limits: `WorkLimits`.
-        room: `PieceRoom`.
         out: [2, 3]; overwritten: [0, 1] where nothing is known.
         shown: [3, n + 3] forms of the colours (`composition.form_color`), of infinite radius where nothing is known.
 
@@ -373,7 +365,6 @@ def _keep(out, counts, place, cells, found, shown, line, low, high):
         counts: [d] parts by axis.
         place, cells: [d] the piece is number ``place`` of ``cells`` by axis.
         found, shown: What `bound_piece` made.
-        line: See `forms`.
         low, high: [d] scratch.
     """
     d = counts.shape[0]

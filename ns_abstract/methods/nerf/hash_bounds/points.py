@@ -77,7 +77,6 @@ def harmonics(direction, line, out, work):
 
     Args:
         direction: [3, n + 3] forms.
-        line: See `forms`.
         out: [16, n + 3].
         work: [9, n + 3].
     """
@@ -137,7 +136,6 @@ def quotients(origin, direction, line, ratios, shifts, along, work):
 
     Args:
         origin, direction: [3, n + 3].
-        line: See `forms`.
         ratios, shifts: [3 (j), 3 (i), n + 3].
         along: [3] whether those of an axis are made; overwritten.
         work: [4, n + 3].
@@ -259,7 +257,6 @@ def point(ray, distance, line, out, work):
     Args:
         ray: origin, direction [3, n + 3], and what `quotients` makes of them.
         distance: [n + 3] with the place symbol.
-        line: See `forms`.
         out: [3, n + 3].
         work: [13, n + 3].
 

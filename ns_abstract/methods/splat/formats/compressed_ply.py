@@ -47,10 +47,8 @@ def decode_compressed_ply(path: Path, elements: list[PlyElement], mode: str | No
     """The Gaussians of a compressed .ply.
 
     Args:
-        path: The file.
         elements: What its header declares, checked against the file's size.
         mode: "classic" or "antialiased" where a comment says it.
-        comment: That comment.
 
     Raises:
         InputError: The elements are not those of the format, or the file is damaged.

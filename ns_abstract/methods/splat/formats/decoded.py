@@ -46,13 +46,11 @@ class DecodedSplats:
     Attributes:
         format: What the file is, such as "an SPZ file, version 3".
         files: What was read; the first is the one that was given.
-        rows: Stored parameters.
         mode: "classic" or "antialiased"; None where the file says nothing.
         mode_origin: Where the file says it.
         background: RGB in [0, 1]; None where the file says nothing.
         background_origin: Where the file says it.
         fields: Names in the file of scales, quats, opacities and colours, for messages.
-        notes: What a user should know, one sentence each.
     """
 
     format: str
@@ -163,13 +161,6 @@ def smallest_three(parts: NDArray[np.float64], largest: NDArray[np.int64]) -> ND
 
 def lossless_picture(data: bytes, name: str, least: int, most: int, file: Path) -> Bytes:
     """Texels [H, W, 4] of a lossless WebP or PNG picture.
-
-    Args:
-        data: The picture's file.
-        name: Its name, for messages.
-        least: Texels that it must have.
-        most: Texels that it may have.
-        file: What holds it, for messages.
 
     Raises:
         InputError: Not such a picture, of another size, or damaged.

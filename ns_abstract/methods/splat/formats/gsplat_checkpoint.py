@@ -46,7 +46,6 @@ def checkpoint(folder: Path, step: int | None) -> Path | None:
     """The first rank of a checkpoint in a folder or its ``ckpts``; None where there is none.
 
     Args:
-        folder: The folder.
         step: Whose checkpoint is wanted; None: the last one.
 
     Raises:

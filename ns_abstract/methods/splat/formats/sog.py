@@ -97,13 +97,7 @@ def decode_sog(path: Path, overrides: Overrides) -> DecodedSplats:
 
 
 class _Description:
-    """A parsed ``meta.json``.
-
-    Args:
-        meta: What it holds, with plain names of pictures.
-        file: Where it is from, for messages.
-        read: The content of a picture by its name.
-    """
+    """A parsed ``meta.json``; ``meta``: what it holds, with plain names of pictures."""
 
     def __init__(self, meta: dict[str, Any], file: Path, read: Callable[[str], bytes]) -> None:
         self._meta, self._file, self._read = meta, file, read

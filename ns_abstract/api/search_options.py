@@ -1,0 +1,101 @@
+"""Options of a search that `ns_abstract.certify`, `locate` and `reach` have in common, and the search itself."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, TypedDict, TypeVar
+
+from ns_abstract.api.bounding import listener
+from ns_abstract.api.cell_search import CellQuestion, CellSearch, Request, Row
+from ns_abstract.execution.starting import EngineName, started
+from ns_abstract.execution.stopping import interruptible
+from ns_abstract.io.arguments import positive, whole
+from ns_abstract.io.errors import InputError
+
+P = TypeVar("P")
+
+
+class SearchKeywords(TypedDict, total=False):
+    """The fields of `SearchOptions` as keyword arguments."""
+
+    time_budget: float
+    output_dir: str | os.PathLike[str] | None
+    arithmetic: str | None
+    resume: bool
+    workers: int
+    engine: EngineName
+    scheduler_address: str | None
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """How long, where and in how many processes verdicts are searched for.
+
+    Attributes:
+        time_budget: Seconds for all sets together.
+        output_dir: Folder for cells.sqlite, the report and counterexamples, as the command writes them; None: none.
+        arithmetic: "float32" or "real", of the pictures; None: float32.
+        resume: Whether to go on with what ``output_dir`` holds.
+        workers: Processes (for a NeRF: that bound rays, which all cells share); with more than one, a script needs
+            ``if __name__ == "__main__":``.
+        engine: "dask" spreads the cells over a Dask cluster.
+        scheduler_address: HOST:PORT of its scheduler; None: a cluster on this machine.
+
+    Raises:
+        InputError: One of them cannot be used.
+    """
+
+    time_budget: float = 600.0
+    output_dir: str | os.PathLike[str] | None = None
+    arithmetic: str | None = None
+    resume: bool = False
+    workers: int = 1
+    engine: EngineName = "local"
+    scheduler_address: str | None = None
+
+    def __post_init__(self) -> None:
+        positive(self.time_budget, "time_budget")
+        whole(self.workers, 1, "workers")
+        if self.resume and self.output_dir is None:
+            raise InputError("given without output_dir", field="resume", fix="give the folder to go on with")
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """What the report says of them."""
+        return {name: getattr(self, name) for name in ("time_budget", "arithmetic", "workers", "engine")}
+
+    def search(
+        self,
+        question: CellQuestion[P],
+        on_progress: Callable[[P], object] | None,
+        *,
+        workers: int,
+        report: bool = True,
+        scene_margin: bool = False,
+    ) -> tuple[dict[int, list[Row]], dict[str, Any]]:
+        """The cells by number and the content of report.json; Ctrl-C or the listener may end the search.
+
+        Args:
+            question: What is claimed.
+            on_progress: Told about once a second.
+            workers: Processes that examine cells.
+            report, scene_margin: See `Request`.
+        """
+        with ExitStack() as stack:
+            folder = self.output_dir
+            if folder is None:
+                folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="ns-abstract-"))
+            stop = stack.enter_context(interruptible())
+            request = Request(self.time_budget, self.resume, report, scene_margin)
+            search = CellSearch(question, Path(folder))
+            document = search.run(
+                lambda engines: engines.enter_context(started(self.engine, self.scheduler_address, workers)),
+                stop,
+                replace(request, on_progress=listener(stop, on_progress)),
+            )
+            return search.rows, document
