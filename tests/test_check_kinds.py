@@ -262,6 +262,8 @@ BAD: dict[str, tuple[str, int, str]] = {
         1,
         "report counts",
     ),
+    "no counterexample": ("UPDATE cells SET verdict = 'falsified'", 2, "a counterexample that is none"),
+    "a margin of letters": ("UPDATE cells SET margin = 'much'", 2, "a margin or"),
     "no list": ("UPDATE cells SET lower = '7'", 2, "cannot be read as the cells"),
     "no number": ("UPDATE cells SET lower = '[NaN]'", 2, "cannot be read as the cells"),
 }
@@ -274,6 +276,31 @@ def test_a_forged_table_is_found(name: str, copy: Path, in_process: InProcess) -
     rewrite(copy, change)
     code, out, err = in_process(check_command.main, [str(copy), "--claims", "1"])
     assert code == expected and words in out + err and len(err.splitlines()) == (expected == 2)
+
+
+def headlines(document: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Changes of what a report says of all its frames, by what is wrong then."""
+    (frame,) = document["frames"]
+    second = frame | {"index": 1}
+    some = {"certified": 0.5, "falsified": 0.0, "unknown": 0.5, "not_examined": 0.0}
+    return {
+        "the verdict is certified, the report says falsified": {"verdict": "falsified"},
+        "the report says 0.5 of all sets are certified, its frames do not": {"coverage": some},
+        "frame 1: no cells": {"frames": [frame, second]},
+        # a frame that stands twice may say anything once
+        "the verdict is unknown, the report says certified": {"frames": [frame, frame]},
+    }
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(4))
+def test_a_forged_headline_is_found(number: int, copy: Path, in_process: InProcess) -> None:
+    file = copy / "report.json"
+    document = json.loads(file.read_text())
+    wrong, change = list(headlines(document).items())[number]
+    file.write_text(json.dumps(document | change))
+    code, out, _ = in_process(check_command.main, [str(copy), "--claims", "1"])
+    assert code == 1 and wrong in out
 
 
 @pytest.mark.slow
@@ -398,6 +425,13 @@ def test_a_loop_is_proved_again_and_other_sets_are_not(tmp_path: Path) -> None:
     file.write_text(json.dumps(document))
     found = check(out, claims=1, seconds=120)
     assert (found.proved, found.refuted, found.structure) == (1, 0, [])
+    # cells of a part of what the loop begins in
+    initial = document["loop"]["initial"]
+    document["loop"]["initial"] = initial | {"across": [-0.5, 0.104]}
+    file.write_text(json.dumps(document))
+    with pytest.raises(nsa.InputError, match="other initial states than the loop"):
+        check(out, claims=1)
+    document["loop"]["initial"] = initial
     # a half-space that runs do enter
     document["loop"]["unsafe"] = [{"half_space": {"normal": [0.0, 1.0, 0.0, 0.0, 0.0], "at_least": 0.05}}]
     file.write_text(json.dumps(document))
