@@ -42,6 +42,7 @@ from ns_abstract.check.inputs import BadInput, read_poses, read_scene
 from ns_abstract.check.loops import _lifted
 from ns_abstract.check.networks import read_network
 from ns_abstract.check.poses import CheckedCamera, Poses
+from ns_abstract.check.results import read_verdicts
 from ns_abstract.check.splats import (
     FLOAT,
     ActivatedScene,
@@ -436,6 +437,24 @@ def test_a_loop_is_proved_again_and_other_sets_are_not(tmp_path: Path) -> None:
     document["loop"]["unsafe"] = [{"half_space": {"normal": [0.0, 1.0, 0.0, 0.0, 0.0], "at_least": 0.05}}]
     file.write_text(json.dumps(document))
     assert check(out, claims=1, seconds=5).proved == 0
+
+
+def test_cells_of_a_loop_are_of_all_its_initial_states(tmp_path: Path) -> None:
+    with sqlite3.connect(tmp_path / "cells.sqlite") as base:
+        columns = "lower, upper, verdict, margin, seconds, counterexample"
+        base.execute(f"CREATE TABLE cells(frame, {columns})")
+        base.execute("CREATE TABLE search_state(key, value)")
+        base.execute("INSERT INTO cells VALUES (0, '[0.0]', '[1.0]', 'certified', 1.0, 1.0, NULL)")
+    loop = {"state": ["x", "y"], "initial": {"y": 0.5, "x": [0, 1]}}
+    parameters = [{"name": "x", "unit": "", "lower": 0.0, "upper": 1.0}]
+    write_json(tmp_path / "report.json", {"kind": "loop", "loop": loop, "parameters": parameters})
+    rewrite(tmp_path, "UPDATE cells SET margin = 2.0")
+    report = json.loads((tmp_path / "report.json").read_text())
+    (cells,) = read_verdicts(tmp_path, report)
+    assert cells.names == ("x",) and cells.verdicts == [("certified", 2.0, None)]
+    for wider in ({"x": [-1, 1], "y": 0.5}, {"x": [0, 1], "y": [0.5, 0.6]}):
+        with pytest.raises(BadInput, match="other initial states"):
+            read_verdicts(tmp_path, report | {"loop": loop | {"initial": wider}})
 
 
 def test_errors_of_states_become_symbols() -> None:

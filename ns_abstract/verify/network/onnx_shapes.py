@@ -315,7 +315,12 @@ def _resize(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
         # onnxruntime copies, the operator's definition does not
         raise InputError(f"scales of {item(whole)} that keep its size", fix="export with sizes, or without the node")
     r.builder.reserve(float(math.prod(out)) * 4.0)
-    maps = [interpolation(whole[k], out[k], mode, coordinates, nearest, ratio[k], bend) for k in (2, 3)]
+    # before operator set 11 onnxruntime rounds places up where an axis shrinks
+    picks = ["ceil" if old and (ratio[k] or 1.0) < 1.0 else nearest for k in (2, 3)]
+    maps = [
+        interpolation(whole[k], out[k], mode, coordinates, pick, ratio[k], bend)
+        for k, pick in zip((2, 3), picks, strict=True)
+    ]
     r.result(node, r.builder.resize(x, maps))
 
 
