@@ -36,13 +36,14 @@ from test_check import splats_of
 import ns_abstract as nsa
 from ns_abstract.api.checking import check
 from ns_abstract.check import inputs
+from ns_abstract.check.audit import _together
 from ns_abstract.check.fields import CheckedField
 from ns_abstract.check.forms import Affine
 from ns_abstract.check.inputs import BadInput, read_poses, read_scene
 from ns_abstract.check.loops import _lifted
 from ns_abstract.check.networks import read_network
 from ns_abstract.check.poses import CheckedCamera, Poses
-from ns_abstract.check.results import read_verdicts
+from ns_abstract.check.results import StoredCells, read_verdicts
 from ns_abstract.check.splats import (
     FLOAT,
     ActivatedScene,
@@ -291,6 +292,29 @@ def headlines(document: dict[str, Any]) -> dict[str, dict[str, Any]]:
         # a frame that stands twice may say anything once
         "the verdict is unknown, the report says certified": {"frames": [frame, frame]},
     }
+
+
+def test_headlines_are_those_of_the_cells() -> None:
+    low, high = np.zeros((2, 1))
+    frame = {"index": 0, "cells": {}, "coverage": {"certified": 1.0, "falsified": 0.0, "unknown": 0.0}}
+    parts = [StoredCells(0, ("x",), low, high, {}, [("certified", 1.0, None)])]
+    report = {"frames": [frame], "verdict": "certified", "coverage": frame["coverage"]}
+    assert _together(report, parts) == []
+    assert _together(report | {"verdict": "falsified"}, parts) == [
+        "the verdict is certified, the report says falsified"
+    ]
+    assert _together(report | {"coverage": {"certified": 0.5}}, parts) == [
+        "the report says 0.5 of all sets are certified, its frames do not"
+    ]
+    twice = report | {"frames": [frame, frame | {"index": 1}], "verdict": "unknown"}
+    assert _together(twice, parts) == ["frame 1: no cells"]
+    # a question of a loop that is answered for all of its cells
+    loop = {"kind": "loop", "questions": dict.fromkeys(("safe", "reaches"), frame["coverage"]), "verdict": "safe"}
+    assert _together(loop, parts) == ["frame 1: no cells"]
+    both = [*parts, dataclasses.replace(parts[0], index=1)]
+    assert _together(loop | {"verdict": "reaches"}, both) == []
+    broken = [parts[0], dataclasses.replace(parts[0], index=1, verdicts=[("falsified", None, [0.0])])]
+    assert _together(loop | {"verdict": "falsified"}, broken) == []
 
 
 @pytest.mark.slow

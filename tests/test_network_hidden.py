@@ -92,6 +92,22 @@ def test_constants_are_not_scattered_by_products(op: str) -> None:
         fold(f.nodes[-1], given if op == "ScatterElements" else [given[0], given[1], given[2][0, 0]], 18)
 
 
+@pytest.mark.parametrize("op", ["ReduceL1", "ReduceL2", "ReduceSumSquare", "ReduceSum"])
+def test_sums_over_no_axis(op: str, tmp_path: Path) -> None:
+    """onnxruntime takes sizes and squares all the same, the reference operators do not."""
+    f = OnnxFile((4,), opset=18)
+    beside_large(f, f.node(op, "image", noop_with_empty_axes=1), 4)
+    file = f.write(tmp_path / "net.onnx")
+    if op == "ReduceSum":
+        assert holds(file, np.array([-1.0, 2.0, -3.0, 0.5], np.float32)) < 1e-4
+        return
+    with pytest.raises(InputError, match="noop_with_empty_axes = 1: programs differ"):
+        load_network(file)
+    if op != "ReduceSumSquare":
+        with pytest.raises(InputError, match="noop_with_empty_axes = 1: programs differ"):
+            fold(f.nodes[0], [np.array([-1.0], np.float32)], 18)
+
+
 def test_constants_are_not_taken_backwards_from_before_the_first() -> None:
     """The format begins with the first number then, the reference operators with none."""
     f = OnnxFile((4,))

@@ -119,13 +119,17 @@ def _refuse_unlike(node: onnx.NodeProto, values: Sequence[np.ndarray]) -> None:
     """Refuse nodes that the reference operators compute otherwise than the format says.
 
     Raises:
-        InputError: Numbers are scattered by an operation, or taken backwards from before the first.
+        InputError: Numbers are scattered by an operation, taken backwards from before the first, or their sizes are
+            summed over no axis.
     """
     fix = "fold constants when exporting"
     for attribute in node.attribute:
         if attribute.name == "reduction" and attribute.s not in (b"", b"none"):
             # the reference has not all of them, and sums of floats are rounded
             raise InputError(f"attribute reduction = {attribute.s.decode(errors='replace')} is not supported", fix=fix)
+        sizes_taken = node.op_type in ("ReduceL1", "ReduceL2") and (len(values) < 2 or not values[1].size)
+        if attribute.name == "noop_with_empty_axes" and attribute.i and sizes_taken:
+            raise InputError("attribute noop_with_empty_axes = 1: programs differ", fix="name the axes")
     if node.op_type == "Slice" and len(values) == 5:
         starts, axes, steps = (values[k].reshape(-1) for k in (1, 3, 4))
         rank = values[0].ndim
