@@ -82,6 +82,14 @@ def test_nearest_pixels_before_operator_set_11(scales: tuple[float, float], tmp_
     assert holds(f.write(tmp_path / "net.onnx"), x) < 1e-4
 
 
+def test_axes_that_count_from_the_end_are_refused_before_the_file_is_run(tmp_path: Path) -> None:
+    """onnxruntime ends the process by some of them; by these it fails."""
+    f = OnnxFile((2, 5, 3), opset=19)
+    f.node("Resize", "image", "", "", f.constant([3, 4], np.int64), axes=[-2, -1], mode="nearest")
+    with pytest.raises(InputError, match=r"axes = \[-2, -1\] is not supported"):
+        load_network(f.write(tmp_path / "net.onnx"))
+
+
 @pytest.mark.parametrize("op", ["ScatterElements", "ScatterND"])
 def test_constants_are_not_scattered_by_products(op: str) -> None:
     """The reference operators put the factors where products belong."""

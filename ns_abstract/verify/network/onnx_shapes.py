@@ -288,7 +288,10 @@ def _resize(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
         a.only("exclude_outside", 0)
     bend = float(a.get("cubic_coeff_a", -0.75))
     a.ignore("exclude_outside")
-    axes = [int(v) % 4 for v in a.get("axes", range(4))]
+    axes = [int(v) for v in a.get("axes", range(4))]
+    if not all(0 <= v < 4 for v in axes):
+        # onnxruntime writes outside of its memory
+        raise InputError(f"attribute axes = {axes} is not supported", fix="count axes from the first one")
     old = node.op_type == "Upsample" or r.opset < 11
     scales = a.get("scales")
     if scales is None:
