@@ -20,8 +20,8 @@ import torch
 from conftest import InProcess, Inputs, blob_scene, environment, ring
 
 import ns_abstract as nsa
+from ns_abstract.api import checking
 from ns_abstract.api.checking import check
-from ns_abstract.check import audit
 from ns_abstract.check.claims import _divided
 from ns_abstract.check.forms import Affine, parameters
 from ns_abstract.check.inputs import BadInput, read_poses
@@ -301,10 +301,10 @@ def test_partitions_are_exact() -> None:
 
 def test_the_least_part_is_that_of_clopper_and_pearson() -> None:
     # all of n: 0.05^(1/n)
-    assert audit.least_part(59, 59) == pytest.approx(0.05 ** (1 / 59), rel=1e-9)
-    assert audit.least_part(0, 10) == 0.0
+    assert checking.least_part(59, 59) == pytest.approx(0.05 ** (1 / 59), rel=1e-9)
+    assert checking.least_part(0, 10) == 0.0
     # tables: 8 of 10, one-sided 95 %
-    assert audit.least_part(8, 10) == pytest.approx(0.4931, abs=1e-4)
+    assert checking.least_part(8, 10) == pytest.approx(0.4931, abs=1e-4)
 
 
 # ---------------------------------------------------------------- results

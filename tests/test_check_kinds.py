@@ -36,12 +36,14 @@ from test_check import splats_of
 import ns_abstract as nsa
 from ns_abstract.api.checking import check
 from ns_abstract.check import inputs
+from ns_abstract.check.audit import _together
 from ns_abstract.check.fields import CheckedField
 from ns_abstract.check.forms import Affine
 from ns_abstract.check.inputs import BadInput, read_poses, read_scene
 from ns_abstract.check.loops import _lifted
 from ns_abstract.check.networks import read_network
 from ns_abstract.check.poses import CheckedCamera, Poses
+from ns_abstract.check.results import StoredCells, read_verdicts
 from ns_abstract.check.splats import (
     FLOAT,
     ActivatedScene,
@@ -262,6 +264,8 @@ BAD: dict[str, tuple[str, int, str]] = {
         1,
         "report counts",
     ),
+    "no counterexample": ("UPDATE cells SET verdict = 'falsified'", 2, "a counterexample that is none"),
+    "a margin of letters": ("UPDATE cells SET margin = 'much'", 2, "a margin or"),
     "no list": ("UPDATE cells SET lower = '7'", 2, "cannot be read as the cells"),
     "no number": ("UPDATE cells SET lower = '[NaN]'", 2, "cannot be read as the cells"),
 }
@@ -274,6 +278,54 @@ def test_a_forged_table_is_found(name: str, copy: Path, in_process: InProcess) -
     rewrite(copy, change)
     code, out, err = in_process(check_command.main, [str(copy), "--claims", "1"])
     assert code == expected and words in out + err and len(err.splitlines()) == (expected == 2)
+
+
+def headlines(document: dict[str, Any]) -> dict[str, dict[str, Any]]:
+    """Changes of what a report says of all its frames, by what is wrong then."""
+    (frame,) = document["frames"]
+    second = frame | {"index": 1}
+    some = {"certified": 0.5, "falsified": 0.0, "unknown": 0.5, "not_examined": 0.0}
+    return {
+        "the verdict is certified, the report says falsified": {"verdict": "falsified"},
+        "the report says 0.5 of all sets are certified, its frames do not": {"coverage": some},
+        "frame 1: no cells": {"frames": [frame, second]},
+        # a frame that stands twice may say anything once
+        "the verdict is unknown, the report says certified": {"frames": [frame, frame]},
+    }
+
+
+def test_headlines_are_those_of_the_cells() -> None:
+    low, high = np.zeros((2, 1))
+    frame = {"index": 0, "cells": {}, "coverage": {"certified": 1.0, "falsified": 0.0, "unknown": 0.0}}
+    parts = [StoredCells(0, ("x",), low, high, {}, [("certified", 1.0, None)])]
+    report = {"frames": [frame], "verdict": "certified", "coverage": frame["coverage"]}
+    assert _together(report, parts) == []
+    assert _together(report | {"verdict": "falsified"}, parts) == [
+        "the verdict is certified, the report says falsified"
+    ]
+    assert _together(report | {"coverage": {"certified": 0.5}}, parts) == [
+        "the report says 0.5 of all sets are certified, its frames do not"
+    ]
+    twice = report | {"frames": [frame, frame | {"index": 1}], "verdict": "unknown"}
+    assert _together(twice, parts) == ["frame 1: no cells"]
+    # a question of a loop that is answered for all of its cells
+    loop = {"kind": "loop", "questions": dict.fromkeys(("safe", "reaches"), frame["coverage"]), "verdict": "safe"}
+    assert _together(loop, parts) == ["frame 1: no cells"]
+    both = [*parts, dataclasses.replace(parts[0], index=1)]
+    assert _together(loop | {"verdict": "reaches"}, both) == []
+    broken = [parts[0], dataclasses.replace(parts[0], index=1, verdicts=[("falsified", None, [0.0])])]
+    assert _together(loop | {"verdict": "falsified"}, broken) == []
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(4))
+def test_a_forged_headline_is_found(number: int, copy: Path, in_process: InProcess) -> None:
+    file = copy / "report.json"
+    document = json.loads(file.read_text())
+    wrong, change = list(headlines(document).items())[number]
+    file.write_text(json.dumps(document | change))
+    code, out, _ = in_process(check_command.main, [str(copy), "--claims", "1"])
+    assert code == 1 and wrong in out
 
 
 @pytest.mark.slow
@@ -398,10 +450,35 @@ def test_a_loop_is_proved_again_and_other_sets_are_not(tmp_path: Path) -> None:
     file.write_text(json.dumps(document))
     found = check(out, claims=1, seconds=120)
     assert (found.proved, found.refuted, found.structure) == (1, 0, [])
+    # cells of a part of what the loop begins in
+    initial = document["loop"]["initial"]
+    document["loop"]["initial"] = initial | {"across": [-0.5, 0.104]}
+    file.write_text(json.dumps(document))
+    with pytest.raises(nsa.InputError, match="other initial states than the loop"):
+        check(out, claims=1)
+    document["loop"]["initial"] = initial
     # a half-space that runs do enter
     document["loop"]["unsafe"] = [{"half_space": {"normal": [0.0, 1.0, 0.0, 0.0, 0.0], "at_least": 0.05}}]
     file.write_text(json.dumps(document))
     assert check(out, claims=1, seconds=5).proved == 0
+
+
+def test_cells_of_a_loop_are_of_all_its_initial_states(tmp_path: Path) -> None:
+    with sqlite3.connect(tmp_path / "cells.sqlite") as base:
+        columns = "lower, upper, verdict, margin, seconds, counterexample"
+        base.execute(f"CREATE TABLE cells(frame, {columns})")
+        base.execute("CREATE TABLE search_state(key, value)")
+        base.execute("INSERT INTO cells VALUES (0, '[0.0]', '[1.0]', 'certified', 1.0, 1.0, NULL)")
+    loop = {"state": ["x", "y"], "initial": {"y": 0.5, "x": [0, 1]}}
+    parameters = [{"name": "x", "unit": "", "lower": 0.0, "upper": 1.0}]
+    write_json(tmp_path / "report.json", {"kind": "loop", "loop": loop, "parameters": parameters})
+    rewrite(tmp_path, "UPDATE cells SET margin = 2.0")
+    report = json.loads((tmp_path / "report.json").read_text())
+    (cells,) = read_verdicts(tmp_path, report)
+    assert cells.names == ("x",) and cells.verdicts == [("certified", 2.0, None)]
+    for wider in ({"x": [-1, 1], "y": 0.5}, {"x": [0, 1], "y": [0.5, 0.6]}):
+        with pytest.raises(BadInput, match="other initial states"):
+            read_verdicts(tmp_path, report | {"loop": loop | {"initial": wider}})
 
 
 def test_errors_of_states_become_symbols() -> None:

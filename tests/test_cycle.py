@@ -131,6 +131,34 @@ def test_the_closing_leg_has_one_field_of_view(tmp_path: Path, inputs: Inputs) -
     assert caught.value.file == str(inputs.path)
 
 
+def test_ends_of_a_leg_have_one_principal_point(tmp_path: Path, inputs: Inputs) -> None:
+    """Else the last picture of the leg would be another one than that of its keyframe."""
+    data = closed()
+    data["camera_path"][1]["cx"] = 3.0
+    inputs.path.write_text(json.dumps(data))
+    with pytest.raises(InputError, match="principal points"):
+        open_job(Settings(inputs.config, inputs.path, inputs.spec))
+
+
+@pytest.mark.parametrize("noise", [2e-7, 1e-5, 4e-4])
+@pytest.mark.parametrize("entry", [0, 1])
+def test_ends_of_a_leg_are_the_keyframes(noise: float, entry: int, tmp_path: Path, inputs: Inputs) -> None:
+    """A leg leads from one rotation to another, so keyframes that are none are refused, not replaced."""
+    data = closed()
+    matrix = np.array(data["camera_path"][entry]["camera_to_world"]).reshape(4, 4)
+    matrix[:3, :3] += noise * np.random.default_rng(entry).uniform(-1.0, 1.0, (3, 3))
+    data["camera_path"][entry]["camera_to_world"] = matrix.ravel().tolist()
+    inputs.path.write_text(json.dumps(data))
+    if noise > 1e-6:
+        with pytest.raises(InputError, match="away from orthonormal"):
+            open_job(Settings(inputs.config, inputs.path, inputs.spec))
+        # alone it is taken as it is
+        assert PoseBox.around(read(tmp_path, data).cameras[entry], Perturbation()).box.names == ()
+    else:
+        swept = open_job(Settings(inputs.config, inputs.path, inputs.spec)).pose_sets[0]
+        assert np.abs(swept.pose(np.array([float(entry)])) - matrix[:3]).max() < 2e-6
+
+
 # ---------------------------------------------------------------- poses and bounds
 
 

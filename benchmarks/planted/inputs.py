@@ -102,4 +102,20 @@ INPUTS = (
         "False",
         "test_keys.py::test_sets_of_entries_are_not_lost_in_a_path_that_serves_as_perturbation_file",
     ),
+    Fault(
+        "segments lead past keyframes that are no rotations",
+        "geometry/poses.py",
+        "_check_segment",
+        "distance <= InputTuning.segment",
+        "distance <= 1.0",
+        "test_cycle.py::test_ends_of_a_leg_are_the_keyframes[0-0.0004]",
+    ),
+    Fault(
+        "segments take the principal point of their first keyframe",
+        "geometry/poses.py",
+        "_check_segment",
+        "following.intrinsics != camera.intrinsics",
+        "following.intrinsics[:2] != camera.intrinsics[:2]",
+        "test_cycle.py::test_ends_of_a_leg_have_one_principal_point",
+    ),
 )

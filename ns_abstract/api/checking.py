@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import statistics
 import time
@@ -10,7 +11,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ns_abstract.check.audit import ClaimOutcome, least_part, opened, outcomes
+from ns_abstract.check.audit import ClaimOutcome, opened, outcomes
 from ns_abstract.check.inputs import BadInput
 from ns_abstract.io.arguments import file_path, positive, whole
 from ns_abstract.io.atomic import write_json
@@ -141,3 +142,18 @@ def _audited(
     audit.seconds, audit.median_seconds = time.monotonic() - begin, statistics.median(spent) if spent else 0.0
     write_json(folder / "check.json", {"version": 1, "seed": seed, **asdict(audit)})
     return audit
+
+
+def least_part(proved: int, count: int, level: float = 0.95) -> float:
+    """Clopper and Pearson's lower limit of the part of all claims that holds: ``proved`` of ``count`` drawn ones do."""
+    low, high = 0.0, float(proved > 0)
+    for _ in range(60):
+        p = 0.5 * (low + high)
+        logs = (
+            math.lgamma(count + 1) - math.lgamma(k + 1) - math.lgamma(count - k + 1)
+            + k * math.log(p) + (count - k) * math.log1p(-p)
+            for k in range(proved, count + 1)
+            if proved
+        )  # fmt: skip
+        low, high = (p, high) if sum(map(math.exp, logs)) <= 1.0 - level else (low, p)
+    return low if proved else 0.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -14,7 +13,7 @@ from ns_abstract.check.claims import Claims
 from ns_abstract.check.inputs import BadInput, dataset_scale, given_set, read_poses, read_scene
 from ns_abstract.check.loops import LoopClaims
 from ns_abstract.check.pictures import Picture
-from ns_abstract.check.results import StoredCells, read_cells, read_report, read_verdicts, structure
+from ns_abstract.check.results import StoredCells, entries_of, read_cells, read_report, read_verdicts, structure
 from ns_abstract.check.splats import RULES
 from ns_abstract.check.verdicts import CertificateClaims, StatementClaims
 
@@ -36,9 +35,7 @@ class ClaimOutcome(NamedTuple):
 
 
 def opened(folder: Path, moved: dict[str, Path | None]) -> tuple[list[str], list[Claims]]:
-    """What is wrong with the cells of a result, and its claims.
-
-    Nothing is wrong if they tile every set, every pixel is bounded, and counts are right.
+    """What is wrong (cells that tile no set, pixels without bounds, figures that do not fit), and a result's claims.
 
     Args:
         folder: Output folder of a command.
@@ -51,11 +48,26 @@ def opened(folder: Path, moved: dict[str, Path | None]) -> tuple[list[str], list
     try:
         parts, subjects = _opened(folder, report, moved)
         wrong = [f"frame {c.index}: {text}" for c in parts for text in structure(c, report)]
+        wrong += [] if not parts or parts[0].verdicts is None else _together(report, parts)
         if not subjects and not wrong:
             raise BadInput("claims nothing: no cell has a result or verdict", name, fix="finish it: --resume")
         return wrong, subjects
     except (KeyError, TypeError, AttributeError, IndexError, OverflowError):
         raise BadInput("is not the report of a result", name, fix="make the result again") from None
+
+
+def _together(report: dict[str, Any], parts: list[StoredCells]) -> list[str]:
+    """What the report says of all frames or questions together, or of those without cells, and their cells do not."""
+    entries, kinds = entries_of(report), {c.index: {v[0] for v in c.verdicts or ()} for c in parts}
+    wrong = [f"frame {k}: no cells" for k, e in entries.items() if k not in kinds and e["certified"] + e["falsified"]]
+    for kind, said in (report.get("coverage") or {}).items():
+        if not abs(sum(e[kind] for e in entries.values()) / len(entries) - said) <= 1e-9:
+            wrong.append(f"the report says {said:.9g} of all sets are {kind}, its frames do not")
+    loop, whole = report.get("kind") == "loop", [k for k in entries if kinds.get(k) == {"certified"}]
+    done = whole if loop else len(whole) == len(entries) == len(report["frames"])
+    verdict = ("safe", "reaches")[whole[-1]] if done and loop else "certified" if done else "unknown"
+    verdict = "falsified" if any("falsified" in found for found in kinds.values()) else verdict
+    return wrong + [f"the verdict is {verdict}, the report says {report['verdict']}"] * (report["verdict"] != verdict)
 
 
 def outcomes(subjects: list[Claims], claims: int, seconds: float, seed: int) -> Iterator[ClaimOutcome]:
@@ -65,11 +77,9 @@ def outcomes(subjects: list[Claims], claims: int, seconds: float, seed: int) -> 
     for number in range(claims):
         subject, start = subjects[int(rng.choice(len(subjects), p=sizes / sizes.sum()))], time.monotonic()
         claim, share = subject.draw(rng, hunted=number % 2 == 1), 4.0 * (end - start) / (claims - number)
-        verdict, float32, detail = None, False, {}
-        if start < end:
-            verdict, float32, detail = subject.settle(claim, min(start + share, end))
-        refutation = {"frame": subject.cells.index, **subject.place(claim), **detail} if verdict is False else {}
-        yield ClaimOutcome(verdict, float32, number % 2 == 0, refutation)
+        settled = subject.settle(claim, min(start + share, end)) if start < end else (None, False, {})
+        refutation = {"frame": subject.cells.index, **subject.place(claim), **settled[2]} if settled[0] is False else {}
+        yield ClaimOutcome(*settled[:2], number % 2 == 0, refutation)
 
 
 def _opened(
@@ -124,18 +134,3 @@ def _frames(folder: Path, report: dict[str, Any]) -> list[StoredCells]:
             raise BadInput(f"found {npz!r}", folder / "report.json", "frames.files.npz")
         parts.append(read_cells(folder, npz, entry["index"], report["sha256"].get(npz)))
     return parts
-
-
-def least_part(proved: int, count: int, level: float = 0.95) -> float:
-    """Clopper and Pearson's lower limit of the part of all claims that holds: ``proved`` of ``count`` drawn ones do."""
-    low, high = 0.0, float(proved > 0)
-    for _ in range(60):
-        p = 0.5 * (low + high)
-        logs = (
-            math.lgamma(count + 1) - math.lgamma(k + 1) - math.lgamma(count - k + 1)
-            + k * math.log(p) + (count - k) * math.log1p(-p)
-            for k in range(proved, count + 1)
-            if proved
-        )  # fmt: skip
-        low, high = (p, high) if sum(map(math.exp, logs)) <= 1.0 - level else (low, p)
-    return low if proved else 0.0

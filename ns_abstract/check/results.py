@@ -20,7 +20,7 @@ Array = Any
 
 #: Bytes of arrays of one frame, and rows of a table, that are read at most.
 _MOST, _ROWS = 32 << 30, 10_000_000
-_AGAIN = "make the result again"
+_AGAIN, _BOX = "make the result again", ("name", "lower", "upper")
 _WHERE = "give the output folder of ns-abstract-render, ns-abstract-certify or ns-abstract-reach"
 
 
@@ -101,6 +101,9 @@ def read_verdicts(folder: Path, report: dict[str, Any]) -> list[StoredCells]:
     loop = report.get("kind") == "loop"
     try:
         sets: dict[int, Any] = dict.fromkeys((0, 1), report["parameters"]) if loop else {}
+        ends = {n: np.ravel(report["loop"]["initial"][n]).tolist() for n in report["loop"]["state"]} if loop else {}
+        if loop and [[n, *v] for n, v in ends.items() if v[0] < v[-1]] != [list(map(p.get, _BOX)) for p in sets[0]]:
+            raise BadInput("is of other initial states than the loop's", folder / "report.json", "parameters", _AGAIN)
         sets |= {} if loop else {int(f["index"]): f["parameters"] for f in report["frames"]}
         base = sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro", uri=True)
         # rows that stand for what is still to be examined
@@ -119,7 +122,7 @@ def read_verdicts(folder: Path, report: dict[str, Any]) -> list[StoredCells]:
             raise BadInput("does not hold the cells that the report names (cells_seal)", file, fix=_AGAIN)
         cells = []
         for index, entries in sorted(by_frame.items()):
-            names, low, high = ([p[k] for p in sets[index]] for k in ("name", "lower", "upper"))
+            names, low, high = ([p[k] for p in sets[index]] for k in _BOX)
             boxes = {
                 f"box_{s}": np.array([e[k] for e in entries], np.float64) for k, s in enumerate(("lower", "upper"))
             }
@@ -163,12 +166,16 @@ def structure(cells: StoredCells, report: dict[str, Any]) -> list[str]:
     return wrong
 
 
+def entries_of(report: dict[str, Any]) -> dict[int, dict[str, Any]]:
+    """Counts of cells and parts of the set that the report says of each question or frame."""
+    if report.get("kind") == "loop":
+        return {k: report["questions"][n] for k, n in enumerate(("safe", "reaches")) if n in report["questions"]}
+    return {f["index"]: f | f["coverage"] for f in report["frames"]}
+
+
 def _tallies(cells: StoredCells, report: dict[str, Any]) -> list[str]:
     """Verdicts of a frame or question against the report, whose parts are sums of disjoint cells' volumes."""
-    question = ("safe", "reaches")[min(cells.index, 1)]
-    entry = (report.get("questions") or {}).get(question) or {}
-    frames = [f for f in report.get("frames") or [] if f["index"] == cells.index]
-    entry, part = (frames[0], frames[0]["coverage"]) if frames else (entry, entry)
+    loop, part = report.get("kind") == "loop", entries_of(report)[cells.index]
     wrong, verdicts = [], np.array([v[0] for v in cells.verdicts or []])
     low, high, whole = cells.arrays["box_lower"], cells.arrays["box_upper"], (cells.lower, cells.upper)
     covered = partition(low, high, *whole)
@@ -176,17 +183,13 @@ def _tallies(cells: StoredCells, report: dict[str, Any]) -> list[str]:
         return ["cells overlap, or leave the set"]
     for kind in ("certified", "falsified", "unknown"):
         # a loop's report counts what is still to be examined as unknown
-        chosen = (verdicts == kind) | ((kind == "unknown") & (not frames) & (verdicts == "open"))
-        if int(chosen.sum()) != entry["cells"][kind]:
-            wrong.append(f"the report counts {entry['cells'][kind]} {kind} cells, the table {int(chosen.sum())}")
+        chosen = (verdicts == kind) | ((kind == "unknown") & loop & (verdicts == "open"))
+        if int(chosen.sum()) != part["cells"][kind]:
+            wrong.append(f"the report counts {part['cells'][kind]} {kind} cells, the table {int(chosen.sum())}")
         share = partition(low[chosen], high[chosen], *whole)
         if kind != "unknown" and (share is None or abs(share - part[kind]) > 1e-9):
-            wrong.append(
-                f"cells that are {kind} are {float(share or 0):.9g} of the set, the report says {part[kind]:.9g}"
-            )
-    if covered != 1:
-        wrong.append("the cells are no partition of the set")
-    return wrong
+            wrong.append(f"{kind} cells are {float(share or 0):.9g} of the set, the report says {part[kind]:.9g}")
+    return wrong + ["the cells are no partition of the set"] * (covered != 1)
 
 
 def partition(low: Array, high: Array, first: Array, last: Array) -> Fraction | None:

@@ -30,6 +30,10 @@ class Verdicts(Claims):
         super().__init__(cells, scene, report)
         self.rows = [k for k, v in enumerate(cells.verdicts or []) if v[0] in self.kinds]
         self.count = len(self.rows)
+        for verdict, margin, example in ((cells.verdicts or [])[k] for k in self.rows):
+            stated = [margin or 0.0, *(cells.lower if verdict == "certified" else example or ())]
+            if len(stated) != 1 + len(cells.names) or not all(isinstance(x, (int, float)) for x in stated):
+                raise BadInput("holds a margin or a counterexample that is none", "cells.sqlite", fix="make it again")
         if not isinstance(scene, ActivatedScene) or (report.get("picture") or "float") != "float":
             raise BadInput("is of a NeRF or of 8-bit pictures, whose cells are not checked", "report.json", "renderer")
 
@@ -117,9 +121,9 @@ class CertificateClaims(OfNetwork):
 
     def bounds(self, low: Array, high: Array, unit: float) -> tuple[Array, Array]:
         """Of the class' output less the largest other one."""
-        forms = self.network.outputs(self.inputs(self.camera, self.poses.view(low, high), unit), self.rivals)
-        least, most = (end.min(axis=1) for end in forms.range())
-        return least, most
+        x = self.inputs(self.camera, self.poses.view(low, high), unit)
+        least, most = self.network.outputs(x, self.rivals).range()
+        return least.min(axis=1), most.min(axis=1)
 
 
 class StatementClaims(Verdicts):

@@ -21,6 +21,7 @@ from ns_abstract.arithmetic.trigonometry import cos_sin
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import InputTuning
 from ns_abstract.perturbation.specification import ROTATIONS, TRANSLATIONS, Perturbation
 
 #: Elementary rotation axes of yaw, pitch and roll in camera axes.
@@ -43,6 +44,29 @@ def rotation_about(axis: Float64Array, angle: float) -> Float64Array:
     """[3, 3] right-handed rotation by ``angle`` (radians) about the unit vector ``axis`` (Rodrigues)."""
     k = _cross_matrix(np.asarray(axis, np.float64))
     return np.eye(3) + np.sin(angle) * k + (1.0 - np.cos(angle)) * (k @ k)
+
+
+def _check_segment(camera: PinholeCamera, following: PinholeCamera) -> None:
+    """Refuse keyframes whose own pictures would not be among those of the segment between them.
+
+    Raises:
+        InputError: Their intrinsics differ, or the nearest rotation would replace what one of them has.
+    """
+    if following.intrinsics != camera.intrinsics:
+        raise InputError(
+            "neighbouring keyframes have different fields of view or principal points",
+            field="camera_path.fov",
+            fix="use one fov for a path that is swept in segments",
+        )
+    for entry in (camera, following):
+        rotation = entry.camera_to_world[:, :3]
+        distance = float(np.abs(rotation.T @ rotation - np.eye(3)).max())
+        if not distance <= InputTuning.segment:
+            raise InputError(
+                f"the rotation part is {distance:.3g} away from orthonormal (segments: {InputTuning.segment:g})",
+                field="camera_path.camera_to_world",
+                fix='write rotations to seven digits, or leave "sweep": "segments" out',
+            )
 
 
 def orthonormal(matrix: Float64Array) -> Float64Array:
@@ -132,7 +156,7 @@ class PoseBox:
         """The set of one keyframe; ``following`` is the next one, used where the sweep is over segments.
 
         Raises:
-            InputError: The two cameras of a segment differ in intrinsics.
+            InputError: The two cameras of a segment differ in intrinsics, or one of their rotations is none.
         """
         ranges: dict[str, tuple[str, tuple[float, float]]] = {}
         for name in TRANSLATIONS:
@@ -141,12 +165,7 @@ class PoseBox:
             ranges[name] = ("rad", perturbation.rotation.get(name, (0.0, 0.0)))
         segment = following if perturbation.sweep == "segments" else None
         if segment is not None:
-            if (segment.fx, segment.fy) != (camera.fx, camera.fy):
-                raise InputError(
-                    "neighbouring keyframes have different fields of view",
-                    field="camera_path.fov",
-                    fix="use one fov for a path that is swept in segments",
-                )
+            _check_segment(camera, segment)
             ranges["segment"] = ("of the way", (0.0, 1.0))
         if perturbation.orbit is not None:
             ranges["azimuth"] = ("rad", perturbation.orbit.azimuth)

@@ -34,6 +34,8 @@ class InputTuning:
     #: 1).
     rotation: float = 1e-3
     last_row: float = 1e-6
+    #: The same for keyframes that a segment connects, which leads from one rotation to another: what float32 leaves.
+    segment: float = 2e-6
 
 
 MODERATE = InputTuning.least, InputTuning.largest

@@ -319,7 +319,8 @@ class CompositeBuilder(ElementwiseBuilder):
         group = np.broadcast_to(np.arange(int(np.prod(reduced_shape))).reshape(reduced_shape), shape).reshape(-1)
         count = int(np.prod([shape[k] for k in axes]))
         size = int(np.prod(shape))
-        if size * count <= _CENTRED_AT_ONCE:
+        # what a number loses where it is taken from itself is no product of a matrix
+        if count > 1 and size * count <= _CENTRED_AT_ONCE:
             self.reserve(3.0 * size * count)
             members = np.argsort(group, kind="stable").reshape(-1, count)
             to = np.broadcast_to(np.arange(size)[:, None], (size, count))

@@ -116,11 +116,16 @@ def _to(b: CompositeBuilder, value: TensorValue, whole: Shape) -> int:
     return b.spread(b.reshape(value.index, before), after)
 
 
-def _both(b: CompositeBuilder, kind: str, one: TensorValue, two: TensorValue) -> tuple[int, Shape]:
+def _together(*shapes: Shape) -> Shape:
+    """The shape that tensors are repeated to."""
     try:
-        whole = np.broadcast_shapes(one.whole, two.whole)
+        return np.broadcast_shapes(*shapes)
     except ValueError:
-        raise InputError(f"shapes {item(one.whole)} and {item(two.whole)} do not fit") from None
+        raise InputError(f"shapes {' and '.join(map(item, shapes))} do not fit") from None
+
+
+def _both(b: CompositeBuilder, kind: str, one: TensorValue, two: TensorValue) -> tuple[int, Shape]:
+    whole = _together(one.whole, two.whole)
     first, second = _to(b, one, whole), _to(b, two, whole)
     if kind in ("Add", "Sub"):
         return b.sum((first, second), (1, 1 if kind == "Add" else -1)), whole
@@ -132,18 +137,17 @@ def _both(b: CompositeBuilder, kind: str, one: TensorValue, two: TensorValue) ->
 def _variadic(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     """Max, Min and Sum of any number of values and constants."""
     kind = node.op_type
-    result = r.value(node, next(k for k in range(len(node.input)) if r.moves(node, k)))
-    done = False
+    first = next(k for k in range(len(node.input)) if r.moves(node, k))
+    result = r.value(node, first)
     for k in range(len(node.input)):
+        if k == first:
+            continue
         other = operand(r, node, k)
         if isinstance(other, TensorValue):
-            if other is result and not done:
-                done = True
-                continue
             if kind == "Sum":
                 result = TensorValue(*_both(r.builder, "Add", result, other))
                 continue
-            whole = np.broadcast_shapes(result.whole, other.whole)
+            whole = _together(result.whole, other.whole)
             parts = _to(r.builder, result, whole), _to(r.builder, other, whole)
             result = TensorValue(r.builder.extreme(parts, kind == "Max"), whole)
             continue
@@ -190,7 +194,7 @@ def _where(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     chosen = np.asarray(r.weight(node, 0), bool)
     parts = [operand(r, node, k) for k in (1, 2)]
     shapes = [chosen.shape, *(p.whole if isinstance(p, TensorValue) else p.shape for p in parts)]
-    whole = np.broadcast_shapes(*shapes)
+    whole = _together(*shapes)
     moving, offset = [], np.zeros(whole)
     for part, mask in zip(parts, (chosen, ~chosen), strict=True):
         if isinstance(part, TensorValue):

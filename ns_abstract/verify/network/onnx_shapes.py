@@ -288,7 +288,10 @@ def _resize(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
         a.only("exclude_outside", 0)
     bend = float(a.get("cubic_coeff_a", -0.75))
     a.ignore("exclude_outside")
-    axes = [int(v) % 4 for v in a.get("axes", range(4))]
+    axes = [int(v) for v in a.get("axes", range(4))]
+    if not all(0 <= v < 4 for v in axes):
+        # onnxruntime writes outside of its memory
+        raise InputError(f"attribute axes = {axes} is not supported", fix="count axes from the first one")
     old = node.op_type == "Upsample" or r.opset < 11
     scales = a.get("scales")
     if scales is None:
@@ -315,7 +318,12 @@ def _resize(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
         # onnxruntime copies, the operator's definition does not
         raise InputError(f"scales of {item(whole)} that keep its size", fix="export with sizes, or without the node")
     r.builder.reserve(float(math.prod(out)) * 4.0)
-    maps = [interpolation(whole[k], out[k], mode, coordinates, nearest, ratio[k], bend) for k in (2, 3)]
+    # before operator set 11 onnxruntime rounds places up where an axis shrinks
+    picks = ["ceil" if old and (ratio[k] or 1.0) < 1.0 else nearest for k in (2, 3)]
+    maps = [
+        interpolation(whole[k], out[k], mode, coordinates, pick, ratio[k], bend)
+        for k, pick in zip((2, 3), picks, strict=True)
+    ]
     r.result(node, r.builder.resize(x, maps))
 
 

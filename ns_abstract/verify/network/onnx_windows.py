@@ -14,6 +14,9 @@ from ns_abstract.verify.network.onnx_arithmetic import (
 )
 from ns_abstract.verify.network.onnx_graph import Attributes, OnnxReader, Rule
 
+#: The operator set since which a mean of a window counts its pads, and not what lies past them.
+_COUNTED_PADS = 19
+
 
 def _ints(a: Attributes, name: str, line: bool, default: int | None = None, beside: int = 1) -> Any:
     """Two numbers of a window operator; of one along a line ``beside`` is the other."""
@@ -95,6 +98,11 @@ def _average_pool(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     if dilation != (1, 1):
         raise InputError(f"attribute dilations = {list(dilation)} is not supported", fix="only 1 is")
     counted = bool(a.get("count_include_pad", 0))
+    if counted and any(more) and r.opset < _COUNTED_PADS:
+        raise InputError(
+            "attributes ceil_mode = 1, count_include_pad = 1: programs divide by different numbers",
+            fix=f"export with operator set {_COUNTED_PADS} or later",
+        )
     _mapped(r, node, r.builder.average_windows(x, kernel, stride, pads, more, counted), line)
 
 
