@@ -1,7 +1,8 @@
-"""Operators are read rightly where the comparison with onnxruntime cannot tell, as large outputs hide small ones."""
+"""Operators are read rightly beside large outputs, and where a comparison with onnxruntime cannot tell."""
 
 from __future__ import annotations
 
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -12,9 +13,11 @@ from test_network_reading import at, run
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import load_network
+from ns_abstract.verify.network.comparison import compare
+from ns_abstract.verify.network.onnx_file import read_onnx
 from ns_abstract.verify.network.onnx_fold import fold
 
-#: What the outputs beside are multiplied by: more than the comparison's tolerance may hide.
+#: What the outputs beside are multiplied by.
 LARGE = 4096.0
 
 
@@ -34,6 +37,20 @@ def holds(file: Path, x: np.ndarray) -> float:
     value = run(file, x)
     assert (low <= value).all() and (value <= high).all()
     return float((high - low)[0])
+
+
+@pytest.mark.parametrize("wrong", [0.0, 0.01])
+def test_small_outputs_beside_large_ones_are_compared(wrong: float, tmp_path: Path) -> None:
+    f = OnnxFile((4,))
+    beside_large(f, f.node("Tanh", "image"), 4)
+    file = f.write(tmp_path / "net.onnx")
+
+    def program(image: np.ndarray) -> np.ndarray:
+        return run(file, image[0]) + wrong * (np.arange(8) == 2)
+
+    images = [np.random.default_rng(seed).normal(size=(1, 4)) for seed in range(3)]
+    with pytest.raises(InputError, match="outputs differ by 0.01") if wrong else nullcontext():
+        compare(read_onnx(file), program, images)
 
 
 @pytest.mark.parametrize("before", [0, 1, 2])
