@@ -89,9 +89,23 @@ PICTURES = (
         "ends[0] < limit - _TUNING.room", _CHANGE,
     ),
     Fault(
-        "enclosing boxes: lines of the grid cut cells", _ENCLOSING, "enclosing_box",
+        "enclosing boxes: lines of the grid cut cells", _ENCLOSING, "_aligned",
         "min(high, max(upper, cell.upper[axis]))", "min(high, upper)",
         "test_nearby_pictures.py::test_enclosing_boxes_hold_cells_and_are_shared",
+    ),
+    Fault(
+        "enclosing boxes: those around them are cut as finely along all parameters", _ENCLOSING, "shared_box",
+        "[max(0, level - less) for less in spared]", "[max(0, level) for less in spared]",
+        "test_nearby_pictures.py::test_boxes_around_enclosing_boxes_hold_them_and_are_few",
+    ),
+    Fault(
+        "near cells: cuts are compared by quarters at an end of the cell", _NEARBY, "NearbyPictures.cut_gains",
+        "part[2].upper[k]", "part[1].upper[k]", "test_nearby_pictures.py::test_cuts_are_compared_by_what_they_narrow",
+    ),
+    Fault(
+        "cells: compared cuts are not made", "verify/search.py", "Search._verdicts",
+        "self.grid.divide(cell.cell, gains,", "self.grid.divide(cell.cell, slopes[number],",
+        "test_nearby_pictures.py::test_cells_are_cut_where_sets_narrow_most",
     ),
     Fault(
         "near cells: settled pixels have their lower bounds", _NEARBY, "NearbyPictures.sets",
