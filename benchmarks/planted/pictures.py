@@ -99,13 +99,14 @@ PICTURES = (
         "test_nearby_pictures.py::test_boxes_around_enclosing_boxes_hold_them_and_are_few",
     ),
     Fault(
-        "near cells: cuts are compared by quarters at an end of the cell", _NEARBY, "NearbyPictures.cut_gains",
-        "part[2].upper[k]", "part[1].upper[k]", "test_nearby_pictures.py::test_cuts_are_compared_by_what_they_narrow",
+        "near cells: cuts are compared by the uncut cell", _NEARBY, "NearbyPictures.cut_gains",
+        "(box, *halves)", "[box] * (1 + len(halves))",
+        "test_nearby_pictures.py::test_cuts_are_compared_by_what_they_narrow",
     ),
     Fault(
         "cells: compared cuts are not made", "verify/search.py", "Search._verdicts",
-        "self.grid.divide(cell.cell, gains,", "self.grid.divide(cell.cell, slopes[number],",
-        "test_nearby_pictures.py::test_cells_are_cut_where_sets_narrow_most",
+        "scene.cut_gains(cell.box) if isinstance(scene, ComparedCuts) else slopes[number]", "slopes[number]",
+        "test_certify_search.py::test_cells_are_cut_where_bounds_narrow_most",
     ),
     Fault(
         "near cells: settled pixels have their lower bounds", _NEARBY, "NearbyPictures.sets",

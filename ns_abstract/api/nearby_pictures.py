@@ -16,11 +16,12 @@ import torch
 
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.tiles import assemble, in_tiles
+from ns_abstract.io.errors import InputError
 from ns_abstract.refine.protocol import Bounds, ElementFrame, Frame, SceneSample
 from ns_abstract.verify.enclosing_boxes import enclosing_box, shared_box
 from ns_abstract.verify.picture_sets import PictureSets
 from ns_abstract.verify.protocol import FrameImages
-from ns_abstract.verify.search_results import ContradictionError
+from ns_abstract.verify.search_results import FAILURES, ContradictionError
 from ns_abstract.verify.settled_pixels import LimitedMeasure, unsettled
 
 
@@ -233,26 +234,37 @@ class NearbyPictures:
         """[d] by how much sets of pixels narrow, about, where a cell is cut to nothing along each parameter (Q7).
 
         Slopes do not tell: sets follow them, and are as wide as pictures may be off these. Twice what the middle half
-        of the cell is narrower, at a few of the pixels that are not settled.
+        of the cell is narrower, at a few of the pixels that are not settled. Zeros where nothing is to be compared.
         """
-        known, gains = self._known, np.zeros(box.dimensions)
-        places = np.flatnonzero(known.open)
-        compared = np.zeros(known.open.shape, bool)
-        compared.flat[places[:: max(1, -(-places.size // _TUNING.compared))]] = True
+        if self._known.elements is None or box.dimensions < 2:
+            return np.zeros(box.dimensions)
         quarters = [box.split(axis, 4) for axis in range(box.dimensions)]
         halves = [box.replace(k, part[1].lower[k], part[2].upper[k]) for k, part in enumerate(quarters)]
-        for (frame, channels), shown in zip(self._weights, known.elements or (), strict=False):
+        try:
+            widths = [self._compared_width(part) for part in (box, *halves)]
+        except InputError:
+            raise
+        except FAILURES:
+            # they stop the cell's own bounds, too
+            return np.zeros(box.dimensions)
+        return 2.0 * np.maximum(0.0, widths[0] - np.array(widths[1:]))
+
+    def _compared_width(self, box: ParameterBox) -> float:
+        """Width of the linear sets of a cell at a pose, a mean over pixels by frame."""
+        known, width = self._known, 0.0
+        assert known.elements is not None
+        places = np.flatnonzero(known.open)
+        compared = np.zeros(known.open.shape, bool)
+        compared.flat[places[:: -(-places.size // _TUNING.compared)]] = True
+        for (frame, channels), shown in zip(self._weights, known.elements, strict=True):
             pixels = in_tiles(compared, frame.side)[shown.tiles]
             some = pixels.any(axis=(1, 2))
             tiles, pixels = shown.tiles[some], pixels[some]
-            widths = []
-            for part in (box, *halves):
-                (bounds,) = frame.bound_parts([part], tiles, shown.context, True, pixels)
-                assert bounds.linear is not None
-                sets = PictureSets(part, bounds.linear, bounds.lower, bounds.upper)
-                widths.append(float(sets.widths[pixels][:, : len(channels)].mean()))
-            gains += 2.0 * np.maximum(0.0, widths[0] - np.array(widths[1:]))
-        return gains
+            (bounds,) = frame.bound_parts([box], tiles, shown.context, True, pixels)
+            assert bounds.linear is not None
+            sets = PictureSets(box, bounds.linear, bounds.lower, bounds.upper)
+            width += float(sets.widths[pixels][:, : len(channels)].mean())
+        return width
 
 
 def place(
