@@ -164,6 +164,26 @@ def test_cells_of_cheap_models_fail_as_a_whole_only_after_a_second_look() -> Non
     assert volume(leaves, "certified") > 0 and volume(leaves, "falsified") > 0
 
 
+class Compared(Ramp):
+    """A ramp whose bounds say that cuts along y alone help."""
+
+    def cut_gains(self, box: ParameterBox) -> np.ndarray:
+        return np.array([0.0, 1.0])
+
+
+def test_cells_are_cut_where_bounds_narrow_most() -> None:
+    """Bounds of narrower cells tell where to cut, and not slopes, if the pictures have them."""
+    for scene, axis in ((Ramp(2), 0), (Compared(2), 1)):
+        search = search_of(scene, Threshold(0.55), (1, 1), costly=False)
+        (root,) = search.grid.roots()
+        cells = [cell for block in search.examine([root]).blocks for cell in block]
+        assert cells
+        lengths = [[cell.past[k] - cell.first[k] for cell in cells] for k in range(2)]
+        shares = [max(lengths[k]) / (root.past[k] - root.first[k]) for k in range(2)]
+        assert shares[axis] < 1.0 and shares[axis] <= shares[1 - axis]
+        assert axis == 0 or shares[0] == 1.0
+
+
 def test_order_of_blocks_does_not_matter() -> None:
     first, count = drive(search_of())
     for seed in range(3):

@@ -13,14 +13,15 @@ import torch
 from conftest import Inputs
 from test_picture_properties import Case
 
-from ns_abstract.api.nearby_pictures import KnownBoxes, NearbyPictures
+from ns_abstract.api.nearby_pictures import KnownBoxes, NearbyPictures, NearbyTuning
 from ns_abstract.api.picture_question import PlanePictures
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.methods.splat.weights import SplatWeightFrame
-from ns_abstract.verify.enclosing_boxes import enclosing_box
+from ns_abstract.verify.enclosing_boxes import enclosing_box, shared_box
 from ns_abstract.verify.picture_measures import Measure
-from ns_abstract.verify.protocol import NearImages
+from ns_abstract.verify.picture_sets import PictureSets
+from ns_abstract.verify.protocol import ComparedCuts, NearImages
 from ns_abstract.verify.search_results import ContradictionError
 from ns_abstract.verify.settled_pixels import LimitedMeasure, unsettled
 
@@ -111,6 +112,41 @@ def test_enclosing_boxes_hold_cells_and_are_shared() -> None:
     assert enclosing_box(cells[0], whole, np.full(2, 1e3)) is None
     assert enclosing_box(cells[0], whole, np.full(2, math.inf)) is None
     assert enclosing_box(whole, whole, np.zeros(2)) is None
+
+
+def test_boxes_around_enclosing_boxes_hold_them_and_are_few() -> None:
+    rng = np.random.default_rng(1)
+    whole = ParameterBox(("x", "y", "z"), ("", "", ""), (-0.7, 2.0, 0.0), (1.9, 2.3, 1.0))
+    motion, size = np.array([3.0, 3.1, 0.4]), np.array(whole.upper) - whole.lower
+    for _ in range(500):
+        width = 2.0 ** -rng.uniform(2.0, 7.0, 3) * size
+        low = np.array(whole.lower) + rng.uniform(size=3) * (size - width)
+        cell = ParameterBox(whole.names, whole.units, tuple(low.tolist()), tuple((low + width).tolist()))
+        box, chain = enclosing_box(cell, whole, motion), 0
+        while box is not None and (around := shared_box(box, whole, motion)) is not None:
+            assert all(a >= b for a, b in zip(box.lower, around.lower, strict=True))
+            assert all(a <= b for a, b in zip(box.upper, around.upper, strict=True))
+            assert around != box
+            box, chain = around, chain + 1
+        assert chain <= 8 and (box is None or box == whole)
+    # whatever shapes cells have, the boxes around theirs have few: the picture moves alike over their sides
+    shapes, shared = set(), set()
+    for counts in ((16, 4, 1), (4, 16, 2), (16, 16, 1), (8, 16, 4)):
+        parts = [whole]
+        for axis, count in enumerate(counts):
+            parts = [piece for part in parts for piece in part.split(axis, count)]
+        for part in parts:
+            around = shared_box(part, whole, motion)
+            assert around is not None
+            shapes.add(tuple(np.round(size / (np.array(around.upper) - around.lower)).astype(int).tolist()))
+            shared.add(around)
+    assert shapes == {(4, 4, 1), (8, 8, 2)} and len(shared) == 4 * 4 + 8 * 8 * 2
+    assert shared_box(whole, whole, motion) is None
+    assert shared_box(whole.split(0, 4)[1], whole, np.full(3, 1e3)) is None
+    assert shared_box(whole.split(0, 4)[1], whole, np.array([1.0, math.inf, 0.0])) is None
+    # a parameter that moves nothing is not cut
+    around = shared_box(whole.split(0, 4)[1].split(2, 8)[3], whole, np.array([1.0, 1.0, 0.0]))
+    assert around == whole
 
 
 # ---------------------------------------------------------------- pictures
@@ -218,7 +254,7 @@ def test_bounds_of_enclosing_boxes_are_attacked(blobs: Inputs, tmp_path: Path, m
 def test_few_boxes_are_kept(blobs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """What is known of a cell is the same after its box was dropped."""
     job, pictures = _pictures(tmp_path, blobs, _tight(tmp_path, blobs, [SMALL]))
-    monkeypatch.setattr("ns_abstract.api.nearby_pictures._KEPT", 0)
+    monkeypatch.setattr("ns_abstract.api.nearby_pictures._TUNING", NearbyTuning(memory=0, drawn=0))
     boxes = KnownBoxes(pictures, [_frame(pictures)], pictures.wanted, job.property.limited(16, 16))
     cells = _cells(pictures.box, 4, np.random.default_rng(3))
     first = [boxes.near(cell) for cell in cells]
@@ -226,7 +262,7 @@ def test_few_boxes_are_kept(blobs: Inputs, tmp_path: Path, monkeypatch: pytest.M
     for one, other, cell in zip(first, again, cells, strict=True):
         assert one is not None and other is not None
         np.testing.assert_array_equal(one.image(cell.middle), other.image(cell.middle))
-    assert len(boxes._known) == 1
+    assert len(boxes._known) == 1 and len(boxes._draws) == 1
 
 
 def test_pixels_that_are_not_wanted_take_no_light(blobs: Inputs, tmp_path: Path) -> None:
@@ -239,3 +275,31 @@ def test_pixels_that_are_not_wanted_take_no_light(blobs: Inputs, tmp_path: Path)
     found, whole = frame.drawn_alone(context, tiles, chosen)(pose), frame.render(pose)
     np.testing.assert_array_equal(found[chosen], whole[chosen])
     assert not found[~chosen].any() and assemble(whole, frame.camera)[..., 0].any()
+
+
+def _widths(near: NearbyPictures, cell: ParameterBox) -> float:
+    """The mean width of the sets of the pixels that are not settled."""
+    linear, lower, upper, _ = near.sets(cell)
+    return float(PictureSets(cell, linear, lower, upper).widths[near._known.open][:, 3].mean())
+
+
+def test_cuts_are_compared_by_what_they_narrow(blobs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """What a cut is said to gain is about what it narrows the sets by, which slopes do not tell."""
+    _, pictures = _pictures(tmp_path, blobs, _tight(tmp_path, blobs, [SMALL]))
+    (cell,) = _cells(pictures.box, 1, np.random.default_rng(1))
+    near = pictures.near(cell)
+    assert isinstance(near, NearbyPictures) and isinstance(near, ComparedCuts)
+    gains = near.cut_gains(cell)
+    assert gains.shape == (3,) and (gains > 0.0).all()
+    whole = _widths(near, cell)
+    narrowed = np.array([2.0 * (whole - np.mean([_widths(near, half) for half in cell.split(k)])) for k in range(3)])
+    # some of the pixels, and the middle half in place of the two
+    assert (np.abs(gains - narrowed) <= 0.5 * narrowed.max()).all()
+    # of one parameter, and where bounds fail, nothing is compared
+    assert not near.cut_gains(cell.without(cell.names[1:])).any()
+
+    def failing(*_: Any) -> Any:
+        raise RuntimeError("planted")
+
+    monkeypatch.setattr(SplatWeightFrame, "bound_parts", failing)
+    assert not near.cut_gains(cell).any()

@@ -89,9 +89,24 @@ PICTURES = (
         "ends[0] < limit - _TUNING.room", _CHANGE,
     ),
     Fault(
-        "enclosing boxes: lines of the grid cut cells", _ENCLOSING, "enclosing_box",
+        "enclosing boxes: lines of the grid cut cells", _ENCLOSING, "_aligned",
         "min(high, max(upper, cell.upper[axis]))", "min(high, upper)",
         "test_nearby_pictures.py::test_enclosing_boxes_hold_cells_and_are_shared",
+    ),
+    Fault(
+        "enclosing boxes: those around them are cut as finely along all parameters", _ENCLOSING, "shared_box",
+        "[max(0, level - less) for less in spared]", "[max(0, level) for less in spared]",
+        "test_nearby_pictures.py::test_boxes_around_enclosing_boxes_hold_them_and_are_few",
+    ),
+    Fault(
+        "near cells: cuts are compared by the uncut cell", _NEARBY, "NearbyPictures.cut_gains",
+        "(box, *halves)", "[box] * (1 + len(halves))",
+        "test_nearby_pictures.py::test_cuts_are_compared_by_what_they_narrow",
+    ),
+    Fault(
+        "cells: compared cuts are not made", "verify/search.py", "Search._verdicts",
+        "scene.cut_gains(cell.box) if isinstance(scene, ComparedCuts) else slopes[number]", "slopes[number]",
+        "test_certify_search.py::test_cells_are_cut_where_bounds_narrow_most",
     ),
     Fault(
         "near cells: settled pixels have their lower bounds", _NEARBY, "NearbyPictures.sets",

@@ -59,8 +59,6 @@ _MOST_SHEARED = 512
 _AIM_SHEARED = 0.32
 #: Cells of the first blocks: early results, of which a kill leaves the more.
 _FIRST_BLOCKS = (1, 1, 1, 1, 2, 2, 4, 4)
-#: Frames whose bounds a process keeps at hand.
-_KEPT = 4
 #: Part of the time in which it must show how long a ray takes.
 _FORESEEN = 0.25
 #: Bytes for the bounds of one process, where nothing is said.
@@ -233,8 +231,11 @@ class Certification:
     def search(self, index: int, grid: CellGrid) -> Search:
         """The search of a frame; kept at hand."""
         key = (index, grid)
-        if key not in self._searches:
-            while len(self._searches) >= _KEPT:
+        if key in self._searches:
+            # the last that was asked for is dropped last
+            self._searches[key] = self._searches.pop(key)
+        else:
+            while len(self._searches) >= self.question.frames:
                 self._searches.pop(next(iter(self._searches)))
             pictures = self.pictures(index)
             every_unit = self.property.partitions is not None

@@ -16,14 +16,27 @@ import torch
 
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.tiles import assemble, in_tiles
+from ns_abstract.io.errors import InputError
 from ns_abstract.refine.protocol import Bounds, ElementFrame, Frame, SceneSample
-from ns_abstract.verify.enclosing_boxes import enclosing_box
+from ns_abstract.verify.enclosing_boxes import enclosing_box, shared_box
+from ns_abstract.verify.picture_sets import PictureSets
 from ns_abstract.verify.protocol import FrameImages
-from ns_abstract.verify.search_results import ContradictionError
+from ns_abstract.verify.search_results import FAILURES, ContradictionError
 from ns_abstract.verify.settled_pixels import LimitedMeasure, unsettled
 
-#: Elements that enclosing boxes may show together, of those that are kept: a few hundred bytes each.
-_KEPT = 1 << 20
+
+@dataclass(frozen=True)
+class NearbyTuning:
+    """What is kept of enclosing boxes, and what cuts are chosen by. None of it decides whether a bound holds."""
+
+    #: Bytes of enclosing boxes, and elements of those that pictures were drawn in, about 200 bytes each.
+    memory: int = 1 << 27
+    drawn: int = 1 << 18
+    #: Pixels at which cuts of a cell are compared. Measured at the plant's pot in the middle.
+    compared: int = 6
+
+
+_TUNING = NearbyTuning()
 
 
 @dataclass(frozen=True)
@@ -33,13 +46,12 @@ class DrawnElements:
     Attributes:
         tiles: [t] numbers of the tiles that hold these pixels.
         pixels: [t, side, side] these pixels.
-        draw: Tiles [t, side, side, 3] of the picture at parameter values [d]; right at these pixels alone.
+        context: Of the box, for bounds of cells inside.
     """
 
     tiles: np.ndarray
     pixels: np.ndarray
     context: Any
-    draw: Callable[[np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -58,11 +70,14 @@ class KnownBox:
     elements: tuple[DrawnElements, ...] | None
 
     @property
-    def size(self) -> int:
-        """Elements that it shows."""
-        return sum(len(one.context.shown) for one in self.elements or ())
+    def nbytes(self) -> int:
+        """Memory that it holds, without what draws pictures."""
+        shown = sum(one.context.nbytes + one.pixels.nbytes for one in self.elements or ())
+        return self.lower.nbytes + self.upper.nbytes + self.open.nbytes + shown
 
 
+#: Tiles [t, side, side, 3] of a picture at parameter values [d]; right at the pixels that are not settled alone.
+Draw = Callable[[np.ndarray], np.ndarray]
 #: Frames of weights, with the channels that their planes have in pictures.
 Weights = Sequence[tuple[ElementFrame, Sequence[int]]]
 
@@ -71,8 +86,10 @@ class KnownBoxes:
     """What is known of boxes around cells (Q5).
 
     Args:
+        pictures: The pictures: blending weights alone.
         weights: What bounds and draws them.
         wanted: [H, W] the pixels that are read.
+        measures: All that the claim reads of them.
     """
 
     def __init__(
@@ -81,54 +98,68 @@ class KnownBoxes:
         self._pictures, self._weights, self._wanted, self._measures = pictures, weights, wanted, measures
         self._channels = [channel for _, some in weights for channel in some]
         self._known: OrderedDict[ParameterBox, KnownBox] = OrderedDict()
+        self._draws: OrderedDict[ParameterBox, tuple[int, tuple[Draw, ...]]] = OrderedDict()
         frame = weights[0][0]
         motion = np.asarray(frame.motion(pictures.box), np.float64)
         self._motion = np.where(np.isfinite(motion), motion, np.inf)
 
     def near(self, cell: ParameterBox) -> NearbyPictures | None:
         """Pictures of a cell, by what is known of a box around it; None: that box would be too wide."""
-        box_bounds = self._around(cell)
-        return None if box_bounds is None else NearbyPictures(self._pictures, self._weights, box_bounds)
-
-    def _around(self, cell: ParameterBox) -> KnownBox | None:
         box = enclosing_box(cell, self._pictures.box, self._motion)
         if box is None:
             return None
+        box_bounds = self._about(box)
+        return NearbyPictures(self._pictures, self._weights, box_bounds, self._drawn(box, box_bounds), self._measures)
+
+    def _about(self, box: ParameterBox) -> KnownBox:
+        """What is known of a box, itself inside of one of which this is known."""
         if box not in self._known:
-            outer = self._around(box)
-            self._known[box] = self._examined(box, outer)
-            while sum(one.size for one in self._known.values()) > _KEPT and len(self._known) > 1:
+            around = shared_box(box, self._pictures.box, self._motion)
+            self._known[box] = self._examined(box, None if around is None else self._about(around))
+            while (
+                sum(box_bounds.nbytes for box_bounds in self._known.values()) > _TUNING.memory and len(self._known) > 1
+            ):
                 self._known.popitem(last=False)
         self._known.move_to_end(box)
         return self._known[box]
+
+    def _drawn(self, box: ParameterBox, box_bounds: KnownBox) -> tuple[Draw, ...]:
+        """By frame of weights, what draws the pixels of a box that are not settled."""
+        if box not in self._draws:
+            shown = list(zip(self._weights, box_bounds.elements or (), strict=False))
+            draws = tuple(frame.drawn_alone(one.context, one.tiles, one.pixels) for (frame, _), one in shown)
+            self._draws[box] = sum(len(one.context.shown) for _, one in shown), draws
+            while sum(count for count, _ in self._draws.values()) > _TUNING.drawn and len(self._draws) > 1:
+                self._draws.popitem(last=False)
+        self._draws.move_to_end(box)
+        return self._draws[box][1]
 
     def _examined(self, box: ParameterBox, outer: KnownBox | None) -> KnownBox:
         """Bounds over a box, itself inside of one of which ``outer`` is known."""
         shape = (*self._wanted.shape, 1 + max(self._channels))
         lower, upper = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
-        wanted, elements = self._wanted, None
+        asked, elements = self._wanted, None
         if outer is not None:
-            lower, upper, wanted, elements = outer.lower.copy(), outer.upper.copy(), outer.open, outer.elements
-        if not wanted.any():
-            return KnownBox(lower, upper, wanted, None)
+            lower, upper, asked, elements = outer.lower.copy(), outer.upper.copy(), outer.open, outer.elements
+        if not asked.any():
+            return KnownBox(lower, upper, asked, None)
         bounds_by_frame: list[Bounds] = []
         for k, (frame, channels) in enumerate(self._weights):
-            pixels = in_tiles(wanted, frame.side)
+            pixels = in_tiles(asked, frame.side)
             tiles = np.flatnonzero(pixels.any(axis=(1, 2)))
             context = None if elements is None else elements[k].context
             bounds = frame.bound_parts([box], tiles, context, False, pixels[tiles])[0]
             bounds_by_frame.append(bounds)
-            place((lower, upper), (bounds.lower, bounds.upper), frame, tiles, channels, wanted)
+            place((lower, upper), (bounds.lower, bounds.upper), frame, tiles, channels, asked)
         self._attack(box, lower, upper)
-        still = unsettled(self._measures, lower, upper) & wanted
+        still = unsettled(self._measures, lower, upper) & asked
         if not still.any():
             return KnownBox(lower, upper, still, None)
         drawn_elements = []
         for (frame, _), bounds in zip(self._weights, bounds_by_frame, strict=True):
             pixels = in_tiles(still, frame.side)
             tiles = np.flatnonzero(pixels.any(axis=(1, 2)))
-            draw = frame.drawn_alone(bounds.context, tiles, pixels[tiles])
-            drawn_elements.append(DrawnElements(tiles, pixels[tiles], bounds.context, draw))
+            drawn_elements.append(DrawnElements(tiles, pixels[tiles], bounds.context))
         return KnownBox(lower, upper, still, tuple(drawn_elements))
 
     def _attack(self, box: ParameterBox, lower: np.ndarray, upper: np.ndarray) -> None:
@@ -150,11 +181,23 @@ class NearbyPictures:
     """Pictures [H, W, C] of cells inside of a box; see `ns_abstract.verify.protocol.FrameImages`.
 
     Args:
+        pictures: The pictures of the set.
         weights: What bounds and draws them.
+        box_bounds: What is known of the box.
+        draws: By frame, what draws the pixels that are not settled; empty where there are none.
+        measures: All that the claim reads of them.
     """
 
-    def __init__(self, pictures: FrameImages, weights: Weights, box_bounds: KnownBox) -> None:
+    def __init__(
+        self,
+        pictures: FrameImages,
+        weights: Weights,
+        box_bounds: KnownBox,
+        draws: Sequence[Draw],
+        measures: Sequence[LimitedMeasure],
+    ) -> None:
         self._pictures, self._weights, self._known, self.box = pictures, weights, box_bounds, pictures.box
+        self._draws, self._measures = draws, measures
 
     def image(self, values: np.ndarray, member: SceneSample | None = None) -> np.ndarray:
         """Picture at a pose of the box: pixels that are settled are in the middle of their bounds."""
@@ -162,8 +205,8 @@ class NearbyPictures:
         box_bounds = self._known
         image = 0.5 * (box_bounds.lower + box_bounds.upper)
         if box_bounds.elements is not None:
-            for (frame, channels), shown in zip(self._weights, box_bounds.elements, strict=True):
-                drawn = shown.draw(np.asarray(values, np.float64))
+            for (frame, channels), shown, draw in zip(self._weights, box_bounds.elements, self._draws, strict=True):
+                drawn = draw(np.asarray(values, np.float64))
                 place((image,), (drawn,), frame, shown.tiles, channels, box_bounds.open)
         return image
 
@@ -188,6 +231,42 @@ class NearbyPictures:
             place_sets((*linear, lower, upper), bounds, frame, shown.tiles, channels, box_bounds.open)
             slopes = slopes + bounds.slopes
         return linear, lower, upper, slopes
+
+    def cut_gains(self, box: ParameterBox) -> np.ndarray:
+        """[d] by how much sets of pixels narrow, about, where a cell is cut to nothing along each parameter (Q7).
+
+        Slopes do not tell: sets follow them, and are as wide as pictures may be off these. Twice what the middle half
+        of the cell is narrower, at a few of the pixels that are not settled. Zeros where nothing is to be compared.
+        """
+        if self._known.elements is None or box.dimensions < 2:
+            return np.zeros(box.dimensions)
+        quarters = [box.split(axis, 4) for axis in range(box.dimensions)]
+        halves = [box.replace(k, part[1].lower[k], part[2].upper[k]) for k, part in enumerate(quarters)]
+        try:
+            widths = [self._compared_width(part) for part in (box, *halves)]
+        except InputError:
+            raise
+        except FAILURES:
+            # they stop the cell's own bounds, too
+            return np.zeros(box.dimensions)
+        return 2.0 * np.maximum(0.0, widths[0] - np.array(widths[1:]))
+
+    def _compared_width(self, box: ParameterBox) -> float:
+        """Width of the linear sets of a cell at a pose, a mean over pixels by frame."""
+        box_bounds, width = self._known, 0.0
+        assert box_bounds.elements is not None
+        places = np.flatnonzero(box_bounds.open)
+        compared = np.zeros(box_bounds.open.shape, bool)
+        compared.flat[places[:: -(-places.size // _TUNING.compared)]] = True
+        for (frame, channels), shown in zip(self._weights, box_bounds.elements, strict=True):
+            pixels = in_tiles(compared, frame.side)[shown.tiles]
+            some = pixels.any(axis=(1, 2))
+            tiles, pixels = shown.tiles[some], pixels[some]
+            (bounds,) = frame.bound_parts([box], tiles, shown.context, True, pixels)
+            assert bounds.linear is not None
+            sets = PictureSets(box, bounds.linear, bounds.lower, bounds.upper)
+            width += float(sets.widths[pixels][:, : len(channels)].mean())
+        return width
 
 
 def place(

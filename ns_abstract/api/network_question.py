@@ -37,6 +37,8 @@ class Question:
 
     #: Pixels that the picture moves by over a first cell: with one parameter, and with more.
     motion = (0.08, 0.5)
+    #: Frames whose bounds a process keeps at hand.
+    frames = 4
 
     def __init__(self, model: Path, source: PropertySource) -> None:
         self.model, self.source = model, source

@@ -352,6 +352,8 @@ class PictureQuestion:
     name, numbers = "the picture itself", 1
     #: Measures bear wider cells than networks do.
     motion = (0.6, 0.6)
+    #: The search goes from frame to frame, and what is known of boxes around cells takes long to find again.
+    frames = 8
 
     def guarantee(self, arithmetic: NetworkArithmetic) -> tuple[str, ...]:
         """What holds of the measures."""

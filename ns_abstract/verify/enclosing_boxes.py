@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -22,6 +23,8 @@ class EnclosingTuning:
     #: grid by, as they are rounded; and parts of a box that it reaches beyond its lines, so that these ends lie inside.
     spare: float = 1e-6
     beyond: float = 1e-9
+    #: Most halvings of other parameters before a parameter is halved over which the picture hardly moves.
+    deepest: int = 64
 
 
 _TUNING = EnclosingTuning()
@@ -37,20 +40,66 @@ def enclosing_box(cell: ParameterBox, whole: ParameterBox, motion: np.ndarray) -
         cell: A box inside of ``whole``.
         motion: [d] pixels that the picture moves by over each parameter's range.
     """
-    box, moved = cell, 0.0
-    for axis in range(whole.dimensions):
+    levels = [max(0, level - _TUNING.halvings) for level in _levels(cell, whole)]
+    return _useful(_aligned(cell, whole, levels), cell, whole, motion)
+
+
+def shared_box(box: ParameterBox, whole: ParameterBox, motion: np.ndarray) -> ParameterBox | None:
+    """Return a wider box of ``whole`` around an enclosing one, over which the picture moves about alike by parameter.
+
+    Enclosing boxes are as long and narrow as cells are; those around them are not, so that few of them serve all (Q5).
+    None: it would be too wide to be of use, or is no wider.
+
+    Args:
+        box: See `enclosing_box`.
+        whole: The set.
+        motion: [d] pixels that the picture moves by over each parameter's range.
+    """
+    most = float(np.max(motion, initial=0.0))
+    if not math.isfinite(most):
+        return None
+    # halvings of other parameters until the picture moves by less over this one
+    spared = [
+        min(_TUNING.deepest, math.floor(math.log2(most / moved))) if moved > 0.0 else _TUNING.deepest
+        for moved in motion.tolist()
+    ]
+    level = min((level + less for level, less in zip(_levels(box, whole), spared, strict=True)), default=0)
+    found = box
+    while found == box and level >= 0:
+        found = _aligned(box, whole, [max(0, level - less) for less in spared])
+        level -= 1
+    return _useful(found, box, whole, motion)
+
+
+def _levels(cell: ParameterBox, whole: ParameterBox) -> list[int]:
+    """[d] halvings of ``whole`` along each parameter that leave it as wide as the cell or less than twice as wide."""
+    widths = zip(cell.lower, cell.upper, whole.lower, whole.upper, strict=True)
+    return [
+        max(0, math.floor(math.log2((high - low) / (past - first)) + _TUNING.spare)) if past > first else 0
+        for first, past, low, high in widths
+    ]
+
+
+def _aligned(cell: ParameterBox, whole: ParameterBox, levels: Sequence[int]) -> ParameterBox:
+    """The smallest box around the cell whose ends lie on lines of ``whole`` halved ``levels`` [d] times, or just by."""
+    box = cell
+    for axis, level in enumerate(levels):
         low, high = whole.lower[axis], whole.upper[axis]
-        width, own = high - low, cell.upper[axis] - cell.lower[axis]
-        level = math.floor(math.log2(width / own) + _TUNING.spare) if own > 0.0 else 0
-        parts = 1 << max(0, level - _TUNING.halvings)
-        if parts == 1:
-            first, past = 0, 1
-        else:
+        width, parts, first, past = high - low, 1 << level, 0, 1
+        if parts > 1:
             first = math.floor((cell.lower[axis] - low) / width * parts + _TUNING.spare)
             past = math.ceil((cell.upper[axis] - low) / width * parts - _TUNING.spare)
-        moved = math.hypot(moved, float(motion[axis]) * (past - first) / parts)
         lower = low + width * ((first - _TUNING.beyond) / parts)
         upper = low + width * ((past + _TUNING.beyond) / parts)
         # the cell lies inside, whatever was rounded
         box = box.replace(axis, max(low, min(lower, cell.lower[axis])), min(high, max(upper, cell.upper[axis])))
-    return box if moved <= _TUNING.motion and box != cell else None
+    return box
+
+
+def _useful(box: ParameterBox, cell: ParameterBox, whole: ParameterBox, motion: np.ndarray) -> ParameterBox | None:
+    """``box`` if it is wider than the cell and the picture moves by little over it."""
+    widths = zip(box.lower, box.upper, whole.lower, whole.upper, motion.tolist(), strict=True)
+    moved = [
+        pixels * (past - first) / (high - low) if high > low else pixels for first, past, low, high, pixels in widths
+    ]
+    return box if math.hypot(*moved) <= _TUNING.motion and box != cell else None

@@ -48,6 +48,15 @@ class NearImages(Protocol):
         ...
 
 
+@runtime_checkable
+class ComparedCuts(Protocol):
+    """An optional interface of `FrameImages`: cuts of a cell are compared by bounds of narrower cells."""
+
+    def cut_gains(self, box: ParameterBox) -> np.ndarray:
+        """[d] what a cut of the cell along each parameter may gain, in place of the slopes of its sets."""
+        ...
+
+
 class Model(Protocol):
     """A network with its preprocessing."""
 

@@ -25,7 +25,7 @@ from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.margin_descent import descend
 from ns_abstract.verify.picture_sets import PictureSets
 from ns_abstract.verify.properties import Claim, LinearClaim
-from ns_abstract.verify.protocol import FrameImages, Model, NearImages
+from ns_abstract.verify.protocol import ComparedCuts, FrameImages, Model, NearImages
 from ns_abstract.verify.search_results import FAILURES, BlockResult, ContradictionError, FinishedCell, failure_text
 from ns_abstract.verify.subboxes import PixelWeights, SubBoxProof
 
@@ -146,7 +146,7 @@ class Search:
         children.sort(key=lambda child: child[0])
         parts = [children[i : i + self.block] for i in range(0, len(children), self.block)]
         return BlockResult(
-            leaves=tuple(_timed(leaf, seconds / len(samples)) for leaf in leaves),
+            leaves=tuple(replace(leaf, seconds=seconds / len(samples)) for leaf in leaves),
             blocks=tuple(tuple(cell for _, cell in part) for part in parts),
             ranks=tuple(part[0][0] for part in parts),
             samples=tuple((cell.cell, cell.holds) for cell in samples),
@@ -420,7 +420,9 @@ class Search:
                 if number in cuts and not cell.broken:
                     parts = self.grid.cut(cell.cell, cuts[number])
                 else:
-                    parts = self.grid.divide(cell.cell, slopes[number], *self._cuts(cell, bound, costs[number]))
+                    scene = cell.scene
+                    gains = scene.cut_gains(cell.box) if isinstance(scene, ComparedCuts) else slopes[number]
+                    parts = self.grid.divide(cell.cell, gains, *self._cuts(cell, bound, costs[number]))
                 children += [(rank, part) for part in parts]
             elif cell.broken:
                 leaves.append(self._counterexample(cell))
@@ -484,10 +486,6 @@ class Search:
             outputs=outputs[0],
             scene=None if member is None else member.arrays,
         )
-
-
-def _timed(leaf: FinishedCell, seconds: float) -> FinishedCell:
-    return replace(leaf, seconds=seconds)
 
 
 def _generator(cell: Cell) -> np.random.Generator:
