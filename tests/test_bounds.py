@@ -896,6 +896,36 @@ def test_too_many_pairs(order, monkeypatch):
     case.check(order, parts=1, count=3)
 
 
+def crowd_case() -> Case:
+    """Layers of many colours near one depth, all of which may change places, over a wide cell."""
+    generator = np.random.default_rng(3)
+    layers = [
+        {
+            "mean": (x, y, -5.0 + 0.02 * z),
+            "scale": 0.5,
+            "opacity": float(generator.uniform(0.2, 0.9)),
+            "color": tuple(generator.uniform(0.0, 1.2, 3).tolist()),
+        }
+        for x, y, z in generator.uniform(-0.8, 0.8, (12, 3)).tolist()
+    ]
+    return Case(scene(*layers, background=(0.2, 0.3, 0.4)), moves(x=0.05, yaw=0.03))
+
+
+@pytest.mark.parametrize("room", [0, 7])
+@pytest.mark.parametrize("build", [swap_case, crowd_case])
+def test_pairs_without_room_are_bounded_by_pixel(build, room, monkeypatch):
+    """Ends over parts hold every order where a block has more pairs than there is room for, and are tight (O6)."""
+    case = build()
+    options = {"parts": shared_out(np.ones(case.poses.box.dimensions), 16), "keep_parts": True}
+    known = case.bounds(case.poses.box, 1, **options)
+    monkeypatch.setattr("ns_abstract.methods.splat.bounds.PART_PAIR_LIMIT", room)
+    case.check(1, parts=1, count=20)
+    cell = case.bounds(case.poses.box, 1, **options)
+    # nothing is given up
+    assert cell.statistics[3] == 0
+    assert (cell.upper - cell.lower).mean() < 1.3 * (known.upper - known.lower).mean()
+
+
 def test_inner_cells_leave_out_what_is_hidden():
     """What no pixel of a cell draws or stops at can be left out of the cells inside it."""
     generator = np.random.default_rng(5)
