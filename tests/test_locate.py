@@ -20,7 +20,6 @@ from ns_abstract.cli.locate import main
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import load_camera_path
 from ns_abstract.geometry.tiles import assemble
-from ns_abstract.refine.protocol import SubBoxFrame
 from ns_abstract.verify.cell_boxes import divided, inner_cell, meeting, resolved, slabs, sub_box_counts
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.location import between
@@ -287,31 +286,6 @@ def test_known_outliers_exclude_a_cell_without_bounds(blobs: Inputs) -> None:
     # any picture explains this photo
     findings = search.examine([replace(root, outliers=tuple(numbers[:-1]))])
     assert not any(leaf.verdict == "certified" for leaf in findings.leaves)
-
-
-def test_sub_boxes_at_few_pixels_are_those_at_all(blobs: Inputs) -> None:
-    """What shows at no requested pixel, in the cell or one around it, is left out and changes nothing (R2)."""
-    generator = np.random.default_rng(4)
-    scene, camera = nsa.load_scene(blobs.config), nsa.load_camera_path(blobs.path).cameras[0]
-    frame = Job(scene, [nsa.PoseSet(camera, **SET).of(scene)]).frame(0)
-    assert isinstance(frame, SubBoxFrame)
-    counts, tiles = np.array([1, 2, 4, 1]), np.arange(frame.tile_count)
-    everywhere = np.ones((frame.tile_count, frame.side, frame.side), bool)
-    few = np.zeros_like(everywhere)
-    few[0, 3, 4:6], few[-1, 5, 2] = True, True
-    outer = frame.box.split(0, 4)[1]
-    whole = frame.sub_box_ends(outer, counts, tiles, few)
-    assert whole is not None
-    for inner in (outer, outer.split(1, 4)[2]):
-        expected = frame.sub_box_ends(inner, counts, tiles, everywhere)
-        assert expected is not None
-        # the context of a few pixels is one of all
-        for pixels in (few, generator.random(few.shape) < 0.1):
-            for within in (None, whole[2]):
-                ends = frame.sub_box_ends(inner, counts, tiles, pixels, within)
-                assert ends is not None
-                assert np.array_equal(ends[0], expected[0][pixels.ravel()])
-                assert np.array_equal(ends[1], expected[1][pixels.ravel()])
 
 
 @pytest.mark.slow_cases(every=4)

@@ -15,7 +15,7 @@ _HEIRS = "test_pixel_rounds.py::test_a_part_inherits_what_excludes_all_of_it"
 _KNOWN = "test_locate.py::test_known_outliers_exclude_a_cell_without_bounds"
 _BOXES = "test_locate.py::test_a_cover_holds_every_pose_of_sheared_boxes"
 
-_FEW = "test_locate.py::test_sub_boxes_at_few_pixels_are_those_at_all"
+_FEW = "test_bounds.py::test_sub_boxes_at_few_pixels_are_those_at_all"
 _CROWD = "test_bounds.py::test_pairs_without_room_are_bounded_by_pixel[crowd_case-0]"
 
 LOCATION = (
