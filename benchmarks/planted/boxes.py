@@ -4,6 +4,8 @@ from planted.fault import Fault
 
 _BOXES = "verify/box_decisions.py"
 _DOMINATED = "test_input_shares.py::test_no_half_and_no_group_is_left_out"
+_TREE = "verify/network/phase_tree.py"
+_ROOM = "test_phase_tree.py::test_branches_without_room_are_not_lost[0]"
 
 BOXES = (
     Fault(
@@ -24,5 +26,14 @@ BOXES = (
         "boxes: an input's part is that of its largest value",
         "verify/network/input_shares.py", "_motions", "v[1] - v[0]", "v[1]",
         "test_input_shares.py::test_parts_are_those_of_the_first_layer",
+    ),
+    Fault(
+        "phase tree: branches that find no room are lost",
+        _TREE, "PhaseTree._taken", "del waiting[-size:]", "del waiting[:size]", _ROOM,
+    ),
+    Fault(
+        "phase tree: a neuron that gained little is bounded again and again",
+        _TREE, "SplitGains.hopeful", "split not in means or split in best", "True",
+        "test_phase_tree.py::test_splits_that_gained_little_are_not_bounded_again",
     ),
 )  # fmt: skip
