@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import heapq
 import math
 from collections.abc import Sequence
 from fractions import Fraction
@@ -23,7 +24,7 @@ from ns_abstract.verify.network import ImageSets, Network, NetworkArithmetic, bo
 from ns_abstract.verify.network.bounds import NetworkBounds
 from ns_abstract.verify.network.coefficients import grid
 from ns_abstract.verify.network.layers import Convolution, LeakyRelu, Matrix
-from ns_abstract.verify.network.phase_tree import PhaseTree, _Branch, _GroupRows, _Half
+from ns_abstract.verify.network.phase_tree import PhaseTree, SplitGains, _Branch, _GroupRows, _Half
 from ns_abstract.verify.network.relaxations import Relaxations
 from ns_abstract.verify.network.slope_choices import ReluSlopes, UnstableNeurons
 from ns_abstract.verify.network.stopping import BackwardBounds
@@ -324,3 +325,40 @@ def test_deadlines_are_asked_often(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert answer.word in ("timeout", "unknown")
     assert asked > 500
     assert most <= 12
+
+
+def test_splits_that_gained_little_are_not_bounded_again() -> None:
+    gains = SplitGains(2, 3)
+    splits = [(4, k) for k in range(5)]
+    for gain in (9.0, 9.0):
+        # noted too seldom to be left out
+        gains.note(splits[4], gain)
+    assert gains.hopeful(splits) == splits
+    for split, gain in zip(splits[:4], (0.1, 0.5, 0.3, 0.2), strict=True):
+        for part in (0.5, 1.0, 1.5):
+            gains.note(split, part * gain)
+    # one is unknown, and two of the others are best
+    assert gains.hopeful(splits) == [splits[1], splits[2], splits[4]]
+    assert gains.hopeful(splits[2:4]) == splits[2:4]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("room", [0, 1 << 30])
+def test_branches_without_room_are_not_lost(room: int, tmp_path: Path) -> None:
+    """The strongest come first where no more fit; each comes once, and what holds is proved all the same."""
+    network = load_network(small(tmp_path))
+    images, rows = box(np.full(3, -1.0), np.full(3, 1.0)), np.array([[1.0, -1.0]])
+    tree = tree_of(network, images, rows, np.zeros(1))
+    tree.room = room
+    order = [3.0, 1.0, 5.0, 2.0, 4.0]
+    waiting = [(v, k, _Branch({}, np.array([v]))) for k, v in enumerate(order)]
+    heapq.heapify(waiting)
+    taken = [[float(branch.lower[0]) for branch in tree._taken(waiting, 2)] for _ in range(3)]
+    assert taken == ([[1.0, 2.0], [3.0, 4.0], [5.0]] if room else [[4.0, 5.0], [2.0, 3.0], [1.0]])
+    assert not waiting
+    corners = np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 41)] * 3), -1).reshape(-1, 3)
+    least = float((network(torch.from_numpy(corners)).numpy() @ rows[0]).min())
+    for offset, holds in ((0.2 - least, True), (-1e-9 - least, False)):
+        tree = tree_of(network, images, rows, np.array([offset]))
+        tree.room = room
+        assert tree.prove([0], 400).proved == holds

@@ -1,5 +1,6 @@
 """Planted faults, by the part of the package that they lie in."""
 
+from planted.boxes import BOXES
 from planted.certificates import CERTIFICATES
 from planted.checks import CHECKS
 from planted.depths import DEPTHS
@@ -27,7 +28,7 @@ from planted.verdicts import VERDICTS
 FAULTS = (
     *FORMS, *POLYNOMIALS, *FIELDS, *VERDICTS, *CERTIFICATES, *SPLATS, *DEPTHS, *LOOPS, *CHECKS,
     *INPUTS, *NETWORKS, *NETWORK_ROWS, *PROCESSES, *RESULTS, *SCENES, *MAPS, *DIFFERENCES,
-    *PICTURES, *LOCATION, *FILES, *HASH_FIELDS, *HASH_BOUNDS,
+    *PICTURES, *LOCATION, *FILES, *HASH_FIELDS, *HASH_BOUNDS, *BOXES,
 )  # fmt: skip
 
 __all__ = ["FAULTS", "Fault", "apply"]

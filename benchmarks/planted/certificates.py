@@ -272,7 +272,7 @@ CERTIFICATES = (
     ),
     Fault(
         "boxes: a half is dropped",
-        _BOXES, "_cut", "[(lower, left), (right, upper)]", "[(lower, left)]", _EITHER,
+        _BOXES, "_halves", "[(lower, left), (right, upper)]", "[(lower, left)]", _EITHER,
     ),
     Fault(
         "branching: one sign of a unit is left out",

@@ -16,6 +16,7 @@ from ns_abstract.execution.cancellation import Deadline, WorkCancelledError, che
 from ns_abstract.verify.network import ImageSets, Network, NetworkArithmetic, OutputBounds, bound_outputs
 from ns_abstract.verify.network.bounds import NetworkBounds
 from ns_abstract.verify.network.branching import branch
+from ns_abstract.verify.network.input_shares import input_shares
 from ns_abstract.verify.network.phase_tree import PhaseTree
 from ns_abstract.verify.network.subnormals import subnormals_kept
 from ns_abstract.verify.network.weighted_means import centred
@@ -52,8 +53,11 @@ class BoxTuning:
     least: tuple[int, int] = (12, 20)
     #: Most inputs that are attacked at a time.
     attacked: int = 1024
-    #: Inputs that vary up to which a box is cut; phases are assumed in boxes of more.
+    #: Inputs that vary up to which a box is cut; phases are assumed in boxes of more. Of up to so many inputs a box is
+    #: cut across one besides, if this has so large a part in what moves the neurons.
     cut: int = 6
+    ranked: int = 64
+    dominant: float = 0.25
     #: What the width of an input counts beside its slope.
     width: float = 1e-9
     #: Part of the time that is left for lines of intermediate bounds. What a step towards these takes beside bounds
@@ -220,13 +224,42 @@ class _BoxSearch:
         return False
 
     def _assume(self, family: _Family, which: int) -> bool:
-        """`decide` of one region by assuming phases of neurons (N16)."""
-        images = self._images(*(v[which][None] for v in (family.lower, family.upper)))
-        tree, left = self._tree(family, which, images, 0, family.unsafe.groups)
+        """`decide` of one region by cutting it across inputs that dominate, and assuming phases of neurons (N16)."""
+        waiting = [(family.lower[which], family.upper[which], family.unsafe.groups)]
+        attacked = False
+        while waiting:
+            check_cancelled()
+            lower, upper, groups = waiting.pop()
+            images = self._images(lower[None], upper[None])
+            tree, left = self._tree(family, which, images, 0, groups)
+            if left and not attacked:
+                if self._attack(family, np.array([which]), *self._later(len(left)), left):
+                    return True
+                attacked = True
+            halves = self._dominated(lower, upper) if left else None
+            if halves is not None:
+                # what is proved of the whole holds in both
+                waiting += [(*half, left) for half in halves]
+            elif not self._phases(family, which, images, tree, left, 1 + len(waiting)):
+                self.undecided = True
+                return False
+        return False
+
+    def _phases(
+        self,
+        family: _Family,
+        which: int,
+        images: ImageSets,
+        tree: PhaseTree,
+        left: Sequence[tuple[int, ...]],
+        boxes: int,
+    ) -> bool:
+        """Whether the groups that are ``left`` are proved by better intermediate bounds and by assuming phases.
+
+        ``boxes``: among so many is the time divided.
+        """
         by_step = max(_TUNING.least_seconds, _TUNING.dear * self.by_bounds)
-        if left and self._attack(family, np.array([which]), *self._later(len(left)), left):
-            return True
-        allowed = _TUNING.lines * self.deadline.left
+        allowed = _TUNING.lines * self.deadline.left / boxes
         steps = min(_STEPS, int(min(1e6, allowed / by_step)) - _TUNING.before)
         if left and steps > 0:
             try:
@@ -239,9 +272,16 @@ class _BoxSearch:
             result = tree.prove(group, _BRANCHES)
             self.boxes += result.branches
             if not result.proved and not self._anew(family, which, images, group):
-                self.undecided = True
                 return False
-        return False
+        return True
+
+    def _dominated(self, lower: np.ndarray, upper: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]] | None:
+        """Two halves of a box [n], cut across the input that moves the neurons most; None if none dominates."""
+        if not 0 < int((upper > lower).sum()) <= _TUNING.ranked:
+            return None
+        parts = input_shares(self.network, lower, upper)
+        at = int(parts.argmax())
+        return _halves(lower, upper, at) if parts[at] > _TUNING.dominant else None
 
     def _tree(
         self, family: _Family, which: int, images: ImageSets, steps: int, groups: Sequence[tuple[int, ...]]
@@ -410,7 +450,11 @@ def _cut(lower: np.ndarray, upper: np.ndarray, slopes: np.ndarray) -> list[tuple
     width = upper - lower
     # slopes are by half widths
     score = np.abs(slopes).max(0) + _TUNING.width * width
-    at = int(np.argmax(np.where(width > 0.0, score, -1.0)))
+    return _halves(lower, upper, int(np.argmax(np.where(width > 0.0, score, -1.0))))
+
+
+def _halves(lower: np.ndarray, upper: np.ndarray, at: int) -> list[tuple[np.ndarray, np.ndarray]] | None:
+    """Return two halves of the box [n], cut across input ``at``; None if too small. Both hold the face between."""
     middle = 0.5 * (lower[at] + upper[at])
     if not lower[at] < middle < upper[at]:
         return None

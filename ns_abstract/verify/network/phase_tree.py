@@ -31,9 +31,11 @@ class TreeTuning:
         root_steps, steps, last_steps: Steps towards better slopes and multipliers, of the whole cell, of a branch, and
             of one without unstable neurons.
         first: The first step's size.
-        tried: Neurons of which both halves are bounded before one is chosen.
+        tried: Neurons that cost a row most, of which one is chosen.
+        bounded: Of those whose halves were bounded often before: so many, the best by what they gained, are again.
+        often: How often.
         better_half: What the better half counts beside the worse one.
-        waiting: Most branches that wait.
+        waiting: Part of the memory that branches may take that wait; past it the strongest come first.
     """
 
     together: int = 128
@@ -42,11 +44,15 @@ class TreeTuning:
     last_steps: int = 60
     first: float = 0.2
     tried: int = 20
+    bounded: int = 5
+    often: int = 4
     better_half: float = 1.0
-    waiting: int = 1 << 14
+    waiting: float = 0.5
 
 
 _TUNING = TreeTuning()
+#: Bytes of a branch beside its arrays' contents, about.
+_OBJECTS = 4096
 
 
 class TreeResult(NamedTuple):
@@ -75,6 +81,12 @@ class _Branch:
     multipliers: Mapping[int, NDArray[np.float32]] = field(default_factory=dict)
     splits: Sequence[tuple[int, int]] = ()
 
+    @property
+    def bytes(self) -> int:
+        """About the memory that it takes."""
+        chosen = [parameter for own in self.parameters.values() for parameter in own]
+        return _OBJECTS + sum(v.nbytes for v in (*self.phases.values(), *self.multipliers.values(), *chosen))
+
     def halves(self, split: tuple[int, int]) -> list[_Branch]:
         """The same with either phase of a neuron assumed besides."""
         node, at = split
@@ -92,6 +104,33 @@ class _Half(NamedTuple):
     branch: int
     split: tuple[int, int]
     side: int
+
+
+class SplitGains:
+    """What assuming the phase of a neuron gained in the branches in which both of its halves were bounded.
+
+    Args:
+        bounded, often: See `TreeTuning`.
+    """
+
+    def __init__(self, bounded: int, often: int) -> None:
+        self.bounded, self.often = bounded, often
+        self._noted: dict[tuple[int, int], tuple[float, int]] = {}
+
+    def note(self, split: tuple[int, int], gain: float) -> None:
+        """Halves of ``split`` gained so large a part of what their branch missed."""
+        total, count = self._noted.get(split, (0.0, 0))
+        self._noted[split] = total + gain, count + 1
+
+    def hopeful(self, splits: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
+        """Those of ``splits`` that were not noted often, and the best of the others by their mean gain."""
+        means = {}
+        for split in splits:
+            total, count = self._noted.get(split, (0.0, 0))
+            if count >= self.often:
+                means[split] = total / count
+        best = set(sorted(means, key=lambda split: -means[split])[: self.bounded])
+        return [split for split in splits if split not in means or split in best]
 
 
 class PhaseTree:
@@ -112,6 +151,8 @@ class PhaseTree:
         self.relus = {k: own[0] for k, own in self.choices.items() if isinstance(own[0], ReluSlopes)}
         self.index = len(self.network.nodes)
         self.shifted = cells.output_rows.shifted(cells.last, rows, offset)
+        self.room = int(tuning.waiting * cells.output_rows.backward.memory)
+        self.gains = SplitGains(tuning.bounded, tuning.often)
 
     def prove(self, group: Sequence[int], most: int, over: Callable[[], bool] = lambda: False) -> TreeResult:
         """Try to prove that a row of ``group`` is positive for every image of the cell.
@@ -131,10 +172,10 @@ class PhaseTree:
         size = max(1, self.tuning.together // (2 * len(group)))
         while waiting:
             check_cancelled()
-            taken = [heapq.heappop(waiting)[2] for _ in range(min(size, len(waiting)))]
-            worst = float(taken[0].lower.max())
-            if count >= most or len(waiting) > self.tuning.waiting or over():
+            worst = waiting[0][0]
+            if count >= most or over():
                 return TreeResult(False, count, worst)
+            taken = self._taken(waiting, size)
             ended = [branch for branch in taken if not branch.splits]
             if ended and self._climbed(rows, ended, self.tuning.last_steps):
                 return TreeResult(False, count, worst)
@@ -146,6 +187,16 @@ class PhaseTree:
             for branch in self._climbed(rows, halves, self.tuning.steps):
                 heapq.heappush(waiting, (float(branch.lower.max()), next(number), branch))
         return TreeResult(True, count, 0.0)
+
+    def _taken(self, waiting: list[tuple[float, int, _Branch]], size: int) -> list[_Branch]:
+        """Take up to ``size`` branches off the heap: the weakest, or the strongest if there is no room for more."""
+        if len(waiting) * waiting[0][2].bytes <= self.room:
+            return [heapq.heappop(waiting)[2] for _ in range(min(size, len(waiting)))]
+        # what is sorted is a heap, and so is its beginning
+        waiting.sort()
+        taken = [entry[2] for entry in waiting[-size:]]
+        del waiting[-size:]
+        return taken
 
     def _ascent(
         self, rows: _GroupRows, branches: Sequence[_Branch], halves: Sequence[_Half] = ()
@@ -240,7 +291,8 @@ class PhaseTree:
     def _halves(self, rows: _GroupRows, branches: Sequence[_Branch]) -> list[_Branch]:
         """Both halves of each branch, of the candidates the one whose worse half is bounded best."""
         g = len(rows.offset)
-        splits = [(number, split) for number, branch in enumerate(branches) for split in branch.splits]
+        hopeful = [self.gains.hopeful(branch.splits) for branch in branches]
+        splits = [(number, split) for number, own in enumerate(hopeful) for split in own]
         bounds = []
         step = max(1, self.tuning.together // (2 * g))
         for first in range(0, len(splits), step):
@@ -255,7 +307,10 @@ class PhaseTree:
         ends = np.minimum(np.concatenate(bounds), 0.0)
         score = ends.min(1) + self.tuning.better_half * ends.max(1)
         chosen: dict[int, int] = {}
-        for k, (number, _) in enumerate(splits):
+        for k, (number, split) in enumerate(splits):
+            miss = -(1.0 + self.tuning.better_half) * float(branches[number].lower.max())
+            if 0.0 < miss < np.inf and np.isfinite(score[k]):
+                self.gains.note(split, 1.0 + float(score[k]) / miss)
             if number not in chosen or score[k] > score[chosen[number]]:
                 chosen[number] = k
         return [half for number, k in chosen.items() for half in branches[number].halves(splits[k][1])]
