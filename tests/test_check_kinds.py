@@ -84,7 +84,7 @@ def test_float32_pictures_are_enclosed_and_need_their_charges(mode: str, version
     cam, none = CheckedCamera(*values), np.zeros((1, 0))
     seen = Poses(cam, ()).view(none, none)
     for unit, holds in ((FLOAT, True), (0.0, False)):
-        form = pictures(splats, cam, seen, unit).of(lambda a: a[..., 0, :, :, :])
+        form = pictures(splats, cam, seen, unit).reshaped(16, 16, 3)
         low, high = form.range()
         outside = (np.clip(low, 0.0, 1.0) > image) | (np.clip(high, 0.0, 1.0) < image)
         assert outside.any() != holds
@@ -147,7 +147,7 @@ def test_networks_are_enclosed(radius: float, tmp_path: Path) -> None:
     # what rounding the input to float32 moves it by is part of the set
     form = Affine(c, g, np.full(c.shape, 0.1 * radius + 4e-7))
     network, exact = read_network(file, None, FLOAT), read_network(file, None, 0.0)
-    rows = torch.tensor([[1.0, -1.0, 0.0], [0.0, 0.5, 2.0]], dtype=torch.float64)
+    rows = np.array([[1.0, -1.0, 0.0], [0.0, 0.5, 2.0]])
     outputs = network.outputs(form)
     (least, most), (inner, _) = (n.outputs(form, rows).range() for n in (network, exact))
     found = []
@@ -156,12 +156,37 @@ def test_networks_are_enclosed(radius: float, tmp_path: Path) -> None:
         x = (c + s[0] * g[0] + s[1] * g[1] + e).astype(np.float32)
         y = np.asarray(session.run(None, {"image": x})[0], np.float64)[0]
         assert (np.abs(y - outputs.c[0] - s @ outputs.g[:, 0]) <= outputs.r[0]).all()
-        value = rows.numpy() @ y
+        value = rows @ y
         assert (least[0] <= value).all() and (value <= most[0]).all()
         found.append(value)
     # rows that go back keep what the picture's slopes cancel
     assert (most - least).max() < 16.0 * max(np.ptp(found, axis=0).max(), 2e-3)
     assert (inner >= least).all() and (inner > least).any()
+
+
+def test_branches_of_networks_have_symbols_of_their_own(tmp_path: Path) -> None:
+    """A difference of two branches, each behind ReLU of its own, over corners of a set of pictures."""
+    rng = np.random.default_rng(6)
+    weights = {"u": rng.normal(size=(4, 12)), "v": rng.normal(size=(4, 12)), "minus": -np.eye(4)}
+    nodes = [
+        helper.make_node("Flatten", ["image"], ["f"]),
+        helper.make_node("Gemm", ["f", "u"], ["a"], transB=1),
+        helper.make_node("Gemm", ["f", "v"], ["b"], transB=1),
+        helper.make_node("Relu", ["a"], ["p"]),
+        helper.make_node("Relu", ["b"], ["q"]),
+        helper.make_node("MatMul", ["q", "minus"], ["n"]),
+        helper.make_node("Add", ["p", "n"], ["y"]),
+    ]
+    network = read_network(write_onnx(tmp_path / "net.onnx", (3, 2, 2), nodes, weights, 4), None, 0.0)
+    u, v = (weights[name].astype(np.float32).astype(np.float64) for name in "uv")
+    for scale in (0.1, 0.5):
+        c, r = scale * rng.normal(size=(1, 3, 2, 2)), np.full((1, 3, 2, 2), 0.3)
+        found = network.outputs(Affine(c, np.zeros((0, 1, 3, 2, 2)), r))
+        low, high = found.range()
+        for corner in rng.choice([-1.0, 1.0], (500, 12)):
+            x = c.ravel() + r.ravel() * corner
+            y = np.maximum(u @ x, 0.0) - np.maximum(v @ x, 0.0)
+            assert (low[0] <= y).all() and (y <= high[0]).all()
 
 
 def test_a_float32_network_leaves_the_exact_one(tmp_path: Path) -> None:
@@ -502,8 +527,7 @@ def nerf(seed: int = 0) -> tuple[NerfScene, CheckedField]:
     parts |= {"field_output_density.net": fine.density, "field_heads.0.net": fine.color}
     for name, layer in parts.items():
         found |= {f"field_fine.{name}.weight": layer.weight, f"field_fine.{name}.bias": layer.bias}
-    field = CheckedField(found)
-    field.near, field.far, field.samples, field.background = 0.0, UNIFORM.far, UNIFORM.samples, UNIFORM.background
+    field = CheckedField(found, 0.0, UNIFORM.far, UNIFORM.samples, UNIFORM.background)
     return scene, field
 
 
@@ -529,13 +553,12 @@ def test_rays_contain_pictures_of_another_renderer(half: float) -> None:
     assert max(widths) < {0.0: 1e-9, 1e-5: 1e-4, 1e-3: np.inf}[half]
 
 
-def test_neurons_that_bend_are_enclosed() -> None:
-    from ns_abstract.check.fields import _Zonotope
-
+@pytest.mark.parametrize("most", [0, 2, 6])
+def test_neurons_that_bend_are_enclosed(most: int) -> None:
     rng = np.random.default_rng(0)
     form = Affine(rng.normal(size=(1, 2, 5)), 0.3 * rng.normal(size=(2, 1, 2, 5)), 0.1 * rng.random((1, 2, 5)))
     weight, bias = rng.normal(size=(6, 5)), rng.normal(size=6)
-    found = _Zonotope.of(form).layer(weight, bias).bent().layer(weight[:, :5].T @ np.eye(6)[:6, :6], bias[:5]).form(2)
+    found = form.lifted(5).dense(weight, bias).bent(most).dense(weight.T, bias[:5]).folded(2)
     for _ in range(200):
         s, e = rng.uniform(-1.0, 1.0, 2), rng.choice([-1.0, 1.0], form.c.shape)
         x = form.c + s[0] * form.g[0] + s[1] * form.g[1] + e * form.r

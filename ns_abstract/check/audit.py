@@ -10,22 +10,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ns_abstract.check.claims import Claims
-from ns_abstract.check.inputs import BadInput, dataset_scale, given_set, read_poses, read_scene
-from ns_abstract.check.loops import LoopClaims
+from ns_abstract.check.inputs import BadInput, dataset_scale, given_set, read_poses, read_scene, reading
+from ns_abstract.check.loops import Loop
 from ns_abstract.check.pictures import Picture
 from ns_abstract.check.results import StoredCells, entries_of, read_cells, read_report, read_verdicts, structure
 from ns_abstract.check.splats import RULES
-from ns_abstract.check.verdicts import CertificateClaims, StatementClaims
+from ns_abstract.check.verdicts import Verdicts, of_class, of_statement
 
 
 class ClaimOutcome(NamedTuple):
-    """What came of a claim.
+    """What came of a claim: True: proved; False: refuted; None: open when its time was over.
 
-    Attributes:
-        verdict: True: proved; False: refuted; None: open when its time was over.
-        float32: Whether that is of every float32 evaluation; else of the picture in real numbers.
-        uniform: Whether it was drawn uniformly.
-        found: If refuted: frame, cell, pose, what is wrong.
+    ``float32``: of every float32 evaluation, else of the picture in real numbers. ``uniform``: it was drawn uniformly.
+    ``found``: of a refuted one frame, cell, pose, and what is wrong.
     """
 
     verdict: bool | None
@@ -37,23 +34,19 @@ class ClaimOutcome(NamedTuple):
 def opened(folder: Path, moved: dict[str, Path | None]) -> tuple[list[str], list[Claims]]:
     """What is wrong (cells that tile no set, pixels without bounds, figures that do not fit), and a result's claims.
 
-    Args:
-        folder: Output folder of a command.
-        moved: Where files lie that have been moved since, by the name of their setting.
+    ``moved`` says by the name of a setting where a file lies that has been moved since.
 
     Raises:
         BadInput: A file cannot be used.
     """
     report, name = read_report(folder), folder / "report.json"
-    try:
+    with reading(name, "is not the report of a result", "make the result again"):
         parts, subjects = _opened(folder, report, moved)
         wrong = [f"frame {c.index}: {text}" for c in parts for text in structure(c, report)]
         wrong += [] if not parts or parts[0].verdicts is None else _together(report, parts)
         if not subjects and not wrong:
             raise BadInput("claims nothing: no cell has a result or verdict", name, fix="finish it: --resume")
-        return wrong, subjects
-    except (KeyError, TypeError, AttributeError, IndexError, OverflowError):
-        raise BadInput("is not the report of a result", name, fix="make the result again") from None
+    return wrong, subjects
 
 
 def _together(report: dict[str, Any], parts: list[StoredCells]) -> list[str]:
@@ -63,11 +56,16 @@ def _together(report: dict[str, Any], parts: list[StoredCells]) -> list[str]:
     for kind, said in (report.get("coverage") or {}).items():
         if not abs(sum(e[kind] for e in entries.values()) / len(entries) - said) <= 1e-9:
             wrong.append(f"the report says {said:.9g} of all sets are {kind}, its frames do not")
-    loop, whole = report.get("kind") == "loop", [k for k in entries if kinds.get(k) == {"certified"}]
-    done = whole if loop else len(whole) == len(entries) == len(report["frames"])
-    verdict = ("safe", "reaches")[whole[-1]] if done and loop else "certified" if done else "unknown"
-    verdict = "falsified" if any("falsified" in found for found in kinds.values()) else verdict
-    return wrong + [f"the verdict is {verdict}, the report says {report['verdict']}"] * (report["verdict"] != verdict)
+    whole, verdict = [k for k in entries if kinds.get(k) == {"certified"}], "unknown"
+    if any("falsified" in found for found in kinds.values()):
+        verdict = "falsified"
+    elif report.get("kind") == "loop" and whole:
+        verdict = ("safe", "reaches")[whole[-1]]
+    elif report.get("kind") != "loop" and len(whole) == len(entries) == len(report["frames"]):
+        verdict = "certified"
+    if report["verdict"] != verdict:
+        wrong.append(f"the verdict is {verdict}, the report says {report['verdict']}")
+    return wrong
 
 
 def outcomes(subjects: list[Claims], claims: int, seconds: float, seed: int) -> Iterator[ClaimOutcome]:
@@ -100,13 +98,13 @@ def _opened(
 
     config = file("load_config")
     scene, scale = read_scene(config, report), dataset_scale(config)
+    certificate, subjects = (folder / "cells.sqlite").exists(), []
+    parts = read_verdicts(folder, report) if certificate else _frames(folder, report)
     if report.get("kind") == "loop":
-        parts = read_verdicts(folder, report)
         model = moved.get("model") or file("loop").parent / report["loop"]["network"]
-        return parts, [s for s in (LoopClaims(c, scene, report, model) for c in parts) if s.count]
+        subjects = [Verdicts(c, scene, report, Loop(c, scene, report, model).bounds) for c in parts]
+        return parts, [s for s in subjects if s.count]
     path, perturbation = file("camera_path_filename"), given_set(settings, moved.get("perturbation_filename"))
-    certificate = (folder / "cells.sqlite").exists()
-    parts, subjects = read_verdicts(folder, report) if certificate else _frames(folder, report), []
     for cells in parts:
         poses, free = read_poses(path, perturbation, cells.index, settings, scale)
         size = (poses.camera.height, poses.camera.width)
@@ -117,9 +115,9 @@ def _opened(
         if not certificate:
             subjects.append(Picture(cells, scene, poses, report))
         elif "sha256" in report.get("model", {}):
-            subjects.append(CertificateClaims(cells, scene, poses, report, file("model")))
+            subjects.append(Verdicts(cells, scene, report, of_class(scene, poses, report, file("model"))))
         else:
-            subjects.append(StatementClaims(cells, scene, poses, report, scale))
+            subjects.append(Verdicts(cells, scene, report, of_statement(scene, poses, report, scale)))
     return parts, [s for s in subjects if s.count]
 
 

@@ -30,9 +30,10 @@ def blended(
     alpha: Affine, color: Affine, depth: Affine, shows: Array, background: Array, unit: float
 ) -> tuple[Affine, Array]:
     """The blended colours [B, 3] before the clamp, and which of the fragments [B, n] matter; colours are [3, B, n]."""
-    count, n = shows.shape
     # those that do not show stand behind all others
     order = np.argsort(np.where(shows, depth.c, np.inf), axis=1, kind="stable")
+    order, keep = order[:, : shows.sum(axis=1).max()], np.zeros(shows.shape, bool)
+    count, n = order.shape
     alpha, color, depth, shows = picked([alpha, color, depth, shows], np.arange(count)[:, None], order)
     color = color.of(lambda a: np.moveaxis(a, -3, -1))
     al, ah = (np.clip(a, 0.0, 1.0) for a in alpha.range())
@@ -55,11 +56,11 @@ def blended(
     place = np.arange(n + 1)[None]
     # the first fragment at which the rasteriser may stop, and the first at which it surely has stopped
     may, sure = least[:, 1:] <= STOP * (1.0 + ROOM + 4.0 * unit), most[:, 1:] <= STOP * (1.0 - ROOM - 4.0 * unit)
-    first, last = (np.where(a.any(axis=1), a.argmax(axis=1), n)[:, None] for a in (may, sure))
+    first, last = ((~np.logical_or.accumulate(a, axis=1)).sum(axis=1)[:, None] for a in (may, sure))
     begin = np.where(clean & (place <= first), place, 0).max(axis=1)[:, None]
     plain = np.take_along_axis(clean, last, 1) & np.take_along_axis(clean, np.minimum(last + 1, n), 1)
     end = np.where(plain, last, np.where(clean & (place > last), place, n).min(axis=1)[:, None])
-    inside = place[:, :-1] < end
+    inside = (place[:, :-1] < end) & (ah > 0.0)
     form = from_the_back(alpha, color, inside, background, unit)
     # other orders than that of the centres, and earlier stops
     lower, upper = _swaps((low, high, front, back), inside, most, ah, cl, ch)
@@ -72,11 +73,11 @@ def blended(
     with np.errstate(invalid="ignore"):
         lower = lower - np.where(light > 0.0, light * (brightest - background), 0.0)
         upper = upper + np.where(light > 0.0, light * (background - darkest), 0.0)
-        rest = 0.5 * (upper - lower) * (1.0 + ROOM) + 8.0 * U * (np.abs(form.c) + 1.0)
+        # where nothing shows the background is drawn, exactly
+        rest = 0.5 * (upper - lower) * (1.0 + ROOM) + 8.0 * U * (np.abs(form.c) + 1.0) * inside.any(axis=1)[:, None]
         middle = 0.5 * (lower + upper)
     bad = ~np.isfinite(rest)
     form = Affine(form.c + np.where(bad, 0.0, middle), form.g, form.r + np.where(bad, np.inf, rest))
-    keep = np.zeros((count, n), bool)
     np.put_along_axis(keep, order, (place[:, :-1] < end + 1) & shows, 1)
     return form, keep
 
@@ -87,22 +88,23 @@ def from_the_back(alpha: Affine, color: Affine, inside: Array, background: Array
     S' = S + alpha (C - S): errors of S are met by 1 - alpha, those of C by alpha. In float32 a fragment's light errs by
     2 units for each in front of it, sums by one for each.
     """
-    count, n = inside.shape
+    count = len(inside)
     size = np.maximum(color.size().max(axis=(1, 2), initial=0.0), np.abs(background).max(initial=1.0))[:, None]
     c, r = np.broadcast_to(background, (count, 3)), np.zeros((count, 3))
     g = np.zeros((len(alpha.g), count, 3))
     al, ah = (np.clip(a, 0.0, 1.0) for a in alpha.range())
     slope = alpha.slope
-    for k in np.flatnonzero((inside & (ah > 0.0)).any(axis=0))[::-1]:
+    for k in np.flatnonzero(inside.any(axis=0))[::-1]:
         used = inside[:, k, None] * 1.0
         a, da, ra, s = (v[..., k, None] * used for v in (alpha.c, alpha.g, alpha.r, slope))
         d, dg = color.c[:, k] - c, color.g[:, :, k] - g
         tilt = np.abs(dg).sum(axis=0)
         r = (1.0 - al[:, k, None] * used) * r + ah[:, k, None] * used * color.r[:, k]
-        r = (r + ra * (np.abs(d) + tilt) + s * tilt) * (1.0 + 16.0 * U) + 32.0 * U * size + TINY
+        r = (r + ra * (np.abs(d) + tilt) + s * tilt) * (1.0 + 16.0 * U) + (32.0 * U * size + TINY) * used
         c, g = c + a * d, g + a * dg + da * d
+    drawn = inside.sum(axis=1, keepdims=True)
     # what is outside of the colours is not known better than that
-    return Affine(c, g, np.where(np.isfinite(r), r, np.inf)).wider((4.0 * n + 16.0) * unit * size)
+    return Affine(c, g, np.where(np.isfinite(r), r, np.inf)).wider((4.0 * drawn + 16.0 * (drawn > 0)) * unit * size)
 
 
 def _swaps(depths: Any, inside: Array, most: Array, ah: Array, cl: Array, ch: Array) -> tuple[Array, Array]:

@@ -18,14 +18,21 @@ _BATCH = 40_000
 _FIRST = 0.5
 
 
+class Claim(NamedTuple):
+    """What is claimed of a cell; of pictures, for a channel of a pixel, with a pose [1, d] that may refute it."""
+
+    cell: int
+    row: int = 0
+    column: int = 0
+    channel: int = 0
+    pose: Array | None = None
+
+
 class ClaimMargins(NamedTuple):
     """By how much a claim holds over B boxes of parameters; negative: by how much it does not.
 
-    Attributes:
-        least: [B] lower bounds at all poses.
-        most: [B] upper bounds at the boxes' middles; of use for boxes that are points.
-        near: [B, n] which of what was looked at matters, or None: all of it.
-        motion: [d, B] by how much the parameters move it, or None: nobody knows.
+    Lower and upper bounds [B] over all poses; which of what was looked at matters [B, n] (None: all of it); by how much
+    the parameters move it [d, B] (None: nobody knows).
     """
 
     least: Array
@@ -35,13 +42,7 @@ class ClaimMargins(NamedTuple):
 
 
 class Claims(ABC):
-    """Claims of one kind about the cells of a frame, or of a question about a loop.
-
-    Args:
-        cells: What is claimed.
-        scene: What is drawn.
-        report: Of the result.
-    """
+    """Claims of one kind about the cells of a frame, or of a question about a loop."""
 
     #: Boxes that are looked at together.
     together = 8
@@ -57,52 +58,47 @@ class Claims(ABC):
         self.units = (FLOAT, 0.0) if splats else (0.0,)
 
     @abstractmethod
-    def one(self, rng: Any) -> Any:
+    def one(self, rng: Any) -> Claim:
         """A claim, uniformly."""
 
     @abstractmethod
-    def interest(self, claim: Any) -> float:
+    def interest(self, claim: Claim) -> float:
         """The larger, the more likely to fail."""
 
-    @abstractmethod
-    def place(self, claim: Any) -> dict[str, Any]:
-        """Its cell, and what else names it."""
+    def place(self, claim: Claim) -> dict[str, Any]:
+        """What names it in check.json."""
+        return {"cell": claim.cell, "parameters": list(self.cells.names)}
 
     @abstractmethod
-    def margins(self, claim: Any, low: Array, high: Array, near: Array, unit: float) -> ClaimMargins:
+    def margins(self, claim: Claim, low: Array, high: Array, near: Array, unit: float) -> ClaimMargins:
         """Over boxes [B, d]; ``near`` are the numbers of what is to be looked at."""
 
     @abstractmethod
-    def detail(self, claim: Any, point: Array) -> dict[str, Any]:
+    def detail(self, claim: Claim, point: Array) -> dict[str, Any]:
         """What is wrong at the pose [1, d]."""
 
-    def near(self, claim: Any, low: Array, high: Array, unit: float) -> Array:
+    def near(self, claim: Claim, low: Array, high: Array, unit: float) -> Array:
         """Numbers of what has to be looked at over the box [1, d]."""
         return np.zeros(0, np.int64)
 
-    def hint(self, claim: Any) -> Array | None:
-        """A pose [1, d] that may refute the claim."""
-        return None
-
-    def floor(self, claim: Any) -> float:
+    def floor(self, claim: Claim) -> float:
         """The margin that is claimed of every pose."""
         return 0.0
 
-    def draw(self, rng: Any, hunted: bool) -> Any:
+    def draw(self, rng: Any, hunted: bool) -> Claim:
         """A claim that is uniform, or the most telling of eight."""
         return max([self.one(rng) for _ in range(8 if hunted else 1)], key=self.interest)
 
-    def box(self, claim: Any) -> tuple[Array, Array]:
+    def box(self, claim: Claim) -> tuple[Array, Array]:
         """The claim's cell."""
-        cell = self.place(claim)["cell"]
-        return self.cells.arrays["box_lower"][cell], self.cells.arrays["box_upper"][cell]
+        return self.cells.arrays["box_lower"][claim.cell], self.cells.arrays["box_upper"][claim.cell]
 
-    def settle(self, claim: Any, deadline: float) -> tuple[bool | None, bool, dict[str, Any]]:
+    def settle(self, claim: Claim, deadline: float) -> tuple[bool | None, bool, dict[str, Any]]:
         """True: proved; False: refuted, with the pose; None: open when the time was over; and whether of float32."""
         begin, (low, high) = time.monotonic(), self.box(claim)
-        near, hint = self.near(claim, low[None], high[None], self.units[0]), self.hint(claim)
-        if hint is not None and self.margins(claim, hint, hint, near, 0.0).most[0] < 0.0:
-            return False, False, self.detail(claim, hint)
+        near, pose = self.near(claim, low[None], high[None], self.units[0]), claim.pose
+        if pose is not None and self.margins(claim, pose, pose, near, 0.0).most[0] < 0.0:
+            return False, False, self.detail(claim, pose)
         for unit in self.units:
             end = begin + (deadline - begin) * (_FIRST if unit else 1.0)
             verdict, detail = self._divide(claim, near, unit, end)
@@ -110,7 +106,7 @@ class Claims(ABC):
                 return verdict, unit > 0.0 and self.in_float32, detail
         return None, False, {}
 
-    def _divide(self, claim: Any, near: Array, unit: float, deadline: float) -> tuple[bool | None, dict[str, Any]]:
+    def _divide(self, claim: Claim, near: Array, unit: float, deadline: float) -> tuple[bool | None, dict[str, Any]]:
         low, high = self.box(claim)
         stack, fresh = [(low, high, near)], True
         while stack:

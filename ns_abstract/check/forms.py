@@ -40,7 +40,7 @@ class Affine:
     @property
     def width(self) -> Array:
         """Largest distance of the function from its centre."""
-        return (self.slope + self.r) * (1.0 + 16.0 * U)
+        return (self.slope + self.r) * (1.0 + (16.0 + 2.0 * len(self.g)) * U)
 
     def range(self) -> tuple[Array, Array]:
         """Lower and upper bounds."""
@@ -61,10 +61,11 @@ class Affine:
     def __add__(self, other: Affine | float | Array) -> Affine:
         if not isinstance(other, Affine):
             c = self.c + other
-            return Affine(c, self.g, self.r + (2.0 * U * np.abs(c) + TINY))
+            return Affine(c, self.g, (self.r + 2.0 * U * np.abs(c)) * (1.0 + 2.0 * U))
+        # sums do not underflow
         c, g = self.c + other.c, self.g + other.g
         size = np.abs(c) + np.abs(g).sum(axis=0)
-        return Affine(c, g, (self.r + other.r + 4.0 * U * size) * (1.0 + 4.0 * U) + TINY)
+        return Affine(c, g, (self.r + other.r + 4.0 * U * size) * (1.0 + 4.0 * U))
 
     def __sub__(self, other: Affine | float | Array) -> Affine:
         return self + (-other)
@@ -167,6 +168,48 @@ class Affine:
             form = (self * slope + 0.5 * (small + large)).wider(0.5 * (large - small) * (1.0 + 4.0 * U))
         return form.boxed(~(np.isfinite(form.r) & np.isfinite(form.c)), bottom, top)
 
+    def mapped(self, f: Any, absolute: Any, bias: Array, terms: int, unit: float = 0.0) -> Affine:
+        """The form of a linear map ``f`` plus ``bias``; ``absolute`` is the map of the absolute coefficients.
+
+        A sum of ``terms`` products, in any order, errs by ``terms`` + 2 roundings of the sum of their sizes: those of
+        float64, and those of ``unit`` where that is how the map is evaluated.
+        """
+        size = absolute(self.size()) + np.abs(bias)
+        charge = (terms + 4.0) * (unit + 2.0 * U) + 2.0 * U * (len(self.g) + 16.0)
+        r = (absolute(self.r) + charge * size) * (1.0 + 2.0 * U * (terms + 16.0)) + TINY
+        return Affine(f(self.c) + bias, f(self.g), r)
+
+    def dense(self, weight: Array, bias: Array, unit: float = 0.0) -> Affine:
+        """The form of ``weight`` [out, in] times the last axis, plus ``bias``; see `mapped`."""
+        size = np.abs(weight).T
+        return self.mapped(lambda a: a @ weight.T, lambda a: a @ size, bias, weight.shape[1], unit)
+
+    def bent(self, most: int) -> Affine:
+        """The form behind a ReLU, `lifted` where it may bend."""
+        low, high = self.range()
+        return self.clamped(0.0, np.inf).lifted(most, where=(low < 0.0) & (high > 0.0))
+
+    def lifted(self, most: int, part: float = 0.0, where: Array = True) -> Affine:
+        """The form whose ``most`` largest remainders along the last axis have symbols of their own, behind the others.
+
+        What is computed from it later keeps track of them. Those below ``part`` of the largest stay remainders.
+        """
+        own = np.where(where, self.r, 0.0)
+        own = np.where(own > part * own.max(axis=-1, keepdims=True), own, 0.0)
+        count = min(most, int((own > 0.0).sum(axis=-1).max(initial=0)))
+        place = np.argsort(-own, axis=-1)[..., :count, None]
+        g = np.moveaxis(np.where(place == np.arange(own.shape[-1]), own[..., None, :], 0.0), -2, 0)
+        return Affine(self.c, np.concatenate([self.g, g]), np.where(g.any(axis=0), 0.0, self.r))
+
+    def padded(self, count: int) -> Affine:
+        """The form with ``count`` symbols."""
+        return Affine(self.c, np.concatenate([self.g, np.zeros((count - len(self.g), *self.c.shape))]), self.r)
+
+    def folded(self, count: int) -> Affine:
+        """The form with its first ``count`` symbols, what the others do in the remainder."""
+        r = self.r + np.abs(self.g[count:]).sum(axis=0)
+        return Affine(self.c, self.g[:count], r * (1.0 + 2.0 * U * (len(self.g) + 8.0)))
+
     @staticmethod
     def joined(forms: Any, axis: int, join: Any = np.concatenate) -> Affine:
         """Forms one behind the other along an axis that is counted from the last one; or stacked along a new one."""
@@ -175,6 +218,10 @@ class Affine:
     def of(self, pick: Any) -> Affine:
         """The form of what ``pick`` makes of its arrays, whose axes it must count from the last one."""
         return Affine(pick(self.c), pick(self.g), pick(self.r))
+
+    def reshaped(self, *shape: int) -> Affine:
+        """The form with another shape of the same size."""
+        return self.of(lambda a: a.reshape(*a.shape[: a.ndim - self.c.ndim], *shape))
 
 
 def parameters(middle: Array, half: Array) -> list[Affine]:

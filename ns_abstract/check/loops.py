@@ -11,17 +11,15 @@ from ns_abstract.check.forms import Affine, Array, U, fixed, parameters, product
 from ns_abstract.check.inputs import BadInput, lens
 from ns_abstract.check.poses import TURNS, CameraForms, CheckedCamera, Poses
 from ns_abstract.check.results import StoredCells
-from ns_abstract.check.verdicts import OfNetwork
+from ns_abstract.check.verdicts import SeeingNetwork
 
 
-class LoopClaims(OfNetwork):
-    """The claims of a question: no run from a cell comes to harm, and (question 1) all reach the goal."""
-
-    kinds = ("certified",)
+class Loop:
+    """The runs of a loop from the cells of a question: no run comes to harm, and (question 1) all reach the goal."""
 
     def __init__(self, cells: StoredCells, scene: Any, report: dict[str, Any], model: Path) -> None:
-        self.loop = loop = report["loop"]
-        super().__init__(cells, scene, report, model, loop)
+        self.loop, self.cells = report["loop"], cells
+        loop, self.seeing = self.loop, SeeingNetwork(scene, report, model, report["loop"])
         if loop["dynamics"].get("type") != "affine":
             problem = "has dynamics that this program does not follow"
             raise BadInput(problem, "report.json", "loop.dynamics.type", "audit an affine loop")
@@ -29,7 +27,7 @@ class LoopClaims(OfNetwork):
         if not all("box" in area or "half_space" in area for area in areas):
             problem = "has properties of the picture, which this program does not follow along a loop"
             raise BadInput(problem, "report.json", "loop.unsafe", "audit a loop whose areas are boxes or half-spaces")
-        height, width = self.shape["resize"]
+        height, width = self.seeing.shape["resize"]
         stated = lens(loop["camera"], loop["camera"].get("fov", 45.0), width, height)
         pose = np.array(loop["camera"]["camera_to_world"], np.float64)[:3]
         self.camera = CheckedCamera(pose, *stated, int(width), int(height))
@@ -60,18 +58,13 @@ class LoopClaims(OfNetwork):
         """
         low, high = (np.stack([e.range()[k] for e in x], axis=-1) for k in (0, 1))
         middle = 0.5 * (low + high)
-        half = np.maximum(high - middle, middle - low) * (1.0 + 4.0 * U)
+        half = np.maximum(np.maximum(high - middle, middle - low) * (1.0 + 4.0 * U), 1e-150)
         own = parameters(middle[:, self.seen], half[:, self.seen])
         local = [own[self.seen.index(k)] if k in self.seen else own[0] * 0.0 + middle[:, k] for k in range(len(x))]
-        y, outputs = self.network.outputs(self.inputs(self.camera, self._view(local), unit)), []
-        inverse = np.where(half > 1e-150, 1.0 / np.maximum(half, 1e-150), 0.0)
-        scaled = [(x[k] + -middle[:, k]) * inverse[:, k] for k in self.seen]
-        for j in range(y.c.shape[-1]):
-            parts = [s * y.g[k, :, j] for k, s in enumerate(scaled)]
-            # what moves by almost nothing is an error
-            still = sum(np.where(inverse[:, k] == 0.0, np.abs(y.g[n, :, j]), 0.0) for n, k in enumerate(self.seen))
-            outputs.append(total([Affine.constant(y.c[:, j], x[0], y.r[:, j] + still), *parts]))
-        return outputs
+        y = self.seeing.outputs(self.camera, self._view(local), unit)
+        scaled = [(x[k] - middle[:, k]) * (1.0 / half[:, k]) for k in self.seen]
+        forms = (Affine.constant(y.c[:, j], x[0], y.r[:, j]) for j in range(y.c.shape[-1]))
+        return [total([form, *(s * y.g[k, :, j] for k, s in enumerate(scaled))]) for j, form in enumerate(forms)]
 
     def _next(self, x: list[Affine], unit: float) -> list[Affine]:
         law, control, x = self.loop["dynamics"], self.loop.get("control") or {}, _lifted(x)
@@ -113,8 +106,8 @@ def _affine(row: Any, x: list[Affine], constant: float) -> Affine:
 
 def _lifted(x: list[Affine]) -> list[Affine]:
     """The same with a symbol for every error, so that what an error does to later states is followed."""
-    errors = np.eye(len(x))[:, :, None] * np.stack([e.r for e in x])[None]
-    return [Affine(e.c, np.concatenate([e.g, errors[:, k]]), 0.0 * e.c) for k, e in enumerate(x)]
+    whole = Affine.joined(x, -1, np.stack).lifted(len(x))
+    return [whole.of(lambda a, k=k: a[..., k]) for k in range(len(x))]
 
 
 def _outside(area: dict[str, Any], x: list[Affine], names: list[str], inner: bool = False) -> Array:

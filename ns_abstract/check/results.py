@@ -14,12 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from ns_abstract.check.inputs import BadInput, read_json
+from ns_abstract.check.inputs import BadInput, read_json, reading
 
 Array = Any
 
 #: Bytes of arrays of one frame, and rows of a table, that are read at most.
 _MOST, _ROWS = 32 << 30, 10_000_000
+#: Arrays of a frame file, and their types.
+_KINDS = {"tile": "<i4", "box_lower": "<f8", "box_upper": "<f8"}
+_KINDS |= dict.fromkeys(("lower", "upper", "b_lower", "b_upper", "A_lower", "A_upper"), "<f4")
 _AGAIN, _BOX = "make the result again", ("name", "lower", "upper")
 _WHERE = "give the output folder of ns-abstract-render, ns-abstract-certify or ns-abstract-reach"
 
@@ -59,9 +62,8 @@ def read_report(folder: Path) -> dict[str, Any]:
 
 def read_cells(folder: Path, name: str, index: int, digest: object) -> StoredCells:
     """A frame file, checked before anything in it is unpacked."""
-    file = folder / name
-    try:
-        content = hashlib.sha256()
+    file, content = folder / name, hashlib.sha256()
+    with reading(file, "cannot be read as a frame file", _AGAIN):
         with file.open("rb") as stream:
             while block := stream.read(1 << 24):
                 content.update(block)
@@ -73,96 +75,83 @@ def read_cells(folder: Path, name: str, index: int, digest: object) -> StoredCel
         with np.load(file, allow_pickle=False) as archive:
             if "box_lower" not in archive:
                 raise BadInput("keeps no cells", file, fix="run ns-abstract-render with --save-cells")
-            sides = [f"{k}_{s}" for k in ("box", "b", "A") for s in ("lower", "upper")]
-            arrays = {name: archive[name] for name in ("lower", "upper", "tile", *sides)}
-            table = archive["parameters"]
+            arrays, table = {key: archive[key] for key in _KINDS}, archive["parameters"]
         (n, d), (h, w, _), side = arrays["box_lower"].shape, arrays["lower"].shape, arrays["b_lower"].shape[1]
-        shapes = {"lower": (h, w, 3), "upper": (h, w, 3), "tile": (n, 2), "box": (n, d), "b": (n, side, side, 3)}
-        shapes["A"] = (*shapes["b"], d)
+        shapes = {"": (h, w, 3), "tile": (n, 2), "box": (n, d), "b": (n, side, side, 3), "A": (n, side, side, 3, d)}
         for key, array in arrays.items():
-            shape = shapes[key.rpartition("_")[0] or key]
-            kind = np.dtype({"tile": "<i4", "box_lower": "<f8", "box_upper": "<f8"}.get(key, "<f4"))
+            shape, kind = shapes[key if key == "tile" else key.rpartition("_")[0]], np.dtype(_KINDS[key])
             if array.shape != shape or array.dtype != kind:
                 raise BadInput(f"{key} is not {kind} {list(shape)}", file, fix=_AGAIN)
+            if not np.isfinite(array).all():
+                raise BadInput("holds numbers that are not finite", file, fix=_AGAIN)
         if table.shape != (d,) or table.dtype.names != ("name", "unit", "lower", "upper"):
             raise BadInput("parameters are no table of names and ranges", file, fix=_AGAIN)
-    except (OSError, zipfile.BadZipFile, ValueError, KeyError, IndexError, MemoryError) as error:
-        if isinstance(error, BadInput):
-            raise
-        raise BadInput("cannot be read as a frame file", file, fix=_AGAIN) from None
-    if not all(np.isfinite(a).all() for a in arrays.values()):
-        raise BadInput("holds numbers that are not finite", file, fix=_AGAIN)
     return StoredCells(index, tuple(map(str, table["name"])), table["lower"], table["upper"], arrays)
 
 
 def read_verdicts(folder: Path, report: dict[str, Any]) -> list[StoredCells]:
     """The cells of a certificate or a loop: by frame, or by question (0 safe, 1 reaches)."""
-    file, rows, total, by_frame = folder / "cells.sqlite", 0, 0, {}
-    loop = report.get("kind") == "loop"
-    try:
-        sets: dict[int, Any] = dict.fromkeys((0, 1), report["parameters"]) if loop else {}
-        ends = {n: np.ravel(report["loop"]["initial"][n]).tolist() for n in report["loop"]["state"]} if loop else {}
-        if loop and [[n, *v] for n, v in ends.items() if v[0] < v[-1]] != [list(map(p.get, _BOX)) for p in sets[0]]:
+    file, rows, total, loop = folder / "cells.sqlite", 0, 0, report.get("kind") == "loop"
+    by_frame: dict[int, list[Any]] = {}
+    cells = []
+    with reading(file, "cannot be read as the cells of this result", _AGAIN):
+        frames = [{"index": k, "parameters": report["parameters"]} for k in (0, 1)] if loop else report["frames"]
+        if loop and _initial(report["loop"]) != [[p.get(key) for key in _BOX] for p in report["parameters"]]:
             raise BadInput("is of other initial states than the loop's", folder / "report.json", "parameters", _AGAIN)
-        sets |= {} if loop else {int(f["index"]): f["parameters"] for f in report["frames"]}
         base = sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro", uri=True)
         # rows that stand for what is still to be examined
         query = "SELECT value FROM search_state WHERE key = 'open_rows'"
         left = set(json.loads((base.execute(query).fetchone() or ["[]"])[0]))
         columns = "rowid, frame, lower, upper, verdict, margin, seconds, counterexample"
         for number, *row in base.execute(f"SELECT {columns} FROM cells LIMIT {_ROWS}"):
-            verdict, margin, example = row[3], row[4], json.loads(row[6] or "null")
-            entry = (*map(json.loads, row[1:3]), "open" if number in left else verdict, margin, example)
-            by_frame.setdefault(row[0], []).append(entry)
+            frame, low, high, verdict, margin, _, example = row
+            boxes = [json.loads(low), json.loads(high)]
+            entry = (boxes, "open" if number in left else verdict, margin, json.loads(example or "null"))
+            by_frame.setdefault(frame, []).append(entry)
             if number not in left:
                 total += int.from_bytes(hashlib.sha256(json.dumps(row).encode()).digest(), "big")
                 rows += 1
         base.close()
-        if [rows, f"{total % (1 << 256):064x}"] != [report["cells_seal"][k] for k in ("rows", "sum")]:
+        if {"rows": rows, "sum": f"{total % (1 << 256):064x}"} != report["cells_seal"]:
             raise BadInput("does not hold the cells that the report names (cells_seal)", file, fix=_AGAIN)
-        cells = []
+        sets = {int(frame["index"]): frame["parameters"] for frame in frames}
         for index, entries in sorted(by_frame.items()):
-            names, low, high = ([p[k] for p in sets[index]] for k in _BOX)
-            boxes = {
-                f"box_{s}": np.array([e[k] for e in entries], np.float64) for k, s in enumerate(("lower", "upper"))
-            }
-            if any(a.shape != (len(entries), len(names)) or not np.isfinite(a).all() for a in boxes.values()):
+            names, first, last = ([p[key] for p in sets[index]] for key in _BOX)
+            boxes = np.array([entry[0] for entry in entries], np.float64)
+            if boxes.shape != (len(entries), 2, len(names)) or not np.isfinite(boxes).all():
                 raise ValueError
-            verdicts = [e[2:] for e in entries]
-            cells.append(StoredCells(index, tuple(names), np.array(low), np.array(high), boxes, verdicts))
-    except (sqlite3.Error, OSError, ValueError, KeyError, TypeError, IndexError, RecursionError) as error:
-        if isinstance(error, BadInput):
-            raise
-        raise BadInput("cannot be read as the cells of this result", file, fix=_AGAIN) from None
+            arrays = {"box_lower": boxes[:, 0], "box_upper": boxes[:, 1]}
+            verdicts = [entry[1:] for entry in entries]
+            cells.append(StoredCells(index, tuple(names), np.array(first), np.array(last), arrays, verdicts))
     return cells
+
+
+def _initial(loop: dict[str, Any]) -> list[list[Any]]:
+    """Name, least and greatest value of each component of a loop's initial states that varies."""
+    ends = {name: np.ravel(loop["initial"][name]).tolist() for name in loop["state"]}
+    return [[name, *values] for name, values in ends.items() if values[0] < values[-1]]
 
 
 def structure(cells: StoredCells, report: dict[str, Any]) -> list[str]:
     """What is wrong with a frame's cells: they must be a partition of the set, every pixel bounded, counts right."""
-    a, wrong = cells.arrays, []
-    if (a["box_lower"] > a["box_upper"]).any():
-        return ["a cell's range is reversed"]
     if cells.verdicts is not None:
         return _tallies(cells, report)
-    height, width, _ = a["lower"].shape
-    side = a["b_lower"].shape[1]
+    a, wrong = cells.arrays, []
+    (height, width, _), side = a["lower"].shape, a["b_lower"].shape[1]
     if not (a["lower"] <= a["upper"]).all():
         wrong.append("a lower bound exceeds the upper bound")
-    tiles = [tuple(map(int, t)) for t in a["tile"]]
-    if set(tiles) != {(r, c) for r in range(0, height, side) for c in range(0, width, side)}:
+    places = {(r, c) for r in range(0, height, side) for c in range(0, width, side)}
+    if set(map(tuple, a["tile"].tolist())) != places:
         wrong.append("the cells' tiles are not those of the picture")
-    groups: dict[tuple[int, ...], list[int]] = {}
-    for k, tile in enumerate(tiles):
-        groups.setdefault(tile, []).append(k)
-    checked: dict[bytes, bool] = {}
-    for tile, members in groups.items():
+    checked: dict[bytes, Fraction | None] = {}
+    for tile in np.unique(a["tile"], axis=0):
+        members = (a["tile"] == tile).all(axis=1)
         low, high = a["box_lower"][members], a["box_upper"][members]
         key = low.tobytes() + high.tobytes()
         if key not in checked:
-            checked[key] = partition(low, high, cells.lower, cells.upper) == 1
-        if not checked[key]:
-            wrong.append(f"the cells of tile {list(tile)} are no partition of the set")
-            break
+            checked[key] = partition(low, high, cells.lower, cells.upper)
+        if checked[key] != 1:
+            return [*wrong, f"the cells of tile {tile.tolist()} are no partition of the set"]
     return wrong
 
 
@@ -175,7 +164,7 @@ def entries_of(report: dict[str, Any]) -> dict[int, dict[str, Any]]:
 
 def _tallies(cells: StoredCells, report: dict[str, Any]) -> list[str]:
     """Verdicts of a frame or question against the report, whose parts are sums of disjoint cells' volumes."""
-    loop, part = report.get("kind") == "loop", entries_of(report)[cells.index]
+    loop, entry = report.get("kind") == "loop", entries_of(report)[cells.index]
     wrong, verdicts = [], np.array([v[0] for v in cells.verdicts or []])
     low, high, whole = cells.arrays["box_lower"], cells.arrays["box_upper"], (cells.lower, cells.upper)
     covered = partition(low, high, *whole)
@@ -183,13 +172,15 @@ def _tallies(cells: StoredCells, report: dict[str, Any]) -> list[str]:
         return ["cells overlap, or leave the set"]
     for kind in ("certified", "falsified", "unknown"):
         # a loop's report counts what is still to be examined as unknown
-        chosen = (verdicts == kind) | ((kind == "unknown") & loop & (verdicts == "open"))
-        if int(chosen.sum()) != part["cells"][kind]:
-            wrong.append(f"the report counts {part['cells'][kind]} {kind} cells, the table {int(chosen.sum())}")
+        chosen = (verdicts == kind) | ((verdicts == "open") & loop & (kind == "unknown"))
+        if int(chosen.sum()) != entry["cells"][kind]:
+            wrong.append(f"the report counts {entry['cells'][kind]} {kind} cells, the table {int(chosen.sum())}")
         share = partition(low[chosen], high[chosen], *whole)
-        if kind != "unknown" and (share is None or abs(share - part[kind]) > 1e-9):
-            wrong.append(f"{kind} cells are {float(share or 0):.9g} of the set, the report says {part[kind]:.9g}")
-    return wrong + ["the cells are no partition of the set"] * (covered != 1)
+        if kind != "unknown" and (share is None or abs(share - entry[kind]) > 1e-9):
+            wrong.append(f"{kind} cells are {float(share or 0):.9g} of the set, the report says {entry[kind]:.9g}")
+    if covered != 1:
+        wrong.append("the cells are no partition of the set")
+    return wrong
 
 
 def partition(low: Array, high: Array, first: Array, last: Array) -> Fraction | None:
@@ -203,9 +194,10 @@ def partition(low: Array, high: Array, first: Array, last: Array) -> Fraction | 
         stop = np.searchsorted(low[:, 0], high[k, 0], "left") if low.shape[1] else len(low)
         if not ((high[k + 1 : stop] <= low[k]) | (low[k + 1 : stop] >= high[k])).any(axis=1).all():
             return None
-    # a float64 is a rational number
-    rows = (zip(a, b, strict=True) for a, b in zip(low.tolist(), high.tolist(), strict=True))
-    volume = sum(
-        (math.prod((Fraction(b) - Fraction(a) for a, b in row), start=Fraction(1)) for row in rows), Fraction(0)
-    )
-    return volume / math.prod(Fraction(b) - Fraction(a) for a, b in zip(first.tolist(), last.tolist(), strict=True))
+
+    def volume(a: Array, b: Array) -> Fraction:
+        # a float64 is a rational number
+        sides = (Fraction(y) - Fraction(x) for x, y in zip(a.tolist(), b.tolist(), strict=True))
+        return math.prod(sides, start=Fraction(1))
+
+    return sum(map(volume, low, high), Fraction(0)) / volume(first, last)

@@ -78,11 +78,10 @@ class ActivatedScene:
 
 
 def activated(
-    means: Array, logs: Array, quats: Array, logits: Array, sh: Array, *, sigmoid: bool, degree: int,
-    antialiased: bool, background: Array, version: str,
-) -> ActivatedScene:  # fmt: skip
-    """The scene of stored float32 parameters."""
-    logs, q, logits = (v.astype(np.float64) for v in (logs, quats, logits))
+    stored: list[Array], sigmoid: bool, degree: int, antialiased: bool, background: Array, version: str
+) -> ActivatedScene:
+    """The scene of stored float32 parameters: means, logarithms of scales, quaternions, logits and coefficients."""
+    means, logs, q, logits, sh = (v.astype(np.float64) for v in stored)
     scales = np.exp(logs)
     w, *v = (q / np.sqrt((q * q).sum(axis=1, keepdims=True))).T
     # v x u as a matrix times u
@@ -90,7 +89,7 @@ def activated(
     turn = np.eye(3) + 2.0 * w[:, None, None] * cross + 2.0 * cross @ cross
     opacity = 1.0 / (1.0 + np.exp(np.minimum(-logits, 700.0)))
     return ActivatedScene(
-        means.astype(np.float64), turn * scales[:, None, :], scales, opacity, sh.astype(np.float64),
+        means, turn * scales[:, None, :], scales, opacity, sh,
         sigmoid, degree, antialiased, np.asarray(background, np.float64), RULES[version],
     )  # fmt: skip
 
@@ -382,61 +381,38 @@ def pixels(
 ) -> tuple[Affine, Array, Array]:  # fmt: skip
     """Colours [B, 3] before the clamp of one pixel over each of B boxes; which Gaussians matter [B, n]; their motion.
 
-    The motion [d, B], in pixels, is what each parameter moves a Gaussian by at most, about.
-
-    Args:
-        splats, cam: The scene, and the camera's intrinsics.
-        view: Cameras over B boxes, or what `projected` makes of them.
-        index: [B, n] numbers of the Gaussians that may show (`reaches`); negative ones stand for none.
-        pixel: Rows [B] and columns [B].
-        unit: 0 for the picture in real numbers, `FLOAT` for all those in float32.
+    The motion [d, B], in pixels, is what each parameter moves a Gaussian by at most, about. The pixels are at rows [B]
+    and columns [B]. Of the Gaussians ``index`` [B, n], which may show (`reaches`), negative ones stand for none. The
+    ``view`` are cameras over B boxes, or what `projected` makes of them.
     """
-    count = index.shape[1]
-    index = index if count else np.full((len(index), 1), -1)
     with np.errstate(all="ignore"):
         if not isinstance(view, ProjectedForms):
             view = projected(splats, cam, view, np.maximum(index, 0), unit)
         alpha, shows, motion = _fragments(splats, cam, view, index, pixel, unit)
-        used = np.flatnonzero(shows.any(axis=0))
-        # one, so that there is one
-        used = used if len(used) else np.zeros(1, int)
-        alpha, color, depth, some = picked(
-            [alpha, view.color, view.depth, shows], np.arange(len(index))[:, None], used[None]
-        )
-        form, keep = blended(alpha, color, depth, some, splats.background, unit)
-        counted, seen = np.zeros(shows.shape, bool), shows.any(axis=1)[:, None]
-        counted[:, used] = keep
-        # where nothing shows the background is drawn, exactly
-        c, r = np.where(seen, form.c, splats.background), np.where(seen, form.r, 0.0)
-        form = Affine(c, np.where(seen, form.g, 0.0), r)
-        return form, counted[:, :count], motion
+        return *blended(alpha, view.color, view.depth, shows, splats.background, unit), motion
 
 
-def pictures(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit: float) -> Affine:
-    """The pictures [B, H, W, 3] over B boxes of poses."""
-    form = several(splats, cam, view, np.arange(cam.height * cam.width), unit)
-    return form.of(lambda a: a.reshape(*a.shape[:-2], cam.height, cam.width, 3))
-
-
-def several(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, numbers: Array, unit: float) -> Affine:
-    """Colours [B, P, 3] of pixels over B boxes of poses, by their numbers [P] in the picture."""
-    count, size, lists = len(view.origin), len(numbers), []
+def pictures(
+    splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit: float, numbers: Array | None = None
+) -> Affine:
+    """Colours [B, P, 3] of pixels over B boxes of poses: those with the ``numbers`` [P] in the picture, or all."""
+    at: Array = np.arange(cam.height * cam.width) if numbers is None else numbers
+    count, lists = len(view.origin), []
     for ends in reaches(splats, cam, view, unit):
         inside = (ends[:, 0] <= cam.width) & (ends[:, 1] >= 0.0) & (ends[:, 2] <= cam.height) & (ends[:, 3] >= 0.0)
         some = np.flatnonzero(inside)
-        lists += [some[meeting(ends[some], *divmod(p, cam.width))] for p in numbers]
-    # one more, so that there is one
-    every = np.unique(np.concatenate([*lists, [0]]).astype(np.int64))
+        lists += [some[meeting(ends[some], *divmod(p, cam.width))] for p in at]
+    every = np.unique(np.concatenate(lists))
     with np.errstate(all="ignore"):
         whole = projected(splats, cam, view, np.broadcast_to(every, (count, len(every))), unit)
-    longest = max(1, *map(len, lists))
-    step, parts = max(1, TOGETHER // longest), []
+    longest, parts = max(map(len, lists)), []
+    step = max(1, TOGETHER // max(1, longest))
     for start in range(0, len(lists), step):
         chosen = lists[start : start + step]
         index = np.full((len(chosen), longest), -1)
         for place, gaussians in zip(index, chosen, strict=True):
             place[: len(gaussians)] = np.searchsorted(every, gaussians)
-        box, place = np.divmod(np.arange(start, start + len(chosen)), size)
+        box, place = np.divmod(np.arange(start, start + len(chosen)), len(at))
         part = picked(whole, box[:, None], index)
-        parts.append(pixels(splats, cam, part, index, np.divmod(numbers[place], cam.width), unit)[0].clamped(0.0, 1.0))
-    return Affine.joined(parts, -2).of(lambda a: a.reshape(*a.shape[:-2], count, size, 3))
+        parts.append(pixels(splats, cam, part, index, np.divmod(at[place], cam.width), unit)[0].clamped(0.0, 1.0))
+    return Affine.joined(parts, -2).reshaped(count, len(at), 3)

@@ -21,7 +21,7 @@ class CombinedMargins(NamedTuple):
     parts: list[Any]
 
     def margin(self, picture: Callable[[Any], Affine]) -> tuple[Array, Array]:
-        """Lower and upper bounds [B] of the margin over B boxes; ``picture`` gives forms [B, H, W, 3] of a plane."""
+        """Lower and upper bounds [B] of the margin over B boxes; ``picture`` gives forms [B, H W, 3] of a plane."""
         lower, upper = zip(*(part.margin(picture) for part in self.parts), strict=True)
         return self.pick(lower, axis=0), self.pick(upper, axis=0)
 
@@ -29,11 +29,9 @@ class CombinedMargins(NamedTuple):
 class Measured(NamedTuple):
     """A number of a plane lies between ``low`` and ``high``.
 
-    Attributes:
-        paint: The plane: colours (None), the weights of Gaussians in a box ([2, 3]) or nearer than a distance.
-        channels: [3] weights.
-        regions: Numbers of pixels; what is measured of a second region is subtracted.
-        rank: The so many-th largest pixel counts; 0: their mean; -1: the least.
+    The plane is ``paint``: colours (None), the weights of Gaussians in a box ([2, 3]) or nearer than a distance. Its
+    channels are weighted. What is measured of a second region of numbered pixels is subtracted. The pixel of a ``rank``
+    counts, 1 the largest one; 0: the mean; -1: the least.
     """
 
     paint: Any
@@ -47,7 +45,7 @@ class Measured(NamedTuple):
         """Lower and upper bounds [B] of the margin; see `CombinedMargins`."""
         plane = picture(self.paint)
         single = total(plane.of(lambda a, k=k: a[..., k]) * w for k, w in enumerate(self.channels))
-        parts = [single.of(lambda a, k=k: a.reshape(*a.shape[:-2], -1)[..., k]) for k in self.regions]
+        parts = [single.of(lambda a, k=k: a[..., k]) for k in self.regions]
         if self.rank == 0:
             means = [p.of(lambda a: a.mean(axis=-1)).wider(2.0 * U * p.size().sum(axis=-1)) for p in parts]
             least, most = (means[0] - means[1] if parts[1:] else means[0]).range()
@@ -63,16 +61,7 @@ class Measured(NamedTuple):
 
 
 def parsed(root: dict[str, Any], size: tuple[int, int], scale: float) -> CombinedMargins | Measured:
-    """The statement of a property file.
-
-    Args:
-        root: The property, or a part of it.
-        size: Height and width of the picture.
-        scale: Normalised units per unit of the data set.
-
-    Raises:
-        BadInput: It says something that this program does not check.
-    """
+    """The statement of a property or a part of it; ``size`` is height and width, ``scale`` that of `dataset_scale`."""
     for name, pick in (("all", np.min), ("any", np.max)):
         if name in root:
             return CombinedMargins(pick, [parsed(part, size, scale) for part in root[name]])

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
-from abc import abstractmethod
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
-from ns_abstract.check.claims import ClaimMargins, Claims
+from ns_abstract.check.claims import Claim, ClaimMargins, Claims
 from ns_abstract.check.forms import Affine, Array, U
 from ns_abstract.check.inputs import BadInput
 from ns_abstract.check.networks import read_network
@@ -20,16 +19,20 @@ from ns_abstract.check.results import StoredCells
 from ns_abstract.check.splats import FLOAT, ActivatedScene, pictures
 from ns_abstract.check.statements import parsed
 
+#: Lower and upper bounds [B] of a margin over boxes [B, d]; the last argument is the unit of the pictures' rounding.
+Bounds = Callable[[Array, Array, float], tuple[Array, Array]]
+
 
 class Verdicts(Claims):
     """Cells with verdicts: of all their poses a margin is positive, or of one pose it is not."""
 
-    kinds: tuple[str, ...] = ("certified", "falsified")
-
-    def __init__(self, cells: StoredCells, scene: Any, report: dict[str, Any]) -> None:
+    def __init__(self, cells: StoredCells, scene: Any, report: dict[str, Any], bounds: Bounds) -> None:
         super().__init__(cells, scene, report)
-        self.rows = [k for k, v in enumerate(cells.verdicts or []) if v[0] in self.kinds]
-        self.count = len(self.rows)
+        # runs of loops that go wrong are not simulated again
+        kinds = ("certified",) if report.get("kind") == "loop" else ("certified", "falsified")
+        self.rows = [k for k, v in enumerate(cells.verdicts or []) if v[0] in kinds]
+        self.count, self.bounds = len(self.rows), bounds
+        self.in_float32 = "sha256" not in report.get("model", {}) or in_float32(report)
         for verdict, margin, example in ((cells.verdicts or [])[k] for k in self.rows):
             stated = [margin or 0.0, *(cells.lower if verdict == "certified" else example or ())]
             if len(stated) != 1 + len(cells.names) or not all(isinstance(x, (int, float)) for x in stated):
@@ -37,25 +40,19 @@ class Verdicts(Claims):
         if not isinstance(scene, ActivatedScene) or (report.get("picture") or "float") != "float":
             raise BadInput("is of a NeRF or of 8-bit pictures, whose cells are not checked", "report.json", "renderer")
 
-    def one(self, rng: Any) -> int:
-        """A cell with a verdict."""
-        return self.rows[int(rng.integers(self.count))]
+    def one(self, rng: Any) -> Claim:
+        return Claim(self.rows[int(rng.integers(self.count))])
 
-    def interest(self, claim: int) -> float:
+    def interest(self, claim: Claim) -> float:
         """Margins that are small."""
         return -self.floor(claim)
 
-    def place(self, claim: int) -> dict[str, Any]:
-        """The claim for check.json."""
-        return {"cell": claim, "parameters": list(self.cells.names)}
+    def floor(self, claim: Claim) -> float:
+        return max(0.0, (self.cells.verdicts or [])[claim.cell][1] or 0.0)
 
-    def floor(self, claim: int) -> float:
-        """The margin that is claimed of every pose."""
-        return max(0.0, (self.cells.verdicts or [])[claim][1] or 0.0)
-
-    def settle(self, claim: int, deadline: float) -> tuple[bool | None, bool, dict[str, Any]]:
+    def settle(self, claim: Claim, deadline: float) -> tuple[bool | None, bool, dict[str, Any]]:
         """As `Claims.settle`; where a pose is claimed to fail it is looked at alone."""
-        verdict, _, example = (self.cells.verdicts or [])[claim]
+        verdict, _, example = (self.cells.verdicts or [])[claim.cell]
         if verdict != "falsified":
             return super().settle(claim, deadline)
         point, (low, high) = np.array(example, np.float64)[None], self.box(claim)
@@ -64,80 +61,75 @@ class Verdicts(Claims):
             return False, False, self.detail(claim, point)
         return (True if most[0] <= 0.0 else None), False, {}
 
-    def detail(self, claim: int, point: Array) -> dict[str, Any]:
+    def detail(self, claim: Claim, point: Array) -> dict[str, Any]:
         """The pose, the margin there at most, and by how much that is below what is claimed."""
         most = float(self.bounds(point, point, 0.0)[1][0])
         return {"pose": point[0].tolist(), "margin": most, "excess": max(self.floor(claim) - most, 0.0)}
 
-    def margins(self, claim: int, low: Array, high: Array, near: Array, unit: float) -> ClaimMargins:
-        """Over boxes [B, d]."""
+    def margins(self, claim: Claim, low: Array, high: Array, near: Array, unit: float) -> ClaimMargins:
         least, most = self.bounds(low, high, unit)
         return ClaimMargins(np.where(least > 0.0, least, -np.inf), most)
 
-    @abstractmethod
-    def bounds(self, low: Array, high: Array, unit: float) -> tuple[Array, Array]:
-        """`ClaimMargins.least` and `ClaimMargins.most`."""
+
+def in_float32(report: dict[str, Any]) -> bool:
+    """Whether what is claimed of a network holds of its float32 evaluations."""
+    return report["fingerprint"].get("network_arithmetic") == "float32"
 
 
-class OfNetwork(Verdicts):
-    """Verdicts about a network that sees the pictures."""
+class SeeingNetwork:
+    """A network that sees pictures of the scene, by the ``preprocess`` of a property or loop."""
 
-    def __init__(self, cells: StoredCells, scene: Any, report: dict[str, Any], model: Path, about: Any) -> None:
-        super().__init__(cells, scene, report)
-        self.shape = about.get("preprocess") or {}
+    def __init__(self, scene: ActivatedScene, report: dict[str, Any], model: Path, about: dict[str, Any]) -> None:
+        self.scene, self.shape = scene, about.get("preprocess") or {}
         if not model.is_file() or hashlib.sha256(model.read_bytes()).hexdigest() != report["model"]["sha256"]:
             raise BadInput("is not the network of the result (sha256)", model, fix="say with --model where it lies now")
         if self.shape.get("layout", "NCHW") != "NCHW":
             raise BadInput("takes pictures that this program does not make", model, "preprocess.layout")
-        self.in_float32 = report["fingerprint"].get("network_arithmetic") == "float32"
         try:
-            self.network = read_network(model, about.get("output"), FLOAT if self.in_float32 else 0.0)
+            self.network = read_network(model, about.get("output"), FLOAT if in_float32(report) else 0.0)
         except Exception as error:  # onnx raises whatever a damaged file makes it run into
             raise BadInput(" ".join(str(error).split())[:160] or "cannot be read", model) from None
 
-    def inputs(self, camera: CheckedCamera, view: CameraForms, unit: float) -> Affine:
-        """The network's inputs [B, 3, H, W] over B boxes of poses."""
-        image = pictures(self.scene, camera, view, unit).of(lambda a: np.moveaxis(a, -1, -3))
+    def outputs(self, camera: CheckedCamera, view: CameraForms, unit: float, rows: Array | None = None) -> Affine:
+        """The outputs over B boxes of poses, as `CheckedNetwork.outputs`."""
+        image = pictures(self.scene, camera, view, unit).reshaped(len(view.origin), camera.height, camera.width, 3)
+        image = image.of(lambda a: np.moveaxis(a, -1, -3))
         if self.shape.get("channels", "RGB") == "BGR":
             image = image.of(lambda a: a[..., ::-1, :, :])
         low, high = self.shape.get("range") or (0.0, 1.0)
         mean, std = (np.reshape(self.shape.get(k) or [d] * 3, (3, 1, 1)) for k, d in (("mean", 0.0), ("std", 1.0)))
         size = (abs(low) + abs(high) + np.abs(mean)) / np.abs(std)
-        return ((image * (high - low) + (low - mean)) * (1.0 / std)).wider(16.0 * (self.network.unit + U) * size)
+        image = ((image * (high - low) + (low - mean)) * (1.0 / std)).wider(16.0 * (self.network.unit + U) * size)
+        return self.network.outputs(image, rows)
 
 
-class CertificateClaims(OfNetwork):
-    """The claims of a frame's cells: a class is the largest output on every picture of a cell, or not on one."""
+def of_class(scene: Any, poses: Poses, report: dict[str, Any], model: Path) -> Bounds:
+    """Bounds of a class' output less the largest other one."""
+    about = report["property"]
+    if about.get("type") != "classification":
+        raise BadInput(f"{about.get('type')!r} is a property that this program does not check", model, "type")
+    seeing, label = SeeingNetwork(scene, report, model, about), int(about["label"])
+    camera, rows = resized(poses.camera, seeing.shape), -np.eye(int(report["model"]["output"][-1]))
+    rows[:, label] += 1.0
+    rivals = np.delete(rows, label, axis=0)
 
-    def __init__(self, cells: StoredCells, scene: Any, poses: Poses, report: dict[str, Any], model: Path) -> None:
-        about = report["property"]
-        if about.get("type") != "classification":
-            raise BadInput(f"{about.get('type')!r} is a property that this program does not check", model, "type")
-        super().__init__(cells, scene, report, model, about)
-        self.poses, self.camera, label = poses, resized(poses.camera, self.shape), int(about["label"])
-        rows = -torch.eye(int(report["model"]["output"][-1]), dtype=torch.float64)
-        rows[:, label] += 1.0
-        self.rivals = torch.cat([rows[:label], rows[label + 1 :]])
-
-    def bounds(self, low: Array, high: Array, unit: float) -> tuple[Array, Array]:
-        """Of the class' output less the largest other one."""
-        x = self.inputs(self.camera, self.poses.view(low, high), unit)
-        least, most = self.network.outputs(x, self.rivals).range()
+    def bounds(low: Array, high: Array, unit: float) -> tuple[Array, Array]:
+        least, most = seeing.outputs(camera, poses.view(low, high), unit, rivals).range()
         return least.min(axis=1), most.min(axis=1)
 
+    return bounds
 
-class StatementClaims(Verdicts):
-    """The claims of a frame's cells about the picture itself."""
 
-    def __init__(self, cells: StoredCells, scene: Any, poses: Poses, report: dict[str, Any], scale: float) -> None:
-        super().__init__(cells, scene, report)
-        self.poses, self.camera = poses, resized(poses.camera, report["property"].get("preprocess") or {})
-        self.statement = parsed(report["property"], (self.camera.height, self.camera.width), scale)
+def of_statement(scene: Any, poses: Poses, report: dict[str, Any], scale: float) -> Bounds:
+    """Bounds of the margin of a statement about the picture itself."""
+    camera = resized(poses.camera, report["property"].get("preprocess") or {})
+    statement = parsed(report["property"], (camera.height, camera.width), scale)
 
-    def bounds(self, low: Array, high: Array, unit: float) -> tuple[Array, Array]:
-        """Of the statement's margin."""
-        view = self.poses.view(low, high)
-        return self.statement.margin(lambda paint: pictures(self.scene.painted(paint), self.camera, view, unit))
+    def bounds(low: Array, high: Array, unit: float) -> tuple[Array, Array]:
+        view = poses.view(low, high)
+        return statement.margin(lambda paint: pictures(scene.painted(paint), camera, view, unit))
+
+    return bounds
 
 
 def resized(camera: CheckedCamera, shape: dict[str, Any]) -> CheckedCamera:
