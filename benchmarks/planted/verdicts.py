@@ -72,7 +72,7 @@ VERDICTS = (
         _PROPAGATION,
         "ForwardPropagation.linear",
         "moves + tiny + rows_rounding * width",
-        "(moves if k > 1 else 0.0 * moves) + tiny + rows * width",
+        "(moves if k > 1 else 0.0 * moves) + tiny + rows_rounding * width",
         "test_network_rounding.py::test_sums_that_lose_as_much_as_they_can[2]",
     ),
     Fault(
