@@ -294,7 +294,8 @@ def certify(
         memory_limit: GiB; None: 80 % of what is free.
         scene_margin: Whether to look, in half of the time, for the largest variation of the Gaussians for which what is
             certified holds; see the report's key ``scene_margin``.
-        **search: Fields of `SearchOptions`: ``time_budget``, ``output_dir``, ``workers``, ...
+        **search: Fields of `SearchOptions`: ``time_budget``, ``output_dir``, ``arithmetic``, ``resume``, ``workers``,
+            ``engine``, ``scheduler_address``.
 
     Raises:
         InputError: An argument cannot be used.

@@ -229,7 +229,8 @@ def locate(
         contract: Whether cells are contracted by their pixels' linear bounds before they are cut.
         on_progress: Told about once a second.
         memory_limit: GiB; None: 80 % of what is free.
-        **search: Fields of `SearchOptions`: ``time_budget``, ``output_dir``, ``workers``, ...
+        **search: Fields of `SearchOptions`: ``time_budget``, ``output_dir``, ``arithmetic``, ``resume``, ``workers``,
+            ``engine``, ``scheduler_address``.
 
     Raises:
         InputError: An argument cannot be used.

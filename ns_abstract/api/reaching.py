@@ -213,7 +213,8 @@ def reach(
             certified holds; see the report's key ``scene_margin``.
         film: Whether to write, in a tenth of the time, film.mp4 (film.gif without the package av) into ``output_dir``:
             the abstract image along the tube of the widest certified cell; see the report's key ``film``.
-        **search: Fields of `SearchOptions`: ``time_budget``, ``output_dir``, ``workers``, ...
+        **search: Fields of `SearchOptions`: ``time_budget``, ``output_dir``, ``arithmetic``, ``resume``, ``workers``,
+            ``engine``, ``scheduler_address``.
 
     Raises:
         InputError: An argument cannot be used.
