@@ -30,7 +30,8 @@ LOCATION = (
     ),
     Fault(
         "order by pixel: the last layer that may move is left out",
-        "methods/splat/reordering.py", "swap_bounds_by_pixel", "other > last", "other >= last", _CROWD,
+        "methods/splat/reordering.py", "swap_bounds_by_pixel", "other > last", "other >= last",
+        _CROWD.replace("crowd", "swap"),
     ),
     Fault(
         "order by pixel: brighter layers behind do not raise",
