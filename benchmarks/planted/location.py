@@ -30,8 +30,7 @@ LOCATION = (
     ),
     Fault(
         "order by pixel: the last layer that may move is left out",
-        "methods/splat/reordering.py", "swap_bounds_by_pixel", "other > last", "other >= last",
-        _CROWD.replace("crowd", "swap"),
+        "methods/splat/reordering.py", "swap_bounds_by_pixel", "other > last", "other >= last", _CROWD,
     ),
     Fault(
         "order by pixel: brighter layers behind do not raise",
