@@ -334,7 +334,6 @@ class SplatBounds:
         """
         seen = np.zeros(candidates.size, np.uint8)
         seen[alive] = 1
-        places: np.ndarray
         places, reach = visible_again(seen, np.arange(candidates.size), gaussians.box, gaussians.tiles, self.side)
         return (candidates[places], reach), places[touching(np.arange(places.size), reach, table)]
 
