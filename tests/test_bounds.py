@@ -896,62 +896,6 @@ def test_too_many_pairs(order, monkeypatch):
     case.check(order, parts=1, count=3)
 
 
-def crowd_case() -> Case:
-    """Layers of many colours near one depth, all of which may change places, over a wide cell."""
-    generator = np.random.default_rng(3)
-    layers = [
-        {
-            "mean": (x, y, -5.0 + 0.02 * z),
-            "scale": 0.5,
-            "opacity": float(generator.uniform(0.2, 0.9)),
-            "color": tuple(generator.uniform(0.0, 1.2, 3).tolist()),
-        }
-        for x, y, z in generator.uniform(-0.8, 0.8, (12, 3)).tolist()
-    ]
-    return Case(scene(*layers, background=(0.2, 0.3, 0.4)), moves(x=0.05, yaw=0.03))
-
-
-@pytest.mark.parametrize("room", [0, 7])
-@pytest.mark.parametrize("build", [swap_case, crowd_case])
-def test_pairs_without_room_are_bounded_by_pixel(build, room, monkeypatch):
-    """Ends over parts hold every order where a block has more pairs than there is room for, and are tight (O6)."""
-    case = build()
-    options = {"parts": shared_out(np.ones(case.poses.box.dimensions), 16), "keep_parts": True}
-    known = case.bounds(case.poses.box, 1, **options)
-    monkeypatch.setattr("ns_abstract.methods.splat.bounds.PART_PAIR_LIMIT", room)
-    case.check(1, parts=1, count=20)
-    cell = case.bounds(case.poses.box, 1, **options)
-    # nothing is given up
-    assert cell.statistics[3] == 0
-    assert (cell.upper - cell.lower).mean() < 1.3 * (known.upper - known.lower).mean()
-
-
-def test_sub_boxes_at_few_pixels_are_those_at_all():
-    """What shows at no requested pixel, in the cell or one around it, is left out and changes nothing (R2)."""
-    layers = [
-        {"mean": (x, y, -5.0 - 0.1 * k), "scale": 0.2, "opacity": 0.8, "color": (0.3 * k, 0.9, 1.0 - 0.3 * k)}
-        for k, (x, y) in enumerate([(-2.0, 0.1), (-1.8, 0.0), (0.0, 0.4), (1.5, -0.5)])
-    ]
-    case = Case(scene(*layers, background=(0.2, 0.3, 0.4)), moves(x=0.05, yaw=0.02), camera(32, 16))
-    frame = SplatFrame(case.splats, GSPLAT_1_4_0, REAL, case.poses)
-    counts, tiles = np.array([1, 8]), np.arange(frame.tile_count)
-    few, others = np.zeros((2, frame.tile_count, frame.side, frame.side), bool)
-    few[0, 7, 4], others[0, 8, 3:6], others[1, 6, 7], others[1, 10, 6] = True, True, True, True
-    inner = case.poses.box.split(1, 2)[0]
-    around, whole = (frame.sub_box_ends(box, counts, tiles, few | others) for box in (case.poses.box, inner))
-    context = frame.sub_box_ends(case.poses.box, counts, tiles, few)
-    assert around is not None and whole is not None and context is not None
-    # the context of a few pixels is one of all
-    assert context[2].visible.tolist() == around[2].visible.tolist() == [0, 1, 2, 3]
-    for pixels in (few, others):
-        chosen = pixels[few | others]
-        for within in (None, context[2]):
-            ends = frame.sub_box_ends(inner, counts, tiles, pixels, within)
-            assert ends is not None
-            assert np.array_equal(ends[0], whole[0][chosen]) and np.array_equal(ends[1], whole[1][chosen])
-            assert (ends[1] - ends[0]).max() > 0.0
-
-
 def test_inner_cells_leave_out_what_is_hidden():
     """What no pixel of a cell draws or stops at can be left out of the cells inside it."""
     generator = np.random.default_rng(5)

@@ -15,33 +15,7 @@ _HEIRS = "test_pixel_rounds.py::test_a_part_inherits_what_excludes_all_of_it"
 _KNOWN = "test_locate.py::test_known_outliers_exclude_a_cell_without_bounds"
 _BOXES = "test_locate.py::test_a_cover_holds_every_pose_of_sheared_boxes"
 
-_FEW = "test_bounds.py::test_sub_boxes_at_few_pixels_are_those_at_all"
-_CROWD = "test_bounds.py::test_pairs_without_room_are_bounded_by_pixel[crowd_case-0]"
-
 LOCATION = (
-    Fault(
-        "location: the context of some pixels is taken for one of all",
-        "methods/splat/bounds.py", "SplatBounds._drawable", "seen[alive] = 1", "seen[alive[:1]] = 1", _FEW,
-    ),
-    Fault(
-        "location: a context of few pixels is handed on",
-        "methods/splat/bounds.py", "SplatBounds._drawable", "(candidates[places], reach)",
-        "(candidates[places[:1]], reach[:1])", _FEW,
-    ),
-    Fault(
-        "order by pixel: the last layer that may move is left out",
-        "methods/splat/reordering.py", "swap_bounds_by_pixel", "other > last", "other >= last", _CROWD,
-    ),
-    Fault(
-        "order by pixel: brighter layers behind do not raise",
-        "methods/splat/reordering.py", "swap_bounds_by_pixel", "minimum(rises, highest)",
-        "minimum(0.0 * rises, highest)", _CROWD,
-    ),
-    Fault(
-        "order by pixel: pairs beyond the room are forgotten",
-        "methods/splat/depth_pairs.py", "find_pairs", "pixel_set & int(theirs) == 0",
-        "pixel_set & int(theirs) == 0 or count > reordering.pair_limit", _CROWD,
-    ),
     Fault(
         "location: gains above 1 alone are looked at",
         _PHOTO, "Brightness.before", "[moved / gain for gain in self.gain]", "[moved / self.gain[1]]", _BRIGHT,

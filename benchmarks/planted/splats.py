@@ -238,7 +238,7 @@ SPLATS = (
     Fault(
         "order swap is ignored",
         _DEPTH_PAIRS,
-        "uncertain",
+        "_uncertain",
         "not (abs(center) > (spread + radius) * UP + rounding + depth_error[i] + depth_error[j])",
         "False and not (abs(center) > (spread + radius) * UP + rounding + depth_error[i] + depth_error[j])",
         "test_bounds.py::test_depth_swap[2]",
@@ -270,7 +270,7 @@ SPLATS = (
     Fault(
         "equal depths keep the list's order",
         _DEPTH_PAIRS,
-        "uncertain",
+        "_uncertain",
         "not (abs(center) > (spread + radius) * UP + rounding + depth_error[i] + depth_error[j])",
         "center != 0.0 and (not abs(center) > (spread + radius) * UP + rounding + depth_error[i] + depth_error[j])",
         "test_bounds.py::test_ties[2]",

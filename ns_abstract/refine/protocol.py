@@ -259,18 +259,15 @@ class SubBoxFrame(Protocol):
     """An optional interface of a `Frame`: bounds over each of many equal sub-boxes of a wide cell."""
 
     def sub_box_ends(
-        self, box: ParameterBox, counts: np.ndarray, tiles: np.ndarray, pixels: np.ndarray, within: Any = None
-    ) -> tuple[np.ndarray, np.ndarray, Any] | None:
-        """Lower and upper bounds [n, 3, k] of ``n`` pixels over ``k`` sub-boxes, and a context of all pixels.
-
-        None: there are none for this set.
+        self, box: ParameterBox, counts: np.ndarray, tiles: np.ndarray, pixels: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray] | None:
+        """Lower and upper bounds [n, 3, k] of ``n`` pixels over ``k`` sub-boxes; None: there are none for this set.
 
         Args:
             counts: [d] sub-boxes along its axes, powers of two, at least 8 together; they are numbered like the
                 entries of an array of this shape. Each is widened by `SUB_BOX_OVERLAP` of the cell's half-widths.
             tiles: [t] numbers.
             pixels: [t, side, side] the ``n`` pixels.
-            within: The context that this function returned for a box around ``box``.
         """
         ...
 

@@ -12,7 +12,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 
@@ -208,8 +207,6 @@ class _Examination:
     share: float = 1.0
     #: The last sub-boxes that were bounded: of which cell, their numbers along axes, and their pixels.
     divisions: tuple[Cell, np.ndarray, PixelRounds] | None = None
-    #: What the frame knows of all pixels over the cell.
-    context: Any = None
 
     def run(self) -> None:
         """Exclude the cell, contract it and cut it."""
@@ -254,11 +251,10 @@ class _Examination:
         while (chosen := rounds.following()) is not None:
             self.bounded += 1
             tiles = np.flatnonzero(chosen.any(axis=(1, 2)))
-            ends = search.frame.sub_box_ends(box, counts, tiles, chosen[tiles], self.context)
+            ends = search.frame.sub_box_ends(box, counts, tiles, chosen[tiles])
             if ends is None:
                 return None
-            lower, upper, self.context = ends
-            rounds.count(lower, upper, chosen)
+            rounds.count(*ends, chosen)
             self.share = min(1.0, rounds.expected)
         self.divisions = self.cell, counts, rounds
         left = rounds.left.reshape(counts)
@@ -393,7 +389,7 @@ class _Examination:
         self.bounded += 1
         frame = self.search.frame
         if pixels is not None and isinstance(frame, PartsFrame):
-            return frame.bound_parts([box], tiles, self.context, linear, pixels)[0]
+            return frame.bound_parts([box], tiles, None, linear, pixels)[0]
         return frame.bound(box, tiles, None, linear)
 
     def _settled(self, known: BoundedPixels) -> bool:

@@ -422,12 +422,12 @@ def _form_bounds(begin, end, block, inputs, linear):
 
 
 @njit(cache=True, error_model="numpy")
-def shade(pixels, left, above, grouped, block, inputs, bounds):
+def shade(pixels, left, above, reordered, block, inputs, bounds):
     """Blend the fragments of each of a block's ``pixels`` and write its bounds (design.md, B7-B9, B11, B12).
 
     The block begins at column ``left`` and row ``above`` of its tile, whose parts of `PixelBounds` are ``bounds``;
-    ``grouped`` tells whether fragments may move in groups (O4). Row OPEN of `Fragments.per_pixel` bounds the light that
-    comes to fragments that are missing and have colours between the two of `Palette.unseen`.
+    ``reordered`` tells whether fragments may move. Row OPEN of `Fragments.per_pixel` bounds the light that comes to
+    fragments that are missing and have colours between the two of `Palette.unseen`.
     """
     fragments, palette, polynomials = block.fragments, block.palette, block.sums
     lower, upper, linear, slopes = bounds.lower, bounds.upper, bounds.linear, bounds.slopes
@@ -444,13 +444,13 @@ def shade(pixels, left, above, grouped, block, inputs, bounds):
         begin = q * fragments.capacity
         end = begin + int(fragments.lengths[q])
         if inputs.shape.parts > 0:
-            own = blend_parts(begin, end, grouped, block, inputs, offset_by(polynomials, 4))
+            own = blend_parts(begin, end, reordered, block, inputs, offset_by(polynomials, 4))
             pixel_bounds = _PixelResult(own.low, own.high, own, 0.5 * (own.low + own.high), 0.5 * (own.high - own.low))
         else:
             pixel_bounds = _form_bounds(begin, end, block, inputs, linear.shape[0] > 0)
         form_low, form_high, ends = pixel_bounds.low, pixel_bounds.high, pixel_bounds.ends
         low, high = ends.low, ends.high
-        if grouped:
+        if reordered:
             low, high = sharpened(begin, end, ends, form_low, form_high, block, reorder_scratch)
         for k in range(d):
             store(sums, 4 * k, load4(sums, 4 * k) + abs(load4(polynomials, 4 + 4 * k)))

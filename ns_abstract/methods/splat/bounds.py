@@ -32,16 +32,7 @@ from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.colors import color_magnitudes, fixed_colors, gathered, moving_colors
 from ns_abstract.methods.splat.constants import Rasteriser, RasterRules, raster_rules
 from ns_abstract.methods.splat.gaussians import covariance_noise, gaussian_stage
-from ns_abstract.methods.splat.lists import (
-    TileLists,
-    depth_order,
-    pixel_sets,
-    pixel_table,
-    tile_lists,
-    tile_mask,
-    touching,
-    visible_again,
-)
+from ns_abstract.methods.splat.lists import TileLists, depth_order, pixel_sets, tile_lists, tile_mask, visible_again
 from ns_abstract.methods.splat.pixel_regions import exponent_limits
 from ns_abstract.methods.splat.pixels import pixel_stage
 from ns_abstract.methods.splat.projection_errors import columns
@@ -64,10 +55,8 @@ from ns_abstract.methods.splat.variations import VariedSplats
 
 #: Most pairs of fragments whose depth order is examined in one block of pixels.
 PAIR_LIMIT = 30_000
-#: The same where bounds over many sub-boxes come of it: what more pairs change is found by pixel (O6).
+#: The same where bounds over many sub-boxes come of it: blocks with more pairs take longest and exclude least.
 PART_PAIR_LIMIT = 3_000
-#: Most pairs of these.
-PIXEL_PAIR_LIMIT = 300_000
 
 
 class Stages(NamedTuple):
@@ -91,8 +80,7 @@ class CellBounds:
     Attributes:
         wanted: [t] tile numbers, row-major.
         lower, upper: [t, side, side, 3] float64 enclosures of every image of the cell.
-        visible: [n] scene indices of the Gaussians that some pose of the cell may show on the pixels that were wanted;
-            of all candidates that it may show on any pixel, where ends over parts were asked for.
+        visible: [n] scene indices of the Gaussians that some pose of the cell may show on the pixels that were wanted.
         reach: [n, 4] rectangles of pixels outside of which they are not seen: columns first and past, rows likewise.
         linear: [t, side, side, 3, m + 1] polynomial coefficients and radius, or None.
         layers: [t, side, side, 4] accumulation and expected depth as in `PixelBounds.layers`, or None.
@@ -271,10 +259,6 @@ class SplatBounds:
             candidates = np.arange(self.splats.count, dtype=np.int32)
         poses = _cell_poses(forms)
         gaussians, alive = self._projected(candidates, poses, camera, shape)
-        context = None
-        if keep_parts:
-            table = pixel_table(wanted, pixels, (across, down), self.side)
-            context, alive = self._drawable(alive, candidates, gaussians, table)
         colors = self._colors(forms, poses.camera_magnitude, candidates, alive, candidates.size)
         offsets, entries = tile_lists(
             self._listed(alive, candidates, gaussians), gaussians.tiles, tile_mask(wanted, across * down), across
@@ -292,7 +276,7 @@ class SplatBounds:
             Colors(colors, self.splats.background, self._sums.color_radius, 4 if layers else 3, common),
             self.rules,
             self.charges,
-            self._cutoffs(floor, PART_PAIR_LIMIT if keep_parts else PAIR_LIMIT, PIXEL_PAIR_LIMIT * keep_parts),
+            self._cutoffs(floor, PART_PAIR_LIMIT if keep_parts else PAIR_LIMIT),
             shape,
             cell_parts(np.ones(shape.dimensions, np.int64) if parts is None else parts, SUB_BOX_OVERLAP * keep_parts),
         )
@@ -300,7 +284,7 @@ class SplatBounds:
         self.stages.pixel_stage(TileLists(wanted, offsets, entries), sets, inputs, bounds)
         return CellBounds(
             wanted, bounds.lower, bounds.upper,
-            *(context or visible_again(bounds.marks, candidates, gaussians.box, gaussians.tiles, self.side)),
+            *visible_again(bounds.marks, candidates, gaussians.box, gaussians.tiles, self.side),
             bounds.linear if keep_linear else None, bounds.layers if layers else None,
             bounds.slopes.sum(axis=0) / (max(wanted.size, 1) * self.side**2 * 3), bounds.statistics.sum(axis=0),
             bounds.parts if keep_parts else None,
@@ -317,25 +301,6 @@ class SplatBounds:
             state,
         )  # fmt: skip
         return gaussians, np.flatnonzero(state)
-
-    def _drawable(
-        self, alive: np.ndarray, candidates: np.ndarray, gaussians: ProjectedGaussians, table: np.ndarray
-    ) -> tuple[tuple[np.ndarray, np.ndarray], np.ndarray]:
-        """What may be drawn at all, and the places of ``alive`` that may be drawn where a table tells (design.md, R2).
-
-        Args:
-            alive: [k] places of candidates.
-            candidates: [n] scene indices.
-            gaussians: [n] of the candidates.
-            table: `summed_area` of pixels.
-
-        Returns:
-            Scene indices [k] and rectangles of pixels [k, 4]; and the places.
-        """
-        seen = np.zeros(candidates.size, np.uint8)
-        seen[alive] = 1
-        places, reach = visible_again(seen, np.arange(candidates.size), gaussians.box, gaussians.tiles, self.side)
-        return (candidates[places], reach), places[touching(np.arange(places.size), reach, table)]
 
     def _allocate_bounds(
         self, tiles: int, gaussians: int, shape: FormShape, keep_linear: bool, layers: bool, keep_parts: bool
@@ -398,7 +363,7 @@ class SplatBounds:
         forms[:, m] = error * REGION
         return forms
 
-    def _cutoffs(self, floor: float, pairs: int, by_pixel: int) -> Cutoffs:
+    def _cutoffs(self, floor: float, pairs: int) -> Cutoffs:
         """What need not be followed where no more light than ``floor`` comes (design.md, B6, B8)."""
         stop, fade = self.rules.transmittance_min, 0.0
         if stop > 0.0 < floor:
@@ -407,7 +372,7 @@ class SplatBounds:
             fade = (1.1 + 4.0 * floor) * most * self.charges.left_out
         else:
             floor = -1.0
-        return Cutoffs(floor, fade, self.rasteriser.alpha_negligible * self.splats.count, pairs, by_pixel)
+        return Cutoffs(floor, fade, self.rasteriser.alpha_negligible * self.splats.count, pairs)
 
     def _colors(
         self, forms: PoseForms, camera_magnitude: np.ndarray, candidates: np.ndarray, alive: np.ndarray, n: int

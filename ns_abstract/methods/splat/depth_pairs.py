@@ -63,7 +63,7 @@ class DepthWindow(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def uncertain(i, j, listed):
+def _uncertain(i, j, listed):
     """Whether the depth order of Gaussians i and j, listed in this order, may be another in the cell (design.md, O1).
 
     Depths differ by the third row of the rotation times ``delta_i - delta_j``.
@@ -160,7 +160,7 @@ def find_pairs(k, found, pixels, listed, entries, per_pixel, window, reordering,
     """Append the pairs (k, later entry) that share a pixel and are of uncertain order; widen ``first``, ``last``.
 
     Pairs of one colour are not appended (O5). ``pixels`` in the lanes ``found`` are those of k. Returns the number of
-    pairs. Where there is no room for them, all pairs in the window count and widen ``first`` and ``last`` (O6).
+    pairs, or -1 where there is no room for them.
     """
     radii, deep, far, pairs = entries.depth_radius, entries.depth, entries.far, reordering.pairs
     i = listed.numbers[k]
@@ -192,17 +192,15 @@ def find_pairs(k, found, pixels, listed, entries, per_pixel, window, reordering,
         if pixel_set == 0:
             pixel_set = pixels_at(found, pixels)
         theirs = pixels_once(other, listed, entries, per_pixel)
-        if pixel_set & int(theirs) == 0:
-            continue
-        full = count > reordering.pair_limit
-        if not full and not uncertain(i, listed.numbers[other], listed):
+        if pixel_set & int(theirs) == 0 or not _uncertain(i, listed.numbers[other], listed):
             continue
         entries.last[k] = max(entries.last[k], other)
         entries.first[other] = min(entries.first[other], k)
-        if not full and _same_color(i, listed.numbers[other], listed):
+        if _same_color(i, listed.numbers[other], listed):
             continue
-        if count < reordering.pair_limit:
-            pairs[2 * count] = k
-            pairs[2 * count + 1] = other
+        if count >= reordering.pair_limit:
+            return -1
+        pairs[2 * count] = k
+        pairs[2 * count + 1] = other
         count += 1
     return count

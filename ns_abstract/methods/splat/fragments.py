@@ -328,25 +328,12 @@ def _hide_dim(dim, k, length, live, missing, fragments, stop_low):
 
 
 @njit(cache=True, error_model="numpy")
-def block_list(numbers, place, inputs):
-    """The `BlockList` of the Gaussians ``numbers`` (rows of ``inputs.gaussians``), nearest first."""
-    gaussians, colors = inputs.gaussians, inputs.colors
-    return BlockList(
-        pointer(numbers), numbers.size, pointer(gaussians.record), gaussians.record.shape[1], pointer(gaussians.box),
-        pointer(gaussians.tiles), pointer(gaussians.delta), pointer(gaussians.depth_error),
-        pointer(inputs.axes.depth), inputs.axes.tied, pointer(colors.values), colors.values.shape[1],
-        colors.values.shape[1] // colors.channels, place.x0, place.y0, inputs.shape.monomials,
-    )  # fmt: skip
-
-
-@njit(cache=True, error_model="numpy")
-def collect_fragments(numbers, listed, place, inputs, block, marks_):
+def collect_fragments(numbers, place, inputs, block, marks_):
     """Collect the fragments of every pixel of a block, nearest first (design.md, B5-B6).
 
-    Fills ``block`` but for its sums, from the Gaussians ``numbers`` (rows of ``inputs.gaussians``), nearest first, and
-    their `block_list`; sets ``marks_`` [n] for those that some pixel that takes light may draw, or stop at. Returns the
-    number of pairs and of slots; or GIVE_UP where more pairs are uncertain than there is room for, or than are looked
-    at by pixel (O6), or GROW where another buffer is too small.
+    Fills ``block`` but for its sums, from the Gaussians ``numbers`` (rows of ``inputs.gaussians``), nearest first; sets
+    ``marks_`` [n] for those that some pixel that takes light may draw, or stop at. Returns the number of pairs and of
+    slots; or GIVE_UP where more pairs are uncertain than there is room for, or GROW where another buffer is too small.
 
     A list may end where no pose leaves more light than ``inputs.cutoffs.floor``. All that is missing lies behind what
     it holds, and row OPEN of `Fragments.per_pixel` bounds the light that comes there, `Palette.unseen` the colours.
@@ -354,8 +341,14 @@ def collect_fragments(numbers, listed, place, inputs, block, marks_):
     to a stop that the kept fragments ignore.
     """
     fragments, entries, reordering, batch = block.fragments, block.entries, block.reordering, block.batch
-    charges, m = inputs.charges, inputs.shape.monomials
+    gaussians, charges, m = inputs.gaussians, inputs.charges, inputs.shape.monomials
     colors, channels, marks = inputs.colors.values, inputs.colors.channels, pointer(marks_)
+    listed = BlockList(
+        pointer(numbers), numbers.size, pointer(gaussians.record), gaussians.record.shape[1], pointer(gaussians.box),
+        pointer(gaussians.tiles), pointer(gaussians.delta), pointer(gaussians.depth_error),
+        pointer(inputs.axes.depth), inputs.axes.tied, pointer(colors), colors.shape[1], colors.shape[1] // channels,
+        place.x0, place.y0, m,
+    )  # fmt: skip
     length, capacity, color_columns = listed.length, fragments.capacity, colors.shape[1]
     stop_light, step = inputs.rules.transmittance_min, charges.transmittance
     stop = _EarlyTermination(
@@ -388,7 +381,7 @@ def collect_fragments(numbers, listed, place, inputs, block, marks_):
             k = start + b
             i = listed.numbers[k]
             pairs = find_pairs(k, lanes, pixels, listed, entries, fragments.per_pixel, window, reordering, pairs)
-            if pairs > reordering.pair_limit and pairs > inputs.cutoffs.pairs_by_pixel:
+            if pairs < 0:
                 return GIVE_UP, 0
             # threads share these bytes: written no more than once each
             if marks[i] == 0:

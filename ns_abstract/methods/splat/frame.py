@@ -16,12 +16,12 @@ from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.execution.threads import each
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseBox, translation_only
-from ns_abstract.geometry.tiles import tile_grid
+from ns_abstract.geometry.tiles import laid_out, tile_grid
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.bounds import SceneSums, SplatBounds, Stages
 from ns_abstract.methods.splat.constants import Rasteriser
 from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW, DEPTH_HIGH, DEPTH_LOW
-from ns_abstract.methods.splat.lists import pixel_table, touching
+from ns_abstract.methods.splat.lists import summed_area, touching
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.stage_data import shared_out
 from ns_abstract.methods.splat.variations import VariedSplats
@@ -296,25 +296,22 @@ class SplatFrame:
         return each(lambda box: self._bound(box, tiles, within, candidates, keep_linear, pixels), boxes)
 
     def sub_box_ends(
-        self, box: ParameterBox, counts: np.ndarray, tiles: np.ndarray, pixels: np.ndarray,
-        within: VisibleContext | None = None,
-    ) -> tuple[np.ndarray, np.ndarray, VisibleContext] | None:  # fmt: skip
+        self, box: ParameterBox, counts: np.ndarray, tiles: np.ndarray, pixels: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray] | None:
         """See `ns_abstract.refine.protocol.SubBoxFrame` (design.md, U5)."""
         if box.dimensions < 2:
             return None
         check_cancelled()
         forms = self.pose_set.enclosure(box, self.order)
-        candidates = self.candidates(tiles, within, pixels)
         cell = self.bounds.cell(
-            self.camera, forms, tiles, candidates, floor=self._floor, pixels=pixels, parts=counts, keep_parts=True
+            self.camera, forms, tiles, floor=self._floor, pixels=pixels, parts=counts, keep_parts=True
         )
         assert cell.parts is not None
         ends = cell.parts[pixels]
         lower, upper = ends[:, :COLORS], ends[:, COLORS:]
         # crossed or not a number: nothing is known
         sane = lower <= upper
-        lower, upper = np.where(sane, lower, 0.0).clip(0.0, 1.0), np.where(sane, upper, 1.0).clip(0.0, 1.0)
-        return lower, upper, within or VisibleContext(cell.visible, cell.reach)
+        return np.where(sane, lower, 0.0).clip(0.0, 1.0), np.where(sane, upper, 1.0).clip(0.0, 1.0)
 
     def _bound(
         self, box: ParameterBox, tiles: np.ndarray, within: VisibleContext | None, candidates: np.ndarray | None,
@@ -378,7 +375,9 @@ class SplatFrame:
             return None
         if tiles.size == self.tile_count and pixels is None:
             return within.visible
-        table = pixel_table(tiles, pixels, (self.across, self.down), self.side)
+        chosen = np.zeros((self.tile_count, self.side, self.side), bool)
+        chosen[tiles] = True if pixels is None else pixels
+        table = summed_area(laid_out(chosen, self.across))
         return within.visible[touching(np.arange(within.visible.size), within.reach, table)]
 
     def _shear(self) -> dict[str, dict[str, float]]:

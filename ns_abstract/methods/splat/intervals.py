@@ -173,7 +173,7 @@ def _ordered_end(value, start, stop, channel, side, block, alphas):
 
 
 @njit(cache=True, error_model="numpy")
-def _blend_eight(begin, end, part, grouped, block, inputs, slopes):
+def _blend_eight(begin, end, part, reordered, block, inputs, slopes):
     """`blend_parts` of eight parts from ``part`` on; returns the darkest and the brightest colour."""
     fragments, palette, moves, out = block.fragments, block.palette, block.reordering.moves, block.part_ends
     values, colors, forms = fragments.values, palette.values, palette.forms
@@ -191,7 +191,7 @@ def _blend_eight(begin, end, part, grouped, block, inputs, slopes):
     stop = end
     while stop > begin:
         start, moved = stop - 1, False
-        if grouped:
+        if reordered:
             group = groups[int(lists[LISTED * start + 1])]
             while start > begin and groups[int(lists[LISTED * (start - 1) + 1])] == group:
                 start -= 1
@@ -241,18 +241,18 @@ def _blend_eight(begin, end, part, grouped, block, inputs, slopes):
 
 
 @njit(cache=True, error_model="numpy")
-def blend_parts(begin, end, grouped, block, inputs, slopes):
+def blend_parts(begin, end, reordered, block, inputs, slopes):
     """Bounds of the list entries [begin, end) of a pixel by intervals over the parts of the cell (design.md, B12).
 
-    ``grouped`` tells whether fragments may move in groups (O4). ``slopes`` [d, 4] receives how much the channels vary
-    along the parameters, as far as the parts tell.
+    ``reordered`` tells whether fragments may change places. ``slopes`` [d, 4] receives how much the channels vary along
+    the parameters, as far as the parts tell.
     """
     out, parts, d = block.part_ends, inputs.parts, inputs.shape.dimensions
     for k in range(4 * d):
         slopes[k] = 0.0
-    darkest, brightest = _blend_eight(begin, end, 0, grouped, block, inputs, slopes)
+    darkest, brightest = _blend_eight(begin, end, 0, reordered, block, inputs, slopes)
     for part in range(PART_LANES, inputs.shape.parts, PART_LANES):
-        _blend_eight(begin, end, part, grouped, block, inputs, slopes)
+        _blend_eight(begin, end, part, reordered, block, inputs, slopes)
     for k in range(d):
         store(slopes, 4 * k, parts.slope[k] * load4(slopes, 4 * k))
     for side in range(2):

@@ -9,7 +9,6 @@ import numpy as np
 from numba import njit
 
 from ns_abstract.arithmetic.simd.intrinsics import prefetch
-from ns_abstract.geometry.tiles import laid_out
 
 #: Side of a block in pixels; a block is what one pass of the compiled pixel stages works on.
 BLOCK = 8
@@ -69,16 +68,6 @@ def summed_area(chosen):
     table = np.zeros((chosen.shape[0] + 1, chosen.shape[1] + 1), np.int32)
     table[1:, 1:] = np.cumsum(np.cumsum(chosen, axis=0, dtype=np.int32), axis=1, dtype=np.int32)
     return table
-
-
-def pixel_table(tiles, pixels, grid, side):
-    """`summed_area` of the picture's ``pixels`` [t, side, side] in ``tiles`` [t], all of them if None.
-
-    ``grid`` holds the numbers of tiles across and down.
-    """
-    chosen = np.zeros((grid[0] * grid[1], side, side), bool)
-    chosen[tiles] = True if pixels is None else pixels
-    return summed_area(laid_out(chosen, grid[0]))
 
 
 @njit(cache=True, error_model="numpy")

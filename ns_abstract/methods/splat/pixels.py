@@ -15,10 +15,10 @@ from ns_abstract.arithmetic.simd.intrinsics import borrowed, lowest_bit, pointer
 from ns_abstract.methods.splat.blend import shade
 from ns_abstract.methods.splat.block_buffers import block_of, new_buffers, resized
 from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW, DEPTH_HIGH, DEPTH_LOW, shade_layers
-from ns_abstract.methods.splat.fragments import GIVE_UP, GROW, apply_stops, block_list, collect_fragments, number_groups
+from ns_abstract.methods.splat.fragments import GIVE_UP, GROW, apply_stops, collect_fragments, number_groups
 from ns_abstract.methods.splat.lists import BLOCK, TileLists, block_lists, longest_first
 from ns_abstract.methods.splat.pixel_block import BlockPlace, longest_list
-from ns_abstract.methods.splat.reordering import swap_bounds, swap_bounds_by_pixel
+from ns_abstract.methods.splat.reordering import swap_bounds
 from ns_abstract.methods.splat.stage_data import (
     Colors,
     Parts,
@@ -78,8 +78,7 @@ def _bound_block(numbers, place, inputs, block, bounds):
     v = (place.y0 + 0.5 * BLOCK - camera.cy) / camera.fy
     for k in range(3):
         ray[k] = direction[k] * u + direction[3 + k] * v + direction[6 + k]
-    listed = block_list(numbers, place, inputs)
-    pairs, slots = collect_fragments(numbers, listed, place, inputs, block, bounds.marks)
+    pairs, slots = collect_fragments(numbers, place, inputs, block, bounds.marks)
     if pairs == GROW:
         return False
     bounds.statistics[0] += 1
@@ -91,18 +90,13 @@ def _bound_block(numbers, place, inputs, block, bounds):
         _set_trivial(signed(place.wanted), left, above, bounds, m)
         _set_trivial_parts(signed(place.wanted), left, above, bounds)
         return True
-    grouped = slots > 0 and pairs <= block.reordering.pair_limit
     if slots > 0:
-        if grouped:
-            swap_bounds(pairs, slots, block)
+        swap_bounds(pairs, slots, block)
         apply_stops(slots, block, inputs)
-        if grouped:
-            number_groups(numbers.size, block.entries)
-        else:
-            swap_bounds_by_pixel(place.wanted, listed, block)
+        number_groups(numbers.size, block.entries)
     bounds.statistics[1] += longest_list(block.fragments.lengths)
     bounds.statistics[2] += pairs
-    shade(place.wanted, left, above, grouped, block, inputs, bounds)
+    shade(place.wanted, left, above, slots > 0, block, inputs, bounds)
     if bounds.layers.shape[0] > 0:
         shade_layers(place.wanted, left, above, block, inputs, bounds)
     return True

@@ -12,9 +12,8 @@ from numba import njit
 
 from ns_abstract.arithmetic.elementary import fma
 from ns_abstract.arithmetic.rounding import SWAP_ROUNDING, UP
-from ns_abstract.arithmetic.simd.intrinsics import lowest_bit, signed
+from ns_abstract.arithmetic.simd.intrinsics import lowest_bit
 from ns_abstract.arithmetic.simd.lanes import bits, load4, load8, maximum, minimum, store
-from ns_abstract.methods.splat.depth_pairs import uncertain
 from ns_abstract.methods.splat.intervals import BlendBounds, blend_interval, sort_keys
 from ns_abstract.methods.splat.lists import PIXELS
 from ns_abstract.methods.splat.pixel_block import (
@@ -89,44 +88,6 @@ def swap_bounds(pairs, slots, block):
             at, _, move = listed_fragment(fragments, q * capacity + int(places[slot * PIXELS + q]), forms)
             # the weights of the fragments it may move behind add up to at most one
             store(moves, move, values[at + ALPHA_HIGH] * minimum(load8(moves, move), load8(moves, move + 8)) * up)
-
-
-@njit(cache=True, error_model="numpy")
-def swap_bounds_by_pixel(pixels, listed, block):
-    """What `swap_bounds` finds, from the lists of ``pixels``, where a block has too many pairs (design.md, O6)."""
-    fragments, palette, entries, moves = block.fragments, block.palette, block.entries, block.reordering.moves
-    values, lists, colors, forms = fragments.values, fragments.lists, palette.values, palette.forms
-    while pixels != 0:
-        q = lowest_bit(pixels)
-        pixels = signed(pixels & (pixels - 1))
-        begin = q * fragments.capacity
-        end = begin + int(fragments.lengths[q])
-        # one rounding by pair
-        up = UP + SWAP_ROUNDING * (end - begin)
-        for entry in range(begin, end):
-            at, key, move = listed_fragment(fragments, entry, forms)
-            if move == 0:
-                continue
-            k = int(lists[LISTED * entry + 1])
-            i, last = listed.numbers[k], entries.last[k]
-            dark, bright = load4(colors, key + color_ends(forms)), load4(colors, key + color_ends(forms) + 4)
-            falls = 0.0 * dark
-            rises, deepest, highest = falls, falls, falls
-            for behind in range(entry + 1, end):
-                other = int(lists[LISTED * behind + 1])
-                if other > last:
-                    break
-                if not uncertain(i, listed.numbers[other], listed):
-                    continue
-                there, color, _ = listed_fragment(fragments, behind, forms)
-                alpha = values[there + ALPHA_HIGH]
-                fall = maximum(0.0, bright - load4(colors, color + color_ends(forms)))
-                rise = maximum(0.0, load4(colors, color + color_ends(forms) + 4) - dark)
-                falls, rises = fma(alpha, fall, falls), fma(alpha, rise, rises)
-                deepest, highest = maximum(deepest, fall), maximum(highest, rise)
-            # the weights of the fragments it may move behind add up to at most one
-            store(moves, move, values[at + ALPHA_HIGH] * minimum(falls, deepest) * up)
-            store(moves, move + 4, values[at + ALPHA_HIGH] * minimum(rises, highest) * up)
 
 
 @njit(cache=True, error_model="numpy")

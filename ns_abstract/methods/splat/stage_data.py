@@ -177,15 +177,13 @@ class Cutoffs(NamedTuple):
         floor: Fragments are left out where no pose lets more light come to them (B6); none if negative.
         fade: Bound of the program's rounding when it adds up what was left out, in units of the brightest colour.
         negligible: Bound of what all fragments that were left out for a negligible alpha may add up to.
-        pairs: Most depth-order pairs listed in one block of pixels.
-        pairs_by_pixel: Most pairs whose changes are found by pixel, where there is no room to list them (O6).
+        pairs: Most depth-order pairs looked at in one block of pixels.
     """
 
     floor: float
     fade: float
     negligible: float
     pairs: int
-    pairs_by_pixel: int
 
 
 class Parts(NamedTuple):
