@@ -185,7 +185,7 @@ def test_products_of_rows_are_charged(local: str, tmp_path: Path) -> None:
         low, high = (np.repeat(v[None], m, 0) for v in lent.fixed.T)
         if index in other.intermediate.relaxations[0].noise:
             noise = noise + other.intermediate.relaxations[0].noise[index].reshape(m, -1).numpy()[:, lent.flat]
-        for at, rows in lent.rows.items():
+        for at, rows in lent.by_node.items():
             values = rows.astype(np.float64)
             one, two = np.maximum(values, 0.0), np.minimum(values, 0.0)
             if at == 0:
