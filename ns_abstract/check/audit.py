@@ -11,7 +11,7 @@ import numpy as np
 
 from ns_abstract.check.claims import Claims
 from ns_abstract.check.inputs import BadInput, dataset_scale, given_set, read_poses, read_scene, reading
-from ns_abstract.check.loops import Loop
+from ns_abstract.check.loops import LoopRuns
 from ns_abstract.check.pictures import Picture
 from ns_abstract.check.results import StoredCells, entries_of, read_cells, read_report, read_verdicts, structure
 from ns_abstract.check.splats import RULES
@@ -102,7 +102,7 @@ def _opened(
     parts = read_verdicts(folder, report) if certificate else _frames(folder, report)
     if report.get("kind") == "loop":
         model = moved.get("model") or file("loop").parent / report["loop"]["network"]
-        subjects = [Verdicts(c, scene, report, Loop(c, scene, report, model).bounds) for c in parts]
+        subjects = [Verdicts(c, scene, report, LoopRuns(c, scene, report, model).bounds) for c in parts]
         return parts, [s for s in subjects if s.count]
     path, perturbation = file("camera_path_filename"), given_set(settings, moved.get("perturbation_filename"))
     for cells in parts:

@@ -18,7 +18,7 @@ _BATCH = 40_000
 _FIRST = 0.5
 
 
-class Claim(NamedTuple):
+class BoxClaim(NamedTuple):
     """What is claimed of a cell; of pictures, for a channel of a pixel, with a pose [1, d] that may refute it."""
 
     cell: int
@@ -58,42 +58,42 @@ class Claims(ABC):
         self.units = (FLOAT, 0.0) if splats else (0.0,)
 
     @abstractmethod
-    def one(self, rng: Any) -> Claim:
+    def one(self, rng: Any) -> BoxClaim:
         """A claim, uniformly."""
 
     @abstractmethod
-    def interest(self, claim: Claim) -> float:
+    def interest(self, claim: BoxClaim) -> float:
         """The larger, the more likely to fail."""
 
-    def place(self, claim: Claim) -> dict[str, Any]:
+    def place(self, claim: BoxClaim) -> dict[str, Any]:
         """What names it in check.json."""
         return {"cell": claim.cell, "parameters": list(self.cells.names)}
 
     @abstractmethod
-    def margins(self, claim: Claim, low: Array, high: Array, near: Array, unit: float) -> ClaimMargins:
+    def margins(self, claim: BoxClaim, low: Array, high: Array, near: Array, unit: float) -> ClaimMargins:
         """Over boxes [B, d]; ``near`` are the numbers of what is to be looked at."""
 
     @abstractmethod
-    def detail(self, claim: Claim, point: Array) -> dict[str, Any]:
+    def detail(self, claim: BoxClaim, point: Array) -> dict[str, Any]:
         """What is wrong at the pose [1, d]."""
 
-    def near(self, claim: Claim, low: Array, high: Array, unit: float) -> Array:
+    def near(self, claim: BoxClaim, low: Array, high: Array, unit: float) -> Array:
         """Numbers of what has to be looked at over the box [1, d]."""
         return np.zeros(0, np.int64)
 
-    def floor(self, claim: Claim) -> float:
+    def floor(self, claim: BoxClaim) -> float:
         """The margin that is claimed of every pose."""
         return 0.0
 
-    def draw(self, rng: Any, hunted: bool) -> Claim:
+    def draw(self, rng: Any, hunted: bool) -> BoxClaim:
         """A claim that is uniform, or the most telling of eight."""
         return max([self.one(rng) for _ in range(8 if hunted else 1)], key=self.interest)
 
-    def box(self, claim: Claim) -> tuple[Array, Array]:
+    def box(self, claim: BoxClaim) -> tuple[Array, Array]:
         """The claim's cell."""
         return self.cells.arrays["box_lower"][claim.cell], self.cells.arrays["box_upper"][claim.cell]
 
-    def settle(self, claim: Claim, deadline: float) -> tuple[bool | None, bool, dict[str, Any]]:
+    def settle(self, claim: BoxClaim, deadline: float) -> tuple[bool | None, bool, dict[str, Any]]:
         """True: proved; False: refuted, with the pose; None: open when the time was over; and whether of float32."""
         begin, (low, high) = time.monotonic(), self.box(claim)
         near, pose = self.near(claim, low[None], high[None], self.units[0]), claim.pose
@@ -106,7 +106,7 @@ class Claims(ABC):
                 return verdict, unit > 0.0 and self.in_float32, detail
         return None, False, {}
 
-    def _divide(self, claim: Claim, near: Array, unit: float, deadline: float) -> tuple[bool | None, dict[str, Any]]:
+    def _divide(self, claim: BoxClaim, near: Array, unit: float, deadline: float) -> tuple[bool | None, dict[str, Any]]:
         low, high = self.box(claim)
         stack, fresh = [(low, high, near)], True
         while stack:

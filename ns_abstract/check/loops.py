@@ -14,7 +14,7 @@ from ns_abstract.check.results import StoredCells
 from ns_abstract.check.verdicts import SeeingNetwork
 
 
-class Loop:
+class LoopRuns:
     """The runs of a loop from the cells of a question: no run comes to harm, and (question 1) all reach the goal."""
 
     def __init__(self, cells: StoredCells, scene: Any, report: dict[str, Any], model: Path) -> None:

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ns_abstract.check.claims import Claim, ClaimMargins, Claims
+from ns_abstract.check.claims import BoxClaim, ClaimMargins, Claims
 from ns_abstract.check.forms import Affine, Array, U
 from ns_abstract.check.poses import Poses
 from ns_abstract.check.results import StoredCells
@@ -52,21 +52,21 @@ class Picture(Claims):
         self.splats = isinstance(scene, ActivatedScene)
         self.together = 64 if self.splats else 4
 
-    def one(self, rng: Any) -> Claim:
+    def one(self, rng: Any) -> BoxClaim:
         a = self.cells.arrays
         while True:
             cell = int(rng.integers(self.count))
             row, column = (int(t) + int(rng.integers(a["b_lower"].shape[1])) for t in a["tile"][cell])
             # tiles may reach past the picture; those places are drawn again
             if row < a["lower"].shape[0] and column < a["lower"].shape[1]:
-                return Claim(cell, row, column, int(rng.integers(3)))
+                return BoxClaim(cell, row, column, int(rng.integers(3)))
 
-    def interest(self, claim: Claim) -> float:
+    def interest(self, claim: BoxClaim) -> float:
         """Narrow and moving."""
         (_, b), (slope, c) = self.bounds(claim).planes
         return float((np.abs(slope).sum() + 1e-4) / max(c - b, 1e-7)) if np.any(slope) else 0.0
 
-    def draw(self, rng: Any, hunted: bool) -> Claim:
+    def draw(self, rng: Any, hunted: bool) -> BoxClaim:
         """A claim that is uniform, or one that a pose of its cell seems to break, or the most telling of eight."""
         claim = super().draw(rng, hunted)
         if not hunted or not self.splats:
@@ -84,13 +84,13 @@ class Picture(Claims):
         least, most = np.maximum(least, a["lower"][rows][:, columns]), np.minimum(most, a["upper"][rows][:, columns])
         room = np.minimum(drawn - least, most - drawn)
         row, column, channel = np.unravel_index(int(np.argmin(room)), room.shape)
-        broken = Claim(k, int(rows[row]), int(columns[column]), int(channel), point)
+        broken = BoxClaim(k, int(rows[row]), int(columns[column]), int(channel), point)
         return broken if room.min() < -1e-9 else claim
 
-    def place(self, claim: Claim) -> dict[str, Any]:
+    def place(self, claim: BoxClaim) -> dict[str, Any]:
         return super().place(claim) | {"pixel": [claim.row, claim.column], "channel": claim.channel}
 
-    def bounds(self, claim: Claim) -> ClaimedBounds:
+    def bounds(self, claim: BoxClaim) -> ClaimedBounds:
         """What is claimed."""
         a, k, sides = self.cells.arrays, claim.cell, ("lower", "upper")
         at = (k, claim.row - int(a["tile"][k, 0]), claim.column - int(a["tile"][k, 1]), claim.channel)
@@ -98,12 +98,12 @@ class Picture(Claims):
         lower, upper = ((a[f"A_{s}"][at].astype(np.float64), float(a[f"b_{s}"][at])) for s in sides)
         return ClaimedBounds((least, most), (lower, upper), *self.box(claim))
 
-    def near(self, claim: Claim, low: Array, high: Array, unit: float) -> Array:
+    def near(self, claim: BoxClaim, low: Array, high: Array, unit: float) -> Array:
         if not self.splats:
             return super().near(claim, low, high, unit)
         return meeting(reaches(self.scene, self.poses.camera, self.poses.view(low, high), unit)[0], *claim[1:3])
 
-    def margins(self, claim: Claim, low: Array, high: Array, near: Array, unit: float) -> ClaimMargins:
+    def margins(self, claim: BoxClaim, low: Array, high: Array, near: Array, unit: float) -> ClaimMargins:
         none = np.zeros(len(low))
         form, counted, motion = Affine(none, np.zeros((low.shape[1], len(low))), none + np.inf), None, None
         # some bounds hold whatever is drawn
@@ -112,7 +112,7 @@ class Picture(Claims):
         surely, perhaps = self.bounds(claim).excess(low, high, form)
         return ClaimMargins(-perhaps.max(axis=0), -surely.max(axis=0), counted, motion)
 
-    def _forms(self, claim: Claim, low: Array, high: Array, near: Array, unit: float) -> Any:
+    def _forms(self, claim: BoxClaim, low: Array, high: Array, near: Array, unit: float) -> Any:
         camera, view = self.poses.camera, self.poses.view(low, high)
         pixel = np.full(len(low), claim.row), np.full(len(low), claim.column)
         counted = motion = None
@@ -123,7 +123,7 @@ class Picture(Claims):
             form = self.scene.pixels(camera, view, pixel)
         return form.of(lambda a: a[..., claim.channel]), counted, motion
 
-    def detail(self, claim: Claim, point: Array) -> dict[str, Any]:
+    def detail(self, claim: BoxClaim, point: Array) -> dict[str, Any]:
         """The pose, the picture's value, its error, and by how much which bound is left."""
         form = self._forms(claim, point, point, self.near(claim, point, point, 0.0), 0.0)[0]
         excess = self.bounds(claim).excess(point, point, form)[0][:, 0]

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ns_abstract.check.claims import Claim, ClaimMargins, Claims
+from ns_abstract.check.claims import BoxClaim, ClaimMargins, Claims
 from ns_abstract.check.forms import Affine, Array, U
 from ns_abstract.check.inputs import BadInput
 from ns_abstract.check.networks import read_network
@@ -40,17 +40,17 @@ class Verdicts(Claims):
         if not isinstance(scene, ActivatedScene) or (report.get("picture") or "float") != "float":
             raise BadInput("is of a NeRF or of 8-bit pictures, whose cells are not checked", "report.json", "renderer")
 
-    def one(self, rng: Any) -> Claim:
-        return Claim(self.rows[int(rng.integers(self.count))])
+    def one(self, rng: Any) -> BoxClaim:
+        return BoxClaim(self.rows[int(rng.integers(self.count))])
 
-    def interest(self, claim: Claim) -> float:
+    def interest(self, claim: BoxClaim) -> float:
         """Margins that are small."""
         return -self.floor(claim)
 
-    def floor(self, claim: Claim) -> float:
+    def floor(self, claim: BoxClaim) -> float:
         return max(0.0, (self.cells.verdicts or [])[claim.cell][1] or 0.0)
 
-    def settle(self, claim: Claim, deadline: float) -> tuple[bool | None, bool, dict[str, Any]]:
+    def settle(self, claim: BoxClaim, deadline: float) -> tuple[bool | None, bool, dict[str, Any]]:
         """As `Claims.settle`; where a pose is claimed to fail it is looked at alone."""
         verdict, _, example = (self.cells.verdicts or [])[claim.cell]
         if verdict != "falsified":
@@ -61,12 +61,12 @@ class Verdicts(Claims):
             return False, False, self.detail(claim, point)
         return (True if most[0] <= 0.0 else None), False, {}
 
-    def detail(self, claim: Claim, point: Array) -> dict[str, Any]:
+    def detail(self, claim: BoxClaim, point: Array) -> dict[str, Any]:
         """The pose, the margin there at most, and by how much that is below what is claimed."""
         most = float(self.bounds(point, point, 0.0)[1][0])
         return {"pose": point[0].tolist(), "margin": most, "excess": max(self.floor(claim) - most, 0.0)}
 
-    def margins(self, claim: Claim, low: Array, high: Array, near: Array, unit: float) -> ClaimMargins:
+    def margins(self, claim: BoxClaim, low: Array, high: Array, near: Array, unit: float) -> ClaimMargins:
         least, most = self.bounds(low, high, unit)
         return ClaimMargins(np.where(least > 0.0, least, -np.inf), most)
 
