@@ -23,11 +23,7 @@ INPUTS = 8
 def wide(folder: Path, seed: int) -> tuple[Network, np.ndarray, np.ndarray]:
     """A network and a box in which the second input varies a hundred times as much as the others."""
     f = OnnxFile((INPUTS,), seed)
-    f.gemm(INPUTS, 12)
-    f.node("Relu")
-    f.gemm(12, 12)
-    f.node("Relu")
-    f.gemm(12, 2)
+    f.relu_layers(INPUTS, 12, 12, 2)
     middle = np.random.default_rng(seed).uniform(-0.5, 0.5, INPUTS)
     half = np.where(np.arange(INPUTS) == 1, 2.0, 0.02)
     return load_network(f.write(folder / "wide.onnx")), middle - half, middle + half

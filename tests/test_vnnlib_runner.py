@@ -28,11 +28,7 @@ LOWER, UPPER = np.array([-0.5, 0.1]), np.array([0.75, 0.9])
 
 def net(folder: Path, seed: int = 0, inputs: int = 2) -> Path:
     f = OnnxFile((inputs,), seed)
-    f.gemm(inputs, 8)
-    f.node("Relu")
-    f.gemm(8, 8)
-    f.node("Relu")
-    f.gemm(8, 2)
+    f.relu_layers(inputs, 8, 8, 2)
     return f.write(folder / "net.onnx")
 
 

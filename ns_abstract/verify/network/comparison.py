@@ -73,7 +73,8 @@ def compare(network: Network, run: Evaluate, images: Iterable[np.ndarray], *, us
             # a rounding that falls the other way moves a value by a step
             size = np.full_like(size, _STEPPED * max(1.0 if usual else 0.0, size.max()))
         difference = np.abs(expected - computed)
-        if (difference <= _DIFFERENCE * np.maximum(size, 1.0 if usual else 0.0)).all():
+        alike = difference <= _DIFFERENCE * np.maximum(size, 1.0 if usual else 0.0)
+        if alike.all():
             continue
         if not usual and any(isinstance(node.layer, Variance) for node in network.nodes):
             # of features that are all alike programs find variances that differ by much, and bounds charge that
@@ -81,8 +82,7 @@ def compare(network: Network, run: Evaluate, images: Iterable[np.ndarray], *, us
         if _within(network, image, expected):
             continue
         rounded = _rounded(network, image)
-        wrong = ~(difference <= _ROUNDED * rounded + (0.0 if usual else _STRANGE)) & np.isfinite(rounded)
-        wrong &= ~(difference <= _DIFFERENCE * np.maximum(size, 1.0 if usual else 0.0))
+        wrong = ~(alike | (difference <= _ROUNDED * rounded + (0.0 if usual else _STRANGE))) & np.isfinite(rounded)
         if wrong.any():
             raise InputError(
                 f"computes something else when run: outputs differ by {difference[wrong].max():.3g}",
