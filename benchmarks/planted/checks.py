@@ -73,6 +73,22 @@ CHECKS = (
         "test_check.py::test_a_file_with_another_digest_is_refused",
     ),
     Fault(
+        "checker: figures may be others than those of the bounds",
+        _RESULTS,
+        "structure",
+        "abs(gap - (entry[name] or 0.0)) <= 1e-6 + 1e-5 * gap",
+        "abs(gap) >= 0.0",
+        "test_check.py::test_figures_that_are_not_the_bounds_are_refuted",
+    ),
+    Fault(
+        "checker: rendered pictures may lie outside of the bounds",
+        _RESULTS,
+        "structure",
+        '(a["witness_upper"] <= a["upper"])',
+        '(a["upper"] <= a["upper"])',
+        "test_check.py::test_figures_that_are_not_the_bounds_are_refuted",
+    ),
+    Fault(
         "checker: linear sets are not looked at",
         _PICTURES,
         "ClaimedBounds.excess",

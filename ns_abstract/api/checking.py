@@ -34,6 +34,7 @@ class Audit:
         structure: What is wrong with the cells; empty: they tile every set, every pixel is bounded, counts are right.
         seconds, median_seconds: Of all claims, and of one.
         picture: What all proved claims hold of: "real numbers", or "every float32 evaluation".
+        unclaimed: Numbers of frames of which nothing is claimed: they are missing, or their cells do not cover the set.
     """
 
     claims: int = 0
@@ -47,6 +48,7 @@ class Audit:
     seconds: float = 0.0
     median_seconds: float = 0.0
     picture: str = "real numbers"
+    unclaimed: list[int] = field(default_factory=list)
 
     @property
     def exit_code(self) -> int:
@@ -125,8 +127,8 @@ def _audited(
     begin = time.monotonic()
     finished, spent = [], []
     try:
-        wrong, subjects = opened(folder, moved)
-        audit = Audit(structure=wrong)
+        wrong, subjects, silent = opened(folder, moved)
+        audit = Audit(structure=wrong, unclaimed=silent)
         start = time.monotonic()
         for outcome in outcomes(subjects, 0 if wrong else claims, begin + seconds - start, seed):
             finished.append(outcome)

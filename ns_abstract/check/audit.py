@@ -31,9 +31,10 @@ class ClaimOutcome(NamedTuple):
     found: dict[str, Any]
 
 
-def opened(folder: Path, moved: dict[str, Path | None]) -> tuple[list[str], list[Claims]]:
+def opened(folder: Path, moved: dict[str, Path | None]) -> tuple[list[str], list[Claims], list[int]]:
     """What is wrong (cells that tile no set, pixels without bounds, figures that do not fit), and a result's claims.
 
+    The third are frames of which nothing is claimed: those that are missing, or whose cells do not cover the set.
     ``moved`` says by the name of a setting where a file lies that has been moved since.
 
     Raises:
@@ -46,7 +47,8 @@ def opened(folder: Path, moved: dict[str, Path | None]) -> tuple[list[str], list
         wrong += [] if not parts or parts[0].verdicts is None else _together(report, parts)
         if not subjects and not wrong:
             raise BadInput("claims nothing: no cell has a result or verdict", name, fix="finish it: --resume")
-    return wrong, subjects
+        indices = [] if report.get("kind") == "loop" else [f["index"] for f in report["frames"]]
+    return wrong, subjects, sorted({*indices}.difference(c.index for c in parts))
 
 
 def _together(report: dict[str, Any], parts: list[StoredCells]) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from abc import ABC, abstractmethod
 from typing import Any, NamedTuple
@@ -145,8 +146,5 @@ def _divided(low: Array, high: Array, motion: Array, full: Array) -> list[tuple[
     if not (width > 0.0).any():
         return [(low, high)]
     axis, count = int(np.argmax(weight)), 4 if len(width) == 1 else 2
-    ends = np.linspace(low[axis], high[axis], count + 1)
-    parts = [(low.copy(), high.copy()) for _ in range(count)]
-    for (bottom, top), a, b in zip(parts, ends[:-1], ends[1:], strict=True):
-        bottom[axis], top[axis] = a, b
-    return parts
+    ends, cut = np.linspace(low[axis], high[axis], count + 1), np.arange(len(low)) == axis
+    return [(np.where(cut, a, low), np.where(cut, b, high)) for a, b in itertools.pairwise(ends)]

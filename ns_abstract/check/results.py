@@ -22,7 +22,7 @@ Array = Any
 _MOST, _ROWS = 32 << 30, 10_000_000
 #: Arrays of a frame file, and their types.
 _KINDS = {"tile": "<i4", "box_lower": "<f8", "box_upper": "<f8"}
-_KINDS |= dict.fromkeys(("lower", "upper", "b_lower", "b_upper", "A_lower", "A_upper"), "<f4")
+_KINDS |= {f"{of}{side}": "<f4" for of in ("", "witness_", "b_", "A_") for side in ("lower", "upper")}
 _AGAIN, _BOX = "make the result again", ("name", "lower", "upper")
 _WHERE = "give the output folder of ns-abstract-render, ns-abstract-certify or ns-abstract-reach"
 
@@ -48,8 +48,6 @@ class StoredCells:
 
 def read_report(folder: Path) -> dict[str, Any]:
     """The report of a finished result."""
-    if not folder.is_dir():
-        raise BadInput("no such folder", folder, fix=_WHERE)
     file = folder / "report.json"
     report = read_json(file, "report", _WHERE)
     if report.get("version") != 1:
@@ -76,11 +74,12 @@ def read_cells(folder: Path, name: str, index: int, digest: object) -> StoredCel
             if "box_lower" not in archive:
                 raise BadInput("keeps no cells", file, fix="run ns-abstract-render with --save-cells")
             arrays, table = {key: archive[key] for key in _KINDS}, archive["parameters"]
-        (n, d), (h, w, _), side = arrays["box_lower"].shape, arrays["lower"].shape, arrays["b_lower"].shape[1]
-        shapes = {"": (h, w, 3), "tile": (n, 2), "box": (n, d), "b": (n, side, side, 3), "A": (n, side, side, 3, d)}
+        (n, d), picture, side = arrays["box_lower"].shape, arrays["lower"].shape, arrays["b_lower"].shape[1]
+        shapes = {"": picture, "witness": picture, "tile": (n, 2), "box": (n, d)}
+        shapes |= {"b": (n, side, side, 3), "A": (n, side, side, 3, d)}
         for key, array in arrays.items():
             shape, kind = shapes[key if key == "tile" else key.rpartition("_")[0]], np.dtype(_KINDS[key])
-            if array.shape != shape or array.dtype != kind:
+            if array.shape != shape or array.dtype != kind or picture[2:] != (3,):
                 raise BadInput(f"{key} is not {kind} {list(shape)}", file, fix=_AGAIN)
             if not np.isfinite(array).all():
                 raise BadInput("holds numbers that are not finite", file, fix=_AGAIN)
@@ -120,9 +119,8 @@ def read_verdicts(folder: Path, report: dict[str, Any]) -> list[StoredCells]:
             boxes = np.array([entry[0] for entry in entries], np.float64)
             if boxes.shape != (len(entries), 2, len(names)) or not np.isfinite(boxes).all():
                 raise ValueError
-            arrays = {"box_lower": boxes[:, 0], "box_upper": boxes[:, 1]}
-            verdicts = [entry[1:] for entry in entries]
-            cells.append(StoredCells(index, tuple(names), np.array(first), np.array(last), arrays, verdicts))
+            arrays, found = {"box_lower": boxes[:, 0], "box_upper": boxes[:, 1]}, [entry[1:] for entry in entries]
+            cells.append(StoredCells(index, tuple(names), np.array(first), np.array(last), arrays, found))
     return cells
 
 
@@ -140,6 +138,15 @@ def structure(cells: StoredCells, report: dict[str, Any]) -> list[str]:
     (height, width, _), side = a["lower"].shape, a["b_lower"].shape[1]
     if not (a["lower"] <= a["upper"]).all():
         wrong.append("a lower bound exceeds the upper bound")
+    if not ((a["lower"] <= a["witness_lower"]) & (a["witness_upper"] <= a["upper"])).all():
+        wrong.append("a picture that was rendered lies outside of the bounds")
+    entry = next(f for f in report["frames"] if f["index"] == cells.index)
+    gaps = [np.linalg.norm(a[f"{k}upper"] - a[f"{k}lower"], axis=-1).mean(dtype=float) for k in ("", "witness_")]
+    # there is no ratio where no picture differs
+    gaps.append(entry["mpg"] / (entry["mpg_witness"] or np.inf))
+    for name, gap in zip(("mpg", "mpg_witness", "ratio"), gaps, strict=True):
+        if not abs(gap - (entry[name] or 0.0)) <= 1e-6 + 1e-5 * gap:
+            wrong.append(f"{name} is {gap:.9g}, the report says {entry[name]}")
     places = {(r, c) for r in range(0, height, side) for c in range(0, width, side)}
     if set(map(tuple, a["tile"].tolist())) != places:
         wrong.append("the cells' tiles are not those of the picture")

@@ -109,9 +109,8 @@ def of_class(scene: Any, poses: Poses, report: dict[str, Any], model: Path) -> B
     if about.get("type") != "classification":
         raise BadInput(f"{about.get('type')!r} is a property that this program does not check", model, "type")
     seeing, label = SeeingNetwork(scene, report, model, about), int(about["label"])
-    camera, rows = resized(poses.camera, seeing.shape), -np.eye(int(report["model"]["output"][-1]))
-    rows[:, label] += 1.0
-    rivals = np.delete(rows, label, axis=0)
+    camera, unit_rows = resized(poses.camera, seeing.shape), np.eye(int(report["model"]["output"][-1]))
+    rivals = np.delete(unit_rows[label] - unit_rows, label, axis=0)
 
     def bounds(low: Array, high: Array, unit: float) -> tuple[Array, Array]:
         least, most = seeing.outputs(camera, poses.view(low, high), unit, rivals).range()
