@@ -30,8 +30,9 @@ class ClaimedBounds(NamedTuple):
         half, found = np.maximum(high - middle, middle - low), []
         for sign, flat, (slope, height) in zip((1.0, -1.0), self.flat, self.planes, strict=True):
             value = height + ((middle - 0.5 * (self.low + self.high)) / span) @ slope
-            # nothing is rounded where nothing moves
-            room = 1e-13 * np.abs(slope).sum() + np.any(slope) * 2.0 * U * np.abs(value)
+            # middles are off by U times the parameters, the rest by less than 32 roundings; nothing where nothing moves
+            off = 4.0 * U * (np.abs(self.low) + np.abs(self.high)) / span + 32.0 * U
+            room = np.abs(slope) @ off + np.any(slope) * 2.0 * U * np.abs(value)
             plane = Affine(value, slope[:, None] * (half / span).T, room)
             for bound in (plane, Affine.constant(flat, plane)):
                 # of upper bounds everything is negated: values lie in [-1, 0]

@@ -119,8 +119,8 @@ def read_verdicts(folder: Path, report: dict[str, Any]) -> list[StoredCells]:
             boxes = np.array([entry[0] for entry in entries], np.float64)
             if boxes.shape != (len(entries), 2, len(names)) or not np.isfinite(boxes).all():
                 raise ValueError
-            arrays, found = {"box_lower": boxes[:, 0], "box_upper": boxes[:, 1]}, [entry[1:] for entry in entries]
-            cells.append(StoredCells(index, tuple(names), np.array(first), np.array(last), arrays, found))
+            arrays, verdicts = {"box_lower": boxes[:, 0], "box_upper": boxes[:, 1]}, [entry[1:] for entry in entries]
+            cells.append(StoredCells(index, tuple(names), np.array(first), np.array(last), arrays, verdicts))
     return cells
 
 
