@@ -427,7 +427,7 @@ from pathlib import Path
 import numpy as np, torch
 from onnx_files import image_sets
 from ns_abstract.verify.network import bound_outputs, load_network, cost_model, work_budget
-from ns_abstract.verify.network.explain import estimate
+from ns_abstract.verify.network.explain import cell_bytes
 torch.set_num_threads(1)
 cost_model._DEEP = cost_model._OVER = 0.0
 
@@ -445,7 +445,7 @@ cost_model.PLANNED_PRODUCTS = work_budget.PLANNED_PRODUCTS = float(sys.argv[3])
 before = peak("VmRSS")
 Path("/proc/self/clear_refs").write_text("5")
 found = bound_outputs(network, images, rows, np.zeros(3), memory=int(sys.argv[2]), arithmetic="real")
-print(peak("VmHWM") - before, estimate(network, 2)[0], np.isfinite(found.lower).all())
+print(peak("VmHWM") - before, cell_bytes(network, 2), np.isfinite(found.lower).all())
 """
 
 

@@ -15,7 +15,7 @@ from onnx_files import OnnxFile, image_sets, session
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import bound_outputs, load_network
-from ns_abstract.verify.network.explain import check_cell
+from ns_abstract.verify.network.explain import check_cell, measured, moving_picture
 
 SHAPE = (2, 4, 4)
 
@@ -207,6 +207,22 @@ def test_a_network_is_explained_before_any_work(
     text = capsys.readouterr().out
     assert end.value.code == 0
     assert "Convolution" in text and "LeakyRelu" in text and "GiB" in text and "Conv_v0" in text
+    widths = [float(line.split()[-1]) for line in text.splitlines() if line.startswith("  values move by")]
+    assert len(widths) == 3 and 0.0 < widths[0] < widths[1] < widths[2]
+
+
+@pytest.mark.parametrize("dimensions", [0, 1, 5])
+def test_times_are_of_a_picture_that_moves_as_is_said(dimensions: int) -> None:
+    images = moving_picture(SHAPE, dimensions, 0.01)
+    assert images.dimensions == dimensions
+    assert np.allclose(images.upper - images.b_upper, np.abs(images.a_upper).sum(-1), rtol=0.0, atol=1e-15)
+    half = 0.5 * (images.upper - images.lower)
+    assert 0.005 < half.max() <= 0.0106 and images.lower.min() >= 0.0 and images.upper.max() <= 1.0
+
+
+def test_cells_that_take_too_long_are_given_up(tmp_path: Path) -> None:
+    network = load_network(small().write(tmp_path / "net.onnx"))
+    assert list(measured(network, 2, seconds=0.0)) == ["  values move by 0.001: not bounded within 0 s"]
 
 
 @pytest.mark.slow

@@ -90,7 +90,7 @@ class Certify(_PathCommand):
     report.json, report.html and the images of counterexamples. Exit codes: 0 done, whatever the verdict;
     2 bad input; 3 interrupted, or the time budget ended before every frame had a result.
 
-    --model NET --explain alone prints the network's layers, and memory and time of a cell, and does nothing else.
+    --model NET --explain alone prints the network's layers, memory of a cell and times that it measures, and ends.
     """
 
     property: Path

@@ -38,8 +38,6 @@ ALLOWED_PRODUCTS = 5e12
 PLANNED_PRODUCTS = 1.5e13
 #: Where rows for all numbers take so many times more than is allowed, they end by plan.
 _OVER = 1.5
-#: Layers that forms pass well, as a rule.
-_TIGHT = 4
 #: Plans that are compared at first, and to either side of one made before; in the first of them rows for all numbers
 #: cost so much (a logarithm of widths). By how much rows have to be the better.
 _STEPS, _LIKE, _DEAREST, _CLOSE = 64, 6, 2.0**18, 0.1
@@ -51,8 +49,8 @@ _ACTIVE = 0.5
 _FINE = 1e-4
 #: What an activation adds to bounds of its input relative to these and to numbers' sizes, and rows of themselves.
 _BENDS, _ROUNDS = 0.1, 5e-5
-#: How loose an image's form is taken to be where nothing is known; past the other nothing is foreseen.
-_USUAL, _HUGE = 1e-8, 1e100
+#: Width past which nothing is foreseen.
+_HUGE = 1e100
 #: Width of bounds, as a part of numbers, past which nothing is worth any rows if it is foreseen.
 HOPELESS_WIDTH = 1e3
 #: Numbers of a node that ways are tried with.
@@ -111,20 +109,6 @@ class RefinementPlan(NamedTuple):
     widest: float
     rate: float
     step: int
-
-
-class CostEstimate(NamedTuple):
-    """The estimated cost of a cell's backward passes.
-
-    Attributes:
-        products: Of all rows.
-        neurons: How many numbers are bounded by rows that end by plan.
-        given_up: Whether rows are given up before the end.
-    """
-
-    products: float
-    neurons: float
-    given_up: bool
 
 
 class CostModel:
@@ -361,25 +345,6 @@ class CostModel:
     def planned(self) -> bool:
         """Whether rows for all numbers cost so much that each is passed back as far as it pays (N18)."""
         return self.total > max(_DEEP, _OVER * ALLOWED_PRODUCTS)
-
-    def foreseen(self, part: float, deep: float) -> CostEstimate:
-        """What rows of one cell will take (N13).
-
-        Args:
-            part, deep: Part of all numbers that are bounded by rows, in other networks and in deep ones.
-        """
-        if not self.deep:
-            return CostEstimate(part * self.total, 0.0, False)
-        if self.planned:
-            plan = self.plan(PLANNED_PRODUCTS, [_USUAL], 1.0)
-            if plan.widest > HOPELESS_WIDTH:
-                return CostEstimate(0.0, 0.0, True)
-            return CostEstimate(plan.products, sum(self.bounded[k] for k in plan.ways), False)
-        taken = [(index, deep * products) for index, products in self.nodes if self.network.depth[index] > _TIGHT]
-        share = min(1.0, ALLOWED_PRODUCTS / max(1.0, sum(products for _, products in taken)))
-        # where a sign is not all that is asked, numbers have two rows
-        phases = {node.inputs[0] for node in self.network.nodes if isinstance(node.layer, LeakyRelu)}
-        return CostEstimate(share * sum(n if k in phases else 2.0 * n for k, n in taken), 0.0, False)
 
 
 def log_or_least(value: float) -> float:

@@ -1,14 +1,22 @@
-"""Describe a network's layers and estimate the cost of a cell before anything is bounded."""
+"""Describe a network's layers, the memory of a cell, and its time, which is measured on cells of a made-up picture."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import time
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass
 
 import numpy as np
+import torch
 
+from ns_abstract.execution.cancellation import Deadline, WorkCancelledError
 from ns_abstract.io.errors import InputError
+from ns_abstract.verify.network.bounds import bound_outputs
+from ns_abstract.verify.network.coefficients import grid
 from ns_abstract.verify.network.cost_model import cost_model_of
 from ns_abstract.verify.network.graph import Network, item
+from ns_abstract.verify.network.image_sets import ImageSets
 from ns_abstract.verify.network.layers import Convolution, LinearLayer, Matrix
 from ns_abstract.verify.network.sparse_layers import SparseMatrix, TransposedConvolution
 
@@ -16,15 +24,28 @@ from ns_abstract.verify.network.sparse_layers import SparseMatrix, TransposedCon
 _NUMBERS = 8
 #: Bytes of rows under way and of weights in other orders: of a network whose rows are few, and of a deep one.
 _FEW_ROWS, _MANY_ROWS = 128 << 20, 420 << 20
-#: Products a second of one core: of forms in float64, and of rows in float32, few at a time, many, and many that end
-#: by plan; measured.
-_FORMS_SPEED, _FEW_SPEED, _MANY_SPEED, _PLANNED_SPEED = 1.5e9, 1.2e9, 3e10, 7e10
-#: Seconds that a layer takes however small it is, the network's bounds of one cell by themselves; measured.
-_LAYER_EACH = 2.5e-3
-#: Seconds that the two rows of a number take besides where they end by plan: most are short; measured.
-_PLANNED_EACH = 3.2e-5
-#: Part of all units that rows are passed back for, in sets that are worth a proof; of a deep network most.
-_OPEN, _DEEP_OPEN = 0.1, 0.4
+
+
+@dataclass(frozen=True)
+class MeasurementTuning:
+    """How the time of a cell is measured.
+
+    Attributes:
+        motions: By how much the values of a picture move in the cells, at most; values are in [0, 1].
+        rest: What a picture is known to be, beside the motion, as a part of it: about as in cells of splats.
+        seconds: Time for all of them.
+        brief: Seconds up to which a cell is bounded again: the first time loads kernels.
+        rows: Outputs that are bounded at most.
+    """
+
+    motions: tuple[float, ...] = (0.001, 0.01, 0.1)
+    rest: float = 0.05
+    seconds: float = 60.0
+    brief: float = 2.0
+    rows: int = 100
+
+
+_TUNING = MeasurementTuning()
 
 
 def multiplications(network: Network, index: int) -> float:
@@ -42,24 +63,10 @@ def multiplications(network: Network, index: int) -> float:
     return size
 
 
-def least_seconds(network: Network, dimensions: int) -> float:
-    """Return the seconds (roughly) that a cell takes one core where no rows are passed back for units."""
-    count = len(network.nodes)
-    forwards = 2.0 * sum(multiplications(network, k) for k in range(1, count + 1)) * (1 + dimensions)
-    return forwards / _FORMS_SPEED + _LAYER_EACH * count
-
-
-def estimate(network: Network, dimensions: int) -> tuple[float, float, bool]:
-    """Return a cell's bytes, seconds on one core (roughly), and whether backward passes are skipped."""
-    count = len(network.nodes)
-    sizes = [float(np.prod(network.shape(k))) for k in range(count + 1)]
-    costs = cost_model_of(network)
-    foreseen = costs.foreseen(_OPEN, _DEEP_OPEN)
-    many = costs.deep and not foreseen.given_up
-    memory = sum(sizes) * 8 * (3 * dimensions + _NUMBERS) + (_MANY_ROWS if many else _FEW_ROWS)
-    speed = _PLANNED_SPEED if costs.planned else _MANY_SPEED if costs.deep else _FEW_SPEED
-    seconds = least_seconds(network, dimensions) + foreseen.products / speed + _PLANNED_EACH * foreseen.neurons
-    return memory, seconds, foreseen.given_up
+def cell_bytes(network: Network, dimensions: int) -> float:
+    """Return the bytes that one cell in so many parameters takes, about."""
+    sizes = [float(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1)]
+    return sum(sizes) * 8 * (3 * dimensions + _NUMBERS) + (_MANY_ROWS if cost_model_of(network).deep else _FEW_ROWS)
 
 
 def check_cell(
@@ -72,7 +79,7 @@ def check_cell(
     Raises:
         InputError: It does, about.
     """
-    needed, _, _ = estimate(network, dimensions)
+    needed = cell_bytes(network, dimensions)
     if needed > allowed:
         raise InputError(
             f"needs about {needed / 2**30:.1f} GiB for a cell in {dimensions} parameters "
@@ -82,27 +89,62 @@ def check_cell(
         )
 
 
-def explain(network: Network, dimensions: int = 2) -> Sequence[str]:
-    """Return lines of text: every layer with its size, and the estimated memory and time of one cell."""
-    lines = [f"{network.source}: {item(network.input_shape)} -> {item(network.output_shape)}"]
+def moving_picture(shape: tuple[int, ...], dimensions: int, motion: float) -> ImageSets:
+    """One cell of a smooth picture of ``shape`` that moves along smooth directions, values by ``motion`` at most."""
+    channels, height, width = grid(shape)
+    channel, y, x = np.meshgrid(
+        np.arange(channels), np.linspace(0.0, 1.0, height), np.linspace(0.0, 1.0, width), indexing="ij"
+    )
+    middle = (0.5 + 0.3 * np.sin(6.0 * x + channel) * np.cos(5.0 * y)).reshape(1, -1)
+    along = [np.sin((k + 2.0) * (x + (k % 3) * y) + channel).reshape(1, -1) for k in range(dimensions)]
+    slopes = np.stack(along, axis=-1) * (motion / dimensions) if along else np.zeros((1, middle.size, 0))
+    room = np.full(middle.shape, motion * (_TUNING.rest if along else 1.0))
+    reach = np.abs(slopes).sum(-1) + room
+    return ImageSets(slopes, middle - room, slopes, middle + room, middle - reach, middle + reach)
+
+
+def measured(network: Network, dimensions: int, seconds: float = _TUNING.seconds) -> Iterator[str]:
+    """Yield lines of text: what cells of a moving picture took, and how wide the bounds of the outputs are there.
+
+    After ``seconds`` the cell that is worked on is given up, and wider ones are not begun.
+    """
+    count = min(network.output_size, 1 + _TUNING.rows)
+    rows = np.eye(count, network.output_size)
+    rows = np.concatenate([rows, -rows])
+    deadline, threads = Deadline(seconds), torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        for motion in _TUNING.motions:
+            images, took = moving_picture(network.input_shape, dimensions, motion), None
+            with suppress(WorkCancelledError), deadline.enforced():
+                for _ in range(2):
+                    begin = time.perf_counter()
+                    low = bound_outputs(network, images, rows, np.zeros(len(rows))).lower[0]
+                    took = min(time.perf_counter() - begin, np.inf if took is None else took)
+                    if took > _TUNING.brief:
+                        break
+            if took is None:
+                yield f"  values move by {motion:g}: not bounded within {seconds:g} s"
+                return
+            width = float((-low[:count] - low[count:]).max())
+            yield f"  values move by {motion:g}: {took:.2g} s, outputs are bounded within {width:.3g}"
+    finally:
+        torch.set_num_threads(threads)
+
+
+def explain(network: Network, dimensions: int = 2) -> Iterator[str]:
+    """Yield lines of text: every layer with its size, the memory of one cell, and the time of cells (`measured`)."""
+    yield f"{network.source}: {item(network.input_shape)} -> {item(network.output_shape)}"
     for k, node in enumerate(network.nodes, 1):
         kind = type(node.layer).__name__
         kind = "Reshape" if type(node.layer) is LinearLayer else kind
         inputs = ", ".join(map(str, node.inputs))
-        lines.append(f"{k:5d}  {kind:22s} {item(node.layer.shape):>14s}  of {inputs:12s} {node.op} {node.name}")
+        yield f"{k:5d}  {kind:22s} {item(node.layer.shape):>14s}  of {inputs:12s} {node.op} {node.name}"
     work = sum(multiplications(network, k) for k in range(1, len(network.nodes) + 1))
-    memory, seconds, given_up = estimate(network, dimensions)
-    lines.append(f"{len(network.nodes)} layers, {network.neuron_count:,} numbers, {work:,.0f} products an evaluation")
-    lines.append(
-        f"one cell in {dimensions} parameters: about {memory / 2**30:.2f} GiB, and for the network, of one core, "
-        f"{least_seconds(network, dimensions):.2g} s where hardly a unit is unstable, {seconds:.2g} s where one of "
-        f"{1 / _OPEN:.0f} is"
-    )
-    if given_up:
-        lines.append("deep: rows for its units cost more than they may, so they are given up and bounds are wide")
-    elif cost_model_of(network).planned:
-        lines.append(
-            "deep: rows end on the way; of sets for which that leaves nothing known they are given up after seconds"
-        )
-    lines += [line if line.startswith("not covered") else f"covered: {line}" for line in network.guarantee()]
-    return lines
+    yield f"{len(network.nodes)} layers, {network.neuron_count:,} numbers, {work:,.0f} products an evaluation"
+    memory = cell_bytes(network, dimensions) / 2**30
+    yield f"one cell in {dimensions} parameters: about {memory:.2f} GiB; one core, smooth pictures in [0, 1]:"
+    yield from measured(network, dimensions)
+    if cost_model_of(network).planned:
+        yield "deep: backward passes end on the way, where that leaves nothing known they are given up after seconds"
+    yield from (line if line.startswith("not covered") else f"covered: {line}" for line in network.guarantee())
