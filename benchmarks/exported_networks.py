@@ -441,6 +441,10 @@ NETWORKS: dict[str, tuple[Callable[[], nn.Module], int]] = {
 
 
 def export(name: str, exporter: str, file: Path) -> tuple[int, ...]:
+    from ns_abstract.nerfstudio.torchvision_operators import declare_missing
+
+    # torchvision and timm, and with dynamo the exporter itself, import torchvision's operators
+    declare_missing()
     torch.manual_seed(0)
     make, side = NETWORKS[name]
     module = make().eval()
