@@ -128,8 +128,8 @@ def test_video_shows_every_frame(call: Call, bounded: Path, tmp_path: Path) -> N
         assert np.abs(picture[:, :32] / 255.0 - result.image).mean() < 0.05
 
 
-def test_odd_sizes_and_missing_bounds(bounded: Path, tmp_path: Path, call: Call) -> None:  # noqa: F811
-    pytest.importorskip("av", reason="needs the extra video")
+def test_frames_of_odd_size_and_without_bounds_are_filmed(bounded: Path, tmp_path: Path, call: Call) -> None:  # noqa: F811
+    av = pytest.importorskip("av", reason="needs the extra video")
     result = frames(bounded)[0]
     cut = {name: np.ascontiguousarray(getattr(result, name)[:31, :29]) for name in IMAGES}
     cut["lower"], cut["upper"] = np.zeros_like(cut["lower"]), np.ones_like(cut["upper"])
@@ -141,6 +141,10 @@ def test_odd_sizes_and_missing_bounds(bounded: Path, tmp_path: Path, call: Call)
     )
     code, said = run(call, "mp4", "--input-dir", tmp_path, "--output-filename", tmp_path / "a.mp4")
     assert code == 0 and "no bounds but [0, 1] in frames 0" in said
+    with av.open(str(tmp_path / "a.mp4")) as film:
+        stream = film.streams.video[0]
+        # even, as the codec wants it, and no picture is cut
+        assert stream.height % 2 == 0 and stream.height >= 31 and stream.width % 2 == 0 and stream.width >= 29
 
 
 @pytest.mark.parametrize("scene", [blob_scene(40, degree=3), blob_scene(7, degree=0)], ids=["degree 3", "degree 0"])
