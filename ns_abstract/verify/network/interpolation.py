@@ -6,10 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ns_abstract.arithmetic.network_charges import (
-    POLYNOMIAL,
-    POSITION,
-)
+from ns_abstract.arithmetic.network_charges import POLYNOMIAL, POSITION
 from ns_abstract.io.errors import InputError
 
 

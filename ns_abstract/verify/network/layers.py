@@ -21,12 +21,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ns_abstract.arithmetic.network_charges import (
-    AFFINE,
-    FLUSH,
-    FUNCTION_FLUSHES,
-    OWN_LINE,
-)
+from ns_abstract.arithmetic.network_charges import AFFINE, FLUSH, FUNCTION_FLUSHES, OWN_LINE
 from ns_abstract.verify.network.coefficients import Coefficients, add_gathered, full, grid, interleave, unflatten
 
 Shape = tuple[int, ...]
@@ -403,8 +398,6 @@ class Activation:
     """An elementwise activation; ``shape`` is that of one item."""
 
     shape: Shape
-    #: `function` in float64 is within this of the true one, beside roundings relative to its value.
-    room: ClassVar[float] = 0.0
 
     def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
         """How far a float32 evaluation may be from the function of a number between."""
@@ -412,7 +405,7 @@ class Activation:
 
     def missing(self, lower: Tensor, upper: Tensor) -> Tensor | float:
         """How far what the network computes, in real numbers, too, may be from `function`."""
-        return self.room
+        return 0.0
 
     def range(self, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
         """Least and greatest value; a monotone function's are those of the ends."""

@@ -13,9 +13,9 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import file_size, show
 from ns_abstract.verify.network.comparison import Evaluate, compare, levels, probes
 from ns_abstract.verify.network.graph import Network
-from ns_abstract.verify.network.onnx_file import read_onnx
-from ns_abstract.verify.network.onnx_graph import ReadRequest
-from ns_abstract.verify.network.onnx_tensors import PACKED, unpacked_model
+from ns_abstract.verify.network.onnx_graph import OnnxReader, ReadRequest, operator_set
+from ns_abstract.verify.network.onnx_rules import RULES
+from ns_abstract.verify.network.onnx_tensors import PACKED, parse_model, unpacked_model
 from ns_abstract.verify.network.subnormals import subnormals_kept
 
 #: Types of inputs beside float32.
@@ -60,6 +60,16 @@ def load_network(
         strange = itertools.chain(shown(network.input_shape), strange)
     compare(network, run, strange, usual=False)
     return network
+
+
+def read_onnx(path: Path, asked: ReadRequest | None = None) -> Network:
+    """The network in an ONNX file, up to the output that is asked for; nothing in it is executed.
+
+    Raises:
+        InputError: The file cannot be read, or uses what is not supported; names node, operator and attribute.
+    """
+    model = parse_model(path)
+    return OnnxReader(path, model.graph, operator_set(model, path), RULES, asked or ReadRequest()).network()
 
 
 def _instead(path: Path) -> str:

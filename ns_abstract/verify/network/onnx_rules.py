@@ -12,9 +12,7 @@ from ns_abstract.arithmetic.network_charges import LEAST_DIVISOR
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import activations
 from ns_abstract.verify.network.composite_layers import CompositeBuilder
-from ns_abstract.verify.network.onnx_arithmetic import (
-    ARITHMETIC_RULES,
-)
+from ns_abstract.verify.network.onnx_arithmetic import ARITHMETIC_RULES
 from ns_abstract.verify.network.onnx_graph import Attributes, OnnxReader, Rule
 from ns_abstract.verify.network.onnx_norms import NORM_RULES
 from ns_abstract.verify.network.onnx_quantised import dequantize, quantize

@@ -12,11 +12,7 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network.contractions import concatenated
 from ns_abstract.verify.network.graph import item
 from ns_abstract.verify.network.interpolation import interpolation
-from ns_abstract.verify.network.onnx_arithmetic import (
-    broadcast,
-    contraction_operand,
-    operand,
-)
+from ns_abstract.verify.network.onnx_arithmetic import broadcast, contraction_operand, operand
 from ns_abstract.verify.network.onnx_graph import Attributes, OnnxReader, Rule, TensorValue
 
 
