@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ns_abstract.geometry.box import Float64Array, ParameterBox
 from ns_abstract.verify.attack.violations import KEPT, STRATEGIES, Attack, Violation, _severity
+from ns_abstract.verify.margin_descent import descend
 
 #: Parameter values [d] to an image [H, W, 3].
 Render = Callable[[Float64Array], NDArray[np.floating]]
@@ -32,7 +33,6 @@ _CORNERS = 64
 # of the poses left after the given ones
 _SHARES = {"corners": 0.4, "random": 0.4, "ascent": 0.6}
 _ASCENT_STEPS = 16
-_FIRST_STEP = 0.25
 _LINE = 9
 _HALVINGS = 60
 
@@ -248,40 +248,15 @@ def _corners(box: ParameterBox, count: int, generator: np.random.Generator) -> F
 
 
 def _ascend(record: _ImageExtremes, twin: DifferentiableRender, target: _Target, start: Float64Array) -> Float64Array:
-    """Projected gradient ascent of one pixel channel, in parameters scaled to [-1, 1]^d.
-
-    Steps follow the normalised gradient; they double where the value grew and shrink to a quarter where not.
-    """
-    low = torch.tensor(record.box.lower, dtype=torch.float64)
-    high = torch.tensor(record.box.upper, dtype=torch.float64)
+    """The pose that projected gradient ascent of one pixel channel ends at."""
     pixel = torch.tensor([[target.row, target.column]])
 
-    def evaluate(scaled: torch.Tensor) -> tuple[float, torch.Tensor]:
-        scaled = scaled.detach().requires_grad_(True)
-        value = target.sign * twin(low + 0.5 * (scaled + 1.0) * (high - low), pixel)[0, target.channel]
+    def value(values: torch.Tensor) -> torch.Tensor:
         record.steps += 1
-        slope = torch.zeros_like(scaled)
-        if value.requires_grad:
-            (slope,) = torch.autograd.grad(value, scaled)
-        return float(value.detach()), slope
+        return -target.sign * twin(values, pixel)[0, target.channel]
 
-    span = high - low
-    scaled = (2.0 * (torch.from_numpy(start) - low) / span - 1.0).clamp(-1.0, 1.0)
-    best, slope = evaluate(scaled)
-    step = _FIRST_STEP
-    for _ in range(_ASCENT_STEPS):
-        # directions that leave the box are no use
-        free = torch.where(((scaled >= 1.0) & (slope > 0)) | ((scaled <= -1.0) & (slope < 0)), 0.0, slope)
-        length = float(free.norm())
-        if not (0.0 < length < np.inf) or time.perf_counter() >= record.deadline:
-            break
-        trial = (scaled + step * free / length).clamp(-1.0, 1.0)
-        value, trial_slope = evaluate(trial)
-        if value > best:
-            scaled, best, slope, step = trial, value, trial_slope, min(2.0 * step, 1.0)
-        else:
-            step *= 0.25
-    return record.box.at(scaled.numpy())
+    end = descend(record.box, start, value, _ASCENT_STEPS, lambda _: time.perf_counter() >= record.deadline)
+    return start if end is None else end
 
 
 def _jump(record: _ImageExtremes, probe: RenderPixels | None, target: _Target, generator: np.random.Generator) -> None:

@@ -147,7 +147,7 @@ def concatenated(b: CompositeBuilder, parts: Sequence[Operand], axis: int) -> tu
         if isinstance(value, int):
             index = np.full(whole, -1, np.int64)
             index[place] = b.positions(value).reshape(shape)
-            moving.append(b.rearranged(value, index.reshape(after)))
+            moving.append(b.gather(value, index.reshape(after)))
         else:
             offset[place] = value
     if not np.isfinite(offset).all():

@@ -214,7 +214,7 @@ class ElementwiseBuilder(NetworkBuilder):
             raise InputError(f"shapes {item(before)} and {item(shape)} do not fit") from None
         if int(np.prod(before)) == int(np.prod(shape)):
             return self.reshape(x, tuple(shape))
-        return self._gather(x, index, 0.0)
+        return self.gather(x, index)
 
     def common(self, *inputs: int) -> tuple[int, ...]:
         """The inputs, spread to one shape."""

@@ -94,7 +94,7 @@ _BY_ITEM = frozenset(
             "Pad",
             "Relu",
         ),
-        *("Reshape", "Resize", "Selu", "Sigmoid", "Softmax", "Softplus", "Sub", "Tanh", "Upsample"),
+        *("Relu", "Reshape", "Resize", "Selu", "Sigmoid", "Softmax", "Softplus", "Sub", "Tanh", "Upsample"),
     )
 )
 
