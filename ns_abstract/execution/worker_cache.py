@@ -75,8 +75,7 @@ def load(recipe: Recipe[F]) -> F:
     """Return the object of the recipe, loaded once in this process.
 
     Raises:
-        InputError: This process runs another version of the package than the one that asks, or reads other files
-            under the same names.
+        InputError: This process runs another version than the one that asks, or reads other files under the same names.
     """
 
     def make() -> F:

@@ -1,8 +1,7 @@
 """The affine version of the paper's rules: forms with their ranges.
 
-An `Enclosure` is a `FormArray` together with an `Interval` that holds the same quantity. Each
-operation is carried out on both, and each narrows the other: the range never exceeds what interval
-arithmetic gives, and a form that says less than its range is replaced by it.
+An `Enclosure` is a `FormArray` together with an `Interval` that holds the same quantity. Each operation is carried out
+on both, and each narrows the other.
 """
 
 from __future__ import annotations
@@ -43,11 +42,7 @@ def _merge(mask: BoolArray, first: FormArray, second: FormArray) -> FormArray:
 class Enclosure:
     """An array of quantities over a box ``p in [-1, 1]^d``, as forms and as intervals at once.
 
-    Attributes:
-        range: Intervals that hold it over the whole box, never wider than the forms' bounds.
-
-    Args:
-        range_: What else is known of the values over the whole box.
+    ``range``, never wider than the forms' bounds, holds them over the whole box; ``range_`` is what else is known.
     """
 
     __array_ufunc__ = None

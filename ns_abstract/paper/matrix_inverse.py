@@ -16,11 +16,9 @@ Norm = Literal["frobenius", "spectral"]
 
 
 def matrix_norm(x: Interval, norm: Norm) -> Float64Array | np.float64:
-    """Upper bound of a submultiplicative norm that is at least the largest entry.
+    """Upper bound of a submultiplicative norm of a matrix [n, m] that is at least the largest entry.
 
-    Args:
-        x: Matrix [n, m].
-        norm: "frobenius", or "spectral", bounded by ``sqrt(|x|_1 |x|_inf)``.
+    "spectral" is bounded by ``sqrt(|x|_1 |x|_inf)``.
     """
     if norm == "frobenius":
         return x.norm().upper

@@ -261,11 +261,7 @@ KEYS = {
 
 
 def matrix(value: Any, name: str, rows: int, columns: int | None, fail: Fail) -> Float64:
-    """A [rows, columns] matrix of moderate numbers; ``columns`` None: as many as the first row has.
-
-    Raises:
-        InputError: Of ``fail``.
-    """
+    """A [rows, columns] matrix of moderate numbers, or the error of ``fail``; ``columns`` None: the first row's."""
     if columns is None and isinstance(value, list) and value and isinstance(value[0], list):
         columns = len(value[0])
     good = isinstance(value, list) and len(value) == rows and columns is not None
@@ -279,33 +275,21 @@ def matrix(value: Any, name: str, rows: int, columns: int | None, fail: Fail) ->
 
 
 def numbers(value: Any, name: str, count: int, fail: Fail) -> Float64:
-    """[count] moderate numbers.
-
-    Raises:
-        InputError: Of ``fail``.
-    """
+    """[count] moderate numbers, or the error of ``fail``."""
     if not (isinstance(value, list) and len(value) == count and all(is_moderate(v) for v in value)):
         raise fail(name, f"found {show(value)}", f"write {count} numbers, each {FIX_MODERATE}")
     return np.array(value, np.float64)
 
 
 def number(value: Any, name: str, fail: Fail, *, positive: bool = False) -> float:
-    """One moderate number.
-
-    Raises:
-        InputError: Of ``fail``.
-    """
+    """One moderate number, or the error of ``fail``."""
     if not is_moderate(value) or (positive and not value > 0):
         raise fail(name, f"found {show(value)}", f"write a {'positive ' if positive else ''}number, {FIX_MODERATE}")
     return float(value)
 
 
 def named_file(value: Any, name: str, folder: Path, endings: str, fail: Fail) -> Path:
-    """The file beside LOOP.json that a field names.
-
-    Raises:
-        InputError: Of ``fail``; or the name leads out of the folder.
-    """
+    """The file beside LOOP.json that a field names, or the error of ``fail``."""
     if not isinstance(value, str) or not value:
         raise fail(name, f"found {show(value)}", f"name {endings} file beside this one")
     try:
@@ -315,10 +299,7 @@ def named_file(value: Any, name: str, folder: Path, endings: str, fail: Fail) ->
 
 
 def parse_dynamics(value: Any, states: int, dt: float, folder: Path, fail: Fail) -> Dynamics | LearnedDynamics:
-    """The object under the key ``dynamics``.
-
-    Args:
-        dt: Sampling time, seconds.
+    """The object under the key ``dynamics``; ``dt`` is the sampling time in seconds.
 
     Raises:
         InputError: A key is unknown, or a value cannot be used.

@@ -47,11 +47,7 @@ KEYS = (
 
 @dataclass(frozen=True)
 class HalfSpace:
-    """``normal . x - offset``, a function of the state that is above 0 on one side of a plane.
-
-    Attributes:
-        normal: [n].
-    """
+    """``normal . x - offset`` with normal [n], a function of the state that is above 0 on one side of a plane."""
 
     normal: tuple[float, ...]
     offset: float

@@ -45,11 +45,9 @@ class LoopPictures(Protocol):
 
 
 class Pictures:
-    """A scene's pictures.
+    """A scene's pictures at the ``poses`` that may be looked at, boxes of which are bounded.
 
-    Args:
-        poses: All poses that may be looked at; boxes of them are bounded.
-        response: The cameras that may show them; None: one that shows what is rendered.
+    ``response``: the cameras that may show them; None: one that shows what is rendered.
     """
 
     def __init__(self, method: Method, poses: PoseBox, response: CameraResponse | None = None) -> None:
@@ -76,11 +74,7 @@ class Pictures:
 
 @dataclass(frozen=True)
 class PropertyView:
-    """The pictures that one property of a loop is read off (L7).
-
-    Attributes:
-        pictures: Colours and the further planes that it reads.
-    """
+    """The pictures that a property is read off (L7), with the further planes that it reads behind the colours."""
 
     prop: PictureProperty
     pictures: LoopPictures

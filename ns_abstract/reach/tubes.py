@@ -341,11 +341,7 @@ class TubeBuilder:
         return values if off is None else values + off
 
     def tube(self, cell: ParameterBox, *, whole: bool = False) -> Tube:
-        """The tube of a cell of the initial box; it ends early where an unsafe set cannot be ruled out.
-
-        Args:
-            whole: Whether to go on although unsafe sets cannot be ruled out.
-        """
+        """The tube of a cell of the initial box; unless ``whole`` it ends where an unsafe set cannot be ruled out."""
         lower, upper = self.loop.initial(cell)
         state = AffineSet.box(lower, upper)
         # which generators are which parameters of the cell

@@ -30,11 +30,7 @@ from ns_abstract.refine.result import RenderedMaximum, greater
 
 @dataclass(frozen=True)
 class DifferenceTuning:
-    """What is looked at closer. None of the numbers decides whether a bound holds.
-
-    Attributes:
-        most_pixels: Pixels above the floor up to which a cell's orders are looked at.
-    """
+    """What is looked at closer, up to so many pixels above the floor. It does not decide whether a bound holds."""
 
     most_pixels: int = 64
 

@@ -1,10 +1,8 @@
 """Anytime two-sided refinement of one frame (design.md, R1-R4).
 
-The set is covered by cells. Every (cell, tile) pair is a leaf with an outer bound; real renders
-give an inner one. What the leaves of a tile leave open beyond the inner bound is the tile's excess,
-and the leaves with most of it are split until the ratio of outer to inner gap is reached or the
-time is over. The order of splits depends on bounds only, so the result after a given number of
-cells is the same on every machine and for every number of threads.
+The set is covered by cells. Every (cell, tile) pair is a leaf with an outer bound; real renders give an inner one. The
+leaves that leave most open beyond it are split until the ratio of outer to inner gap is reached or the time is over.
+The order of splits depends on bounds only, so the result after a number of cells is the same on every machine.
 """
 
 from __future__ import annotations
@@ -369,8 +367,7 @@ class Refinement:
 def groups(frame: Frame, count: int) -> list[np.ndarray]:
     """The frame's tiles in ``count`` parts of equal number, fewer where there are fewer tiles.
 
-    Runs of tiles, which show few scene elements each; where every ray is a tile of its own, every ``count``-th one,
-    so that the parts are alike.
+    Runs of tiles show few scene elements each; where every ray is a tile, every ``count``-th one makes parts alike.
     """
     count = max(1, min(count, frame.tile_count))
     everything = np.arange(frame.tile_count)

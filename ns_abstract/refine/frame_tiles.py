@@ -49,10 +49,7 @@ class FrameTiles:
 
     @property
     def by_pixel(self) -> bool:
-        """Whether cells may be split for some of their pixels only.
-
-        Linear sets are kept of all pixels, and nobody looks where layers are open.
-        """
+        """Whether cells may be split for some of their pixels only: not where linear sets or layers are kept."""
         return isinstance(self.frame, PartsFrame) and not self.keep_linear and self.frame.channels == COLORS
 
     def numbers(self, places: np.ndarray | None) -> np.ndarray:

@@ -19,11 +19,7 @@ from ns_abstract.refine.tuning import TUNING, Tuning
 
 
 class Partition(NamedTuple):
-    """Sub-boxes that cover the set, and the bounds of one, or of another sub-box, that was tried.
-
-    Attributes:
-        tried: What was tried.
-    """
+    """Sub-boxes that cover the set, and the bounds of the one, or another, that was ``tried``."""
 
     parts: list[SubBox]
     tried: SubBox

@@ -244,10 +244,7 @@ class LeafBounds:
         return np.concatenate(excess), owner
 
     def _open(self, t: int, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-        """[n, side, side] what leaves of tile t leave open beyond the inner bound, where that is not too little.
-
-        A pixel where a leaf has nothing open has nothing open in any part of it, then or later.
-        """
+        """[n, side, side] what leaves of tile t leave open beyond the inner bound, where that is not too little."""
         colors = np.s_[..., :COLORS]
         lower, upper = lower[colors], upper[colors]
         if self.earlier is not None:

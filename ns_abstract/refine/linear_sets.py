@@ -11,11 +11,7 @@ from ns_abstract.refine.result import Leaves
 
 
 class LeafSets:
-    """The linear sets of every (cell, tile) leaf.
-
-    Args:
-        tiles: What is bounded; nothing is kept unless its bounds carry linear sets.
-    """
+    """The linear sets of every (cell, tile) leaf of ``tiles``; nothing is kept unless its bounds carry them."""
 
     def __init__(self, tiles: FrameTiles) -> None:
         self.tiles, self.bytes = tiles, 0

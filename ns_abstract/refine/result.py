@@ -54,14 +54,9 @@ class TracePoint:
 class Leaves(ArrayRecord):
     """Linear sets of the leaf cells of one frame, one row per (cell, tile).
 
-    On a leaf's box, with its parameters scaled to ``p`` in [-1, 1]^d, every pixel and channel of
-    every image of the set lies in ``[A_lower p + b_lower, A_upper p + b_upper]``.
-
-    Attributes:
-        box_lower, box_upper: [L, d] ends of the leaf's box, in the parameters' units.
-        tile: [L, 2] first row and first column of the tile's pixels.
-        A_lower, A_upper: [L, side, side, 3, d] float32.
-        b_lower, b_upper: [L, side, side, 3] float32.
+    With the parameters of a leaf's box, ends [L, d], scaled to ``p`` in [-1, 1]^d, every pixel and channel of every
+    image of the set lies in ``[A_lower p + b_lower, A_upper p + b_upper]``, [L, side, side, 3, d] and [L, side, side,
+    3] float32. ``tile`` [L, 2] is the first row and column of the tile's pixels.
     """
 
     box_lower: Float64Array
@@ -104,12 +99,7 @@ EXTRA_OUTPUTS = ("depth", "accumulation")
 
 
 class RenderedMaximum(NamedTuple):
-    """The largest value of a rendered picture, and the pose that shows it.
-
-    Attributes:
-        value: Over all pixels and channels.
-        pose: [d] parameter values, in the parameters' units.
-    """
+    """The largest value of a rendered picture, over all pixels and channels, and the pose [d] that shows it."""
 
     value: float
     pose: tuple[float, ...]
@@ -122,12 +112,7 @@ def greater(*maxima: RenderedMaximum | None) -> RenderedMaximum | None:
 
 @dataclass(frozen=True, repr=False)
 class SampleImages(ArrayRecord):
-    """Concrete renders of some poses of a frame's set.
-
-    Attributes:
-        values: [n, d] parameter values, in the parameters' units.
-        images: [n, H, W, 3] float32; of a part of a frame [n, t, side, side, 3].
-    """
+    """Concrete renders [n, H, W, 3] float32 at parameter values [n, d]; of a part of a frame in tiles."""
 
     values: Float64Array
     images: Float32Array
@@ -210,9 +195,7 @@ _NOTHING = TracePoint(0.0, 0, math.sqrt(3.0), 0.0, 0.0)
 
 
 def joined(parts: Sequence[PartResult], camera: Any) -> FrameResult:
-    """Return the frame whose tiles are divided among ``parts``.
-
-    Its cells are those of all parts, its time is the longest of a part.
+    """Return the frame whose tiles are divided among ``parts``: cells are those of all, its time is the longest.
 
     Raises:
         ValueError: Parts of different frames, or a tile that is missing or there twice.
@@ -261,12 +244,7 @@ def joined(parts: Sequence[PartResult], camera: Any) -> FrameResult:
 
 
 def _whole_depth(depth: ExtraOutput, accumulation: ExtraOutput) -> ExtraOutput:
-    """The expected depth also where nothing is drawn: there it is the largest one of the picture (design.md, D4).
-
-    Args:
-        depth: [H, W] where anything is drawn; see `ns_abstract.refine.protocol.Frame`.
-        accumulation: [H, W].
-    """
+    """The expected depth [H, W] also where nothing is drawn: the largest one of the picture (design.md, D4)."""
     never, perhaps = depth.lower > depth.upper, ~(accumulation.lower > 0.0)
     # of every picture of the set, the largest depth lies between these
     most = np.where(never, 0.0, depth.upper).max(initial=0.0)

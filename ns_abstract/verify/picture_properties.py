@@ -74,11 +74,7 @@ class Leaf:
     cap: float = math.inf
 
     def measure(self, height: int, width: int) -> Measure:
-        """The measure of pictures of this size.
-
-        Raises:
-            InputError: A region does not lie in them, or has too few pixels.
-        """
+        """The measure of pictures of this size; InputError if a region does not lie in them or has too few pixels."""
         places = np.flatnonzero(self.region.pixels(height, width))
         minus = None if self.minus is None else np.flatnonzero(self.minus.pixels(height, width))
         rank: int | None = 1
@@ -200,11 +196,7 @@ class PictureProperty(Property):
         return MeasureModel(measures, places, COLORS + len(others))
 
     def limited(self, height: int, width: int) -> tuple[LimitedMeasure, ...]:
-        """The measures of pictures of this size with their limits, by leaf.
-
-        Raises:
-            InputError: A region does not lie in them.
-        """
+        """The measures of pictures of this size with their limits, by leaf; InputError as `measures`."""
         model = self.model(height, width)
         by_leaf = zip(model.measures, model.places, leaves(self.statement), strict=True)
         return tuple(
@@ -213,11 +205,7 @@ class PictureProperty(Property):
         )
 
     def measures(self, height: int, width: int) -> tuple[Measure, ...]:
-        """The measures of pictures of this size, by leaf.
-
-        Raises:
-            InputError: A region does not lie in them.
-        """
+        """The measures of pictures of this size, by leaf; InputError if a region does not lie in them."""
         return tuple(leaf.measure(height, width) for leaf in leaves(self.statement))
 
 
@@ -226,12 +214,9 @@ def _nearer(plane: Plane) -> bool:
 
 
 class MeasureModel:
-    """Measures of pictures, in the place of a network (`ns_abstract.verify.protocol.Model`).
+    """Measures of pictures, by leaf, in the place of a network (`ns_abstract.verify.protocol.Model`).
 
-    Args:
-        measures: By leaf.
-        places: By leaf, the first channel of its plane.
-        channels: Of the pictures.
+    ``places``: by leaf, the first channel of its plane, of the ``channels`` of the pictures.
     """
 
     def __init__(self, measures: Sequence[Measure], places: Sequence[int], channels: int) -> None:
@@ -433,10 +418,7 @@ def is_of_picture(root: Any) -> bool:
 def parse_picture_property(root: dict[str, Any], folder: Path, dataset_scale: float = 1.0) -> PictureProperty:
     """Return the property of the picture that a parsed PROP.json states; files that it names lie in ``folder``.
 
-    Args:
-        root: Content of the file.
-        folder: See above.
-        dataset_scale: Normalised units per unit of the data set.
+    ``dataset_scale``: normalised units per unit of the data set.
 
     Raises:
         InputError: A field cannot be used.

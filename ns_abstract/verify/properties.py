@@ -40,12 +40,7 @@ COMPONENTS = ("camera.x", "camera.y", "camera.z", "object.x", "object.y", "objec
 
 @dataclass(frozen=True)
 class Query:
-    """The linear functions ``rows @ y + offset`` of the outputs whose lower bounds a proof needs.
-
-    Attributes:
-        rows: [k, output_size].
-        offset: [k].
-    """
+    """The linear functions ``rows @ y + offset``, [k, output_size] and [k], whose lower bounds a proof needs."""
 
     rows: np.ndarray
     offset: np.ndarray
@@ -296,17 +291,15 @@ class Regression(Property):
 
 
 def decode(outputs: torch.Tensor, stride: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """The VOC TinyYOLO head, after Redmon and Farhadi's YOLOv2 (V4).
+    """The VOC TinyYOLO head, after Redmon and Farhadi's YOLOv2 (V4), of pictures with ``stride`` pixels by grid cell.
 
     Args:
-        outputs: [B, 125 g g]: channels of [125, g, g] are 5 objectness logits, 5 x 20 class logits and
-            5 x 4 numbers tx, ty, tw, th, each by anchor.
-        stride: Pixels by grid cell.
+        outputs: [B, 125 g g]: channels of [125, g, g] are 5 objectness logits, 5 x 20 class logits and 5 x 4 numbers
+            tx, ty, tw, th, each by anchor.
 
     Returns:
-        Objectness [B, 5, g, g], class probabilities [B, 5, 20, g, g], and boxes [B, 5, 4, g, g] as
-        x0, y0, x1, y1 in pixels: centres at ``(sigmoid(t) + cell) stride``, sides
-        ``anchor exp(t) stride``.
+        Objectness [B, 5, g, g], class probabilities [B, 5, 20, g, g], and boxes [B, 5, 4, g, g] x0, y0, x1, y1 in
+            pixels: centres at ``(sigmoid(t) + cell) stride``, sides ``anchor exp(t) stride``.
     """
     grid = math.isqrt(outputs.shape[1] // HEAD)
     head = outputs.reshape(-1, HEAD, grid, grid)

@@ -53,7 +53,6 @@ class VariationKind:
 
     Attributes:
         name: Key of a scene variation, of `KINDS`.
-        text, unit: For people.
         place: Parameters of where the scene as a whole stands, if these vary (`PoseBox.registered`).
     """
 
@@ -131,12 +130,7 @@ ProveCell = Callable[[float, int, ParameterBox], CellOutcome]
 
 @dataclass(frozen=True)
 class CertifiedBox:
-    """A certified cell.
-
-    Attributes:
-        margin: What was proved; cells with little of it come first.
-        part: Of all that is certified, by volume.
-    """
+    """A certified cell with its proved margin, and its part of all that is certified, by volume."""
 
     frame: int
     box: ParameterBox
@@ -245,9 +239,8 @@ def largest_radius(
 ) -> SceneMargin:
     """Return the largest radius, within a tenth, for which every cell is proved again (V13).
 
-    Args:
-        prove: Sound bounds and an attack of one cell.
-        over: Whether to end with what is known; asked about once a second.
+    ``prove``: sound bounds and an attack of one cell. ``over``: whether to end with what is known, asked about once a
+    second.
     """
     begin = time.perf_counter()
     margin = SceneMargin(kind, len(cells))
@@ -352,14 +345,7 @@ class _Bisection:
 
 
 def check_scenes(varied: bool, rays: bool) -> None:
-    """Raise InputError where a scene margin is not defined.
-
-    Args:
-        varied: Whether the sets hold several scenes already.
-
-    Raises:
-        InputError: There are no Gaussians, or they vary already.
-    """
+    """Raise InputError where a scene margin is not defined: there are no Gaussians, or they are ``varied`` already."""
     if rays:
         raise InputError("Gaussians vary, a NeRF has none", field="--scene-margin", fix="leave it out")
     if varied:

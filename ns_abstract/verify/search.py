@@ -100,11 +100,7 @@ class Search:
     def margins(
         self, samples: Sequence[Sample], scenes: Sequence[FrameImages] | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """[s] concrete margins and [s, n] outputs at poses, each of a scene of the set.
-
-        Args:
-            scenes: What draws each of them; None: the set's pictures.
-        """
+        """[s] concrete margins and [s, n] outputs at poses, drawn by ``scenes`` or the set's pictures."""
         drawn_by = [self.scene] * len(samples) if scenes is None else scenes
         images = np.stack([drawn(scene, sample) for scene, sample in zip(drawn_by, samples, strict=True)])
         self._latest = {sample_key(sample): image for sample, image in zip(samples, images, strict=True)}
@@ -204,8 +200,7 @@ class Search:
         """Scenes of the set that break the property, at every pose looked at of every cell without a proof (V12).
 
         The nearest is moved to the ends of its ranges along the signs of the margin's gradient, the worst by then half
-        as far, and the worst of all tried at the other poses, for what breaks the property at one mostly breaks it
-        nearby.
+        as far, and the worst of all tried at the other poses, where it mostly breaks the property, too.
         """
         members: list[SceneSample] = []
         for cell in sorted(cells, key=lambda c: c.margins[c.worst]):
@@ -400,8 +395,7 @@ class Search:
     def _rank(self, cell: CellSamples, bound: float | None) -> float:
         """How many times the bound of ``cell`` misses the margin that samples show: its parts need about as many cuts.
 
-        Largest cells first would prove nothing for long where all cells need several cuts; the nearest to a proof
-        first go deep at once, and come back from where the property is about to fail.
+        The nearest to a proof first go deep at once, and come back from where the property is about to fail.
         """
         share = cell.cell.volume / self.grid.volume
         if not self.costly:

@@ -1,12 +1,11 @@
 """Read VNN-LIB files (versions 1 and 2): sets of unsafe outputs, and boxes of inputs.
 
 Only what the format's users write is read: ``declare-const`` (of version 2: `ns_abstract.verify.vnnlib2`), and
-``assert`` of ``<=``, ``>=``, ``and``,
-``or`` over bounds of single inputs and linear expressions of the outputs. In certificates of scenes bounds of the
-inputs are set aside: the images take their place.
+``assert`` of ``<=``, ``>=``, ``and``, ``or`` over bounds of single inputs and linear expressions of the outputs. In
+certificates of scenes the images take the place of the inputs' bounds.
 
-Numbers that overflow or vanish on the way are refused, and constraints with huge or tiny
-factors are multiplied by powers of two, which changes no sign: no overflow may become a verdict.
+No overflow may become a verdict: numbers that overflow or vanish on the way are refused, and constraints with huge or
+tiny factors are multiplied by powers of two.
 """
 
 from __future__ import annotations
@@ -54,11 +53,9 @@ _Linear = tuple[dict[int, float], float]
 
 @dataclass(frozen=True)
 class _Run:
-    """Bounds of single inputs, all of which hold.
+    """Bounds of single inputs, all of which hold: one text each, without the closing bracket.
 
-    Attributes:
-        texts: One of them each, without the closing bracket.
-        limits: Shared by all runs: the side (0 below, 1 above), the input and the limit of a text.
+    ``limits``, shared by all runs: the side (0 below, 1 above), the input and the limit of a text.
     """
 
     texts: list[str]
@@ -101,11 +98,9 @@ def _size(shape: Shape) -> int:
 
 
 def load_vnnlib(path: Path, output_shape: Shape, input_shape: Shape | None = None) -> UnsafeSet:
-    """Read a VNN-LIB file, packed (.gz) or not.
+    """Read a VNN-LIB file, packed (.gz) or not, for a network of these shapes.
 
-    Args:
-        output_shape: Of the network; as many outputs must be declared.
-        input_shape: Of the network; as many inputs must be declared, or none. None: not compared.
+    As many outputs must be declared, and as many inputs or none; ``input_shape`` None: inputs are not compared.
 
     Raises:
         InputError: The file cannot be read or says something that is not understood.
@@ -160,11 +155,8 @@ def load_query(
 ) -> tuple[tuple[InputRegion, ...], Vnnlib2Query | None]:
     """Read a VNN-LIB file with its inputs: the property is violated if some region has an input with an unsafe output.
 
-    Args:
-        path: The file; only named in errors if ``text`` is given.
-
-    Returns:
-        The regions, and the query that a file of version 2 is; None for version 1.
+    Returns the regions, and the query that a file of version 2 is; None for version 1. ``path`` is only named in errors
+    if ``text`` is given.
 
     Raises:
         InputError: As `load_vnnlib`, or an input has no bounds.
@@ -214,11 +206,7 @@ def _regions(expressions: list[Any], sizes: _VariableCounts) -> tuple[InputRegio
 
 
 def _bound(constraint: _Linear | _Run, ends: np.ndarray) -> bool:
-    """Whether ``constraint`` is one on an input; if it is, ``ends`` [2, n] obey it afterwards.
-
-    Raises:
-        InputError: It is on several inputs, or on inputs and outputs.
-    """
+    """Whether ``constraint`` is one on an input, which ``ends`` [2, n] obey then; InputError: it joins several."""
     if isinstance(constraint, _Run):
         constraint.limit(ends)
         return True
@@ -240,11 +228,7 @@ def _bound(constraint: _Linear | _Run, ends: np.ndarray) -> bool:
 
 
 def _declares(expression: Any, declared: set[str]) -> bool:
-    """Whether an expression declares a variable; if not, it is an assertion.
-
-    Raises:
-        InputError: It is neither.
-    """
+    """Whether an expression declares a variable; if not, it is an assertion, or InputError is raised."""
     head = expression[0] if isinstance(expression, list) and expression else None
     if head == "declare-const" and len(expression) == 3:
         _, name, kind = expression
@@ -418,11 +402,7 @@ def _sum(first: _Linear, second: _Linear, factor: float) -> _Linear:
 
 
 def _added(total: float, factor: float, value: float) -> float:
-    """``total + factor * value``.
-
-    Raises:
-        InputError: It overflows, or the product vanishes.
-    """
+    """``total + factor * value``; InputError if it overflows, or the product vanishes."""
     product = factor * value
     sum_ = total + product
     if not math.isfinite(sum_) or (factor and value and abs(product) < _SMALLEST):

@@ -33,12 +33,7 @@ _ONE = "give a query about one network with one input and one output"
 
 @dataclass(frozen=True)
 class Tensor:
-    """A declared tensor.
-
-    Attributes:
-        kind: Element type, "real" or "float32".
-        shape: Empty: a scalar.
-    """
+    """A declared tensor of elements of ``kind`` "real" or "float32"; an empty shape: a scalar."""
 
     name: str
     kind: str
@@ -93,12 +88,9 @@ def joined(text: str) -> str:
 def parse_query(
     expressions: list[Any], input_shape: Sequence[int] | int | None, output_shape: Sequence[int] | int
 ) -> Vnnlib2Query:
-    """Return the query that the nested tokens of a file are.
+    """Return the query that the nested tokens of a file's `joined` text are.
 
-    Args:
-        expressions: Of the text that `joined` returned.
-        input_shape, output_shape: Of the network, without the batch; a number: of the elements alone; None: not
-            compared.
+    Shapes are of the network, without the batch; a number: of the elements alone; None: not compared.
 
     Raises:
         InputError: The query says something that is not understood, or is about another network.
@@ -276,11 +268,7 @@ def _fail(expression: Any, fix: str) -> InputError:
 
 
 def write_query(d: int, n: int, groups: Sequence[Sequence[int]], k: int, notes: Sequence[str] = ()) -> str:
-    """The query whose input is ``d`` parameters and ``n`` slacks in [-1, 1], violated where a group of outputs is <= 0.
-
-    Args:
-        notes: Lines of comment.
-    """
+    """The query of ``d`` parameters and ``n`` slacks in [-1, 1], violated where a group of outputs is <= 0."""
     lines = ["(vnnlib-version <2.0>)", *(f"; {note}" for note in notes)]
     lines += [f"(declare-network f (declare-input X float32 [1,{d + n}]) (declare-output Y float32 [1,{k}]))"]
     lines += violation("X[0,{}]", "Y[0,{}]", d + n, groups)
@@ -290,8 +278,7 @@ def write_query(d: int, n: int, groups: Sequence[Sequence[int]], k: int, notes: 
 def violation(source: str, result: str, count: int, groups: Sequence[Sequence[int]]) -> list[str]:
     """The assertions that ``count`` inputs lie in [-1, 1] and that a group of outputs is <= 0, in either version.
 
-    Args:
-        source, result: Names of an input and of an output, with {} for the number.
+    ``source`` and ``result`` are names of an input and of an output, with {} for the number.
     """
     lines = []
     for name in map(source.format, range(count)):

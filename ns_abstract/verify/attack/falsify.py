@@ -1,10 +1,9 @@
-"""Attack an abstract image: search its set of poses for a rendered image outside its bounds.
+"""Attack an abstract image: search its set of poses for a rendered image outside its bounds, at tolerance zero.
 
-Tolerance is zero. What the attack returns is a lower bound of what is wrong: no violation found is no
-proof. The poses tried are, in this order, given ones, the middle and corners of the box, random ones,
-and two searches that look where an image comes closest to a bound relative to the gap: projected
-gradient ascent through a differentiable twin of the renderer, and bisection towards jumps (the
-rasteriser's thresholds), whose two sides are rendered.
+What the attack returns is a lower bound of what is wrong. The poses tried are given ones, the middle and corners of the
+box, random ones, and two searches that look where an image comes closest to a bound relative to the gap: projected
+gradient ascent through a differentiable twin of the renderer, and bisection towards jumps, whose two sides are
+rendered.
 """
 
 from __future__ import annotations
@@ -311,18 +310,16 @@ def falsify(
     starts: ArrayLike | None = None,
     strategies: Sequence[str] = STRATEGIES,
 ) -> Attack:
-    """Attack the abstract image [lower, upper] of the poses of ``box``.
+    """Attack the abstract image [lower, upper] [H, W, 3] of the poses of ``box``.
 
     Args:
-        lower, upper: [H, W, 3]; compared as they are.
-        render: Parameter values [d] to an image [H, W, 3]. Its images are what must lie inside.
-        twin: Differentiable with respect to the values; it guides the ascent and is not compared.
-            Without it there is no ascent.
-        probe: The value of single pixels, equal to ``render``'s; saves the search for jumps from
-            rendering whole images.
+        lower, upper, box: See above.
+        render: Parameter values [d] to an image [H, W, 3], which must lie inside.
+        twin: Differentiable with respect to the values; it guides the ascent. Without it there is none.
+        probe: The value of single pixels, equal to ``render``'s; saves rendering whole images.
         poses: Most images rendered.
-        seconds: Most time spent; reaching it ends the attack after the image in progress. A limit
-            makes the outcome depend on the machine.
+        seconds: Most time spent; a limit makes the outcome depend on the machine.
+        seed: Of what is random.
         starts: [n, d] poses to try first, clipped into the box.
         strategies: Which of `STRATEGIES` to use. Poses that one does not need go to the next.
 

@@ -84,8 +84,7 @@ class SwitchedSoftplus(Softplus):
 class Quantised(Clip):
     """``step * min(max(round(z / step), low), high)``, enclosed by the clipped z and half a step (N25).
 
-    `function` is the clipped z; a call gives the steps, whose gradient is that of the clipped z.
-    ``least`` and ``most`` are ``step * low`` and ``step * high``.
+    `function` is the clipped z from ``least = step * low`` to ``most = step * high``, whose gradient a call has.
     """
 
     step: float = 1.0

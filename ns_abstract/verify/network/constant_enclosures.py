@@ -39,13 +39,7 @@ _FIX = "fold constants when exporting, in float64"
 
 
 class EnclosedConstant(NamedTuple):
-    """Two enclosures of a constant, in float64.
-
-    Attributes:
-        kind: The type that the file gives it.
-        real: Ends of the exact value.
-        evaluated: Ends of what evaluations in its type may give.
-    """
+    """Two float64 enclosures of a constant of the type ``kind``: of its exact value, and of its evaluations."""
 
     kind: np.dtype
     real: Interval64

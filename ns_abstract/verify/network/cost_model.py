@@ -100,9 +100,8 @@ class RefinementPlan(NamedTuple):
 
     Attributes:
         ways: By node: how rows for all of its numbers go back.
-        products: What they take together.
+        products, rate: What they take together, and what a product costs in logarithms of widths.
         widest: How wide bounds of a node are foreseen to be at most.
-        rate: What a product costs in logarithms of widths.
         step: Which of the plans compared it is.
     """
 
@@ -114,13 +113,7 @@ class RefinementPlan(NamedTuple):
 
 
 class CostEstimate(NamedTuple):
-    """The estimated cost of a cell's backward passes.
-
-    Attributes:
-        products: Of all rows.
-        neurons: How many numbers are bounded by rows that end by plan.
-        given_up: Whether rows are given up before the end.
-    """
+    """The products of a cell's rows, how many numbers rows bound that end by plan, and whether rows are given up."""
 
     products: float
     neurons: float

@@ -65,12 +65,9 @@ def estimate(network: Network, dimensions: int) -> tuple[float, float, bool]:
 def check_cell(
     network: Network, dimensions: int, allowed: float, remedy: str = "a larger --memory-limit, fewer --workers"
 ) -> None:
-    """Raise InputError if one cell of the network takes more than ``allowed`` bytes.
+    """Raise InputError if one cell of the network takes more than ``allowed`` bytes, about.
 
     ``remedy`` is what may be given instead of a smaller network.
-
-    Raises:
-        InputError: It does, about.
     """
     needed, _, _ = estimate(network, dimensions)
     if needed > allowed:

@@ -1,12 +1,9 @@
-"""Layers: what each computes, and how forms pass it forwards and coefficients backwards.
+"""Layers: what each computes, and how forms pass it forwards and coefficients backwards (design.md, N3, N4).
 
-See design.md, N3, N4.
-
-A layer is linear (`LinearLayer` and the classes built on it) or acts on every number by itself (`Activation`).
-A linear layer has three faces that share one matrix W: the concrete ``W x + bias``, its magnitude
-``|W| x`` (for radii and for rounding), and its transpose ``coefficients W`` on windows of rows
-(`ns_abstract.verify.network.coefficients`). An activation has its concrete value and lines that enclose it over
-an interval. Labels N1, N2, ... are those of docs/dev/design.md.
+A layer is linear (`LinearLayer` and the classes built on it) or acts on every number by itself (`Activation`). A linear
+layer has three faces that share one matrix W: the concrete ``W x + bias``, its magnitude ``|W| x`` (for radii and for
+rounding), and its transpose ``coefficients W`` on windows of rows (`coefficients`). An activation has its concrete
+value and lines that enclose it over an interval.
 """
 
 from __future__ import annotations
@@ -258,9 +255,8 @@ class Matrix(Weighted):
 class ScaleLayer(LinearLayer):
     """``factor * x + offset`` with constants; both [*shape] float64 (batch normalisation, Mul, Add, ...).
 
-    Attributes:
-        parts: The product of 1 + |f| over the largest constants that the factor and the offset are made of, if these
-            are others.
+    ``parts``: the product of 1 + |f| over the largest constants that factor and offset are made of, if these are
+    others.
     """
 
     factor: Tensor = field(default_factory=lambda: torch.zeros(0))
@@ -356,12 +352,7 @@ class ChannelEmbedding(LinearLayer):
 
 @dataclass(frozen=True, eq=False)
 class Gather(LinearLayer):
-    """Gathers numbers of the input by index.
-
-    Attributes:
-        index: [prod(shape)] flat positions in the input; -1 stands for ``fill``.
-        fill: A constant.
-    """
+    """Gathers numbers of the input by flat positions ``index`` [prod(shape)]; -1 stands for the constant ``fill``."""
 
     index: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64))
     fill: float = 0.0

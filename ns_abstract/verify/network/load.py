@@ -39,8 +39,7 @@ def load_network(
         path: The file.
         vector: Whether the input may be a vector [n], without a batch.
         output: Name of the output that is read; None: the only one.
-        picture: Height and width of pictures, used where the file leaves them free.
-        layout: "NCHW" or "NHWC", of such pictures.
+        picture, layout: Height and width of pictures, where the file leaves them free, "NCHW" or "NHWC".
         whole_numbers: Whether the input may be uint8, for whole numbers from 0 to 255.
         shown: Inputs [1, *input_shape] to compare besides, for an input shape: what the network will be given.
 
@@ -84,11 +83,7 @@ def _instead(path: Path) -> str:
 
 
 def onnx_session(path: Path) -> onnxruntime.InferenceSession:
-    """onnxruntime's session of a model on one thread.
-
-    Raises:
-        InputError: onnxruntime refuses the file.
-    """
+    """onnxruntime's session of a model on one thread; InputError if it refuses the file."""
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 4
     options.intra_op_num_threads = options.inter_op_num_threads = 1
@@ -106,8 +101,7 @@ def onnx_runner(path: Path, output: str = "", shape: Sequence[int] | None = None
     A model without a batch is given the image alone; one of a fixed batch, as many copies.
 
     Args:
-        path: The model.
-        output: Name of the output; empty: the first.
+        path, output: The model, and the name of the output; empty: the first.
         shape: One item of the network's input; None: the input is a vector or has a batch of 1.
 
     Raises:

@@ -22,15 +22,7 @@ _ROWS_OF_A_THREAD = 128
 class NeuronBounds:
     """Bounds chosen neurons of a node by backward passes of their own.
 
-    Args:
-        intermediate: What is known so far.
-        backward: Passes rows back over it.
-        schedule: What rows cost.
-        sharing: Takes notice of the rows.
-        ascent: Chooses lines for them.
-
-    Attributes:
-        spared: Products that rows have not taken because they ended on the way.
+    ``spared`` counts products that rows have not taken because they ended on the way.
     """
 
     def __init__(

@@ -32,15 +32,8 @@ _STRAIGHT, _BENT = 2.0**-20, 2.0**-5
 class NeuronSelection:
     """Chooses the neurons whose bounds are refined; plays no part in soundness.
 
-    Args:
-        neuron_bounds: What is known so far.
-        intermediate: Bounds the numbers that are chosen.
-        schedule: What rows cost, and how many of them a deep network is worth.
-        sharing: What other cells say of a node before.
-        used: By node: [*shape] numbers that matter to anybody; None: all.
-
-    Attributes:
-        unsure: Part of the latest ReLU's inputs whose signs have not been found out.
+    ``used``: by node [*shape], numbers that matter to anybody; None: all. ``unsure``: part of the latest ReLU's inputs
+    whose signs have not been found out.
     """
 
     def __init__(

@@ -71,12 +71,7 @@ def _size(kind: str, node: onnx.NodeProto, values: Sequence[np.ndarray]) -> floa
 
 
 def _refuse_unlike(node: onnx.NodeProto, values: Sequence[np.ndarray]) -> None:
-    """Refuse nodes that the reference operators compute otherwise than the format says.
-
-    Raises:
-        InputError: Numbers are scattered by an operation, taken backwards from before the first, or their sizes are
-            summed over no axis.
-    """
+    """Raise InputError for nodes that the reference operators compute otherwise than the format says."""
     fix = "fold constants when exporting"
     for attribute in node.attribute:
         if attribute.name == "reduction" and attribute.s not in (b"", b"none"):

@@ -39,11 +39,8 @@ def outward(value: Tensor, side: float) -> Tensor:
 def partial_sums(count: Tensor | int, peak: Tensor, squares: Tensor, end: Tensor) -> Tensor:
     """Return an upper bound of the total size of all partial sums, in any order of ``count`` additions (N20).
 
-    Args:
-        count: Additions, broadcast like the others.
-        peak: The greater of the positive numbers together and the negative ones, or more.
-        squares: The same of their squares.
-        end: The size of the whole sum, or more.
+    ``peak``: the greater of the positive numbers together and the negative ones, or more; ``squares``: the same of
+    their squares; ``end``: the size of the whole sum, or more.
     """
     number = torch.as_tensor(count, dtype=torch.float64)
     root = squares.sqrt() * UP
@@ -62,9 +59,7 @@ def partial_sums(count: Tensor | int, peak: Tensor, squares: Tensor, end: Tensor
 class Extremes(NamedTuple):
     """What numbers may grow to where a program groups the scales before a node in another way, [m] or [1] each (N21).
 
-    Attributes:
-        scales: Of products of scales alone, since the last layer of sums or activation.
-        sums: Of those with one layer of sums among them.
+    ``scales``: products of scales alone, since the last layer of sums or activation; ``sums``: with one such layer.
     """
 
     scales: Tensor

@@ -39,12 +39,9 @@ _POINT = 2.0**-36
 
 
 class _SampledFunction(NamedTuple):
-    """Samples of a function at ascending points [K, ...].
+    """Samples z, value, slope [K, ...] of a function at ascending points.
 
-    Attributes:
-        z, value, slope: [K, ...].
-        bend: [K - 1, ...] 1 convex, 0 straight, -1 concave between.
-        size: [...] for the rounding of everything.
+    ``bend`` [K - 1, ...] is 1 where it is convex between, 0 straight, -1 concave; ``size`` is for the rounding.
     """
 
     z: Tensor

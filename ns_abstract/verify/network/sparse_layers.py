@@ -1,7 +1,4 @@
-"""Sparse linear layers: sparse matrices, pairwise differences, transposed convolutions.
-
-See docs/dev/design.md, N11, N19; the plain ones are in `ns_abstract.verify.network.layers`.
-"""
+"""Sparse matrices, pairwise differences and transposed convolutions as layers (docs/dev/design.md, N11, N19)."""
 
 from __future__ import annotations
 
@@ -138,13 +135,10 @@ class Variance(SparseMatrix):
 
 @dataclass(frozen=True, eq=False)
 class ChannelWindows(SparseMatrix):
-    """Weighted sums over windows of neighbouring channels, and an offset.
+    """Weighted sums over windows of neighbouring channels, ``before`` of them before its middle, and an offset.
 
     A program may go from channel to channel, add the one that enters the window and subtract the one that leaves it:
     what that loses is relative to all channels that have left, too (N11).
-
-    Attributes:
-        before: Channels of a window before its middle.
     """
 
     before: int = 0
@@ -161,8 +155,7 @@ class ChannelWindows(SparseMatrix):
 class Resize(SparseMatrix):
     """A resized map: rows and columns are interpolated; programs compute their positions in float32.
 
-    Attributes:
-        rows, columns: [2, out, in] sizes of the weights along an axis, and what they may be off.
+    ``rows``, ``columns`` [2, out, in]: sizes of the weights along an axis, and what they may be off.
     """
 
     rows: Tensor = field(default_factory=_none)
@@ -179,13 +172,7 @@ class Resize(SparseMatrix):
 
 @dataclass(frozen=True, eq=False)
 class PairwiseDifferences(LinearLayer):
-    """``x_j - x_i`` for all i and j along an axis of the item: j is a new last axis; zero where they are the same.
-
-    As a sparse matrix they would take some hundred bytes each.
-
-    Attributes:
-        axis: The axis of the item.
-    """
+    """``x_j - x_i`` for all i and j along an axis of the item: j is a new last axis; zero where they are the same."""
 
     axis: int = 0
     mixes: ClassVar[bool] = True

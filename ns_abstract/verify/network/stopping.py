@@ -72,10 +72,8 @@ class BackwardBounds:
 class NeuronTarget(NamedTuple):
     """How tight the bounds of a neuron have to be; plays no part in soundness (N6, N17).
 
-    Attributes:
-        width: How far apart a number's bounds may be; None: its sign is all that is asked.
-        kink: Whether the sign is asked for.
-        cut: Whether a number that is certainly not positive may have any bounds.
+    ``width``: how far apart they may be, None: its sign is all that is asked; ``kink``: whether the sign is asked for;
+    ``cut``: whether a number that is certainly not positive may have any bounds.
     """
 
     width: float | None = None
@@ -87,10 +85,7 @@ class NeuronTarget(NamedTuple):
 class StoppingCriterion:
     """The criterion that stops the backward pass of a neuron before it is at the image.
 
-    Attributes:
-        goal: What is asked for.
-        zero: [R] what a row is where its number is zero.
-        negative: [R] whether a row is its number's negative.
+    ``zero`` [R]: what a row is where its number is zero; ``negative`` [R]: whether a row is its number's negative.
     """
 
     goal: NeuronTarget
