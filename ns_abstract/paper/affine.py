@@ -6,7 +6,7 @@ on both, and each narrows the other.
 
 from __future__ import annotations
 
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -60,14 +60,6 @@ class Enclosure:
         """Quantities of which nothing but ``values`` is known."""
         values = Interval.lift(values)
         return cls(form_of(basis, values), values)
-
-    @overload
-    @classmethod
-    def lift(cls, value: Enclosure | FormArray, basis: Basis | None = None) -> Enclosure: ...
-
-    @overload
-    @classmethod
-    def lift(cls, value: Enclosure | FormArray | Interval | ArrayLike, basis: Basis) -> Enclosure: ...
 
     @classmethod
     def lift(cls, value: Enclosure | FormArray | Interval | ArrayLike, basis: Basis | None = None) -> Enclosure:

@@ -337,7 +337,7 @@ class Refinement:
     def _part_result(self, point: TracePoint) -> PartResult:
         pictures = self.leaves.lower, self.leaves.upper, self.inner.lower, self.inner.upper, self.inner.image
         lower, upper, witness_lower, witness_upper, image = (picture[..., :COLORS] for picture in pictures)
-        layers = None
+        layers: dict[str, ExtraOutput] = {}
         if self.frame.channels > COLORS:
             places = {"accumulation": ACCUMULATION, "depth": DEPTH}
             layers = {name: ExtraOutput(*(picture[..., k] for picture in pictures)) for name, k in places.items()}

@@ -119,14 +119,13 @@ class SampleImages(ArrayRecord):
 
 
 @dataclass(frozen=True, repr=False)
-class FrameResult(ArrayRecord):
-    """One frame's abstract image.
+class AbstractPicture(ArrayRecord):
+    """The abstract image of a frame [H, W, 3], or of some tiles of it [t, side, side, 3], float32.
 
     Attributes:
-        lower, upper: [H, W, 3] enclose every image of the set, after background and clamp to [0, 1].
-        witness_lower, witness_upper: [H, W, 3] least and largest values that were really rendered.
-        image: [H, W, 3] one concrete render, at the middle of the box.
-        plan: What was left out for this frame and why, one sentence each.
+        lower, upper: Enclose every image of the set, after background and clamp to [0, 1].
+        witness_lower, witness_upper: Least and largest values that were really rendered.
+        image: One concrete render, at the middle of the box.
         bounded: False while no bound but [0, 1] is known (the budget ended first).
         leaves: The leaf cells' linear sets, if they were asked for.
         layers: What else was bounded, by name, of `EXTRA_OUTPUTS`.
@@ -145,7 +144,6 @@ class FrameResult(ArrayRecord):
     seconds: float
     cells: int
     trace: tuple[TracePoint, ...] = field(default=(), repr=False)
-    plan: tuple[str, ...] = ()
     bounded: bool = True
     leaves: Leaves | None = field(default=None, repr=False)
     layers: Mapping[str, ExtraOutput] = field(default_factory=dict, repr=False)
@@ -155,39 +153,27 @@ class FrameResult(ArrayRecord):
 
 
 @dataclass(frozen=True, repr=False)
-class PartResult(ArrayRecord):
-    """Some tiles of a frame's abstract image; fields as in `FrameResult` where nothing is said.
+class FrameResult(AbstractPicture):
+    """One frame's abstract image; ``plan``: what was left out for this frame and why, one sentence each."""
+
+    plan: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, repr=False, kw_only=True)
+class PartResult(AbstractPicture):
+    """Some tiles of a frame's abstract image; depths where anything is drawn, as a `Frame` has them.
 
     Attributes:
         tiles: [t] numbers of the tiles.
-        lower, upper, witness_lower, witness_upper, image: [t, side, side, 3].
-        pixels: Number of the tiles' pixels that belong to the image.
-        trace: Measures are those of these pixels.
+        pixels: Number of the tiles' pixels that belong to the image, whose measures the trace has.
         shown: Scene elements that some cell shows in these tiles, or None.
         floor: What no more light comes to was left out of the first cover; 0: nothing.
-        layers: Arrays [t, side, side]; depths where anything is drawn, as a `Frame` has them; or None.
     """
 
-    index: int
-    box: ParameterBox
     tiles: NDArray[np.int64]
-    lower: Float32Array
-    upper: Float32Array
-    witness_lower: Float32Array
-    witness_upper: Float32Array
-    image: Float32Array
     pixels: int
-    seconds: float
-    cells: int
-    trace: tuple[TracePoint, ...]
-    bounded: bool
     shown: NDArray[np.int64] | None
     floor: float = 0.0
-    leaves: Leaves | None = field(default=None, repr=False)
-    layers: Mapping[str, ExtraOutput] | None = field(default=None, repr=False)
-    views: SampleImages | None = field(default=None, repr=False)
-    problems: tuple[str, ...] = ()
-    largest: RenderedMaximum | None = None
 
 
 #: Of a part that has no point yet: [0, 1] everywhere.
@@ -214,8 +200,8 @@ def joined(parts: Sequence[PartResult], camera: Any) -> FrameResult:
         return assemble(np.concatenate([getattr(part, name) for part in parts])[order], camera)
 
     layers: dict[str, ExtraOutput] = {}
-    for name in first.layers or ():
-        part_layers = [part.layers[name] for part in parts if part.layers is not None]
+    for name in first.layers:
+        part_layers = [part.layers[name] for part in parts]
         arrays = (
             np.concatenate([getattr(layer, array) for layer in part_layers])[order] for array in EXTRA_OUTPUT_ARRAYS
         )

@@ -9,12 +9,12 @@ from typing import Literal
 
 import numpy as np
 
-from ns_abstract.arithmetic.outward import outward
 from ns_abstract.arithmetic.rounding import RESPONSE_ROUNDING, RESPONSE_ROUNDINGS
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.refine.protocol import Bounds, Frame, LinearSets, Score
+from ns_abstract.verify.picture_sets import flatter_where_better
 
 ResponseName = Literal["brightness", "white balance", "gamma"]
 
@@ -73,11 +73,7 @@ class CameraResponse:
         below = b_lower * shrink - fall - slack
         slack = np.abs(a_above - a_upper * grow).sum(axis=-1) + RESPONSE_ROUNDINGS
         above = b_upper * grow + rise + slack
-        flat_lower, flat_upper = least > below, most < above
-        b_lower, b_upper = outward(np.where(flat_lower, least, below), np.where(flat_upper, most, above))
-        a_lower = np.where(flat_lower[..., None], np.float32(0.0), a_below)
-        a_upper = np.where(flat_upper[..., None], np.float32(0.0), a_above)
-        return (a_lower, b_lower, a_upper, b_upper), *outward(least, most)
+        return flatter_where_better((a_below, a_above), (below, above), least, most)
 
 
 def response_sets(

@@ -31,18 +31,6 @@ CHANNELS = {
 
 
 @dataclass(frozen=True)
-class MeasureTuning:
-    """Into how many parts a cell's linear bounds are looked at. It does not decide whether a bound holds."""
-
-    #: Most parts, and most numbers (parts times pixels) at once.
-    parts: int = 32
-    numbers: int = 1 << 21
-
-
-_TUNING = MeasureTuning()
-
-
-@dataclass(frozen=True)
 class Region:
     """A set of pixels: a box x0, y0, x1, y1 with exclusive ends, white ones of a mask (.png), or all of the picture.
 

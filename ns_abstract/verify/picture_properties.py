@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,23 +28,23 @@ from ns_abstract.verify.picture_measures import (
     CHANNELS,
     CellParts,
     Measure,
-    MeasureTuning,
     Plane,
     PlaneSets,
     Region,
 )
 from ns_abstract.verify.pixel_parts import fewest_reaching
-from ns_abstract.verify.preprocess import Preprocess, parse_preprocess
+from ns_abstract.verify.preprocess import parse_preprocess
 from ns_abstract.verify.properties import Claim, Property, Query
 from ns_abstract.verify.property_reading import parse_partitions
 from ns_abstract.verify.settled_pixels import LimitedMeasure
 
-_TUNING = MeasureTuning()
 STATISTICS = ("mean", "least", "greatest")
 #: The depth of a pixel on which nothing is drawn, and the greatest that is told apart, normalised units.
 FARTHEST = 2.0**20
 #: What reports say of distances.
 _DISTANCES = "distances: depth of the centres of Gaussians along the optical axis; of a NeRF's samples along their rays"
+#: Preferences: most parts of a cell, and most numbers (parts times pixels) at once.
+_PARTS, _NUMBERS = 32, 1 << 21
 #: Most leaves of a property, and how deep it may be.
 _MOST_LEAVES, _DEEPEST = 64, 8
 
@@ -165,8 +165,6 @@ class PictureProperty(Property):
     """A statement about the picture, its depths or its blending weights."""
 
     statement: Statement
-    preprocess: Preprocess = field(default_factory=Preprocess)
-    partitions: tuple[int, ...] | None = None
 
     def sentence(self) -> str:
         return _sentence(self.statement)
@@ -257,7 +255,7 @@ class MeasureModel:
     def _cell(self, planes: PlaneSets) -> np.ndarray:
         read = np.unique(np.concatenate([m.pixels for m in self.measures]))
         effects = np.abs(planes.linear[0][read].astype(np.float64)).sum(axis=(0, 1))
-        most = max(1, min(_TUNING.parts, _TUNING.numbers // read.size))
+        most = max(1, min(_PARTS, _NUMBERS // read.size))
         parts = CellParts.along(effects, most)
         ends = [m.bounds(planes, first, parts) for m, first in zip(self.measures, self.places, strict=True)]
         low, high = (np.stack(side, axis=1) for side in zip(*ends, strict=True))

@@ -63,11 +63,12 @@ class Claim(ABC):
         """[m] lower bounds of the margin over the cells ``boxes``; -inf where nothing is known."""
 
 
+@dataclass(frozen=True, kw_only=True)
 class Property(ABC):
     """A property as its file states it."""
 
-    preprocess: Preprocess
-    partitions: tuple[int, ...] | None
+    preprocess: Preprocess = field(default_factory=Preprocess)
+    partitions: tuple[int, ...] | None = None
 
     @abstractmethod
     def sentence(self) -> str:
@@ -118,8 +119,6 @@ class Classification(Property):
 
     label: int
     classes: int
-    preprocess: Preprocess = field(default_factory=Preprocess)
-    partitions: tuple[int, ...] | None = None
 
     def sentence(self) -> str:
         return f"output {self.label} is larger than each of the other {self.classes - 1}"
@@ -138,8 +137,6 @@ class VnnLibProperty(Property):
 
     file: Path
     unsafe: UnsafeSet
-    preprocess: Preprocess = field(default_factory=Preprocess)
-    partitions: tuple[int, ...] | None = None
 
     def sentence(self) -> str:
         return f"the outputs are outside the unsafe set of {self.file.name}"
@@ -271,8 +268,6 @@ class Regression(Property):
     truth: TrueValues
     absolute: tuple[float, ...] | None
     relative: float | None
-    preprocess: Preprocess = field(default_factory=Preprocess)
-    partitions: tuple[int, ...] | None = None
 
     def sentence(self) -> str:
         names = ", ".join(c if isinstance(c, str) else f"{c:g}" for c in self.truth.components)
@@ -451,8 +446,6 @@ class Detection(Property):
     box: tuple[float, float, float, float] | None
     grid: int
     stride: float
-    preprocess: Preprocess = field(default_factory=Preprocess)
-    partitions: tuple[int, ...] | None = None
 
     def sentence(self) -> str:
         what = "objectness" if self.label is None else f"score of class {self.label}"

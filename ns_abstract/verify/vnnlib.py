@@ -23,7 +23,7 @@ from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import read_text
 from ns_abstract.io.packed import unpacked
-from ns_abstract.verify.vnnlib2 import Vnnlib2Query, is_version_2, joined, parse_query
+from ns_abstract.verify.vnnlib2 import Vnnlib2Query, is_version_2, joined, parse_query, refused
 from ns_abstract.verify.vnnlib_sets import InputRegion, UnsafeSet
 
 _LIMIT = 256 << 20
@@ -60,6 +60,9 @@ class _Run:
 
     texts: list[str]
     limits: dict[str, tuple[int, int, float]]
+
+    def __str__(self) -> str:
+        return " ".join(f"{text})" for text in self.texts)
 
     def read(self, declared: set[str], size: _VariableCounts) -> None:
         """Learn what the texts say."""
@@ -233,12 +236,12 @@ def _declares(expression: Any, declared: set[str]) -> bool:
     if head == "declare-const" and len(expression) == 3:
         _, name, kind = expression
         if not (isinstance(name, str) and _VARIABLE.fullmatch(name)) or kind != "Real":
-            raise _fail(expression, "declare X_0, X_1, ..., Y_0, Y_1, ... as Real")
+            raise refused(expression, "declare X_0, X_1, ..., Y_0, Y_1, ... as Real")
         declared.add(name)
         return True
     if head == "assert" and len(expression) == 2:
         return False
-    raise _fail(expression, "use declare-const and assert of VNN-LIB version 1")
+    raise refused(expression, "use declare-const and assert of VNN-LIB version 1")
 
 
 def _expressions(text: str, runs: bool = False) -> list[Any]:
@@ -277,17 +280,6 @@ def _expressions(text: str, runs: bool = False) -> list[Any]:
     if len(stack) > 1:
         raise InputError("a bracket is never closed", fix="add the missing )")
     return stack[0]
-
-
-def _show(expression: Any) -> str:
-    if isinstance(expression, _Run):
-        expression = " ".join(f"{text})" for text in expression.texts)
-    text = f"({' '.join(map(_show, expression))})" if isinstance(expression, list) else str(expression)
-    return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def _fail(expression: Any, fix: str) -> InputError:
-    return InputError(f"not understood: {_show(expression)}", fix=fix)
 
 
 def _parse(expressions: list[Any], output_size: int, input_size: int | None) -> UnsafeSet:
@@ -391,7 +383,7 @@ def _ways(expression: Any, declared: set[str], size: _VariableCounts) -> list[_C
         left, right = (_linear(part, declared, size) for part in expression[1:])
         low, high = (left, right) if head == "<=" else (right, left)
         return [[_sum(low, high, -1.0)]]
-    raise _fail(expression, "use <=, >=, and, or of version 1")
+    raise refused(expression, "use <=, >=, and, or of version 1")
 
 
 def _sum(first: _Linear, second: _Linear, factor: float) -> _Linear:
@@ -430,7 +422,7 @@ def _linear(expression: Any, declared: set[str], size: _VariableCounts) -> _Line
     if head == "*" and len(terms) == 2 and not all(term[0] for term in terms):
         factor, other = (terms[0][1], terms[1]) if not terms[0][0] else (terms[1][1], terms[0])
         return _sum(({}, 0.0), other, factor)
-    raise _fail(expression, "write a linear expression of outputs")
+    raise refused(expression, "write a linear expression of outputs")
 
 
 def _atom(text: str, declared: set[str], size: _VariableCounts) -> _Linear:
@@ -438,10 +430,10 @@ def _atom(text: str, declared: set[str], size: _VariableCounts) -> _Linear:
     if match is None:
         number = _NUMBER.fullmatch(text)
         if number is None:
-            raise _fail(text, "write a number or a variable such as Y_0")
+            raise refused(text, "write a number or a variable such as Y_0")
         value = float(text)
         if not math.isfinite(value) or (abs(value) < _SMALLEST and re.search("[1-9]", number[1])):
-            raise _fail(text, "write a number that float64 can hold")
+            raise refused(text, "write a number that float64 can hold")
         return {}, value
     if text not in declared:
         raise InputError(f"{text} is not declared", fix=f"add (declare-const {text} Real)")

@@ -110,25 +110,29 @@ class Weighted(LinearLayer):
 
 
 @dataclass(frozen=True, eq=False)
-class Convolution(Weighted):
-    """Two-dimensional convolution with zero padding; average pooling and selections are such, too.
-
-    Attributes:
-        weight: [Cout, Cin / groups, kh, kw] float64.
-        offset: [Cout] float64 or None.
-        stride, dilation: (rows, columns).
-        pads: top, left, bottom, right.
-        groups: As in ONNX.
-    """
+class WindowLayer(Weighted):
+    """A layer of windows of rows and columns, with an ``offset`` [Cout] float64 or None."""
 
     stride: tuple[int, int] = (1, 1)
     dilation: tuple[int, int] = (1, 1)
-    pads: tuple[int, int, int, int] = (0, 0, 0, 0)
-    groups: int = 1
 
     @property
     def bias(self) -> Tensor | None:
         return None if self.offset is None else self.offset[:, None, None]
+
+
+@dataclass(frozen=True, eq=False)
+class Convolution(WindowLayer):
+    """Two-dimensional convolution with zero padding; average pooling and selections are such, too.
+
+    Attributes:
+        weight: [Cout, Cin / groups, kh, kw] float64.
+        pads: top, left, bottom, right.
+        groups: As in ONNX.
+    """
+
+    pads: tuple[int, int, int, int] = (0, 0, 0, 0)
+    groups: int = 1
 
     @cached_property
     def _phases(self) -> dict[torch.dtype, Tensor | None]:

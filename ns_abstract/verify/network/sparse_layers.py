@@ -25,7 +25,7 @@ from ns_abstract.arithmetic.network_charges import (
 )
 from ns_abstract.verify.network.coefficients import Coefficients, full, grid
 from ns_abstract.verify.network.forms import NodeForm
-from ns_abstract.verify.network.layers import LinearLayer, Weighted
+from ns_abstract.verify.network.layers import LinearLayer, WindowLayer
 
 
 def _none() -> Tensor:
@@ -209,25 +209,17 @@ class PairwiseDifferences(LinearLayer):
 
 
 @dataclass(frozen=True, eq=False)
-class TransposedConvolution(Weighted):
+class TransposedConvolution(WindowLayer):
     """Two-dimensional transposed convolution; nearest upsampling by whole factors is one.
 
     Attributes:
         weight: [Cin, Cout / groups, kh, kw] float64.
-        offset: [Cout] float64 or None.
-        stride, dilation: (rows, columns).
         pads: top, left; cut from the result.
         groups: As in ONNX.
     """
 
-    stride: tuple[int, int] = (1, 1)
-    dilation: tuple[int, int] = (1, 1)
     pads: tuple[int, int] = (0, 0)
     groups: int = 1
-
-    @property
-    def bias(self) -> Tensor | None:
-        return None if self.offset is None else self.offset[:, None, None]
 
     def _spread(self, x: Tensor, weight: Tensor) -> Tensor:
         whole = functional.conv_transpose2d(
