@@ -74,10 +74,7 @@ if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
 
 @njit(inline="always", error_model="numpy")
 def exp_kernel(x):
-    """exp(x), ``EXP_LOWEST <= x <= EXP_HIGHEST``, of floats or lanes; relative error ``<= EXP_RELATIVE_ERROR``.
-
-    See design.md, E1.
-    """
+    """exp(x), EXP_LOWEST <= x <= EXP_HIGHEST, of floats or lanes, within EXP_RELATIVE_ERROR of it (design.md, E1)."""
     shifted = fma(x, _LOG2E, _ROUND_TO_INTEGER)
     k = shifted - _ROUND_TO_INTEGER
     r = fma(-k, _LN2_HIGH, x)

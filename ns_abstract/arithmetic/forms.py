@@ -96,10 +96,7 @@ def set_norms(out, d, order, m):
 
 @njit(cache=True, error_model="numpy")
 def scale_add(a, s, b, t, shift, out, d, order, m):
-    """``out = s * a + t * b + shift`` for numbers ``s``, ``t``, ``shift``; ``out`` may be ``a`` or ``b``.
-
-    See design.md, A1.
-    """
+    """``out = s * a + t * b + shift`` for numbers s, t, shift (design.md, A1); ``out`` may be ``a`` or ``b``."""
     n = out.shape[1]
     absolute_s = abs(s)
     absolute_t = abs(t)
@@ -339,11 +336,7 @@ def reciprocal_square_root(a, work, out, d, order, m):
 
 @njit(cache=True, error_model="numpy")
 def logarithm(a, work, out, d, order, m):
-    """``out = log(a)`` for ``a > 0``; ``work`` is [5, n] scratch.
-
-    The library's logarithm is charged four units of ``|log(a)| + 1`` (checked at start-up,
-    `ns_abstract.arithmetic.selfcheck`).
-    """
+    """``out = log(a)`` for ``a > 0``, charged four units of ``|log(a)| + 1`` more; ``work`` is [5, n] scratch."""
     for q in range(out.shape[1]):
         c, (low, high, inside) = a[0, q], _ends(a, m, q)
         inverse = 1.0 / c if inside else 1.0

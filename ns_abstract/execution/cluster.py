@@ -31,11 +31,7 @@ _TRIM = "MALLOC_TRIM_THRESHOLD_"
 
 
 class Cluster:
-    """A Dask cluster. Its workers must see the input files under the same paths.
-
-    Args:
-        client: Of `connected`.
-    """
+    """A Dask cluster, a client of `connected`. Its workers must see the input files under the same paths."""
 
     shares = False
     starting = False

@@ -1,7 +1,4 @@
-"""Threads of this process that work on one cell or picture; compiled kernels release the interpreter's lock.
-
-numba's own parallel loops would have each kernel compiled four times.
-"""
+"""Threads of this process that work on one cell or picture; compiled kernels release the interpreter's lock."""
 
 from __future__ import annotations
 

@@ -51,12 +51,7 @@ class LatestValue(Generic[T]):
 
 @dataclass(frozen=True)
 class Recipe(Generic[F]):
-    """A recipe with which another process loads the same object.
-
-    Attributes:
-        open: Opens it again; can be pickled.
-        file: Named by the error where the other process finds something else.
-    """
+    """A recipe that can be pickled, with which another process opens the same object; errors name ``file``."""
 
     open: Callable[[], F]
     fingerprint: Mapping[str, Any]

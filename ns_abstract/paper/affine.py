@@ -1,12 +1,8 @@
-"""The affine version of the paper's rules: forms with their ranges.
-
-An `Enclosure` is a `FormArray` together with an `Interval` that holds the same quantity. Each operation is carried out
-on both, and each narrows the other.
-"""
+"""The affine version of the paper's rules: forms with their ranges, which narrow each other."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -265,3 +261,17 @@ class Enclosure:
     def indicator(self) -> Enclosure:
         """1 where ``x > 0``, else 0; both where undecided (no slope narrows the unit step's range)."""
         return Enclosure.of(self.basis, self.range.indicator())
+
+
+#: Intervals, or forms with their ranges: a result of a rule has the face of its operands.
+Face = TypeVar("Face", Interval, Enclosure)
+
+
+def range_of(x: Interval | Enclosure) -> Interval:
+    """The intervals that hold ``x``."""
+    return x if isinstance(x, Interval) else x.range
+
+
+def constant_like(like: Face, values: Interval) -> Face:
+    """Return constants that enclose ``values``, in the arithmetic and basis of ``like``."""
+    return type(like).lift(values) if isinstance(like, Interval) else type(like).of(like.basis, values)

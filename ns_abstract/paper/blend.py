@@ -10,8 +10,7 @@ import itertools
 
 import numpy as np
 
-from ns_abstract.paper.affine import Enclosure
-from ns_abstract.paper.faces import Face, constant_like, range_of
+from ns_abstract.paper.affine import Enclosure, Face, constant_like, range_of
 from ns_abstract.paper.interval import Float64Array, Interval
 
 

@@ -1,7 +1,4 @@
-"""Bounds of blending when the depth order is uncertain: the paper's VR-IND, and sorting.
-
-Layers run along the first axis in any order; depths are [n], opacities [n, ...].
-"""
+"""Bounds of blending when the depth order [n] of layers [n, ...] is uncertain: the paper's VR-IND, and sorting."""
 
 from __future__ import annotations
 
@@ -11,9 +8,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from ns_abstract.paper.affine import Enclosure
+from ns_abstract.paper.affine import Enclosure, Face, constant_like, range_of
 from ns_abstract.paper.blend import cumulative_blend
-from ns_abstract.paper.faces import Face, constant_like, range_of
 from ns_abstract.paper.interval import BoolArray, Float64Array, Interval
 
 # depths may be of another face than opacities

@@ -45,10 +45,7 @@ class LoopPictures(Protocol):
 
 
 class Pictures:
-    """A scene's pictures at the ``poses`` that may be looked at, boxes of which are bounded.
-
-    ``response``: the cameras that may show them; None: one that shows what is rendered.
-    """
+    """A scene's pictures at ``poses``, boxes of which are bounded, as any camera of ``response`` shows them."""
 
     def __init__(self, method: Method, poses: PoseBox, response: CameraResponse | None = None) -> None:
         self.frame: Frame = method.frame(poses)

@@ -128,12 +128,7 @@ def _clipped(corners: list[tuple[float, float]], a: float, b: float, level: floa
 
 @dataclass(frozen=True)
 class LoopPlot:
-    """A plot of a loop in the plane of two world axes, to the right and up.
-
-    Attributes:
-        clip: The scene above it, towards the viewer, is left out; the world's unit.
-        marks: What is drawn over the scene.
-    """
+    """A plot of a loop in the plane of two world axes, to the right and up; the scene above ``clip`` is left out."""
 
     title: str
     axes: tuple[int, int]

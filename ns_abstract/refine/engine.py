@@ -22,8 +22,7 @@ from ns_abstract.refine.frame_tiles import FrameTiles, LeafCell, context_bytes, 
 from ns_abstract.refine.goal import RefinementGoal
 from ns_abstract.refine.initial import InitialPartition, Partition
 from ns_abstract.refine.inner import InnerBound, sampled_gap
-from ns_abstract.refine.leaves import BoundedCell, Change, LeafBounds
-from ns_abstract.refine.linear_sets import LeafSets
+from ns_abstract.refine.leaves import BoundedCell, Change, LeafBounds, LeafSets
 from ns_abstract.refine.protocol import ACCUMULATION, COLORS, DEPTH, Bounds, Frame, Render
 from ns_abstract.refine.result import ExtraOutput, FrameResult, PartResult, TracePoint, joined
 from ns_abstract.refine.sub_boxes import BoxSplitter, SubBox

@@ -12,7 +12,7 @@ import numpy as np
 from ns_abstract.refine.frame_tiles import FrameTiles, context_bytes
 from ns_abstract.refine.goal import RefinementGoal
 from ns_abstract.refine.inner import InnerBound
-from ns_abstract.refine.linear_sets import linear_bytes
+from ns_abstract.refine.leaves import linear_bytes
 from ns_abstract.refine.protocol import Bounds
 from ns_abstract.refine.sub_boxes import BoxSplitter, SubBox
 from ns_abstract.refine.tuning import TUNING, Tuning

@@ -16,7 +16,7 @@ from ns_abstract.execution.cancellation import Deadline, WorkCancelledError, che
 from ns_abstract.verify.network import ImageSets, Network, NetworkArithmetic, OutputBounds, bound_outputs
 from ns_abstract.verify.network.bounds import NetworkBounds
 from ns_abstract.verify.network.branching import branch
-from ns_abstract.verify.network.input_shares import input_shares
+from ns_abstract.verify.network.dependence import input_shares
 from ns_abstract.verify.network.phase_tree import PhaseTree
 from ns_abstract.verify.network.subnormals import subnormals_kept
 from ns_abstract.verify.network.weighted_means import centred

@@ -32,10 +32,7 @@ CHANNELS = {
 
 @dataclass(frozen=True)
 class Region:
-    """A set of pixels: a box x0, y0, x1, y1 with exclusive ends, white ones of a mask (.png), or all of the picture.
-
-    ``name`` is the key of the property file, for errors.
-    """
+    """A set of pixels: a box x0, y0, x1, y1 with exclusive ends, white ones of a mask, or all; ``name`` is its key."""
 
     box: tuple[int, int, int, int] | None = None
     mask: Path | None = None

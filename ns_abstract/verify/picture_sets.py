@@ -32,10 +32,7 @@ def sane(linear: Sequence[np.ndarray], lower: np.ndarray, upper: np.ndarray) -> 
 def flatter_where_better(
     slopes: tuple[np.ndarray, np.ndarray], offsets: tuple[np.ndarray, np.ndarray], least: np.ndarray, most: np.ndarray
 ) -> tuple[LinearSets, np.ndarray, np.ndarray]:
-    """Return linear sets and bounds, rounded outward; a bound takes a plane's place where it is better in the middle.
-
-    Slopes [..., d] are float32; offsets and bounds [...] float64.
-    """
+    """Return linear sets and bounds, rounded outward; a bound is taken for a plane where it is better in the middle."""
     # comparisons that a NaN fails keep it, so that it is noticed
     flat = least > offsets[0], most < offsets[1]
     b_lower, b_upper = outward(np.where(flat[0], least, offsets[0]), np.where(flat[1], most, offsets[1]))

@@ -24,10 +24,7 @@ PLACE = 3
 
 
 class RegisteredImages:
-    """Pictures of poses for every position of the scene; see `ns_abstract.verify.protocol.FrameImages`.
-
-    ``scene``: pictures of a set of `PoseBox.registered`, whose last parameters tell where the scene stands.
-    """
+    """Pictures of poses for every position of the scene, of a set of `PoseBox.registered`; see `FrameImages`."""
 
     def __init__(self, scene: FrameImages, frame: Frame) -> None:
         self.scene, self.frame = scene, frame

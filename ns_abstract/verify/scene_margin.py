@@ -110,12 +110,9 @@ def bounded_kinds(places: Callable[[VariationKind], bool]) -> tuple[VariationKin
 
 @dataclass(frozen=True)
 class CellOutcome:
-    """The outcome of a cell for all scenes of a set.
+    """The outcome of a cell for all scenes of a set, with arrays of a scene that breaks it.
 
-    Attributes:
-        outcome: "holds": proved; "falsified": a scene was found, and rendered again, that breaks it; "unknown".
-        slopes: [d] what a cut along each parameter may gain.
-        example: Arrays that tell a scene that breaks it, or None.
+    ``slopes`` [d] are what a cut along each parameter may gain.
     """
 
     outcome: Outcome

@@ -303,10 +303,7 @@ class Search:
                 cell.reason = reason
 
     def _too_wide(self, cell: CellSamples, sets: PictureSets) -> bool:
-        """Whether the network's bounds would be wasted on the sets.
-
-        A guess by the margin's gradient at the middle, which decides about work and not about verdicts.
-        """
+        """Whether the network's bounds would be wasted on the sets: a guess by the margin's gradient at the middle."""
         weights = self._weights(cell)
         cell.cost = math.nan if weights is None else weights.cost(sets)
         return float(sets.widths.mean()) > _HOPELESS or cell.cost > _COSTLY

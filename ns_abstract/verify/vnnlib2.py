@@ -53,11 +53,7 @@ class Tensor:
 
 @dataclass(frozen=True)
 class Vnnlib2Query:
-    """A query as assertions of version 1 about ``X_0, ...`` and ``Y_0, ...``, elements in rows.
-
-    Attributes:
-        expressions: Declarations and assertions of version 1, as nested lists of tokens.
-    """
+    """A query as declarations and assertions of version 1 about ``X_0, ...`` and ``Y_0, ...``, elements in rows."""
 
     network: str
     input: Tensor

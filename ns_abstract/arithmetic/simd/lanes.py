@@ -336,10 +336,7 @@ def store_columns(typingctx, elements, at, stride, rows):  # pyright: ignore[rep
 
 @intrinsic
 def scatter_columns(typingctx, elements, places, first, stride, shift, rows):  # pyright: ignore[reportRedeclaration]
-    """Write lane k of the eight ``rows`` side by side to ``elements[stride * places[first + k] + shift : ...]``.
-
-    ``elements`` and ``places`` (int64) are `compiled.pointer`.
-    """
+    """Write lane k of the eight ``rows`` side by side to ``elements[stride * places[first + k] + shift : ...]``."""
     _check(elements, _KINDS[8][0])
     if places != types.CPointer(types.int64):
         raise TypeError(f"places are read through pointer(int64 array), not {places}")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -362,13 +362,6 @@ class _ReusingCells(CoefficientSource):
             c[:, at] = np.where(better, center, c[:, at])
             r[:, at] = np.where(better, radius, r[:, at])
             a[:, :, at] = np.where(better[:, None], tilt.transpose(0, 2, 1), a[:, :, at])
-        reused_form = NodeForm(
-            form.reference,
-            torch.from_numpy(c).reshape(shape),
-            torch.from_numpy(a).reshape(form.a.shape),
-            torch.from_numpy(r).reshape(shape),
-            torch.from_numpy(lower).reshape(shape),
-            torch.from_numpy(upper).reshape(shape),
-            form.active,
-        )
-        return self.intermediate.within(reused_form, reused_form.lower, reused_form.upper)
+        c, r, lower, upper = (torch.from_numpy(v).reshape(shape) for v in (c, r, lower, upper))
+        reused = replace(form, c=c, a=torch.from_numpy(a).reshape(form.a.shape), r=r, lower=lower, upper=upper)
+        return self.intermediate.within(reused, reused.lower, reused.upper)

@@ -63,12 +63,10 @@ class SplitNeurons:
 
 @dataclass
 class OptimisedSlopes:
-    """The slopes and multipliers of a cell's coefficients, and the coefficients themselves.
+    """The slopes and multipliers of a cell's coefficients, and these coefficients, by node.
 
-    Attributes:
-        lines: By node: as `pass_activation` wants them, with rows in place of cells.
-        paid: By node: where, and what `SplitNeurons.pay` gives.
-        trace: By node: [R, C, H, W] rows on its output, and on the image (0).
+    ``lines`` are as `pass_activation` wants them, with rows in place of cells; ``paid`` says where, and what
+    `SplitNeurons.pay` gives; ``trace`` [R, C, H, W] has rows on the output, and on the image (0).
     """
 
     lines: dict[int, Float32]

@@ -34,13 +34,7 @@ def _none() -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class SparseMatrix(LinearLayer):
-    """A sparse matrix applied to the flattened item: means over axes, resizing, differences.
-
-    Attributes:
-        to, source: [E] int64 positions in the output and in the input.
-        weight: [E] float64.
-        offset: [*shape] float64 or None.
-    """
+    """A sparse matrix applied to the flattened item: weights [E] float64 from ``source`` [E] to ``to`` [E]."""
 
     to: Tensor = field(default_factory=_none)
     source: Tensor = field(default_factory=_none)
@@ -210,13 +204,7 @@ class PairwiseDifferences(LinearLayer):
 
 @dataclass(frozen=True, eq=False)
 class TransposedConvolution(WindowLayer):
-    """Two-dimensional transposed convolution; nearest upsampling by whole factors is one.
-
-    Attributes:
-        weight: [Cin, Cout / groups, kh, kw] float64.
-        pads: top, left; cut from the result.
-        groups: As in ONNX.
-    """
+    """Two-dimensional transposed convolution with weights [Cin, Cout / groups, kh, kw]; pads top, left are cut off."""
 
     pads: tuple[int, int] = (0, 0)
     groups: int = 1

@@ -16,12 +16,9 @@ from ns_abstract.verify.network.coefficients import Coefficients, Float64, Int64
 
 @dataclass
 class BackwardBounds:
-    """Concretised bounds of backward coefficients, and the planes they come from.
+    """Concretised bounds [R] of backward coefficients, and their planes below and above [R, 2, d + 1]; NaN if unknown.
 
-    Attributes:
-        plane: [R, 2, d + 1] slopes and offset of a plane below and one above; NaN if unknown.
-        lower, upper: [R]; infinite if unknown.
-        ended: [R] the node at which they ended; 0 is the image.
+    ``ended`` [R] is the node at which they ended; 0 is the image.
     """
 
     plane: Float64
