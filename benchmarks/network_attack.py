@@ -32,7 +32,7 @@ import extreme_networks as extreme  # noqa: E402  # pyright: ignore[reportMissin
 
 from ns_abstract.io.errors import InputError  # noqa: E402
 from ns_abstract.verify.network import ImageSets, Network, bound_outputs  # noqa: E402
-from ns_abstract.verify.network.onnx_file import read_onnx  # noqa: E402
+from ns_abstract.verify.network.load import read_onnx  # noqa: E402
 
 Array = np.ndarray
 #: Powers of two that constants and images are multiplied by.

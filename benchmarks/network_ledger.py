@@ -37,7 +37,7 @@ from network_table import ROWS  # noqa: E402  # pyright: ignore[reportMissingImp
 
 from ns_abstract.io.errors import InputError  # noqa: E402
 from ns_abstract.verify.network import ImageSets, bound_outputs  # noqa: E402
-from ns_abstract.verify.network.onnx_file import read_onnx  # noqa: E402
+from ns_abstract.verify.network.load import read_onnx  # noqa: E402
 
 PAGE = ROOT / "docs" / "dev" / "measurements.md"
 MARKS = "<!-- ledger of networks -->", "<!-- end of the ledger of networks -->"

@@ -27,7 +27,7 @@ sys.path[:0] = [str(ROOT)]
 
 from ns_abstract.verify.network import ImageSets, bound_outputs  # noqa: E402
 from ns_abstract.verify.network.graph import Network, NetworkArithmetic  # noqa: E402
-from ns_abstract.verify.network.onnx_file import read_onnx  # noqa: E402
+from ns_abstract.verify.network.load import read_onnx  # noqa: E402
 
 
 def dense(sizes: Sequence[int], function: Callable[[], nn.Module], gain: float = 1.4) -> nn.Module:

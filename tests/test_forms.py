@@ -28,8 +28,6 @@ from ns_abstract.arithmetic.form_array import FormArray
 from ns_abstract.arithmetic.forms import (
     MAX_DIMENSIONS,
     Basis,
-    add_product,
-    add_square,
     clamp_below,
     logarithm,
     scale_add,
@@ -43,15 +41,6 @@ LANES = 12
 
 def layout(basis: Basis) -> tuple[int, int, int]:
     return basis.dimensions, basis.order, basis.monomials
-
-
-def accumulated(basis: Basis, shape: tuple[int, ...], steps) -> FormArray:
-    """A sum built from nothing by kernels that add to their output."""
-    out = np.zeros((basis.rows, math.prod(shape)))
-    for kernel, *operands in steps:
-        kernel(*(x.data if isinstance(x, FormArray) else x for x in operands), out, *layout(basis))
-    set_norms(out, *layout(basis))
-    return FormArray(basis, out, shape)
 
 
 def logarithms(form: FormArray) -> FormArray:
@@ -71,20 +60,6 @@ BINARY = {
     "scale_add": (
         lambda a, b: scaled(a, 0.1, b, -0.7, 0.3),
         lambda x, y: rational(0.1) * x + rational(-0.7) * y + rational(0.3),
-    ),
-    "three_products": (
-        lambda a, b: accumulated(
-            a.basis, a.shape, ((add_product, a, b, 1.0), (add_product, b, b, -1.0), (add_product, a, a, 1.0))
-        ),
-        lambda x, y: x * y - y * y + x * x,
-    ),
-    "three_squares": (
-        lambda a, b: accumulated(a.basis, a.shape, ((add_square, a), (add_square, b), (add_square, a))),
-        lambda x, y: 2 * x * x + y * y,
-    ),
-    "cancelling_products": (
-        lambda a, b: accumulated(a.basis, a.shape, ((add_product, a, b, 1.0), (add_product, b, a, -1.0))),
-        lambda x, y: fmpq(0) * x * y,
     ),
 }
 UNARY = {
@@ -481,7 +456,7 @@ def test_monotone_in_radius(basis):
     wide = FormArray(basis, a.data.copy(), a.shape)
     wide.data[basis.monomials] *= 1.5
     m = basis.monomials
-    for name in ("add", "sub", "mul", "scale_add", "three_products"):
+    for name in ("add", "sub", "mul", "scale_add"):
         operation = BINARY[name][0]
         narrow_result, wide_result = operation(a, b), operation(wide, b)
         assert np.array_equal(narrow_result.data[:m], wide_result.data[:m])

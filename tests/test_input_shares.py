@@ -12,8 +12,8 @@ from onnx_files import OnnxFile
 from ns_abstract.execution.cancellation import Deadline
 from ns_abstract.verify import box_decisions
 from ns_abstract.verify.network import Network, load_network
+from ns_abstract.verify.network.dependence import input_shares
 from ns_abstract.verify.network.graph import as_double
-from ns_abstract.verify.network.input_shares import input_shares
 from ns_abstract.verify.network.layers import Matrix
 from ns_abstract.verify.vnnlib_sets import InputRegion, UnsafeSet
 

@@ -34,7 +34,7 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import ImageSets, Network, bound_outputs
 from ns_abstract.verify.network.build import NetworkBuilder
 from ns_abstract.verify.network.layers import Convolution, Matrix
-from ns_abstract.verify.network.onnx_file import read_onnx
+from ns_abstract.verify.network.load import read_onnx
 from ns_abstract.verify.network.sparse_layers import TransposedConvolution
 
 

@@ -32,7 +32,7 @@ from ns_abstract.verify.network import (
 )
 from ns_abstract.verify.network import rounding as network_rounding
 from ns_abstract.verify.network.layers import Activation
-from ns_abstract.verify.network.onnx_file import read_onnx
+from ns_abstract.verify.network.load import read_onnx
 
 ledger = script("network_ledger")
 table = script("network_table")

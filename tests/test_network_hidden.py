@@ -14,7 +14,7 @@ from test_network_reading import at, run
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import load_network
 from ns_abstract.verify.network.comparison import compare
-from ns_abstract.verify.network.onnx_file import read_onnx
+from ns_abstract.verify.network.load import read_onnx
 from ns_abstract.verify.network.onnx_fold import fold
 
 #: What the outputs beside are multiplied by.

@@ -19,7 +19,7 @@ from extreme_networks import Array, Extreme, Layer, batch_norm, flushing, gemm, 
 from onnx_files import OnnxFile
 from test_network_charges import bounds, outside
 
-from ns_abstract.verify.network.onnx_file import read_onnx
+from ns_abstract.verify.network.load import read_onnx
 
 Exact = Callable[[list[Any]], list[Any]]
 BIG = 2.0**24

@@ -15,7 +15,7 @@ from onnx_files import OnnxFile, image_sets, session
 
 from ns_abstract.verify.network import ImageSets, Network, bound_outputs, load_network
 from ns_abstract.verify.network.bounds import NetworkBounds
-from ns_abstract.verify.network.partial_sums import partial_sums
+from ns_abstract.verify.network.rounding import partial_sums
 
 Layers = list[tuple[np.ndarray, np.ndarray]]
 #: A product that is lost when it is added to 1 in float32, and 1 stays.

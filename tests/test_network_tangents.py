@@ -17,12 +17,10 @@ from ns_abstract.arithmetic.network_charges import UNIT
 from ns_abstract.verify.network import ImageSets, bound_outputs
 from ns_abstract.verify.network.graph import NetworkArithmetic
 from ns_abstract.verify.network.layers import Activation, LeakyRelu
-from ns_abstract.verify.network.load import load_network
-from ns_abstract.verify.network.onnx_file import read_onnx
+from ns_abstract.verify.network.load import load_network, read_onnx
 from ns_abstract.verify.network.relaxations import Relaxations
-from ns_abstract.verify.network.scalar_function import ScalarFunction
+from ns_abstract.verify.network.scalar_function import ScalarFunction, Tangents
 from ns_abstract.verify.network.slope_choices import UnstableNeurons
-from ns_abstract.verify.network.tangents import Tangents
 
 BENT = [name for name, (curve, _, _) in CURVES.items() if any(curve.bends)]
 DOUBLE = torch.float64

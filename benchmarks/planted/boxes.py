@@ -24,7 +24,7 @@ BOXES = (
     ),
     Fault(
         "boxes: an input's part is that of its largest value",
-        "verify/network/input_shares.py", "_motions", "v[1] - v[0]", "v[1]",
+        "verify/network/dependence.py", "_motions", "v[1] - v[0]", "v[1]",
         "test_input_shares.py::test_parts_are_those_of_the_first_layer",
     ),
     Fault(

@@ -386,12 +386,14 @@ CERTIFICATES = (
     ),
     Fault(
         "search: a bound below 0 is a proof",
-        _SEARCH, "Search._verdicts", "bound is not None and bound > 0.0", "bound is not None and bound > -0.05",
+        _SEARCH, "Search._verdicts", "cell.bound is not None and cell.bound > 0.0",
+        "cell.bound is not None and cell.bound > -0.05",
         _VERDICTS + "[1-0.43]",
     ),
     Fault(
         "search: a proof need not survive an attack",
-        _SEARCH, "Search.examine", "self._sample([samples[k] for k in sorted(proved)], self._attack)", "pass",
+        _SEARCH, "Search.examine", "self._sample([cell for cell in open_cells if cell.proved], self._attack)",
+        "pass",
         "test_certify_search.py::test_number_that_is_lost_after_a_proof_takes_it_back[nan]",
     ),
     Fault(
@@ -409,8 +411,7 @@ CERTIFICATES = (
     ),
     Fault(
         "search: a swallowed error proves",
-        _SEARCH, "Search._bound", "reasons.update(dict.fromkeys(numbers_kept, failure_text(error)))",
-        "bounded.update(dict.fromkeys(numbers_kept, 1.0))", _NETWORKS + "[exception]",
+        _SEARCH, "Search._bound", "np.full(len(usable), -np.inf)", "np.ones(len(usable))", _NETWORKS + "[exception]",
     ),
     Fault(
         "search: counterexamples are not rendered again",
@@ -425,7 +426,7 @@ CERTIFICATES = (
     Fault(
         "search: networks are asked about the widest cells",
         _SEARCH, "Search._too_wide",
-        "float(sets.widths.mean()) > _HOPELESS or costs[number] > _COSTLY", "False", _CHEAP,
+        "float(sets.widths.mean()) > _HOPELESS or cell.cost > _COSTLY", "False", _CHEAP,
     ),
     Fault(
         "search: only the stored scene is shown",

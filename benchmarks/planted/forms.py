@@ -50,11 +50,11 @@ FORMS = (
     ),
     Fault(
         "accumulated product's rounding is dropped",
-        _FORMS,
+        _WIDE_FORMS,
         "add_product",
-        "pa * b[m, q] + pb * a[m, q] + a[m, q] * b[m, q] + ADDED_PRODUCT_ROUNDING * (pa * pb)",
-        "pa * b[m, q] + pb * a[m, q] + a[m, q] * b[m, q]",
-        "test_forms.py::test_binary_contains[exact-three_products-d2o2]",
+        "ADDED_PRODUCT_ROUNDING",
+        "0.0",
+        "test_wide_forms.py::test_pairs",
     ),
     Fault(
         "underflow is not charged",

@@ -112,7 +112,7 @@ NETWORK_ROWS = (
     _curve("the error function is exact", "Erf.error", "2.0 * LIBRARY", "0.0", "error function-Erf"),
     _curve("a gate is one function", "_Gated.error", "4.0 * LIBRARY * _size(lower, upper)",
            "LIBRARY * _size(lower, upper)", "SiLU, GELU, Mish-Gelu"),
-    _curve("the file's quotients are exact", "ScaledGelu.missing", "OWN_QUOTIENTS * _far(lower, upper)", "0.0",
+    _curve("the file's quotients are exact", "ScaledGelu.missing", "OWN_QUOTIENTS * _size(lower, upper)", "0.0",
            "functions with constants of the file-ScaledGelu", "composite_activations.py"),
     _curve("a switch leaves no gap", "SwitchedSoftplus.missing", "math.exp(-self.limit) * SWITCH", "0.0",
            "switched softplus-SwitchedSoftplus", "composite_activations.py"),

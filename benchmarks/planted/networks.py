@@ -92,7 +92,7 @@ NETWORKS = (
     Fault(
         "root: small numbers are never flushed",
         _NETWORK + "activations.py",
-        "Root._cuts",
+        "_Positive._cuts",
         "lower >= FLUSH",
         "lower > 0.0",
         _TESTS + "test_flushed_images",

@@ -105,7 +105,7 @@ PICTURES = (
     ),
     Fault(
         "cells: compared cuts are not made", "verify/search.py", "Search._verdicts",
-        "scene.cut_gains(cell.box) if isinstance(scene, ComparedCuts) else slopes[number]", "slopes[number]",
+        "scene.cut_gains(cell.box) if isinstance(scene, ComparedCuts) else cell.slopes", "cell.slopes",
         "test_certify_search.py::test_cells_are_cut_where_bounds_narrow_most",
     ),
     Fault(

@@ -157,7 +157,7 @@ VERDICTS = (
     ),
     Fault(
         "network: tangents forget the part behind the inflection",
-        "verify/network/tangents.py",
+        "verify/network/scalar_function.py",
         "Tangents.line",
         "torch.maximum(touch, self.side * (height - slope * corner))",
         "touch",
@@ -165,7 +165,7 @@ VERDICTS = (
     ),
     Fault(
         "network: rounded slopes turn tangents about nothing",
-        "verify/network/tangents.py",
+        "verify/network/scalar_function.py",
         "Tangents.line",
         "(slope - tangent).abs() * width",
         "0.0",
@@ -357,7 +357,7 @@ VERDICTS = (
     ),
     Fault(
         "network: partial sums on the way to a large sum are forgotten",
-        "verify/network/partial_sums.py",
+        "verify/network/rounding.py",
         "partial_sums",
         "half * end",
         "0.0 * end",

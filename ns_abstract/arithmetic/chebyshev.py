@@ -1,8 +1,7 @@
 """Polynomials of ``[-1, 1]^d`` in Chebyshev's basis: interpolation, ranges and fits with certified errors.
 
-A polynomial of total degree ``D`` is its coefficients in ``T_k(p) = prod_j T_{k_j}(p_j)``, ``|k| <= D``
-(design.md, F2). The functions here only build matrices; whoever applies them adds `CHEBYSHEV_ROUNDING` times the sum of
-absolute coefficients.
+A polynomial of total degree ``D`` is its coefficients in ``T_k(p) = prod_j T_{k_j}(p_j)``, ``|k| <= D`` (design.md,
+F2). Who applies the matrices built here adds `CHEBYSHEV_ROUNDING` times the sum of absolute coefficients.
 """
 
 from __future__ import annotations
@@ -29,8 +28,7 @@ def chebyshev_values(points: Float64Array, degree: int) -> Float64Array:
 class ChebyshevBasis:
     """Polynomials of ``dimensions`` variables up to a total ``degree``.
 
-    Attributes:
-        grid: Intervals by axis of the grid (extrema of T_grid) on which ranges and fits are taken; above ``degree``.
+    ``grid``, above ``degree``: intervals by axis of the grid (extrema of T_grid) on which ranges and fits are taken.
     """
 
     dimensions: int

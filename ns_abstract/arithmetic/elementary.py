@@ -1,8 +1,4 @@
-"""Elementary functions for compiled kernels, with proven relative errors.
-
-``exp`` is built from IEEE additions, multiplications and fused multiply-adds only, so its error
-does not depend on the platform's mathematical library.
-"""
+"""Elementary functions for compiled kernels, with proven relative errors on every platform."""
 
 from __future__ import annotations
 
@@ -78,10 +74,7 @@ if config.DISABLE_JIT:  # pyright: ignore[reportAttributeAccessIssue]
 
 @njit(inline="always", error_model="numpy")
 def exp_kernel(x):
-    """exp(x), ``EXP_LOWEST <= x <= EXP_HIGHEST``, of floats or lanes; relative error ``<= EXP_RELATIVE_ERROR``.
-
-    See design.md, E1.
-    """
+    """exp(x), EXP_LOWEST <= x <= EXP_HIGHEST, of floats or lanes, within EXP_RELATIVE_ERROR of it (design.md, E1)."""
     shifted = fma(x, _LOG2E, _ROUND_TO_INTEGER)
     k = shifted - _ROUND_TO_INTEGER
     r = fma(-k, _LN2_HIGH, x)

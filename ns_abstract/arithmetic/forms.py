@@ -29,7 +29,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from ns_abstract.arithmetic.rounding import (
-    ADDED_PRODUCT_ROUNDING,
     CURVATURE_DOWN,
     FORM_ROUNDING,
     LARGEST,
@@ -97,10 +96,7 @@ def set_norms(out, d, order, m):
 
 @njit(cache=True, error_model="numpy")
 def scale_add(a, s, b, t, shift, out, d, order, m):
-    """``out = s * a + t * b + shift`` for numbers ``s``, ``t``, ``shift``; ``out`` may be ``a`` or ``b``.
-
-    See design.md, A1.
-    """
+    """``out = s * a + t * b + shift`` for numbers s, t, shift (design.md, A1); ``out`` may be ``a`` or ``b``."""
     n = out.shape[1]
     absolute_s = abs(s)
     absolute_t = abs(t)
@@ -235,72 +231,6 @@ def square(a, out, d, order, m):
 
 
 @njit(cache=True, error_model="numpy")
-def add_product(a, b, sign, out, d, order, m):
-    """``out += sign * a * b`` except for the rows ``sum |.|`` of ``out``; `set_norms` must follow.
-
-    ``sign`` is 1 or -1. Charges its own share of the rounding of up to three such additions.
-    """
-    n = out.shape[1]
-    for q in range(n):
-        out[m + 1, q] = abs(a[0, q]) + a[m + 1, q] + a[m + 2, q]
-    for q in range(n):
-        out[m + 2, q] = abs(b[0, q]) + b[m + 1, q] + b[m + 2, q]
-    for q in range(n):
-        pa = out[m + 1, q]
-        pb = out[m + 2, q]
-        out[m, q] += pa * b[m, q] + pb * a[m, q] + a[m, q] * b[m, q] + ADDED_PRODUCT_ROUNDING * (pa * pb)
-    for q in range(n):
-        out[0, q] += sign * (a[0, q] * b[0, q])
-    for k in range(1, m):
-        for q in range(n):
-            out[k, q] += sign * (a[0, q] * b[k, q] + b[0, q] * a[k, q])
-    if order == 2:
-        row = d + 1
-        for k in range(1, d + 1):
-            for q in range(n):
-                out[row, q] += sign * (a[k, q] * b[k, q])
-            row += 1
-            for l in range(k + 1, d + 1):
-                for q in range(n):
-                    out[row, q] += sign * (a[k, q] * b[l, q] + a[l, q] * b[k, q])
-                row += 1
-        for q in range(n):
-            out[m, q] += a[m + 1, q] * b[m + 2, q] + a[m + 2, q] * (b[m + 1, q] + b[m + 2, q])
-    else:
-        for q in range(n):
-            out[m, q] += a[m + 1, q] * b[m + 1, q]
-        for k in range(1, d + 1):
-            for q in range(n):
-                out[m + 1, q] = 0.5 * (a[k, q] * b[k, q])
-            for q in range(n):
-                out[0, q] += sign * out[m + 1, q]
-            for q in range(n):
-                out[m, q] -= abs(out[m + 1, q])
-    for q in range(n):
-        out[m, q] = out[m, q] * UP + UNDERFLOW64
-
-
-@njit(cache=True, error_model="numpy")
-def add_square(a, out, d, order, m):
-    """``out += a * a`` except for the rows ``sum |.|`` of ``out``; `set_norms` must follow."""
-    if order == 2:
-        add_product(a, a, 1.0, out, d, order, m)
-        return
-    n = out.shape[1]
-    for q in range(n):
-        l = a[m + 1, q]
-        r = a[m, q]
-        half = 0.5 * (l * l)
-        p = abs(a[0, q]) + l
-        out[m, q] = (out[m, q] + (2.0 * p + r) * r + half + ADDED_PRODUCT_ROUNDING * (p * p)) * UP + UNDERFLOW64
-    for q in range(n):
-        out[0, q] += a[0, q] * a[0, q] + 0.5 * (a[m + 1, q] * a[m + 1, q])
-    for k in range(1, m):
-        for q in range(n):
-            out[k, q] += 2.0 * (a[0, q] * a[k, q])
-
-
-@njit(cache=True, error_model="numpy")
 def bounds(a, low, high, d, order, m):
     """``low[q] <= x_q(p) <= high[q]`` over the box, rounded outward (design.md, A4)."""
     n = a.shape[1]
@@ -342,14 +272,20 @@ def bounds(a, low, high, d, order, m):
         high[q] += a[0, q]
 
 
+@njit(cache=True, error_model="numpy", inline="always")
+def _ends(a, m, q):
+    """Lower and upper bounds of a positive quantity, and whether functions of it are evaluated there."""
+    c = a[0, q]
+    e = (a[m + 1, q] + a[m + 2, q] + a[m, q]) * UP
+    low = (c - e) * (1.0 - FORM_ROUNDING)
+    return low, (c + e) * UP, SMALLEST < low < LARGEST
+
+
 @njit(cache=True, error_model="numpy")
 def reciprocal(a, work, out, d, order, m):
     """``out = 1 / a`` for ``a > 0`` (1e-75 to 1e75); ``work`` is [5, n] scratch."""
     for q in range(out.shape[1]):
-        c = a[0, q]
-        e = (a[m + 1, q] + a[m + 2, q] + a[m, q]) * UP
-        low = (c - e) * (1.0 - FORM_ROUNDING)
-        inside = SMALLEST < low < LARGEST
+        c, (low, high, inside) = a[0, q], _ends(a, m, q)
         f0 = 1.0 / c if inside else 1.0
         work[0, q] = f0
         work[1, q] = -f0 * f0
@@ -358,7 +294,6 @@ def reciprocal(a, work, out, d, order, m):
             low2 = low * low
             work[4, q] = 1.0 / (low2 * low2) * UP if inside else np.inf
         else:
-            high = (c + e) * UP
             work[2, q] = 1.0 / (high * high * high) * (1.0 - FORM_ROUNDING) if inside else 0.0
             work[3, q] = 1.0 / (low * low * low) * UP if inside else np.inf
     compose(a, work[0], work[1], work[2], work[3], work[4], out, d, order, m)
@@ -368,10 +303,7 @@ def reciprocal(a, work, out, d, order, m):
 def square_root(a, work, out, d, order, m):
     """``out = sqrt(a)`` for ``a > 0``; ``work`` is [5, n] scratch."""
     for q in range(out.shape[1]):
-        c = a[0, q]
-        e = (a[m + 1, q] + a[m + 2, q] + a[m, q]) * UP
-        low = (c - e) * (1.0 - FORM_ROUNDING)
-        inside = SMALLEST < low < LARGEST
+        c, (low, high, inside) = a[0, q], _ends(a, m, q)
         f0 = np.sqrt(c) if inside else 1.0
         work[0, q] = f0
         work[1, q] = 0.5 / f0
@@ -379,7 +311,6 @@ def square_root(a, work, out, d, order, m):
             work[2, q] = -0.125 / (f0 * f0 * f0)
             work[4, q] = 0.0625 / (low * low * np.sqrt(low)) * UP if inside else np.inf
         else:
-            high = (c + e) * UP
             work[2, q] = -0.125 / (low * np.sqrt(low)) * UP if inside else -np.inf
             work[3, q] = -0.125 / (high * np.sqrt(high)) * CURVATURE_DOWN if inside else np.inf
     compose(a, work[0], work[1], work[2], work[3], work[4], out, d, order, m)
@@ -389,10 +320,7 @@ def square_root(a, work, out, d, order, m):
 def reciprocal_square_root(a, work, out, d, order, m):
     """``out = 1 / sqrt(a)`` for ``a > 0``; ``work`` is [5, n] scratch."""
     for q in range(out.shape[1]):
-        c = a[0, q]
-        e = (a[m + 1, q] + a[m + 2, q] + a[m, q]) * UP
-        low = (c - e) * (1.0 - FORM_ROUNDING)
-        inside = SMALLEST < low < LARGEST
+        c, (low, high, inside) = a[0, q], _ends(a, m, q)
         f0 = 1.0 / np.sqrt(c) if inside else 1.0
         f2 = f0 * f0
         work[0, q] = f0
@@ -401,7 +329,6 @@ def reciprocal_square_root(a, work, out, d, order, m):
             work[2, q] = 0.375 * f0 * f2 * f2
             work[4, q] = 0.3125 / (low * low * low * np.sqrt(low)) * UP if inside else np.inf
         else:
-            high = (c + e) * UP
             work[2, q] = 0.375 / (high * high * np.sqrt(high)) * CURVATURE_DOWN if inside else -np.inf
             work[3, q] = 0.375 / (low * low * np.sqrt(low)) * UP if inside else np.inf
     compose(a, work[0], work[1], work[2], work[3], work[4], out, d, order, m)
@@ -409,16 +336,9 @@ def reciprocal_square_root(a, work, out, d, order, m):
 
 @njit(cache=True, error_model="numpy")
 def logarithm(a, work, out, d, order, m):
-    """``out = log(a)`` for ``a > 0``; ``work`` is [5, n] scratch.
-
-    The library's logarithm is charged four units of ``|log(a)| + 1`` (checked at start-up,
-    `ns_abstract.arithmetic.selfcheck`).
-    """
+    """``out = log(a)`` for ``a > 0``, charged four units of ``|log(a)| + 1`` more; ``work`` is [5, n] scratch."""
     for q in range(out.shape[1]):
-        c = a[0, q]
-        e = (a[m + 1, q] + a[m + 2, q] + a[m, q]) * UP
-        low = (c - e) * (1.0 - FORM_ROUNDING)
-        inside = SMALLEST < low < LARGEST
+        c, (low, high, inside) = a[0, q], _ends(a, m, q)
         inverse = 1.0 / c if inside else 1.0
         work[0, q] = np.log(c) if inside else 0.0
         work[1, q] = inverse
@@ -426,7 +346,6 @@ def logarithm(a, work, out, d, order, m):
             work[2, q] = -0.5 * inverse * inverse
             work[4, q] = 1.0 / (3.0 * low * low * low) * UP if inside else np.inf
         else:
-            high = (c + e) * UP
             work[2, q] = -0.5 / (low * low) * UP if inside else -np.inf
             work[3, q] = -0.5 / (high * high) * CURVATURE_DOWN if inside else np.inf
     compose(a, work[0], work[1], work[2], work[3], work[4], out, d, order, m)

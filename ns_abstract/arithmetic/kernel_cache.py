@@ -1,19 +1,16 @@
 """Compiled kernels, kept between runs in the user's cache folder.
 
-numba keeps compiled code by the file of each function alone, but that code holds the functions and constants of other
-modules, too, and numba reads back whatever lies in its files. Here, kernels belong to a hash of all sources that they
-may use, and what is read back is what was written:
+numba keeps compiled code by the file of each function alone, but that code holds functions of other modules, too. Here,
+kernels belong to a hash of all sources that they may use, and what is read back is what was written:
 
 * ``ROOT/<hash of the sources>/manifest.json`` names the files of every kernel and their SHA-256;
 * ``ROOT/<hash>/blobs/<SHA-256>`` are these files; one that is damaged is dropped, and its kernel compiled again;
-* ``ROOT/<hash>/session-<host>-<process>-*`` is where numba reads and writes in one process. New files are published
-  from there, so that processes that start at once do not get into each other's way. Processes that compile for
-  another one share its session: a lock for every kernel keeps two of them from compiling the same one.
+* ``ROOT/<hash>/session-<host>-<process>-*`` is where numba reads and writes in one process, and new files are published
+  from. Processes that compile for another one share its session: a lock for every kernel keeps two from compiling it.
 
-ROOT is ``$NS_ABSTRACT_CACHE_DIR``, or ``kernels`` in the cache folder that the platform provides. Where that cannot be
-written, a temporary folder serves the process and those that it starts. The installation itself is never written to.
-numba is told by its setting ``CACHE_LOCATOR_CLASSES``. Kept are kernels that Python calls; they hold what they call
-(`kernel_linking`). An installation may bring kernels along (`shipped_kernels`), which are taken where none are kept.
+ROOT is ``$NS_ABSTRACT_CACHE_DIR``, or ``kernels`` in the platform's cache folder; where that cannot be written, a
+temporary folder. Kept are kernels that Python calls; they hold what they call (`kernel_linking`). Kernels that an
+installation brings along (`shipped_kernels`) are taken where none are kept.
 """
 
 from __future__ import annotations
@@ -79,10 +76,9 @@ class KernelMissingError(Exception):
 
 
 class KernelStore:
-    """The kernels of one version of the sources, as one process sees them.
+    """The kernels of one version of the sources, ``key``, as one process sees them in the folder ``root``.
 
-    Args:
-        session: That of the process that this one compiles for; None: one of its own.
+    ``session``: that of the process that this one compiles for; None: one of its own.
 
     Raises:
         OSError: ``root`` cannot be written.

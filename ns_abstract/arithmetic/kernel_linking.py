@@ -1,11 +1,8 @@
 """Functions that only kernels call are linked into these, without machine code of their own.
 
-numba compiles each function that a kernel calls as if Python called it, too: with a wrapper that unpacks Python's
-objects, optimised by itself and once more in each of its callers, and translated to machine code that nothing runs.
-Here, what is compiled on the way to a kernel of this package stays LLVM code. The kernel is linked from all of it and
-optimised once. A function that Python calls is compiled like any other, also where a kernel called it before.
-
-The arithmetic is the same: without ``fastmath`` no optimisation changes what is rounded.
+numba compiles each function that a kernel calls as if Python called it, too. Here, what is compiled on the way to a
+kernel of this package stays LLVM code; the kernel is linked from all of it and optimised once. The arithmetic is the
+same: without ``fastmath`` no optimisation changes what is rounded.
 """
 
 from __future__ import annotations

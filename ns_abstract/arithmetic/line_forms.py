@@ -1,9 +1,7 @@
-"""Forms of order 2 in one parameter as four numbers: the rules of `forms` for one quantity.
+"""Forms of order 2 in one parameter as four numbers: the rules of `forms` for one quantity (design.md, A6).
 
-See design.md, A6.
-
-Sets of one parameter are the common case. Compiled loops over many quantities keep these numbers in registers, which
-takes a fifth of the time that the array kernels take for the same rules; each function names its kernel.
+Compiled loops over many quantities keep these numbers in registers, which takes a fifth of the time that the array
+kernels take; each function names its kernel.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
-"""Rounding units and the error constants that bounds are charged with.
+"""Rounding units and the error constants that bounds are charged with: only this place knows how large an error is.
 
-This is the only place that knows how large a rounding error is.
-
-A floating-point evaluation of ``x op y`` returns ``(x op y)(1 + d)``, ``|d| <= k u``, with
-``u`` the unit of the format and ``k`` the error of the operation in units of ``u``.
+A floating-point evaluation of ``x op y`` returns ``(x op y)(1 + d)``, ``|d| <= k u``, with ``u`` the unit of the format
+and ``k`` the error of the operation in units of ``u``.
 """
 
 from __future__ import annotations

@@ -1,14 +1,12 @@
 """Start-up check that this machine's elementary functions are as accurate as the bounds assume.
 
-The bounds charge a fixed error to every elementary function. IEEE 754 fixes division and the square root;
-the logarithm and the trigonometric functions come from libraries that differ between machines, and
-`exp_kernel` relies on a true fused multiply-add. `check_functions` compares them all with stored values, in
-a millisecond once the kernels are compiled.
+IEEE 754 fixes division and the square root; the logarithm and the trigonometric functions come from libraries that
+differ between machines, and `exp_kernel` relies on a true fused multiply-add. `check_functions` compares them with
+stored values, in a millisecond once the kernels are compiled.
 
-The stored values (selfcheck.txt) were computed offline by python-flint's Arb: for each point x the two
-neighbouring float64 numbers (equal where the value is a float64 itself) that enclose f(x). A function's points are
-special ones (next to zeros, ends of the argument reduction, ends of the range) and, of some 9 000 random ones, those
-whose value lies nearest to the middle of two float64 numbers, where a faulty last bit shows first.
+The stored values (selfcheck.txt) were computed by python-flint's Arb: for each point x the two neighbouring float64
+numbers (equal where the value is one) that enclose f(x). Points are next to zeros and at ends of ranges, and of some 9
+000 random ones those whose value lies nearest to the middle of two float64 numbers.
 """
 
 from __future__ import annotations
@@ -92,13 +90,9 @@ def table(name: str) -> tuple[Float64Array, Float64Array, Float64Array]:
 def check_functions(
     functions: Mapping[str, Callable[[Float64Array, Float64Array], None]] | None = None,
 ) -> list[str]:
-    """Compare this machine's functions with the stored values.
+    """One sentence for each of this machine's functions that is less accurate than the bounds assume.
 
-    Args:
-        functions: ``f(x, out)`` for arrays [n], by the names of `ASSUMED_ERRORS`; those the bounds use if None.
-
-    Returns:
-        One sentence per function that is less accurate than the bounds assume; empty if all is well.
+    ``functions``: ``f(x, out)`` for arrays [n], by the names of `ASSUMED_ERRORS`; those the bounds use if None.
     """
     problems = []
     for name, function in (FUNCTIONS if functions is None else functions).items():

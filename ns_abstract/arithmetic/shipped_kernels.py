@@ -1,12 +1,9 @@
 """Compiled kernels that come with an installation, for processors of a level of x86-64.
 
-numba names with each kernel the processor that it was compiled for, and loads it on that one alone. What a wheel brings
-was compiled for a level, x86-64-v3 say (NUMBA_CPU_NAME), and runs on every processor that has the level's features
-(System V ABI, AMD64 supplement, section 3.1.1). Here it gets the name of this processor. A level's folder is
-``kernels/LEVEL/<hash of the sources>`` in the package, of the form that `kernel_cache` describes; kernels of other
-sources, or of another version of numba, are not looked at. ``benchmarks/ship_kernels.py`` makes the folders.
-
-The arithmetic is the same on every level: without ``fastmath`` no choice of instructions changes what is rounded.
+numba loads a kernel on the processor alone that it was compiled for. What a wheel brings was compiled for a level,
+x86-64-v3 say (NUMBA_CPU_NAME), and gets the name of this processor where it has the level's features (System V ABI,
+AMD64 supplement, section 3.1.1). A level's folder is ``kernels/LEVEL/<hash of the sources>`` in the package, of the
+form that `kernel_cache` describes; ``benchmarks/ship_kernels.py`` makes it.
 """
 
 from __future__ import annotations
@@ -49,8 +46,7 @@ def shipped_folder(package: Path, key: str) -> Path | None:
 def adopt(folder: Path, function: str, stamp: str) -> None:
     """Put this processor in place of the level that a function's kernels in ``folder`` were compiled for.
 
-    Args:
-        stamp: Of the sources; kernels of others are dropped.
+    Kernels of other sources than those of ``stamp`` are dropped.
     """
     index = IndexDataCacheFile(str(folder), function, stamp)
     # compiled for: triple, name of the processor, its features

@@ -1,10 +1,8 @@
 """Taylor models: quantities over a parameter box as polynomials of any total degree plus a radius.
 
 A model over ``p in [-1, 1]^d`` encloses a function ``x`` as ``x(p) = sum_a c_a p^a + e(p)``, ``|a| <= degree``,
-``|e(p)| <= r`` (design.md, F1). They describe poses, where the two orders of `ns_abstract.arithmetic.forms`
-leave too much to the radius; arrays are small, so numpy does the work.
-
-Every operation charges its own float64 rounding to the radius.
+``|e(p)| <= r`` (design.md, F1), and charges its own float64 rounding to the radius. They describe poses; arrays are
+small, so numpy does the work.
 """
 
 from __future__ import annotations
@@ -56,12 +54,7 @@ class TaylorBasis:
 
 
 class TaylorArray:
-    """An array of Taylor models over one box, with numpy-like operators.
-
-    Attributes:
-        coefficients: [monomials, *shape].
-        radius: [*shape].
-    """
+    """An array of Taylor models over one box: coefficients [monomials, *shape] and radius [*shape]."""
 
     #: numpy arrays on the left of an operator leave it to this class
     __array_ufunc__ = None
@@ -167,10 +160,8 @@ class TaylorArray:
     def compose(self, derivatives: Sequence[Float64Array], last: Float64Array) -> TaylorArray:
         """``f`` of the array by Taylor's formula about the centre.
 
-        Args:
-            derivatives: ``f^(k)(centre) / k!`` for k from 0 to the degree, each up to a relative rounding
-                of 32 units of float64.
-            last: Upper bound of ``|f^(degree + 1)| / (degree + 1)!`` over the range.
+        ``derivatives`` are ``f^(k)(centre) / k!`` for k up to the degree, each up to a relative rounding of 32 units;
+        ``last`` is an upper bound of ``|f^(degree + 1)| / (degree + 1)!`` over the range.
         """
         step = self - self.center
         largest = (step.size + step.radius) * TAYLOR_UP

@@ -62,11 +62,7 @@ class Deadline:
 
     @contextmanager
     def enforced(self) -> Iterator[None]:
-        """Cancel work inside the block, at its next `check_cancelled`, once the deadline is reached.
-
-        Raises:
-            WorkCancelledError: It is reached.
-        """
+        """Cancel work inside the block once the deadline is reached (`cancel_when`)."""
         with cancel_when(self):
             yield
 
@@ -87,11 +83,7 @@ def is_cancelled() -> bool:
 
 
 def check_cancelled() -> None:
-    """Raise `WorkCancelledError` if the current work is cancelled; long loops call it about once a second.
-
-    Raises:
-        WorkCancelledError: It is.
-    """
+    """Raise `WorkCancelledError` if the current work is cancelled; long loops call it about once a second."""
     if is_cancelled():
         raise WorkCancelledError
 

@@ -31,11 +31,7 @@ _TRIM = "MALLOC_TRIM_THRESHOLD_"
 
 
 class Cluster:
-    """A Dask cluster. Its workers must see the input files under the same paths.
-
-    Args:
-        client: Of `connected`.
-    """
+    """A Dask cluster, a client of `connected`. Its workers must see the input files under the same paths."""
 
     shares = False
     starting = False
@@ -139,11 +135,7 @@ class Cluster:
         return True
 
     def _again(self) -> None:
-        """Hand everything in once more: with the connection its tasks were lost.
-
-        Raises:
-            InputError: The scheduler does not answer any more.
-        """
+        """Hand everything in once more, as its tasks went with the connection; InputError if the scheduler is gone."""
         end = time.monotonic() + _GONE
         while self.client.status == "connecting" and time.monotonic() < end:
             time.sleep(0.1)
@@ -157,11 +149,7 @@ class Cluster:
             self._submit(key)
 
     def _look(self) -> None:
-        """Refuse to wait for ever.
-
-        Raises:
-            InputError: The scheduler, or every worker, has been gone for a while.
-        """
+        """Refuse to wait on where the scheduler, or every worker, has been gone for a while."""
         if self._now():
             self._lost_since = None
             return
@@ -222,11 +210,7 @@ class Tls:
 
 
 def _check_pem(ca_file: Path, cert: Path, key: Path) -> None:
-    """Refuse files that hold no certificates.
-
-    Raises:
-        InputError: A file is no PEM file, or the key is another one's or needs a password.
-    """
+    """Refuse a file that is no PEM file, and a key that is another one's or needs a password."""
 
     def password() -> str:
         raise ValueError("the key needs a password")
@@ -281,11 +265,8 @@ def _within(seconds: float, make: Callable[[], Any]) -> Any:
 def connected(address: str | None, workers: int = 1, tls: Tls | None = None) -> Iterator[Any]:
     """A Dask client of the scheduler at ``address``, or of a cluster on this machine if None.
 
-    That cluster and its dashboard listen on the loopback interface alone.
-
-    Args:
-        workers: Processes of the cluster on this machine, one thread each.
-        tls: Encrypts the connection to ``address``, and both ends prove who they are.
+    That cluster has ``workers`` processes of one thread, and listens on the loopback interface alone. ``tls`` encrypts
+    the connection to ``address``, and both ends prove who they are.
 
     Raises:
         InputError: Dask is missing or its scheduler does not answer.

@@ -43,11 +43,7 @@ class EngineOptions:
         return 1 if self.engine == "dask" and self.workers is None else self.processes
 
     def check(self) -> None:
-        """Refuse what makes no sense together.
-
-        Raises:
-            InputError: The option and its value.
-        """
+        """Raise InputError where options make no sense together."""
         if self.processes < 1:
             raise InputError(f"found {self.workers}", field="--workers", fix="give a number of at least 1")
         if self.engine == "local" and self.scheduler_address is not None:

@@ -1,7 +1,6 @@
 """Engines that run tasks: the interface, this process, and processes of this machine (a Dask cluster: `cluster`).
 
-An engine takes tasks (a function of a module and picklable arguments) and hands back each one's result
-exactly once, in any order, whatever workers die on the way.
+An engine hands back each task's result exactly once, in any order, whatever workers die on the way.
 """
 
 from __future__ import annotations

@@ -14,12 +14,7 @@ EngineName = Literal["local", "dask"]
 
 @contextmanager
 def started(name: EngineName, address: str | None, workers: int, tls: Tls | None = None) -> Iterator[Engine]:
-    """An engine, closed at the end of the block.
-
-    Args:
-        name: "dask", or "local": this process if there is one worker, otherwise processes.
-        address: HOST:PORT of a Dask scheduler; None: a cluster on this machine.
-        tls: As for `connected`.
+    """An engine, closed at the end of the block: `connected` for "dask", else processes, or this one for one worker.
 
     Raises:
         InputError: As `connected`.

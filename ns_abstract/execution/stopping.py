@@ -34,11 +34,7 @@ class StopRequest:
 
     @contextmanager
     def at_once(self) -> Iterator[None]:
-        """Inside the block there is nothing to save: the first signal ends it.
-
-        Raises:
-            KeyboardInterrupt: A signal came, or had come before.
-        """
+        """Inside the block there is nothing to save: a signal, also one before, raises KeyboardInterrupt."""
         self._raising += 1
         try:
             if self.signal is not None:
@@ -53,11 +49,7 @@ class StopRequest:
 
     @contextmanager
     def last_words(self, write: Callable[[], object]) -> Iterator[None]:
-        """Inside the block, ``write`` says what is there wherever the process is ended in the middle of a library call.
-
-        Args:
-            write: May be called by another thread while this one is in the call.
-        """
+        """Inside the block, ``write`` says what is there if the process ends in a library call, on any thread."""
         before, self._last = self._last, write
         try:
             yield
@@ -90,8 +82,7 @@ class StopRequest:
 def interruptible() -> Iterator[StopRequest]:
     """Yield a request that Ctrl-C sets, where Python's own handler would raise KeyboardInterrupt.
 
-    So the work ends between two cells, with results that are whole. Elsewhere (other threads, programs that handle the
-    signal themselves) signals are left alone.
+    In other threads, and programs that handle the signal themselves, signals are left alone.
     """
     stop = StopRequest()
     main = threading.current_thread() is threading.main_thread()

@@ -1,8 +1,4 @@
-"""Threads of this process that work on one cell or picture; compiled kernels release the interpreter's lock.
-
-numba's own parallel loops would have each kernel compiled four times: for the type that they count by, in the loop's
-body and around it.
-"""
+"""Threads of this process that work on one cell or picture; compiled kernels release the interpreter's lock."""
 
 from __future__ import annotations
 
@@ -73,10 +69,7 @@ def _pool(process: int) -> ThreadPoolExecutor:
 
 
 def side_by_side(work: Callable[[int], object], count: int) -> None:
-    """Call ``work`` with 0 .. ``count`` - 1, the first in this thread and the others beside it, and wait for all.
-
-    Each has a copy of the caller's context variables.
-    """
+    """Call ``work`` with 0 .. ``count`` - 1 side by side, the first in this thread, in copies of its context."""
     others: list[Future[object]] = []
     try:
         others = [_pool(os.getpid()).submit(copy_context().run, work, number) for number in range(1, count)]

@@ -51,12 +51,7 @@ class LatestValue(Generic[T]):
 
 @dataclass(frozen=True)
 class Recipe(Generic[F]):
-    """A recipe with which another process loads the same object.
-
-    Attributes:
-        open: Opens it again; can be pickled.
-        file: Named by the error where the other process finds something else.
-    """
+    """A recipe that can be pickled, with which another process opens the same object; errors name ``file``."""
 
     open: Callable[[], F]
     fingerprint: Mapping[str, Any]
@@ -75,8 +70,7 @@ def load(recipe: Recipe[F]) -> F:
     """Return the object of the recipe, loaded once in this process.
 
     Raises:
-        InputError: This process runs another version of the package than the one that asks, or reads other files
-            under the same names.
+        InputError: This process runs another version than the one that asks, or reads other files under the same names.
     """
 
     def make() -> F:

@@ -1,13 +1,8 @@
-"""The affine version of the paper's rules: forms with their ranges.
-
-An `Enclosure` is a `FormArray` together with an `Interval` that holds the same quantity. Each
-operation is carried out on both, and each narrows the other: the range never exceeds what interval
-arithmetic gives, and a form that says less than its range is replaced by it.
-"""
+"""The affine version of the paper's rules: forms with their ranges, which narrow each other."""
 
 from __future__ import annotations
 
-from typing import Any, overload
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -43,11 +38,7 @@ def _merge(mask: BoolArray, first: FormArray, second: FormArray) -> FormArray:
 class Enclosure:
     """An array of quantities over a box ``p in [-1, 1]^d``, as forms and as intervals at once.
 
-    Attributes:
-        range: Intervals that hold it over the whole box, never wider than the forms' bounds.
-
-    Args:
-        range_: What else is known of the values over the whole box.
+    ``range``, never wider than the forms' bounds, holds them over the whole box; ``range_`` is what else is known.
     """
 
     __array_ufunc__ = None
@@ -65,14 +56,6 @@ class Enclosure:
         """Quantities of which nothing but ``values`` is known."""
         values = Interval.lift(values)
         return cls(form_of(basis, values), values)
-
-    @overload
-    @classmethod
-    def lift(cls, value: Enclosure | FormArray, basis: Basis | None = None) -> Enclosure: ...
-
-    @overload
-    @classmethod
-    def lift(cls, value: Enclosure | FormArray | Interval | ArrayLike, basis: Basis) -> Enclosure: ...
 
     @classmethod
     def lift(cls, value: Enclosure | FormArray | Interval | ArrayLike, basis: Basis | None = None) -> Enclosure:
@@ -278,3 +261,17 @@ class Enclosure:
     def indicator(self) -> Enclosure:
         """1 where ``x > 0``, else 0; both where undecided (no slope narrows the unit step's range)."""
         return Enclosure.of(self.basis, self.range.indicator())
+
+
+#: Intervals, or forms with their ranges: a result of a rule has the face of its operands.
+Face = TypeVar("Face", Interval, Enclosure)
+
+
+def range_of(x: Interval | Enclosure) -> Interval:
+    """The intervals that hold ``x``."""
+    return x if isinstance(x, Interval) else x.range
+
+
+def constant_like(like: Face, values: Interval) -> Face:
+    """Return constants that enclose ``values``, in the arithmetic and basis of ``like``."""
+    return type(like).lift(values) if isinstance(like, Interval) else type(like).of(like.basis, values)

@@ -10,8 +10,7 @@ import itertools
 
 import numpy as np
 
-from ns_abstract.paper.affine import Enclosure
-from ns_abstract.paper.faces import Face, constant_like, range_of
+from ns_abstract.paper.affine import Enclosure, Face, constant_like, range_of
 from ns_abstract.paper.interval import Float64Array, Interval
 
 
@@ -53,17 +52,10 @@ def _over(alpha: Interval, color: Interval, behind: Interval) -> Interval:
 def sumcumprod(alphas: Face, colors: Interval | Float64Array, behind: float = 0.0) -> Face:
     """SUMCUMPROD (Algorithm 5): blend back to front, ``P <- a_i c_i + (1 - a_i) P``, each ``a_i`` once.
 
-    For independent opacities in [0, 1] the interval face is the exact range up to rounding: P
-    increases with the P behind it, and each step is exact. The affine face takes each step as
-    ``P + a (c - P)``, so a remainder behind a layer is multiplied by what passes the layer.
-
-    Args:
-        alphas: Opacities [n, ...], of any face.
-        colors: Colours [n, ...] that broadcast against them.
-        behind: What shows through all layers.
-
-    Returns:
-        The blended value, of the same face, [...].
+    For independent opacities in [0, 1] the interval face is the exact range up to rounding: P increases with the P
+    behind it, and each step is exact. The affine face takes each step as ``P + a (c - P)``, so a remainder behind a
+    layer is multiplied by what passes the layer. Opacities [n, ...] may have any face, colours [n, ...] broadcast
+    against them, and ``behind`` shows through all layers.
     """
     n = alphas.shape[0]
     ranges = range_of(alphas)

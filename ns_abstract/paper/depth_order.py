@@ -1,7 +1,4 @@
-"""Bounds of blending when the depth order is uncertain: the paper's VR-IND, and sorting.
-
-Layers run along the first axis in any order; depths are [n], opacities [n, ...].
-"""
+"""Bounds of blending when the depth order [n] of layers [n, ...] is uncertain: the paper's VR-IND, and sorting."""
 
 from __future__ import annotations
 
@@ -11,9 +8,8 @@ from typing import TypeVar
 
 import numpy as np
 
-from ns_abstract.paper.affine import Enclosure
+from ns_abstract.paper.affine import Enclosure, Face, constant_like, range_of
 from ns_abstract.paper.blend import cumulative_blend
-from ns_abstract.paper.faces import Face, constant_like, range_of
 from ns_abstract.paper.interval import BoolArray, Float64Array, Interval
 
 # depths may be of another face than opacities
@@ -33,14 +29,10 @@ def surely_in_front(depths: Depths) -> BoolArray:
 
 
 def sort_by(x: Face, y: Depths) -> Face:
-    """Bounds of ``x`` in ascending order of ``y``: each place holds every element that may stand there.
+    """Bounds of ``x`` [n, ...] in ascending order of ``y`` [n]: each place holds every element that may stand there.
 
-    Element i may take the places from the number of elements surely before it to n - 1 minus the
-    number surely after it; equal keys are undecided. A place with one candidate keeps its form.
-
-    Args:
-        x: Values [n, ...].
-        y: Keys [n].
+    Element i may take the places from the number of elements surely before it to n - 1 minus the number surely after
+    it; equal keys are undecided. A place with one candidate keeps its form.
     """
     n = y.shape[0]
     if n == 0:
@@ -64,16 +56,11 @@ def sorted_blend(alphas: Face, depths: Depths, colors: Interval | Float64Array) 
 
 
 def vr_ind(alphas: Face, depths: Depths, colors: Interval | Float64Array) -> Face:
-    """VR-IND (Algorithm 4): ``pc = sum_i w_i c_i``, without sorting.
+    """VR-IND (Algorithm 4): ``pc = sum_i w_i c_i``, without sorting, of opacities [n, ...] in [0, 1] and depths [n].
 
     ``w_i = a_i prod_{j != i} (1 - a_j Ind(d_i - d_j))`` (eq. 22; its ``a_i`` inside the product is a misprint for
     ``a_j``). The indicator of a pair that may be equally deep counts as undecided, so that either order of a tie is
-    enclosed.
-
-    Args:
-        alphas: Opacities [n, ...] in [0, 1], of any face.
-        depths: [n]; the order is decided from the forms of the differences where it has forms.
-        colors: Colours [n, ...] that broadcast against ``alphas``.
+    enclosed. The order is decided from the forms of the differences where depths have forms.
     """
     n = alphas.shape[0]
     front = surely_in_front(depths)

@@ -107,18 +107,10 @@ def _defers(operation: Callable[[Interval, Any], Interval]) -> Callable[[Interva
 
 
 class Interval:
-    """An array of closed intervals ``[lower, upper]``.
+    """An array of closed intervals ``[lower, upper]``, float64, infinite where unbounded.
 
-    Numbers and arrays of numbers mix with intervals by broadcasting and stand for themselves.
-
-    Attributes:
-        lower: float64 array; ``-inf`` where unbounded.
-        upper: float64 array of the same shape; ``inf`` where unbounded.
-
-    Args:
-        lower: Lower ends.
-        upper: Upper ends; equal to ``lower`` if None. An interval with an end that is not a number
-            is taken as ``[-inf, inf]``.
+    Numbers and arrays of numbers mix with intervals by broadcasting and stand for themselves. An interval with an end
+    that is not a number is taken as ``[-inf, inf]``.
 
     Raises:
         ValueError: An interval is empty: its ends are reversed, or it starts at ``inf`` or ends at ``-inf``.

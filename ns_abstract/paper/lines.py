@@ -1,9 +1,8 @@
 """Lines that enclose a function over an interval: ``s x + low <= f(x) <= s x + high``.
 
-For any slope ``s`` the offsets follow from convexity alone: the chord bounds a convex function from
-above at the ends of the interval, a tangent bounds it from below. All offsets are evaluated with
-outward rounding, so a slope or a point of contact that is only nearly optimal costs tightness,
-never soundness (CROWN, Zhang et al. 2018, table 1, gives the same lines for activations).
+For any slope ``s`` the offsets follow from convexity: the chord bounds a convex function from above at the ends of the
+interval, a tangent bounds it from below. They are rounded outward, so a slope or point of contact that is only nearly
+optimal costs tightness alone (CROWN, Zhang et al. 2018, table 1, gives the same lines for activations).
 """
 
 from __future__ import annotations
@@ -74,11 +73,7 @@ def tangent_side(
 
 
 def band(curve: ConvexFunction, x: Interval) -> tuple[Float64Array, Interval]:
-    """The narrowest band around ``curve`` over the bounded interval ``x``.
-
-    Returns:
-        The slope and the interval of ``f(t) - slope * t`` for t in ``x``.
-    """
+    """The narrowest band around ``curve`` over the bounded ``x``: slope, and the interval of ``f(t) - slope * t``."""
     slope = chord_slope(curve, x)
     chord, tangent = chord_side(curve, x, slope), tangent_side(curve, x, slope)
     return slope, Interval(tangent, chord) if curve.convex else Interval(chord, tangent)

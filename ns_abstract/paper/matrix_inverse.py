@@ -1,7 +1,4 @@
-"""Bounds of matrix inverses: the paper's MATRIXINV, and the adjugate.
-
-All take a set of matrices ``X`` and return a set that holds ``X^-1`` of each of them.
-"""
+"""Bounds of matrix inverses of a set of matrices: the paper's MATRIXINV, and the adjugate."""
 
 from __future__ import annotations
 
@@ -9,18 +6,16 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ns_abstract.paper.faces import Face, constant_like, range_of
+from ns_abstract.paper.affine import Face, constant_like, range_of
 from ns_abstract.paper.interval import Float64Array, Interval
 
 Norm = Literal["frobenius", "spectral"]
 
 
 def matrix_norm(x: Interval, norm: Norm) -> Float64Array | np.float64:
-    """Upper bound of a submultiplicative norm that is at least the largest entry.
+    """Upper bound of a submultiplicative norm of a matrix [n, m] that is at least the largest entry.
 
-    Args:
-        x: Matrix [n, m].
-        norm: "frobenius", or "spectral", bounded by ``sqrt(|x|_1 |x|_inf)``.
+    "spectral" is bounded by ``sqrt(|x|_1 |x|_inf)``.
     """
     if norm == "frobenius":
         return x.norm().upper

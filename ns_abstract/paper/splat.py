@@ -1,8 +1,7 @@
-"""Algorithm 1 of "Abstract Rendering" as printed, and its bound by the paper's own rules.
+"""Algorithm 1 of "Abstract Rendering" as printed, and its bound by the paper's own rules, for comparison.
 
-Written for clarity and for comparison: every Gaussian reaches every pixel, nothing is culled, and
-the cost of the depth order grows with the square of the number of Gaussians. `SplatBounds` with the
-rasteriser `PAPER` bounds the same picture for whole scenes.
+Every Gaussian reaches every pixel, nothing is culled, and the cost of the depth order grows with the square of the
+number of Gaussians. `SplatBounds` with the rasteriser `PAPER` bounds the same picture for whole scenes.
 """
 
 from __future__ import annotations

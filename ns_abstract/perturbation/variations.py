@@ -26,10 +26,8 @@ _INDEX_FIX = "write whole numbers of at least 0: a list, or the name of a .json,
 class Selection:
     """A set of Gaussians: those that every rule given picks; all without a rule.
 
-    Attributes:
-        box: Corners (x, y, z) that the stored mean lies between, normalised frame.
-        indices: Numbers in the source, counted from 0.
-        color_min, color_max: Range of the activated colour of band 0 (RGB).
+    The stored mean lies in ``box`` (normalised frame), ``indices`` count from 0, and the activated colour of band 0
+    (RGB) lies between its ends.
     """
 
     box: tuple[Vector, Vector] | None = None

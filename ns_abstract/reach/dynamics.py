@@ -19,7 +19,7 @@ from ns_abstract.arithmetic.forms import MAX_DIMENSIONS, Basis
 from ns_abstract.arithmetic.rounding import HALF_UP, STEP_ROUNDINGS, STEP_UP, UNDERFLOW64, gamma
 from ns_abstract.arithmetic.trigonometry import cos_sin
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.fields import Fail, known
+from ns_abstract.io.fields import known
 from ns_abstract.io.jsonio import FIX_MODERATE, file_beside, is_moderate, show
 from ns_abstract.reach.learned import LearnedDynamics
 
@@ -260,12 +260,13 @@ KEYS = {
 }
 
 
-def matrix(value: Any, name: str, rows: int, columns: int | None, fail: Fail) -> Float64:
-    """A [rows, columns] matrix of moderate numbers; ``columns`` None: as many as the first row has.
+def fail(name: str, problem: str, fix: str) -> InputError:
+    """The error of a field, for `ns_abstract.io.fields`."""
+    return InputError(problem, field=name, fix=fix)
 
-    Raises:
-        InputError: Of ``fail``.
-    """
+
+def matrix(value: Any, name: str, rows: int, columns: int | None) -> Float64:
+    """A [rows, columns] matrix of moderate numbers, or InputError; ``columns`` None: the first row's."""
     if columns is None and isinstance(value, list) and value and isinstance(value[0], list):
         columns = len(value[0])
     good = isinstance(value, list) and len(value) == rows and columns is not None
@@ -278,47 +279,32 @@ def matrix(value: Any, name: str, rows: int, columns: int | None, fail: Fail) ->
     return np.array(value, np.float64)
 
 
-def numbers(value: Any, name: str, count: int, fail: Fail) -> Float64:
-    """[count] moderate numbers.
-
-    Raises:
-        InputError: Of ``fail``.
-    """
+def numbers(value: Any, name: str, count: int) -> Float64:
+    """[count] moderate numbers, or InputError."""
     if not (isinstance(value, list) and len(value) == count and all(is_moderate(v) for v in value)):
         raise fail(name, f"found {show(value)}", f"write {count} numbers, each {FIX_MODERATE}")
     return np.array(value, np.float64)
 
 
-def number(value: Any, name: str, fail: Fail, *, positive: bool = False) -> float:
-    """One moderate number.
-
-    Raises:
-        InputError: Of ``fail``.
-    """
+def number(value: Any, name: str, *, positive: bool = False) -> float:
+    """One moderate number, or InputError."""
     if not is_moderate(value) or (positive and not value > 0):
         raise fail(name, f"found {show(value)}", f"write a {'positive ' if positive else ''}number, {FIX_MODERATE}")
     return float(value)
 
 
-def named_file(value: Any, name: str, folder: Path, endings: str, fail: Fail) -> Path:
-    """The file beside LOOP.json that a field names.
-
-    Raises:
-        InputError: Of ``fail``; or the name leads out of the folder.
-    """
+def named_file(value: Any, name: str, folder: Path) -> Path:
+    """The .onnx file beside LOOP.json that a field names, or InputError."""
     if not isinstance(value, str) or not value:
-        raise fail(name, f"found {show(value)}", f"name {endings} file beside this one")
+        raise fail(name, f"found {show(value)}", "name an .onnx file beside this one")
     try:
         return file_beside(folder, value)
     except InputError as error:
         raise InputError(error.problem, fix=error.fix, field=name) from None
 
 
-def parse_dynamics(value: Any, states: int, dt: float, folder: Path, fail: Fail) -> Dynamics | LearnedDynamics:
-    """The object under the key ``dynamics``.
-
-    Args:
-        dt: Sampling time, seconds.
+def parse_dynamics(value: Any, states: int, dt: float, folder: Path) -> Dynamics | LearnedDynamics:
+    """The object under the key ``dynamics``; ``dt`` is the sampling time in seconds.
 
     Raises:
         InputError: A key is unknown, or a value cannot be used.
@@ -332,25 +318,25 @@ def parse_dynamics(value: Any, states: int, dt: float, folder: Path, fail: Fail)
     known(value, KEYS[kind], "dynamics.", fail)
     dynamics: Dynamics | LearnedDynamics
     if kind == "onnx":
-        dynamics = LearnedDynamics(named_file(value.get("file"), "dynamics.file", folder, "an .onnx", fail), states)
+        dynamics = LearnedDynamics(named_file(value.get("file"), "dynamics.file", folder), states)
     elif kind == "affine":
-        a = matrix(value.get("A"), "dynamics.A", states, states, fail)
-        b = matrix(value.get("B"), "dynamics.B", states, None, fail)
-        c = numbers(value.get("c", [0.0] * states), "dynamics.c", states, fail)
+        a = matrix(value.get("A"), "dynamics.A", states, states)
+        b = matrix(value.get("B"), "dynamics.B", states, None)
+        c = numbers(value.get("c", [0.0] * states), "dynamics.c", states)
         dynamics = affine(a, b, c)
     elif kind == "unicycle":
-        speed = None if "speed" not in value else number(value["speed"], "dynamics.speed", fail)
+        speed = None if "speed" not in value else number(value["speed"], "dynamics.speed")
         dynamics = unicycle(dt, speed)
     elif kind == "fixed wing":
-        dynamics = fixed_wing(dt, number(value.get("speed"), "dynamics.speed", fail, positive=True))
+        dynamics = fixed_wing(dt, number(value.get("speed"), "dynamics.speed", positive=True))
     elif kind == "quadrotor":
-        lag = number(value.get("lag"), "dynamics.lag", fail, positive=True)
-        dynamics = quadrotor(dt, lag, number(value.get("gravity", _GRAVITY), "dynamics.gravity", fail, positive=True))
+        lag = number(value.get("lag"), "dynamics.lag", positive=True)
+        dynamics = quadrotor(dt, lag, number(value.get("gravity", _GRAVITY), "dynamics.gravity", positive=True))
     else:
         axes = value.get("axes")
         if type(axes) is not int or not 1 <= axes <= MOST // 3:
             raise fail("dynamics.axes", f"found {show(axes)}", f"write a whole number from 1 to {MOST // 3}")
-        drags = [number(value.get(key, 0), f"dynamics.{key}", fail) for key in ("drag", "quadratic_drag")]
+        drags = [number(value.get(key, 0), f"dynamics.{key}") for key in ("drag", "quadratic_drag")]
         dynamics = double_integrator(dt, axes, *drags)
     if dynamics.states != states:
         raise fail("state", f"{states} names", f"dynamics of type {kind} have {dynamics.states} here; name as many")
@@ -358,8 +344,3 @@ def parse_dynamics(value: Any, states: int, dt: float, folder: Path, fail: Fail)
         count = f"{dynamics.states} states and {dynamics.controls} controls"
         raise fail("dynamics", count, f"use at most {MOST} together")
     return dynamics
-
-
-def unusable(problem: str, name: str, fix: str) -> InputError:
-    """The error of a field, for `ns_abstract.io.fields`."""
-    return InputError(problem, field=name, fix=fix)

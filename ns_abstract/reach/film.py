@@ -33,8 +33,7 @@ class Film:
     """Abstract images along a tube.
 
     Attributes:
-        about: For report.json: the cell, its verdict, the pictures' height and width, and of every step its mean and
-            largest gap and the box of the camera's parameters.
+        about: For report.json: cell, verdict, size of pictures; of every step gaps and the box of camera parameters.
         steps: The images, ``index`` is the step.
     """
 

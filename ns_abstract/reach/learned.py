@@ -20,11 +20,9 @@ _MEMORY = 1 << 28
 
 
 class LearnedDynamics:
-    """``x' = f(x, u)`` of an ONNX file.
+    """``x' = f(x, u)`` of an ONNX file with one input [1, n + m] or [n + m], the n ``states`` before the controls.
 
-    Args:
-        file: One input of shape [1, n + m] or [n + m], the states and then the controls; outputs of n numbers together,
-            the next state.
+    Its outputs are n numbers together, the next state.
 
     Raises:
         InputError: The file cannot be read, uses what is not supported, or its sizes do not fit.

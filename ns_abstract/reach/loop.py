@@ -16,18 +16,18 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import PinholeCamera, checked_pose, focal_length, stated_intrinsics
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.fields import Fail, interval, known
+from ns_abstract.io.fields import interval, known
 from ns_abstract.io.jsonio import is_moderate, is_number, load_json, show
 from ns_abstract.perturbation.specification import ROTATIONS, TRANSLATIONS, Perturbation
 from ns_abstract.reach.dynamics import (
     MOST,
     Dynamics,
+    fail,
     matrix,
     named_file,
     number,
     numbers,
     parse_dynamics,
-    unusable,
 )
 from ns_abstract.reach.learned import LearnedDynamics
 from ns_abstract.verify.picture_properties import PictureProperty, is_of_picture, parse_picture_property
@@ -47,11 +47,7 @@ KEYS = (
 
 @dataclass(frozen=True)
 class HalfSpace:
-    """``normal . x - offset``, a function of the state that is above 0 on one side of a plane.
-
-    Attributes:
-        normal: [n].
-    """
+    """``normal . x - offset`` with normal [n], a function of the state that is above 0 on one side of a plane."""
 
     normal: tuple[float, ...]
     offset: float
@@ -252,28 +248,24 @@ def parse_loop(value: Any, folder: Path, dataset_scale: float = 1.0) -> Loop:
     Raises:
         InputError: A key is unknown, or a value cannot be used.
     """
-
-    def fail(name: str, problem: str, fix: str) -> InputError:
-        return unusable(problem, name, fix)
-
     if not isinstance(value, dict):
         raise fail("", f"found {show(value)}", "write an object")
     known(value, KEYS, "", fail)
     if value.get("version") != 1 or isinstance(value.get("version"), bool):
         raise fail("version", f"found {show(value.get('version'))}", "write 1")
-    names = _names(value.get("state"), fail)
+    names = _names(value.get("state"))
     n = len(names)
     units = value.get("units", [""] * n)
     if not (isinstance(units, list) and len(units) == n and all(isinstance(u, str) and len(u) < 40 for u in units)):
         raise fail("units", f"found {show(units)}", f"write {n} short texts")
-    lower, upper = _ranges(value.get("initial"), "initial", names, fail, every=True)
+    lower, upper = _ranges(value.get("initial"), "initial", names, every=True)
     steps = value.get("steps")
     if type(steps) is not int or not 1 <= steps <= MOST_STEPS:
         raise fail("steps", f"found {show(steps)}", f"write a whole number from 1 to {MOST_STEPS}")
-    dt = number(value.get("sampling_time"), "sampling_time", fail, positive=True)
-    dynamics = parse_dynamics(value.get("dynamics"), n, dt, folder, fail)
-    disturbance = np.stack(_ranges(value.get("disturbance", {}), "disturbance", names, fail))
-    network = named_file(value.get("network"), "network", folder, "an .onnx", fail)
+    dt = number(value.get("sampling_time"), "sampling_time", positive=True)
+    dynamics = parse_dynamics(value.get("dynamics"), n, dt, folder)
+    disturbance = np.stack(_ranges(value.get("disturbance", {}), "disturbance", names))
+    network = named_file(value.get("network"), "network", folder)
     if "output" in value and not (isinstance(output := value["output"], str) and output):
         raise fail("output", f"found {show(output)}", "write the name of one of the network's outputs")
     unsafe = value.get("unsafe", [])
@@ -281,7 +273,7 @@ def parse_loop(value: Any, folder: Path, dataset_scale: float = 1.0) -> Loop:
         raise fail("unsafe", f"found {show(unsafe)}", f"write a list of at most {_MOST_SETS} sets")
     view = partial(_view, folder=folder, dataset_scale=dataset_scale)
     required = tuple(view(entry, f"unsafe[{k}]") for k, entry in enumerate(unsafe) if is_of_picture(entry))
-    goal = None if "goal" not in value else _goal(value["goal"], names, fail, view)
+    goal = None if "goal" not in value else _goal(value["goal"], names, view)
     if not unsafe and goal is None:
         raise fail("unsafe", "missing", "give unsafe sets, or a goal, or both")
     return Loop(
@@ -293,20 +285,18 @@ def parse_loop(value: Any, folder: Path, dataset_scale: float = 1.0) -> Loop:
         dt,
         dynamics,
         disturbance,
-        _camera(value.get("camera"), n, fail),
+        _camera(value.get("camera"), n),
         network,
         parse_preprocess(value.get("preprocess", {})),
-        _control(value.get("control"), dynamics.controls, fail),
-        tuple(
-            _unsafe(entry, f"unsafe[{k}]", names, fail) for k, entry in enumerate(unsafe) if not is_of_picture(entry)
-        ),
+        _control(value.get("control"), dynamics.controls),
+        tuple(_unsafe(entry, f"unsafe[{k}]", names) for k, entry in enumerate(unsafe) if not is_of_picture(entry)),
         required,
         goal,
         value,
     )
 
 
-def _names(value: Any, fail: Fail) -> tuple[str, ...]:
+def _names(value: Any) -> tuple[str, ...]:
     good = isinstance(value, list) and 1 <= len(value) < MOST
     good = good and all(isinstance(v, str) and 0 < len(v) <= 40 and v.isprintable() for v in value)
     if not good or len(set(value)) != len(value):
@@ -314,9 +304,7 @@ def _names(value: Any, fail: Fail) -> tuple[str, ...]:
     return tuple(value)
 
 
-def _ranges(
-    value: Any, field: str, names: tuple[str, ...], fail: Fail, *, every: bool = False
-) -> tuple[Float64, Float64]:
+def _ranges(value: Any, field: str, names: tuple[str, ...], *, every: bool = False) -> tuple[Float64, Float64]:
     """Ends [n] of an interval by state; a number r is [-r, r], or r itself where ``every`` state has to be given."""
     if not isinstance(value, Mapping):
         raise fail(field, f"found {show(value)}", "write an object with a range by state")
@@ -335,7 +323,7 @@ def _ranges(
     return ends[0], ends[1]
 
 
-def _camera(value: Any, n: int, fail: Fail) -> CameraMount:
+def _camera(value: Any, n: int) -> CameraMount:
     if not isinstance(value, Mapping):
         raise fail("camera", f"found {show(value)}", "write an object")
     known(value, ("camera_to_world", "fov", *LENS, "position", *ROTATIONS), "camera.", fail)
@@ -363,8 +351,8 @@ def _camera(value: Any, n: int, fail: Fail) -> CameraMount:
     if not isinstance(place, Mapping):
         raise fail("camera.position", f"found {show(place)}", "write an object with offset and matrix")
     known(place, ("offset", "matrix"), "camera.position.", fail)
-    start = numbers(place.get("offset", [0.0] * 3), "camera.position.offset", 3, fail)
-    factors = matrix(place.get("matrix"), "camera.position.matrix", 3, n, fail)
+    start = numbers(place.get("offset", [0.0] * 3), "camera.position.offset", 3)
+    factors = matrix(place.get("matrix"), "camera.position.matrix", 3, n)
     if pose[:, 3].any():
         raise fail("camera.camera_to_world", "has a position", "write 0, 0, 0 there: camera.position says where it is")
     for name, offset, row in zip(TRANSLATIONS, start, factors, strict=True):
@@ -374,21 +362,21 @@ def _camera(value: Any, n: int, fail: Fail) -> CameraMount:
         if not isinstance(entry, Mapping):
             raise fail(f"camera.{name}", f"found {show(entry)}", "write an object with offset and row")
         known(entry, ("offset", "row"), f"camera.{name}.", fail)
-        offset = number(entry.get("offset", 0.0), f"camera.{name}.offset", fail)
-        take(name, offset, numbers(entry.get("row", [0.0] * n), f"camera.{name}.row", n, fail))
+        offset = number(entry.get("offset", 0.0), f"camera.{name}.offset")
+        take(name, offset, numbers(entry.get("row", [0.0] * n), f"camera.{name}.row", n))
     if not names:
         raise fail("camera", "the pose does not depend on the state", "give it a matrix or a row that is not 0")
     return CameraMount(pose[:, :3].copy(), float(fov), lens, tuple(names), np.array(offsets), np.stack(rows), fixed)
 
 
-def _control(value: Any, controls: int, fail: Fail) -> Control:
+def _control(value: Any, controls: int) -> Control:
     if not isinstance(value, Mapping):
         raise fail("control", f"found {show(value)}", "write an object with gain, goal and clip")
     known(value, ("gain", "goal", "clip"), "control.", fail)
-    gain = np.eye(controls) if "gain" not in value else matrix(value["gain"], "control.gain", controls, None, fail)
+    gain = np.eye(controls) if "gain" not in value else matrix(value["gain"], "control.gain", controls, None)
     if gain.shape[1] > _MOST_OUTPUTS:
         raise fail("control.gain", f"{gain.shape[1]} columns", f"use a network of at most {_MOST_OUTPUTS} outputs")
-    goal = numbers(value.get("goal", [0.0] * gain.shape[1]), "control.goal", gain.shape[1], fail)
+    goal = numbers(value.get("goal", [0.0] * gain.shape[1]), "control.goal", gain.shape[1])
     lower, upper = np.full(controls, -np.inf), np.full(controls, np.inf)
     clip = value.get("clip")
     if clip is not None:
@@ -399,7 +387,7 @@ def _control(value: Any, controls: int, fail: Fail) -> Control:
     return Control(gain, goal, lower, upper)
 
 
-def _box_faces(value: Any, field: str, names: tuple[str, ...], fail: Fail, *, inside: bool) -> tuple[HalfSpace, ...]:
+def _box_faces(value: Any, field: str, names: tuple[str, ...], *, inside: bool) -> tuple[HalfSpace, ...]:
     """Faces of a box; above 0 inside, or each above 0 on its own outside."""
     if not isinstance(value, Mapping) or not value:
         raise fail(field, f"found {show(value)}", "write an object with [low, high] by state, null for no end")
@@ -417,20 +405,20 @@ def _box_faces(value: Any, field: str, names: tuple[str, ...], fail: Fail, *, in
     return tuple(faces)
 
 
-def _unsafe(value: Any, field: str, names: tuple[str, ...], fail: Fail) -> tuple[HalfSpace, ...]:
+def _unsafe(value: Any, field: str, names: tuple[str, ...]) -> tuple[HalfSpace, ...]:
     if not isinstance(value, Mapping) or len(value) != 1:
         raise fail(field, f"found {show(value)}", f'write {{"box": ..}}, {{"half_space": ..}} or {_VIEW}')
     known(value, ("box", "half_space"), f"{field}.", fail)
     if "box" in value:
-        return _box_faces(value["box"], f"{field}.box", names, fail, inside=False)
+        return _box_faces(value["box"], f"{field}.box", names, inside=False)
     entry = value["half_space"]
     if not isinstance(entry, Mapping):
         raise fail(f"{field}.half_space", f"found {show(entry)}", "write an object with normal and at_least")
     known(entry, ("normal", "at_least"), f"{field}.half_space.", fail)
-    normal = numbers(entry.get("normal"), f"{field}.half_space.normal", len(names), fail)
+    normal = numbers(entry.get("normal"), f"{field}.half_space.normal", len(names))
     if not normal.any():
         raise fail(f"{field}.half_space.normal", "all are 0", "write a direction")
-    end = number(entry.get("at_least"), f"{field}.half_space.at_least", fail)
+    end = number(entry.get("at_least"), f"{field}.half_space.at_least")
     return (HalfSpace(tuple((-normal).tolist()), -end),)
 
 
@@ -438,7 +426,7 @@ def _view(value: Mapping[str, Any], field: str, folder: Path, dataset_scale: flo
     """The property of the picture under a key."""
     try:
         if "partitions" in value:
-            raise unusable("is for certificates", "partitions", "remove it")
+            raise fail("partitions", "is for certificates", "remove it")
         return parse_picture_property(dict(value), folder, dataset_scale)
     except InputError as error:
         raise within_field(error, field) from None
@@ -449,7 +437,7 @@ def within_field(error: InputError, field: str) -> InputError:
     return InputError(error.problem, file=error.file, field=f"{field}.{error.field}", fix=error.fix)
 
 
-def _goal(value: Any, names: tuple[str, ...], fail: Fail, view: Callable[[Any, str], PictureProperty]) -> Goal:
+def _goal(value: Any, names: tuple[str, ...], view: Callable[[Any, str], PictureProperty]) -> Goal:
     if not isinstance(value, Mapping):
         raise fail("goal", f"found {show(value)}", f"write an object with box and when, or {_VIEW}")
     when = value.get("when", "end")
@@ -458,4 +446,4 @@ def _goal(value: Any, names: tuple[str, ...], fail: Fail, view: Callable[[Any, s
     if is_of_picture(value):
         return Goal((), when, view({key: v for key, v in value.items() if key != "when"}, "goal"))
     known(value, ("box", "when"), "goal.", fail)
-    return Goal(_box_faces(value.get("box"), "goal.box", names, fail, inside=True), when)  # pyright: ignore[reportArgumentType]
+    return Goal(_box_faces(value.get("box"), "goal.box", names, inside=True), when)  # pyright: ignore[reportArgumentType]

@@ -34,15 +34,14 @@ def loop_page(
     outside: SceneDrawing | None = None,
     strips: Sequence[tuple[int, bytes]] = (),
 ) -> str:
-    """The page.
+    """The page: HTML, self-contained; every text of the ``document`` is escaped.
 
     Args:
+        document: Content of report.json.
         rows: By number of the question, the cells: lower, upper, verdict.
+        loop: The loop.
         outside: Draws the scene behind the tubes; None: it has no elements with a place of their own.
         strips: Steps of the film and their PNGs.
-
-    Returns:
-        HTML, self-contained; every text of the document is escaped.
     """
     name = str(document["scene"].get("name", "scene"))
     kind, heading = _TITLES[document["verdict"]]
@@ -87,10 +86,7 @@ def _pictures(
     loop: Loop,
     outside: SceneDrawing | None,
 ) -> list[tuple[str, str, Markup]]:
-    """Titles, texts and plots: the loop from above and from the side, or in the plane of two states.
-
-    The latter where the camera only turns.
-    """
+    """Titles, texts and plots, from above and from the side; in the plane of two states where the camera only turns."""
     last = max(rows, default=None)
     cells = [] if last is None else rows[last]
     plot_arguments = (

@@ -45,12 +45,7 @@ class LoopPictures(Protocol):
 
 
 class Pictures:
-    """A scene's pictures.
-
-    Args:
-        poses: All poses that may be looked at; boxes of them are bounded.
-        response: The cameras that may show them; None: one that shows what is rendered.
-    """
+    """A scene's pictures at ``poses``, boxes of which are bounded, as any camera of ``response`` shows them."""
 
     def __init__(self, method: Method, poses: PoseBox, response: CameraResponse | None = None) -> None:
         self.frame: Frame = method.frame(poses)
@@ -76,11 +71,7 @@ class Pictures:
 
 @dataclass(frozen=True)
 class PropertyView:
-    """The pictures that one property of a loop is read off (L7).
-
-    Attributes:
-        pictures: Colours and the further planes that it reads.
-    """
+    """The pictures that a property is read off (L7), with the further planes that it reads behind the colours."""
 
     prop: PictureProperty
     pictures: LoopPictures

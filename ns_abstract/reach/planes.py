@@ -20,12 +20,7 @@ _MOST_CELLS = 4000
 
 @dataclass(frozen=True)
 class Marks:
-    """The boxes and lines of a plot, in the plane's coordinates.
-
-    Attributes:
-        boxes: Class of the style sheet, and ends [2], [2].
-        lines: Class, and points.
-    """
+    """The boxes and lines of a plot in the plane's coordinates, each with its class of the style sheet."""
 
     boxes: list[tuple[str, Float64, Float64]]
     lines: list[tuple[str, Float64]]
@@ -133,13 +128,7 @@ def _clipped(corners: list[tuple[float, float]], a: float, b: float, level: floa
 
 @dataclass(frozen=True)
 class LoopPlot:
-    """A plot of a loop in a plane.
-
-    Attributes:
-        axes: The world's axes to the right and up.
-        clip: The scene above it, towards the viewer, is left out; the world's unit.
-        marks: What is drawn over the scene.
-    """
+    """A plot of a loop in the plane of two world axes, to the right and up; the scene above ``clip`` is left out."""
 
     title: str
     axes: tuple[int, int]

@@ -86,10 +86,7 @@ class AffineSet:
         return np.where(still, self.center, low), np.where(still, self.center, high)
 
     def mapped(self, matrix: Float64, offset: Float64, radius: Float64 | float = 0.0) -> AffineSet:
-        """``matrix x + offset + e`` with |e| <= radius, in the same ``s``.
-
-        Entries of ``matrix`` may carry relative errors of `SET_ROUNDINGS` units.
-        """
+        """``matrix x + offset + e`` with |e| <= radius, in the same ``s``; entries may be `SET_ROUNDINGS` units off."""
         n, q = self.generators.shape
         share = 2.0 * gamma(n + SET_ROUNDINGS)
         with np.errstate(all="ignore"):
@@ -149,12 +146,7 @@ def _scaled(values: AffineSet, middle: Float64, half: Float64) -> AffineSet:
 
 @dataclass(frozen=True)
 class AffineBounds:
-    """``y = slopes q + center + e`` with |e| <= radius, and ``lower <= y <= upper``, at places q in [-1, 1]^d.
-
-    Attributes:
-        slopes: [m, d].
-        center, radius, lower, upper: [m].
-    """
+    """``y = slopes q + center + e``, |e| <= radius, and ``lower <= y <= upper`` [m], at places q in [-1, 1]^d."""
 
     slopes: Float64
     center: Float64
@@ -341,11 +333,7 @@ class TubeBuilder:
         return values if off is None else values + off
 
     def tube(self, cell: ParameterBox, *, whole: bool = False) -> Tube:
-        """The tube of a cell of the initial box; it ends early where an unsafe set cannot be ruled out.
-
-        Args:
-            whole: Whether to go on although unsafe sets cannot be ruled out.
-        """
+        """The tube of a cell of the initial box; unless ``whole`` it ends where an unsafe set cannot be ruled out."""
         lower, upper = self.loop.initial(cell)
         state = AffineSet.box(lower, upper)
         # which generators are which parameters of the cell

@@ -27,19 +27,8 @@ from ns_abstract.refine.protocol import (
 )
 from ns_abstract.refine.result import RenderedMaximum, greater
 
-
-@dataclass(frozen=True)
-class DifferenceTuning:
-    """What is looked at closer. None of the numbers decides whether a bound holds.
-
-    Attributes:
-        most_pixels: Pixels above the floor up to which a cell's orders are looked at.
-    """
-
-    most_pixels: int = 64
-
-
-TUNING = DifferenceTuning()
+#: A preference: pixels above the floor up to which a cell's orders are looked at.
+_MOST_PIXELS = 64
 
 
 @dataclass(frozen=True)
@@ -184,7 +173,7 @@ class DifferenceFrame:
         assert self._shared is not None
         wanted = self._inside[tiles] & (difference.upper > self.floor).any(axis=-1)
         wanted &= True if pixels is None else pixels
-        if not 0 < wanted.sum() <= TUNING.most_pixels:
+        if not 0 < wanted.sum() <= _MOST_PIXELS:
             return
         contexts = difference.context.first, difference.context.second
         for k in np.flatnonzero(wanted.any(axis=(1, 2))):

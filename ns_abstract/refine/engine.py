@@ -1,10 +1,8 @@
 """Anytime two-sided refinement of one frame (design.md, R1-R4).
 
-The set is covered by cells. Every (cell, tile) pair is a leaf with an outer bound; real renders
-give an inner one. What the leaves of a tile leave open beyond the inner bound is the tile's excess,
-and the leaves with most of it are split until the ratio of outer to inner gap is reached or the
-time is over. The order of splits depends on bounds only, so the result after a given number of
-cells is the same on every machine and for every number of threads.
+The set is covered by cells. Every (cell, tile) pair is a leaf with an outer bound; real renders give an inner one. The
+leaves that leave most open beyond it are split until the ratio of outer to inner gap is reached or the time is over.
+The order of splits depends on bounds only, so the result after a number of cells is the same on every machine.
 """
 
 from __future__ import annotations
@@ -24,8 +22,7 @@ from ns_abstract.refine.frame_tiles import FrameTiles, LeafCell, context_bytes, 
 from ns_abstract.refine.goal import RefinementGoal
 from ns_abstract.refine.initial import InitialPartition, Partition
 from ns_abstract.refine.inner import InnerBound, sampled_gap
-from ns_abstract.refine.leaves import BoundedCell, Change, LeafBounds
-from ns_abstract.refine.linear_sets import LeafSets
+from ns_abstract.refine.leaves import BoundedCell, Change, LeafBounds, LeafSets
 from ns_abstract.refine.protocol import ACCUMULATION, COLORS, DEPTH, Bounds, Frame, Render
 from ns_abstract.refine.result import ExtraOutput, FrameResult, PartResult, TracePoint, joined
 from ns_abstract.refine.sub_boxes import BoxSplitter, SubBox
@@ -339,7 +336,7 @@ class Refinement:
     def _part_result(self, point: TracePoint) -> PartResult:
         pictures = self.leaves.lower, self.leaves.upper, self.inner.lower, self.inner.upper, self.inner.image
         lower, upper, witness_lower, witness_upper, image = (picture[..., :COLORS] for picture in pictures)
-        layers = None
+        layers: dict[str, ExtraOutput] = {}
         if self.frame.channels > COLORS:
             places = {"accumulation": ACCUMULATION, "depth": DEPTH}
             layers = {name: ExtraOutput(*(picture[..., k] for picture in pictures)) for name, k in places.items()}
@@ -369,8 +366,7 @@ class Refinement:
 def groups(frame: Frame, count: int) -> list[np.ndarray]:
     """The frame's tiles in ``count`` parts of equal number, fewer where there are fewer tiles.
 
-    Runs of tiles, which show few scene elements each; where every ray is a tile of its own, every ``count``-th one,
-    so that the parts are alike.
+    Runs of tiles show few scene elements each; where every ray is a tile, every ``count``-th one makes parts alike.
     """
     count = max(1, min(count, frame.tile_count))
     everything = np.arange(frame.tile_count)

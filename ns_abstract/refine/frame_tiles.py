@@ -49,10 +49,7 @@ class FrameTiles:
 
     @property
     def by_pixel(self) -> bool:
-        """Whether cells may be split for some of their pixels only.
-
-        Linear sets are kept of all pixels, and nobody looks where layers are open.
-        """
+        """Whether cells may be split for some of their pixels only: not where linear sets or layers are kept."""
         return isinstance(self.frame, PartsFrame) and not self.keep_linear and self.frame.channels == COLORS
 
     def numbers(self, places: np.ndarray | None) -> np.ndarray:
@@ -102,10 +99,7 @@ def pixels_inside(frame: Frame) -> np.ndarray:
 
 
 def usable(lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds within [0, 1]; where they are not finite, cross or miss [0, 1], nothing is known.
-
-    Depths are at least 0, and may be unknown above or nowhere (see `Frame`).
-    """
+    """Bounds within [0, 1], depths from 0 on; where they are not finite, cross or miss that, nothing is known."""
     if lower.shape[-1] <= DEPTH and bool((lower >= 0.0).all() and (lower <= upper).all() and (upper <= 1.0).all()):
         return lower, upper
     good = np.isfinite(lower) & np.isfinite(upper) & (lower <= upper) & (lower <= 1.0) & (upper >= 0.0)

@@ -12,18 +12,14 @@ import numpy as np
 from ns_abstract.refine.frame_tiles import FrameTiles, context_bytes
 from ns_abstract.refine.goal import RefinementGoal
 from ns_abstract.refine.inner import InnerBound
-from ns_abstract.refine.linear_sets import linear_bytes
+from ns_abstract.refine.leaves import linear_bytes
 from ns_abstract.refine.protocol import Bounds
 from ns_abstract.refine.sub_boxes import BoxSplitter, SubBox
 from ns_abstract.refine.tuning import TUNING, Tuning
 
 
 class Partition(NamedTuple):
-    """Sub-boxes that cover the set, and the bounds of one, or of another sub-box, that was tried.
-
-    Attributes:
-        tried: What was tried.
-    """
+    """Sub-boxes that cover the set, and the bounds of the one, or another, that was ``tried``."""
 
     parts: list[SubBox]
     tried: SubBox

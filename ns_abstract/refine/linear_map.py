@@ -22,12 +22,7 @@ class LinearImage(ArrayRecord):
     """Linear bounds of every picture of a box of parameters.
 
     With the box's parameters scaled to ``p`` in [-1, 1]^d, every pixel and channel of the picture at ``p`` lies in
-    ``[A_lower p + b_lower, A_upper p + b_upper]``, in real numbers.
-
-    Attributes:
-        box: Names, units and ranges of the parameters.
-        A_lower, A_upper: [H, W, 3, d] float32.
-        b_lower, b_upper: [H, W, 3] float32.
+    ``[A_lower p + b_lower, A_upper p + b_upper]``, in real numbers; A [H, W, 3, d], b [H, W, 3] float32.
     """
 
     box: ParameterBox
@@ -39,10 +34,9 @@ class LinearImage(ArrayRecord):
     def to_torch(self) -> Any:
         """A torch module whose images contain every picture of the box.
 
-        ``module(p, e)`` takes parameters [n, d] and slacks [n, 3, H, W], all in [-1, 1], and returns
-        ``A p + b + radius * e`` [n, 3, H, W]: for every ``p``, the picture there is the image of some ``e`` (R7). Both
-        are inputs of a verifier with an infinity norm of 1 around 0. What holds is real arithmetic; a float32
-        evaluation of the module errs as that of any layer.
+        ``module(p, e)`` takes parameters [n, d] and slacks [n, 3, H, W] in [-1, 1], and returns ``A p + b + radius *
+        e`` [n, 3, H, W]: for every ``p``, the picture there is the image of some ``e`` (R7). What holds is real
+        arithmetic; a float32 evaluation of the module errs as that of any layer.
         """
         from ns_abstract.refine.torch_image import LinearRenderer
 
@@ -142,12 +136,10 @@ def _by_tile(leaves: Leaves) -> Iterator[tuple[int, int, np.ndarray]]:
 
 
 def linear_image(leaves: Leaves, lower: Float32Array, upper: Float32Array, box: ParameterBox) -> LinearImage:
-    """One linear map for a whole picture over a box (R7).
+    """One linear map for a whole picture over a ``box``, a part of the set (R7).
 
-    Args:
-        lower, upper: [H, W, 3] bounds that hold on the whole set; taken where no plane is better on average, and where
-            leaves do not cover the box.
-        box: A part of the set.
+    ``lower``, ``upper`` [H, W, 3] hold on the whole set; they are taken where no plane is better on average, and where
+    leaves do not cover the box.
     """
     varied = np.array(box.lower) < np.array(box.upper)
     slopes = [np.zeros((*lower.shape, box.dimensions), np.float32) for _ in range(2)]

@@ -217,20 +217,14 @@ class Frame(Protocol):
         ...
 
     def set_tolerance(self, excess: float) -> float:
-        """Let later bounds be looser by a small part of ``excess`` on average, where that saves time.
-
-        Returns:
-            What no more light comes to is left out; 0: nothing is.
-        """
+        """Let later bounds be looser by a small part of ``excess`` on average; returns what light is left out, or 0."""
         ...
 
     def plan(self, visible: int | None, lower: np.ndarray, upper: np.ndarray) -> list[str]:
         """What was left out for this frame and why, one sentence each.
 
-        Args:
-            visible: Number of scene elements that some cell shows, if they are told apart.
-            lower: [H, W, 3] what refinement found.
-            upper: [H, W, 3] likewise.
+        ``visible``: scene elements that some cell shows, if they are told apart; bounds [H, W, 3] are what refinement
+        found.
         """
         ...
 
@@ -243,13 +237,10 @@ class PartsFrame(Protocol):
         self, boxes: Sequence[ParameterBox], tiles: np.ndarray, within: Any, keep_linear: bool,
         pixels: np.ndarray | None,
     ) -> Sequence[Bounds]:  # fmt: skip
-        """What `Frame.bound` returns of each of ``boxes``.
+        """What `Frame.bound` returns of each of ``boxes``, at most `MOST_PARTS`.
 
-        Args:
-            boxes: Cells, at most `MOST_PARTS`.
-            tiles: [t] numbers.
-            within: The context of these tiles, and at least of these pixels, from a box around all cells.
-            pixels: [t, side, side] which pixels are wanted, others may be left at [0, 1]; all if None.
+        ``within``: the context from a box around all cells. ``pixels`` [t, side, side]: which are wanted, others may be
+        left at [0, 1]; all if None.
         """
         ...
 
@@ -263,11 +254,9 @@ class SubBoxFrame(Protocol):
     ) -> tuple[np.ndarray, np.ndarray] | None:
         """Lower and upper bounds [n, 3, k] of ``n`` pixels over ``k`` sub-boxes; None: there are none for this set.
 
-        Args:
-            counts: [d] sub-boxes along its axes, powers of two, at least 8 together; they are numbered like the
-                entries of an array of this shape. Each is widened by `SUB_BOX_OVERLAP` of the cell's half-widths.
-            tiles: [t] numbers.
-            pixels: [t, side, side] the ``n`` pixels.
+        There are ``counts`` [d] sub-boxes along the axes, powers of two, at least 8 together, numbered like entries of
+        an array of this shape. Each is widened by `SUB_BOX_OVERLAP` of the cell's half-widths. ``pixels`` [t, side,
+        side]: the ``n``.
         """
         ...
 
@@ -280,12 +269,8 @@ class SharedOrder(Protocol):
     ) -> Sequence[tuple[Bounds, Bounds]] | None:
         """Bounds of both scenes with linear bounds, once for every order of elements that a pose of ``box`` may have.
 
-        Args:
-            pixels: [side, side] which pixels are wanted.
-            contexts: Those of both scenes for this tile and cell, or one around it.
-
-        Returns:
-            None: there are too many orders, or one alone.
+        ``pixels`` [side, side] are wanted; ``contexts`` are of this tile and cell, or one around it. None: there are
+        too many orders, or one alone.
         """
         ...
 
@@ -314,14 +299,10 @@ class RayFrame(Frame, Protocol):
     def sets(
         self, box: ParameterBox, weigh: Callable[[], np.ndarray | None] | None = None, most: int | None = None
     ) -> Bounds:
-        """Bounds of all tiles over a cell with linear bounds, for certificates.
+        """Bounds of all tiles over a cell with linear bounds, for certificates, whatever was bounded before.
 
-        What is found depends on the cell and on ``weigh`` alone, whatever was bounded before.
-
-        Args:
-            weigh: [H, W, 3] what part of a margin a unit of each pixel's width may cost, or None; asked at most once,
-                where rays could be refined.
-            most: Rays that are bounded, about, those that matter most first; others are left at [0, 1]. All if None.
+        ``weigh``: [H, W, 3] what part of a margin a unit of each pixel's width may cost, or None; asked at most once.
+        ``most``: rays that are bounded, about, those that matter most first; others are left at [0, 1].
 
         Raises:
             WorkCancelledError: There is no time for it.
@@ -338,12 +319,10 @@ class RayFrame(Frame, Protocol):
 
 @dataclass(frozen=True)
 class WeightPlane:
-    """Which scene elements a plane adds up the blending weights of: those that meet both rules.
+    """Which scene elements a plane adds up the blending weights of: those that meet both rules, None: any.
 
-    Attributes:
-        select: What is stored of the element; None: anything.
-        nearer: Distance (normalised units) that the element is nearer than to the camera: along the optical axis for
-            what has a place of its own, along the ray for samples of a field; None: anywhere.
+    ``nearer``: distance to the camera (normalised units), along the optical axis for what has a place of its own, along
+    the ray for samples of a field.
     """
 
     select: Selection | None = None
@@ -373,10 +352,7 @@ class ElementFrame(WeightFrame, PartsFrame, Protocol):
     def drawn_alone(self, context: Any, tiles: np.ndarray, pixels: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
         """What draws the ``tiles`` [t, side, side, 3] at parameter values [d] of a box; right at ``pixels`` alone.
 
-        Args:
-            context: Of these pixels and the box.
-            tiles: [t] numbers.
-            pixels: [t, side, side] which pixels will be read.
+        ``context``: of these pixels and the box.
         """
         ...
 
@@ -386,10 +362,7 @@ class WeightMethod(Protocol):
     """An optional interface of a `Method`: frames of blending weights."""
 
     def weight_frame(self, poses: PoseBox, planes: Sequence[WeightPlane], pixels: np.ndarray) -> WeightFrame:
-        """The frame whose first channels are ``planes``, at most `MOST_PLANES`.
-
-        Args:
-            pixels: [H, W] the pixels that will be read.
+        """The frame whose first channels are ``planes``, at most `MOST_PLANES`; ``pixels`` [H, W] will be read.
 
         Raises:
             InputError: A selection picks nothing, or this program's weights are not bounded.
@@ -445,11 +418,7 @@ class Method(Protocol):
         ...
 
     def prepare(self, perturbations: Sequence[Perturbation]) -> None:
-        """Find out what the scene itself may do.
-
-        Raises:
-            InputError: Not with this scene.
-        """
+        """Find out what the scene itself may do; InputError: not with this scene."""
         ...
 
     def memory(self, pixels: int, threads: int) -> int:
@@ -459,12 +428,8 @@ class Method(Protocol):
     def frame(self, poses: PoseBox, sheared: bool = False, layers: bool = False) -> Frame:
         """One frame.
 
-        Args:
-            sheared: Its box may count parameters otherwise than the set does, where that is tighter.
-            layers: Whether accumulation and expected depth stand behind the colours.
-
-        Raises:
-            InputError: This representation has no such layers.
+        ``sheared``: its box may count parameters otherwise than the set does, where that is tighter. ``layers``:
+        accumulation and expected depth stand behind the colours; InputError: this representation has none.
         """
         ...
 
@@ -481,8 +446,5 @@ class Method(Protocol):
         ...
 
     def differentiable(self, poses: PoseBox) -> Callable[[torch.Tensor], torch.Tensor] | None:
-        """Parameter values [d] to the picture [H, W, 3] by differentiable operations, for the search.
-
-        None: certificates are not made of this representation.
-        """
+        """Parameter values [d] to the picture [H, W, 3], differentiable; None: there are no certificates of it."""
         ...

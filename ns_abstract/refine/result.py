@@ -54,14 +54,9 @@ class TracePoint:
 class Leaves(ArrayRecord):
     """Linear sets of the leaf cells of one frame, one row per (cell, tile).
 
-    On a leaf's box, with its parameters scaled to ``p`` in [-1, 1]^d, every pixel and channel of
-    every image of the set lies in ``[A_lower p + b_lower, A_upper p + b_upper]``.
-
-    Attributes:
-        box_lower, box_upper: [L, d] ends of the leaf's box, in the parameters' units.
-        tile: [L, 2] first row and first column of the tile's pixels.
-        A_lower, A_upper: [L, side, side, 3, d] float32.
-        b_lower, b_upper: [L, side, side, 3] float32.
+    With the parameters of a leaf's box, ends [L, d], scaled to ``p`` in [-1, 1]^d, every pixel and channel of every
+    image of the set lies in ``[A_lower p + b_lower, A_upper p + b_upper]``, [L, side, side, 3, d] and [L, side, side,
+    3] float32. ``tile`` [L, 2] is the first row and column of the tile's pixels.
     """
 
     box_lower: Float64Array
@@ -104,12 +99,7 @@ EXTRA_OUTPUTS = ("depth", "accumulation")
 
 
 class RenderedMaximum(NamedTuple):
-    """The largest value of a rendered picture, and the pose that shows it.
-
-    Attributes:
-        value: Over all pixels and channels.
-        pose: [d] parameter values, in the parameters' units.
-    """
+    """The largest value of a rendered picture, over all pixels and channels, and the pose [d] that shows it."""
 
     value: float
     pose: tuple[float, ...]
@@ -122,26 +112,20 @@ def greater(*maxima: RenderedMaximum | None) -> RenderedMaximum | None:
 
 @dataclass(frozen=True, repr=False)
 class SampleImages(ArrayRecord):
-    """Concrete renders of some poses of a frame's set.
-
-    Attributes:
-        values: [n, d] parameter values, in the parameters' units.
-        images: [n, H, W, 3] float32; of a part of a frame [n, t, side, side, 3].
-    """
+    """Concrete renders [n, H, W, 3] float32 at parameter values [n, d]; of a part of a frame in tiles."""
 
     values: Float64Array
     images: Float32Array
 
 
 @dataclass(frozen=True, repr=False)
-class FrameResult(ArrayRecord):
-    """One frame's abstract image.
+class AbstractPicture(ArrayRecord):
+    """The abstract image of a frame [H, W, 3], or of some tiles of it [t, side, side, 3], float32.
 
     Attributes:
-        lower, upper: [H, W, 3] enclose every image of the set, after background and clamp to [0, 1].
-        witness_lower, witness_upper: [H, W, 3] least and largest values that were really rendered.
-        image: [H, W, 3] one concrete render, at the middle of the box.
-        plan: What was left out for this frame and why, one sentence each.
+        lower, upper: Enclose every image of the set, after background and clamp to [0, 1].
+        witness_lower, witness_upper: Least and largest values that were really rendered.
+        image: One concrete render, at the middle of the box.
         bounded: False while no bound but [0, 1] is known (the budget ended first).
         leaves: The leaf cells' linear sets, if they were asked for.
         layers: What else was bounded, by name, of `EXTRA_OUTPUTS`.
@@ -160,7 +144,6 @@ class FrameResult(ArrayRecord):
     seconds: float
     cells: int
     trace: tuple[TracePoint, ...] = field(default=(), repr=False)
-    plan: tuple[str, ...] = ()
     bounded: bool = True
     leaves: Leaves | None = field(default=None, repr=False)
     layers: Mapping[str, ExtraOutput] = field(default_factory=dict, repr=False)
@@ -170,39 +153,27 @@ class FrameResult(ArrayRecord):
 
 
 @dataclass(frozen=True, repr=False)
-class PartResult(ArrayRecord):
-    """Some tiles of a frame's abstract image; fields as in `FrameResult` where nothing is said.
+class FrameResult(AbstractPicture):
+    """One frame's abstract image; ``plan``: what was left out for this frame and why, one sentence each."""
+
+    plan: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, repr=False, kw_only=True)
+class PartResult(AbstractPicture):
+    """Some tiles of a frame's abstract image; depths where anything is drawn, as a `Frame` has them.
 
     Attributes:
         tiles: [t] numbers of the tiles.
-        lower, upper, witness_lower, witness_upper, image: [t, side, side, 3].
-        pixels: Number of the tiles' pixels that belong to the image.
-        trace: Measures are those of these pixels.
+        pixels: Number of the tiles' pixels that belong to the image, whose measures the trace has.
         shown: Scene elements that some cell shows in these tiles, or None.
         floor: What no more light comes to was left out of the first cover; 0: nothing.
-        layers: Arrays [t, side, side]; depths where anything is drawn, as a `Frame` has them; or None.
     """
 
-    index: int
-    box: ParameterBox
     tiles: NDArray[np.int64]
-    lower: Float32Array
-    upper: Float32Array
-    witness_lower: Float32Array
-    witness_upper: Float32Array
-    image: Float32Array
     pixels: int
-    seconds: float
-    cells: int
-    trace: tuple[TracePoint, ...]
-    bounded: bool
     shown: NDArray[np.int64] | None
     floor: float = 0.0
-    leaves: Leaves | None = field(default=None, repr=False)
-    layers: Mapping[str, ExtraOutput] | None = field(default=None, repr=False)
-    views: SampleImages | None = field(default=None, repr=False)
-    problems: tuple[str, ...] = ()
-    largest: RenderedMaximum | None = None
 
 
 #: Of a part that has no point yet: [0, 1] everywhere.
@@ -210,9 +181,7 @@ _NOTHING = TracePoint(0.0, 0, math.sqrt(3.0), 0.0, 0.0)
 
 
 def joined(parts: Sequence[PartResult], camera: Any) -> FrameResult:
-    """Return the frame whose tiles are divided among ``parts``.
-
-    Its cells are those of all parts, its time is the longest of a part.
+    """Return the frame whose tiles are divided among ``parts``: cells are those of all, its time is the longest.
 
     Raises:
         ValueError: Parts of different frames, or a tile that is missing or there twice.
@@ -231,8 +200,8 @@ def joined(parts: Sequence[PartResult], camera: Any) -> FrameResult:
         return assemble(np.concatenate([getattr(part, name) for part in parts])[order], camera)
 
     layers: dict[str, ExtraOutput] = {}
-    for name in first.layers or ():
-        part_layers = [part.layers[name] for part in parts if part.layers is not None]
+    for name in first.layers:
+        part_layers = [part.layers[name] for part in parts]
         arrays = (
             np.concatenate([getattr(layer, array) for layer in part_layers])[order] for array in EXTRA_OUTPUT_ARRAYS
         )
@@ -261,12 +230,7 @@ def joined(parts: Sequence[PartResult], camera: Any) -> FrameResult:
 
 
 def _whole_depth(depth: ExtraOutput, accumulation: ExtraOutput) -> ExtraOutput:
-    """The expected depth also where nothing is drawn: there it is the largest one of the picture (design.md, D4).
-
-    Args:
-        depth: [H, W] where anything is drawn; see `ns_abstract.refine.protocol.Frame`.
-        accumulation: [H, W].
-    """
+    """The expected depth [H, W] also where nothing is drawn: the largest one of the picture (design.md, D4)."""
     never, perhaps = depth.lower > depth.upper, ~(accumulation.lower > 0.0)
     # of every picture of the set, the largest depth lies between these
     most = np.where(never, 0.0, depth.upper).max(initial=0.0)

@@ -19,12 +19,7 @@ class SubBox(NamedTuple):
 
 
 class BoxSplitter:
-    """Cuts the box of a frame's parameters.
-
-    Args:
-        frame: Knows which parameters belong to poses of the set.
-        narrowest: Boxes narrower than this part of the set are not cut.
-    """
+    """Cuts the box of a frame's parameters; boxes narrower than the part ``narrowest`` of the set are not cut."""
 
     def __init__(self, frame: Frame, narrowest: float) -> None:
         self.frame, self.narrowest = frame, narrowest

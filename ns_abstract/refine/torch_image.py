@@ -9,9 +9,7 @@ import torch
 class LinearRenderer(torch.nn.Module):
     """Pictures ``A p + b + radius * e`` for parameters ``p`` and slacks ``e`` in [-1, 1].
 
-    Args:
-        slope: A, [H, W, 3, d].
-        offset, radius: b and radius, [H, W, 3].
+    ``slope`` is A [H, W, 3, d]; ``offset`` and ``radius`` are [H, W, 3].
     """
 
     def __init__(self, slope: np.ndarray, offset: np.ndarray, radius: np.ndarray) -> None:

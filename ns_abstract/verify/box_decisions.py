@@ -16,7 +16,7 @@ from ns_abstract.execution.cancellation import Deadline, WorkCancelledError, che
 from ns_abstract.verify.network import ImageSets, Network, NetworkArithmetic, OutputBounds, bound_outputs
 from ns_abstract.verify.network.bounds import NetworkBounds
 from ns_abstract.verify.network.branching import branch
-from ns_abstract.verify.network.input_shares import input_shares
+from ns_abstract.verify.network.dependence import input_shares
 from ns_abstract.verify.network.phase_tree import PhaseTree
 from ns_abstract.verify.network.subnormals import subnormals_kept
 from ns_abstract.verify.network.weighted_means import centred
@@ -74,11 +74,7 @@ _TUNING = BoxTuning()
 
 @dataclass(frozen=True)
 class Decision:
-    """The answer to an instance.
-
-    Attributes:
-        x, y: With "sat": the input [n] float64 inside a region and the outputs [k] for it in float32.
-    """
+    """The answer to an instance; with "sat" the input x [n] inside a region and the outputs y [k] for it in float32."""
 
     word: Verdict
     x: np.ndarray | None = None
@@ -98,11 +94,8 @@ def decide(
 ) -> Decision:
     """Search the regions for an input with an unsafe output and for a proof that there is none (V11).
 
-    Args:
-        run: The program that counts: outputs [k] for one image [1, *input_shape] float32. Only what it
-            computes is a counterexample.
-        memory: Bytes that bounds may take.
-        arithmetic: What a proof covers.
+    ``run``, the program that counts, gives outputs [k] for one image [1, *input_shape] float32; only what it computes
+    is a counterexample. Bounds may take ``memory`` bytes; ``arithmetic`` is what a proof covers.
     """
     search = _BoxSearch(network, run, deadline, memory, arithmetic)
     try:
@@ -117,12 +110,7 @@ def decide(
 
 @dataclass(frozen=True)
 class _Family:
-    """Regions of which the same functions of the outputs are asked.
-
-    Attributes:
-        lower, upper: [m, n].
-        offset: [m, k].
-    """
+    """Regions, of ends [m, n], of which the same functions of the outputs are asked, with offsets [m, k]."""
 
     regions: Sequence[InputRegion]
     lower: np.ndarray
@@ -135,10 +123,7 @@ class _Family:
         return self.regions[0].unsafe
 
     def value(self, y: torch.Tensor, which: np.ndarray, group: Sequence[int] | None) -> torch.Tensor:
-        """[B] of outputs [B, ...] for inputs of regions ``which``: unsafe where it is not positive, differentiable.
-
-        ``group``: of this group alone.
-        """
+        """[B] of outputs [B, ...] for inputs of regions ``which``, of one ``group`` or all: unsafe where <= 0."""
         rows = y.flatten(1) @ torch.from_numpy(self.unsafe.rows).T + torch.from_numpy(self.offset[which])
         wanted = self.unsafe.groups if group is None else [group]
         groups = [rows[:, list(one)].amax(1) for one in wanted if one]

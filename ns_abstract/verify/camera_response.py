@@ -9,24 +9,22 @@ from typing import Literal
 
 import numpy as np
 
-from ns_abstract.arithmetic.outward import outward
 from ns_abstract.arithmetic.rounding import RESPONSE_ROUNDING, RESPONSE_ROUNDINGS
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.refine.protocol import Bounds, Frame, LinearSets, Score
+from ns_abstract.verify.picture_sets import flatter_where_better
 
 ResponseName = Literal["brightness", "white balance", "gamma"]
 
 
 @dataclass(frozen=True)
 class CameraResponse:
-    """A set of camera responses around the nominal one.
+    """A set of camera responses around the nominal one, whose factor or power is within ``radius`` < 1 of 1.
 
-    Attributes:
-        name: "brightness": all values times one factor; "white balance": each channel times one of its own; "gamma":
-            all values to one power. The result is clipped to [0, 1].
-        radius: How far factor or power may be from 1; below 1.
+    "brightness": all values times one factor; "white balance": each channel times its own; "gamma": all values to one
+    power. The result is clipped to [0, 1].
     """
 
     name: ResponseName
@@ -52,12 +50,7 @@ class CameraResponse:
     ) -> tuple[LinearSets, np.ndarray, np.ndarray]:
         """Sets that hold what every camera makes of the pictures that ``linear``, ``lower`` and ``upper`` hold (V14).
 
-        Args:
-            linear: A_lower [..., d], b_lower [...], A_upper, b_upper, float32.
-            lower, upper: [...] float32.
-
-        Returns:
-            The same, float32, rounded outward.
+        All are float32, rounded outward: A_lower [..., d], b_lower [...], A_upper, b_upper; lower, upper [...].
         """
         low, high = (np.clip(np.asarray(bound, np.float64), 0.0, 1.0) for bound in (lower, upper))
         r = self.radius
@@ -80,11 +73,7 @@ class CameraResponse:
         below = b_lower * shrink - fall - slack
         slack = np.abs(a_above - a_upper * grow).sum(axis=-1) + RESPONSE_ROUNDINGS
         above = b_upper * grow + rise + slack
-        flat_lower, flat_upper = least > below, most < above
-        b_lower, b_upper = outward(np.where(flat_lower, least, below), np.where(flat_upper, most, above))
-        a_lower = np.where(flat_lower[..., None], np.float32(0.0), a_below)
-        a_upper = np.where(flat_upper[..., None], np.float32(0.0), a_above)
-        return (a_lower, b_lower, a_upper, b_upper), *outward(least, most)
+        return flatter_where_better((a_below, a_above), (below, above), least, most)
 
 
 def response_sets(
@@ -99,11 +88,7 @@ def response_sets(
 
 @dataclass(frozen=True)
 class ResponseSample:
-    """One camera response of a set; see `ns_abstract.refine.protocol.SceneSample`.
-
-    Attributes:
-        values: [3] factors or powers by channel.
-    """
+    """One camera response of a set, factors or powers [3] by channel; see `ns_abstract.refine.protocol.SceneSample`."""
 
     frame: Frame
     response: CameraResponse

@@ -77,9 +77,8 @@ def resolved(box: ParameterBox, counts: np.ndarray) -> bool:
 def divided(cell: Cell, left: np.ndarray, filled: float) -> Iterator[tuple[Cell, bool]]:
     """Cells that tile ``cell``, each with whether some of its sub-boxes are left (U5).
 
-    Args:
-        left: [counts] which of its equal sub-boxes are left; counts divide the cell's units.
-        filled: Part of a box that has to be left for it to become one cell.
+    ``left`` [counts]: which of its equal sub-boxes are; counts divide the cell's units. ``filled``: part of a box that
+    has to be left for it to become one cell.
     """
     if not left.any():
         yield cell, False

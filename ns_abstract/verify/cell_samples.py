@@ -1,4 +1,4 @@
-"""Concrete pictures of one cell of a search, with their margins."""
+"""One cell of a search: concrete pictures with their margins, and bounds."""
 
 from __future__ import annotations
 
@@ -20,13 +20,30 @@ Sample = tuple[np.ndarray, "SceneSample | None"]
 
 @dataclass
 class CellSamples:
-    """Concrete pictures of one cell, with their margins."""
+    """Concrete pictures of one cell, with their margins, and what bounds say of it.
+
+    Attributes:
+        outputs: [n] of the model, of the first sample.
+        bound: A lower bound of the margin; None: there is none, for the ``reason``.
+        slopes: [d] what a cut along each parameter may gain.
+        cost: The part of the margin that the width of the sets costs, about; NaN: nobody knows.
+        cuts: Into how many parts to cut the cell along each parameter; empty: as slopes say.
+    """
 
     cell: Cell
     box: ParameterBox
     scene: FrameImages
     samples: list[Sample] = field(default_factory=list)
     margins: list[float] = field(default_factory=list)
+    outputs: np.ndarray | None = None
+    bound: float | None = None
+    reason: str = ""
+    slopes: np.ndarray = field(init=False)
+    cost: float = math.nan
+    cuts: tuple[int, ...] = ()
+
+    def __post_init__(self) -> None:
+        self.slopes = np.zeros(self.box.dimensions)
 
     @property
     def worst(self) -> int:
@@ -55,6 +72,11 @@ class CellSamples:
     def hopeless(self) -> bool:
         """Whether there is no pose at which the property was seen to hold for all scenes."""
         return len(self._where(_spoilt)) == len(self.poses)
+
+    @property
+    def proved(self) -> bool:
+        """Whether bounds prove the property of the whole cell."""
+        return self.bound is not None and self.bound > 0.0
 
     @property
     def wavers(self) -> bool:

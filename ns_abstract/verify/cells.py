@@ -51,9 +51,7 @@ class Cell:
 class CellGrid:
     """The grid of a frame: each parameter cut into ``units[k]`` equal units, of which cells consist.
 
-    Attributes:
-        units: Parts along each parameter: the finest cells there are.
-        coarse: Parts along each parameter that the search begins with.
+    The search begins with ``coarse[k]`` parts.
     """
 
     box: ParameterBox
@@ -108,9 +106,8 @@ class CellGrid:
     def divide(self, cell: Cell, slopes: np.ndarray, shrink: float, most: int) -> list[Cell]:
         """The cell halved along the parameter with the largest slope, and so on; empty if it is one unit.
 
-        Args:
-            slopes: [d] what a cut along each parameter may gain.
-            shrink: Until the slopes' sum is so many times smaller; there is one halving at least.
+        ``slopes`` [d]: what a cut along each parameter may gain; there is one halving at least, until their sum is
+        ``shrink`` times smaller or there are ``most`` parts.
         """
         gains = np.where(np.isfinite(slopes), slopes, 0.0)
         sizes = np.array(cell.past, np.int64) - np.array(cell.first, np.int64)
@@ -144,8 +141,7 @@ class CellGrid:
 def initial_divisions(motion: np.ndarray, pixels: float) -> tuple[int, ...]:
     """Return the number of initial cells along each parameter such that the picture moves by ``pixels`` in one.
 
-    Fewer where there would be too many; in several parameters the search finds by itself where fine cells
-    are needed, so it begins with large ones.
+    Fewer where there would be too many: in several parameters the search finds where fine cells are needed.
     """
     counts = [max(1, math.ceil(m / pixels)) if np.isfinite(m) else 1 for m in motion]
     while math.prod(counts) > _MOST_FIRST:

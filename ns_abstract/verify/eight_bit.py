@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from ns_abstract.arithmetic.network_charges import QUOTIENT, STEP
-from ns_abstract.arithmetic.outward import outward
+from ns_abstract.verify.picture_sets import flatter_where_better
 
 #: What a network is shown: the renderer's floats, or these rounded to multiples of 1/255.
 Picture = Literal["float", "8-bit"]
@@ -26,16 +26,10 @@ def rounded_sets(
 ) -> tuple[tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], np.ndarray, np.ndarray]:
     """Return sets that contain the rounded pictures of those in ``linear``, ``lower`` and ``upper`` (V10).
 
-    Rounding may be to either neighbour at a tie, and in float32: any program that computes 255 x + 1/2 with two
-    roundings and cuts the fraction off, or takes the nearest whole number, is enclosed. Linear sets keep their slopes
-    and are half a step wider on each side; where the constant bound is better at the middle of the cell, it is taken.
-
-    Args:
-        linear: A_lower [..., d], b_lower [...], A_upper, b_upper, float32.
-        lower, upper: [...] float32.
-
-    Returns:
-        The same for the rounded pictures, float32, rounded outward.
+    Any program that computes 255 x + 1/2 with two roundings and cuts the fraction off, or takes the nearest whole
+    number, is enclosed. Linear sets keep their slopes and are half a step wider on each side; where the constant bound
+    is better at the middle of the cell, it is taken. All are float32, rounded outward: A_lower [..., d], b_lower [...],
+    A_upper, b_upper; lower, upper [...].
     """
     low, high = (np.clip(np.asarray(bound, np.float64), 0.0, 1.0) * _STEPS for bound in (lower, upper))
     least = np.maximum(np.ceil(low - 0.5 - STEP), 0.0) / _STEPS * (1.0 - QUOTIENT)
@@ -45,11 +39,5 @@ def rounded_sets(
     a_lower, b_lower, a_upper, b_upper = linear
     half = (0.5 + STEP) / _STEPS + QUOTIENT
     below, above = np.asarray(b_lower, np.float64) - half, np.asarray(b_upper, np.float64) + half
-    # comparisons that a NaN fails keep it, so that it is noticed
-    flat_lower, flat_upper = least > below, most < above
-    b_lower, b_upper = outward(np.where(flat_lower, least, below), np.where(flat_upper, most, above))
-    a_lower, a_upper = (
-        np.where(flat[..., None], np.float32(0.0), np.asarray(a, np.float32))
-        for flat, a in ((flat_lower, a_lower), (flat_upper, a_upper))
-    )
-    return (a_lower, b_lower, a_upper, b_upper), *outward(least, most)
+    slopes = np.asarray(a_lower, np.float32), np.asarray(a_upper, np.float32)
+    return flatter_where_better(slopes, (below, above), least, most)

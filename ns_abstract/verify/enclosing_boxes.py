@@ -34,11 +34,7 @@ def enclosing_box(cell: ParameterBox, whole: ParameterBox, motion: np.ndarray) -
     """Return a box of ``whole`` around a cell of it, about two to eight times wider along each parameter.
 
     Its ends lie on a dyadic grid of ``whole``, so that neighbouring cells of about the same widths share it (Q5). None:
-    it would be too wide to be of use.
-
-    Args:
-        cell: A box inside of ``whole``.
-        motion: [d] pixels that the picture moves by over each parameter's range.
+    the picture, which moves by ``motion`` [d] pixels over each parameter's range, would move by too much.
     """
     levels = [max(0, level - _TUNING.halvings) for level in _levels(cell, whole)]
     return _useful(_aligned(cell, whole, levels), cell, whole, motion)
@@ -47,13 +43,8 @@ def enclosing_box(cell: ParameterBox, whole: ParameterBox, motion: np.ndarray) -
 def shared_box(box: ParameterBox, whole: ParameterBox, motion: np.ndarray) -> ParameterBox | None:
     """Return a wider box of ``whole`` around an enclosing one, over which the picture moves about alike by parameter.
 
-    Enclosing boxes are as long and narrow as cells are; those around them are not, so that few of them serve all (Q5).
-    None: it would be too wide to be of use, or is no wider.
-
-    Args:
-        box: See `enclosing_box`.
-        whole: The set.
-        motion: [d] pixels that the picture moves by over each parameter's range.
+    Enclosing boxes are as long and narrow as cells are; few of those around them serve all (Q5). None: it would be too
+    wide to be of use, by ``motion`` as in `enclosing_box`, or is no wider.
     """
     most = float(np.max(motion, initial=0.0))
     if not math.isfinite(most):

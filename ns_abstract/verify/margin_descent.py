@@ -1,4 +1,4 @@
-"""Projected gradient descent of a margin over the poses of a cell."""
+"""Projected gradient descent of a function of the pose over a box."""
 
 from __future__ import annotations
 
@@ -10,39 +10,51 @@ import torch
 
 from ns_abstract.geometry.box import ParameterBox
 
-#: Steps of the descent to a counterexample.
-_STEPS = 6
 _FIRST_STEP = 0.25
 
 
-def descend(box: ParameterBox, start: np.ndarray, margin: Callable[[torch.Tensor], torch.Tensor]) -> np.ndarray | None:
-    """Return a pose [d] of the cell whose margin is smaller than at ``start`` [d]; None: no step found one.
+def descend(
+    box: ParameterBox,
+    start: np.ndarray,
+    value: Callable[[torch.Tensor], torch.Tensor],
+    steps: int,
+    enough: Callable[[float], bool],
+) -> np.ndarray | None:
+    """Return the pose [d] of the box with the least value that was found; None: no step was better than ``start`` [d].
+
+    Steps follow the normalised gradient in parameters scaled to [-1, 1]^d; they double where the value fell and shrink
+    to a quarter where not.
 
     Args:
-        margin: Of parameter values [d]; differentiable.
+        box: Limits of the parameters.
+        start: Where the descent begins.
+        value: Of parameter values [d]; differentiable.
+        steps: Most steps.
+        enough: Whether the least value so far ends the descent.
     """
     low, high = (torch.tensor(v, dtype=torch.float64) for v in (box.lower, box.upper))
 
     def evaluate(scaled: torch.Tensor) -> tuple[float, torch.Tensor]:
         scaled = scaled.detach().requires_grad_(True)
-        value = margin(low + 0.5 * (scaled + 1.0) * (high - low))
+        result = value(low + 0.5 * (scaled + 1.0) * (high - low))
         slope = torch.zeros_like(scaled)
-        if value.requires_grad:
-            (slope,) = torch.autograd.grad(value, scaled)
-        return float(value.detach()), slope
+        if result.requires_grad:
+            (slope,) = torch.autograd.grad(result, scaled)
+        return float(result.detach()), slope
 
     scaled = (2.0 * (torch.from_numpy(start) - low) / (high - low) - 1.0).clamp(-1.0, 1.0)
     best, slope = evaluate(scaled)
     step, moved = _FIRST_STEP, False
-    for _ in range(_STEPS):
+    for _ in range(steps):
+        # directions that leave the box are no use
         free = torch.where(((scaled <= -1.0) & (slope > 0)) | ((scaled >= 1.0) & (slope < 0)), 0.0, slope)
         length = float(free.norm())
-        if not 0.0 < length < math.inf or best <= 0.0:
+        if not 0.0 < length < math.inf or enough(best):
             break
         trial = (scaled - step * free / length).clamp(-1.0, 1.0)
-        value, trial_slope = evaluate(trial)
-        if value < best:
-            scaled, best, slope, step, moved = trial, value, trial_slope, min(2.0 * step, 1.0), True
+        found, trial_slope = evaluate(trial)
+        if found < best:
+            scaled, best, slope, step, moved = trial, found, trial_slope, min(2.0 * step, 1.0), True
         else:
             step *= 0.25
     return box.at(scaled.detach().numpy()) if moved else None

@@ -25,12 +25,7 @@ from ns_abstract.verify.properties import Query
 
 
 class NetworkModel:
-    """A network with its preprocessing, for `ns_abstract.verify.search.Search`.
-
-    Args:
-        memory: Bytes that its bounds may take.
-        arithmetic: Whether every float32 evaluation is meant, or the exact network alone.
-    """
+    """A network with its preprocessing, for `ns_abstract.verify.search.Search`; bounds take ``memory`` bytes."""
 
     def __init__(
         self, network: Network, preprocess: Preprocess, memory: int, arithmetic: NetworkArithmetic = "float32"

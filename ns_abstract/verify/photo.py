@@ -27,8 +27,7 @@ _FITS = 8
 class Brightness:
     """What a camera may do to all values alike (U6): it shows ``gain * value + offset``, clipped to [0, 1].
 
-    Attributes:
-        gain, offset: Ends of their intervals; gains are above 0.
+    Gains, above 0, and offsets lie between their ends.
     """
 
     gain: tuple[float, float] = (1.0, 1.0)
@@ -159,22 +158,19 @@ class TiledPhoto:
         return self.counted & ~((picture >= self.low) & (picture <= self.high)).all(axis=-1)
 
     def beyond(self, lower: np.ndarray, upper: np.ndarray, tiles: np.ndarray) -> np.ndarray:
-        """[t, side, side] which counted pixels of ``tiles`` no picture between the bounds explains (U2).
+        """[t, side, side] which counted pixels of ``tiles`` [t] no picture between the bounds explains (U2).
 
-        Args:
-            lower, upper: [t, side, side, 3] bounds of all pictures of a cell; NaN excludes nothing.
-            tiles: [t] numbers.
+        The bounds [t, side, side, 3] are of all pictures of a cell; NaN excludes nothing.
         """
         # bounds that cross bound nothing
         sane = (lower <= upper).all(axis=-1)
         return sane & self.counted[tiles] & ((lower > self.high[tiles]) | (upper < self.low[tiles])).any(axis=-1)
 
     def excluding(self, lower: np.ndarray, upper: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-        """[n, k] which pixels exclude which of ``k`` sub-boxes: the bounds lie beyond what explains them (U2, U5).
+        """[n, k] which of the ``n`` ``pixels`` [T, side, side] exclude which of ``k`` sub-boxes (U2, U5).
 
-        Args:
-            lower, upper: [n, 3, k] bounds of the pictures of each sub-box; NaN and crossed bounds exclude nothing.
-            pixels: [T, side, side] the ``n`` pixels; those that do not count exclude nothing.
+        Their bounds [n, 3, k] lie beyond what explains them; NaN, crossed bounds and pixels that do not count exclude
+        nothing.
         """
         high, low = self.high[pixels][:, :, None], self.low[pixels][:, :, None]
         beyond = (lower <= upper).all(axis=1) & ((lower > high) | (upper < low)).any(axis=1)

@@ -1,8 +1,7 @@
 """Numbers that are read off a picture, its depths or its blending weights, and their bounds (docs/dev/design.md, Q4).
 
 A measure is a mean or an order statistic of the pixels of a region: it grows with every pixel, so that bounds of the
-pixels bound it. Over a cell it is bounded part by part, where the pixels' linear bounds hold: pixels that rise and fall
-with the pose at the same time keep doing so.
+pixels bound it, over a cell part by part, where the pixels' linear bounds hold.
 """
 
 from __future__ import annotations
@@ -32,26 +31,8 @@ CHANNELS = {
 
 
 @dataclass(frozen=True)
-class MeasureTuning:
-    """Into how many parts a cell's linear bounds are looked at. It does not decide whether a bound holds."""
-
-    #: Most parts, and most numbers (parts times pixels) at once.
-    parts: int = 32
-    numbers: int = 1 << 21
-
-
-_TUNING = MeasureTuning()
-
-
-@dataclass(frozen=True)
 class Region:
-    """A set of pixels: a box, what is white in a mask, or all of the picture.
-
-    Attributes:
-        box: First columns and rows, past columns and rows: x0, y0, x1, y1; None: no box.
-        mask: A .png; None: none.
-        name: The key of the property file, for errors.
-    """
+    """A set of pixels: a box x0, y0, x1, y1 with exclusive ends, white ones of a mask, or all; ``name`` is its key."""
 
     box: tuple[int, int, int, int] | None = None
     mask: Path | None = None
@@ -190,11 +171,7 @@ def ranked(values: np.ndarray, place: int) -> np.ndarray:
 
 @dataclass(frozen=True)
 class CellParts:
-    """Equal parts of a cell in its parameters, each scaled to [-1, 1].
-
-    Attributes:
-        middles, halves: [s, d] middles and half widths.
-    """
+    """Equal parts of a cell in its parameters, each scaled to [-1, 1]: middles and half widths [s, d]."""
 
     middles: np.ndarray
     halves: np.ndarray
@@ -221,12 +198,7 @@ class CellParts:
 
 @dataclass(frozen=True)
 class PlaneSets:
-    """Linear sets of all planes of one cell's pictures, pixels in a row.
-
-    Attributes:
-        linear: A_lower [n, C, d], b_lower [n, C], A_upper, b_upper.
-        lower, upper: [n, C].
-    """
+    """Linear sets of all planes of one cell's pictures, A_lower [n, C, d], b_lower [n, C], A_upper, b_upper."""
 
     linear: tuple[np.ndarray, ...]
     lower: np.ndarray

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -28,23 +28,23 @@ from ns_abstract.verify.picture_measures import (
     CHANNELS,
     CellParts,
     Measure,
-    MeasureTuning,
     Plane,
     PlaneSets,
     Region,
 )
 from ns_abstract.verify.pixel_parts import fewest_reaching
-from ns_abstract.verify.preprocess import Preprocess, parse_preprocess
+from ns_abstract.verify.preprocess import parse_preprocess
 from ns_abstract.verify.properties import Claim, Property, Query
 from ns_abstract.verify.property_reading import parse_partitions
 from ns_abstract.verify.settled_pixels import LimitedMeasure
 
-_TUNING = MeasureTuning()
 STATISTICS = ("mean", "least", "greatest")
 #: The depth of a pixel on which nothing is drawn, and the greatest that is told apart, normalised units.
 FARTHEST = 2.0**20
 #: What reports say of distances.
 _DISTANCES = "distances: depth of the centres of Gaussians along the optical axis; of a NeRF's samples along their rays"
+#: Preferences: most parts of a cell, and most numbers (parts times pixels) at once.
+_PARTS, _NUMBERS = 32, 1 << 21
 #: Most leaves of a property, and how deep it may be.
 _MOST_LEAVES, _DEEPEST = 64, 8
 
@@ -74,11 +74,7 @@ class Leaf:
     cap: float = math.inf
 
     def measure(self, height: int, width: int) -> Measure:
-        """The measure of pictures of this size.
-
-        Raises:
-            InputError: A region does not lie in them, or has too few pixels.
-        """
+        """The measure of pictures of this size; InputError if a region does not lie in them or has too few pixels."""
         places = np.flatnonzero(self.region.pixels(height, width))
         minus = None if self.minus is None else np.flatnonzero(self.minus.pixels(height, width))
         rank: int | None = 1
@@ -169,8 +165,6 @@ class PictureProperty(Property):
     """A statement about the picture, its depths or its blending weights."""
 
     statement: Statement
-    preprocess: Preprocess = field(default_factory=Preprocess)
-    partitions: tuple[int, ...] | None = None
 
     def sentence(self) -> str:
         return _sentence(self.statement)
@@ -200,11 +194,7 @@ class PictureProperty(Property):
         return MeasureModel(measures, places, COLORS + len(others))
 
     def limited(self, height: int, width: int) -> tuple[LimitedMeasure, ...]:
-        """The measures of pictures of this size with their limits, by leaf.
-
-        Raises:
-            InputError: A region does not lie in them.
-        """
+        """The measures of pictures of this size with their limits, by leaf; InputError as `measures`."""
         model = self.model(height, width)
         by_leaf = zip(model.measures, model.places, leaves(self.statement), strict=True)
         return tuple(
@@ -213,11 +203,7 @@ class PictureProperty(Property):
         )
 
     def measures(self, height: int, width: int) -> tuple[Measure, ...]:
-        """The measures of pictures of this size, by leaf.
-
-        Raises:
-            InputError: A region does not lie in them.
-        """
+        """The measures of pictures of this size, by leaf; InputError if a region does not lie in them."""
         return tuple(leaf.measure(height, width) for leaf in leaves(self.statement))
 
 
@@ -226,12 +212,9 @@ def _nearer(plane: Plane) -> bool:
 
 
 class MeasureModel:
-    """Measures of pictures, in the place of a network (`ns_abstract.verify.protocol.Model`).
+    """Measures of pictures, by leaf, in the place of a network (`ns_abstract.verify.protocol.Model`).
 
-    Args:
-        measures: By leaf.
-        places: By leaf, the first channel of its plane.
-        channels: Of the pictures.
+    ``places``: by leaf, the first channel of its plane, of the ``channels`` of the pictures.
     """
 
     def __init__(self, measures: Sequence[Measure], places: Sequence[int], channels: int) -> None:
@@ -272,7 +255,7 @@ class MeasureModel:
     def _cell(self, planes: PlaneSets) -> np.ndarray:
         read = np.unique(np.concatenate([m.pixels for m in self.measures]))
         effects = np.abs(planes.linear[0][read].astype(np.float64)).sum(axis=(0, 1))
-        most = max(1, min(_TUNING.parts, _TUNING.numbers // read.size))
+        most = max(1, min(_PARTS, _NUMBERS // read.size))
         parts = CellParts.along(effects, most)
         ends = [m.bounds(planes, first, parts) for m, first in zip(self.measures, self.places, strict=True)]
         low, high = (np.stack(side, axis=1) for side in zip(*ends, strict=True))
@@ -433,10 +416,7 @@ def is_of_picture(root: Any) -> bool:
 def parse_picture_property(root: dict[str, Any], folder: Path, dataset_scale: float = 1.0) -> PictureProperty:
     """Return the property of the picture that a parsed PROP.json states; files that it names lie in ``folder``.
 
-    Args:
-        root: Content of the file.
-        folder: See above.
-        dataset_scale: Normalised units per unit of the data set.
+    ``dataset_scale``: normalised units per unit of the data set.
 
     Raises:
         InputError: A field cannot be used.

@@ -8,7 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ns_abstract.arithmetic.network_charges import OWN_MARGIN
+from ns_abstract.arithmetic.outward import outward
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.refine.protocol import LinearSets
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,17 @@ _TUNING = HullTuning()
 def sane(linear: Sequence[np.ndarray], lower: np.ndarray, upper: np.ndarray) -> bool:
     """Whether linear sets and bounds are all finite, and the bounds do not cross."""
     return all(np.isfinite(v).all() for v in (*linear, lower, upper)) and bool((lower <= upper).all())
+
+
+def flatter_where_better(
+    slopes: tuple[np.ndarray, np.ndarray], offsets: tuple[np.ndarray, np.ndarray], least: np.ndarray, most: np.ndarray
+) -> tuple[LinearSets, np.ndarray, np.ndarray]:
+    """Return linear sets and bounds, rounded outward; a bound is taken for a plane where it is better in the middle."""
+    # comparisons that a NaN fails keep it, so that it is noticed
+    flat = least > offsets[0], most < offsets[1]
+    b_lower, b_upper = outward(np.where(flat[0], least, offsets[0]), np.where(flat[1], most, offsets[1]))
+    a_lower, a_upper = (np.where(f[..., None], np.float32(0.0), a) for f, a in zip(flat, slopes, strict=True))
+    return (a_lower, b_lower, a_upper, b_upper), *outward(least, most)
 
 
 @dataclass(frozen=True)

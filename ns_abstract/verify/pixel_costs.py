@@ -13,8 +13,7 @@ from ns_abstract.verify.protocol import FrameImages, Model
 def pixel_weights(scene: FrameImages, model: Model, claim: Claim, box: ParameterBox) -> np.ndarray | None:
     """[H, W, 3] slopes of the margin by pixel in the middle of a cell, as parts of the margin there (an estimate).
 
-    None where the margin is not above 0, or a slope is no number: no width would be narrow enough. What is found
-    decides about work alone, never about a bound.
+    None where the margin is not above 0, or a slope is no number. What is found decides about work alone.
     """
     values = box.middle
     image = torch.from_numpy(scene.image(values).astype(np.float64)).requires_grad_(True)

@@ -109,14 +109,11 @@ class Preprocess:
         lower: np.ndarray,
         upper: np.ndarray,
     ) -> ImageSets:
-        """Linear sets of network inputs from those of pictures (docs/dev/design.md, V1).
+        """Linear sets of network inputs, with every float32 evaluation of `apply`, from those of pictures (V1).
 
         Args:
             linear: A_lower [m, H, W, 3, d], b_lower [m, H, W, 3], A_upper, b_upper of m cells.
             lower, upper: [m, H, W, 3] interval bounds.
-
-        Returns:
-            Sets that hold every float32 evaluation of `apply`, too.
         """
         from ns_abstract.verify.network import ImageSets
 

@@ -40,12 +40,7 @@ COMPONENTS = ("camera.x", "camera.y", "camera.z", "object.x", "object.y", "objec
 
 @dataclass(frozen=True)
 class Query:
-    """The linear functions ``rows @ y + offset`` of the outputs whose lower bounds a proof needs.
-
-    Attributes:
-        rows: [k, output_size].
-        offset: [k].
-    """
+    """The linear functions ``rows @ y + offset``, [k, output_size] and [k], whose lower bounds a proof needs."""
 
     rows: np.ndarray
     offset: np.ndarray
@@ -68,11 +63,12 @@ class Claim(ABC):
         """[m] lower bounds of the margin over the cells ``boxes``; -inf where nothing is known."""
 
 
+@dataclass(frozen=True, kw_only=True)
 class Property(ABC):
     """A property as its file states it."""
 
-    preprocess: Preprocess
-    partitions: tuple[int, ...] | None
+    preprocess: Preprocess = field(default_factory=Preprocess)
+    partitions: tuple[int, ...] | None = None
 
     @abstractmethod
     def sentence(self) -> str:
@@ -123,8 +119,6 @@ class Classification(Property):
 
     label: int
     classes: int
-    preprocess: Preprocess = field(default_factory=Preprocess)
-    partitions: tuple[int, ...] | None = None
 
     def sentence(self) -> str:
         return f"output {self.label} is larger than each of the other {self.classes - 1}"
@@ -143,8 +137,6 @@ class VnnLibProperty(Property):
 
     file: Path
     unsafe: UnsafeSet
-    preprocess: Preprocess = field(default_factory=Preprocess)
-    partitions: tuple[int, ...] | None = None
 
     def sentence(self) -> str:
         return f"the outputs are outside the unsafe set of {self.file.name}"
@@ -276,8 +268,6 @@ class Regression(Property):
     truth: TrueValues
     absolute: tuple[float, ...] | None
     relative: float | None
-    preprocess: Preprocess = field(default_factory=Preprocess)
-    partitions: tuple[int, ...] | None = None
 
     def sentence(self) -> str:
         names = ", ".join(c if isinstance(c, str) else f"{c:g}" for c in self.truth.components)
@@ -296,17 +286,15 @@ class Regression(Property):
 
 
 def decode(outputs: torch.Tensor, stride: float) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """The VOC TinyYOLO head, after Redmon and Farhadi's YOLOv2 (V4).
+    """The VOC TinyYOLO head, after Redmon and Farhadi's YOLOv2 (V4), of pictures with ``stride`` pixels by grid cell.
 
     Args:
-        outputs: [B, 125 g g]: channels of [125, g, g] are 5 objectness logits, 5 x 20 class logits and
-            5 x 4 numbers tx, ty, tw, th, each by anchor.
-        stride: Pixels by grid cell.
+        outputs: [B, 125 g g]: channels of [125, g, g] are 5 objectness logits, 5 x 20 class logits and 5 x 4 numbers
+            tx, ty, tw, th, each by anchor.
 
     Returns:
-        Objectness [B, 5, g, g], class probabilities [B, 5, 20, g, g], and boxes [B, 5, 4, g, g] as
-        x0, y0, x1, y1 in pixels: centres at ``(sigmoid(t) + cell) stride``, sides
-        ``anchor exp(t) stride``.
+        Objectness [B, 5, g, g], class probabilities [B, 5, 20, g, g], and boxes [B, 5, 4, g, g] x0, y0, x1, y1 in
+            pixels: centres at ``(sigmoid(t) + cell) stride``, sides ``anchor exp(t) stride``.
     """
     grid = math.isqrt(outputs.shape[1] // HEAD)
     head = outputs.reshape(-1, HEAD, grid, grid)
@@ -458,8 +446,6 @@ class Detection(Property):
     box: tuple[float, float, float, float] | None
     grid: int
     stride: float
-    preprocess: Preprocess = field(default_factory=Preprocess)
-    partitions: tuple[int, ...] | None = None
 
     def sentence(self) -> str:
         what = "objectness" if self.label is None else f"score of class {self.label}"

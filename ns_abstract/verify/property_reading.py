@@ -5,16 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.fields import known
 from ns_abstract.io.jsonio import FIX_MODERATE, MODERATE, file_beside, is_moderate, is_number, show
 from ns_abstract.verify.preprocess import parse_preprocess
-from ns_abstract.verify.vnnlib import load_vnnlib
-
-if TYPE_CHECKING:
-    pass
 from ns_abstract.verify.properties import (
     CLASSES,
     COMPONENTS,
@@ -26,6 +22,7 @@ from ns_abstract.verify.properties import (
     TrueValues,
     VnnLibProperty,
 )
+from ns_abstract.verify.vnnlib import load_vnnlib
 
 _COMMON = ("type", "preprocess", "partitions", "output")
 

@@ -1,7 +1,6 @@
 """Pictures of a scene whose registration is uncertain: the whole scene may be shifted (docs/dev/design.md, V13, P3).
 
-Where the scene stands is three parameters more, which the sets of pictures and the network's bounds keep; only what is
-left of them at the end is taken at its worst.
+Where the scene stands is three parameters more, which sets of pictures and bounds keep until the end.
 """
 
 from __future__ import annotations
@@ -25,11 +24,7 @@ PLACE = 3
 
 
 class RegisteredImages:
-    """Pictures of poses for every position of the scene; see `ns_abstract.verify.protocol.FrameImages`.
-
-    Args:
-        scene: Pictures of a set of `PoseBox.registered`: its last parameters tell where the scene stands.
-    """
+    """Pictures of poses for every position of the scene, of a set of `PoseBox.registered`; see `FrameImages`."""
 
     def __init__(self, scene: FrameImages, frame: Frame) -> None:
         self.scene, self.frame = scene, frame
@@ -67,11 +62,7 @@ class RegisteredImages:
 
 @dataclass(frozen=True)
 class RegisteredSample:
-    """One position of the scene; see `ns_abstract.refine.protocol.SceneSample`.
-
-    Attributes:
-        offset: [3] where the scene stands.
-    """
+    """One position [3] of the scene; see `ns_abstract.refine.protocol.SceneSample`."""
 
     scene: RegisteredImages = field(repr=False)
     offset: np.ndarray

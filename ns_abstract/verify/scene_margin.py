@@ -53,7 +53,6 @@ class VariationKind:
 
     Attributes:
         name: Key of a scene variation, of `KINDS`.
-        text, unit: For people.
         place: Parameters of where the scene as a whole stands, if these vary (`PoseBox.registered`).
     """
 
@@ -111,12 +110,9 @@ def bounded_kinds(places: Callable[[VariationKind], bool]) -> tuple[VariationKin
 
 @dataclass(frozen=True)
 class CellOutcome:
-    """The outcome of a cell for all scenes of a set.
+    """The outcome of a cell for all scenes of a set, with arrays of a scene that breaks it.
 
-    Attributes:
-        outcome: "holds": proved; "falsified": a scene was found, and rendered again, that breaks it; "unknown".
-        slopes: [d] what a cut along each parameter may gain.
-        example: Arrays that tell a scene that breaks it, or None.
+    ``slopes`` [d] are what a cut along each parameter may gain.
     """
 
     outcome: Outcome
@@ -131,12 +127,7 @@ ProveCell = Callable[[float, int, ParameterBox], CellOutcome]
 
 @dataclass(frozen=True)
 class CertifiedBox:
-    """A certified cell.
-
-    Attributes:
-        margin: What was proved; cells with little of it come first.
-        part: Of all that is certified, by volume.
-    """
+    """A certified cell with its proved margin, and its part of all that is certified, by volume."""
 
     frame: int
     box: ParameterBox
@@ -245,9 +236,8 @@ def largest_radius(
 ) -> SceneMargin:
     """Return the largest radius, within a tenth, for which every cell is proved again (V13).
 
-    Args:
-        prove: Sound bounds and an attack of one cell.
-        over: Whether to end with what is known; asked about once a second.
+    ``prove``: sound bounds and an attack of one cell. ``over``: whether to end with what is known, asked about once a
+    second.
     """
     begin = time.perf_counter()
     margin = SceneMargin(kind, len(cells))
@@ -352,14 +342,7 @@ class _Bisection:
 
 
 def check_scenes(varied: bool, rays: bool) -> None:
-    """Raise InputError where a scene margin is not defined.
-
-    Args:
-        varied: Whether the sets hold several scenes already.
-
-    Raises:
-        InputError: There are no Gaussians, or they vary already.
-    """
+    """Raise InputError where a scene margin is not defined: there are no Gaussians, or they are ``varied`` already."""
     if rays:
         raise InputError("Gaussians vary, a NeRF has none", field="--scene-margin", fix="leave it out")
     if varied:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 import math
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -49,6 +49,8 @@ _FAR = 4.0
 _LEFT, _NARROWEST, _AWAY = 0.7, 0.125, 4.0
 #: Corners sampled in a cell without a proof, beside its two ends, and random poses.
 _LATE, _RANDOM = 4, 2
+#: Steps of the descent to a counterexample.
+_STEPS = 6
 #: Scenes of a set tried in a cell without a proof.
 _MEMBERS = 4
 #: Why a cell is unknown where a sample's margin decides nothing.
@@ -98,11 +100,7 @@ class Search:
     def margins(
         self, samples: Sequence[Sample], scenes: Sequence[FrameImages] | None = None
     ) -> tuple[np.ndarray, np.ndarray]:
-        """[s] concrete margins and [s, n] outputs at poses, each of a scene of the set.
-
-        Args:
-            scenes: What draws each of them; None: the set's pictures.
-        """
+        """[s] concrete margins and [s, n] outputs at poses, drawn by ``scenes`` or the set's pictures."""
         drawn_by = [self.scene] * len(samples) if scenes is None else scenes
         images = np.stack([drawn(scene, sample) for scene, sample in zip(drawn_by, samples, strict=True)])
         self._latest = {sample_key(sample): image for sample, image in zip(samples, images, strict=True)}
@@ -121,26 +119,19 @@ class Search:
         begin = time.perf_counter()
         boxes = [self.grid.box_of(cell) for cell in block]
         samples = [CellSamples(cell, box, self._near(box)) for cell, box in zip(block, boxes, strict=True)]
-        outputs = self._sample(samples, self._early)
-        bounded: dict[int, float] = {}
-        reasons: dict[int, str] = {}
-        slopes = np.zeros((len(samples), self.grid.box.dimensions))
-        costs = np.full(len(samples), np.nan)
-        cuts: dict[int, tuple[int, ...]] = {}
-        open_cells = [k for k, cell in enumerate(samples) if not (cell.broken or cell.undecided)]
-        if open_cells:
-            self._bound([samples[k] for k in open_cells], outputs, open_cells, bounded, reasons, slopes, costs, cuts)
-        proved = {k for k in open_cells if bounded.get(k, -math.inf) > 0.0}
-        self._sample([samples[k] for k in sorted(proved)], self._attack)
-        failing = [samples[k] for k in open_cells if k not in proved]
+        self._sample(samples, self._early)
+        open_cells = [cell for cell in samples if not (cell.broken or cell.undecided)]
+        self._bound(open_cells)
+        self._sample([cell for cell in open_cells if cell.proved], self._attack)
+        failing = [cell for cell in open_cells if not cell.proved]
         if not self.costly:
-            self._sample([cell for k, cell in enumerate(samples) if k not in proved], self._corners)
+            self._sample([cell for cell in samples if not cell.proved], self._corners)
         # a cell is falsified as a whole where nothing else is seen
         self._sample(failing if self.costly else [c for c in samples if c.broken and c.hopeless], self._late)
         self._descend_worst_cell(failing)
         if self.varies:
             self._vary(failing)
-        leaves, children = self._verdicts(samples, bounded, reasons, slopes, costs, cuts)
+        leaves, children = self._verdicts(samples)
         seconds = time.perf_counter() - begin
         # cells of one rank are examined together
         children.sort(key=lambda child: child[0])
@@ -150,7 +141,7 @@ class Search:
             blocks=tuple(tuple(cell for _, cell in part) for part in parts),
             ranks=tuple(part[0][0] for part in parts),
             samples=tuple((cell.cell, cell.holds) for cell in samples),
-            bounded=len(bounded),
+            bounded=sum(cell.bound is not None for cell in samples),
             seconds=seconds,
         )
 
@@ -186,8 +177,8 @@ class Search:
         fresh = {pose.tobytes(): pose for pose in (*poses, *box.sample(_RANDOM, generator))}
         return [(pose, None) for key, pose in fresh.items() if key not in cell.poses]
 
-    def _sample(self, cells: Sequence[CellSamples], choose: Callable[[CellSamples], list[Sample]]) -> list[np.ndarray]:
-        """Add samples to the cells; returns the outputs at each cell's first new one."""
+    def _sample(self, cells: Sequence[CellSamples], choose: Callable[[CellSamples], list[Sample]]) -> None:
+        """Add samples to the cells."""
         chosen = [choose(cell) for cell in cells]
         # neighbours share corners
         unique = {
@@ -196,20 +187,20 @@ class Search:
             for sample in samples
         }
         if not unique:
-            return []
+            return
         margins, outputs = self.margins(*zip(*unique.values(), strict=True))
         place = {key: k for k, key in enumerate(unique)}
         for cell, samples in zip(cells, chosen, strict=True):
             cell.samples += samples
             cell.margins += [float(margins[place[sample_key(sample)]]) for sample in samples]
-        return [outputs[place[sample_key(samples[0])]] for samples in chosen if samples]
+            if cell.outputs is None:
+                cell.outputs = outputs[place[sample_key(samples[0])]]
 
     def _vary(self, cells: Sequence[CellSamples]) -> None:
         """Scenes of the set that break the property, at every pose looked at of every cell without a proof (V12).
 
         The nearest is moved to the ends of its ranges along the signs of the margin's gradient, the worst by then half
-        as far, and the worst of all tried at the other poses, for what breaks the property at one mostly breaks it
-        nearby.
+        as far, and the worst of all tried at the other poses, where it mostly breaks the property, too.
         """
         members: list[SceneSample] = []
         for cell in sorted(cells, key=lambda c: c.margins[c.worst]):
@@ -247,7 +238,7 @@ class Search:
         if not self.costly or self.grid.box.dimensions < 2 or not hopeful:
             return
         cell = min(hopeful, key=lambda c: c.margins[c.worst])
-        step = descend(cell.box, cell.samples[cell.worst][0], self._slope)
+        step = descend(cell.box, cell.samples[cell.worst][0], self._slope, _STEPS, lambda margin: margin <= 0.0)
         if step is not None:
             self._sample([cell], lambda c: [(step, None)])
 
@@ -258,107 +249,85 @@ class Search:
 
     # ---------------------------------------------------------------- bounds
 
-    def _bound(
-        self,
-        cells: Sequence[CellSamples],
-        outputs: Sequence[np.ndarray],
-        numbers: Sequence[int],
-        bounded: dict[int, float],
-        reasons: dict[int, str],
-        slopes: np.ndarray,
-        costs: np.ndarray,
-        cuts: dict[int, tuple[int, ...]],
-    ) -> None:
+    def _bound(self, cells: Sequence[CellSamples]) -> None:
         """Lower bounds of the margin by cell; what fails leaves a reason and no bound, maybe how to cut the cell."""
-        numbers_kept: list[int] = []
+        usable: list[CellSamples] = []
         parts: list[Any] = []
-        cells_by_number = dict(zip(numbers, cells, strict=True))
-        for number, cell in cells_by_number.items():
+        for cell in cells:
             check_cancelled()
             try:
-                linear, lower, upper, slope = cell.scene.sets(cell.box)
+                linear, lower, upper, cell.slopes = cell.scene.sets(cell.box)
             except InputError:
                 raise
             except FAILURES as error:
-                reasons[number] = failure_text(error)
+                cell.reason = failure_text(error)
                 continue
-            slopes[number] = slope
             sets = PictureSets(cell.box, linear, lower, upper)
             if not sets.sane:
-                reasons[number] = "the image's bounds are not finite or cross"
+                cell.reason = "the image's bounds are not finite or cross"
             elif (
                 self.costly
                 and (self._splittable(cell.cell) or self._coverable(cell.cell))
-                and self._too_wide(cell, number, sets, costs)
+                and self._too_wide(cell, sets)
             ):
-                reasons[number] = "the image's bounds are too wide"
+                cell.reason = "the image's bounds are too wide"
                 if self._coverable(cell.cell):
-                    self._covered(cell, number, outputs[number], bounded, reasons, cuts)
+                    self._covered(cell)
             else:
-                numbers_kept.append(number)
-                parts.append((*linear, lower, upper, cell.box))
-        if not numbers_kept:
+                usable.append(cell)
+                parts.append((*linear, lower, upper, cell.box, cell.outputs))
+        if not usable:
             return
-        *arrays, boxes = zip(*parts, strict=True)
+        *arrays, boxes, outputs = zip(*parts, strict=True)
         stacked = [np.stack(values) for values in arrays]
         try:
-            query = self.claim.query(np.stack([outputs[number] for number in numbers_kept]))
+            query = self.claim.query(np.stack(outputs))
             inputs = self.model.input_sets(tuple(stacked[:4]), stacked[4], stacked[5])
             margins = np.array(self.claim.proved(query, self.model.bound(inputs, query), boxes), np.float64)
-            for place, number in enumerate(numbers_kept):
-                groups = self._branching(cells_by_number[number], float(margins[place]))
+            for place, cell in enumerate(usable):
+                groups = self._branching(cell, float(margins[place]))
                 if groups:
                     better = self.model.branch(inputs[place : place + 1], query, groups, _BRANCHES)
                     margins[place] = max(margins[place], better)
         except InputError:
             raise
         except FAILURES as error:
-            reasons.update(dict.fromkeys(numbers_kept, failure_text(error)))
-            return
-        for number, margin in zip(numbers_kept, margins.tolist(), strict=True):
+            margins, reason = np.full(len(usable), -np.inf), failure_text(error)
+        else:
+            reason = "the network's bounds are not finite"
+        for cell, margin in zip(usable, margins.tolist(), strict=True):
             # infinite or NaN bounds prove nothing
             if math.isfinite(margin):
-                bounded[number] = margin
+                cell.bound = margin
             else:
-                reasons[number] = "the network's bounds are not finite"
+                cell.reason = reason
 
-    def _too_wide(self, cell: CellSamples, number: int, sets: PictureSets, costs: np.ndarray) -> bool:
-        """Whether the network's bounds would be wasted on the sets.
-
-        ``costs[number]`` becomes the part of the margin that they cost. A guess by the margin's gradient at the middle,
-        which decides about work and not about verdicts.
-        """
+    def _too_wide(self, cell: CellSamples, sets: PictureSets) -> bool:
+        """Whether the network's bounds would be wasted on the sets: a guess by the margin's gradient at the middle."""
         weights = self._weights(cell)
-        costs[number] = math.nan if weights is None else weights.cost(sets)
-        return float(sets.widths.mean()) > _HOPELESS or costs[number] > _COSTLY
+        cell.cost = math.nan if weights is None else weights.cost(sets)
+        return float(sets.widths.mean()) > _HOPELESS or cell.cost > _COSTLY
 
     def _coverable(self, cell: Cell) -> bool:
         return self.cover is not None and len(cell.first) > 1 and cell.volume > 1
 
-    def _covered(
-        self,
-        cell: CellSamples,
-        number: int,
-        outputs: np.ndarray,
-        bounded: dict[int, float],
-        reasons: dict[int, str],
-        cuts: dict[int, tuple[int, ...]],
-    ) -> None:
+    def _covered(self, cell: CellSamples) -> None:
         """Bound a cell part by part, or find out how to cut it."""
         weights = self._weights(cell)
         if weights is None or self.cover is None:
             return
+        assert cell.outputs is not None
         try:
-            outcome = self.cover.prove(cell.box, outputs, weights)
+            outcome = self.cover.prove(cell.box, cell.outputs, weights)
         except InputError:
             raise
         except FAILURES as error:
-            reasons[number] = failure_text(error)
+            cell.reason = failure_text(error)
             return
         if outcome.margin is not None and math.isfinite(outcome.margin):
-            bounded[number] = outcome.margin
-        elif outcome.cuts:
-            cuts[number] = outcome.cuts
+            cell.bound = outcome.margin
+        else:
+            cell.cuts = outcome.cuts
 
     def _weights(self, cell: CellSamples) -> PixelWeights | None:
         """The margin's gradient at the middle, as a part of the margin; None where one of them is no number."""
@@ -388,54 +357,42 @@ class Search:
 
     # ---------------------------------------------------------------- verdicts
 
-    def _verdicts(
-        self,
-        seen: Sequence[CellSamples],
-        bounded: dict[int, float],
-        reasons: dict[int, str],
-        slopes: np.ndarray,
-        costs: np.ndarray,
-        cuts: Mapping[int, tuple[int, ...]],
-    ) -> tuple[list[FinishedCell], list[tuple[float, Cell]]]:
+    def _verdicts(self, cells: Sequence[CellSamples]) -> tuple[list[FinishedCell], list[tuple[float, Cell]]]:
         leaves: list[FinishedCell] = []
         children: list[tuple[float, Cell]] = []
-        for number, cell in enumerate(seen):
-            bound = bounded.get(number)
-            if bound is not None and bound > 0.0:
+        for cell in cells:
+            if cell.bound is not None and cell.bound > 0.0:
                 if cell.broken:
                     # a proof and a counterexample cannot both be right
                     raise ContradictionError(
-                        f"internal error: margin proved to be at least {bound} on {cell.box.lower} to "
+                        f"internal error: margin proved to be at least {cell.bound} on {cell.box.lower} to "
                         f"{cell.box.upper}, found {cell.margins[cell.worst]} at {cell.samples[cell.worst][0].tolist()}"
                     )
                 if not cell.undecided:
-                    leaves.append(FinishedCell(cell.cell, "certified", bound, 0.0))
+                    leaves.append(FinishedCell(cell.cell, "certified", cell.bound, 0.0))
                     continue
-                bound = None
-            if cell.undecided:
-                reasons[number] = NO_NUMBER
+            bound, reason = (None, NO_NUMBER) if cell.undecided else (cell.bound, cell.reason or "the finest cell")
             hopeless = cell.hopeless and not self.every_unit
             if self._splittable(cell.cell) and not hopeless:
-                rank = self._rank(cell, bound, costs[number])
-                if number in cuts and not cell.broken:
-                    parts = self.grid.cut(cell.cell, cuts[number])
+                rank = self._rank(cell, bound)
+                if cell.cuts and not cell.broken:
+                    parts = self.grid.cut(cell.cell, cell.cuts)
                 else:
                     scene = cell.scene
-                    gains = scene.cut_gains(cell.box) if isinstance(scene, ComparedCuts) else slopes[number]
-                    parts = self.grid.divide(cell.cell, gains, *self._cuts(cell, bound, costs[number]))
+                    gains = scene.cut_gains(cell.box) if isinstance(scene, ComparedCuts) else cell.slopes
+                    parts = self.grid.divide(cell.cell, gains, *self._cuts(cell, bound))
                 children += [(rank, part) for part in parts]
             elif cell.broken:
                 leaves.append(self._counterexample(cell))
             else:
-                reason, undecided = reasons.get(number, "the finest cell"), cell.undecided > 0
+                undecided = cell.undecided > 0
                 leaves.append(FinishedCell(cell.cell, "unknown", bound, 0.0, reason=reason, undecided=undecided))
         return leaves, children
 
-    def _rank(self, cell: CellSamples, bound: float | None, cost: float) -> float:
+    def _rank(self, cell: CellSamples, bound: float | None) -> float:
         """How many times the bound of ``cell`` misses the margin that samples show: its parts need about as many cuts.
 
-        Largest cells first would prove nothing for long where all cells need several cuts; the nearest to a proof
-        first go deep at once, and come back from where the property is about to fail.
+        The nearest to a proof first go deep at once, and come back from where the property is about to fail.
         """
         share = cell.cell.volume / self.grid.volume
         if not self.costly:
@@ -451,15 +408,15 @@ class Search:
             return _RANK_UNKNOWN * (1.0 + share)
         if bound is None:
             # the cuts are made for the parts to be near a proof
-            return min(cost, RANK_FIRST / 2.0) if math.isfinite(cost) else _RANK_UNKNOWN * (1.0 + share)
+            return min(cell.cost, RANK_FIRST / 2.0) if math.isfinite(cell.cost) else _RANK_UNKNOWN * (1.0 + share)
         return min((margin - bound) / margin, _RANK_UNKNOWN)
 
-    def _cuts(self, cell: CellSamples, bound: float | None, cost: float) -> tuple[float, int]:
+    def _cuts(self, cell: CellSamples, bound: float | None) -> tuple[float, int]:
         """How many times narrower parts should be for a proof, and how many there may be."""
         if cell.broken:
             return 0.25, 4
         if bound is None:
-            return ((_AIM / cost) ** (1.0 / _POWER), _MOST_PARTS) if cost > _COSTLY else (0.25, 4)
+            return ((_AIM / cell.cost) ** (1.0 / _POWER), _MOST_PARTS) if cell.cost > _COSTLY else (0.25, 4)
         margin = cell.margins[cell.worst]
         if self.costly:
             return (0.25, 4) if margin - bound > _FAR * margin else (0.5, 2)

@@ -24,13 +24,7 @@ _TUNING = SettledTuning()
 
 @dataclass(frozen=True)
 class LimitedMeasure:
-    """A measure, the first channel of its plane in pictures, and the limits that a claim compares it with.
-
-    Attributes:
-        measure: The measure.
-        place: The channel.
-        limits: Finite ones.
-    """
+    """A measure, the first channel of its plane in pictures, and the finite limits that a claim compares it with."""
 
     measure: Measure
     place: int
@@ -45,13 +39,10 @@ class LimitedMeasure:
 
 
 def unsettled(measures: Sequence[LimitedMeasure], lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
-    """Return [H, W] bool: the pixels of which a claim needs to know more than their bounds (Q5).
+    """Return [H, W] bool: the pixels of which a claim needs to know more than their bounds [H, W, C] (Q5).
 
-    Every picture within the bounds that has the same values at these pixels has the same verdict.
-
-    Args:
-        measures: All that the claim reads.
-        lower, upper: [H, W, C] bounds of pictures.
+    Every picture within the bounds that has the same values at these pixels has the same verdict. ``measures`` are all
+    that the claim reads.
     """
     still_open = np.zeros(lower.shape[:2], bool)
     flat, low, high = still_open.reshape(-1), lower.reshape(-1, lower.shape[-1]), upper.reshape(-1, upper.shape[-1])

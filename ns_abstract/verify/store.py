@@ -1,11 +1,10 @@
 """The store ``cells.sqlite`` of a search's finished cells (design.md, V8).
 
-A block's findings are one transaction, which also takes the block off the list of open ones and puts its
-children there. So a kill at any moment loses at most the blocks that were being examined, and what arrives
-twice (a retried worker) counts once.
+A block's findings are one transaction, which also puts its children in its place among the open blocks. So a kill loses
+at most the blocks that were being examined, and what arrives twice (a retried worker) counts once.
 
-Tables ``parameters`` and ``cells`` are for readers; ``search_*`` are the search's own. What was changed by others
-since is noticed (`TableChecksum`) and not continued.
+Tables ``parameters`` and ``cells`` are for readers; ``search_*`` are the search's own. What was changed by others since
+is noticed (`TableChecksum`) and not continued.
 """
 
 from __future__ import annotations

@@ -59,10 +59,7 @@ SETTLED = "kind, radius, frame, lower, upper, outcome, reason, slopes"
 
 @dataclass
 class TableChecksum:
-    """Number and sum of the hashes of a table's rows: rows come and go in any order, and no other rows fit.
-
-    It finds what was damaged or edited; who also writes the seal anew is not found out.
-    """
+    """Number and sum of the hashes of a table's rows, in any order; it finds what was damaged or edited."""
 
     rows: int = 0
     total: int = 0
@@ -152,11 +149,7 @@ class StoreFile:
 
     @contextmanager
     def errors_as_input(self) -> Iterator[None]:
-        """Errors of the file inside the block are told like a user's mistakes.
-
-        Raises:
-            InputError: The disk is full, or the file was damaged meanwhile.
-        """
+        """Errors of the file inside the block become InputError: a full disk, or a file damaged meanwhile."""
         try:
             yield
         except sqlite3.Error as error:
@@ -215,11 +208,7 @@ class StoreFile:
         return (json.dumps([int(row) for row in self._get("open_rows") or []]),)
 
     def _verify(self, parameters: Sequence[tuple[str, str]]) -> None:
-        """Refuse a file that others have changed.
-
-        Raises:
-            InputError: Its rows are not those that were written.
-        """
+        """Raise InputError for a file whose rows are not those that were written."""
         (state,) = self._base.execute("PRAGMA quick_check(1)").fetchone()
         if state != "ok":
             raise self._damaged(state)
@@ -284,18 +273,11 @@ class StoreFile:
         return file.parent / IMAGES / file.name if file.suffix == ".npz" else file
 
     def keep_image(self, name: str, data: bytes) -> None:
-        """Write the image of a counterexample, as `keep` does.
-
-        Raises:
-            InputError: It cannot be written.
-        """
+        """Write the image of a counterexample, as `keep` does."""
         self.keep(f"{name}.npz", data)
 
     def keep(self, name: str, data: bytes) -> Path:
-        """Write a file; one of that name that is not ours stays, and ours gets another name.
-
-        Returns:
-            The file.
+        """Write a file and return it; one of that name that is not ours stays, and ours gets another name.
 
         Raises:
             InputError: It cannot be written.

@@ -1,12 +1,11 @@
 """Read VNN-LIB files (versions 1 and 2): sets of unsafe outputs, and boxes of inputs.
 
 Only what the format's users write is read: ``declare-const`` (of version 2: `ns_abstract.verify.vnnlib2`), and
-``assert`` of ``<=``, ``>=``, ``and``,
-``or`` over bounds of single inputs and linear expressions of the outputs. In certificates of scenes bounds of the
-inputs are set aside: the images take their place.
+``assert`` of ``<=``, ``>=``, ``and``, ``or`` over bounds of single inputs and linear expressions of the outputs. In
+certificates of scenes the images take the place of the inputs' bounds.
 
-Numbers that overflow or vanish on the way are refused, and constraints with huge or tiny
-factors are multiplied by powers of two, which changes no sign: no overflow may become a verdict.
+No overflow may become a verdict: numbers that overflow or vanish on the way are refused, and constraints with huge or
+tiny factors are multiplied by powers of two.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import read_text
 from ns_abstract.io.packed import unpacked
-from ns_abstract.verify.vnnlib2 import Vnnlib2Query, is_version_2, joined, parse_query
+from ns_abstract.verify.vnnlib2 import Vnnlib2Query, is_version_2, joined, parse_query, refused
 from ns_abstract.verify.vnnlib_sets import InputRegion, UnsafeSet
 
 _LIMIT = 256 << 20
@@ -54,15 +53,16 @@ _Linear = tuple[dict[int, float], float]
 
 @dataclass(frozen=True)
 class _Run:
-    """Bounds of single inputs, all of which hold.
+    """Bounds of single inputs, all of which hold: one text each, without the closing bracket.
 
-    Attributes:
-        texts: One of them each, without the closing bracket.
-        limits: Shared by all runs: the side (0 below, 1 above), the input and the limit of a text.
+    ``limits``, shared by all runs: the side (0 below, 1 above), the input and the limit of a text.
     """
 
     texts: list[str]
     limits: dict[str, tuple[int, int, float]]
+
+    def __str__(self) -> str:
+        return " ".join(f"{text})" for text in self.texts)
 
     def read(self, declared: set[str], size: _VariableCounts) -> None:
         """Learn what the texts say."""
@@ -101,11 +101,9 @@ def _size(shape: Shape) -> int:
 
 
 def load_vnnlib(path: Path, output_shape: Shape, input_shape: Shape | None = None) -> UnsafeSet:
-    """Read a VNN-LIB file, packed (.gz) or not.
+    """Read a VNN-LIB file, packed (.gz) or not, for a network of these shapes.
 
-    Args:
-        output_shape: Of the network; as many outputs must be declared.
-        input_shape: Of the network; as many inputs must be declared, or none. None: not compared.
+    As many outputs must be declared, and as many inputs or none; ``input_shape`` None: inputs are not compared.
 
     Raises:
         InputError: The file cannot be read or says something that is not understood.
@@ -160,11 +158,8 @@ def load_query(
 ) -> tuple[tuple[InputRegion, ...], Vnnlib2Query | None]:
     """Read a VNN-LIB file with its inputs: the property is violated if some region has an input with an unsafe output.
 
-    Args:
-        path: The file; only named in errors if ``text`` is given.
-
-    Returns:
-        The regions, and the query that a file of version 2 is; None for version 1.
+    Returns the regions, and the query that a file of version 2 is; None for version 1. ``path`` is only named in errors
+    if ``text`` is given.
 
     Raises:
         InputError: As `load_vnnlib`, or an input has no bounds.
@@ -214,11 +209,7 @@ def _regions(expressions: list[Any], sizes: _VariableCounts) -> tuple[InputRegio
 
 
 def _bound(constraint: _Linear | _Run, ends: np.ndarray) -> bool:
-    """Whether ``constraint`` is one on an input; if it is, ``ends`` [2, n] obey it afterwards.
-
-    Raises:
-        InputError: It is on several inputs, or on inputs and outputs.
-    """
+    """Whether ``constraint`` is one on an input, which ``ends`` [2, n] obey then; InputError: it joins several."""
     if isinstance(constraint, _Run):
         constraint.limit(ends)
         return True
@@ -240,21 +231,17 @@ def _bound(constraint: _Linear | _Run, ends: np.ndarray) -> bool:
 
 
 def _declares(expression: Any, declared: set[str]) -> bool:
-    """Whether an expression declares a variable; if not, it is an assertion.
-
-    Raises:
-        InputError: It is neither.
-    """
+    """Whether an expression declares a variable; if not, it is an assertion, or InputError is raised."""
     head = expression[0] if isinstance(expression, list) and expression else None
     if head == "declare-const" and len(expression) == 3:
         _, name, kind = expression
         if not (isinstance(name, str) and _VARIABLE.fullmatch(name)) or kind != "Real":
-            raise _fail(expression, "declare X_0, X_1, ..., Y_0, Y_1, ... as Real")
+            raise refused(expression, "declare X_0, X_1, ..., Y_0, Y_1, ... as Real")
         declared.add(name)
         return True
     if head == "assert" and len(expression) == 2:
         return False
-    raise _fail(expression, "use declare-const and assert of VNN-LIB version 1")
+    raise refused(expression, "use declare-const and assert of VNN-LIB version 1")
 
 
 def _expressions(text: str, runs: bool = False) -> list[Any]:
@@ -293,17 +280,6 @@ def _expressions(text: str, runs: bool = False) -> list[Any]:
     if len(stack) > 1:
         raise InputError("a bracket is never closed", fix="add the missing )")
     return stack[0]
-
-
-def _show(expression: Any) -> str:
-    if isinstance(expression, _Run):
-        expression = " ".join(f"{text})" for text in expression.texts)
-    text = f"({' '.join(map(_show, expression))})" if isinstance(expression, list) else str(expression)
-    return text if len(text) <= 60 else f"{text[:57]}..."
-
-
-def _fail(expression: Any, fix: str) -> InputError:
-    return InputError(f"not understood: {_show(expression)}", fix=fix)
 
 
 def _parse(expressions: list[Any], output_size: int, input_size: int | None) -> UnsafeSet:
@@ -407,7 +383,7 @@ def _ways(expression: Any, declared: set[str], size: _VariableCounts) -> list[_C
         left, right = (_linear(part, declared, size) for part in expression[1:])
         low, high = (left, right) if head == "<=" else (right, left)
         return [[_sum(low, high, -1.0)]]
-    raise _fail(expression, "use <=, >=, and, or of version 1")
+    raise refused(expression, "use <=, >=, and, or of version 1")
 
 
 def _sum(first: _Linear, second: _Linear, factor: float) -> _Linear:
@@ -418,11 +394,7 @@ def _sum(first: _Linear, second: _Linear, factor: float) -> _Linear:
 
 
 def _added(total: float, factor: float, value: float) -> float:
-    """``total + factor * value``.
-
-    Raises:
-        InputError: It overflows, or the product vanishes.
-    """
+    """``total + factor * value``; InputError if it overflows, or the product vanishes."""
     product = factor * value
     sum_ = total + product
     if not math.isfinite(sum_) or (factor and value and abs(product) < _SMALLEST):
@@ -450,7 +422,7 @@ def _linear(expression: Any, declared: set[str], size: _VariableCounts) -> _Line
     if head == "*" and len(terms) == 2 and not all(term[0] for term in terms):
         factor, other = (terms[0][1], terms[1]) if not terms[0][0] else (terms[1][1], terms[0])
         return _sum(({}, 0.0), other, factor)
-    raise _fail(expression, "write a linear expression of outputs")
+    raise refused(expression, "write a linear expression of outputs")
 
 
 def _atom(text: str, declared: set[str], size: _VariableCounts) -> _Linear:
@@ -458,10 +430,10 @@ def _atom(text: str, declared: set[str], size: _VariableCounts) -> _Linear:
     if match is None:
         number = _NUMBER.fullmatch(text)
         if number is None:
-            raise _fail(text, "write a number or a variable such as Y_0")
+            raise refused(text, "write a number or a variable such as Y_0")
         value = float(text)
         if not math.isfinite(value) or (abs(value) < _SMALLEST and re.search("[1-9]", number[1])):
-            raise _fail(text, "write a number that float64 can hold")
+            raise refused(text, "write a number that float64 can hold")
         return {}, value
     if text not in declared:
         raise InputError(f"{text} is not declared", fix=f"add (declare-const {text} Real)")

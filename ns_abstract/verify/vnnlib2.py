@@ -33,12 +33,7 @@ _ONE = "give a query about one network with one input and one output"
 
 @dataclass(frozen=True)
 class Tensor:
-    """A declared tensor.
-
-    Attributes:
-        kind: Element type, "real" or "float32".
-        shape: Empty: a scalar.
-    """
+    """A declared tensor of elements of ``kind`` "real" or "float32"; an empty shape: a scalar."""
 
     name: str
     kind: str
@@ -58,11 +53,7 @@ class Tensor:
 
 @dataclass(frozen=True)
 class Vnnlib2Query:
-    """A query as assertions of version 1 about ``X_0, ...`` and ``Y_0, ...``, elements in rows.
-
-    Attributes:
-        expressions: Declarations and assertions of version 1, as nested lists of tokens.
-    """
+    """A query as declarations and assertions of version 1 about ``X_0, ...`` and ``Y_0, ...``, elements in rows."""
 
     network: str
     input: Tensor
@@ -93,12 +84,9 @@ def joined(text: str) -> str:
 def parse_query(
     expressions: list[Any], input_shape: Sequence[int] | int | None, output_shape: Sequence[int] | int
 ) -> Vnnlib2Query:
-    """Return the query that the nested tokens of a file are.
+    """Return the query that the nested tokens of a file's `joined` text are.
 
-    Args:
-        expressions: Of the text that `joined` returned.
-        input_shape, output_shape: Of the network, without the batch; a number: of the elements alone; None: not
-            compared.
+    Shapes are of the network, without the batch; a number: of the elements alone; None: not compared.
 
     Raises:
         InputError: The query says something that is not understood, or is about another network.
@@ -107,7 +95,7 @@ def parse_query(
         raise InputError("no (vnnlib-version <2.0>) and network", fix="write (vnnlib-version <2.0>) first")
     version = expressions[0][1]
     if not isinstance(version, str) or not _VERSION.fullmatch(version):
-        raise InputError(f"found version {_show(version)}", field="vnnlib-version", fix="give a query of 1.0 or 2.0")
+        raise InputError(f"found version {shown(version)}", field="vnnlib-version", fix="give a query of 1.0 or 2.0")
     name, tensors = _network(expressions[1])
     inputs, result = tensors
     if input_shape is not None:
@@ -124,7 +112,7 @@ def parse_query(
         if isinstance(expression, list) and expression and expression[0] == "declare-network":
             raise InputError("is about several networks", field="declare-network", fix=_ONE)
         if not (isinstance(expression, list) and len(expression) == 2 and expression[0] == "assert"):
-            raise _fail(expression, "write assertions behind the network")
+            raise refused(expression, "write assertions behind the network")
         converted.append(["assert", reader.condition(expression[1])])
     return Vnnlib2Query(name, inputs, result, converted)
 
@@ -132,12 +120,12 @@ def parse_query(
 def _network(expression: Any) -> tuple[str, tuple[Tensor, Tensor]]:
     good = isinstance(expression, list) and len(expression) >= 2 and expression[0] == "declare-network"
     if not good or not isinstance(expression[1], str) or not _NAME.fullmatch(expression[1]):
-        raise _fail(expression, "write (declare-network f (declare-input ..) (declare-output ..)) behind the version")
+        raise refused(expression, "write (declare-network f (declare-input ..) (declare-output ..)) behind the version")
     tensors: dict[str, list[Tensor]] = {"declare-input": [], "declare-output": []}
     for part in expression[2:]:
         head = part[0] if isinstance(part, list) and part else None
         if head not in tensors or len(part) != 3:
-            raise _fail(part, _ONE)
+            raise refused(part, _ONE)
         tensors[head].append(_tensor(part))
     declared = [*tensors["declare-input"], *tensors["declare-output"]]
     if [len(group) for group in tensors.values()] != [1, 1] or declared[0].name == declared[1].name:
@@ -151,7 +139,7 @@ def _tensor(part: list[Any]) -> Tensor:
     _, name, declared = part
     match = _TENSOR.fullmatch(declared) if isinstance(declared, str) else None
     if match is None or match[2] is None or not isinstance(name, str) or not _NAME.fullmatch(name):
-        raise _fail(part, "write a name, a type and a shape, such as X float32 [1,3]")
+        raise refused(part, "write a name, a type and a shape, such as X float32 [1,3]")
     kind = match[1] if match[1] == "float32" else match[1].lower()
     if kind not in ("real", "float32"):
         fix = "declare real, if the network's exact function is meant, or float32"
@@ -193,9 +181,9 @@ class _Reader:
             return [head, *(self.condition(part) for part in expression[1:])]
         if head in ("<", ">", "!="):
             fix = "write <= or >=; the closed set holds the open one"
-            raise InputError(f"a comparison with {head}: {_show(expression)}", fix=fix)
+            raise InputError(f"a comparison with {head}: {shown(expression)}", fix=fix)
         if not isinstance(head, str) or head not in _COMPARISONS or len(expression) != 3:
-            raise _fail(expression, "use <=, >=, ==, and, or of version 2")
+            raise refused(expression, "use <=, >=, ==, and, or of version 2")
         parts = [self._side(expression, head, operator) for operator in _COMPARISONS[head]]
         return parts[0] if len(parts) == 1 else ["and", *parts]
 
@@ -208,7 +196,7 @@ class _Reader:
         if all(n is not None for n in numbers) or any(
             n is None and not self._is_element(part) for n, part in zip(numbers, (left, right), strict=True)
         ):
-            problem = f"arithmetic of float32 would round: {_show(expression)}"
+            problem = f"arithmetic of float32 would round: {shown(expression)}"
             raise InputError(problem, fix="compare an element with an element or a number, or declare real")
         sides = []
         for place, (part, value) in enumerate(zip((left, right), numbers, strict=True)):
@@ -233,7 +221,7 @@ class _Reader:
             for term in terms[1:]:
                 product = ["*", product, term]
             return product
-        raise _fail(expression, "write a linear expression of elements")
+        raise refused(expression, "write a linear expression of elements")
 
     def _element(self, text: str) -> str:
         match = _TENSOR.fullmatch(text)
@@ -266,21 +254,19 @@ def _outward(value: float, larger: bool) -> str:
     return repr(max(value, single) if larger else min(value, single))
 
 
-def _show(expression: Any) -> str:
-    text = f"({' '.join(map(_show, expression))})" if isinstance(expression, list) else str(expression)
+def shown(expression: Any) -> str:
+    """An expression for messages, cut off where it is long."""
+    text = f"({' '.join(map(shown, expression))})" if isinstance(expression, list) else str(expression)
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
-def _fail(expression: Any, fix: str) -> InputError:
-    return InputError(f"not understood: {_show(expression)}", fix=fix)
+def refused(expression: Any, fix: str) -> InputError:
+    """The error of an expression."""
+    return InputError(f"not understood: {shown(expression)}", fix=fix)
 
 
 def write_query(d: int, n: int, groups: Sequence[Sequence[int]], k: int, notes: Sequence[str] = ()) -> str:
-    """The query whose input is ``d`` parameters and ``n`` slacks in [-1, 1], violated where a group of outputs is <= 0.
-
-    Args:
-        notes: Lines of comment.
-    """
+    """The query of ``d`` parameters and ``n`` slacks in [-1, 1], violated where a group of outputs is <= 0."""
     lines = ["(vnnlib-version <2.0>)", *(f"; {note}" for note in notes)]
     lines += [f"(declare-network f (declare-input X float32 [1,{d + n}]) (declare-output Y float32 [1,{k}]))"]
     lines += violation("X[0,{}]", "Y[0,{}]", d + n, groups)
@@ -290,8 +276,7 @@ def write_query(d: int, n: int, groups: Sequence[Sequence[int]], k: int, notes: 
 def violation(source: str, result: str, count: int, groups: Sequence[Sequence[int]]) -> list[str]:
     """The assertions that ``count`` inputs lie in [-1, 1] and that a group of outputs is <= 0, in either version.
 
-    Args:
-        source, result: Names of an input and of an output, with {} for the number.
+    ``source`` and ``result`` are names of an input and of an output, with {} for the number.
     """
     lines = []
     for name in map(source.format, range(count)):

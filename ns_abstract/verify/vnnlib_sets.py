@@ -11,10 +11,7 @@ import numpy as np
 class UnsafeSet:
     """Outputs y are unsafe if ``rows[g] @ y + offset[g] <= 0`` holds for every row of some group g.
 
-    Attributes:
-        rows: [k, n].
-        offset: [k].
-        inputs: Number of assertions on inputs that were set aside.
+    ``inputs`` is the number of assertions on inputs that were set aside.
     """
 
     rows: np.ndarray
@@ -25,12 +22,7 @@ class UnsafeSet:
 
 @dataclass(frozen=True)
 class InputRegion:
-    """A box of inputs with the outputs that are unsafe there.
-
-    Attributes:
-        lower, upper: [n] float64.
-        unsafe: Outputs; without rows and groups, any output is unsafe.
-    """
+    """A box [n] of inputs with the outputs that are unsafe there; without rows and groups, any output is."""
 
     lower: np.ndarray
     upper: np.ndarray

@@ -37,10 +37,7 @@ def borrowed(typingctx, array):  # pyright: ignore[reportRedeclaration]
 
 @intrinsic
 def prefetch(typingctx, array, row, byte):  # pyright: ignore[reportRedeclaration]
-    """Ask for the cache line of ``array[row]`` (first axis) that lies ``byte`` bytes in; changes nothing.
-
-    ``array`` may be a `pointer`.
-    """
+    """Ask for the cache line of ``array[row]`` (or a `pointer`'s) that lies ``byte`` bytes in; changes nothing."""
     if not isinstance(array, types.Array | types.CPointer):
         raise TypeError(f"prefetch() takes an array or a pointer, not {array}")
 
@@ -66,10 +63,9 @@ def prefetch(typingctx, array, row, byte):  # pyright: ignore[reportRedeclaratio
 
 @intrinsic
 def pointer(typingctx, array):  # pyright: ignore[reportRedeclaration]
-    """The elements of a contiguous array, in memory order, to be indexed from 0.
+    """The elements of a contiguous array, in memory order, to be indexed from 0; the caller keeps the owner alive.
 
-    Unlike an array it is not counted, has no size and knows no negative index, which short loops notice. The caller
-    keeps the owner alive for as long as the result is used.
+    Unlike an array it is not counted, has no size and knows no negative index, which short loops notice.
     """
     if not isinstance(array, types.Array) or array.layout != "C":
         raise TypeError(f"pointer() takes a contiguous array, not {array}")

@@ -1,11 +1,8 @@
 """Several floats side by side: explicit vectors for compiled kernels.
 
-`load8` and `load4` take 8 or 4 doubles that are neighbours in memory as one value, `load_line` 8 doubles or 16 float32.
-``+ - * /``, comparisons, ``abs``, and the functions below work lane by lane on such values and on floats of their type,
-which stand for all lanes; every lane is rounded as that type's arithmetic is. Loops that a compiler turns into vector
-code work on at most half as wide vectors, and lose more than they gain where they are short.
-
-Interpreted (without compilation), lanes are arrays.
+`load8` and `load4` take 8 or 4 neighbouring doubles as one value, `load_line` 8 doubles or 16 float32. ``+ - * /``,
+comparisons, ``abs``, and the functions below work lane by lane on such values and on floats of their type, which stand
+for all lanes; every lane is rounded as that type's arithmetic is. Interpreted, lanes are arrays.
 """
 
 from __future__ import annotations
@@ -339,10 +336,7 @@ def store_columns(typingctx, elements, at, stride, rows):  # pyright: ignore[rep
 
 @intrinsic
 def scatter_columns(typingctx, elements, places, first, stride, shift, rows):  # pyright: ignore[reportRedeclaration]
-    """Write lane k of the eight ``rows`` side by side to ``elements[stride * places[first + k] + shift : ...]``.
-
-    ``elements`` and ``places`` (int64) are `compiled.pointer`.
-    """
+    """Write lane k of the eight ``rows`` side by side to ``elements[stride * places[first + k] + shift : ...]``."""
     _check(elements, _KINDS[8][0])
     if places != types.CPointer(types.int64):
         raise TypeError(f"places are read through pointer(int64 array), not {places}")

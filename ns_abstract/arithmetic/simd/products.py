@@ -1,8 +1,7 @@
 """Products of small matrices, six rows by two lines at a time, by explicit vectors (design.md, F4).
 
-Each sum is of its products in their order, every product added by `muladd`: what is charged for sums in any order, with
-roundings of products and sums apart, covers it. Twelve sums are under way at a time, as one takes the next product only
-when it has the last, and each element that is loaded serves six of them.
+Each sum is of its products in their order, added by `muladd`: what is charged for sums in any order, with roundings of
+products and sums apart, covers it. Twelve sums are under way at a time, and each element loaded serves six of them.
 """
 
 from __future__ import annotations

@@ -2,12 +2,11 @@
 
 A form lies in a flat array of doubles (`compiled.pointer`), row after row as `forms` has them, eight lanes each; the
 row ``sum |q|`` has no meaning where there are no terms of order 2. A rule takes the places where its operands and its
-result begin, and `size` tells how long a form is. The array kernels of `forms` take four times as long, for they pass
-over memory once for every term of a sum. Each function names its kernel by its own name; results may be written over
-no operand unless it says so.
+result begin, and `size` tells how long a form is. Each function has the name of its kernel there; results may be
+written over no operand unless it says so.
 
-What is linear is there for both orders, because Gaussians are culled over cells of one parameter with it; products and
-functions are there for order 1, where ``m`` says all: their one-parameter kin is `line_forms`.
+What is linear is there for both orders, for culling over cells of one parameter; products and functions are there for
+order 1: their one-parameter kin is `line_forms`.
 """
 
 from __future__ import annotations
@@ -123,7 +122,7 @@ def _accumulate(w, a, b, sign, out, coefficient, fresh, m):
 
 @njit(cache=True, error_model="numpy")
 def add_product(w, a, b, sign, out, m):
-    """`forms.add_product`; `set_norms` must follow."""
+    """``out += sign a b``, but for the rows of sums: `set_norms` must follow (design.md, A2)."""
     _accumulate(w, a, b, sign, out, ADDED_PRODUCT_ROUNDING, False, m)
 
 
@@ -149,7 +148,7 @@ def _accumulate_square(w, a, out, coefficient, fresh, m):
 
 @njit(cache=True, error_model="numpy")
 def add_square(w, a, out, m):
-    """`forms.add_square`; `set_norms` must follow."""
+    """``out += a a``, but for the rows of sums: `set_norms` must follow (design.md, A2)."""
     _accumulate_square(w, a, out, ADDED_PRODUCT_ROUNDING, False, m)
 
 

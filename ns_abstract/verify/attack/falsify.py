@@ -1,10 +1,9 @@
-"""Attack an abstract image: search its set of poses for a rendered image outside its bounds.
+"""Attack an abstract image: search its set of poses for a rendered image outside its bounds, at tolerance zero.
 
-Tolerance is zero. What the attack returns is a lower bound of what is wrong: no violation found is no
-proof. The poses tried are, in this order, given ones, the middle and corners of the box, random ones,
-and two searches that look where an image comes closest to a bound relative to the gap: projected
-gradient ascent through a differentiable twin of the renderer, and bisection towards jumps (the
-rasteriser's thresholds), whose two sides are rendered.
+What the attack returns is a lower bound of what is wrong. The poses tried are given ones, the middle and corners of the
+box, random ones, and two searches that look where an image comes closest to a bound relative to the gap: projected
+gradient ascent through a differentiable twin of the renderer, and bisection towards jumps, whose two sides are
+rendered.
 """
 
 from __future__ import annotations
@@ -19,6 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ns_abstract.geometry.box import Float64Array, ParameterBox
 from ns_abstract.verify.attack.violations import KEPT, STRATEGIES, Attack, Violation, _severity
+from ns_abstract.verify.margin_descent import descend
 
 #: Parameter values [d] to an image [H, W, 3].
 Render = Callable[[Float64Array], NDArray[np.floating]]
@@ -32,7 +32,6 @@ _CORNERS = 64
 # of the poses left after the given ones
 _SHARES = {"corners": 0.4, "random": 0.4, "ascent": 0.6}
 _ASCENT_STEPS = 16
-_FIRST_STEP = 0.25
 _LINE = 9
 _HALVINGS = 60
 
@@ -248,40 +247,15 @@ def _corners(box: ParameterBox, count: int, generator: np.random.Generator) -> F
 
 
 def _ascend(record: _ImageExtremes, twin: DifferentiableRender, target: _Target, start: Float64Array) -> Float64Array:
-    """Projected gradient ascent of one pixel channel, in parameters scaled to [-1, 1]^d.
-
-    Steps follow the normalised gradient; they double where the value grew and shrink to a quarter where not.
-    """
-    low = torch.tensor(record.box.lower, dtype=torch.float64)
-    high = torch.tensor(record.box.upper, dtype=torch.float64)
+    """The pose that projected gradient ascent of one pixel channel ends at."""
     pixel = torch.tensor([[target.row, target.column]])
 
-    def evaluate(scaled: torch.Tensor) -> tuple[float, torch.Tensor]:
-        scaled = scaled.detach().requires_grad_(True)
-        value = target.sign * twin(low + 0.5 * (scaled + 1.0) * (high - low), pixel)[0, target.channel]
+    def value(values: torch.Tensor) -> torch.Tensor:
         record.steps += 1
-        slope = torch.zeros_like(scaled)
-        if value.requires_grad:
-            (slope,) = torch.autograd.grad(value, scaled)
-        return float(value.detach()), slope
+        return -target.sign * twin(values, pixel)[0, target.channel]
 
-    span = high - low
-    scaled = (2.0 * (torch.from_numpy(start) - low) / span - 1.0).clamp(-1.0, 1.0)
-    best, slope = evaluate(scaled)
-    step = _FIRST_STEP
-    for _ in range(_ASCENT_STEPS):
-        # directions that leave the box are no use
-        free = torch.where(((scaled >= 1.0) & (slope > 0)) | ((scaled <= -1.0) & (slope < 0)), 0.0, slope)
-        length = float(free.norm())
-        if not (0.0 < length < np.inf) or time.perf_counter() >= record.deadline:
-            break
-        trial = (scaled + step * free / length).clamp(-1.0, 1.0)
-        value, trial_slope = evaluate(trial)
-        if value > best:
-            scaled, best, slope, step = trial, value, trial_slope, min(2.0 * step, 1.0)
-        else:
-            step *= 0.25
-    return record.box.at(scaled.numpy())
+    end = descend(record.box, start, value, _ASCENT_STEPS, lambda _: time.perf_counter() >= record.deadline)
+    return start if end is None else end
 
 
 def _jump(record: _ImageExtremes, probe: RenderPixels | None, target: _Target, generator: np.random.Generator) -> None:
@@ -336,18 +310,16 @@ def falsify(
     starts: ArrayLike | None = None,
     strategies: Sequence[str] = STRATEGIES,
 ) -> Attack:
-    """Attack the abstract image [lower, upper] of the poses of ``box``.
+    """Attack the abstract image [lower, upper] [H, W, 3] of the poses of ``box``.
 
     Args:
-        lower, upper: [H, W, 3]; compared as they are.
-        render: Parameter values [d] to an image [H, W, 3]. Its images are what must lie inside.
-        twin: Differentiable with respect to the values; it guides the ascent and is not compared.
-            Without it there is no ascent.
-        probe: The value of single pixels, equal to ``render``'s; saves the search for jumps from
-            rendering whole images.
+        lower, upper, box: See above.
+        render: Parameter values [d] to an image [H, W, 3], which must lie inside.
+        twin: Differentiable with respect to the values; it guides the ascent. Without it there is none.
+        probe: The value of single pixels, equal to ``render``'s; saves rendering whole images.
         poses: Most images rendered.
-        seconds: Most time spent; reaching it ends the attack after the image in progress. A limit
-            makes the outcome depend on the machine.
+        seconds: Most time spent; a limit makes the outcome depend on the machine.
+        seed: Of what is random.
         starts: [n, d] poses to try first, clipped into the box.
         strategies: Which of `STRATEGIES` to use. Poses that one does not need go to the next.
 

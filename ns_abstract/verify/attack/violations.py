@@ -15,10 +15,9 @@ KEPT = 16
 
 @dataclass(frozen=True)
 class Violation:
-    """One value outside its bounds.
+    """One value outside its bounds, at the parameters ``values`` in the box's order and units.
 
     Attributes:
-        values: The pose's parameters, in the box's order and units.
         bound: The bound it breaks: the lower one if ``value`` is less, else the upper one.
         amount: Their distance; NaN where one is not a number.
     """
@@ -37,14 +36,11 @@ class Attack:
     """The result of an attack: violations, the closest approach, and the work that was done.
 
     Attributes:
-        poses: Images rendered in full.
-        probes: Single pixels rendered besides (their values are compared as well).
-        comparisons: Pixel channels compared with their bounds.
-        violations: Comparisons that failed, and bounds that are not finite.
+        poses, probes: Images rendered in full, and single pixels besides.
+        comparisons, violations: Pixel channels compared with their bounds; those that failed, with bounds not finite.
         not_finite: Of those, the values and bounds that are not finite numbers.
         worst: The worst violation of at most 16 pixel channels, largest first, NaN before all.
-        witness_lower, witness_upper: [H, W, 3] least and largest values rendered; NaN where every
-            image was NaN.
+        witness_lower, witness_upper: [H, W, 3] least and largest values rendered; NaN where every image was NaN.
         tried: Poses by strategy.
         closest: [n, d] poses at which a pixel came closest to a bound relative to the gap, at most 8.
     """

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -43,12 +42,10 @@ class Clip(ScalarFunction):
         return self.factor
 
     @property
-    def breaks(self) -> tuple[float, ...]:
+    def breaks(self) -> tuple[float, ...]:  # type: ignore[override]
         return (self.least - self.offset) / self.factor, (self.most - self.offset) / self.factor
 
-    @property
-    def bends(self) -> tuple[int, ...]:
-        return 0, 0, 0
+    bends = (0, 0, 0)
 
     def function(self, z: Tensor) -> Tensor:
         return (self.factor * z + self.offset).clamp(self.least, self.most)
@@ -68,13 +65,8 @@ class Clip(ScalarFunction):
 class Abs(ScalarFunction):
     """``|z|``."""
 
-    @property
-    def breaks(self) -> tuple[float, ...]:
-        return (0.0,)
-
-    @property
-    def bends(self) -> tuple[int, ...]:
-        return 0, 0
+    breaks = (0.0,)
+    bends = (0, 0)
 
     def function(self, z: Tensor) -> Tensor:
         return z.abs()
@@ -93,13 +85,8 @@ class Abs(ScalarFunction):
 class HardSwish(ScalarFunction):
     """``z min(max(z / 6 + 1 / 2, 0), 1)``."""
 
-    @property
-    def breaks(self) -> tuple[float, ...]:
-        return -3.0, 3.0
-
-    @property
-    def bends(self) -> tuple[int, ...]:
-        return 0, 1, 0
+    breaks = (-3.0, 3.0)
+    bends = (0, 1, 0)
 
     def function(self, z: Tensor) -> Tensor:
         return z * (z + 3.0).clamp(0.0, 6.0) / 6.0
@@ -118,11 +105,11 @@ class Power(ScalarFunction):
     exponent: int = 2
 
     @property
-    def breaks(self) -> tuple[float, ...]:
+    def breaks(self) -> tuple[float, ...]:  # type: ignore[override]
         return (0.0,) if self.exponent % 2 else ()
 
     @property
-    def bends(self) -> tuple[int, ...]:
+    def bends(self) -> tuple[int, ...]:  # type: ignore[override]
         return (-1, 1) if self.exponent % 2 else (1,)
 
     def function(self, z: Tensor) -> Tensor:
@@ -138,25 +125,38 @@ class Power(ScalarFunction):
         return relative * size**self.exponent + FLUSHED * (1.0 + size)
 
 
-@dataclass(frozen=True, eq=False)
-class Reciprocal(ScalarFunction):
-    """``1 / z``; known where an interval holds no 0, with ``floor`` a bound that the input is known to obey."""
+def _unknown(lower: Tensor, upper: Tensor, where: Tensor) -> tuple[Tensor, Tensor]:
+    """Return NaN where the function has no bound; the cell is then given up."""
+    nan = torch.full_like(lower, math.nan)
+    return torch.where(where, nan, lower), torch.where(where, nan, upper)
 
-    # two operations that keep all digits, however small the slope is
-    slope_scale: ClassVar[float] = 0.0
+
+@dataclass(frozen=True, eq=False)
+class _Floored(ScalarFunction):
+    """A function of inputs that are known to be at least ``floor``."""
+
     floor: float = -math.inf
 
-    @property
-    def least_input(self) -> float:  # type: ignore[override]
-        return self.floor
+    def _inside(self, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
+        return lower.clamp(min=self.floor), upper.clamp(min=self.floor)
 
-    @property
-    def breaks(self) -> tuple[float, ...]:
-        return (0.0,)
 
-    @property
-    def bends(self) -> tuple[int, ...]:
-        return -1, 1
+class _Positive(_Floored):
+    """A function of inputs above 0."""
+
+    def _cuts(self, lower: Tensor, upper: Tensor) -> _SampledFunction:
+        # a number below may be flushed to zero, whose root, power or logarithm is far from its own
+        return super()._cuts(*_unknown(lower, upper, ~(lower >= FLUSH)))
+
+
+@dataclass(frozen=True, eq=False)
+class Reciprocal(_Floored):
+    """``1 / z``; known where an interval holds no 0."""
+
+    # two operations that keep all digits, however small the slope is
+    slope_scale = 0.0
+    breaks = (0.0,)
+    bends = (-1, 1)
 
     def function(self, z: Tensor) -> Tensor:
         return 1.0 / z
@@ -172,25 +172,14 @@ class Reciprocal(ScalarFunction):
         return QUOTIENT / torch.minimum(lower.abs(), upper.abs()) + FLUSHED
 
 
-def _unknown(lower: Tensor, upper: Tensor, where: Tensor) -> tuple[Tensor, Tensor]:
-    """Return NaN where the function has no bound; the cell is then given up."""
-    nan = torch.full_like(lower, math.nan)
-    return torch.where(where, nan, lower), torch.where(where, nan, upper)
-
-
 @dataclass(frozen=True, eq=False)
-class Root(ScalarFunction):
-    """``sqrt(z)``, or ``1 / sqrt(z)`` if ``inverse``, for inputs above 0; ``floor`` is known to bound them."""
+class Root(_Positive):
+    """``sqrt(z)``, or ``1 / sqrt(z)`` if ``inverse``."""
 
-    floor: float = -math.inf
     inverse: bool = False
 
     @property
-    def least_input(self) -> float:  # type: ignore[override]
-        return self.floor
-
-    @property
-    def bends(self) -> tuple[int, ...]:
+    def bends(self) -> tuple[int, ...]:  # type: ignore[override]
         return (1,) if self.inverse else (-1,)
 
     def function(self, z: Tensor) -> Tensor:
@@ -199,23 +188,19 @@ class Root(ScalarFunction):
     def slope(self, z: Tensor) -> Tensor:
         return -0.5 * z.rsqrt() / z if self.inverse else 0.5 * z.rsqrt()
 
-    def _cuts(self, lower: Tensor, upper: Tensor) -> _SampledFunction:
-        # a number below may be flushed to zero, whose root is far from its own
-        return super()._cuts(*_unknown(lower, upper, ~(lower >= FLUSH)))
-
     def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
         lower, upper = self._inside(lower, upper)
         return ROOT * (lower.rsqrt() if self.inverse else upper.sqrt()) + FLUSHED
 
 
 @dataclass(frozen=True, eq=False)
-class PositivePower(ScalarFunction):
-    """``z^exponent`` for inputs above 0 and any exponent but 0 and 1."""
+class PositivePower(_Positive):
+    """``z^exponent`` for any exponent but 0 and 1."""
 
     exponent: float = -0.75
 
     @property
-    def bends(self) -> tuple[int, ...]:
+    def bends(self) -> tuple[int, ...]:  # type: ignore[override]
         return (-1,) if 0.0 < self.exponent < 1.0 else (1,)
 
     def function(self, z: Tensor) -> Tensor:
@@ -223,10 +208,6 @@ class PositivePower(ScalarFunction):
 
     def slope(self, z: Tensor) -> Tensor:
         return self.exponent * z ** (self.exponent - 1.0)
-
-    def _cuts(self, lower: Tensor, upper: Tensor) -> _SampledFunction:
-        # a number below may be flushed to zero, whose power is far from its own
-        return super()._cuts(*_unknown(lower, upper, ~(lower >= FLUSH)))
 
     def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
         return LIBRARY * torch.maximum(lower**self.exponent, upper**self.exponent) + FLUSHED
@@ -239,9 +220,7 @@ class PositivePower(ScalarFunction):
 class Exp(LibraryFunction):
     """The exponential."""
 
-    @property
-    def bends(self) -> tuple[int, ...]:
-        return (1,)
+    bends = (1,)
 
     def function(self, z: Tensor) -> Tensor:
         return z.exp()
@@ -255,28 +234,16 @@ class Exp(LibraryFunction):
 
 
 @dataclass(frozen=True, eq=False)
-class Log(LibraryFunction):
-    """The natural logarithm; ``floor`` is known to bound the input."""
+class Log(_Positive, LibraryFunction):
+    """The natural logarithm."""
 
-    floor: float = -math.inf
-
-    @property
-    def least_input(self) -> float:  # type: ignore[override]
-        return self.floor
-
-    @property
-    def bends(self) -> tuple[int, ...]:
-        return (-1,)
+    bends = (-1,)
 
     def function(self, z: Tensor) -> Tensor:
         return z.log()
 
     def slope(self, z: Tensor) -> Tensor:
         return 1.0 / z
-
-    def _cuts(self, lower: Tensor, upper: Tensor) -> _SampledFunction:
-        # a number below may be flushed to zero, whose root is far from its own
-        return super()._cuts(*_unknown(lower, upper, ~(lower >= FLUSH)))
 
     def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
         lower, upper = self._inside(lower, upper)
@@ -287,9 +254,7 @@ class Log(LibraryFunction):
 class Softplus(LibraryFunction):
     """``log(1 + exp(z))``."""
 
-    @property
-    def bends(self) -> tuple[int, ...]:
-        return (1,)
+    bends = (1,)
 
     def function(self, z: Tensor) -> Tensor:
         return torch.logaddexp(z, torch.zeros_like(z))
@@ -309,13 +274,8 @@ class Elu(LibraryFunction):
     scale: float = 1.0
     width: float = 1.0
 
-    @property
-    def breaks(self) -> tuple[float, ...]:
-        return (0.0,)
-
-    @property
-    def bends(self) -> tuple[int, ...]:
-        return 1, 0
+    breaks = (0.0,)
+    bends = (1, 0)
 
     def function(self, z: Tensor) -> Tensor:
         below = self.alpha * torch.expm1(z.clamp(max=0.0) / self.width)
@@ -334,13 +294,8 @@ class Elu(LibraryFunction):
 class Erf(LibraryFunction):
     """The error function."""
 
-    @property
-    def breaks(self) -> tuple[float, ...]:
-        return (0.0,)
-
-    @property
-    def bends(self) -> tuple[int, ...]:
-        return 1, -1
+    breaks = (0.0,)
+    bends = (1, -1)
 
     def function(self, z: Tensor) -> Tensor:
         return torch.erf(z)
@@ -355,13 +310,8 @@ class Erf(LibraryFunction):
 class _Sigmoidal(ScalarFunction):
     """An increasing function between -1 and 1 that is convex below 0 and concave above."""
 
-    @property
-    def breaks(self) -> tuple[float, ...]:
-        return (0.0,)
-
-    @property
-    def bends(self) -> tuple[int, ...]:
-        return 1, -1
+    breaks = (0.0,)
+    bends = (1, -1)
 
     def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
         return LIBRARY
@@ -401,9 +351,7 @@ class Tanh(_Sigmoidal):
 class _Gated(LibraryFunction):
     """``z g(z)`` with a gate g from 0 to 1: concave, convex, concave."""
 
-    @property
-    def bends(self) -> tuple[int, ...]:
-        return -1, 1, -1
+    bends = (-1, 1, -1)
 
     def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
         # the gate may be made of two such functions, and of constants that are float32 numbers
@@ -415,7 +363,7 @@ class Silu(_Gated):
     """``z / (1 + exp(-z))``."""
 
     @property
-    def breaks(self) -> tuple[float, ...]:
+    def breaks(self) -> tuple[float, ...]:  # type: ignore[override]
         # z tanh(z / 2) = 2
         return -2.3993572805154676, 2.3993572805154676
 
@@ -431,9 +379,7 @@ class Silu(_Gated):
 class Gelu(_Gated):
     """``z (1 + erf(z / sqrt(2))) / 2``."""
 
-    @property
-    def breaks(self) -> tuple[float, ...]:
-        return -math.sqrt(2.0), math.sqrt(2.0)
+    breaks = (-math.sqrt(2.0), math.sqrt(2.0))
 
     def function(self, z: Tensor) -> Tensor:
         return 0.5 * z * torch.special.erfc(-z * math.sqrt(0.5))
@@ -443,9 +389,6 @@ class Gelu(_Gated):
         return 0.5 * torch.special.erfc(-z * math.sqrt(0.5)) + z * density
 
 
-#: Where the second derivatives of the following two are 0 (mpmath, 40 digits).
-_GELU_TANH = (-1.4185040087908283, 1.4185040087908283)
-_MISH = (-2.256376396360793, 1.4905711794854284)
 _CUBIC = 0.044715
 _RATE = math.sqrt(2.0 / math.pi)
 
@@ -454,9 +397,8 @@ _RATE = math.sqrt(2.0 / math.pi)
 class GeluTanh(_Gated):
     """``z (1 + tanh(sqrt(2 / pi) (z + 0.044715 z^3))) / 2``."""
 
-    @property
-    def breaks(self) -> tuple[float, ...]:
-        return _GELU_TANH
+    # second derivative 0 (mpmath, 40 digits)
+    breaks = (-1.4185040087908283, 1.4185040087908283)
 
     def function(self, z: Tensor) -> Tensor:
         return z * torch.sigmoid(2.0 * _RATE * (z + _CUBIC * z**3))
@@ -471,9 +413,8 @@ class GeluTanh(_Gated):
 class Mish(_Gated):
     """``z tanh(log(1 + exp(z)))``."""
 
-    @property
-    def breaks(self) -> tuple[float, ...]:
-        return _MISH
+    # second derivative 0 (mpmath, 40 digits)
+    breaks = (-2.256376396360793, 1.4905711794854284)
 
     def function(self, z: Tensor) -> Tensor:
         return z * torch.tanh(torch.logaddexp(z, torch.zeros_like(z)))

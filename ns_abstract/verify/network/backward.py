@@ -39,9 +39,8 @@ class CoefficientBatch:
 
     Attributes:
         waiting: By node.
-        cell: [R] of every row.
+        cell, number: [R] of every row, and positions in the result.
         total: [R, 2] what rows gathered so far, at least and at most.
-        number: [R] positions in the result.
         passage: What they take.
         chosen: Lines of rows' own, and a place for what rows are on the way.
         trace: A place for what rows are on the way.
@@ -69,10 +68,8 @@ class CoefficientBatch:
 class BackwardPass:
     """Propagates coefficients backwards over the relaxations of the nodes, which it does not change.
 
-    Args:
-        intermediate: What is known so far.
-        memory: Bytes to stay within, roughly.
-        deep: Whether the network's rows are rationed (N13); then those that are kept may end on the way, too.
+    ``memory``: bytes to stay within, roughly. ``deep``: the network's rows are rationed (N13); then those that are kept
+    may end on the way, too.
     """
 
     def __init__(self, intermediate: IntermediateBounds, memory: int, deep: bool) -> None:

@@ -50,16 +50,15 @@ def bound_outputs(
         images: m cells in d parameters.
         rows: [k, output_size] array or scipy sparse matrix.
         offset: [k], or [m, k] by image set.
-        substitution: Where the parameters' correlation is used: in every intermediate bound
-            ("everywhere"), only in the result ("end"), or not at all ("box").
-        memory: Bytes to stay within, roughly; cells and rows are worked on in parts.
+        substitution: Where the parameters' correlation is used: in every intermediate bound ("everywhere"), only in the
+            result ("end"), or not at all ("box").
+        memory: Bytes to stay within, roughly.
         arithmetic: Whether the bounds hold for every float32 evaluation and the exact network, or for that alone.
-        slope_steps: Steps towards the best slopes below open ReLUs and the best tangents of curves, for every row of
-            its own (N14); a bound never is worse for them, and each takes as long as two passes of the rows.
-        intermediate_steps: The same for intermediate bounds, but in deep networks; of an unstable neuron for the end
-            that is nearer to zero.
-        assumed: By cell: signs of inputs of (leaky) ReLUs, by node; bounds are of the images for which these numbers
-            have them in the evaluation that is bounded (N16). ``slope_steps`` must be positive then.
+        slope_steps: Steps towards the best slopes and tangents, for every row of its own (N14); each takes as long as
+            two passes of the rows.
+        intermediate_steps: The same for intermediate bounds, but in deep networks.
+        assumed: By cell: signs of inputs of (leaky) ReLUs, by node, of the images that bounds are of (N16).
+            ``slope_steps`` must be positive then.
     """
     offset = np.asarray(offset, np.float64)
     if images.a_lower.shape[1] != network.input_size:
@@ -87,9 +86,7 @@ def bound_outputs(
 class NetworkBounds:
     """Bounds of one network over several cells: builds the passes and runs them over all nodes.
 
-    Args:
-        asked: [k, output_size] rows of which bounds will be asked; None: any.
-        coarse: See `IntermediateBounds`.
+    ``asked``: [k, output_size] rows of which bounds will be asked, or None; ``coarse``: see `IntermediateBounds`.
 
     Attributes:
         intermediate: What is known of the nodes.

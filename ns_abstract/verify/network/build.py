@@ -14,7 +14,6 @@ from torch import Tensor
 
 from ns_abstract.arithmetic.network_charges import LEAST_DIVISOR, OVERFLOW, gamma
 from ns_abstract.io.errors import InputError
-from ns_abstract.verify.network.activations import Sigmoid, Tanh
 from ns_abstract.verify.network.graph import Layer, Network, Node, as_double, item
 from ns_abstract.verify.network.layers import (
     ChannelEmbedding,
@@ -280,7 +279,8 @@ class NetworkBuilder:
             return x
         return self._add(LinearLayer((self.shape(x),), tuple(shape)), x)
 
-    def _gather(self, x: int, index: np.ndarray, fill: float) -> int:
+    def gather(self, x: int, index: np.ndarray, fill: float = 0.0) -> int:
+        """The item's numbers at flat positions ``index``, in its shape; -1 stands for ``fill``."""
         flat = torch.from_numpy(np.ascontiguousarray(index).reshape(-1).astype(np.int64))
         repeated = int(np.bincount(flat[flat >= 0].numpy(), minlength=1).max())
         return self._add(Gather((self.shape(x),), index.shape, 0, repeated, flat, fill), x)
@@ -290,7 +290,7 @@ class NetworkBuilder:
         shape = self.shape(x)
         if list(order) == list(range(len(shape))):
             return x
-        return self._gather(x, np.arange(int(np.prod(shape))).reshape(shape).transpose(order), 0.0)
+        return self.gather(x, np.arange(int(np.prod(shape))).reshape(shape).transpose(order))
 
     def slice(self, x: int, chosen: Sequence[slice]) -> int:
         """Part of the item."""
@@ -299,7 +299,7 @@ class NetworkBuilder:
         if index.size == 0:
             raise InputError(f"nothing is left of an item {item(shape)}")
         same = index.shape == shape and bool((index.reshape(-1) == np.arange(index.size)).all())
-        return x if same else self._gather(x, index, 0.0)
+        return x if same else self.gather(x, index)
 
     def pad(self, x: int, before: Sequence[int], after: Sequence[int], mode: str, value: float) -> int:
         """Numbers around the item."""
@@ -324,8 +324,8 @@ class NetworkBuilder:
         index = np.arange(int(np.prod(shape))).reshape(shape)
         widths = list(zip(before, after, strict=True))
         if mode == "constant":
-            return self._gather(x, np.pad(index, widths, constant_values=-1), value)
-        return self._gather(x, np.pad(index, widths, mode=mode), 0.0)  # type: ignore[call-overload]
+            return self.gather(x, np.pad(index, widths, constant_values=-1), value)
+        return self.gather(x, np.pad(index, widths, mode=mode))  # type: ignore[call-overload]
 
     def concat(self, sources: Sequence[int], axis: int) -> int:
         """Items one after another along ``axis`` of the item: a sum of items with zeros around them."""
@@ -355,11 +355,3 @@ class NetworkBuilder:
         if not 0.0 <= alpha <= 1.0:
             raise InputError(f"attribute alpha = {alpha} is not supported", fix="between 0 and 1 expected")
         return self._add(LeakyRelu(self.shape(x), alpha), x)
-
-    def sigmoid(self, x: int) -> int:
-        """The logistic function."""
-        return self._add(Sigmoid(self.shape(x)), x)
-
-    def tanh(self, x: int) -> int:
-        """The hyperbolic tangent."""
-        return self._add(Tanh(self.shape(x)), x)

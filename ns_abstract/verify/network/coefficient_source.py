@@ -17,8 +17,7 @@ from ns_abstract.verify.network.stopping import BackwardTrace
 class CoefficientSource:
     """Bounds every cell by itself; subclasses store coefficients for other cells or reuse stored ones.
 
-    Attributes:
-        intermediate: What is known of the cells, before anything but `about` is asked.
+    ``intermediate`` is what is known of the cells, before anything but `about` is asked.
     """
 
     intermediate: IntermediateBounds

@@ -1,9 +1,8 @@
 """Backward coefficients on windows of a map, and their kernels (design.md, N5).
 
-A row is one linear function of the numbers at a node. In a convolutional network it depends on a window of
-the map only, its receptive field, so that is what is stored: ``value`` [R, C, h, w], float32 or float64, and the
-window's first row and column ``y``, ``x`` [R], which may lie outside the map. Coefficients outside mean nothing and
-are set to zero by whatever passes next.
+A row is one linear function of the numbers at a node. It is stored on its receptive field: ``value`` [R, C, h, w],
+float32 or float64, and the window's first row and column ``y``, ``x`` [R], which may lie outside the map. Coefficients
+outside mean nothing and are set to zero by whatever passes next.
 """
 
 from __future__ import annotations
@@ -129,10 +128,7 @@ def _place(value, y, x, target):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def add_gathered(value, y, x, height, width, index, target):
-    """Add windows of a map [C, height, width] to ``target`` [R, M], each number where ``index`` [C height width] says.
-
-    A number whose index is -1 is left out.
-    """
+    """Add windows of a map [C, height, width] to ``target`` [R, M], where ``index`` [C height width] says (-1: not)."""
     count, channels, h, w = value.shape
     for r in range(count):
         first, past = max(0, -x[r]), min(w, width - x[r])
@@ -361,13 +357,7 @@ class NodeColumns(NamedTuple):
 
 
 def columns_of(slopes: Float64, offsets: Float64, lower: Float64, upper: Float64) -> NodeColumns:
-    """The `NodeColumns` of planes and intervals.
-
-    Args:
-        slopes: [m, 2, C, H, W, d] of the lower and upper planes.
-        offsets: [m, 2, C, H, W].
-        lower, upper: [m, C, H, W].
-    """
+    """The `NodeColumns` of planes (slopes [m, 2, C, H, W, d], offsets [m, 2, C, H, W]) and intervals [m, C, H, W]."""
     m, d, shape = slopes.shape[0], slopes.shape[-1], offsets.shape[2:]
     apart = slopes[:, 1] - slopes[:, 0]
     tilted = bool(apart.any())
@@ -385,10 +375,7 @@ def columns_of(slopes: Float64, offsets: Float64, lower: Float64, upper: Float64
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _add_run(tape, n, column, here, step, columns, signed, sums):
-    """Add ``n`` coefficients [tape] times their columns to ``sums`` [columns, 8]; signs count in the first ``signed``.
-
-    The tape ends with zeros; 0 times what lies behind the run is nothing.
-    """
+    """Add ``n`` coefficients [tape] times their columns to ``sums`` [columns, 8]; the first ``signed`` with signs."""
     last = n - n % 8
     for k in range(columns):
         at = here + k * step

@@ -42,16 +42,9 @@ def levels(image: np.ndarray) -> np.ndarray:
 
 
 def compare(network: Network, run: Evaluate, images: Iterable[np.ndarray], *, usual: bool = True) -> None:
-    """Raise InputError if the network as read and the runtime of its file give different outputs.
+    """Raise InputError if the network as read and its file's runtime give different outputs for ``images`` [1, ...].
 
-    Args:
-        network: As it is read.
-        run: The program.
-        images: [1, *input_shape] each.
-        usual: Whether these are inputs for which the outputs must be finite.
-
-    Raises:
-        InputError: Outputs differ by more than rounding.
+    ``usual``: whether these are inputs for which the outputs must be finite.
     """
     path = network.source
     for image in images:

@@ -23,10 +23,7 @@ from ns_abstract.arithmetic.network_charges import (
     SWITCH,
 )
 from ns_abstract.verify.network.activations import FLUSHED, Clip, Exp, Gelu, HardSwish, Reciprocal, Softplus
-
-
-def _far(lower: Tensor, upper: Tensor) -> Tensor:
-    return torch.maximum(lower.abs(), upper.abs())
+from ns_abstract.verify.network.scalar_function import _size
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,8 +33,8 @@ class ScaledGelu(Gelu):
     rate: float = 1.0
 
     @property
-    def breaks(self) -> tuple[float, ...]:
-        return tuple(point / self.rate for point in super().breaks)
+    def breaks(self) -> tuple[float, ...]:  # type: ignore[override]
+        return tuple(point / self.rate for point in Gelu.breaks)
 
     def function(self, z: Tensor) -> Tensor:
         return super().function(self.rate * z) / self.rate
@@ -46,7 +43,7 @@ class ScaledGelu(Gelu):
         return super().slope(self.rate * z)
 
     def missing(self, lower: Tensor, upper: Tensor) -> Tensor | float:
-        return OWN_QUOTIENTS * _far(lower, upper)
+        return OWN_QUOTIENTS * _size(lower, upper)
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +54,7 @@ class GatedClip(HardSwish):
     offset: float = 0.5
 
     @property
-    def breaks(self) -> tuple[float, ...]:
+    def breaks(self) -> tuple[float, ...]:  # type: ignore[override]
         return -self.offset / self.factor, (1.0 - self.offset) / self.factor
 
     def function(self, z: Tensor) -> Tensor:
@@ -67,7 +64,7 @@ class GatedClip(HardSwish):
         return 2.0 * self.factor * z + self.offset
 
     def missing(self, lower: Tensor, upper: Tensor) -> Tensor | float:
-        return OWN_QUOTIENTS * _far(lower, upper)
+        return OWN_QUOTIENTS * _size(lower, upper)
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,7 +76,7 @@ class SwitchedSoftplus(Softplus):
 
     def missing(self, lower: Tensor, upper: Tensor) -> Tensor | float:
         # softplus is less than exp(-z) above its argument
-        gap = math.exp(-self.limit) * SWITCH + (self.excess + OWN_QUOTIENTS) * _far(lower, upper)
+        gap = math.exp(-self.limit) * SWITCH + (self.excess + OWN_QUOTIENTS) * _size(lower, upper)
         return torch.where(upper >= self.limit * (2.0 - SWITCH), gap, torch.zeros_like(gap))
 
 
@@ -87,8 +84,7 @@ class SwitchedSoftplus(Softplus):
 class Quantised(Clip):
     """``step * min(max(round(z / step), low), high)``, enclosed by the clipped z and half a step (N25).
 
-    `function` is the clipped z; a call gives the steps, whose gradient is that of the clipped z.
-    ``least`` and ``most`` are ``step * low`` and ``step * high``.
+    `function` is the clipped z from ``least = step * low`` to ``most = step * high``, whose gradient a call has.
     """
 
     step: float = 1.0
@@ -127,14 +123,8 @@ class CappedExp(Exp):
 
     count: int = 1
     cap: ClassVar[float] = CAP
-
-    @property
-    def breaks(self) -> tuple[float, ...]:
-        return (self.cap,)
-
-    @property
-    def bends(self) -> tuple[int, ...]:
-        return 1, 0
+    breaks = (CAP,)
+    bends = (1, 0)
 
     def function(self, z: Tensor) -> Tensor:
         return z.clamp(max=self.cap).exp()

@@ -163,25 +163,10 @@ class CompositeBuilder(ElementwiseBuilder):
         rest = [k for k in range(len(shape)) if k not in axes]
         reduced_shape = tuple(shape[k] for k in rest)
         places = self.positions(x).transpose(*rest, *axes).reshape(*reduced_shape, -1)
-        parts = [self._gather(x, np.ascontiguousarray(places[..., k]), 0.0) for k in range(places.shape[-1])]
+        parts = [self.gather(x, np.ascontiguousarray(places[..., k])) for k in range(places.shape[-1])]
         index = self.extreme(parts, most)
         final = tuple(1 if k in axes else n for k, n in enumerate(shape)) if keep else reduced_shape
         return self.reshape(index, final or (1,))
-
-    def take(self, x: int, indices: np.ndarray, axis: int) -> int:
-        """Entries along an axis of the item, in the shape of ``indices``."""
-        shape = self.shape(x)
-        if indices.size and not (-shape[axis] <= indices.min() and indices.max() < shape[axis]):
-            raise InputError(f"indices up to {int(indices.max())} of {shape[axis]} numbers", fix="check the indices")
-        self._check_size((*shape[:axis], max(1, indices.size), *shape[axis + 1 :]))
-        positions = np.take(self.positions(x), indices, axis)
-        if positions.size == 0:
-            raise InputError("nothing is taken")
-        return (
-            self._gather(x, positions, 0.0)
-            if positions.ndim
-            else self.reshape(self._gather(x, positions[None], 0.0), (1,))
-        )
 
     def part(self, x: int, chosen: Sequence[slice]) -> int:
         """Part of the item; channels of a map are chosen by a convolution, which keeps windows small."""
@@ -196,10 +181,6 @@ class CompositeBuilder(ElementwiseBuilder):
         place = np.zeros((len(channels), shape[0], 1, 1))
         place[np.arange(len(channels)), channels] = 1.0
         return self.convolution(x, place, None, _ONES, _ONES, (0, 0, 0, 0), 1, exact=True)
-
-    def rearranged(self, x: int, index: np.ndarray) -> int:
-        """The item's numbers at flat positions ``index``, in its shape."""
-        return self._gather(x, index, 0.0)
 
     def shift(self, x: int, offset: Any) -> int:
         """``x + offset`` with a constant, or nothing at all."""
@@ -382,7 +363,7 @@ class CompositeBuilder(ElementwiseBuilder):
         second = np.broadcast_to(
             np.swapaxes(np.arange(int(np.prod(two))).reshape(two), -1, -2).reshape(*lead, 1, m, k), shape
         )
-        index = self.product(self._gather(a, first, 0.0), self._gather(b, second, 0.0))
+        index = self.product(self.gather(a, first), self.gather(b, second))
         return self.reduce(index, [len(shape) - 1], False, False)
 
     def matrix_from_left(self, weight: np.ndarray, x: int) -> int:

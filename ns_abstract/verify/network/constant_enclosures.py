@@ -32,34 +32,14 @@ from ns_abstract.arithmetic.network_charges import (
     gamma,
 )
 from ns_abstract.io.errors import InputError
-from ns_abstract.verify.network.onnx_fold import fold
+from ns_abstract.verify.network.onnx_fold import COMPARES, GROWS, LIBRARIES, MOVES, SHAPES, STEPS, fold
 
 Interval64 = tuple[np.ndarray, np.ndarray]
 _FIX = "fold constants when exporting, in float64"
-#: Arguments may be moved, but no number is computed.
-_MOVES = frozenset(
-    (
-        *("Concat", "Expand", "Flatten", "Gather", "Identity", "Reshape", "ScatterElements", "ScatterND", "Slice"),
-        *("Split", "Squeeze", "Tile", "Transpose", "Trilu", "Unsqueeze", "Where"),
-    )
-)
-#: Nothing is rounded, and results grow with arguments.
-_GROWS = frozenset(("Clip", "Max", "Min", "ReduceMax", "ReduceMin", "Relu"))
-#: Results change at once; both ends must agree.
-_STEPS = frozenset(("Ceil", "Floor", "Round", "Sign"))
-_LIBRARIES = frozenset(("Erf", "Exp", "Log", "Sigmoid", "Tanh"))
-#: Functions of shapes, which no rounding changes.
-_SHAPES = frozenset(("ConstantOfShape", "EyeLike", "Shape", "Size"))
 
 
 class EnclosedConstant(NamedTuple):
-    """Two enclosures of a constant, in float64.
-
-    Attributes:
-        kind: The type that the file gives it.
-        real: Ends of the exact value.
-        evaluated: Ends of what evaluations in its type may give.
-    """
+    """Two float64 enclosures of a constant of the type ``kind``: of its exact value, and of its evaluations."""
 
     kind: np.dtype
     real: Interval64
@@ -127,17 +107,14 @@ def arithmetic(node: onnx.NodeProto, values: Sequence[np.ndarray | None], doubtf
     if doubtful:
         return True
     kind = node.op_type
-    if kind in _MOVES | _GROWS | _STEPS | _SHAPES | {"Abs", "Neg"}:
+    if kind in MOVES | GROWS | STEPS | SHAPES | {"Abs", "Neg"}:
         return False
     if kind in ("Cast", "CastLike"):
         return True
     if kind == "Range":
         # whole numbers are added without rounding
         return any(v is not None and not np.array_equal(v, np.round(v)) for v in values)
-    return any(v is not None and v.dtype.kind == "f" for v in values) and kind not in _COMPARES
-
-
-_COMPARES = frozenset(("And", "Equal", "Greater", "GreaterOrEqual", "Less", "LessOrEqual", "Not", "Or", "Xor"))
+    return any(v is not None and v.dtype.kind == "f" for v in values) and kind not in COMPARES
 
 
 def fold_enclosed(
@@ -156,7 +133,7 @@ def fold_enclosed(
     kinds = [p.kind for p in parts if p is not None]
     if name in ("Cast", "CastLike"):
         return [_cast(node, values)]
-    if name in _COMPARES or name == "Mod":
+    if name in COMPARES or name == "Mod":
         raise InputError("decides by a constant that rounding may change", fix=_FIX)
     if not kinds:
         raise InputError("is not computed with floats", fix=_FIX)
@@ -171,7 +148,7 @@ def fold_enclosed(
             arguments = [v if n is None else n for v, n in zip(values, (*numbers, *[None] * len(values)), strict=False)]
             return fold(node, arguments, opset)  # type: ignore[arg-type]
 
-        if name in _MOVES | _GROWS:
+        if name in MOVES | GROWS:
             lower, upper = ([None if e is None else e[k] for e in ends] for k in range(2))
             return list(zip(put(*lower), put(*upper), strict=True))
         return [_computed(name, [e for e in ends if e is not None], lambda v: put(v)[0], rounds)]
@@ -181,7 +158,7 @@ def fold_enclosed(
         folded = EnclosedConstant(kind, real, evaluated)
         for end in (*real, *evaluated):
             if not np.isfinite(end).all() or (end.size and np.abs(end).max() >= FORMATS[kind.itemsize].largest):
-                if name in _MOVES | _GROWS and not np.isnan(end).any():
+                if name in MOVES | GROWS and not np.isnan(end).any():
                     continue
                 raise InputError("makes a constant that may overflow", fix="check its constants")
         results.append(folded.value.astype(kind) if folded.exact else folded)
@@ -198,14 +175,14 @@ def _computed(
         return -high, -low
     if name == "Abs":
         return _size(given[0])
-    if name in _STEPS:
+    if name in STEPS:
         below, above = put(low), put(high)
         if not np.array_equal(below, above):
             raise InputError("rounds a constant that may fall either way", fix=_FIX)
         return below, above
     if name in ("Add", "Sub", "Mul", "Div", "Reciprocal", "Sqrt"):
         return _elementary(name, given, rounds)
-    if name in _LIBRARIES:
+    if name in LIBRARIES:
         below, above = put(low), put(high)
         return _widened((below, above), _library(unit) * (1.0 + np.maximum(np.abs(below), np.abs(above))) + tiny)
     if name in ("Sin", "Cos"):

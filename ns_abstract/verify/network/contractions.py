@@ -18,11 +18,7 @@ Operand = tuple[int | np.ndarray, Shape]
 
 
 def einsum(b: CompositeBuilder, equation: str, operands: Sequence[Operand]) -> tuple[int, Shape]:
-    """The node of an equation of one or two operands, and its shape.
-
-    Raises:
-        InputError: The equation is not read, or does not fit.
-    """
+    """The node of an equation of one or two operands, and its shape; InputError if it is not read, or does not fit."""
     equation = equation.replace(" ", "")
     left, arrow, out = equation.partition("->")
     names = left.split(",")
@@ -147,7 +143,7 @@ def concatenated(b: CompositeBuilder, parts: Sequence[Operand], axis: int) -> tu
         if isinstance(value, int):
             index = np.full(whole, -1, np.int64)
             index[place] = b.positions(value).reshape(shape)
-            moving.append(b.rearranged(value, index.reshape(after)))
+            moving.append(b.gather(value, index.reshape(after)))
         else:
             offset[place] = value
     if not np.isfinite(offset).all():

@@ -98,9 +98,8 @@ class RefinementPlan(NamedTuple):
 
     Attributes:
         ways: By node: how rows for all of its numbers go back.
-        products: What they take together.
+        products, rate: What they take together, and what a product costs in logarithms of widths.
         widest: How wide bounds of a node are foreseen to be at most.
-        rate: What a product costs in logarithms of widths.
         step: Which of the plans compared it is.
     """
 

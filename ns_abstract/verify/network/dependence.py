@@ -1,4 +1,4 @@
-"""Which numbers of a network some rows on its outputs depend on: the others need no better bounds (design.md, V11)."""
+"""Which numbers of a network matter to rows on its outputs, and which inputs move it most (docs/dev/design.md, V11)."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.verify.network.coefficients import Coefficients, Float64, full, grid
 from ns_abstract.verify.network.graph import Network
 from ns_abstract.verify.network.layers import LinearLayer
@@ -35,3 +36,39 @@ def dependence(network: Network, rows: Float64) -> dict[int, Tensor]:
                 own = used
             reached[source] = reached[source] | own if source in reached else own
     return dependent
+
+
+def input_shares(network: Network, lower: Float64, upper: Float64) -> Float64:
+    """Return [n] the part of each input in the motion of the neurons before activations; plays no part in soundness.
+
+    Each input alone goes from one end of the box ``lower`` to ``upper`` [n] to the other, with the others in the
+    middle. The parts of a node sum to one; the result is the nodes' mean.
+    """
+    middle, total, nodes = 0.5 * (lower + upper), np.zeros(len(lower)), 0
+    varies = np.flatnonzero(upper > lower)
+    ends = np.tile(middle, (len(varies), 2, 1))
+    number = np.arange(len(varies))
+    ends[number, 0, varies], ends[number, 1, varies] = lower[varies], upper[varies]
+    motions = np.array([_motions(network, torch.from_numpy(pair)) for pair in ends])
+    for moved in motions.T:
+        size = moved.sum()
+        if 0.0 < size < np.inf:
+            total[varies] += moved / size
+            nodes += 1
+    return total / max(1, nodes)
+
+
+def _motions(network: Network, pair: Tensor) -> list[float]:
+    """By nonlinear node: how far its inputs are apart, together, for a pair of images [2, n]."""
+    values, left, motions = [pair.reshape(2, *network.input_shape)], list(network.readers), []
+    for node in network.nodes:
+        check_cancelled()
+        inputs = [values[k] for k in node.inputs]
+        if not isinstance(node.layer, LinearLayer):
+            motions.append(float(sum((v[1] - v[0]).abs().sum() for v in inputs)))
+        values.append(node.layer(inputs))
+        for k in node.inputs:
+            left[k] -= 1
+            if not left[k]:
+                values[k] = values[k][:0]
+    return motions

@@ -10,13 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from ns_abstract.arithmetic.network_charges import (
-    FOLDING,
-    LEAST_DIVISOR,
-    NEAR,
-    OVERFLOW,
-    gamma,
-)
+from ns_abstract.arithmetic.network_charges import FOLDING, LEAST_DIVISOR, NEAR, OVERFLOW, gamma
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import activations
 from ns_abstract.verify.network.bilinear import Product
@@ -36,10 +30,7 @@ from ns_abstract.verify.network.layers import (
 )
 from ns_abstract.verify.network.max_pooling import MaxPool
 from ns_abstract.verify.network.scalar_function import ScalarFunction
-from ns_abstract.verify.network.sparse_layers import (
-    SparseMatrix,
-    Variance,
-)
+from ns_abstract.verify.network.sparse_layers import SparseMatrix, Variance
 
 #: A preference: constants of a gate this close to a known function's, relative to them, are bounded as a curve.
 _ALIKE = 2.0**-10
@@ -223,7 +214,7 @@ class ElementwiseBuilder(NetworkBuilder):
             raise InputError(f"shapes {item(before)} and {item(shape)} do not fit") from None
         if int(np.prod(before)) == int(np.prod(shape)):
             return self.reshape(x, tuple(shape))
-        return self._gather(x, index, 0.0)
+        return self.gather(x, index)
 
     def common(self, *inputs: int) -> tuple[int, ...]:
         """The inputs, spread to one shape."""

@@ -72,12 +72,9 @@ def cell_bytes(network: Network, dimensions: int) -> float:
 def check_cell(
     network: Network, dimensions: int, allowed: float, remedy: str = "a larger --memory-limit, fewer --workers"
 ) -> None:
-    """Raise InputError if one cell of the network takes more than ``allowed`` bytes.
+    """Raise InputError if one cell of the network takes more than ``allowed`` bytes, about.
 
     ``remedy`` is what may be given instead of a smaller network.
-
-    Raises:
-        InputError: It does, about.
     """
     needed = cell_bytes(network, dimensions)
     if needed > allowed:

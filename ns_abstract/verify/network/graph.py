@@ -44,14 +44,7 @@ _SIGMOIDAL = "sigmoid and tanh are taken to be evaluated within 2^-20 of the exa
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """One layer of a network with the nodes that it reads.
-
-    Attributes:
-        name: As in the file.
-        op: The operator's name in the file.
-        layer: What it computes.
-        inputs: Indices of nodes; 0 is the image.
-    """
+    """One layer of a network, with name and operator in the file, and the nodes that it reads; 0 is the image."""
 
     name: str
     op: str

@@ -20,8 +20,7 @@ ConstantIntervals = tuple[np.ndarray, np.ndarray]
 class InexactLayer(LinearLayer):
     """A linear layer with interval constants: charges their width times the input's magnitude.
 
-    Attributes:
-        real, evaluated: The layer with the doubts as weights and offset: of the exact value, of float32 evaluations.
+    ``real`` and ``evaluated`` are the layer with the doubts of the exact value and of float32 evaluations as weights.
     """
 
     real: LinearLayer

@@ -16,10 +16,7 @@ from ns_abstract.verify.network.image_sets import ImageSets, Substitution
 class ImagePlanes(NamedTuple):
     """Linear bounds of the input image as the backward pass reads them.
 
-    Attributes:
-        slopes: [m, 2, C, H, W, d] of the lower and the upper plane.
-        offsets: [m, 2, C, H, W].
-        lower, upper: [m, C, H, W].
+    Slopes [m, 2, C, H, W, d] and offsets [m, 2, C, H, W] of the lower and the upper plane; lower, upper [m, C, H, W].
     """
 
     slopes: Float64

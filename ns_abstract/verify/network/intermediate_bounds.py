@@ -24,8 +24,7 @@ class IntermediateBounds:
     """Forms and relaxations of the nodes: the forward pass adds to them, the backward pass reads them.
 
     Args:
-        network: The network.
-        image: What is known of the image.
+        network, image: The network, and what is known of the image.
         middle: [m, n] the images' reference.
         usable: [m] cells that are not given up; changed in place.
         arithmetic, assumed: As in `ns_abstract.verify.network.bound_outputs`.
@@ -40,8 +39,7 @@ class IntermediateBounds:
         flush: [m] what flushes to zero may lose on the way of any row.
         relaxations: What rows take on their way; rows of outputs take the last, the others the first.
         folded: Nodes whose rounding is in that of their only reader.
-        forms: By node: what is known of it, while other nodes read it.
-        stops: By node: what rows may stop at.
+        forms, stops: By node: what is known of it, while other nodes read it; what rows may stop at.
         unstable: By node: units whose lower lines may have other slopes.
         split: By cell and node: what rows take of signs that are assumed.
         reused_relaxations: By node: lines with slopes of another cell's rows.

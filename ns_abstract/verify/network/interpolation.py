@@ -6,30 +6,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ns_abstract.arithmetic.network_charges import (
-    POLYNOMIAL,
-    POSITION,
-)
+from ns_abstract.arithmetic.network_charges import POLYNOMIAL, POSITION
 from ns_abstract.io.errors import InputError
 
 
 class ResizeAxis(NamedTuple):
-    """The interpolation matrix along one axis, and its error.
-
-    Attributes:
-        weight: [out, size].
-        doubt: [out, size] what a weight may be off in float32, for positions are computed in it, too.
-    """
+    """The interpolation matrix [out, size] along one axis, and what its weights may be off in float32."""
 
     weight: np.ndarray
     doubt: np.ndarray
 
 
 def nearest_pixels(size: int, out: int, coordinates: str, nearest: str, ratio: float) -> np.ndarray:
-    """Return [out] the input pixels that onnxruntime picks along one axis; it computes positions in float32.
-
-    Exact places differ from these by up to a pixel where they lie half way or on a number.
-    """
+    """Return [out] the input pixels that onnxruntime picks along one axis; it computes positions in float32."""
     half = np.float32(0.5)
     k, scale = np.arange(out, dtype=np.float32), np.float32(ratio)
     if coordinates == "align_corners":

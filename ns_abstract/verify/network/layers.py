@@ -1,12 +1,9 @@
-"""Layers: what each computes, and how forms pass it forwards and coefficients backwards.
+"""Layers: what each computes, and how forms pass it forwards and coefficients backwards (design.md, N3, N4).
 
-See design.md, N3, N4.
-
-A layer is linear (`LinearLayer` and the classes built on it) or acts on every number by itself (`Activation`).
-A linear layer has three faces that share one matrix W: the concrete ``W x + bias``, its magnitude
-``|W| x`` (for radii and for rounding), and its transpose ``coefficients W`` on windows of rows
-(`ns_abstract.verify.network.coefficients`). An activation has its concrete value and lines that enclose it over
-an interval. Labels N1, N2, ... are those of docs/dev/design.md.
+A layer is linear (`LinearLayer` and the classes built on it) or acts on every number by itself (`Activation`). A linear
+layer has three faces that share one matrix W: the concrete ``W x + bias``, its magnitude ``|W| x`` (for radii and for
+rounding), and its transpose ``coefficients W`` on windows of rows (`coefficients`). An activation has its concrete
+value and lines that enclose it over an interval.
 """
 
 from __future__ import annotations
@@ -21,12 +18,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ns_abstract.arithmetic.network_charges import (
-    AFFINE,
-    FLUSH,
-    FUNCTION_FLUSHES,
-    OWN_LINE,
-)
+from ns_abstract.arithmetic.network_charges import AFFINE, FLUSH, FUNCTION_FLUSHES, OWN_LINE
 from ns_abstract.verify.network.coefficients import Coefficients, add_gathered, full, grid, interleave, unflatten
 
 Shape = tuple[int, ...]
@@ -118,25 +110,29 @@ class Weighted(LinearLayer):
 
 
 @dataclass(frozen=True, eq=False)
-class Convolution(Weighted):
-    """Two-dimensional convolution with zero padding; average pooling and selections are such, too.
-
-    Attributes:
-        weight: [Cout, Cin / groups, kh, kw] float64.
-        offset: [Cout] float64 or None.
-        stride, dilation: (rows, columns).
-        pads: top, left, bottom, right.
-        groups: As in ONNX.
-    """
+class WindowLayer(Weighted):
+    """A layer of windows of rows and columns, with an ``offset`` [Cout] float64 or None."""
 
     stride: tuple[int, int] = (1, 1)
     dilation: tuple[int, int] = (1, 1)
-    pads: tuple[int, int, int, int] = (0, 0, 0, 0)
-    groups: int = 1
 
     @property
     def bias(self) -> Tensor | None:
         return None if self.offset is None else self.offset[:, None, None]
+
+
+@dataclass(frozen=True, eq=False)
+class Convolution(WindowLayer):
+    """Two-dimensional convolution with zero padding; average pooling and selections are such, too.
+
+    Attributes:
+        weight: [Cout, Cin / groups, kh, kw] float64.
+        pads: top, left, bottom, right.
+        groups: As in ONNX.
+    """
+
+    pads: tuple[int, int, int, int] = (0, 0, 0, 0)
+    groups: int = 1
 
     @cached_property
     def _phases(self) -> dict[torch.dtype, Tensor | None]:
@@ -263,9 +259,8 @@ class Matrix(Weighted):
 class ScaleLayer(LinearLayer):
     """``factor * x + offset`` with constants; both [*shape] float64 (batch normalisation, Mul, Add, ...).
 
-    Attributes:
-        parts: The product of 1 + |f| over the largest constants that the factor and the offset are made of, if these
-            are others.
+    ``parts``: the product of 1 + |f| over the largest constants that factor and offset are made of, if these are
+    others.
     """
 
     factor: Tensor = field(default_factory=lambda: torch.zeros(0))
@@ -361,12 +356,7 @@ class ChannelEmbedding(LinearLayer):
 
 @dataclass(frozen=True, eq=False)
 class Gather(LinearLayer):
-    """Gathers numbers of the input by index.
-
-    Attributes:
-        index: [prod(shape)] flat positions in the input; -1 stands for ``fill``.
-        fill: A constant.
-    """
+    """Gathers numbers of the input by flat positions ``index`` [prod(shape)]; -1 stands for the constant ``fill``."""
 
     index: Tensor = field(default_factory=lambda: torch.zeros(0, dtype=torch.int64))
     fill: float = 0.0
@@ -403,8 +393,6 @@ class Activation:
     """An elementwise activation; ``shape`` is that of one item."""
 
     shape: Shape
-    #: `function` in float64 is within this of the true one, beside roundings relative to its value.
-    room: ClassVar[float] = 0.0
 
     def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
         """How far a float32 evaluation may be from the function of a number between."""
@@ -412,7 +400,7 @@ class Activation:
 
     def missing(self, lower: Tensor, upper: Tensor) -> Tensor | float:
         """How far what the network computes, in real numbers, too, may be from `function`."""
-        return self.room
+        return 0.0
 
     def range(self, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
         """Least and greatest value; a monotone function's are those of the ends."""

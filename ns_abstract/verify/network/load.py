@@ -13,9 +13,9 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import file_size, show
 from ns_abstract.verify.network.comparison import Evaluate, compare, levels, probes
 from ns_abstract.verify.network.graph import Network
-from ns_abstract.verify.network.onnx_file import read_onnx
-from ns_abstract.verify.network.onnx_graph import ReadRequest
-from ns_abstract.verify.network.onnx_tensors import PACKED, unpacked_model
+from ns_abstract.verify.network.onnx_graph import OnnxReader, ReadRequest, operator_set
+from ns_abstract.verify.network.onnx_rules import RULES
+from ns_abstract.verify.network.onnx_tensors import PACKED, parse_model, unpacked_model
 from ns_abstract.verify.network.subnormals import subnormals_kept
 
 #: Types of inputs beside float32.
@@ -39,8 +39,7 @@ def load_network(
         path: The file.
         vector: Whether the input may be a vector [n], without a batch.
         output: Name of the output that is read; None: the only one.
-        picture: Height and width of pictures, used where the file leaves them free.
-        layout: "NCHW" or "NHWC", of such pictures.
+        picture, layout: Height and width of pictures, where the file leaves them free, "NCHW" or "NHWC".
         whole_numbers: Whether the input may be uint8, for whole numbers from 0 to 255.
         shown: Inputs [1, *input_shape] to compare besides, for an input shape: what the network will be given.
 
@@ -62,6 +61,16 @@ def load_network(
     return network
 
 
+def read_onnx(path: Path, asked: ReadRequest | None = None) -> Network:
+    """The network in an ONNX file, up to the output that is asked for; nothing in it is executed.
+
+    Raises:
+        InputError: The file cannot be read, or uses what is not supported; names node, operator and attribute.
+    """
+    model = parse_model(path)
+    return OnnxReader(path, model.graph, operator_set(model, path), RULES, asked or ReadRequest()).network()
+
+
 def _instead(path: Path) -> str:
     """What to do with a file that is not ONNX."""
     target = show(f"{path.stem}.onnx")
@@ -74,11 +83,7 @@ def _instead(path: Path) -> str:
 
 
 def onnx_session(path: Path) -> onnxruntime.InferenceSession:
-    """onnxruntime's session of a model on one thread.
-
-    Raises:
-        InputError: onnxruntime refuses the file.
-    """
+    """onnxruntime's session of a model on one thread; InputError if it refuses the file."""
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 4
     options.intra_op_num_threads = options.inter_op_num_threads = 1
@@ -96,8 +101,7 @@ def onnx_runner(path: Path, output: str = "", shape: Sequence[int] | None = None
     A model without a batch is given the image alone; one of a fixed batch, as many copies.
 
     Args:
-        path: The model.
-        output: Name of the output; empty: the first.
+        path, output: The model, and the name of the output; empty: the first.
         shape: One item of the network's input; None: the input is a vector or has a batch of 1.
 
     Raises:

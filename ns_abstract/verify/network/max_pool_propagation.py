@@ -24,14 +24,11 @@ _TRIED, _CLOSES = 64, 0.1
 
 
 class _UncertainWinners(NamedTuple):
-    """Pooling windows whose largest input is not certain, and planes above them.
+    """Pooling windows ``at`` whose largest input is not certain, and planes above them.
 
     Attributes:
-        at: Their cells, channels and numbers, [n] each.
         top: [n] what may be above the winner.
-        candidates: Their numbers.
-        near: [n, K] how far these may be from their references.
-        planes: One above each.
+        candidates, near: Their numbers, and [n, K] how far these may be from their references.
     """
 
     at: tuple[Tensor, ...]
@@ -42,14 +39,7 @@ class _UncertainWinners(NamedTuple):
 
 
 class MaxPoolPropagation:
-    """Propagates forms through max pooling and bounds differences of its inputs.
-
-    Args:
-        intermediate: What is known so far; rows that pass the maxima find their planes there.
-        backward: Passes rows of differences back over it.
-        schedule: What rows cost.
-        sharing: Whose winners are followed.
-    """
+    """Propagates forms through max pooling and bounds differences of its inputs."""
 
     def __init__(
         self, intermediate: IntermediateBounds, backward: BackwardPass, schedule: WorkBudget, sharing: CoefficientSource

@@ -23,14 +23,7 @@ _LARGE = 1e300
 
 @dataclass(frozen=True, eq=False)
 class MaxPool:
-    """Max pooling over windows of every channel; padding never wins.
-
-    Attributes:
-        input_shapes: One item of the only input, [C, H, W].
-        shape: One item of the output.
-        kernel, stride, dilation: (rows, columns).
-        pads: top, left, bottom, right.
-    """
+    """Max pooling over windows of every channel, [C, H, W]; padding never wins. ``pads``: top, left, bottom, right."""
 
     input_shapes: tuple[Shape]
     shape: Shape
@@ -98,10 +91,7 @@ class WindowInputs(NamedTuple):
         return self.reference.abs() + moves + self.lower.abs() + self.upper.abs()
 
     def relaxation_gap(self) -> Tensor:
-        """[B, K, K]: number j is above number i by at most entry (j, i); 0 on the diagonal.
-
-        Numbers in the padding are below all others by far, and no others are compared with them.
-        """
+        """[B, K, K]: number j is above number i by at most entry (j, i); 0 on the diagonal, far below in padding."""
 
         def less(v: Tensor) -> Tensor:
             return v[:, :, None] - v[:, None, :]
@@ -119,12 +109,7 @@ class WindowInputs(NamedTuple):
 
 
 class WindowPlanes(NamedTuple):
-    """Planes of pooling windows: ``low <= max z - slopes z <= high``.
-
-    Attributes:
-        slopes: [B, K] float64, not negative, zero in the padding.
-        low, high: [B].
-    """
+    """Planes of pooling windows: ``low <= max z - slopes z <= high``; slopes [B, K] >= 0, zero in the padding."""
 
     slopes: Tensor
     low: Tensor

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
@@ -22,15 +24,7 @@ _ROWS_OF_A_THREAD = 128
 class NeuronBounds:
     """Bounds chosen neurons of a node by backward passes of their own.
 
-    Args:
-        intermediate: What is known so far.
-        backward: Passes rows back over it.
-        schedule: What rows cost.
-        sharing: Takes notice of the rows.
-        ascent: Chooses lines for them.
-
-    Attributes:
-        spared: Products that rows have not taken because they ended on the way.
+    ``spared`` counts products that rows have not taken because they ended on the way.
     """
 
     def __init__(
@@ -86,15 +80,9 @@ class NeuronBounds:
         r[at] = torch.where(better, radius, r[at])
         lower[at] = torch.maximum(lower[at], torch.from_numpy(bounds.lower))
         upper[at] = torch.minimum(upper[at], torch.from_numpy(bounds.upper))
-        tight = NodeForm(
-            form.reference,
-            c.reshape(-1, *item),
-            a.movedim(-1, 1).reshape(self.intermediate.count, self.intermediate.d, *item),
-            r.reshape(-1, *item),
-            lower.reshape(-1, *item),
-            upper.reshape(-1, *item),
-            form.active,
-        )
+        a = a.movedim(-1, 1).reshape(self.intermediate.count, self.intermediate.d, *item)
+        c, r, lower, upper = (v.reshape(-1, *item) for v in (c, r, lower, upper))
+        tight = replace(form, c=c, a=a, r=r, lower=lower, upper=upper)
         return self.intermediate.within(tight, tight.lower, tight.upper)
 
     def _climb(self, index: int, where: Int64, reference: Float64, bounds: BackwardBounds, decides: bool) -> None:

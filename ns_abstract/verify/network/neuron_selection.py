@@ -32,15 +32,8 @@ _STRAIGHT, _BENT = 2.0**-20, 2.0**-5
 class NeuronSelection:
     """Chooses the neurons whose bounds are refined; plays no part in soundness.
 
-    Args:
-        neuron_bounds: What is known so far.
-        intermediate: Bounds the numbers that are chosen.
-        schedule: What rows cost, and how many of them a deep network is worth.
-        sharing: What other cells say of a node before.
-        used: By node: [*shape] numbers that matter to anybody; None: all.
-
-    Attributes:
-        unsure: Part of the latest ReLU's inputs whose signs have not been found out.
+    ``used``: by node [*shape], numbers that matter to anybody; None: all. ``unsure``: part of the latest ReLU's inputs
+    whose signs have not been found out.
     """
 
     def __init__(
@@ -99,13 +92,16 @@ class NeuronSelection:
             return bounds, unstable
         return bounds, unstable | (likely & (apart > _BENT * width_ratio))
 
+    @property
+    def _usable(self) -> Tensor:
+        """[m, 1, 1, 1] cells that are not given up."""
+        return torch.from_numpy(self.intermediate.usable).reshape(-1, 1, 1, 1)
+
     def _tighten(self, index: int, form: NodeForm, unstable: Tensor, decides: bool) -> NodeForm:
         """Better bounds of the numbers of node ``index`` that are open; a sign may be all that is asked (N6)."""
         item = self.network.shape(index)
         shape = grid(item)
-        unstable = unstable.reshape(self.intermediate.count, *shape) & torch.from_numpy(
-            self.intermediate.usable
-        ).reshape(-1, 1, 1, 1)
+        unstable = unstable.reshape(self.intermediate.count, *shape) & self._usable
         where = unstable.nonzero().numpy()
         if not len(where):
             return form
@@ -134,12 +130,10 @@ class NeuronSelection:
         that matter further on, so that forms start again from there.
         """
         shape = grid(self.network.shape(index))
-        unstable = unstable.reshape(self.intermediate.count, *shape) & torch.from_numpy(
-            self.intermediate.usable
-        ).reshape(-1, 1, 1, 1)
+        unstable = unstable.reshape(self.intermediate.count, *shape) & self._usable
         count = int(unstable.sum())
         decides = isinstance(layer, LeakyRelu)
-        matters = torch.from_numpy(self.intermediate.usable).reshape(-1, 1, 1, 1) & torch.ones_like(unstable)
+        matters = self._usable & torch.ones_like(unstable)
         if isinstance(layer, LeakyRelu) and layer.alpha == 0.0:
             # what is certainly cut off is exact behind the layer
             matters &= form.interval.upper.reshape(unstable.shape) > 0.0
@@ -181,7 +175,7 @@ class NeuronSelection:
         """Better bounds of all numbers of a node that matter, by rows as long as the network is worth (N18)."""
         shape = grid(self.network.shape(index))
         every = torch.ones((self.intermediate.count, *shape), dtype=torch.bool)
-        matters = torch.from_numpy(self.intermediate.usable).reshape(-1, 1, 1, 1) & every
+        matters = self._usable & every
         if isinstance(layer, LeakyRelu) and layer.alpha == 0.0:
             matters &= form.interval.upper.reshape(matters.shape) > 0.0
         chosen = matters.nonzero().numpy()

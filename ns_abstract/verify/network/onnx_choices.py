@@ -18,8 +18,7 @@ _Number = Callable[[str], float | None]
 def without_choices(graph: onnx.GraphProto) -> list[onnx.NodeProto]:
     """The nodes of a graph, with `Where` replaced where it equals a maximum, minimum, ReLU or soft threshold.
 
-    Every replacement gives the same float32 number for every input: both branches meet at the number that is
-    compared, and the replacement rounds what the chosen branch rounds.
+    The replacement gives the same float32 number for every input: both branches meet at the number that is compared.
     """
     made = {name: node for node in graph.node for name in node.output if name}
     stored = {tensor.name: tensor for tensor in graph.initializer}

@@ -13,78 +13,33 @@ from ns_abstract.io.errors import InputError
 
 #: Numbers that a result may have.
 _LARGEST = 1 << 24
+#: Operators that move numbers of their arguments and compute none.
+MOVES = frozenset(
+    (
+        *("Concat", "Expand", "Flatten", "Gather", "Identity", "Reshape", "ScatterElements", "ScatterND", "Slice"),
+        *("Split", "Squeeze", "Tile", "Transpose", "Trilu", "Unsqueeze", "Where"),
+    )
+)
+#: Nothing is rounded, and results grow with arguments.
+GROWS = frozenset(("Clip", "Max", "Min", "ReduceMax", "ReduceMin", "Relu"))
+#: Results change at once.
+STEPS = frozenset(("Ceil", "Floor", "Round", "Sign"))
+#: Functions of a library.
+LIBRARIES = frozenset(("Erf", "Exp", "Log", "Sigmoid", "Tanh"))
+#: Functions of shapes, which no rounding changes.
+SHAPES = frozenset(("ConstantOfShape", "EyeLike", "Shape", "Size"))
+#: Comparisons, and what joins them.
+COMPARES = frozenset(("And", "Equal", "Greater", "GreaterOrEqual", "Less", "LessOrEqual", "Not", "Or", "Xor"))
+_COMPUTES = frozenset(
+    (
+        *("Abs", "Add", "Cast", "CastLike", "Cos", "Div", "MatMul", "Mod", "Mul", "Neg", "Pow", "Range", "Reciprocal"),
+        *("ReduceL1", "ReduceL2", "ReduceMean", "ReduceProd", "ReduceSum", "Sin", "Sqrt", "Sub"),
+    )
+)
+#: Operators whose results on constants are computed when the file is read.
+FOLDED = MOVES | GROWS | STEPS | LIBRARIES | SHAPES | COMPARES | _COMPUTES
 #: Results are no larger than the operands spread over each other.
-_SPREAD = frozenset(
-    (
-        "Add",
-        "And",
-        "Div",
-        "Equal",
-        "Expand",
-        "Greater",
-        "GreaterOrEqual",
-        "Less",
-        "LessOrEqual",
-        "Max",
-        "Min",
-        "Mod",
-        "Mul",
-        "Or",
-        "Pow",
-        "Sub",
-        "Where",
-        "Xor",
-    )
-)
-#: Results are no larger than the operands together.
-_PLAIN = frozenset(
-    (
-        "Abs",
-        "Cast",
-        "CastLike",
-        "Ceil",
-        "Clip",
-        "Concat",
-        "Cos",
-        "Erf",
-        "Exp",
-        "EyeLike",
-        "Flatten",
-        "Floor",
-        "Identity",
-        "Log",
-        "Neg",
-        "Not",
-        "Reciprocal",
-        "ReduceL1",
-        "ReduceL2",
-        "ReduceMax",
-        "ReduceMean",
-        "ReduceMin",
-        "ReduceProd",
-        "ReduceSum",
-        "Relu",
-        "Reshape",
-        "Round",
-        "ScatterElements",
-        "ScatterND",
-        "Shape",
-        "Sigmoid",
-        "Sign",
-        "Sin",
-        "Size",
-        "Slice",
-        "Split",
-        "Sqrt",
-        "Squeeze",
-        "Tanh",
-        "Transpose",
-        "Trilu",
-        "Unsqueeze",
-    )
-)
-_GROWING = frozenset(("ConstantOfShape", "Gather", "MatMul", "Range", "Tile"))
-FOLDED = _SPREAD | _PLAIN | _GROWING
+_SPREAD = (COMPARES - {"Not"}) | {"Add", "Div", "Expand", "Max", "Min", "Mod", "Mul", "Pow", "Sub", "Where"}
 
 
 def _size(kind: str, node: onnx.NodeProto, values: Sequence[np.ndarray]) -> float:
@@ -116,12 +71,7 @@ def _size(kind: str, node: onnx.NodeProto, values: Sequence[np.ndarray]) -> floa
 
 
 def _refuse_unlike(node: onnx.NodeProto, values: Sequence[np.ndarray]) -> None:
-    """Refuse nodes that the reference operators compute otherwise than the format says.
-
-    Raises:
-        InputError: Numbers are scattered by an operation, taken backwards from before the first, or their sizes are
-            summed over no axis.
-    """
+    """Raise InputError for nodes that the reference operators compute otherwise than the format says."""
     fix = "fold constants when exporting"
     for attribute in node.attribute:
         if attribute.name == "reduction" and attribute.s not in (b"", b"none"):

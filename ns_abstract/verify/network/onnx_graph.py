@@ -94,7 +94,7 @@ _BY_ITEM = frozenset(
             "Pad",
             "Relu",
         ),
-        *("Reshape", "Resize", "Selu", "Sigmoid", "Softmax", "Softplus", "Sub", "Tanh", "Upsample"),
+        *("Relu", "Reshape", "Resize", "Selu", "Sigmoid", "Softmax", "Softplus", "Sub", "Tanh", "Upsample"),
     )
 )
 
@@ -213,11 +213,7 @@ class OnnxReader:
         return value.name, TensorValue(0, (1, *sizes[1:]))
 
     def _check_levels(self, name: str, field: str, asked: ReadRequest) -> None:
-        """Arithmetic of integers wraps around and cuts off: a uint8 input may be moved, and then made a float.
-
-        Raises:
-            InputError: Something else is done with it, or no whole numbers are given.
-        """
+        """Refuse a uint8 input that is computed with before it is made a float, or that is given no whole numbers."""
         if not asked.whole_numbers:
             fix = 'for pictures: write "range": [0, 255] alone in preprocess; else export with a float input'
             raise InputError("is a uint8 tensor", file=self.path, field=field, fix=fix)
@@ -261,10 +257,9 @@ class OnnxReader:
         return self.builder.network(self.values[name].index, name, self.whole_numbers)
 
     def _chosen(self, asked: str | None) -> str:
-        """The name of the output that is read: the one asked for, or the only one.
+        """The name of the output that is read: the one asked for, or the only one of scores.
 
-        Outputs are never joined: a label would count through all of them. Those that are no scores, such as masks
-        and indices, are read only where they are asked for.
+        Outputs are never joined: a label would count through all of them. Masks and indices are no scores.
         """
         shapes, beside = {}, []
         for value in self.graph.output:

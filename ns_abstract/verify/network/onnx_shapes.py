@@ -12,11 +12,7 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network.contractions import concatenated
 from ns_abstract.verify.network.graph import item
 from ns_abstract.verify.network.interpolation import interpolation
-from ns_abstract.verify.network.onnx_arithmetic import (
-    broadcast,
-    contraction_operand,
-    operand,
-)
+from ns_abstract.verify.network.onnx_arithmetic import broadcast, contraction_operand, operand
 from ns_abstract.verify.network.onnx_graph import Attributes, OnnxReader, Rule, TensorValue
 
 
@@ -31,7 +27,7 @@ def _moved(r: OnnxReader, node: onnx.NodeProto, value: TensorValue, places: np.n
         raise InputError(f"nothing is left of {item(value.whole)}", fix="check the constants")
     index = value.index
     if places.size != math.prod(value.whole) or not np.array_equal(places.reshape(-1), np.arange(places.size)):
-        index = r.builder.rearranged(index, places.reshape(TensorValue(0, places.shape or (1,)).item))
+        index = r.builder.gather(index, places.reshape(TensorValue(0, places.shape or (1,)).item))
     r.result(node, index, places.shape or (1,), output)
 
 

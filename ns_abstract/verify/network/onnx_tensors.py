@@ -132,11 +132,7 @@ def _give_defaults(model: onnx.ModelProto) -> None:
 
 
 class StoredTensors:
-    """Reads the tensors of one model, also from files beside it.
-
-    Args:
-        path: The model.
-    """
+    """Reads the tensors of one model, also from files beside it."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -144,11 +140,7 @@ class StoredTensors:
         self._taken = 0
 
     def array(self, tensor: onnx.TensorProto, field: str) -> np.ndarray:
-        """A stored constant.
-
-        Raises:
-            InputError: It claims more than is stored, or cannot be used.
-        """
+        """A stored constant; InputError if it claims more than is stored, or cannot be used."""
         count = 1
         for size in tensor.dims:
             if size < 0:

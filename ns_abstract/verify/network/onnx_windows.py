@@ -9,9 +9,7 @@ import onnx
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network.graph import item
-from ns_abstract.verify.network.onnx_arithmetic import (
-    intervals_of,
-)
+from ns_abstract.verify.network.onnx_arithmetic import intervals_of
 from ns_abstract.verify.network.onnx_graph import Attributes, OnnxReader, Rule
 
 #: The operator set since which a mean of a window counts its pads, and not what lies past them.

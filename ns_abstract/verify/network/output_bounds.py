@@ -23,8 +23,7 @@ class ShiftedRows(NamedTuple):
 
     Attributes:
         stored: [k, n] of the type of rows.
-        missing: [m, k] what the numbers that are not stored may be, and the rounding of ``offset``.
-        offset: [m, k].
+        missing, offset: [m, k] what the numbers that are not stored may be, and rounding; the offset.
     """
 
     stored: Floats
@@ -37,13 +36,7 @@ class ShiftedRows(NamedTuple):
 
 
 class OutputRows:
-    """Bounds linear functions of the outputs once all intermediate bounds are there.
-
-    Args:
-        intermediate: What is known of the nodes.
-        backward: Passes rows back over it.
-        ascent: Chooses lines and multipliers for them.
-    """
+    """Bounds linear functions of the outputs once all intermediate bounds are there."""
 
     def __init__(self, intermediate: IntermediateBounds, backward: BackwardPass, ascent: RowAscent) -> None:
         self.intermediate, self.network, self.backward = intermediate, intermediate.network, backward

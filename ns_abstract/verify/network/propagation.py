@@ -36,12 +36,9 @@ from ns_abstract.verify.network.sparse_layers import Variance
 
 
 class ForwardPropagation:
-    """Propagates forms through single nodes.
+    """Propagates forms through single nodes; rows that pass the nodes find lines and rounding in ``intermediate``.
 
-    Args:
-        intermediate: What is known so far; rows that pass the nodes find lines and rounding there.
-        sharing: References, sizes and slopes of other cells.
-        chooses: Whether rows of outputs choose slopes of their own (N14).
+    ``sharing``: references, sizes and slopes of other cells. ``chooses``: whether rows of outputs choose slopes (N14).
     """
 
     def __init__(self, intermediate: IntermediateBounds, sharing: CoefficientSource, chooses: bool) -> None:

@@ -59,9 +59,8 @@ class MaxPoolPlanes(NamedTuple):
 class ReusedRelaxation(NamedTuple):
     """The relaxation of an activation around slopes that another cell's coefficients use (N15).
 
-    Attributes:
-        lines: [6, m, C, H, W] float32 as `pass_activation` takes them.
-        tilts: [2, m, d, n] slopes in the parameters of what is between the offsets, for rows of either sign.
+    ``lines`` [6, m, C, H, W] as `pass_activation` takes them; ``tilts`` [2, m, d, n] slopes, in the parameters, of what
+    is between the offsets, for rows of either sign.
     """
 
     lines: np.ndarray
@@ -73,8 +72,7 @@ class Relaxations:
     """The relaxations of all nodes for coefficients of one float type, and that type's own rounding (N2).
 
     Attributes:
-        dtype: Of rows, slopes and offsets.
-        unit: Its unit roundoff.
+        dtype, unit: Of rows, slopes and offsets, and its unit roundoff.
         sums: What their sums of offsets in float64 lose, relatively.
         lines: By activation, [6, m, C, H, W] as `pass_activation` takes them.
         products: By product: the same for its first and its second factor.

@@ -24,7 +24,6 @@ from ns_abstract.verify.network.forms import NodeForm
 from ns_abstract.verify.network.graph import Network
 from ns_abstract.verify.network.layers import LinearLayer, ScaleLayer, Sum, Weighted
 from ns_abstract.verify.network.max_pooling import MaxPool
-from ns_abstract.verify.network.partial_sums import partial_sums
 from ns_abstract.verify.network.sparse_layers import Variance
 
 #: A preference: sums of fewer additions gain too little by their partial sums to pay for them.
@@ -37,12 +36,30 @@ def outward(value: Tensor, side: float) -> Tensor:
     return torch.where(value == 0.0, near, torch.nextafter(near, torch.full_like(near, side * torch.inf)))
 
 
+def partial_sums(count: Tensor | int, peak: Tensor, squares: Tensor, end: Tensor) -> Tensor:
+    """Return an upper bound of the total size of all partial sums, in any order of ``count`` additions (N20).
+
+    ``peak``: the greater of the positive numbers together and the negative ones, or more; ``squares``: the same of
+    their squares; ``end``: the size of the whole sum, or more.
+    """
+    number = torch.as_tensor(count, dtype=torch.float64)
+    root = squares.sqrt() * UP
+
+    def ordered(leaves: Tensor) -> Tensor:
+        """The sum of what one to ``leaves`` numbers of one sign may be together."""
+        # the first few by their squares, the others by all of them
+        few = torch.minimum(leaves, (peak / root).square().nan_to_num(nan=0.0, posinf=0.0).floor())
+        return (2.0 / 3.0 * few * few.sqrt() + few.sqrt()) * root + (leaves - few) * peak
+
+    half = (0.5 * (number + 1.0)).ceil()
+    least = torch.minimum(ordered(number + 1.0), 2.0 * ordered(half) + peak + half * end)
+    return torch.minimum(number * peak, least * UP)
+
+
 class Extremes(NamedTuple):
     """What numbers may grow to where a program groups the scales before a node in another way, [m] or [1] each (N21).
 
-    Attributes:
-        scales: Of products of scales alone, since the last layer of sums or activation.
-        sums: Of those with one layer of sums among them.
+    ``scales``: products of scales alone, since the last layer of sums or activation; ``sums``: with one such layer.
     """
 
     scales: Tensor

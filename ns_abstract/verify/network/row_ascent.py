@@ -28,11 +28,7 @@ _ROWS_OF_A_THREAD = 32
 class RowAscent:
     """Bounds rows with lines and multipliers of their own.
 
-    Args:
-        intermediate: What is known of the nodes.
-        backward: Passes rows back over it.
-        steps: Steps towards the best lines; 0: none. Rows are of the type that the outputs' are.
-        first: The first step's size.
+    ``steps`` towards the best lines, the first of size ``first``; rows are of the type that the outputs' are.
     """
 
     def __init__(

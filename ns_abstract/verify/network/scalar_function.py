@@ -1,4 +1,4 @@
-"""One relaxation for all functions of one number (docs/dev/design.md, N10).
+"""One relaxation for all functions of one number, and their tangents (docs/dev/design.md, N10, N14).
 
 The interval is cut at evenly spaced points and where the function's curvature changes, so that every part has one
 curvature. A line with any slope becomes a sound one by the greatest or least distance of the function
@@ -10,17 +10,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar, NamedTuple
 
 import torch
 from torch import Tensor
 
-from ns_abstract.arithmetic.network_charges import (
-    OWN_FUNCTION,
-)
+from ns_abstract.arithmetic.network_charges import OWN_FUNCTION
 from ns_abstract.verify.network.layers import Activation, LinearRelaxation
-from ns_abstract.verify.network.tangents import Tangents
 
 #: Intervals worked on at a time.
 _TOGETHER = 1 << 13
@@ -34,17 +31,17 @@ _STEPS = 6
 #: A preference: better bounds of the input are asked for where the lines are this part of the width apart.
 _APART = 2.0**-6
 
+#: Halvings of where a tangent may touch; what is off costs its square.
+_HALVINGS = 20
+
 #: A preference: intervals of at most this part of their ends count as points.
 _POINT = 2.0**-36
 
 
 class _SampledFunction(NamedTuple):
-    """Samples of a function at ascending points [K, ...].
+    """Samples z, value, slope [K, ...] of a function at ascending points.
 
-    Attributes:
-        z, value, slope: [K, ...].
-        bend: [K - 1, ...] 1 convex, 0 straight, -1 concave between.
-        size: [...] for the rounding of everything.
+    ``bend`` [K - 1, ...] is 1 where it is convex between, 0 straight, -1 concave; ``size`` is for the rounding.
     """
 
     z: Tensor
@@ -58,18 +55,10 @@ class _SampledFunction(NamedTuple):
 class ScalarFunction(Activation):
     """An activation that is piecewise convex, concave or linear."""
 
-    @property
-    def breaks(self) -> tuple[float, ...]:
-        """Where the curvature changes, growing; kinks and poles are such."""
-        return ()
-
-    @property
-    def bends(self) -> tuple[int, ...]:
-        """Curvature before, between and behind the breaks: 1 convex, 0 straight, -1 concave."""
-        raise AssertionError
-
-    #: Values of the input that are known to be impossible lie below.
-    least_input: ClassVar[float] = -math.inf
+    #: Where the curvature changes, growing; kinks and poles are such.
+    breaks: ClassVar[tuple[float, ...]] = ()
+    #: Curvature before, between and behind the breaks: 1 convex, 0 straight, -1 concave.
+    bends: ClassVar[tuple[int, ...]]
     #: What the error of a computed slope is relative to, beside the slope.
     slope_scale: ClassVar[float] = 1.0
 
@@ -132,8 +121,7 @@ class ScalarFunction(Activation):
 
     def _inside(self, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
         """The interval without what is known to be impossible."""
-        least = self.least_input
-        return (lower, upper) if least == -math.inf else (lower.clamp(min=least), upper.clamp(min=least))
+        return lower, upper
 
     def straight(self, z: Tensor) -> Tensor:
         """The slope at ``z`` of a function without curved parts."""
@@ -223,6 +211,97 @@ class ScalarFunction(Activation):
 
 class LibraryFunction(ScalarFunction):
     """An activation whose float32 evaluation calls a library's exponential, logarithm or error function."""
+
+
+@dataclass(frozen=True)
+class Tangents:
+    """Tangents of a curve, below (``side`` -1) or above (1), that touch a part of the interval that bends that way.
+
+    A tangent is on its side of the part that it touches. If no other part bends that way, the function less the line
+    is most extreme at an end of those, wherever it touches; its offset is taken from there where that is farther out.
+
+    Attributes:
+        curve, side: The function, and on which side of it the lines are.
+        first, last: [...] points between which tangents are on that side as they are; ``first > last`` or NaN: none.
+        lower, upper: [...] the interval.
+        corners, values: [E, ...] ends of all parts, and the function there.
+    """
+
+    curve: ScalarFunction
+    side: float
+    first: Tensor
+    last: Tensor
+    lower: Tensor
+    upper: Tensor
+    corners: Tensor
+    values: Tensor
+
+    @staticmethod
+    def of(curve: ScalarFunction, lower: Tensor, upper: Tensor, side: float) -> Tangents:
+        """The tangents over [lower, upper]."""
+        edges = [lower, *(torch.clamp(lower.new_tensor(b), lower, upper) for b in curve.breaks), upper]
+        first, last = torch.full_like(lower, math.nan), torch.full_like(lower, math.nan)
+        parts = torch.zeros_like(lower)
+        for before, after, bend in zip(edges[:-1], edges[1:], curve.bends, strict=True):
+            if bend == -side:
+                here = after > before
+                first, last = torch.where(here, before, first), torch.where(here, after, last)
+                parts = parts + here
+        first = torch.where(parts == 1.0, first, math.nan)
+        corners = torch.stack([edges[0], edges[-1], *edges[1:-1]])
+        tangents = Tangents(curve, side, first, last, lower, upper, corners, curve.function(corners))
+        # functions without such parts may have no slope
+        return tangents._narrowed() if -side in curve.bends else tangents
+
+    def _narrowed(self) -> Tangents:
+        """With first and last points from which the interval's ends are on the right side."""
+        points = []
+        for start, stop, end, value in (
+            (self.first, self.last, self.lower, self.values[0]),
+            (self.last, self.first, self.upper, self.values[1]),
+        ):
+            wrong = ~self._clear(start, end, value)
+            point = start.clone()
+            at = wrong & ~start.isnan()
+            if bool(at.any()):
+                failing, holding, end, value = start[at], stop[at], end[at], value[at]
+                none = ~self._clear(holding, end, value)
+                for _ in range(_HALVINGS):
+                    middle = 0.5 * (failing + holding)
+                    fine = self._clear(middle, end, value)
+                    failing, holding = torch.where(fine, failing, middle), torch.where(fine, middle, holding)
+                point[at] = torch.where(none, math.nan, holding)
+            points.append(point)
+        return replace(self, first=points[0], last=points[1])
+
+    def _clear(self, t: Tensor, end: Tensor, value: Tensor) -> Tensor:
+        """Whether the tangent at ``t`` is on its side of the function at an end."""
+        return self.side * (self.curve.function(t) + self.curve.slope(t) * (end - t) - value) >= 0.0
+
+    @property
+    def known(self) -> Tensor:
+        """[...] whether there are tangents."""
+        return self.first <= self.last
+
+    def __getitem__(self, at: Tensor) -> Tangents:
+        """Those of some intervals, in one row."""
+        parts = (self.first[at], self.last[at], self.lower[at], self.upper[at])
+        return Tangents(self.curve, self.side, *parts, self.corners[:, at], self.values[:, at])
+
+    def line(self, t: Tensor, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
+        """Slope, a number of ``dtype`` in float64, and offset of the line that touches at or near ``t`` [..., *U].
+
+        Sound for any t of the part that bends towards the side.
+        """
+        value, tangent = self.curve.function(t), self.curve.slope(t)
+        slope = tangent.to(dtype).double()
+        width = self.upper - self.lower
+        touch = self.side * (value - slope * t) + (slope - tangent).abs() * width
+        for corner, height in zip(self.corners, self.values, strict=True):
+            touch = torch.maximum(touch, self.side * (height - slope * corner))
+        far = torch.maximum(self.lower.abs(), self.upper.abs())
+        size = self.values.abs().amax(0) + value.abs() + (slope.abs() + self.curve.slope_scale) * width + OWN_FUNCTION
+        return slope, self.side * (touch + OWN_FUNCTION * (size + slope.abs() * far))
 
 
 def _fields(lines: LinearRelaxation) -> tuple[Tensor, Tensor, Tensor, Tensor]:

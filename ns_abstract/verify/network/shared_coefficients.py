@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,24 +36,13 @@ _NEARLY = 0.25
 
 
 def reusable_anywhere(network: Network) -> bool:
-    """Return whether one cell's coefficients are valid for cells outside it.
-
-    At maxima and products they gather what holds for the cell alone, and where what they are on the way is too much to
-    be kept.
-    """
+    """Return whether one cell's coefficients are valid for cells outside it: no maxima and products, and few."""
     local = any(isinstance(node.layer, (MaxPool, Product)) for node in network.nodes)
     return not local and network.neuron_count <= _MOST_TRACED
 
 
 class SharedCoefficients:
-    """Bounds one cell, and other cells with the backward coefficients of that one.
-
-    Args:
-        network: The network.
-        first: One cell.
-        memory: Bytes to stay within, roughly.
-        arithmetic: As in `ns_abstract.verify.network.bound_outputs`.
-    """
+    """Bounds one cell, and other cells with the backward coefficients of that one, in ``memory`` bytes, roughly."""
 
     @subnormals_kept()
     def __init__(
@@ -72,13 +61,10 @@ class SharedCoefficients:
 
     @subnormals_kept()
     def others(self, images: ImageSets, rows: Any, offset: Float64, *, fresh: bool = False) -> OutputBounds:
-        """Lower bounds of ``rows @ y + offset`` over other cells.
+        """Lower bounds of ``rows @ y + offset`` over other cells, m sets in parameters of their own.
 
-        Args:
-            images: m sets, each in parameters of its own; of images that obey those of the first cell as well unless
-                the network `reusable_anywhere`.
-            rows, offset: As in `ns_abstract.verify.network.bound_outputs`.
-            fresh: Whether all that is open before the last activation or product has rows of the cell's own.
+        Images must obey those of the first cell as well unless the network `reusable_anywhere`. ``fresh``: all that is
+        open before the last activation or product has rows of the cell's own.
         """
         offset = np.asarray(offset, np.float64)
         if not self._first.intermediate.usable[0]:
@@ -189,12 +175,9 @@ class _ReferenceCell(CoefficientSource):
 
 
 class _ReusedBounds(NamedTuple):
-    """Bounds of neurons from stored coefficients: within ``half`` of ``slopes p + middle`` about the reference.
+    """Bounds of neurons from stored coefficients: within ``half`` [m, R] of ``slopes p + middle`` about the reference.
 
-    Attributes:
-        slopes: [m, R, d].
-        middle, half: [m, R].
-        lower, upper: [m, R] what the numbers are at least and at most.
+    Slopes are [m, R, d]; lower and upper [m, R] are what the numbers are at least and at most.
     """
 
     slopes: Float64
@@ -379,13 +362,6 @@ class _ReusingCells(CoefficientSource):
             c[:, at] = np.where(better, center, c[:, at])
             r[:, at] = np.where(better, radius, r[:, at])
             a[:, :, at] = np.where(better[:, None], tilt.transpose(0, 2, 1), a[:, :, at])
-        reused_form = NodeForm(
-            form.reference,
-            torch.from_numpy(c).reshape(shape),
-            torch.from_numpy(a).reshape(form.a.shape),
-            torch.from_numpy(r).reshape(shape),
-            torch.from_numpy(lower).reshape(shape),
-            torch.from_numpy(upper).reshape(shape),
-            form.active,
-        )
-        return self.intermediate.within(reused_form, reused_form.lower, reused_form.upper)
+        c, r, lower, upper = (torch.from_numpy(v).reshape(shape) for v in (c, r, lower, upper))
+        reused = replace(form, c=c, a=torch.from_numpy(a).reshape(form.a.shape), r=r, lower=lower, upper=upper)
+        return self.intermediate.within(reused, reused.lower, reused.upper)

@@ -16,8 +16,7 @@ from ns_abstract.verify.network.coefficients import Floats
 from ns_abstract.verify.network.layers import Activation, LeakyRelu
 from ns_abstract.verify.network.relaxations import Relaxations
 from ns_abstract.verify.network.relu_lines import write_relu_lines
-from ns_abstract.verify.network.scalar_function import ScalarFunction
-from ns_abstract.verify.network.tangents import Tangents
+from ns_abstract.verify.network.scalar_function import ScalarFunction, Tangents
 
 Float64 = NDArray[np.float64]
 Int64 = NDArray[np.int64]

@@ -63,12 +63,10 @@ class SplitNeurons:
 
 @dataclass
 class OptimisedSlopes:
-    """The slopes and multipliers of a cell's coefficients, and the coefficients themselves.
+    """The slopes and multipliers of a cell's coefficients, and these coefficients, by node.
 
-    Attributes:
-        lines: By node: as `pass_activation` wants them, with rows in place of cells.
-        paid: By node: where, and what `SplitNeurons.pay` gives.
-        trace: By node: [R, C, H, W] rows on its output, and on the image (0).
+    ``lines`` are as `pass_activation` wants them, with rows in place of cells; ``paid`` says where, and what
+    `SplitNeurons.pay` gives; ``trace`` [R, C, H, W] has rows on the output, and on the image (0).
     """
 
     lines: dict[int, Float32]
@@ -102,12 +100,10 @@ class _Adam:
 
 
 class DualAscent:
-    """Adam's steps on the lines and multipliers of a cell's rows.
+    """Adam's steps on the lines and multipliers of ``count`` rows of a cell.
 
     Args:
-        choices: What rows may choose, by node.
-        lines: The cell's lines [6, C, H, W], by node.
-        rows: Number of rows.
+        choices, lines: What rows may choose, and the cell's lines [6, C, H, W], by node.
         held: Numbers of the cell whose signs are assumed, by node.
         phases: By node, what rows assume of the neurons of its first choice [R, U]: 1, -1, or 0 for nothing.
         step: The first step.
@@ -160,11 +156,9 @@ class DualAscent:
     def climb(
         self, slopes: Mapping[int, Sequence[Float64]], forces: Mapping[int, Float64], size: Mapping[int, float]
     ) -> None:
-        """Step along derivatives of the bounds, within what parameters and multipliers may be.
+        """Step along derivatives of the bounds, [R, U] by parameters and [R, B] by multipliers, within their limits.
 
-        Args:
-            slopes, forces: Derivatives [R, U] by parameters and [R, B] by multipliers.
-            size: What coefficients of rows on a node are about.
+        ``size``: what coefficients of rows on a node are about.
         """
         for k, own in self.choices.items():
             for number, choice in enumerate(own):

@@ -1,7 +1,4 @@
-"""Sparse linear layers: sparse matrices, pairwise differences, transposed convolutions.
-
-See docs/dev/design.md, N11, N19; the plain ones are in `ns_abstract.verify.network.layers`.
-"""
+"""Sparse matrices, pairwise differences and transposed convolutions as layers (docs/dev/design.md, N11, N19)."""
 
 from __future__ import annotations
 
@@ -28,7 +25,7 @@ from ns_abstract.arithmetic.network_charges import (
 )
 from ns_abstract.verify.network.coefficients import Coefficients, full, grid
 from ns_abstract.verify.network.forms import NodeForm
-from ns_abstract.verify.network.layers import LinearLayer, Weighted
+from ns_abstract.verify.network.layers import LinearLayer, WindowLayer
 
 
 def _none() -> Tensor:
@@ -37,13 +34,7 @@ def _none() -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class SparseMatrix(LinearLayer):
-    """A sparse matrix applied to the flattened item: means over axes, resizing, differences.
-
-    Attributes:
-        to, source: [E] int64 positions in the output and in the input.
-        weight: [E] float64.
-        offset: [*shape] float64 or None.
-    """
+    """A sparse matrix applied to the flattened item: weights [E] float64 from ``source`` [E] to ``to`` [E]."""
 
     to: Tensor = field(default_factory=_none)
     source: Tensor = field(default_factory=_none)
@@ -138,13 +129,10 @@ class Variance(SparseMatrix):
 
 @dataclass(frozen=True, eq=False)
 class ChannelWindows(SparseMatrix):
-    """Weighted sums over windows of neighbouring channels, and an offset.
+    """Weighted sums over windows of neighbouring channels, ``before`` of them before its middle, and an offset.
 
     A program may go from channel to channel, add the one that enters the window and subtract the one that leaves it:
     what that loses is relative to all channels that have left, too (N11).
-
-    Attributes:
-        before: Channels of a window before its middle.
     """
 
     before: int = 0
@@ -161,8 +149,7 @@ class ChannelWindows(SparseMatrix):
 class Resize(SparseMatrix):
     """A resized map: rows and columns are interpolated; programs compute their positions in float32.
 
-    Attributes:
-        rows, columns: [2, out, in] sizes of the weights along an axis, and what they may be off.
+    ``rows``, ``columns`` [2, out, in]: sizes of the weights along an axis, and what they may be off.
     """
 
     rows: Tensor = field(default_factory=_none)
@@ -179,13 +166,7 @@ class Resize(SparseMatrix):
 
 @dataclass(frozen=True, eq=False)
 class PairwiseDifferences(LinearLayer):
-    """``x_j - x_i`` for all i and j along an axis of the item: j is a new last axis; zero where they are the same.
-
-    As a sparse matrix they would take some hundred bytes each.
-
-    Attributes:
-        axis: The axis of the item.
-    """
+    """``x_j - x_i`` for all i and j along an axis of the item: j is a new last axis; zero where they are the same."""
 
     axis: int = 0
     mixes: ClassVar[bool] = True
@@ -222,25 +203,11 @@ class PairwiseDifferences(LinearLayer):
 
 
 @dataclass(frozen=True, eq=False)
-class TransposedConvolution(Weighted):
-    """Two-dimensional transposed convolution; nearest upsampling by whole factors is one.
+class TransposedConvolution(WindowLayer):
+    """Two-dimensional transposed convolution with weights [Cin, Cout / groups, kh, kw]; pads top, left are cut off."""
 
-    Attributes:
-        weight: [Cin, Cout / groups, kh, kw] float64.
-        offset: [Cout] float64 or None.
-        stride, dilation: (rows, columns).
-        pads: top, left; cut from the result.
-        groups: As in ONNX.
-    """
-
-    stride: tuple[int, int] = (1, 1)
-    dilation: tuple[int, int] = (1, 1)
     pads: tuple[int, int] = (0, 0)
     groups: int = 1
-
-    @property
-    def bias(self) -> Tensor | None:
-        return None if self.offset is None else self.offset[:, None, None]
 
     def _spread(self, x: Tensor, weight: Tensor) -> Tensor:
         whole = functional.conv_transpose2d(

@@ -16,12 +16,9 @@ from ns_abstract.verify.network.coefficients import Coefficients, Float64, Int64
 
 @dataclass
 class BackwardBounds:
-    """Concretised bounds of backward coefficients, and the planes they come from.
+    """Concretised bounds [R] of backward coefficients, and their planes below and above [R, 2, d + 1]; NaN if unknown.
 
-    Attributes:
-        plane: [R, 2, d + 1] slopes and offset of a plane below and one above; NaN if unknown.
-        lower, upper: [R]; infinite if unknown.
-        ended: [R] the node at which they ended; 0 is the image.
+    ``ended`` [R] is the node at which they ended; 0 is the image.
     """
 
     plane: Float64
@@ -72,10 +69,8 @@ class BackwardBounds:
 class NeuronTarget(NamedTuple):
     """How tight the bounds of a neuron have to be; plays no part in soundness (N6, N17).
 
-    Attributes:
-        width: How far apart a number's bounds may be; None: its sign is all that is asked.
-        kink: Whether the sign is asked for.
-        cut: Whether a number that is certainly not positive may have any bounds.
+    ``width``: how far apart they may be, None: its sign is all that is asked; ``kink``: whether the sign is asked for;
+    ``cut``: whether a number that is certainly not positive may have any bounds.
     """
 
     width: float | None = None
@@ -87,10 +82,7 @@ class NeuronTarget(NamedTuple):
 class StoppingCriterion:
     """The criterion that stops the backward pass of a neuron before it is at the image.
 
-    Attributes:
-        goal: What is asked for.
-        zero: [R] what a row is where its number is zero.
-        negative: [R] whether a row is its number's negative.
+    ``zero`` [R]: what a row is where its number is zero; ``negative`` [R]: whether a row is its number's negative.
     """
 
     goal: NeuronTarget

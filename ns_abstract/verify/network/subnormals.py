@@ -30,9 +30,7 @@ def _flushed_by_workers() -> bool:
 
 @contextmanager
 def subnormals_kept() -> Iterator[None]:
-    """Keep subnormal numbers in a block, or in a function that it decorates; afterwards the thread is as before.
-
-    Numbers are moved outward to their neighbours, which flushed ones would not be.
+    """Keep subnormal numbers in a block or function, as numbers are moved outward to their neighbours.
 
     Raises:
         InputError: Threads that torch works with flush them.

@@ -20,12 +20,9 @@ def centred(network: Network, image: Tensor) -> Network:
     """Return a network that is equal in real arithmetic, with weighted means written about their values at an image.
 
     ``W x / sum(x)`` is ``m + (W - m) x / sum(x)`` for any m. Bounds of the quotient grow with the size of what is
-    divided, which is about nothing next to the image if m is the value there. The network is the same object if it has
-    no such means, or if a difference of weights is no number of float32.
-
-    Args:
-        network: The network; must not be bounded in float32, where it computes something else.
-        image: [1, *input_shape] float64.
+    divided, which is about nothing next to ``image`` [1, *input_shape] if m is the value there. The network is the same
+    object if it has no such means, or a difference of weights is no float32. It must not be bounded in float32, where
+    it computes something else.
     """
     builder = NetworkBuilder(network.source, network.input_shape)
     values, new_number, changed = [image], [0], False
