@@ -27,8 +27,8 @@ from ns_abstract.io.atomic import write_json
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.version import computed_by
 from ns_abstract.methods.splat.load import load_scene
-from ns_abstract.methods.splat.ply import write_ply
 from ns_abstract.methods.splat.scene import SplatScene
+from ns_abstract.methods.splat.write import write_ply
 from ns_abstract.refine.result import FrameResult
 from ns_abstract.report.export import Results
 from ns_abstract.report.files import IMAGES, load_frame, save_frame

@@ -11,19 +11,18 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.api.assumptions import DEFAULT
-from ns_abstract.api.bounding import OnProgress, bound_frames, listener
+from ns_abstract.api.bounding import OnProgress, bound_alone
 from ns_abstract.api.files import Settings, path_sets
 from ns_abstract.api.job import Job
 from ns_abstract.api.poses import PoseSet, pose_set
 from ns_abstract.api.scenes import Scene, SceneSource, checked_scene
 from ns_abstract.arithmetic.selfcheck import platform_problems
-from ns_abstract.execution.engines import SerialEngine
-from ns_abstract.execution.stopping import interruptible
 from ns_abstract.execution.worker_cache import Recipe
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import CameraPath, PinholeCamera, load_camera_path
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
+from ns_abstract.io.arguments import at_least, positive
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.refine.difference import DifferenceFrame
@@ -325,20 +324,8 @@ def compare(
         arithmetic=arithmetic, seed=seed,
         memory_limit=memory_limit, workers=workers,
     )  # fmt: skip
-    with interruptible() as stop:
-        results = list(
-            bound_frames(
-                job, [0], engine=SerialEngine(), budget=time_budget, target_ratio=target_ratio, stop=stop,
-                on_progress=listener(stop, on_progress),
-            )
-        )  # fmt: skip
-    if not results:
-        if stop():
-            raise KeyboardInterrupt
-        raise InputError("over before one picture was rendered", field="time_budget", fix="give more")
-    result = results[0]
+    result, guarantee, interrupted = bound_alone(job, time_budget, on_progress, target_ratio)
     assert result.largest is not None
-    guarantee = "sampled" if result.problems else job.method.guarantee
     return Comparison(
         result.upper,
         result.witness_upper,
@@ -351,7 +338,7 @@ def compare(
         seconds=result.seconds,
         cell_count=result.cells,
         bounded=result.bounded,
-        interrupted=stop(),
+        interrupted=interrupted,
         assumptions=job.assumptions,
     )
 
@@ -368,7 +355,6 @@ def check_comparison(tolerance: float | None, target_ratio: float, budget: float
 
     if tolerance is not None and not 0.0 <= tolerance <= 1.0:
         raise InputError(f"found {tolerance}", field=name("tolerance"), fix="give a number from 0 to 1")
-    if budget is not None and not 0.0 < budget < float("inf"):
-        raise InputError(f"found {budget}", field=name("time_budget"), fix="give a positive number")
-    if not 1.0 <= target_ratio < float("inf"):
-        raise InputError(f"found {target_ratio}", field=name("target_ratio"), fix="give a number of at least 1")
+    if budget is not None:
+        positive(budget, name("time_budget"))
+    at_least(target_ratio, 1.0, name("target_ratio"))

@@ -9,8 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from ns_abstract.cli.options import EngineOptions, Overrides, Program, ProgramOptions, SceneOverrides, Where
-from ns_abstract.cli.sets import GivenSet, given_set
+from ns_abstract.cli.sets import (
+    EngineOptions,
+    GivenSet,
+    Overrides,
+    Program,
+    ProgramOptions,
+    SceneOverrides,
+    Where,
+    given_set,
+)
 from ns_abstract.io.errors import InputError
 
 if TYPE_CHECKING:

@@ -17,10 +17,11 @@ from ns_abstract.report.files import frame_name, load_frame
 from ns_abstract.report.html import counted, set_of, whole_page
 from ns_abstract.report.picture import (
     GAP_COLORS,
-    bare_axes,
     color_stops,
     heat,
+    panels_figure,
     preview,
+    save_figure,
     to_bytes,
 )
 from ns_abstract.report.record import PAGE_FRAMES, Report, RunRecord
@@ -141,10 +142,7 @@ class ComparisonReport(Report):
 
     def _draw(self, result: FrameResult) -> None:
         figure = difference_figure(result, self._panels(result), str(self.run.scene.get("name", "")), self.tolerance)
-        path = self.folder / frame_name(result.index, "png")
-        write_atomic(
-            path, lambda stream: figure.savefig(stream, format="png", dpi=120, metadata={"Software": "ns_abstract"})
-        )
+        save_figure(self.folder / frame_name(result.index, "png"), figure, 120)
         self._previews[result.index] = self._small(result)
         self._undrawn.discard(result.index)
 
@@ -190,31 +188,17 @@ def difference_figure(
     result: FrameResult, panels: Sequence[tuple[str, np.ndarray, bool]], about: str, tolerance: float | None
 ) -> Figure:
     """The picture of one frame: both scenes at the worst pose, their difference, and the maps, of one colour scale."""
-    from matplotlib.figure import Figure
-
-    height, width = result.upper.shape[:2]
-    side = 2.6
-    figure = Figure(
-        figsize=(len(panels) * side + 1.0, side * min(1.5, max(0.25, height / width)) + 0.9), facecolor="white",
-        layout="constrained",
-    )  # fmt: skip
-    axes: Any = figure.subplots(1, len(panels))
     top = float(result.upper.max()) or 1.0
-    for place, (title, image, hot) in zip(axes, panels, strict=True):
-        place.imshow(
-            image if hot else to_bytes(image), cmap=GAP_COLORS if hot else None, vmin=0.0, vmax=top,
-            interpolation="antialiased",
-        )  # fmt: skip
-        bare_axes(place)
-        place.set_title(title, fontsize=8.5)
-    figure.colorbar(axes[-1].images[0], ax=axes[-1], fraction=0.05, pad=0.02).ax.tick_params(labelsize=7.5)
     figures = difference_figures(result)
     text = (
         f"Frame {result.index}  ·  {about}  ·  largest difference between {number(figures['largest_lower'])} and "
         f"{number(figures['largest_upper'])}"
     )
-    figure.suptitle(text if tolerance is None else f"{text}  ·  tolerance {number(tolerance)}", fontsize=10.5)
-    return figure
+    text = text if tolerance is None else f"{text}  ·  tolerance {number(tolerance)}"
+    pictures = [
+        (title, image, GAP_COLORS, top) if hot else (title, to_bytes(image), None, top) for title, image, hot in panels
+    ]
+    return panels_figure(pictures, text, bars=[len(panels) - 1])
 
 
 _TITLES = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
@@ -15,18 +16,17 @@ from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.refine.protocol import SceneElements
 from ns_abstract.report.cameras import CameraDrawings, cell_cameras, standing
 from ns_abstract.report.figures import number, unit_of_axis
-from ns_abstract.report.html import uri, whole_page
+from ns_abstract.report.html import whole_page
 from ns_abstract.report.outside import SceneDrawing
 from ns_abstract.report.picture import heat, preview, to_bytes
 from ns_abstract.report.run import CommandRun, plain
-from ns_abstract.report.svg import draw_svg
-from ns_abstract.report.verdict_maps import NONE, OPEN, pixels
+from ns_abstract.report.verdict_maps import LEFT, NONE, OPEN, pairs_svg
 
 Row = Mapping[str, Any]
 #: Longest side of pictures on the page, and the difference that its scale ends at.
 _PIXELS, _LARGEST = 384, 0.25
-#: Places along a parameter of a map; pixels of the whole matrix, between its maps and beside them.
-_BINS, _WIDTH, _GAP, _LEFT, _BELOW, _PANEL = 48, 760, 10, 62, 34, 190
+#: Places along a parameter of a map.
+_BINS = 48
 #: Colours of what may have made the photo, and of where the best pose is.
 _POSSIBLE, _BEST = (29, 116, 64), (179, 38, 30)
 
@@ -233,40 +233,27 @@ def pair_svg(entry: Mapping[str, Any], rows: Sequence[Row]) -> Markup | None:
     whole = np.array([[parameters[k][end] for k in free] for end in ("lower", "upper")], np.float64)
     hull = np.array([entry["hull"]["lower"], entry["hull"]["upper"]], np.float64)[:, free]
     best = None if entry["best"] is None else np.array(entry["best"]["pose"], np.float64)[free]
-    d = len(free)
-    panel = min(_PANEL, (_WIDTH - _LEFT - (d - 1) * _GAP) // d)
-    step = panel + _GAP
-    marks = []
-    for i in range(d):
-        for j in range(d):
-            if i == j:
-                continue
-            window = whole if i > j else hull
-            image = _touched(ends[:, :, (j, i)], possible, window[:, (j, i)], None if best is None else best[[j, i]])
-            names = escape(f"{parameters[free[i]]['name']} over {parameters[free[j]]['name']}")
-            what = "the set" if i > j else "the hull"
-            x, y = _LEFT + j * step, 8 + i * step
-            marks.append(
-                f'<image class="pixels" x="{x}" y="{y}" width="{panel}" height="{panel}" preserveAspectRatio="none" '
-                f'href="{uri(pixels(image))}"><title>{what}: {names}</title></image>'
-                f'<rect class="frame" x="{x}" y="{y}" width="{panel}" height="{panel}"/>'
-            )
-    bottom = 8 + d * step - _GAP
-    for k in range(d):
-        p = parameters[free[k]]
-        x, y = _LEFT + k * step, 8 + k * step
+    shown = [parameters[k] for k in free]
+    pictures = {}
+    for i, j in itertools.permutations(range(len(free)), 2):
+        window = whole if i > j else hull
+        image = _touched(ends[:, :, (j, i)], possible, window[:, (j, i)], None if best is None else best[[j, i]])
+        pictures[i, j] = image, "the set" if i > j else "the hull"
+
+    def labels(k: int, x: float, y: float, panel: int, bottom: float) -> list[str]:
+        p = shown[k]
         label = escape(f"{p['name']} ({unit_of_axis(p['unit'])})")
         middle = f'x="{x + 0.5 * panel:.0f}" text-anchor="middle"'
-        marks += [
+        return [
             f'<text {middle} y="{bottom + 13}">{label}</text>',
             f'<text {middle} y="{bottom + 28}">{number(whole[0, k], 3)} to {number(whole[1, k], 3)}</text>',
-            f'<text x="{_LEFT - 4}" y="{y + 0.5 * panel + 4:.0f}" text-anchor="end">{escape(str(p["name"]))}</text>',
+            f'<text x="{LEFT - 4}" y="{y + 0.5 * panel + 4:.0f}" text-anchor="end">{escape(str(p["name"]))}</text>',
             f'<text {middle} y="{y + 0.5 * panel:.0f}">left:</text>',
             f'<text {middle} y="{y + 0.5 * panel + 14:.0f}">{number(hull[0, k], 3)}</text>',
             f'<text {middle} y="{y + 0.5 * panel + 28:.0f}">{number(hull[1, k], 3)}</text>',
         ]
-    title = "What is left over pairs of parameters"
-    return draw_svg(_LEFT + d * step - _GAP + 8, bottom + _BELOW, title, "".join(marks), kind="pairs")
+
+    return pairs_svg("What is left over pairs of parameters", shown, pictures, labels)
 
 
 def _touched(

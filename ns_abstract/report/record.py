@@ -110,37 +110,19 @@ class Report:
 
     Args:
         output_dir: Made if it is absent.
-        keep_stored: See `resume`.
+        keep_stored: Continue in the folder: frames stored with the same fingerprint are kept, asked for or not.
+            Truncated, damaged or foreign frame files are not used; see ``ignored``.
 
     Attributes:
         kept: Numbers of the frames taken over from an earlier run.
         ignored: Stored frames that were not, with the reason, one sentence each.
 
     Raises:
-        InputError: The folder cannot be written.
+        InputError: The folder cannot be written, or its report, which is to be kept, has another fingerprint.
     """
 
     def __init__(self, output_dir: str | os.PathLike[str], run: RunRecord, *, keep_stored: bool = False) -> None:
-        self._start(Path(output_dir), run)
-        self._first_command = first_command(self.folder) if keep_stored else None
-        if keep_stored:
-            self._keep()
-        self._publish(page=True)
-
-    @classmethod
-    def resume(cls, output_dir: str | os.PathLike[str], run: RunRecord) -> Report:
-        """Continue in a folder: frames stored with the same fingerprint are kept, asked for or not.
-
-        A folder without results starts afresh. Truncated, damaged or foreign frame files are not used;
-        see ``ignored``.
-
-        Raises:
-            InputError: The folder's report has another fingerprint, or the folder cannot be written.
-        """
-        return cls(output_dir, run, keep_stored=True)
-
-    def _start(self, folder: Path, run: RunRecord) -> None:
-        self.folder, self.run = folder, run
+        folder = self.folder = Path(output_dir)
         self.kept: list[int] = []
         self.ignored: list[str] = []
         self._entries: dict[int, dict[str, Any]] = {}
@@ -160,6 +142,10 @@ class Report:
             self._present = sorted(path.name for kind in ("npz", "png") for path in folder.glob(f"frame_*.{kind}"))
         except OSError as error:
             raise unwritable(folder, error) from None
+        self._first_command = first_command(self.folder) if keep_stored else None
+        if keep_stored:
+            self._keep()
+        self._publish(page=True)
 
     def _describe(self, run: RunRecord) -> None:
         """Take ``run`` for what report.json and the files of frames say from now on."""
@@ -347,14 +333,14 @@ class Report:
             raise unwritable(self.folder, error) from None
 
     def _draw(self, result: FrameResult) -> None:
-        from ns_abstract.report.picture import previews, save_layer_picture, save_picture
+        from ns_abstract.report.picture import layer_figure, previews, save_figure, save_picture
 
         name = str(self.run.scene.get("name", ""))
         path = self.folder / frame_name(result.index, "png")
         guarantee = short_guarantee(self.run.guarantee, self.run.scene.get("bounded"))
         save_picture(path, result, guarantee=guarantee, about=name, units=ShownUnits.of(self.run.scene))
         for layer in result.layers:
-            save_layer_picture(self.folder / layer_name(result.index, layer), result, layer)
+            save_figure(self.folder / layer_name(result.index, layer), layer_figure(result, layer), 120)
         self._previews[result.index] = previews(result, _PREVIEW_PIXELS)
         self._undrawn.discard(result.index)
 

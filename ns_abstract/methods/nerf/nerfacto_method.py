@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.device import check_device
-from ns_abstract.methods.nerf.hash_bounds.frame import NerfactoFrame
+from ns_abstract.methods.nerf.hash_bounds.bounds import NerfactoFrame
 from ns_abstract.methods.nerf.hash_field import NerfactoScene
 from ns_abstract.methods.nerf.ray_pictures import (
     FieldMethod,
