@@ -398,7 +398,7 @@ def test_stored_frames_are_read_where_their_digests_are_known() -> None:
         if re.search(r"\bload_frame\b", text := path.read_text())
     }
     # these read what the report, or the export's results, have checked
-    checked = {"report/comparison.py": "(Report)", "report/recordings.py": "report.export import Results"}
+    checked = {"report/recordings.py": "report.export import Results"}
     assert readers.keys() == {"report/files.py", "report/record.py", "report/export.py", *checked}
     assert all("frame_digests" in readers[name] for name in ("report/record.py", "report/export.py"))
     assert all(word in readers[name] for name, word in checked.items())

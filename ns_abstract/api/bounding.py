@@ -110,12 +110,8 @@ def bound_part(
 ) -> PartResult | None:
     """Bound one part of a frame on a worker, which keeps the scene open; None if the time ended before any result.
 
-    Args:
-        neighbours: Tasks that share this machine's cores.
-        earlier: What was found of the frame before, where that saves work.
-
-    Raises:
-        InputError: The worker reads other files under the same names than the command did.
+    ``neighbours``: tasks that share this machine's cores. ``earlier``: what was found of the frame before, where that
+    saves work. Raises InputError where the worker reads other files under the same names than the command did.
     """
     use_threads(len(os.sched_getaffinity(0)) // neighbours)
     job = load(recipe)

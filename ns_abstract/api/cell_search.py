@@ -38,6 +38,10 @@ P = TypeVar("P")
 C = TypeVar("C")
 #: A row of ``cells``, JSON read: see `Store.leaves`.
 Row = dict[str, Any]
+#: Seconds between notes of progress, and between reports.
+_TRACE, _REPORT = 1.0, 30.0
+#: Examines cells of a grid of the frame with this number.
+Examine = Callable[[int, CellGrid, tuple[Cell, ...]], BlockResult]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -76,9 +80,7 @@ class Examiner(Protocol):
         """What becomes of cells of the set with this number: verdicts, and smaller cells where there is none.
 
         Depends on the cells alone. "certified" means a proved lower bound above 0 of the margin of every picture.
-
-        Raises:
-            WorkCancelledError: There is no time for it.
+        Raises WorkCancelledError where there is no time for it.
         """
         ...
 
@@ -142,11 +144,7 @@ class CellQuestion(ABC, Generic[P]):
         return iter(())
 
     def check(self, request: Request) -> None:
-        """Refuse what cannot be done, before anything is written.
-
-        Raises:
-            InputError: What and why.
-        """
+        """Refuse what cannot be done, before anything is written. Raises InputError that says what and why."""
 
     def reserved(self, seconds: float) -> float:
         """Seconds of so many for search and report together that are kept for `after`."""
@@ -229,11 +227,7 @@ class CellSearch(Generic[P]):
         self.store: Store
 
     def open(self, *, resume: bool) -> Store:
-        """The store, with the sets begun.
-
-        Raises:
-            InputError: The folder cannot be used.
-        """
+        """The store, with the sets begun. Raises InputError where the folder cannot be used."""
         question = self.question
         fingerprint = question.examiner.fingerprint
         self.store = store = question.store(
@@ -269,12 +263,8 @@ class CellSearch(Generic[P]):
     def run(self, engine: Callable[[ExitStack], Engine], stop: StopRequest, request: Request) -> dict[str, Any]:
         """Search, and write the results as they come; returns the content of report.json.
 
-        Args:
-            engine: Starts the engine, which ends with the stack.
-            stop: Asked at least twice a second.
-
-        Raises:
-            InputError: The folder cannot be used, or the question cannot be asked.
+        ``engine``: starts the engine, which ends with the stack. ``stop``: asked at least twice a second. Raises
+        InputError where the folder cannot be used, or the question cannot be asked.
         """
         question, self.request, self.stop = self.question, request, stop
         question.check(request)
@@ -387,12 +377,6 @@ def result_cells(rows: Mapping[int, list[Row]], make: Callable[..., C], *columns
 def cell_place(cell: Cell, otherwise: str) -> str:
     """A part of a file's name that tells a cell from all others of its set."""
     return "_".join(f"{a}-{b}" for a, b in zip(cell.first, cell.past, strict=True)) or otherwise
-
-
-#: Seconds between notes of progress, and between reports.
-_TRACE, _REPORT = 1.0, 30.0
-#: Examines cells of a grid of the frame with this number.
-Examine = Callable[[int, CellGrid, tuple[Cell, ...]], BlockResult]
 
 
 def periodic_report(

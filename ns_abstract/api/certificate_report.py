@@ -20,12 +20,13 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.report import regions as broken
 from ns_abstract.report import walk
 from ns_abstract.report.cameras import CameraDrawings, cameras_entry, cell_cameras, standing, upward
-from ns_abstract.report.certificate import CertifiedRun, certificate_document
+from ns_abstract.report.certificate import certificate_document, search_figures
 from ns_abstract.report.certificate_page import CertificateDetails, certificate_page
 from ns_abstract.report.figures import ShownUnits
 from ns_abstract.report.outside import SceneDrawing
 from ns_abstract.report.picture import preview
 from ns_abstract.report.regions import FailureRegion, PoseImage
+from ns_abstract.report.run import CommandRun
 from ns_abstract.report.verdict_picture import write_pictures
 from ns_abstract.verify.properties import Claim
 from ns_abstract.verify.store import Store, Tally, fractions
@@ -36,12 +37,17 @@ _EXAMPLES, _IMAGES = 5, 6
 _PIXELS = 256
 #: Cells whose picture the page shows when they are chosen, and its longest side.
 _SEEN, _SEEN_PIXELS = 64, 96
+#: Seconds that a closer look may take; the longest side of its pictures; cells without a verdict that are tried for a
+#: right pose where none is certified.
+SECONDS, _CLOSE_PIXELS, _TRIED = 10.0, 160, 4
+_OVER = ", without pictures: there was no time for them"
+CellRows = Mapping[int, Sequence[Mapping[str, Any]]]
 
 
 class CertificateReport:
     """Writes report.json and report.html of a search."""
 
-    def __init__(self, job: Certification, about: CertifiedRun, search: CellSearch[Any]) -> None:
+    def __init__(self, job: Certification, about: CommandRun, search: CellSearch[Any]) -> None:
         self.job, self.about, self.search = job, about, search
         self.shown: list[dict[str, Any]] = []
         self.seen: dict[tuple[int, int], dict[str, Any]] = {}
@@ -54,18 +60,17 @@ class CertificateReport:
         sets = {frame: self.job.job.pose_sets[frame] for frame in rows}
         cells, left_out = cell_cameras(sets, rows, [name for name, _ in self.job.job.parameters])
         self.cameras = CameraDrawings(cells, left_out, self._standing, self._outside, upward(sets))
+        claim = {
+            "property": self.job.question.source.value,
+            "property_text": self.job.property.sentence(),
+            "network_guarantee": self.job.question.guarantee(self.job.arithmetic),
+            "picture": self.job.picture,
+            "model": self.job.question.describe(),
+        }
         document = certificate_document(
-            self.about,
-            entries,
-            state=state,
-            trace=store.points,
-            seconds=store.seconds,
-            effort=store.effort,
-            reasons=store.reasons,
-            cells_seal={"rows": store.seal.rows, "sum": store.seal.text},
-            scene_margin=self.search.scene_margin,
-            cameras=cameras_entry(cells, left_out),
-        )
+            self.about, claim, entries, search_figures(store), state=state,
+            scene_margin=self.search.scene_margin, cameras=cameras_entry(cells, left_out),
+        )  # fmt: skip
         return document, rows
 
     def write(self, state: str, *, pictures: bool = True) -> dict[str, Any]:
@@ -237,14 +242,6 @@ def _worst(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Falsified cells, worst first; neighbours may share their counterexample, which counts once."""
     broken = sorted((row for row in rows if row["verdict"] == "falsified"), key=_depth)
     return list({tuple(row["counterexample"]): row for row in reversed(broken)}.values())[::-1]
-
-
-#: Seconds that a closer look may take; the longest side of its pictures; cells without a verdict that are tried for a
-#: right pose where none is certified.
-SECONDS, _CLOSE_PIXELS, _TRIED = 10.0, 160, 4
-_OVER = ", without pictures: there was no time for them"
-
-CellRows = Mapping[int, Sequence[Mapping[str, Any]]]
 
 
 class _PoseRenderer:

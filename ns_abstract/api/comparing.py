@@ -103,7 +103,7 @@ class ComparisonJob(Job):
     def recipe(self) -> Recipe[Any]:
         sources = self.source.absolute, self.other.source.absolute
         again = partial(
-            _open, *sources, self.pose_sets, self.tolerance, arithmetic=self._arithmetic, seed=self.seed,
+            _open, *sources, self.pose_sets, self.tolerance, arithmetic=self.arithmetic, seed=self.seed,
             memory_limit=self.memory_limit,
         )  # fmt: skip
         return Recipe(again, self.fingerprint, sources[0].file)
@@ -185,11 +185,7 @@ def _named(other: Scene) -> Iterator[None]:
 
 
 def _check_comparable(scene: Scene, other: Scene, pose_sets: Sequence[PoseBox]) -> None:
-    """Refuse what cannot be compared.
-
-    Raises:
-        InputError: Which, and what to do.
-    """
+    """Refuse what cannot be compared. Raises InputError that says which, and what to do."""
     if scene.rays != other.rays:
         raise InputError(
             "a NeRF and a splat scene have no common bounds",
@@ -226,12 +222,8 @@ def _frame_choice(scene: Scene, other: Scene) -> Assumption:
 def open_comparison(settings: Settings, other: SceneSource, tolerance: float | None = None) -> ComparisonJob:
     """Open the files of a command line.
 
-    Args:
-        other: B.
-        tolerance: See `ComparisonJob`.
-
-    Raises:
-        InputError: A file, a field or an option cannot be used.
+    ``other``: B. ``tolerance``: see `ComparisonJob`. Raises InputError where a file, a field or an option cannot be
+    used.
     """
     scene, second = settings.scene.open(), other.open()
     if second.background is None and scene.background is not None:
@@ -344,11 +336,7 @@ def compare(
 
 
 def check_comparison(tolerance: float | None, target_ratio: float, budget: float | None, prefix: str = "--") -> None:
-    """Refuse numbers that cannot be used.
-
-    Raises:
-        InputError: One of them; options are named with ``prefix``.
-    """
+    """Refuse numbers that cannot be used. Raises InputError: one of them; options are named with ``prefix``."""
 
     def name(word: str) -> str:
         return f"--{word}".replace("_", "-") if prefix else word

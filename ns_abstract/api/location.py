@@ -32,6 +32,7 @@ from ns_abstract.verify.photo import Brightness, Photo
 
 #: Of the search's rules: results of different ones are not mixed.
 _RULES = 4
+_OPTION, _DATA = "--calibrate", "transforms.json"
 
 
 @dataclass(frozen=True)
@@ -182,11 +183,7 @@ class LocateSettings:
 
 
 def open_location(settings: LocateSettings) -> Location:
-    """Open the files of a command line.
-
-    Raises:
-        InputError: A file or a field cannot be used.
-    """
+    """Open the files of a command line. Raises InputError where a file or a field cannot be used."""
     levels = read_photo(settings.image)
     mask = None if settings.mask is None else read_mask(settings.mask, levels.shape[:2])
     job = open_job(settings.files, default=Perturbation())
@@ -210,9 +207,6 @@ def calibrated(scene: Scene, job: Job, options: PhotoOptions) -> tuple[PhotoOpti
         arithmetic=job.arithmetic,
     )
     return replace(options, noise=calibration.noise, outliers=calibration.outliers), calibration
-
-
-_OPTION, _DATA = "--calibrate", "transforms.json"
 
 
 @dataclass(frozen=True)
@@ -316,10 +310,8 @@ def _noise(residuals: np.ndarray, part: float) -> float:
 def training_data(scene: Scene) -> Path:
     """The ``transforms.json`` of the data set that a run was trained on.
 
-    It is looked for where config.yml says, and under the ends of that path beside config.yml and above it.
-
-    Raises:
-        InputError: The scene is no run, or nothing is there.
+    It is looked for where config.yml says, and under the ends of that path beside config.yml and above it. Raises
+    InputError where the scene is no run, or nothing is there.
     """
     file = scene.source.file
     if scene.run_frame is None:

@@ -28,11 +28,7 @@ if TYPE_CHECKING:
 
 
 class Question:
-    """A network and the property to prove of it.
-
-    Raises:
-        InputError: A file or a field cannot be used.
-    """
+    """A network and the property to prove of it. Raises InputError where a file or a field cannot be used."""
 
     #: Pixels that the picture moves by over a first cell: with one parameter, and with more.
     motion = (0.08, 0.5)

@@ -134,12 +134,8 @@ def _without_kernels() -> Iterator[None]:
 def compile_times(job: PathJob, name: str, frame: int) -> list[dict[str, Any]]:
     """Seconds that each kernel of a frame takes to compile in one new process, stage by stage, and all together.
 
-    Args:
-        name: Of the set of poses; see `sets.SETS`.
-
-    Returns:
-        By kernel: its stage, how many functions it is linked from, seconds by the clock, of the processor, and inside
-        LLVM, and what took most of it.
+    ``name``: of the set of poses; see `sets.SETS`. Returns by kernel: its stage, how many functions it is linked from,
+    seconds by the clock, of the processor, and inside LLVM, and what took most of it.
     """
     with _without_kernels(), ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         rows = pool.submit(_measured, job.recipe, pose_set(job, name, frame)).result()

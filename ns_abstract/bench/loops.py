@@ -21,6 +21,22 @@ from ns_abstract.reach.tubes import Dependence, Tube
 
 #: What tubes keep, by how a table calls it.
 _MODES: dict[Dependence, str] = {"kept": "kept", "step": "within a step", "none": "none"}
+#: Seconds between two words of where a search stands.
+_SAID = 10.0
+#: Sets by name, as a perturbation file writes them.
+SETS: dict[str, dict[str, Any]] = {
+    "x": {"translation": {"x": 0.05}},
+    "xyz": {"translation": {"x": 0.05, "y": 0.05, "z": 0.05}},
+    "xyz-small": {"translation": {"x": 0.01, "y": 0.01, "z": 0.01}},
+    "six": {
+        "translation": {"x": 0.005, "y": 0.005, "z": 0.005},
+        "rotation": {"yaw": 0.005, "pitch": 0.005, "roll": 0.005},
+    },
+    "six-wide": {
+        "translation": {"x": 0.05, "y": 0.05, "z": 0.05},
+        "rotation": {"yaw": 0.02, "pitch": 0.02, "roll": 0.02},
+    },
+}
 
 
 class LoopTables(NamedTuple):
@@ -47,10 +63,8 @@ def measure(
 ) -> LoopTables:
     """Search a loop, then attack its certified cells and compare one of them with simulated runs.
 
-    Args:
-        runs: Random runs from the whole initial box, each compared with the tube of its cell; and as many from one
-            cell.
-        marks: Seconds at which the certified fraction is told.
+    ``runs``: random runs from the whole initial box, each compared with the tube of its cell; and as many from one
+    cell. ``marks``: seconds at which the certified fraction is told.
     """
     points: list[ReachProgress] = []
     said(f"searching for {seconds:g} s")
@@ -59,11 +73,8 @@ def measure(
     question = QUESTIONS[job.questions[-1]]
     cells = [cell for cell in result.cells if cell.question == question]
     row: dict[str, Any] = {"question": question, "seconds": result.seconds}
-    for mark in marks:
-        fractions = [getattr(point, question) for point in points if point.seconds <= mark]
-        row[f"at {mark:g} s"] = (
-            getattr(result, question) if result.seconds <= mark else fractions[-1] if fractions else 0.0
-        )
+    told = [(point.seconds, getattr(point, question)) for point in points]
+    row |= _at_marks(marks, told, result.seconds, getattr(result, question))
     said(f"{runs} runs from the whole box")
     row |= _attack(job, result, cells, runs, rng)
     certified = [cell for cell in cells if cell.verdict == "certified"]
@@ -75,6 +86,16 @@ def measure(
     row["violations"] += outside
     row["states compared"] += runs * (job.loop.steps + 1)
     return LoopTables([row], steps)
+
+
+def _at_marks(
+    marks: Sequence[float], told: Sequence[tuple[float, float]], seconds: float, last: float
+) -> dict[str, float]:
+    """The fraction at each of ``marks``, by what was ``told`` (seconds, fraction); after all ``seconds`` the last."""
+    return {
+        f"at {mark:g} s": last if seconds <= mark else next((f for t, f in reversed(told) if t <= mark), 0.0)
+        for mark in marks
+    }
 
 
 def _box(job: LoopJob, cell: ReachCell) -> ParameterBox:
@@ -144,24 +165,6 @@ def _by_step(job: LoopJob, box: ParameterBox, count: int, rng: np.random.Generat
     return rows, outside
 
 
-#: Seconds between two words of where a search stands.
-_SAID = 10.0
-#: Sets by name, as a perturbation file writes them.
-SETS: dict[str, dict[str, Any]] = {
-    "x": {"translation": {"x": 0.05}},
-    "xyz": {"translation": {"x": 0.05, "y": 0.05, "z": 0.05}},
-    "xyz-small": {"translation": {"x": 0.01, "y": 0.01, "z": 0.01}},
-    "six": {
-        "translation": {"x": 0.005, "y": 0.005, "z": 0.005},
-        "rotation": {"yaw": 0.005, "pitch": 0.005, "roll": 0.005},
-    },
-    "six-wide": {
-        "translation": {"x": 0.05, "y": 0.05, "z": 0.05},
-        "rotation": {"yaw": 0.02, "pitch": 0.02, "roll": 0.02},
-    },
-}
-
-
 def curve(
     scene: Scene,
     camera: PinholeCamera,
@@ -208,10 +211,8 @@ def curve(
     effort = certificate.report["effort"]
     bounded = effort["cells_bounded"]
     row: dict[str, Any] = {"set": name, "parameters": len(certificate.parameters), "network": model.stem}
-    for mark in marks:
-        certified = [point.certified for point in points if point.seconds <= mark]
-        done = certificate.seconds <= mark
-        row[f"at {mark:g} s"] = certificate.certified if done else certified[-1] if certified else 0.0
+    told = [(point.seconds, point.certified) for point in points]
+    row |= _at_marks(marks, told, certificate.seconds, certificate.certified)
     return row | {
         "seconds": certificate.seconds,
         "certified": certificate.certified,

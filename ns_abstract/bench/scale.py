@@ -28,6 +28,8 @@ from ns_abstract.refine.engine import RefinementGoal, sampled_gap
 
 #: Width of pictures at which the measured cell is `PART` of the set; it moves wider pictures by as many pixels.
 _WIDTH = 100.0
+#: Width of the measured cell as a part of the set's: about what refinement ends with.
+PART = 1.0 / 32.0
 
 
 def resampled(scene: SplatScene, count: int, seed: int = 0) -> SplatScene:
@@ -106,24 +108,10 @@ def curve(
             refine_seconds = seconds if (count, width) == (counts[-1], widths[-1]) else 0.0
             # a process keeps its peak, so each row has its own
             with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
-                arguments = (
-                    config,
-                    path,
-                    frame,
-                    name,
-                    count,
-                    width,
-                    repeats,
-                    refine_seconds,
-                    gibibytes,
-                    version,
+                yield pool.submit(
+                    _row, config, path, frame, name, count, width, repeats, refine_seconds, gibibytes, version,
                     overrides,
-                )
-                yield pool.submit(_row, *arguments).result()
-
-
-#: Width of the measured cell as a part of the set's: about what refinement ends with.
-PART = 1.0 / 32.0
+                ).result()  # fmt: skip
 
 
 def measure(functions: Sequence[Callable[[], object]], repeats: int) -> np.ndarray:
@@ -152,10 +140,8 @@ def cell_cost(job: PathJob, name: str, frame: int, repeats: int) -> dict[str, ob
     """Times of the render, of a cell of a first cover and of a cell inside a bounded one, and their ratios.
 
     The first leaves out what a run to the usual goal leaves out of its cover, the second nothing, as in refinement.
-
-    Returns:
-        Milliseconds (medians), and medians of the ratios to the render: each of ``repeats`` times the three follow one
-        another, so that they see the machine at the same speed.
+    Returns milliseconds (medians), and medians of the ratios to the render: each of ``repeats`` times the three follow
+    one another, so that they see the machine at the same speed.
     """
     poses = pose_set(job, name, frame)
     splat = splat_of(job)

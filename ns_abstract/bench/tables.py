@@ -61,12 +61,7 @@ class Table:
 
 def save_curves(path: Path, results: Mapping[str, FrameResult]) -> None:
     """Left: ratio - 1 against seconds, log-log. Right: outer (solid) and witness (dashed) MPG."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11.0, 4.4), layout="constrained")
-    FigureCanvasAgg(figure)
-    left, right = figure.subplots(1, 2)
+    figure, left, right = _two_panels()
     for label, result in results.items():
         points = [p for p in result.trace if p.mpg_witness > 0.0 and p.seconds > 0.0]
         seconds = [p.seconds for p in points]
@@ -81,12 +76,7 @@ def save_curves(path: Path, results: Mapping[str, FrameResult]) -> None:
 
 def save_scale(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Left: nanoseconds by Gaussian-pixel pair against Gaussians, by size of the picture. Right: peak memory."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11.0, 4.4), layout="constrained")
-    FigureCanvasAgg(figure)
-    left, right = figure.subplots(1, 2)
+    figure, left, right = _two_panels()
     for size in dict.fromkeys(row["size"] for row in rows):
         same_size = [row for row in rows if row["size"] == size]
         counts = [row["Gaussians"] for row in same_size]
@@ -97,6 +87,16 @@ def save_scale(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     right.set(xlabel="Gaussians", ylabel="peak memory of the process, GiB")
     _finish(left, right)
     figure.savefig(path, dpi=130)
+
+
+def _two_panels() -> Any:
+    """A figure and its two axes."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11.0, 4.4), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, *figure.subplots(1, 2)
 
 
 def _finish(*panels: Any) -> None:

@@ -132,9 +132,7 @@ def show_log() -> None:
 def parse(read: Callable[[], Any]) -> Any:
     """Call ``read``, which parses the command line with tyro, and turn its complaint into one line.
 
-    Raises:
-        InputError: The options cannot be used.
-        SystemExit: Help was asked for and printed.
+    Raises InputError where the options cannot be used. Raises SystemExit: help was asked for and printed.
     """
     empty = [position for position, word in enumerate(sys.argv[1:], 1) if word == "" or word.endswith("=")]
     if empty:

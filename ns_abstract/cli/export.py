@@ -6,7 +6,7 @@ import re
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, Union
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union
 
 import tyro
 
@@ -217,14 +217,11 @@ _PARTS = {
     "statement": Statement, "ply": Ply, "vnnlib": ExportVnnLib, "occupancy": Occupancy, "schemas": Schemas,
 }  # fmt: skip
 Command = Union[tuple(Annotated[kind, tyro.conf.subcommand(name)] for name, kind in _PARTS.items())]  # noqa: UP007
-Options = (
-    Npz | Png | Mp4 | Exr | Safetensors | Rrd | Viser | Statement | Ply | ExportVnnLib | Occupancy | Schemas
-)  # fmt: skip
 
 
-def export(options: Options) -> int:
+def export(options: Any) -> int:
     """Run the command; returns the exit code."""
-    target = getattr(options, "output_dir", None) or options.output_filename  # pyright: ignore[reportAttributeAccessIssue]
+    target = getattr(options, "output_dir", None) or options.output_filename
     try:
         if hasattr(options, "output_filename"):
             target.parent.mkdir(parents=True, exist_ok=True)

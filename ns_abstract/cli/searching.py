@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,7 +21,7 @@ from ns_abstract.api.sequence import open_sequence
 from ns_abstract.cli.common import SignalStop, plain_console
 from ns_abstract.cli.sets import stated
 from ns_abstract.execution.engine_options import EngineOptions
-from ns_abstract.report.certificate import CertifiedRun, coverage
+from ns_abstract.report.certificate import coverage
 from ns_abstract.report.figures import listed, percent
 from ns_abstract.report.progress import ProgressBar
 from ns_abstract.verify.store import Store
@@ -147,12 +147,12 @@ def _search(
     return document
 
 
-def _introduce(console: Console, job: Certification, about: CertifiedRun) -> None:
+def _introduce(console: Console, job: Certification, plan: Sequence[str]) -> None:
     method = job.job.method
-    console.print(f"{method.name}: {method.content}; {job.question.name}; {about.sentence}")
+    console.print(f"{method.name}: {method.content}; {job.question.name}; {job.property.sentence()}")
     for warning in job.job.warnings:
         console.print(f"warning: {warning}")
-    for note in about.plan:
+    for note in plan:
         console.print(f"  {note}")
 
 
@@ -166,7 +166,7 @@ def certify_path(options: Certify, stop: SignalStop) -> bool:
         check_network_memory(job, options.memory_limit, workers)
         frames = check_frames(options.frames, job.job.frame_count)
         question = CertificateQuestion(job, frames, stated(options), ("ns-abstract-certify", *sys.argv[1:]))
-    _introduce(console, job, question.about)
+    _introduce(console, job, question.about.plan)
 
     budget = options.time_budget or _CERTIFY_SECONDS
     document = searched(

@@ -15,6 +15,13 @@ from ns_abstract.methods.program_options import ProgramOptions
 
 #: Keys of a perturbation file, in the order of the options' numbers.
 _AXES = {"translation": ("x", "y", "z"), "rotation": ("yaw", "pitch", "roll")}
+_BESIDE = tyro.conf.arg(name="")
+#: What the user says of the scene in place of its files.
+SceneOverrides = Annotated[Overrides, _BESIDE, tyro.conf.FlagCreatePairsOff]
+#: The program that draws the scene.
+Program = Annotated[ProgramOptions, _BESIDE]
+#: Where the work is done.
+Where = Annotated[EngineOptions, _BESIDE]
 
 
 @dataclass(kw_only=True)
@@ -54,15 +61,6 @@ def given_set(options: GivenSet) -> dict[str, Any] | None:
             raise InputError(f"found {len(radii)} numbers", field=f"--{name}", fix=fix)
         perturbation[name] = dict(zip(axes, radii if len(radii) == 3 else radii * 3, strict=True))
     return perturbation
-
-
-_BESIDE = tyro.conf.arg(name="")
-#: What the user says of the scene in place of its files.
-SceneOverrides = Annotated[Overrides, _BESIDE, tyro.conf.FlagCreatePairsOff]
-#: The program that draws the scene.
-Program = Annotated[ProgramOptions, _BESIDE]
-#: Where the work is done.
-Where = Annotated[EngineOptions, _BESIDE]
 
 
 def stated(options: Any) -> dict[str, Any]:

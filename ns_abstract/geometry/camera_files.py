@@ -65,11 +65,8 @@ def inria_cameras(root: list[dict[str, Any]]) -> Iterator[FileCamera]:
 def transforms_cameras(root: Mapping[str, Any], frame: DataparserTransform | None) -> Iterator[FileCamera]:
     """The cameras of a data set's ``transforms.json``, in the frame of a run that was trained on it.
 
-    Args:
-        frame: The run's; None: the scene is no run.
-
-    Raises:
-        InputError: There is no run, a camera is not a plain perspective one, or a field is missing.
+    ``frame``: the run's; None: the scene is no run. Raises InputError where there is no run, a camera is not a plain
+    perspective one, or a field is missing.
     """
     if frame is None:
         problem = "is a data set's transforms.json, and the scene is no run whose frame could be told from it"

@@ -68,11 +68,9 @@ class PinholeCamera:
     def rescaled(self, downscale_factor: float) -> PinholeCamera:
         """The camera of an image ``downscale_factor`` times smaller; sides are rounded down.
 
-        Uses the arithmetic of nerfstudio's ``Cameras.rescale_output_resolution``, which holds
-        the factor and the principal point in float32, so that sizes agree with ns-render.
-
-        Raises:
-            InputError: The factor is not a positive finite number, or a side leaves 1..16384.
+        Uses the arithmetic of nerfstudio's ``Cameras.rescale_output_resolution``, which holds the factor and the
+        principal point in float32, so that sizes agree with ns-render. Raises InputError where the factor is not a
+        positive finite number, or a side leaves 1..16384.
         """
         field = "--downscale-factor"
         if not is_number(downscale_factor) or not downscale_factor > 0:
@@ -204,11 +202,7 @@ def _photo_path(file_cameras: Iterable[FileCamera], source: str, downscale_facto
 
 
 def focal_pixels(value: Any, field: str) -> float:
-    """``value`` as a focal length in pixels.
-
-    Raises:
-        InputError: It is no moderate number above 0.
-    """
+    """``value`` as a focal length in pixels. Raises InputError where it is no moderate number above 0."""
     if not is_moderate(value) or not value > 0:
         raise InputError(f"found {show(value)}", field=field, fix="write a number of pixels above 0")
     return float(value)
@@ -359,11 +353,7 @@ def _keyframe_matrix(value: Any, field: str) -> Any:
 
 
 def checked_side(value: Any, name: str) -> int:
-    """A number of pixels, from the field ``name``.
-
-    Raises:
-        InputError: It is no integer from 1 to `SIDE_LIMIT`.
-    """
+    """A number of pixels, from the field ``name``. Raises InputError where it is no integer from 1 to `SIDE_LIMIT`."""
     # The viewer may write 1080.0.
     if not is_number(value) or value != math.floor(value) or not 1 <= value <= SIDE_LIMIT:
         problem = "missing" if value is None else f"found {show(value)}"

@@ -92,11 +92,7 @@ def _template(name: str, **values: Any) -> str:
 
 
 def _run_folder(folder: Path, method: str, timestamp: str, experiment_name: str) -> Path:
-    """Make the folder of a run.
-
-    Raises:
-        InputError: ``timestamp`` or ``experiment_name`` is not a plain folder name.
-    """
+    """Make the folder of a run. Raises InputError: ``timestamp`` or ``experiment_name`` is not a plain folder name."""
     for field, value in (("timestamp", timestamp), ("experiment_name", experiment_name)):
         if not value or value in {".", ".."} or any(c in value for c in "/\\\0\n"):
             raise InputError(f"{value!r} is not a folder name", fix="use letters, digits, _ and -", field=field)
@@ -123,10 +119,8 @@ def background_name(colour: NDArray[np.float32]) -> str:
 def optimizer_lines(kind: str, eps: str, groups: Mapping[str, tuple[str, tuple[str, str, int] | None]]) -> str:
     """What config.yml says of the optimizers, from "optimizers:" to the line before "output_dir:".
 
-    Args:
-        kind: "Adam" or "RAdam".
-        groups: Learning rate of each group of parameters, and of its schedule the last rate, the first one and the
-            steps of warming up; numbers as YAML spells them.
+    ``kind``: "Adam" or "RAdam". ``groups``: learning rate of each group of parameters, and of its schedule the last
+    rate, the first one and the steps of warming up; numbers as YAML spells them.
     """
     lines = ["optimizers:"]
     target = f"&id001 !!python/name:torch.optim.{kind.lower()}.{kind} ''"

@@ -247,11 +247,8 @@ def target_class(run: RunConfig) -> str:
 def read_dataparser_transform(run: RunConfig) -> tuple[DataparserTransform, tuple[str, ...]]:
     """Read ``dataparser_transforms.json`` beside ``config.yml``.
 
-    Returns:
-        The transform, and notes about what was assumed: without the file it is the identity.
-
-    Raises:
-        InputError: The file exists and is not what Nerfstudio writes.
+    Returns the transform, and notes about what was assumed: without the file it is the identity. Raises InputError
+    where the file exists and is not what Nerfstudio writes.
     """
     path = run.folder / TRANSFORMS_NAME
     if not os.path.lexists(path):
@@ -288,16 +285,9 @@ def read_dataparser_transform(run: RunConfig) -> tuple[DataparserTransform, tupl
 def read_model_state(path: Path) -> dict[str, Any]:
     """The model's tensors (`StoredTensor`) in a checkpoint, read without running code in the file.
 
-    Args:
-        path: A ``step-*.ckpt`` file.
-
-    Returns:
-        The state of the model: keys as in ``Model.state_dict()``, that is without the
-        ``_model.`` prefix of the pipeline and the ``module.`` of distributed training.
-
-    Raises:
-        InputError: The file is damaged, holds other Python objects than tensors and plain
-            values, or has no ``pipeline``.
+    ``path``: a ``step-*.ckpt`` file. Returns the state of the model: keys as in ``Model.state_dict()``, that is without
+    the ``_model.`` prefix of the pipeline and the ``module.`` of distributed training. Raises InputError where the file
+    is damaged, holds other Python objects than tensors and plain values, or has no ``pipeline``.
     """
     root = read_checkpoint(path)
     pipeline = root.get("pipeline") if isinstance(root, dict) else None

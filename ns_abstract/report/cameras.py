@@ -73,12 +73,8 @@ def cell_cameras(
 ) -> tuple[list[CellCamera], int]:
     """Cameras at the middles of cells, the widest cells first.
 
-    Args:
-        rows: By frame, cells: lower, upper, verdict.
-        names: Of all parameters, in the order of the cells' ends.
-
-    Returns:
-        At most `MOST` cameras, some of every verdict, and the number of cells that are left out.
+    ``rows``: by frame, cells: lower, upper, verdict. ``names``: of all parameters, in the order of the cells' ends.
+    Returns at most `MOST` cameras, some of every verdict, and the number of cells that are left out.
     """
     keys = [(frame, k) for frame, frame_rows in rows.items() for k in range(len(frame_rows))]
     width = np.concatenate(

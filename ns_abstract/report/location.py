@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from html import escape
 from typing import Any
 
@@ -47,49 +46,30 @@ _HEADINGS = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class LocatedRun(CommandRun):
-    """What a command looked for.
-
-    Attributes:
-        photo: Its file, or None.
-        levels: [H, W, 3] uint8 the photo.
-        noise, outliers: What a picture may miss.
-        counted: Number of pixels that count.
-        allowed: Number of them that may show anything.
-        more: What else report.json says of the photo: "brightness", "calibration".
-    """
-
-    photo: str | None
-    levels: NDArray[np.uint8]
-    noise: float
-    outliers: float
-    counted: int
-    allowed: int
-    more: Mapping[str, Any]
-
-
 def location_document(
-    run: LocatedRun,
+    run: CommandRun,
+    photo: Mapping[str, Any],
     parameters: Sequence[tuple[str, str]],
     sets: Mapping[int, PoseBox],
     rows: Mapping[int, Sequence[Row]],
     poses: Mapping[int, Sequence[Any]],
+    figures: Mapping[str, Any],
     *,
     state: str,
-    seconds: float,
-    effort: Mapping[str, float],
-    trace: Sequence[Mapping[str, float]],
 ) -> dict[str, Any]:
     """Content of report.json.
 
     Args:
+        run: The command's run.
+        photo: The photo and what a picture may miss of it: keys of report.json.
         parameters: Names and units of the table ``parameters``.
+        sets: By frame, the poses.
+        rows: By frame, the cells.
         poses: Rendered poses by frame, the best first, with ``values`` and ``outliers``.
+        figures: See `ns_abstract.report.certificate.search_figures`.
         state: "done", "budget" or "interrupted".
-        seconds: Wall time, earlier runs included.
     """
-    frames = [_frame(run, parameters, frame, sets[frame], rows[frame], poses[frame]) for frame in sorted(rows)]
+    frames = [_frame(parameters, frame, sets[frame], rows[frame], poses[frame]) for frame in sorted(rows)]
     hulls = [entry["hull"] for entry in frames if entry["hull"] is not None]
     bests = [dict(entry["best"], frame=entry["index"]) for entry in frames if entry["best"] is not None]
     best = min(bests, key=lambda entry: entry["outliers"], default=None)
@@ -102,7 +82,7 @@ def location_document(
     if not hulls:
         answer = "none"
     else:
-        answer = "possible" if best is not None and best["outliers"] <= run.allowed else "unknown"
+        answer = "possible" if best is not None and best["outliers"] <= photo["allowed"] else "unknown"
     return plain(
         run.head()
         | {
@@ -110,25 +90,17 @@ def location_document(
             "possible_volume": sum(entry["possible_volume"] for entry in frames) / max(1, len(frames)),
             "hull": hull,
             "best": best,
-            "photo": {
-                "file": run.photo,
-                "noise": run.noise,
-                "outliers": run.outliers,
-                "counted": run.counted,
-                "allowed": run.allowed,
-                **run.more,
-            },
+            "photo": photo,
             "frames": frames,
-            "trace": [{"seconds": p["seconds"], "searched_left": 1.0 - p["certified"]} for p in trace],
-            "seconds": seconds,
-            "effort": effort,
+            "trace": [{"seconds": p["seconds"], "searched_left": 1.0 - p["certified"]} for p in figures["trace"]],
+            "seconds": figures["seconds"],
+            "effort": figures["effort"],
         }
         | run.tail(state, METRICS)
     )
 
 
 def _frame(
-    run: LocatedRun,
     parameters: Sequence[tuple[str, str]],
     index: int,
     poses: PoseBox,

@@ -38,6 +38,10 @@ _PANEL_PIXELS_MAX = 1000
 _MARGIN, _GUTTER, _LABEL, _LINE, _BAR, _BAR_TEXT = 0.14, 0.12, 0.24, 0.19, 0.09, 0.50
 _INK, _SOFT, _WARN = "#1a1a1a", "#555555", "#a32a12"
 _TITLE_POINTS, _TEXT_POINTS, _LABEL_POINTS, _TICK_POINTS = 10.5, 8.0, 8.5, 7.5
+#: Columns of white between two pictures, and most planes that are drawn.
+_GAP, _MOST = 2, 3
+#: What pixels that are not read are darkened to, and the colours of planes.
+_DIM, _MAP = 0.35, "viridis"
 
 
 def to_bytes(image: NDArray[np.floating]) -> NDArray[np.uint8]:
@@ -101,11 +105,8 @@ def frame_figure(
 ) -> Figure:
     """The picture of one frame: lower | upper | gap heat map with colour bar | one render.
 
-    Panels show whole pixels, several screen pixels each for small images.
-
-    Args:
-        guarantee: Shown in the title; see `ns_abstract.report.figures.short_guarantee`.
-        about: More for the title, such as the scene's name.
+    Panels show whole pixels, several screen pixels each for small images. ``guarantee``: shown in the title; see
+    `ns_abstract.report.figures.short_guarantee`. ``about``: more for the title, such as the scene's name.
     """
     from matplotlib.figure import Figure
 
@@ -225,11 +226,7 @@ def panels_figure(
 
 
 def save_figure(path: str | os.PathLike[str], figure: Figure, dpi: int | None = None) -> None:
-    """Write a figure as PNG, whole or not at all.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
+    """Write a figure as PNG, whole or not at all. Raises OSError where the file cannot be written."""
     about = {"Software": "ns_abstract"}
     write_atomic(path, lambda stream: figure.savefig(stream, format="png", dpi=dpi or "figure", metadata=about))
 
@@ -324,12 +321,6 @@ def previews(result: FrameResult, side: int) -> Mapping[str, bytes]:
             images[f"{name}_{kind}"] = heat(array, whole, _LAYER_COLORS)
         images[f"{name}_gap"] = heat(length, float(length.max(initial=0.0)))
     return {name: preview(image, side) for name, image in images.items()}
-
-
-#: Columns of white between two pictures, and most planes that are drawn.
-_GAP, _MOST = 2, 3
-#: What pixels that are not read are darkened to, and the colours of planes.
-_DIM, _MAP = 0.35, "viridis"
 
 
 def planes_picture(image: np.ndarray, wanted: np.ndarray, depth: int | None) -> np.ndarray:

@@ -26,6 +26,7 @@ from ns_abstract.report.files import (
     load_frame,
     save_frame,
 )
+from ns_abstract.report.picture import layer_figure, previews, save_figure, save_picture
 from ns_abstract.report.run import CommandRun, differences, file_stamp, guarantee_text, plain
 
 Status = Literal["done", "partial", "missing"]
@@ -34,7 +35,8 @@ Outcome = Literal["done", "budget", "interrupted"]
 _JSON_LIMIT = 2**30
 # The page is written again when this much time has passed, or this many times what it takes.
 _PAGE_SECONDS, _PAGE_SHARE = 10.0, 20.0
-_PREVIEW_PIXELS = 256
+#: Longest side of a picture on a page.
+PREVIEW_PIXELS = 256
 #: Most frames that the page shows pictures of; its table has all.
 PAGE_FRAMES = 60
 #: Characters of the page that its numbers may take, all frames together, and most bytes of a frame file that is read
@@ -333,25 +335,27 @@ class Report:
             raise unwritable(self.folder, error) from None
 
     def _draw(self, result: FrameResult) -> None:
-        from ns_abstract.report.picture import layer_figure, previews, save_figure, save_picture
+        self._draw_files(result)
+        self._previews[result.index] = self._small(result)
+        self._undrawn.discard(result.index)
 
+    def _draw_files(self, result: FrameResult) -> None:
         name = str(self.run.scene.get("name", ""))
         path = self.folder / frame_name(result.index, "png")
         guarantee = short_guarantee(self.run.guarantee, self.run.scene.get("bounded"))
         save_picture(path, result, guarantee=guarantee, about=name, units=ShownUnits.of(self.run.scene))
         for layer in result.layers:
             save_figure(self.folder / layer_name(result.index, layer), layer_figure(result, layer), 120)
-        self._previews[result.index] = previews(result, _PREVIEW_PIXELS)
-        self._undrawn.discard(result.index)
+
+    def _small(self, result: FrameResult) -> Mapping[str, bytes]:
+        """PNGs of a frame for the page."""
+        return previews(result, PREVIEW_PIXELS)
 
     def finish(self, outcome: Outcome) -> dict[str, Any]:
         """Write the last report.json and report.html.
 
-        Args:
-            outcome: "done", "budget" (the time ended first) or "interrupted" (by a signal).
-
-        Returns:
-            The content of report.json.
+        ``outcome``: "done", "budget" (the time ended first) or "interrupted" (by a signal). Returns the content of
+        report.json.
         """
         self._state = outcome
         # first what must not be lost
@@ -440,17 +444,20 @@ class Report:
             raise unwritable(self.folder, error) from None
 
     def _write_page(self, document: dict[str, Any]) -> None:
+        begin = time.monotonic()
+        text = self._page(document)
+        write_atomic(self.folder / "report.html", lambda stream: stream.write(text.encode()))
+        took = time.monotonic() - begin
+        self._page_due = time.monotonic() + max(_PAGE_SECONDS, _PAGE_SHARE * took)
+
+    def _page(self, document: dict[str, Any]) -> str:
         from ns_abstract.report.page import render_page, shown_frames
 
-        begin = time.monotonic()
         pictures = {}
         for entry in shown_frames(document["frames"], PAGE_FRAMES):
             pictures[entry["index"]] = self._preview(entry["index"])
         plays = {index: play for index in pictures if (play := self._play(index)) is not None}
-        text = render_page(document, pictures, plays)
-        write_atomic(self.folder / "report.html", lambda stream: stream.write(text.encode()))
-        took = time.monotonic() - begin
-        self._page_due = time.monotonic() + max(_PAGE_SECONDS, _PAGE_SHARE * took)
+        return render_page(document, pictures, plays)
 
     def _played(self, result: FrameResult) -> str | None:
         from ns_abstract.report.play import play_data
@@ -468,8 +475,6 @@ class Report:
 
     def _preview(self, index: int) -> Mapping[str, bytes]:
         if index not in self._previews:
-            from ns_abstract.report.picture import previews
-
             result = load_frame(self.folder / frame_name(index, "npz"), leaves=False).result
-            self._previews[index] = previews(result, _PREVIEW_PIXELS)
+            self._previews[index] = self._small(result)
         return self._previews[index]

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
-from ns_abstract.report.export import Results
+from ns_abstract.report.export import Results, picture
 from ns_abstract.report.figures import metrics
 from ns_abstract.report.files import IMAGES, LEAVES, frame_name, load_frame
 
@@ -54,10 +54,8 @@ def write_rerun(results: Results, cameras: Sequence[PinholeCamera], scene: Recor
     """Write a Rerun recording (.rrd).
 
     Its timeline "frame" shows the bounds, their gap and a render of every frame, and the figures of the report. With
-    ``cameras``, those of the path by frame, pictures stand in the scene at their cameras.
-
-    Raises:
-        InputError: The package rerun-sdk is missing.
+    ``cameras``, those of the path by frame, pictures stand in the scene at their cameras. Raises InputError where the
+    package rerun-sdk is missing.
     """
     rerun: Any = optional_package("rerun", "rerun", "rrd")
     recording = rerun.RecordingStream("ns-abstract")
@@ -71,7 +69,7 @@ def write_rerun(results: Results, cameras: Sequence[PinholeCamera], scene: Recor
             colors = np.concatenate([scene.colors, scene.opacities[:, None]], axis=1)
             points = rerun.Points3D(scene.means, radii=radii, colors=np.round(255.0 * colors).astype(np.uint8))
             recording.log("scene/gaussians", points, static=True)
-        for result in results:  # pyright: ignore[reportGeneralTypeIssues]
+        for result in results:
             recording.set_time("frame", sequence=result.index)
             if cameras:
                 camera = cameras[result.index]
@@ -85,10 +83,10 @@ def write_rerun(results: Results, cameras: Sequence[PinholeCamera], scene: Recor
                         width=results.size[1], height=results.size[0],
                     ),
                 )  # fmt: skip
-                recording.log("scene/camera/image", rerun.Image(results.picture(result, "image")))
+                recording.log("scene/camera/image", rerun.Image(picture(result, "image", results.largest)))
             for name in ("lower", "upper", "image"):
                 recording.log(f"bounds/{name}", rerun.Image(getattr(result, name)))
-            recording.log("bounds/gap", rerun.Image(results.picture(result, "gap")))
+            recording.log("bounds/gap", rerun.Image(picture(result, "gap", results.largest)))
             for name, value in metrics(result).items():
                 if isinstance(value, (int, float)):
                     recording.log(f"figures/{name}", rerun.Scalars(float(value)))
@@ -119,12 +117,12 @@ def write_viser(
                 rgbs=scene.colors.astype(np.float32), opacities=scene.opacities[:, None].astype(np.float32),
             )  # fmt: skip
         frustum: Any = None
-        for result in results:  # pyright: ignore[reportGeneralTypeIssues]
+        for result in results:
             camera = cameras[result.index]
             former, rotation = frustum, camera.camera_to_world[:3, :3] @ _FLIP
             frustum = server.scene.add_camera_frustum(
                 f"/frames/{result.index:05d}", fov=2.0 * float(np.arctan2(0.5 * camera.height, camera.fy)),
-                aspect=camera.width / camera.height, scale=0.15, image=results.picture(result, "gap"),
+                aspect=camera.width / camera.height, scale=0.15, image=picture(result, "gap", results.largest),
                 wxyz=viser.transforms.SO3.from_matrix(rotation).wxyz, position=camera.camera_to_world[:3, 3],
             )  # fmt: skip
             if former is not None:
@@ -166,15 +164,13 @@ def write_exr(results: Results, folder: Path) -> list[Path]:
     """Write ``frame_00000.exr`` for every frame, and return the files.
 
     Its parts ``lower``, ``upper``, ``witness_lower``, ``witness_upper`` and ``image`` hold RGB as float32, bit for bit
-    those of the npz: display-referred values in [0, 1], not linear light.
-
-    Raises:
-        InputError: The package OpenEXR is missing.
+    those of the npz: display-referred values in [0, 1], not linear light. Raises InputError where the package OpenEXR
+    is missing.
     """
     exr: Any = optional_package("OpenEXR", "exr", "exr")
     folder.mkdir(parents=True, exist_ok=True)
     files = []
-    for result in results:  # pyright: ignore[reportGeneralTypeIssues]
+    for result in results:
         header = {
             "compression": exr.ZIP_COMPRESSION,
             "type": exr.scanlineimage,
@@ -197,11 +193,9 @@ def write_safetensors(results: Results, folder: Path) -> list[Path]:
     """Write ``frame_00000.safetensors`` for every frame, and return the files.
 
     They hold the arrays of the npz by the same names: the bounds, and of leaf cells ``box_lower``, ``box_upper``,
-    ``tile``, ``A_lower``, ``b_lower``, ``A_upper`` and ``b_upper``. The metadata are texts: ``format``,
-    ``guarantee``, and ``parameters`` as JSON.
-
-    Raises:
-        InputError: The package safetensors is missing, or a frame keeps no linear sets.
+    ``tile``, ``A_lower``, ``b_lower``, ``A_upper`` and ``b_upper``. The metadata are texts: ``format``, ``guarantee``,
+    and ``parameters`` as JSON. Raises InputError where the package safetensors is missing, or a frame keeps no linear
+    sets.
     """
     safetensors: Any = optional_package("safetensors.numpy", "safetensors", "safetensors")
     folder.mkdir(parents=True, exist_ok=True)

@@ -210,10 +210,8 @@ def pairs_svg(
 ) -> Markup:
     """A square of maps by pairs of parameters.
 
-    Args:
-        pictures: By row and column, a map and what it shows.
-        labels: SVG of a parameter: takes its number, where its map on the diagonal begins, the side of a map, and where
-            the square ends below.
+    ``pictures``: by row and column, a map and what it shows. ``labels``: SVG of a parameter: takes its number, where
+    its map on the diagonal begins, the side of a map, and where the square ends below.
     """
     d = len(parameters)
     panel = min(_PANEL, (_WIDTH - LEFT - (d - 1) * _GAP) // d)

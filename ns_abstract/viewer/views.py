@@ -313,11 +313,7 @@ class NerfSource:
         return f"of the fine field at {s.samples} uniform samples by ray, not of the picture with importance samples"
 
     def frame(self, camera: PinholeCamera, perturbation: Perturbation) -> NerfFrame:
-        """The frame of ``camera`` and a set of poses around it.
-
-        Raises:
-            InputError: Gaussians are to vary.
-        """
+        """The frame of ``camera`` and a set of poses around it. Raises InputError: Gaussians are to vary."""
         self._method.prepare([perturbation])
         return self._method.frame(PoseBox.around(camera, perturbation))
 

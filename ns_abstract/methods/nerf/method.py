@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -29,9 +29,6 @@ from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.nerf.white import WhiteSamples
 from ns_abstract.refine.protocol import MOST_PLANES, SceneSample, WeightPlane
-
-if TYPE_CHECKING:
-    import torch
 
 #: Samples by ray where nothing is said: those of Nerfstudio's coarse pass.
 _SAMPLES = 64
@@ -199,8 +196,6 @@ class NerfMethod(FieldMethod):
 
     def differentiable(self, poses: PoseBox) -> Callable[[torch.Tensor], torch.Tensor]:
         """Parameter values [d] to the picture [H, W, 3], by the concrete renderer."""
-        from ns_abstract.methods.nerf.render import NerfRenderer
-
         return picture_of_parameters(poses, NerfRenderer(self.scene, self.sampling).picture)
 
 
@@ -231,12 +226,8 @@ def white_samples(planes: Sequence[WeightPlane], sampling: Sampling) -> WhiteSam
 class NerfWeightFrame(NerfFrame):
     """A NeRF's frame of weights. Shifts of colours change none.
 
-    Args:
-        scene, sampling, pose_set, device, workers: As `NerfFrame` takes them.
-        pixels: [H, W] the rays that are read; nothing is said of others.
-
-    Raises:
-        InputError: See `white_samples`.
+    ``scene``, ``sampling``, ``pose_set``, ``device``, ``workers``: as `NerfFrame` takes them. ``pixels``: [H, W] the
+    rays that are read; nothing is said of others. Raises InputError: see `white_samples`.
     """
 
     def __init__(

@@ -103,12 +103,8 @@ def check_model(run: runs.RunConfig, overrides: Overrides, classes: Sequence[str
 def background(run: runs.RunConfig, overrides: Overrides, default: str) -> tuple[Assumption, NDArray[np.float32] | str]:
     """The record of the background's choice, and its colour [3] or `LAST_SAMPLE`.
 
-    Args:
-        run: Its ``background_color`` is read.
-        overrides: ``background`` takes its place.
-
-    Raises:
-        InputError: No such background.
+    ``run``: its ``background_color`` is read. ``overrides``: ``background`` takes its place. Raises InputError: no such
+    background.
     """
     named, origin = "background_color" in run.model, "config.yml: pipeline.model.background_color"
     stored: Any = LAST_SAMPLE

@@ -27,13 +27,8 @@ def write_nerf_run(
     """Write ``scene`` as a vanilla-nerf run.
 
     Files and arguments are those of `ns_abstract.methods.splat.write.write_splatfacto_run`. Nerfstudio itself loads the
-    checkpoint where the fields have its own sizes (8 x 256, head 2 x 128).
-
-    Returns:
-        The path of config.yml.
-
-    Raises:
-        InputError: ``timestamp`` or ``experiment_name`` is not a plain folder name.
+    checkpoint where the fields have its own sizes (8 x 256, head 2 x 128). Returns the path of config.yml. Raises
+    InputError: ``timestamp`` or ``experiment_name`` is not a plain folder name.
     """
     config = {
         "optimizers": _OPTIMIZERS,
@@ -94,13 +89,8 @@ def write_nerfacto_run(
     """Write ``scene`` as a nerfacto run of the torch implementation; the grids begin at resolution 16 or the scene's.
 
     Files and arguments are those of `ns_abstract.methods.splat.write.write_splatfacto_run`. Proposal fields are written
-    one by round, each with two layers; the appearance embedding is a part of the colours' bias.
-
-    Returns:
-        The path of config.yml.
-
-    Raises:
-        InputError: ``timestamp`` or ``experiment_name`` is not a plain folder name.
+    one by round, each with two layers; the appearance embedding is a part of the colours' bias. Returns the path of
+    config.yml. Raises InputError: ``timestamp`` or ``experiment_name`` is not a plain folder name.
     """
     field = scene.field
     grid = _grid(field.encoding)

@@ -65,12 +65,12 @@ def load_scene(path: str | os.PathLike[str], overrides: Overrides | None = None)
 
     Args:
         path: ``config.yml`` of a run, the run folder that holds it, or a file or folder of another program
-            (docs/formats.md): a .ply, a SOG, SPZ or .splat file, a checkpoint of gsplat's trainer, Inria's folder.
+            (docs/formats.md).
         overrides: What the user says in place of the files.
 
     Returns:
-        The stored parameters; world is the run's normalised frame, or that of the ``.ply``.
-        ``sh`` keeps the bands up to the degree that Nerfstudio evaluates after loading.
+        The stored parameters; world is the run's normalised frame, or that of the ``.ply``. ``sh`` keeps the bands up
+        to the degree that Nerfstudio evaluates after loading.
 
     Raises:
         InputError: For any content of the files, or an override, that cannot be used.
@@ -112,13 +112,9 @@ def scene_from_parameters(
 ) -> SplatScene:
     """The scene that a loaded Splatfacto model holds, checked as one that is read from files.
 
-    Args:
-        parameters: means [N, 3], scales [N, 3], quats [N, 4], features_dc [N, 3], features_rest
-            [N, K - 1, 3] and opacities [N, 1], arrays.
-        name, color_model, sh_degree, rasterize_mode, background: As in `SplatScene`.
-
-    Raises:
-        InputError: A value is not finite or cannot be drawn.
+    ``parameters``: means [N, 3], scales [N, 3], quats [N, 4], features_dc [N, 3], features_rest [N, K - 1, 3] and
+    opacities [N, 1], arrays. ``name``, ``color_model``, ``sh_degree``, ``rasterize_mode``, ``background``: as in
+    `SplatScene`. Raises InputError where a value is not finite or cannot be drawn.
     """
     stored_arrays = {key: np.array(parameters[key], np.float32) for key in _PARAMETERS}
     rest = stored_arrays["features_rest"][:, : (sh_degree + 1) ** 2 - 1]

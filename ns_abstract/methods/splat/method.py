@@ -44,6 +44,7 @@ _BYTES_BY_GAUSSIAN = 1200
 _BYTES_BY_VARIED = 400
 #: Sets of scenes at hand.
 _KEPT = 8
+_WITH_TILES = "the alpha threshold and tiles"
 
 
 class SplatMethod:
@@ -98,11 +99,7 @@ class SplatMethod:
         return f"{self.scene.count:,} Gaussians{alone}"
 
     def frame(self, poses: PoseBox, sheared: bool = False, layers: bool = False) -> SplatFrame:
-        """One frame, ready for refinement; ``sheared``, ``layers``: see `SplatFrame`.
-
-        Raises:
-            InputError: Layers of the paper's renderer, which has none.
-        """
+        """One frame, ready for refinement; ``sheared``, ``layers``: see `SplatFrame`; the paper's has no layers."""
         if layers and self.rasteriser.name != "gsplat":
             raise InputError("the paper's renderer has no depth", field="--outputs", fix="leave it out")
         varied = self.varied(poses.perturbation.scene)
@@ -266,7 +263,6 @@ class CauseTuning:
 
 
 _TUNING = CauseTuning()
-_WITH_TILES = "the alpha threshold and tiles"
 
 
 class _OrderedBounds(SplatBounds):

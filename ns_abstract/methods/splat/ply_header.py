@@ -111,12 +111,8 @@ class PlyDeclaration:
 def read_declaration(path: Path, mode_given: bool) -> PlyDeclaration:
     """What the header of ``path`` declares.
 
-    Args:
-        mode_given: Whether the user says how to rasterise, so that a comment that cannot be understood does not
-            matter.
-
-    Raises:
-        InputError: It is not the header of a .ply of splats, or the file is cut off.
+    ``mode_given``: whether the user says how to rasterise, so that a comment that cannot be understood does not matter.
+    Raises InputError where it is not the header of a .ply of splats, or the file is cut off.
     """
     size = file_size(path, ".ply")
     refuse_other_kind(path)
@@ -151,11 +147,7 @@ def read_declaration(path: Path, mode_given: bool) -> PlyDeclaration:
 
 
 def standard_header(declared: PlyDeclaration, path: Path) -> PlyHeader:
-    """The header of a standard 3DGS .ply.
-
-    Raises:
-        InputError: Its columns are not those of one.
-    """
+    """The header of a standard 3DGS .ply. Raises InputError where its columns are not those of one."""
     vertex = next((element for element in declared.elements if element.name == "vertex"), None)
     if vertex is None or vertex.count < 1:
         raise InputError("no Gaussians", file=path, field="element vertex", fix=FIX)
@@ -168,11 +160,7 @@ def standard_header(declared: PlyDeclaration, path: Path) -> PlyHeader:
 
 
 def read_elements(path: Path, elements: list[PlyElement]) -> dict[str, Any]:
-    """Tables of the named elements, as numpy's structured arrays.
-
-    Raises:
-        InputError: The file is damaged.
-    """
+    """Tables of the named elements, as numpy's structured arrays. Raises InputError where the file is damaged."""
     import plyfile
 
     try:

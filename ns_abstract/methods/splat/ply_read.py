@@ -29,10 +29,8 @@ _FIELDS = {"scales": "vertex.scale_*", "quats": "vertex.rot_*", "opacities": "ve
 def load_ply(path: Path, overrides: Overrides) -> SplatScene:
     """The scene of a standard or compressed ``.ply``.
 
-    A ``cfg_args`` in the folder that the file was trained in says the background.
-
-    Raises:
-        InputError: For any content of the file, or an override, that cannot be used.
+    A ``cfg_args`` in the folder that the file was trained in says the background. Raises InputError: for any content of
+    the file, or an override, that cannot be used.
     """
     overrides.refuse(("load_step", "assume_splatfacto"), "is for runs, this file is a .ply")
     declared = read_declaration(path, overrides.rasterize_mode is not None)
@@ -82,14 +80,9 @@ def filtered(
 ) -> tuple[Float32Array, Float32Array]:
     """Scales and opacities with mip-splatting's 3-D filter, as its ``save_fused_ply`` stores them.
 
-    With s the scales and f the filter's width, the scales become sqrt(s^2 + f^2) and the opacity is multiplied by
-    sqrt(prod(s^2) / prod(s^2 + f^2)). Computed in float64 and rounded once to float32; rows of width 0 stay as they
-    are.
-
-    Args:
-        log_scales: [N, 3] logarithms.
-        opacity_logits: [N] logits.
-        width: [N], units of the scales.
+    With s the scales and f the filter's ``width`` [N], the scales become sqrt(s^2 + f^2) and the opacity is multiplied
+    by sqrt(prod(s^2) / prod(s^2 + f^2)). Takes logarithms [N, 3] and logits [N]; computed in float64 and rounded once
+    to float32; rows of width 0 stay as they are.
     """
     with np.errstate(all="ignore"):
         square = np.square(np.exp(log_scales.astype(np.float64)))

@@ -36,6 +36,25 @@ _LEARNING_RATES = {
     "features_rest": 0.000125,
     "opacities": 0.05,
 }
+_OPTIMIZERS = optimizer_lines(
+    "Adam",
+    "1.0e-15",
+    {
+        "bilateral_grid": ("0.002", ("0.0001", "0", 1000)),
+        "camera_opt": ("0.0001", ("5.0e-07", "0", 1000)),
+        "features_dc": ("0.0025", None),
+        "features_rest": ("0.000125", None),
+        "means": ("0.00016", ("1.6e-06", "1.0e-08", 0)),
+        "opacities": ("0.05", None),
+        "quats": ("0.001", None),
+        "scales": ("0.005", None),
+    },
+)
+_STEPS = """\
+steps_per_eval_all_images: 1000
+steps_per_eval_batch: 0
+steps_per_eval_image: 100
+steps_per_save: 2000"""
 
 
 def write_splatfacto_run(
@@ -47,23 +66,20 @@ def write_splatfacto_run(
     views: Sequence[KeyframeCamera] | None = None,
     render: Callable[[KeyframeCamera], ArrayLike] | None = None,
 ) -> Path:
-    """Write ``scene`` as a Splatfacto run, and a small data set beside it.
+    """Write ``scene`` as a Splatfacto run, and a small data set beside it; returns the path of config.yml.
 
     Files: ``FOLDER/EXPERIMENT/splatfacto/TIMESTAMP/{config.yml, dataparser_transforms.json,
-    nerfstudio_models/step-000029999.ckpt}`` and ``FOLDER/data/{transforms.json, images/*.png}``.
-    Every file is replaced as a whole and config.yml comes last, so a run with a config is complete.
-    Nerfstudio builds its pipeline from the data set; the Gaussians come from the checkpoint alone.
+    nerfstudio_models/step-000029999.ckpt}`` and ``FOLDER/data/{transforms.json, images/*.png}``. Every file is replaced
+    as a whole and config.yml comes last, so a run with a config is complete. Nerfstudio builds its pipeline from the
+    data set; the Gaussians come from the checkpoint alone.
 
     Args:
         scene: SH is stored padded with zeros to degree 3.
         folder: Nerfstudio's working directory for this run; made if missing.
         timestamp: Name of the run, as in "2026-11-21_120000".
+        experiment_name: Name of the folder of its experiment.
         views: Cameras of the data set, normalised frame, at least two of one size and field of view.
-        render: Gives the image [H, W, 3] in [0, 1] of a view; without it the images hold only the
-            background colour.
-
-    Returns:
-        The path of config.yml.
+        render: Gives the image [H, W, 3] in [0, 1] of a view; without it images hold only the background colour.
 
     Raises:
         InputError: ``timestamp`` or ``experiment_name`` is not a plain folder name.
@@ -132,39 +148,12 @@ def _scheduler_state(rate: float) -> dict[str, Any]:
     }
 
 
-_OPTIMIZERS = optimizer_lines(
-    "Adam",
-    "1.0e-15",
-    {
-        "bilateral_grid": ("0.002", ("0.0001", "0", 1000)),
-        "camera_opt": ("0.0001", ("5.0e-07", "0", 1000)),
-        "features_dc": ("0.0025", None),
-        "features_rest": ("0.000125", None),
-        "means": ("0.00016", ("1.6e-06", "1.0e-08", 0)),
-        "opacities": ("0.05", None),
-        "quats": ("0.001", None),
-        "scales": ("0.005", None),
-    },
-)
-_STEPS = """\
-steps_per_eval_all_images: 1000
-steps_per_eval_batch: 0
-steps_per_eval_image: 100
-steps_per_save: 2000"""
-
-
 def write_ply(scene: SplatScene, file: Path) -> tuple[str, ...]:
     """Write ``scene``; `ns_abstract.methods.splat.load.load_scene` reads the same numbers back.
 
     A comment says how the scene is rasterised. The file holds what the standard has room for: means in the run's
     normalised frame, logarithms of scales, logits of opacities, quaternions as stored, spherical harmonics channel by
-    channel.
-
-    Returns:
-        What it has no room for, one sentence each.
-
-    Raises:
-        OSError: The file cannot be written.
+    channel. Returns what it has no room for, one sentence each. Raises OSError where the file cannot be written.
     """
     import plyfile
 

@@ -35,6 +35,11 @@ from ns_abstract.methods.nerf.nerfacto_render import NerfactoRenderer
 from ns_abstract.methods.nerf.ray_bundle import TAYLOR, RayBundle
 from ns_abstract.methods.nerf.ray_field import BoundedRays, RayBounds, RayRequest
 
+#: Harmonics of a direction.
+HARMONICS = 16
+#: Rays that are bounded together, and shares of a worker between two looks at the goal. Preferences.
+_SHARE, _SHARES = 4, 4
+
 
 @dataclass(frozen=True)
 class HashTuning:
@@ -158,10 +163,6 @@ class HashBounds(BoundedRays):
         return max(_TUNING.least_displacement, displacement * min(max(factor, 0.25), 2.0))
 
 
-#: Harmonics of a direction.
-HARMONICS = 16
-
-
 def _density(encoding: HashEncoding, net: DenseNet, scale: float) -> DensityArrays:
     table = np.ascontiguousarray(encoding.table, np.float64)
     ranges = np.stack([table.min(axis=1), table.max(axis=1)], axis=1)
@@ -222,10 +223,6 @@ def piece_room(field: NerfactoField, arrays: FieldArrays, dimensions: int) -> Pi
         np.zeros(most, np.int64),
         np.zeros((ROWS, 2 * LINE // 8)),
     )  # fmt: skip
-
-
-#: Rays that are bounded together, and shares of a worker between two looks at the goal. Preferences.
-_SHARE, _SHARES = 4, 4
 
 
 class NerfactoFrame(FieldFrame):
