@@ -25,9 +25,8 @@ from ns_abstract.report.files import load_frame, save_frame
 from ns_abstract.report.picture import preview
 from ns_abstract.report.play import play_data
 from ns_abstract.report.record import Report
-from ns_abstract.report.regions import PoseImage
+from ns_abstract.report.regions import PoseImage, stops
 from ns_abstract.report.run import CommandRun
-from ns_abstract.report.walk import stops
 
 SIDE = 16
 LARGE = 10**9

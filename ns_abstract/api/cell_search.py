@@ -183,13 +183,10 @@ class CellQuestion(ABC, Generic[P]):
 
 @dataclass(frozen=True)
 class Request:
-    """How much is to be done.
+    """How much is to be done, in ``budget`` seconds.
 
-    Attributes:
-        budget: Seconds.
-        scene_margin: Whether to look for the largest variation of the scene for which what is certified holds, in half
-            of the time.
-        on_open: Called with the store before the search, when there is a report.
+    ``scene_margin``: whether to look, in half of the time, for the largest variation of the scene for which what is
+    certified holds. ``on_open`` is called with the store before the search, when there is a report.
     """
 
     budget: float
@@ -205,11 +202,9 @@ class Request:
 class CellSearch(Generic[P]):
     """The search for verdicts on a question's cells.
 
-    Attributes:
-        store: ``cells.sqlite``, from `open` on.
-        last: Writes the report, also when the process is ended.
-        scene_margin: What report.json says of margins of the scene.
-        deadline: When no more pictures are made for the report.
+    ``store`` is ``cells.sqlite``, from `open` on; ``last`` writes the report, also when the process is ended;
+    ``scene_margin`` is what report.json says of margins of the scene; from ``deadline`` on no more pictures are made
+    for the report.
     """
 
     question: CellQuestion[P]

@@ -18,14 +18,14 @@ from ns_abstract.api.certification import Certification, FramePictures
 from ns_abstract.execution.cancellation import WorkCancelledError, cancel_when, check_cancelled
 from ns_abstract.io.errors import InputError
 from ns_abstract.report import regions as broken
-from ns_abstract.report import walk
 from ns_abstract.report.cameras import CameraDrawings, cameras_entry, cell_cameras, standing, upward
 from ns_abstract.report.certificate import certificate_document, search_figures
 from ns_abstract.report.certificate_page import CertificateDetails, certificate_page
 from ns_abstract.report.figures import ShownUnits
 from ns_abstract.report.outside import SceneDrawing
 from ns_abstract.report.picture import preview
-from ns_abstract.report.regions import FailureRegion, PoseImage
+from ns_abstract.report.regions import FailureRegion, PoseImage, coarse_first
+from ns_abstract.report.regions import stops as poses_along
 from ns_abstract.report.run import CommandRun
 from ns_abstract.report.verdict_picture import write_pictures
 from ns_abstract.verify.properties import Claim
@@ -305,7 +305,7 @@ def look_closer(
     regions = broken.falsified_regions(entries, rows)
     sides = {entry["index"]: entry["parameters"] for entry in entries}
     pictures: list[tuple[PoseImage, PoseImage | None]] = []
-    stops = walk.stops(entries, rows, ShownUnits.of(job.job.describe()))
+    stops = poses_along(entries, rows, ShownUnits.of(job.job.describe()))
     pictures_by_frame: dict[int, PoseImage] = {}
     why = _OVER
     # a property that makes no sense for a frame is told by who searches
@@ -314,7 +314,7 @@ def look_closer(
             picture = looks.look("counterexample", region.frame, region.pose)
             pictures.append((picture, looks.right(region, rows, sides[region.frame])))
         why = ""
-        for k in walk.coarse_first(len(stops)) if len(stops) > 1 else []:
+        for k in coarse_first(len(stops)) if len(stops) > 1 else []:
             pictures_by_frame[k] = looks.look(stops[k].at, stops[k].frame, stops[k].values)
     return CertificateDetails(
         regions, pictures, [(stops[k], pictures_by_frame[k]) for k in sorted(pictures_by_frame)], why

@@ -408,11 +408,9 @@ def _open(
 class CertifySettings:
     """What to certify, as the command line says it.
 
-    Attributes:
-        model: Network, .onnx; None: the property is one of the picture.
-        network_arithmetic: "float32" or "real", of the network.
-        picture: Whether the network is shown floats or pictures of 8 bits.
-        memory: Bytes for the bounds of one process.
+    ``model``: network, .onnx; None: the property is one of the picture. ``network_arithmetic``: "float32" or "real".
+    ``picture``: whether the network is shown floats or pictures of 8 bits. ``memory``: bytes for the bounds of one
+    process.
     """
 
     files: Settings

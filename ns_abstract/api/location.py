@@ -225,15 +225,10 @@ class CalibrationTuning:
 
 @dataclass(frozen=True)
 class Calibration:
-    """What every looked-at training photo's own pose misses of it at most.
+    """What every looked-at training photo's own pose misses of it at most: ``noise`` and ``outliers`` explain them all.
 
-    Attributes:
-        noise, outliers: What explains them all.
-        data: File that names the photos.
-        photos: How many were looked at.
-        size: Height and width of the pictures that were compared.
-        psnr: Mean over the photos, dB.
-        noise_by_outliers: Of each part that was weighed, the noise that it needs.
+    ``data`` names the photos, of which so many were looked at; ``size`` is height and width of the pictures that were
+    compared, ``psnr`` the mean over the photos, dB; ``noise_by_outliers`` the noise that each weighed part needs.
     """
 
     noise: float

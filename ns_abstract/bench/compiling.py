@@ -24,12 +24,7 @@ _NAMED = 3
 
 @dataclass
 class _Running:
-    """A function that is being compiled.
-
-    Attributes:
-        wall, processor: Clocks when it began, seconds.
-        inner: Processor seconds of the functions that were compiled for it.
-    """
+    """A function that is being compiled: its clocks when it began, and processor seconds ``inner`` compiled for it."""
 
     name: str
     wall: float

@@ -40,11 +40,10 @@ SETS: dict[str, dict[str, Any]] = {
 
 
 class LoopTables(NamedTuple):
-    """Rows of a benchmark.
+    """Rows of a benchmark, of its ``search`` and of its ``steps``.
 
-    Attributes:
-        search: One row: certified fraction by time, the part of random runs that go well, states compared with tubes.
-        steps: A row by step: mean widths of a certified cell's tubes, and of the hull of runs from it.
+    ``search`` is one row: certified fraction by time, the part of random runs that go well, states compared with tubes.
+    ``steps`` is a row by step: mean widths of a certified cell's tubes, and of the hull of runs from it.
     """
 
     search: list[dict[str, Any]]

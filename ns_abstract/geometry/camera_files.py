@@ -22,12 +22,9 @@ _INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 
 @dataclass(frozen=True)
 class FileCamera:
-    """A camera as a file has it.
+    """A camera as a file has it: ``camera_to_world`` 3x4 numbers, OpenGL axes, and intrinsics in pixels.
 
-    Attributes:
-        camera_to_world: 3x4 numbers, OpenGL axes.
-        fx, fy, cx, cy: Pixels; numbers as the file has them, not checked but for being numbers.
-        width, height: Pixels, as the file has them.
+    Numbers are not checked but for being numbers, ``width`` and ``height`` not at all.
     """
 
     field: str

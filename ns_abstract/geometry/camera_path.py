@@ -41,15 +41,11 @@ class PinholeCamera:
     """A pinhole camera.
 
     Attributes:
-        camera_to_world: [3, 4] float64, read-only, OpenGL axes (x right, y up, z back), in the
-            normalised frame of the run. The rotation is kept as written: it is orthonormal
-            within 1e-3.
-        fx: Focal length, pixels.
-        fy: Focal length, pixels.
-        cx: Principal point from the left edge, pixels.
-        cy: Principal point from the top edge, pixels.
-        width: Image width, pixels.
-        height: Image height, pixels.
+        camera_to_world: [3, 4] float64, read-only, OpenGL axes (x right, y up, z back), in the normalised frame of the
+            run. The rotation is kept as written: it is orthonormal within 1e-3.
+        fx, fy: Focal lengths, pixels.
+        cx, cy: Principal point from the left and the top edge, pixels.
+        width, height: Image size, pixels.
     """
 
     camera_to_world: NDArray[np.float64]

@@ -44,15 +44,11 @@ def render_page(
     pictures: Mapping[int, Mapping[str, bytes]],
     plays: Mapping[int, str] | None = None,
 ) -> str:
-    """The page of a report.
+    """The page of a report: HTML, self-contained; every text of the document is escaped.
 
-    Args:
-        document: Content of report.json (`ns_abstract.report.record.Report.document`).
-        pictures: For the frames shown, by number: PNGs lower, upper, gap, witness and image.
-        plays: Frames to play with, by number, as `ns_abstract.report.play.play_data` gives them.
-
-    Returns:
-        HTML, self-contained; every text of the document is escaped.
+    ``document`` is the content of report.json (`ns_abstract.report.record.Report.document`). Of the frames shown, by
+    number, ``pictures`` are PNGs lower, upper, gap, witness and image, and ``plays`` what
+    `ns_abstract.report.play.play_data` gives.
     """
     name, frames = str(document["scene"].get("name", "scene")), document["frames"]
     sampled = document["guarantee"] == "sampled"

@@ -90,14 +90,11 @@ def failed_self_check(problem: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class RunRecord(CommandRun):
-    """A command's run.
+    """A command's run over ``frames``, numbers of the camera path's entries that were asked for.
 
-    Attributes:
-        frames: Numbers of the camera path's entries that were asked for.
-        settings: The command's options; ``target_ratio`` decides when a frame is done, and with a true
-            ``save_cells`` stored frames without leaf cells are computed again.
-        size: Height and width of the pictures; None: any that stored frames have.
-        intrinsics: By frame the pictures' `Intrinsics`.
+    Of its ``settings``, ``target_ratio`` decides when a frame is done, and with a true ``save_cells`` stored frames
+    without leaf cells are computed again. ``size`` is height and width of the pictures; None: any that stored frames
+    have. ``intrinsics`` has by frame the pictures' `Intrinsics`.
     """
 
     frames: tuple[int, ...]
@@ -267,23 +264,14 @@ class Report:
         self._publish(page=time.monotonic() >= self._page_due)
 
     def add(self, result: FrameResult, status: Status | None = None, *, picture: bool = True) -> dict[str, Any]:
-        """Write one frame and bring the report up to date.
+        """Write one frame and bring the report up to date; returns the frame's entry in report.json.
 
-        May be called again as a frame gets tighter: ``seconds``, ``cells`` and ``trace`` are those of
-        this command so far. Bounds are intersected with those on disk (`merged`), which holds for the
-        frames of an earlier command too; its time and trace are put in front.
-
-        Args:
-            status: "done", or "partial" where the work ended before its target; decided by
-                ``target_ratio`` if None. A frame without bounds is always "missing".
-            picture: Whether to draw the PNG now; otherwise `draw` or `finish` does.
-
-        Returns:
-            The frame's entry in report.json.
-
-        Raises:
-            ValueError: As `ns_abstract.report.files.check_frame`: nothing unsound is written.
-            InputError: A file cannot be written.
+        May be called again as a frame gets tighter: ``seconds``, ``cells`` and ``trace`` are those of this command so
+        far. Bounds are intersected with those on disk (`merged`), which holds for the frames of an earlier command too;
+        its time and trace are put in front. ``status``: "done", or "partial" where the work ended before its target;
+        decided by ``target_ratio`` if None. A frame without bounds is always "missing". ``picture``: whether to draw
+        the PNG now; otherwise `draw` or `finish` does. Raises ValueError as `ns_abstract.report.files.check_frame`, so
+        that nothing unsound is written, and InputError where a file cannot be written.
         """
         check_frame(result)
         if result.problems:

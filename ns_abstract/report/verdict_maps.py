@@ -35,10 +35,8 @@ _WIDTH, _GAP, LEFT, _BELOW, _TOP, _PANEL = 760, 10, 62, 34, 8, 190
 class PairMaps:
     """Certified and falsified shares of a set's volume by bin; no share exceeds the true one.
 
-    Attributes:
-        certified, falsified: By pair (i, j), i < j, of positions of parameters: [bins, bins] parts of the volume over
-            the other parameters, place of i first.
-        along_certified, along_falsified: [d, bins] the same for one parameter.
+    Those of two parameters, by pair (i, j), i < j, of their positions, are [bins, bins] parts of the volume over the
+    other parameters, place of i first; ``along_certified`` and ``along_falsified`` [d, bins] are the same for one.
     """
 
     certified: Mapping[tuple[int, int], Float64]
@@ -71,13 +69,9 @@ def pair_maps(
 ) -> PairMaps:
     """What part of every place of two parameters, and of one, is certified and falsified (docs/dev/design.md, V16).
 
-    Args:
-        lower, upper: [n, d] ends of cells that do not overlap.
-        verdicts: [n] "certified", "falsified" or anything else.
-        ends: [d], [d] ends of the set; every one has a width.
-
-    Returns:
-        Parts rounded downward, but exactly 1 where the cells of one verdict are all of a place.
+    ``lower`` and ``upper`` [n, d] are ends of cells that do not overlap, ``verdicts`` [n] "certified", "falsified" or
+    anything else; ``ends`` [d], [d] are those of the set, each with a width. Parts are rounded downward, but exactly 1
+    where the cells of one verdict are all of a place.
     """
     count, d = lower.shape
     low, high = ends

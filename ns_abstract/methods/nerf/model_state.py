@@ -28,14 +28,7 @@ _BACKGROUNDS = {
     "blue": (0.0, 0.0, 1.0),
 }
 LAST_SAMPLE = "last_sample"
-#: Modules that draw nothing in evaluation, and what they are for.
-_IDLE = {
-    "device_indicator_param": "no values",
-    "lpips.": "a metric",
-    "psnr.": "a metric",
-    "ssim.": "a metric",
-    "camera_optimizer.": "poses of the training pictures, used in training alone",
-}
+_IDLE = runs.IDLE_MODULES
 _SHOWN = 8
 _SPLATS = ("rasterize_mode", "assume_splatfacto", "drop_nan_gaussians")
 
@@ -137,14 +130,9 @@ def records(
     """
     target = runs.target_class(run)
     whose = "config.yml: pipeline.model._target" if target else "default: config.yml names no class"
-    units = "default: dataparser_transforms.json is missing" if assumed_units else "dataparser_transforms.json"
     return (
         runs.step_assumption(run, checkpoint, overrides.load_step),
         Assumption("model", target or stock.rpartition(".")[2], whose),
-        *(
-            Assumption(f"module {prefix.rstrip('.')}", f"left out: {why}", "checkpoint")
-            for prefix, why in _IDLE.items()
-            if why != "no values" and any(key.startswith(prefix) for key in state)
-        ),
-        Assumption("units", f"1 of the data set is {transform.scale:.9g}", units),
+        *runs.idle_assumptions(state, _IDLE),
+        runs.units_assumption(transform, assumed_units),
     )
