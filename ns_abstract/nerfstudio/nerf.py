@@ -189,7 +189,7 @@ def log_lipschitz(module: torch.nn.Module) -> torch.Tensor:
 
     The exponential bounds how much a network of these layers and of activations that are no steeper
     than 1 stretches a box, up to skip connections (H.-T. D. Liu et al., "Learning smooth neural
-    functions via Lipschitz regularization", 2022, eq. 5); interval bounds widen by just these norms.
+    functions via Lipschitz regularization", 2022, eq. 5); interval bounds widen by just these norms (design.md, W5).
     """
     norms = [layer.weight.abs().sum(dim=1).max() for layer in module.modules() if isinstance(layer, torch.nn.Linear)]
     return torch.stack(norms).log().sum()
