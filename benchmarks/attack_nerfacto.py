@@ -26,7 +26,7 @@ from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.keyframe_cameras import look_at
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.nerf.hash_bounds import bounds
-from ns_abstract.methods.nerf.hash_bounds.frame import NerfactoFrame
+from ns_abstract.methods.nerf.hash_bounds.bounds import NerfactoFrame
 from ns_abstract.methods.nerf.hash_field import DenseNet, HashEncoding, NerfactoField, NerfactoScene, ProposalField
 from ns_abstract.methods.nerf.nerfacto_load import FEATURES, HARMONICS, resolutions
 from ns_abstract.methods.nerf.nerfacto_render import NerfactoRenderer

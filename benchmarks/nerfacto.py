@@ -27,8 +27,7 @@ from ns_abstract.geometry.keyframe_cameras import look_at
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.load import load_any
 from ns_abstract.methods.nerf.hash_bounds import composition, light, network, pieces
-from ns_abstract.methods.nerf.hash_bounds.bounds import HashBounds
-from ns_abstract.methods.nerf.hash_bounds.frame import NerfactoFrame
+from ns_abstract.methods.nerf.hash_bounds.bounds import HashBounds, NerfactoFrame
 from ns_abstract.perturbation.specification import parse_perturbation
 from ns_abstract.refine.engine import Refinement, RefinementGoal
 

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ns_abstract.bench.cell import small_cell
+from ns_abstract.bench.scale import small_cell
 from ns_abstract.bench.sets import open_jobs, pose_set, splat_of
 from ns_abstract.methods.splat.frame import SplatFrame
 

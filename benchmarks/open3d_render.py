@@ -25,8 +25,8 @@ from ns_abstract.bench.tables import markdown, write
 from ns_abstract.execution.threads import threads
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.methods.splat.frame import SplatFrame
-from ns_abstract.methods.splat.ply import write_ply
 from ns_abstract.methods.splat.scene import SplatScene
+from ns_abstract.methods.splat.write import write_ply
 
 
 class Open3DRenderer:

@@ -25,8 +25,8 @@ from torch.nn import functional
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling, camera_rays
 from ns_abstract.methods.nerf.scene import NerfScene
-from ns_abstract.methods.nerf.smoothness import log_lipschitz
 from ns_abstract.methods.nerf.write import write_nerf_run
+from ns_abstract.nerfstudio.nerf import log_lipschitz
 
 HULL = 96
 BINS = 96

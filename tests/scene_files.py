@@ -25,9 +25,8 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.methods.load import load_any
 from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.methods.overrides import Overrides
-from ns_abstract.methods.splat.ply import write_ply
 from ns_abstract.methods.splat.scene import SplatScene
-from ns_abstract.methods.splat.write import write_splatfacto_run
+from ns_abstract.methods.splat.write import write_ply, write_splatfacto_run
 
 torch.set_num_threads(1)
 NAN, INF = float("nan"), float("inf")

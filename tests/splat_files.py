@@ -19,8 +19,8 @@ import numpy as np
 import torch
 from PIL import Image
 
-from ns_abstract.methods.splat.ply import write_ply
 from ns_abstract.methods.splat.scene import SplatScene
+from ns_abstract.methods.splat.write import write_ply
 
 C0 = 0.28209479177387814
 QUAT_OTHERS = ((1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2))

@@ -11,7 +11,7 @@ import torch
 
 from ns_abstract.arithmetic.rounding import FLOAT32, REAL, UNIT32
 from ns_abstract.bench.sets import open_jobs, pose_set, splat_of
-from ns_abstract.bench.soundness import attack
+from ns_abstract.bench.tightness import attack
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble

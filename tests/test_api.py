@@ -22,6 +22,7 @@ from nerfs import tiny_scene
 from wall import WALL, write_wall
 
 import ns_abstract as nsa
+from ns_abstract.api import cell_search
 from ns_abstract.cli import render as render_command
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.keyframe_cameras import look_at
@@ -230,9 +231,8 @@ def test_interrupt_keeps_what_is_known(how: str, wall: nsa.Scene, request: pytes
 
 @pytest.mark.slow
 def test_certificate_ends_early_and_goes_on(wall: nsa.Scene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from ns_abstract.api import searching
 
-    monkeypatch.setattr(searching, "_TRACE", 0.0)
+    monkeypatch.setattr(cell_search, "_TRACE", 0.0)
     rows = np.stack([np.ones(3 * 64), np.zeros(3 * 64)]) / 192
     net = linear(tmp_path / "net.onnx", rows, np.array([0.0, 0.6]), 8)
     poses = nsa.PoseSet(straight(8), translation={"x": 0.6}, frame="world")

@@ -26,7 +26,7 @@ from ns_abstract.io.atomic import write_json
 from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.program_options import ProgramOptions
-from ns_abstract.methods.splat.ply import write_ply
+from ns_abstract.methods.splat.write import write_ply
 from ns_abstract.report.page import render_page
 from ns_abstract.report.record import Report, RunRecord
 

@@ -15,7 +15,7 @@ from certifying import linear
 
 from ns_abstract.api.certifying import CertifyProgress
 from ns_abstract.api.files import PathJob
-from ns_abstract.bench import certificates, plan, rules, scale
+from ns_abstract.bench import loops, plan, rules, scale
 from ns_abstract.bench import paper as paper_tables
 from ns_abstract.bench.sets import open_jobs, pose_set, splat_of
 from ns_abstract.cli.bench import bench
@@ -193,11 +193,11 @@ def test_certified_fraction_against_time(monkeypatch: pytest.MonkeyPatch) -> Non
             report={"effort": effort}, parameters=("x",), certified=0.8, falsified=0.05, unknown=0.15, seconds=33.0
         )
 
-    monkeypatch.setattr(certificates, "certify", certify)
-    monkeypatch.setattr(certificates.PoseSet, "from_json", lambda *_, **__: None)
+    monkeypatch.setattr(loops, "certify", certify)
+    monkeypatch.setattr(loops.PoseSet, "from_json", lambda *_, **__: None)
     said: list[str] = []
     any_: Any = None
-    row = certificates.curve(any_, any_, "x", {}, Path("net.onnx"), any_, 60.0, 2, (3.0, 10.0, 32.0, 40.0), said.append)
+    row = loops.curve(any_, any_, "x", {}, Path("net.onnx"), any_, 60.0, 2, (3.0, 10.0, 32.0, 40.0), said.append)
     assert [row[f"at {mark} s"] for mark in (3, 10, 32, 40)] == pytest.approx([0.0, 0.2, 0.8, 0.8])
     assert row["worker s / bounded"] == 3.0
     # at 12, 24 seconds, and not at every point

@@ -29,11 +29,11 @@ from interrupting import check_ended_in_a_library_call, check_interrupted, held_
 from PIL import Image
 from waiting import LONG, until
 
-from ns_abstract.api import showing
+from ns_abstract.api import certificate_report
 from ns_abstract.api.cell_search import examine_block
+from ns_abstract.api.certificate_report import look_closer
 from ns_abstract.api.certification import Certification, CertifySettings, FramePictures, open_certification
 from ns_abstract.api.files import Settings
-from ns_abstract.api.showing import look_closer
 from ns_abstract.cli import certify as certify_command
 from ns_abstract.cli.certify import Certify, certify
 from ns_abstract.demo.writing import write_demo
@@ -203,7 +203,7 @@ def test_given_set_is_that_of_a_file(
 ) -> None:
     """--translation and --rotation, as ns-abstract-render has them; without a set, the path's poses alone."""
     orders: list[Any] = []
-    monkeypatch.setattr("ns_abstract.cli.certifying.certify_path", lambda order, stop: orders.append(order) or True)
+    monkeypatch.setattr("ns_abstract.cli.searching.certify_path", lambda order, stop: orders.append(order) or True)
     prop = {"type": "classification", "label": 0, "preprocess": PRE}
     for more, spec in (
         ({"translation": 0.05, "rotation": (2, 1, 0), "angle_units": "degrees"},
@@ -502,8 +502,8 @@ def test_interrupt_leaves_what_is_finished(planted: Case, finished: Path, tmp_pa
 @pytest.mark.parametrize(
     "place",
     [
-        "ns_abstract.cli.certifying:open_certification",
-        "ns_abstract.cli.certifying:compile_beside",
+        "ns_abstract.cli.searching:open_certification",
+        "ns_abstract.cli.searching:compile_beside",
         "ns_abstract.api.certificate_report:preview",
         "ns_abstract.api.cell_search:examine_here",
     ],
@@ -524,7 +524,7 @@ def test_interrupted_before_the_first_block(
 def test_ended_while_kernels_are_compiled(planted: Case, tmp_path: Path) -> None:
     folder = tmp_path / "out"
     options = planted.options(folder)
-    check_ended_in_a_library_call(MODULE, "ns_abstract.cli.certifying.compile_beside", options, folder)
+    check_ended_in_a_library_call(MODULE, "ns_abstract.cli.searching.compile_beside", options, folder)
 
 
 @pytest.mark.slow
@@ -731,7 +731,7 @@ def test_where_it_fails_is_looked_at_closely(planted: Case, finished: Path, monk
         for _, low, high, kind, margin, example in cells(finished)
     ]
     job = planted.job
-    monkeypatch.setattr(showing, "SECONDS", np.inf)
+    monkeypatch.setattr(certificate_report, "SECONDS", np.inf)
     found = look_closer(job, entries, {0: rows}, lambda *_: None, lambda: False)
     broken = sum(r["upper"][0] - r["lower"][0] for r in rows if r["verdict"] == "falsified") / 0.3
     assert sum(region.share for region in found.regions) == pytest.approx(broken) and found.why == ""

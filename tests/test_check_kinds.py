@@ -64,8 +64,8 @@ from ns_abstract.io.atomic import write_json
 from ns_abstract.methods.nerf.render import NerfRenderer
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.splat.constants import VERSIONS
-from ns_abstract.methods.splat.ply import write_ply
 from ns_abstract.methods.splat.reference import Reference
+from ns_abstract.methods.splat.write import write_ply
 from ns_abstract.verify.picture_properties import parse_picture_property
 
 # ---------------------------------------------------------------- float32

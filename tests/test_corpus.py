@@ -48,8 +48,7 @@ from ns_abstract.io.folder import MARK, claim
 from ns_abstract.methods.nerf.occupancy import OccupancyGrid
 from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.methods.splat.load import load_scene
-from ns_abstract.methods.splat.ply import write_ply
-from ns_abstract.methods.splat.write import write_splatfacto_run
+from ns_abstract.methods.splat.write import write_ply, write_splatfacto_run
 from ns_abstract.refine.result import FrameResult, TracePoint
 from ns_abstract.report.certificate import write_certificate
 from ns_abstract.report.record import Report, RunRecord

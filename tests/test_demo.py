@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
+import io
 import json
 import os
-import struct
 import subprocess
 import sys
 import textwrap
-import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
 from benchmark_scripts import script
 from nerfstudio_runs import START
+from PIL import Image
 
 from ns_abstract.demo.paths import (
     TARGET,
@@ -68,22 +68,10 @@ def load_checkpoint(config: Path) -> dict:
 
 
 def read_png(data: bytes) -> np.ndarray:
-    """An independent reader of unfiltered 8-bit RGB PNGs: [H, W, 3]."""
-    assert data[:8] == b"\x89PNG\r\n\x1a\n"
-    at, packed, size = 8, b"", (0, 0)
-    while at < len(data):
-        (length,) = struct.unpack(">I", data[at : at + 4])
-        kind, body = data[at + 4 : at + 8], data[at + 8 : at + 8 + length]
-        assert struct.unpack(">I", data[at + 8 + length : at + 12 + length])[0] == zlib.crc32(kind + body)
-        if kind == b"IHDR":
-            size = struct.unpack(">II", body[:8])
-            assert body[8:] == bytes([8, 2, 0, 0, 0])
-        elif kind == b"IDAT":
-            packed += body
-        at += 12 + length
-    rows = np.frombuffer(zlib.decompress(packed), np.uint8).reshape(size[1], 1 + 3 * size[0])
-    assert not rows[:, 0].any()
-    return rows[:, 1:].reshape(size[1], size[0], 3)
+    """[H, W, 3] of an 8-bit RGB PNG."""
+    with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
+        assert image.mode == "RGB"
+        return np.asarray(image)
 
 
 # ---------------------------------------------------------------- scene

@@ -27,10 +27,9 @@ from ns_abstract.geometry.tiles import assemble
 from ns_abstract.geometry.transform import DataparserTransform
 from ns_abstract.methods.splat.frame import linear_sets
 from ns_abstract.methods.splat.method import SplatMethod
-from ns_abstract.methods.splat.ply import write_ply
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.methods.splat.shared_order import extensions, groups, matched, uncertain
-from ns_abstract.methods.splat.write import write_splatfacto_run
+from ns_abstract.methods.splat.write import write_ply, write_splatfacto_run
 from ns_abstract.perturbation.specification import parse_perturbation
 from ns_abstract.refine.difference import DifferenceFrame, _polynomial_upper, linear_upper
 from ns_abstract.refine.goal import RefinementGoal

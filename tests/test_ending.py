@@ -26,11 +26,11 @@ from waiting import until
 from ns_abstract.api import bounding
 from ns_abstract.api import job as job_module
 from ns_abstract.api.bounding import TileTask, bound, bound_frames, bound_part
+from ns_abstract.api.cell_search import search_blocks
 from ns_abstract.api.files import Settings, open_job
 from ns_abstract.api.job import Job
 from ns_abstract.api.poses import PoseSet
 from ns_abstract.api.scenes import load_scene
-from ns_abstract.api.searching import search_blocks
 from ns_abstract.cli import certify as certify_command
 from ns_abstract.cli import render as render_command
 from ns_abstract.cli.common import SignalStop, run

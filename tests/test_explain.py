@@ -56,7 +56,7 @@ def plain(*colors: list[float]) -> np.ndarray:
 
 def explained(inputs: Inputs, cells: int = 2) -> tuple[Job, Explanation]:
     job = open_job(Settings(inputs.config, inputs.path, inputs.spec))
-    result = job.bound(0, RefinementGoal(1.0, 300.0, cells), keep_leaves=True)
+    result = job.joined([job.bound_part(0, RefinementGoal(1.0, 300.0, cells), keep_leaves=True)])
     return job, explain(job, 0, result)
 
 
@@ -77,7 +77,8 @@ def test_other_layers_change_nothing(make_blobs: Make) -> None:
     job, found = explained(inputs)
     layered = open_job(Settings(inputs.config, inputs.path, inputs.spec, outputs=("rgb", "depth", "accumulation")))
     assert layered.layers and job.layers == ()
-    assert explain(layered, 0, job.bound(0, RefinementGoal(1.0, 300.0, 2), keep_leaves=True)) == found
+    same = job.joined([job.bound_part(0, RefinementGoal(1.0, 300.0, 2), keep_leaves=True)])
+    assert explain(layered, 0, same) == found
 
 
 def test_versions_without_tiles_to_miss_are_not_told_of_them(make_blobs: Make) -> None:
@@ -87,7 +88,7 @@ def test_versions_without_tiles_to_miss_are_not_told_of_them(make_blobs: Make) -
         job = open_job(
             Settings(inputs.config, inputs.path, inputs.spec, program=ProgramOptions(gsplat_version=version))
         )
-        found = explain(job, 0, job.bound(0, RefinementGoal(1.0, 300.0, 2), keep_leaves=True))
+        found = explain(job, 0, job.joined([job.bound_part(0, RefinementGoal(1.0, 300.0, 2), keep_leaves=True)]))
         assert [cause for cause in found.causes if "threshold" in cause] == [name]
 
 

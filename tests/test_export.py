@@ -27,10 +27,11 @@ from ns_abstract.io.atomic import write_json
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.version import computed_by
 from ns_abstract.methods.splat.load import load_scene
-from ns_abstract.methods.splat.ply import write_ply
 from ns_abstract.methods.splat.scene import SplatScene
+from ns_abstract.methods.splat.write import write_ply
 from ns_abstract.refine.result import FrameResult
 from ns_abstract.report.export import Results
+from ns_abstract.report.export import picture as picture_of
 from ns_abstract.report.files import IMAGES, load_frame, save_frame
 from ns_abstract.verify.properties import LinearClaim
 from ns_abstract.verify.vnnlib import load_vnnlib
@@ -105,7 +106,7 @@ def test_video_of_panels_labels_pictures(call: Call, bounded: Path, tmp_path: Pa
         for k, name in enumerate(("lower", "upper", "gap", "image")):
             left = k * (times * width + 6)
             panel = picture[20 : 20 + times * height, left : left + times * width]
-            wanted = results.picture(result, name).repeat(times, axis=0).repeat(times, axis=1).astype(int)
+            wanted = picture_of(result, name, results.largest).repeat(times, axis=0).repeat(times, axis=1).astype(int)
             # a lossy video
             assert np.abs(panel - wanted).mean() < 12.0, name
             label = picture[:20, left : left + times * width]

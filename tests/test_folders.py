@@ -12,6 +12,7 @@ import sqlite3
 import subprocess
 import sys
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -82,7 +83,7 @@ def test_a_new_search_removes_the_images_of_the_last_one(tmp_path: Path) -> None
 def test_frames_are_bounded_beside_the_files_of_others(tmp_path: Path) -> None:
     put(tmp_path)
     claim(tmp_path).close()
-    for start in (Report, Report.resume):
+    for start in (Report, partial(Report, keep_stored=True)):
         report = start(tmp_path, run(frames=(0,)))
         report.add(frame(0), picture=False)
         untouched(tmp_path)
@@ -370,7 +371,7 @@ def test_an_edited_frame_is_computed_again(tmp_path: Path) -> None:
     save_frame(file, dataclasses.replace(stored.result, lower=middle), about=stored.about)
     with pytest.raises(InputError, match=r"frame_00000\.npz: not as report\.json knows it"):
         Results(tmp_path)
-    again = Report.resume(tmp_path, run(frames=(0, 1), fingerprint=computed_by()))
+    again = Report(tmp_path, run(frames=(0, 1), fingerprint=computed_by()), keep_stored=True)
     assert again.kept == [1] and again.pending == [0] and "frame_00000.npz" in again.ignored[0]
     again.add(frame(0, witness=0.97), picture=False)
     np.testing.assert_array_equal(load_frame(file).result.lower, frame(0).lower)
@@ -385,7 +386,7 @@ def test_an_edited_frame_is_computed_again(tmp_path: Path) -> None:
     # without its report nothing is believed, and exports say so
     (tmp_path / "report.json").unlink()
     assert not Results(tmp_path).checked
-    assert Report.resume(tmp_path, run(frames=(0, 1), fingerprint=computed_by())).kept == []
+    assert Report(tmp_path, run(frames=(0, 1), fingerprint=computed_by()), keep_stored=True).kept == []
 
 
 def test_stored_frames_are_read_where_their_digests_are_known() -> None:
@@ -397,7 +398,7 @@ def test_stored_frames_are_read_where_their_digests_are_known() -> None:
         if re.search(r"\bload_frame\b", text := path.read_text())
     }
     # these read what the report, or the export's results, have checked
-    checked = {"report/comparison.py": "(Report)", "report/interchange.py": "report.export import Results"}
+    checked = {"report/recordings.py": "report.export import Results"}
     assert readers.keys() == {"report/files.py", "report/record.py", "report/export.py", *checked}
     assert all("frame_digests" in readers[name] for name in ("report/record.py", "report/export.py"))
     assert all(word in readers[name] for name, word in checked.items())
@@ -408,6 +409,6 @@ def test_digests_of_a_damaged_report(tmp_path: Path) -> None:
     document = read(tmp_path)
     for digests in (None, [], [1], {"frame_00000.npz": 3}, {"a": "b"}, "sha256"):
         (tmp_path / "report.json").write_text(json.dumps(document | {"sha256": digests}))
-        assert Report.resume(tmp_path, run(frames=(0,))).kept == []
+        assert Report(tmp_path, run(frames=(0,)), keep_stored=True).kept == []
         (tmp_path / "frame_00000.npz").unlink()
         Report(tmp_path, run(frames=(0,))).add(frame(0), picture=False)

@@ -39,8 +39,8 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.methods.load import load_any
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.splat.load import load_scene
-from ns_abstract.methods.splat.ply import write_ply
 from ns_abstract.methods.splat.scene import SplatScene
+from ns_abstract.methods.splat.write import write_ply
 
 torch.set_num_threads(1)
 

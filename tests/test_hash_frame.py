@@ -10,7 +10,7 @@ from benchmark_scripts import script
 from nerfactos import random_net, tiny_nerfacto
 from nerfs import poses
 
-from ns_abstract.methods.nerf.hash_bounds.frame import NerfactoFrame
+from ns_abstract.methods.nerf.hash_bounds.bounds import NerfactoFrame
 
 attack_nerfacto = script("attack_nerfacto")
 

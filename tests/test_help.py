@@ -16,8 +16,8 @@ import tyro
 from test_architecture import project
 
 from ns_abstract.cli import bench, export, help
+from ns_abstract.cli.common import mistake
 from ns_abstract.cli.examples import EXAMPLES
-from ns_abstract.cli.mistakes import mistake
 from ns_abstract.io.version import VERSION
 
 SCRIPTS: dict[str, str] = project()["scripts"]

@@ -31,8 +31,7 @@ from ns_abstract.io.keys import Key, KeyTable
 from ns_abstract.methods import config_keys
 from ns_abstract.methods.load import load_any
 from ns_abstract.methods.nerf.hash_field import NerfactoField
-from ns_abstract.methods.nerf.nerfacto_write import write_nerfacto_run
-from ns_abstract.methods.nerf.write import write_nerf_run
+from ns_abstract.methods.nerf.write import write_nerf_run, write_nerfacto_run
 from ns_abstract.methods.splat.write import write_splatfacto_run
 from ns_abstract.nerfstudio.torchvision_operators import declare_missing
 from ns_abstract.perturbation.specification import FILE_KEYS, load_perturbation, parse_perturbation

@@ -14,7 +14,7 @@ from PIL import Image
 from test_locate import taken
 
 import ns_abstract as nsa
-from ns_abstract.api.calibration import calibrate, training_data
+from ns_abstract.api.location import calibrate, training_data
 from ns_abstract.api.sequence import grown
 from ns_abstract.cli.locate import main
 from ns_abstract.geometry.camera_path import load_camera_path

@@ -30,7 +30,7 @@ from ns_abstract.methods.nerf.hash_field import NerfactoScene
 from ns_abstract.methods.nerf.nerfacto_load import resolutions, with_mean
 from ns_abstract.methods.nerf.nerfacto_render import NerfactoRenderer, even, quantiles
 from ns_abstract.methods.nerf.nerfacto_torch import DifferentiableNerfacto, grid_features, harmonics
-from ns_abstract.methods.nerf.nerfacto_write import write_nerfacto_run
+from ns_abstract.methods.nerf.write import write_nerfacto_run
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.nerfstudio.torchvision_operators import declare_missing
 

@@ -35,9 +35,8 @@ from ns_abstract.methods.runs import Tagged
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.load import load_scene
-from ns_abstract.methods.splat.ply import write_ply
 from ns_abstract.methods.splat.render import Renderer
-from ns_abstract.methods.splat.write import write_splatfacto_run
+from ns_abstract.methods.splat.write import write_ply, write_splatfacto_run
 from ns_abstract.nerfstudio import torchvision_operators
 from ns_abstract.perturbation.specification import load_perturbation
 from ns_abstract.viewer.background import Status

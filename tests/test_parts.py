@@ -94,7 +94,7 @@ def test_groups_hold_every_tile_once(blobs: Inputs) -> None:
 
 def test_one_group_is_the_frame(blobs: Inputs) -> None:
     job, goal = job_of(blobs), RefinementGoal(1.05, FOREVER, 40)
-    whole = job.bound(0, goal, keep_leaves=True)
+    whole = job.joined([job.bound_part(0, goal, keep_leaves=True)])
     everything = np.arange(job.frame(0).tile_count)
     part = job.bound_part(0, goal, everything, keep_leaves=True)
     same(job.joined([part]), whole)
@@ -137,7 +137,7 @@ def test_joined_groups_are_sound_and_reach_the_target(blobs: Inputs) -> None:
     said = [sentence for sentence in dim.plan if sentence not in result.plan]
     assert len(said) == 1 and "at most 0.41% of a pixel" in said[0]
     # bounds are about as tight as those of the frame as a whole
-    whole = job.bound(0, RefinementGoal(1.1, FOREVER, 4000))
+    whole = job.joined([job.bound_part(0, RefinementGoal(1.1, FOREVER, 4000))])
     assert mean_pixel_gap(result.lower, result.upper) <= 1.1 * mean_pixel_gap(whole.lower, whole.upper)
     # leaves of every tile cover the set and hold its pictures
     assert result.leaves is not None

@@ -16,10 +16,9 @@ from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.io.errors import InputError
-from ns_abstract.methods.nerf.method import NerfMethod
+from ns_abstract.methods.nerf.method import NerfMethod, NerfWeightFrame
 from ns_abstract.methods.nerf.render import Sampling, camera_rays
 from ns_abstract.methods.nerf.scene import NerfScene
-from ns_abstract.methods.nerf.weights import NerfWeightFrame
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.frame import SplatSample
 from ns_abstract.methods.splat.method import SplatMethod

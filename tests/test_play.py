@@ -19,14 +19,14 @@ from test_report import Reader, frame, run
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.refine.result import FrameResult, Leaves, SampleImages
 from ns_abstract.report import play
-from ns_abstract.report.certificate import CertifiedRun, certificate_document
+from ns_abstract.report.certificate import certificate_document
 from ns_abstract.report.certificate_page import CertificateDetails, certificate_page
 from ns_abstract.report.files import load_frame, save_frame
 from ns_abstract.report.picture import preview
 from ns_abstract.report.play import play_data
 from ns_abstract.report.record import Report
-from ns_abstract.report.regions import PoseImage
-from ns_abstract.report.walk import stops
+from ns_abstract.report.regions import PoseImage, stops
+from ns_abstract.report.run import CommandRun
 
 SIDE = 16
 LARGE = 10**9
@@ -390,15 +390,21 @@ def certificate(folder: Path) -> Path:
             for k, kind in enumerate(kinds)
         ]  # fmt: skip
 
-    about = CertifiedRun(
+    about = CommandRun(
         guarantee="float32-sound", renderer={"name": "gsplat", "version": "1.4.0"}, scene={"name": "a <script>"},
-        fingerprint={}, settings={}, command=("run",), network_guarantee=("sound",), model={"name": "net"}, property={},
-        sentence="it holds",
+        fingerprint={}, settings={}, command=("run",),
     )  # fmt: skip
+    claim = {
+        "property": {}, "property_text": "it holds", "network_guarantee": ("sound",), "picture": "float",
+        "model": {"name": "net"},
+    }  # fmt: skip
+    figures = {
+        "trace": [], "seconds": 1.0, "effort": {"worker_seconds": 1.0, "cells_bounded": 8}, "unknown_because": {},
+        "cells_seal": {},
+    }  # fmt: skip
     document = certificate_document(
-        about, [entry(0, ("azimuth",)), entry(1, ("azimuth", "<b>"))], state="done", trace=[], seconds=1.0,
-        effort={"worker_seconds": 1.0, "cells_bounded": 8}, reasons={}, cells_seal={},
-        scene_margin={"skipped": "not asked for", "kinds": []},
+        about, claim, [entry(0, ("azimuth",)), entry(1, ("azimuth", "<b>"))], figures, state="done",
+        scene_margin={"skipped": "not asked for", "kinds": []}, cameras={"cells": [], "left_out": 0},
     )  # fmt: skip
     red = preview(np.full((4, 4, 3), (200, 10, 10), np.uint8), 64)
     cells = {0: rows(0.0), 1: rows(4.0)}

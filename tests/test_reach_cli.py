@@ -362,7 +362,7 @@ def test_interrupted_and_resumed(edge: Course, finished: Path, tmp_path: Path) -
     "place",
     [
         "ns_abstract.api.reaching:open_loop",
-        "ns_abstract.api.compiling:compile_beside",
+        "ns_abstract.cli.searching:compile_beside",
         "ns_abstract.api.loop_report:simulate",
         "ns_abstract.api.cell_search:examine_here",
     ],
@@ -383,7 +383,7 @@ def test_interrupted_before_the_first_block(
 @pytest.mark.slow
 def test_ended_while_kernels_are_compiled(edge: Course, tmp_path: Path) -> None:
     folder = tmp_path / "out"
-    check_ended_in_a_library_call(MODULE, "ns_abstract.api.compiling.compile_beside", edge.options(folder), folder)
+    check_ended_in_a_library_call(MODULE, "ns_abstract.cli.searching.compile_beside", edge.options(folder), folder)
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -413,22 +414,22 @@ def test_resume(tmp_path):
     report.add(frame(2, witness=0.97), picture=False)
     (tmp_path / "frame_00002.npz").write_bytes((tmp_path / "frame_00002.npz").read_bytes()[:200])
     (tmp_path / ".report.json.0123abcd.part").write_text("half")
-    again = Report.resume(tmp_path, run(settings={"target_ratio": 1.05, "seed": 7}))
+    again = Report(tmp_path, run(settings={"target_ratio": 1.05, "seed": 7}), keep_stored=True)
     assert again.kept == [0, 1] and again.pending == [1, 2]
     assert len(again.ignored) == 1 and again.ignored[0].startswith("frame_00002.npz: cannot be read")
     assert read(tmp_path)["ignored"] == again.ignored and not list(tmp_path.glob(".*"))
-    assert Report.resume(tmp_path, run(settings={"target_ratio": 1.001})).pending == [0, 1, 2]
-    assert Report.resume(tmp_path, run(settings={"target_ratio": 2.0})).pending == [2]
-    needs_leaves = Report.resume(tmp_path, run(settings={"save_cells": True}))
+    assert Report(tmp_path, run(settings={"target_ratio": 1.001}), keep_stored=True).pending == [0, 1, 2]
+    assert Report(tmp_path, run(settings={"target_ratio": 2.0}), keep_stored=True).pending == [2]
+    needs_leaves = Report(tmp_path, run(settings={"save_cells": True}), keep_stored=True)
     assert needs_leaves.kept == [] and "has no leaf cells" in needs_leaves.ignored[0]
-    part = Report.resume(tmp_path, run(frames=(5,)))
+    part = Report(tmp_path, run(frames=(5,)), keep_stored=True)
     assert part.pending == [5] and [e["index"] for e in read(tmp_path)["frames"]] == [0, 1]
 
 
 def test_first_command_stays(tmp_path):
     """The command that began is kept beside those that go on, however many."""
     for k, keep in enumerate((False, True, True)):
-        report = (Report.resume if keep else Report)(tmp_path, run(command=("render", str(k))))
+        report = Report(tmp_path, run(command=("render", str(k))), keep_stored=keep)
         document = report.finish("done")
     assert document["first_command"] == ["render", "0"] and document["command"] == ["render", "2"]
     assert "Begun by" in (tmp_path / "report.html").read_text()
@@ -474,8 +475,8 @@ def test_only_tight_bounds_are_green(tmp_path, witness, kind):
 
 def test_done_by_the_caller_stays_done(tmp_path):
     Report(tmp_path, run()).add(frame(0, witness=0.5), "done", picture=False)
-    assert Report.resume(tmp_path, run()).pending == [1, 2]
-    assert Report.resume(tmp_path, run(settings={"target_ratio": 1.01})).pending == [0, 1, 2]
+    assert Report(tmp_path, run(), keep_stored=True).pending == [1, 2]
+    assert Report(tmp_path, run(settings={"target_ratio": 1.01}), keep_stored=True).pending == [0, 1, 2]
 
 
 @pytest.mark.parametrize(
@@ -495,11 +496,11 @@ def test_resume_refuses_other_settings(tmp_path, change, field):
     Report(tmp_path, run()).add(frame(0), picture=False)
     before = (tmp_path / "report.json").read_bytes()
     with pytest.raises(InputError, match=field) as caught:
-        Report.resume(tmp_path, run(fingerprint=change))
+        Report(tmp_path, run(fingerprint=change), keep_stored=True)
     assert "--output-dir" in str(caught.value) and (tmp_path / "report.json").read_bytes() == before
     # without its report, a frame file still knows what it holds
     (tmp_path / "report.json").unlink()
-    report = Report.resume(tmp_path, run(fingerprint=change))
+    report = Report(tmp_path, run(fingerprint=change), keep_stored=True)
     assert report.kept == [] and report.ignored == ["frame_00000.npz: computed with other settings"]
 
 
@@ -508,8 +509,8 @@ def test_resume_without_a_report(tmp_path):
     for content in ("", "[1]", '{"version": 1', '{"version": 1}', '{"fingerprint": NaN}'):
         (tmp_path / "report.json").write_text(content)
         # nothing says that the frame is as it was written
-        assert Report.resume(tmp_path, run()).kept == []
-    assert Report.resume(tmp_path / "empty", run()).pending == [0, 1, 2]
+        assert Report(tmp_path, run(), keep_stored=True).kept == []
+    assert Report(tmp_path / "empty", run(), keep_stored=True).pending == [0, 1, 2]
 
 
 def test_fresh_start_names_old_files(tmp_path):
@@ -553,7 +554,7 @@ def test_added_again(tmp_path):
     # the same command: time and trace are those of the last call
     assert (entry["seconds"], entry["cells"], len(entry["trace"])) == (4.0, 20, 4)
     assert entry["mpg"] == metrics(tight)["mpg"]
-    later = Report.resume(tmp_path, run())
+    later = Report(tmp_path, run(), keep_stored=True)
     for _ in range(2):
         entry = later.add(wide, picture=False)
         assert (entry["seconds"], entry["cells"], len(entry["trace"])) == (7.0, 32, 8)
@@ -567,7 +568,7 @@ def test_added_again(tmp_path):
 
 def test_unwritable(tmp_path):
     (tmp_path / "file").write_text("")
-    for make in (Report, Report.resume):
+    for make in (Report, partial(Report, keep_stored=True)):
         with pytest.raises(InputError, match="cannot be written") as caught:
             make(tmp_path / "file" / "out", run())
         assert "--output-dir" in str(caught.value)

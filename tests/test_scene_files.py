@@ -44,10 +44,9 @@ from ns_abstract.methods.load import load_any
 from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.splat.load import load_scene
-from ns_abstract.methods.splat.ply import write_ply
 from ns_abstract.methods.splat.scene import SplatScene
-from ns_abstract.methods.splat.write import write_splatfacto_run
-from ns_abstract.report import picture as pictures
+from ns_abstract.methods.splat.write import write_ply, write_splatfacto_run
+from ns_abstract.report import record
 from ns_abstract.report.export import Results
 from ns_abstract.report.run import guarantee_text
 
@@ -373,8 +372,8 @@ def test_the_report_says_of_the_gaussians_alone(
     from ns_abstract.cli import render
 
     titles: list[str] = []
-    save = pictures.save_picture
-    monkeypatch.setattr(pictures, "save_picture", lambda *a, **k: titles.append(k["guarantee"]) or save(*a, **k))
+    save = record.save_picture
+    monkeypatch.setattr(record, "save_picture", lambda *a, **k: titles.append(k["guarantee"]) or save(*a, **k))
     edit(plain, (STOCK, "_target: !!python/name:sea.WaterModel ''"))
     options = ["--load-config", str(plain), "--camera-path-filename", str(path_of(tmp_path)), "--time-budget", "5"]
     code, _, said = in_process(render.main, [*options, "--output-dir", str(tmp_path / "refused")])

@@ -31,9 +31,8 @@ import ns_abstract as nsa
 from ns_abstract.methods.load import load_any
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.splat.load import load_scene
-from ns_abstract.methods.splat.ply import write_ply
 from ns_abstract.methods.splat.scene import SplatScene
-from ns_abstract.methods.splat.write import write_splatfacto_run
+from ns_abstract.methods.splat.write import write_ply, write_splatfacto_run
 
 # Values that are not finite
 

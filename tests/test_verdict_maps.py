@@ -22,13 +22,19 @@ from ns_abstract.report.regions import (
     MOST,
     FailureRegion,
     PoseImage,
+    cell_at,
+    coarse_first,
+    direction,
     distances,
     falsified_regions,
     nearest,
     regions_html,
     reported_outputs,
+    stops,
     touching,
+    walk_html,
 )
+from ns_abstract.report.regions import MOST_STOPS as STOPS
 from ns_abstract.report.verdict_maps import (
     BAD,
     GOOD,
@@ -44,8 +50,6 @@ from ns_abstract.report.verdict_maps import (
     shades,
 )
 from ns_abstract.report.verdict_picture import clear_pictures, write_pictures
-from ns_abstract.report.walk import MOST as STOPS
-from ns_abstract.report.walk import cell_at, coarse_first, direction, stops, walk_html
 from ns_abstract.verify.cells import CellGrid
 
 KINDS = ("certified", "falsified", "unknown")

@@ -2,7 +2,7 @@
 
 from planted.fault import Fault
 
-_RUNS, _HEADER, _READ = "methods/runs.py", "methods/splat/ply_header.py", "methods/splat/ply_read.py"
+_RUNS, _HEADER, _READ = "methods/runs.py", "methods/splat/ply_header.py", "methods/splat/load.py"
 _LOAD, _ROWS = "methods/splat/load.py", "methods/splat/drawable.py"
 _FILES = "test_scene_files.py::"
 

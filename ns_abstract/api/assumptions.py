@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 from ns_abstract.api.scenes import Scene
@@ -67,33 +66,11 @@ def _ray_choices(scene: Scene, program: dict[str, Any]) -> list[Assumption]:
 def set_choices(pose_sets: Sequence[PoseBox], size: str, varied: str) -> tuple[Assumption, ...]:
     """Return the choices about the pictures' size and the varied parameters of the sets.
 
-    Args:
-        size: Origin of the size.
-        varied: Origin of the sets.
+    ``size``: origin of the size. ``varied``: origin of the sets.
     """
     camera = pose_sets[0].camera
     names = dict.fromkeys(name for poses in pose_sets for name in poses.box.names)
     return (
         Assumption("picture size", f"{camera.width} x {camera.height}", size),
         Assumption("varied", ", ".join(names) or "nothing", varied),
-    )
-
-
-def file_choices(
-    pose_sets: Sequence[PoseBox], path: Path, factor: float, file: Path | None, given: bool, inside: bool
-) -> tuple[Assumption, ...]:
-    """The same for the files of a command line.
-
-    Args:
-        file: The perturbation file, or None.
-        given: Whether options say what varies.
-        inside: Whether the camera path says so.
-    """
-    varied = "options" if given else file.name if file is not None else f"{path.name}: perturbation"
-    if not (given or file is not None or inside):
-        varied = "default: single poses"
-    size = f"{path.name}: render_width, render_height"
-    return (
-        *set_choices(pose_sets, size if factor == 1 else f"{size}, by --downscale-factor", varied),
-        choice("downscale_factor", f"{factor:.9g}", None if factor == 1 else factor, "--downscale-factor"),
     )

@@ -110,12 +110,8 @@ def bound_part(
 ) -> PartResult | None:
     """Bound one part of a frame on a worker, which keeps the scene open; None if the time ended before any result.
 
-    Args:
-        neighbours: Tasks that share this machine's cores.
-        earlier: What was found of the frame before, where that saves work.
-
-    Raises:
-        InputError: The worker reads other files under the same names than the command did.
+    ``neighbours``: tasks that share this machine's cores. ``earlier``: what was found of the frame before, where that
+    saves work. Raises InputError where the worker reads other files under the same names than the command did.
     """
     use_threads(len(os.sched_getaffinity(0)) // neighbours)
     job = load(recipe)
@@ -348,17 +344,7 @@ def bound(
         scene, [pose_box], arithmetic=arithmetic, seed=seed, memory_limit=memory_limit, workers=workers,
         layers=[name for name in names if name != "rgb"],
     )  # fmt: skip
-    with interruptible() as stop:
-        results = bound_frames(
-            job, [0], engine=SerialEngine(), budget=time_budget, target_ratio=target_ratio, keep_leaves=keep_cells,
-            stop=stop, on_progress=listener(stop, on_progress),
-        )  # fmt: skip
-        frames = list(results)
-    if not frames:
-        if stop():
-            raise KeyboardInterrupt
-        raise InputError("over before one picture was rendered", field="time_budget", fix="give more")
-    guarantee = "sampled" if frames[0].problems else job.method.guarantee
+    result, guarantee, interrupted = bound_alone(job, time_budget, on_progress, target_ratio, keep_cells)
     about = {
         "guarantee": guarantee,
         "renderer": job.method.program,
@@ -367,9 +353,31 @@ def bound(
     }
     told = short_guarantee(guarantee, about["scene"].get("bounded"))
     return BoundResult.of(
-        frames[0], guarantee=told, interrupted=stop(), target_ratio=target_ratio, about=about,
+        result, guarantee=told, interrupted=interrupted, target_ratio=target_ratio, about=about,
         assumptions=job.assumptions,
     )  # fmt: skip
+
+
+def bound_alone(
+    job: Job, budget: float, on_progress: OnProgress | None, target_ratio: float, keep_leaves: bool = False
+) -> tuple[FrameResult, str, bool]:
+    """The result of a job's only frame, its guarantee, and whether Ctrl-C or ``on_progress`` ended the work.
+
+    Raises:
+        InputError: The time is over before the first render.
+        KeyboardInterrupt: Ctrl-C came before it, or twice.
+    """
+    with interruptible() as stop:
+        results = bound_frames(
+            job, [0], engine=SerialEngine(), budget=budget, target_ratio=target_ratio, keep_leaves=keep_leaves,
+            stop=stop, on_progress=listener(stop, on_progress),
+        )  # fmt: skip
+        frames = list(results)
+    if not frames:
+        if stop():
+            raise KeyboardInterrupt
+        raise InputError("over before one picture was rendered", field="time_budget", fix="give more")
+    return frames[0], "sampled" if frames[0].problems else job.method.guarantee, stop()
 
 
 def listener(stop: StopRequest, on_progress: Callable[[Any], object] | None) -> Callable[[Any], None]:

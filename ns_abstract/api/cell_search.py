@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import io
 import math
+import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
@@ -17,9 +18,10 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 
 from ns_abstract.api.margins import NOT_ASKED, SHARE, Margins, certified_cells
-from ns_abstract.api.searching import periodic_report, search_blocks
-from ns_abstract.execution.cancellation import Deadline
+from ns_abstract.arithmetic.kernel_cache import store as kernels
+from ns_abstract.execution.cancellation import Deadline, WorkCancelledError, cancel_when
 from ns_abstract.execution.engines import Engine
+from ns_abstract.execution.scheduler import Task, work
 from ns_abstract.execution.stopping import StopRequest
 from ns_abstract.execution.threads import use_threads
 from ns_abstract.execution.worker_cache import Recipe, load
@@ -36,6 +38,10 @@ P = TypeVar("P")
 C = TypeVar("C")
 #: A row of ``cells``, JSON read: see `Store.leaves`.
 Row = dict[str, Any]
+#: Seconds between notes of progress, and between reports.
+_TRACE, _REPORT = 1.0, 30.0
+#: Examines cells of a grid of the frame with this number.
+Examine = Callable[[int, CellGrid, tuple[Cell, ...]], BlockResult]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -74,9 +80,7 @@ class Examiner(Protocol):
         """What becomes of cells of the set with this number: verdicts, and smaller cells where there is none.
 
         Depends on the cells alone. "certified" means a proved lower bound above 0 of the margin of every picture.
-
-        Raises:
-            WorkCancelledError: There is no time for it.
+        Raises WorkCancelledError where there is no time for it.
         """
         ...
 
@@ -140,11 +144,7 @@ class CellQuestion(ABC, Generic[P]):
         return iter(())
 
     def check(self, request: Request) -> None:
-        """Refuse what cannot be done, before anything is written.
-
-        Raises:
-            InputError: What and why.
-        """
+        """Refuse what cannot be done, before anything is written. Raises InputError that says what and why."""
 
     def reserved(self, seconds: float) -> float:
         """Seconds of so many for search and report together that are kept for `after`."""
@@ -183,13 +183,10 @@ class CellQuestion(ABC, Generic[P]):
 
 @dataclass(frozen=True)
 class Request:
-    """How much is to be done.
+    """How much is to be done, in ``budget`` seconds.
 
-    Attributes:
-        budget: Seconds.
-        scene_margin: Whether to look for the largest variation of the scene for which what is certified holds, in half
-            of the time.
-        on_open: Called with the store before the search, when there is a report.
+    ``scene_margin``: whether to look, in half of the time, for the largest variation of the scene for which what is
+    certified holds. ``on_open`` is called with the store before the search, when there is a report.
     """
 
     budget: float
@@ -205,11 +202,9 @@ class Request:
 class CellSearch(Generic[P]):
     """The search for verdicts on a question's cells.
 
-    Attributes:
-        store: ``cells.sqlite``, from `open` on.
-        last: Writes the report, also when the process is ended.
-        scene_margin: What report.json says of margins of the scene.
-        deadline: When no more pictures are made for the report.
+    ``store`` is ``cells.sqlite``, from `open` on; ``last`` writes the report, also when the process is ended;
+    ``scene_margin`` is what report.json says of margins of the scene; from ``deadline`` on no more pictures are made
+    for the report.
     """
 
     question: CellQuestion[P]
@@ -227,11 +222,7 @@ class CellSearch(Generic[P]):
         self.store: Store
 
     def open(self, *, resume: bool) -> Store:
-        """The store, with the sets begun.
-
-        Raises:
-            InputError: The folder cannot be used.
-        """
+        """The store, with the sets begun. Raises InputError where the folder cannot be used."""
         question = self.question
         fingerprint = question.examiner.fingerprint
         self.store = store = question.store(
@@ -267,12 +258,8 @@ class CellSearch(Generic[P]):
     def run(self, engine: Callable[[ExitStack], Engine], stop: StopRequest, request: Request) -> dict[str, Any]:
         """Search, and write the results as they come; returns the content of report.json.
 
-        Args:
-            engine: Starts the engine, which ends with the stack.
-            stop: Asked at least twice a second.
-
-        Raises:
-            InputError: The folder cannot be used, or the question cannot be asked.
+        ``engine``: starts the engine, which ends with the stack. ``stop``: asked at least twice a second. Raises
+        InputError where the folder cannot be used, or the question cannot be asked.
         """
         question, self.request, self.stop = self.question, request, stop
         question.check(request)
@@ -385,3 +372,91 @@ def result_cells(rows: Mapping[int, list[Row]], make: Callable[..., C], *columns
 def cell_place(cell: Cell, otherwise: str) -> str:
     """A part of a file's name that tells a cell from all others of its set."""
     return "_".join(f"{a}-{b}" for a, b in zip(cell.first, cell.past, strict=True)) or otherwise
+
+
+def periodic_report(
+    store: Store, on_progress: Callable[[], object], report: Callable[[], object] = lambda: None
+) -> Callable[[float], None]:
+    """Return what a search does between results: often a point of the trace and ``on_progress``, rarely ``report``."""
+    traced = reported = time.perf_counter()
+
+    def tick(instant: float) -> None:
+        nonlocal traced, reported
+        if instant - traced >= _TRACE:
+            traced = instant
+            store.trace()
+            on_progress()
+        if instant - reported >= _REPORT:
+            reported = instant
+            report()
+
+    return tick
+
+
+def search_blocks(
+    store: Store,
+    engine: Engine,
+    grids: dict[int, CellGrid],
+    examine: Examine,
+    on_workers: tuple[Callable[..., BlockResult], Any],
+    *,
+    deadline: Deadline,
+    stop: StopRequest,
+    keep: Callable[[CellBlock, Any], object],
+    on_tick: Callable[[float], object],
+    finish_one: bool = True,
+) -> None:
+    """Examine open blocks until none is left, the time is over or ``stop`` says so.
+
+    Until the engine's workers have started, this process examines blocks, too: a kill in the first seconds keeps those.
+
+    Args:
+        engine: Where blocks are examined; closed at the end.
+        on_workers: For others: a function of a module, and what it takes before the arguments of ``examine``.
+        stop: Asked at least twice a second, and ends a block at once in this process.
+        keep: Given every block and its findings before they are stored.
+        on_tick: Told the reading of the clock after results, and twice a second where others work.
+        finish_one: Whether one block is waited for however late it is, so that resuming with any budget gets on.
+    """
+    # workers take the kernels that were compiled here
+    kernels().publish()
+    flying: dict[int, CellBlock] = {}
+    finished = 0 if finish_one else 1
+
+    def offer(room: int) -> Iterator[Task]:
+        if deadline.late and (flying or finished):
+            return
+        for block in store.pending(set(flying), room):
+            flying[block.number] = block
+            arguments = block.frame, grids[block.frame], block.cells
+            if engine.shares:
+                yield Task(block.number, examined, arguments)
+            else:
+                yield Task(block.number, on_workers[0], (on_workers[1], *arguments))
+
+    def over() -> bool:
+        return stop() or (deadline.late and finished > 0)
+
+    def examined(index: int, grid: CellGrid, cells: tuple[Cell, ...]) -> BlockResult | None:
+        # in this process a block is given up at the deadline or a signal
+        try:
+            with stop.at_once(), cancel_when(lambda: deadline.late and finished > 0):
+                return examine(index, grid, cells)
+        except (KeyboardInterrupt, WorkCancelledError):
+            return None
+
+    def take(block: CellBlock, findings: BlockResult | None) -> None:
+        nonlocal finished
+        if findings is None:
+            return
+        keep(block, findings)
+        store.close_block(block, findings, grids[block.frame])
+        finished += 1
+
+    for results in work(engine, offer, over):
+        for number, findings in results:
+            take(flying.pop(number), findings)
+        if engine.starting and not over():
+            for block in store.pending(set(flying), 1):
+                take(block, examined(block.frame, grids[block.frame], block.cells))
+        on_tick(time.perf_counter())

@@ -2,25 +2,33 @@
 
 from __future__ import annotations
 
+import time
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
 from ns_abstract.api.cell_search import CellSearch
-from ns_abstract.api.certification import Certification
-from ns_abstract.api.showing import look_closer
-from ns_abstract.execution.cancellation import WorkCancelledError
+from ns_abstract.api.certification import Certification, FramePictures
+from ns_abstract.execution.cancellation import WorkCancelledError, cancel_when, check_cancelled
+from ns_abstract.io.errors import InputError
+from ns_abstract.report import regions as broken
 from ns_abstract.report.cameras import CameraDrawings, cameras_entry, cell_cameras, standing, upward
-from ns_abstract.report.certificate import CertifiedRun, certificate_document
-from ns_abstract.report.certificate_page import certificate_page
+from ns_abstract.report.certificate import certificate_document, search_figures
+from ns_abstract.report.certificate_page import CertificateDetails, certificate_page
+from ns_abstract.report.figures import ShownUnits
 from ns_abstract.report.outside import SceneDrawing
 from ns_abstract.report.picture import preview
+from ns_abstract.report.regions import FailureRegion, PoseImage, coarse_first
+from ns_abstract.report.regions import stops as poses_along
+from ns_abstract.report.run import CommandRun
 from ns_abstract.report.verdict_picture import write_pictures
+from ns_abstract.verify.properties import Claim
 from ns_abstract.verify.store import Store, Tally, fractions
 from ns_abstract.verify.store_file import IMAGES
 
@@ -29,12 +37,17 @@ _EXAMPLES, _IMAGES = 5, 6
 _PIXELS = 256
 #: Cells whose picture the page shows when they are chosen, and its longest side.
 _SEEN, _SEEN_PIXELS = 64, 96
+#: Seconds that a closer look may take; the longest side of its pictures; cells without a verdict that are tried for a
+#: right pose where none is certified.
+SECONDS, _CLOSE_PIXELS, _TRIED = 10.0, 160, 4
+_OVER = ", without pictures: there was no time for them"
+CellRows = Mapping[int, Sequence[Mapping[str, Any]]]
 
 
 class CertificateReport:
     """Writes report.json and report.html of a search."""
 
-    def __init__(self, job: Certification, about: CertifiedRun, search: CellSearch[Any]) -> None:
+    def __init__(self, job: Certification, about: CommandRun, search: CellSearch[Any]) -> None:
         self.job, self.about, self.search = job, about, search
         self.shown: list[dict[str, Any]] = []
         self.seen: dict[tuple[int, int], dict[str, Any]] = {}
@@ -47,18 +60,17 @@ class CertificateReport:
         sets = {frame: self.job.job.pose_sets[frame] for frame in rows}
         cells, left_out = cell_cameras(sets, rows, [name for name, _ in self.job.job.parameters])
         self.cameras = CameraDrawings(cells, left_out, self._standing, self._outside, upward(sets))
+        claim = {
+            "property": self.job.question.source.value,
+            "property_text": self.job.property.sentence(),
+            "network_guarantee": self.job.question.guarantee(self.job.arithmetic),
+            "picture": self.job.picture,
+            "model": self.job.question.describe(),
+        }
         document = certificate_document(
-            self.about,
-            entries,
-            state=state,
-            trace=store.points,
-            seconds=store.seconds,
-            effort=store.effort,
-            reasons=store.reasons,
-            cells_seal={"rows": store.seal.rows, "sum": store.seal.text},
-            scene_margin=self.search.scene_margin,
-            cameras=cameras_entry(cells, left_out),
-        )
+            self.about, claim, entries, search_figures(store), state=state,
+            scene_margin=self.search.scene_margin, cameras=cameras_entry(cells, left_out),
+        )  # fmt: skip
         return document, rows
 
     def write(self, state: str, *, pictures: bool = True) -> dict[str, Any]:
@@ -230,3 +242,80 @@ def _worst(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Falsified cells, worst first; neighbours may share their counterexample, which counts once."""
     broken = sorted((row for row in rows if row["verdict"] == "falsified"), key=_depth)
     return list({tuple(row["counterexample"]): row for row in reversed(broken)}.values())[::-1]
+
+
+class _PoseRenderer:
+    """Renders poses and shows them to the network."""
+
+    def __init__(self, job: Certification, cached: Callable[[int, np.ndarray], np.ndarray | None]) -> None:
+        self._job, self._kept = job, cached
+        self._names = [name for name, _ in job.job.parameters]
+        self._frames: dict[int, tuple[FramePictures, Claim]] = {}
+
+    def look(self, title: str, frame: int, values: Sequence[float]) -> PoseImage:
+        """The picture at values of all parameters, the network's outputs and the margin.
+
+        Raises:
+            WorkCancelledError: There is no time for it.
+        """
+        check_cancelled()
+        if frame not in self._frames:
+            pictures = self._job.pictures(frame)
+            self._frames[frame] = pictures, self._job.claim(pictures)
+        pictures, claim = self._frames[frame]
+        pose = np.array([values[self._names.index(name)] for name in pictures.box.names], np.float64)
+        # of another scene of the set, maybe
+        image = self._kept(frame, pose) if pictures.pose_set.perturbation.scene else None
+        if image is None:
+            image = pictures.image(pose)
+        outputs = np.asarray(self._job.model.outputs(image[None]), np.float64)
+        with torch.no_grad():
+            margin = float(claim.margin(torch.from_numpy(outputs), torch.from_numpy(pose[None]))[0])
+        png = preview(pictures.shown(image, pose), _CLOSE_PIXELS)
+        return PoseImage(title, values, png, outputs[0].tolist(), margin if np.isfinite(margin) else None)
+
+    def right(self, region: FailureRegion, rows: CellRows, parameters: Sequence[Mapping[str, Any]]) -> PoseImage | None:
+        """The nearest certified pose; where none is, the middle of a near cell at which the network is right."""
+        cells = rows[region.frame]
+        for _, pose in broken.nearest(cells, "certified", region.pose, parameters):
+            return self.look("nearest certified pose", region.frame, pose)
+        for k, _ in broken.nearest(cells, "unknown", region.pose, parameters, _TRIED):
+            pose = [0.5 * (a + b) for a, b in zip(cells[k]["lower"], cells[k]["upper"], strict=True)]
+            picture = self.look("a near pose, right but not certified", region.frame, pose)
+            if picture.margin is not None and picture.margin > 0.0:
+                return picture
+        return None
+
+
+def look_closer(
+    job: Certification,
+    entries: Sequence[Mapping[str, Any]],
+    rows: CellRows,
+    cached: Callable[[int, np.ndarray], np.ndarray | None],
+    over: Callable[[], bool],
+) -> CertificateDetails:
+    """Regions where the property fails, and poses along the sets, with pictures.
+
+    Args:
+        cached: The stored image of a counterexample, by frame and pose.
+        over: Whether no more pictures are to be rendered; `SECONDS` from now none are, either.
+    """
+    end = time.perf_counter() + SECONDS
+    looks = _PoseRenderer(job, cached)
+    regions = broken.falsified_regions(entries, rows)
+    sides = {entry["index"]: entry["parameters"] for entry in entries}
+    pictures: list[tuple[PoseImage, PoseImage | None]] = []
+    stops = poses_along(entries, rows, ShownUnits.of(job.job.describe()))
+    pictures_by_frame: dict[int, PoseImage] = {}
+    why = _OVER
+    # a property that makes no sense for a frame is told by who searches
+    with suppress(WorkCancelledError, InputError), cancel_when(lambda: over() or time.perf_counter() >= end):
+        for region in regions[: broken.MOST]:
+            picture = looks.look("counterexample", region.frame, region.pose)
+            pictures.append((picture, looks.right(region, rows, sides[region.frame])))
+        why = ""
+        for k in coarse_first(len(stops)) if len(stops) > 1 else []:
+            pictures_by_frame[k] = looks.look(stops[k].at, stops[k].frame, stops[k].values)
+    return CertificateDetails(
+        regions, pictures, [(stops[k], pictures_by_frame[k]) for k in sorted(pictures_by_frame)], why
+    )

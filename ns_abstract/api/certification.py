@@ -187,11 +187,8 @@ class Certification:
     def claim(self, pictures: FramePictures, poses: PoseBox | None = None) -> Claim:
         """What is to hold in a frame.
 
-        Args:
-            poses: The frame's set, if its parameters are counted otherwise than the pictures have them.
-
-        Raises:
-            InputError: The property makes no sense there.
+        ``poses``: the frame's set, if its parameters are counted otherwise than the pictures have them. Raises
+        InputError where the property makes no sense there.
         """
 
         def nominal() -> np.ndarray:
@@ -372,14 +369,8 @@ class Certification:
     ) -> tuple[Path, Path]:
         """Write the abstract image of a cell, the network and the property for other verifiers.
 
-        Args:
-            form, version: As in `ns_abstract.verify.interop.write_vnnlib`.
-
-        Returns:
-            The .onnx and the .vnnlib file.
-
-        Raises:
-            InputError: The property is not linear in the outputs, or the network cannot be extended.
+        ``form``, ``version``: as in `ns_abstract.verify.interop.write_vnnlib`. Returns the .onnx and the .vnnlib file.
+        Raises InputError where the property is not linear in the outputs, or the network cannot be extended.
         """
         from ns_abstract.verify.interop import write_vnnlib
 
@@ -417,11 +408,9 @@ def _open(
 class CertifySettings:
     """What to certify, as the command line says it.
 
-    Attributes:
-        model: Network, .onnx; None: the property is one of the picture.
-        network_arithmetic: "float32" or "real", of the network.
-        picture: Whether the network is shown floats or pictures of 8 bits.
-        memory: Bytes for the bounds of one process.
+    ``model``: network, .onnx; None: the property is one of the picture. ``network_arithmetic``: "float32" or "real".
+    ``picture``: whether the network is shown floats or pictures of 8 bits. ``memory``: bytes for the bounds of one
+    process.
     """
 
     files: Settings
@@ -433,11 +422,7 @@ class CertifySettings:
 
 
 def open_certification(settings: CertifySettings) -> Certification:
-    """Open the files of a command line.
-
-    Raises:
-        InputError: A file or a field cannot be used.
-    """
+    """Open the files of a command line. Raises InputError where a file or a field cannot be used."""
     question = asked(settings.model, PropertySource.of(settings.property))
     job = open_job(settings.files, default=Perturbation(), drawn=question.drawn)
     return Certification(job, question, settings.memory, settings.network_arithmetic, settings.picture)

@@ -33,9 +33,10 @@ from ns_abstract.io.arguments import file_path
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.memory import allowed_memory
-from ns_abstract.report.certificate import CertifiedRun, coverage, verdict
+from ns_abstract.report.certificate import coverage, verdict
 from ns_abstract.report.figures import percent, short_guarantee
 from ns_abstract.report.notebook import verdicts_html
+from ns_abstract.report.run import CommandRun
 from ns_abstract.report.verdict_picture import clear_pictures
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.eight_bit import Picture
@@ -102,21 +103,10 @@ class CertificateQuestion(CellQuestion[CertifyProgress]):
         sets = {index: job.job.pose_sets[index].box for index in frames}
         super().__init__(job, job.job.parameters, sets, job.job.fixed)
         self.job, self.finish_one = job, not job.job.rays
-        self.about = CertifiedRun(
-            guarantee=job.job.method.guarantee,
-            network_guarantee=job.question.guarantee(job.arithmetic),
-            renderer={name: job.job.method.program[name] for name in ("name", "version")},
-            scene=job.job.describe(),
-            model=job.question.describe(),
-            property=job.question.source.value,
-            sentence=job.property.sentence(),
-            settings=settings,
-            fingerprint=job.fingerprint,
-            command=command,
+        self.about = CommandRun.of(
+            job.job, settings, command, fingerprint=job.fingerprint, assumptions=job.assumptions,
             plan=(*job.job.plan, *job.scenes, *job.property.notes),
-            picture=job.picture,
-            assumptions=job.assumptions,
-        )
+        )  # fmt: skip
         self._report: CertificateReport | None = None
 
     def reports(self, search: CellSearch[Any]) -> CertificateReport:

@@ -11,19 +11,18 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.api.assumptions import DEFAULT
-from ns_abstract.api.bounding import OnProgress, bound_frames, listener
+from ns_abstract.api.bounding import OnProgress, bound_alone
 from ns_abstract.api.files import Settings, path_sets
 from ns_abstract.api.job import Job
 from ns_abstract.api.poses import PoseSet, pose_set
 from ns_abstract.api.scenes import Scene, SceneSource, checked_scene
 from ns_abstract.arithmetic.selfcheck import platform_problems
-from ns_abstract.execution.engines import SerialEngine
-from ns_abstract.execution.stopping import interruptible
 from ns_abstract.execution.worker_cache import Recipe
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import CameraPath, PinholeCamera, load_camera_path
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
+from ns_abstract.io.arguments import at_least, positive
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.refine.difference import DifferenceFrame
@@ -104,7 +103,7 @@ class ComparisonJob(Job):
     def recipe(self) -> Recipe[Any]:
         sources = self.source.absolute, self.other.source.absolute
         again = partial(
-            _open, *sources, self.pose_sets, self.tolerance, arithmetic=self._arithmetic, seed=self.seed,
+            _open, *sources, self.pose_sets, self.tolerance, arithmetic=self.arithmetic, seed=self.seed,
             memory_limit=self.memory_limit,
         )  # fmt: skip
         return Recipe(again, self.fingerprint, sources[0].file)
@@ -186,11 +185,7 @@ def _named(other: Scene) -> Iterator[None]:
 
 
 def _check_comparable(scene: Scene, other: Scene, pose_sets: Sequence[PoseBox]) -> None:
-    """Refuse what cannot be compared.
-
-    Raises:
-        InputError: Which, and what to do.
-    """
+    """Refuse what cannot be compared. Raises InputError that says which, and what to do."""
     if scene.rays != other.rays:
         raise InputError(
             "a NeRF and a splat scene have no common bounds",
@@ -227,12 +222,8 @@ def _frame_choice(scene: Scene, other: Scene) -> Assumption:
 def open_comparison(settings: Settings, other: SceneSource, tolerance: float | None = None) -> ComparisonJob:
     """Open the files of a command line.
 
-    Args:
-        other: B.
-        tolerance: See `ComparisonJob`.
-
-    Raises:
-        InputError: A file, a field or an option cannot be used.
+    ``other``: B. ``tolerance``: see `ComparisonJob`. Raises InputError where a file, a field or an option cannot be
+    used.
     """
     scene, second = settings.scene.open(), other.open()
     if second.background is None and scene.background is not None:
@@ -325,20 +316,8 @@ def compare(
         arithmetic=arithmetic, seed=seed,
         memory_limit=memory_limit, workers=workers,
     )  # fmt: skip
-    with interruptible() as stop:
-        results = list(
-            bound_frames(
-                job, [0], engine=SerialEngine(), budget=time_budget, target_ratio=target_ratio, stop=stop,
-                on_progress=listener(stop, on_progress),
-            )
-        )  # fmt: skip
-    if not results:
-        if stop():
-            raise KeyboardInterrupt
-        raise InputError("over before one picture was rendered", field="time_budget", fix="give more")
-    result = results[0]
+    result, guarantee, interrupted = bound_alone(job, time_budget, on_progress, target_ratio)
     assert result.largest is not None
-    guarantee = "sampled" if result.problems else job.method.guarantee
     return Comparison(
         result.upper,
         result.witness_upper,
@@ -351,24 +330,19 @@ def compare(
         seconds=result.seconds,
         cell_count=result.cells,
         bounded=result.bounded,
-        interrupted=stop(),
+        interrupted=interrupted,
         assumptions=job.assumptions,
     )
 
 
 def check_comparison(tolerance: float | None, target_ratio: float, budget: float | None, prefix: str = "--") -> None:
-    """Refuse numbers that cannot be used.
-
-    Raises:
-        InputError: One of them; options are named with ``prefix``.
-    """
+    """Refuse numbers that cannot be used. Raises InputError: one of them; options are named with ``prefix``."""
 
     def name(word: str) -> str:
         return f"--{word}".replace("_", "-") if prefix else word
 
     if tolerance is not None and not 0.0 <= tolerance <= 1.0:
         raise InputError(f"found {tolerance}", field=name("tolerance"), fix="give a number from 0 to 1")
-    if budget is not None and not 0.0 < budget < float("inf"):
-        raise InputError(f"found {budget}", field=name("time_budget"), fix="give a positive number")
-    if not 1.0 <= target_ratio < float("inf"):
-        raise InputError(f"found {target_ratio}", field=name("target_ratio"), fix="give a number of at least 1")
+    if budget is not None:
+        positive(budget, name("time_budget"))
+    at_least(target_ratio, 1.0, name("target_ratio"))

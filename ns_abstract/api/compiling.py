@@ -81,10 +81,7 @@ class _CompileProgress:
 def compile_beside(job: Job, index: int, processes: int | None = None) -> None:
     """Compile the kernels that frame ``index`` needs and the cache lacks, in several processes, each once.
 
-    What they cannot compile is left to this process.
-
-    Args:
-        processes: How many; None: one for every core.
+    What they cannot compile is left to this process. ``processes``: how many; None: one for every core.
     """
     frame = job.frame(index)
     if not frame.stages or not (stages := missing(frame)):

@@ -33,12 +33,11 @@ _REST = "motion over a cell, and what is loose only together"
 class Explanation:
     """The explanation of a frame's gap: its causes, regions and scene elements.
 
-    Attributes:
-        gap, excess: Mean over pixels and channels of the bounds' width, and what of it no render reached.
-        leaves: Leaf cells (one tile each) that were bounded again.
-        causes: Part of these leaves' excess that goes away without each, taken one at a time.
-        regions: Share of the excess, first and past row, first and past column, of the tiles that hold most.
-        elements: Number of a scene element, and the part of the widest leaf's gap that goes away without it.
+    ``gap`` is the mean over pixels and channels of the bounds' width, ``excess`` what of it no render reached;
+    ``leaves`` leaf cells (one tile each) were bounded again. ``causes`` are the part of these leaves' excess that goes
+    away without each, taken one at a time; ``regions`` the share of the excess, first and past row, first and past
+    column, of the tiles that hold most; ``elements`` the number of a scene element, and the part of the widest leaf's
+    gap that goes away without it.
     """
 
     index: int

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from ns_abstract.api.assumptions import file_choices
+from ns_abstract.api.assumptions import choice, set_choices
 from ns_abstract.api.job import Job
 from ns_abstract.api.scenes import Scene, SceneSource
 from ns_abstract.geometry.camera_path import CameraPath, load_camera_path
@@ -51,11 +51,19 @@ class Settings:
 
     def set_choices(self, pose_sets: Sequence[PoseBox], path: CameraPath) -> tuple[Assumption, ...]:
         """Where the size of the pictures and their sets come from."""
-        inside = any(entry is not None for entry in path.perturbations)
-        return file_choices(
-            pose_sets, Path(path.source), self.downscale_factor, self.perturbation_filename,
-            self.given_set is not None, inside,
-        )  # fmt: skip
+        file, factor, name = self.perturbation_filename, self.downscale_factor, Path(path.source).name
+        if self.given_set is not None:
+            varied = "options"
+        elif file is not None:
+            varied = file.name
+        else:
+            inside = any(entry is not None for entry in path.perturbations)
+            varied = f"{name}: perturbation" if inside else "default: single poses"
+        size = f"{name}: render_width, render_height"
+        return (
+            *set_choices(pose_sets, size if factor == 1 else f"{size}, by --downscale-factor", varied),
+            choice("downscale_factor", f"{factor:.9g}", None if factor == 1 else factor, "--downscale-factor"),
+        )
 
 
 class PathJob(Job):
@@ -79,14 +87,6 @@ class PathJob(Job):
             # options have no file
             named = error.field is not None and not error.field.startswith("--")
             raise error.within(settings.perturbation_filename or path.source) if named else error from None
-
-    def pose_set(self, index: int, perturbation: Perturbation) -> PoseBox:
-        """The poses of ``perturbation`` around entry ``index`` of the path.
-
-        Raises:
-            InputError: The path cannot be swept as asked.
-        """
-        return pose_set(self.path, index, perturbation)
 
 
 def pose_set(path: CameraPath, index: int, perturbation: Perturbation) -> PoseBox:

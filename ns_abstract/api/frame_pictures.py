@@ -35,11 +35,7 @@ class PropertySource:
 
     @classmethod
     def of(cls, given: Mapping[str, Any] | str | Path) -> PropertySource:
-        """Of a mapping, or read from a file.
-
-        Raises:
-            InputError: The file cannot be read.
-        """
+        """Of a mapping, or read from a file. Raises InputError where the file cannot be read."""
         if isinstance(given, Mapping):
             return cls(dict(given))
         return cls(load_json(Path(given), "property file"), Path(given))

@@ -76,7 +76,9 @@ class Job:
         self.layers = tuple(name for name in EXTRA_OUTPUTS if name in layers)
         if unknown := [name for name in layers if name not in EXTRA_OUTPUTS]:
             raise InputError(f"found {unknown[0]}", field="--outputs", fix=f"use rgb, {', '.join(EXTRA_OUTPUTS)}")
-        self.source, self._arithmetic, self.rays = scene.source, arithmetic, scene.rays
+        self.source, self.rays = scene.source, scene.rays
+        #: what was asked for; None: the strongest that the scene has
+        self.arithmetic = arithmetic
         self.method: Method = scene.method(arithmetic, workers)
         self.pose_sets, self.seed, self.memory_limit = tuple(pose_sets), seed, memory_limit
         self.workers = workers if scene.rays else 1
@@ -98,11 +100,6 @@ class Job:
         self._check_memory()
 
     @property
-    def arithmetic(self) -> str | None:
-        """The arithmetic that was asked for; None: the strongest that the scene has."""
-        return self._arithmetic
-
-    @property
     def frame_count(self) -> int:
         """Number of sets."""
         return len(self.pose_sets)
@@ -111,7 +108,7 @@ class Job:
     def recipe(self) -> Recipe[Job]:
         """How another process opens this job; files are looked for under the same paths."""
         source = self.source.absolute
-        again = partial(_open, source, self.pose_sets, self._arithmetic, self.seed, self.memory_limit, self.layers)
+        again = partial(_open, source, self.pose_sets, self.arithmetic, self.seed, self.memory_limit, self.layers)
         return Recipe(again, self.fingerprint, Path(self.source.file))
 
     @property
@@ -202,18 +199,6 @@ class Job:
                 field="--time-budget",
                 fix="give more, raise --downscale-factor, or take fewer samples",
             )
-
-    def bound(
-        self,
-        index: int,
-        goal: RefinementGoal,
-        *,
-        keep_leaves: bool = False,
-        stopped: Callable[[], bool] = lambda: False,
-        progress: Callable[[TracePoint, float], None] = lambda point, share: None,
-    ) -> FrameResult:
-        """Refine frame ``index``."""
-        return self.joined([self.bound_part(index, goal, keep_leaves=keep_leaves, stopped=stopped, progress=progress)])
 
     def bound_part(
         self,
@@ -368,11 +353,7 @@ def warm_up(frame: Frame) -> None:
 
 
 def check_frames(frames: Sequence[int] | None, count: int) -> tuple[int, ...]:
-    """The frames asked for, each once, in order.
-
-    Raises:
-        InputError: A number is not an entry of the path.
-    """
+    """The frames asked for, each once, in order. Raises InputError where a number is not an entry of the path."""
     if not frames:
         return tuple(range(count))
     for frame in frames:

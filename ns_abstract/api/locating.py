@@ -25,9 +25,11 @@ from ns_abstract.api.scenes import Scene, checked_scene
 from ns_abstract.api.search_options import SearchKeywords, SearchOptions
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.io.errors import InputError
+from ns_abstract.report.certificate import search_figures
 from ns_abstract.report.figures import percent, short_guarantee
-from ns_abstract.report.location import LocatedRun, location_document, location_page, location_pictures
+from ns_abstract.report.location import location_document, location_page, location_pictures
 from ns_abstract.report.notebook import verdicts_html
+from ns_abstract.report.run import CommandRun
 from ns_abstract.verify.cells import CellGrid
 from ns_abstract.verify.location_store import LocationStore
 from ns_abstract.verify.store import Store
@@ -75,23 +77,8 @@ class LocationQuestion(CellQuestion[LocateProgress]):
     ) -> None:
         self.job = job
         super().__init__(job, job.job.parameters, {k: job.search(k).frame.box for k in frames}, job.job.fixed)
-        self.about = LocatedRun(
-            guarantee=job.job.method.guarantee,
-            renderer=dict(job.job.method.program),
-            scene=job.job.describe(),
-            assumptions=job.job.assumptions,
-            photo=None if job.file is None else str(job.file),
-            levels=job.photo.levels,
-            noise=job.photo.noise,
-            outliers=job.photo.outliers,
-            counted=int(job.photo.counted.sum()),
-            allowed=job.photo.allowed,
-            more=_more(job),
-            settings=settings,
-            fingerprint=job.fingerprint,
-            command=command,
-            plan=job.job.plan,
-        )
+        program = dict(job.job.method.program)
+        self.about = CommandRun.of(job.job, settings, command, fingerprint=job.fingerprint, renderer=program)
 
     def grid(self, number: int) -> CellGrid:
         return self.job.search(number).grid
@@ -120,12 +107,20 @@ class LocationQuestion(CellQuestion[LocateProgress]):
         rows = {tally.frame: store.leaves(tally.frame) for tally in store.tallies()}
         sets = {frame: self.job.job.pose_sets[frame] for frame in rows}
         poses = {frame: store.poses(frame) for frame in rows}
+        photo = self.job.photo
+        about = {
+            "file": self.job.file,
+            "noise": photo.noise,
+            "outliers": photo.outliers,
+            "counted": int(photo.counted.sum()),
+            "allowed": photo.allowed,
+            **_more(self.job),
+        }
         document = location_document(
-            self.about, self.parameters, sets, rows, poses, state=state, seconds=store.seconds, effort=store.effort,
-            trace=store.points,
-        )  # fmt: skip
+            self.about, about, self.parameters, sets, rows, poses, search_figures(store), state=state
+        )
         if search.request.report:
-            photo, picture, missed = self.job.photo, None, None
+            picture, missed = None, None
             if document["best"] is not None and state != "interrupted":
                 values = poses[document["best"]["frame"]][0].values
                 picture = self.job.picture(document["best"]["frame"], np.array(values))

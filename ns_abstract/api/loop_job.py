@@ -46,12 +46,9 @@ _RULES = 3
 class LoopJob:
     """An opened scene and a loop.
 
-    Args:
-        job: The scene, with the poses of the loop's camera as its only set.
-        network_arithmetic: Whether every float32 evaluation of the network is meant, or the exact one alone.
-
-    Raises:
-        InputError: The loop does not go with the network, or the platform's arithmetic is not sound.
+    ``job``: the scene, with the poses of the loop's camera as its only set. ``network_arithmetic``: whether every
+    float32 evaluation of the network is meant, or the exact one alone. Raises InputError where the loop does not go
+    with the network, or the platform's arithmetic is not sound.
     """
 
     def __init__(self, job: Job, loop: Loop, network_arithmetic: NetworkArithmetic = "float32") -> None:
@@ -221,11 +218,7 @@ def open_loop(
 
 
 def _seen(scene: Scene, loop: Loop, size: tuple[int, int], arithmetic: str | None) -> Job:
-    """The scene with the poses of the loop's camera.
-
-    Raises:
-        InputError: Loops are not for this scene.
-    """
+    """The scene with the poses of the loop's camera. Raises InputError: loops are not for this scene."""
     poses = loop.camera.poses(size)
     origin = "the network's input" if loop.preprocess.resize is None else "loop file: preprocess.resize"
     job = Job(scene, [poses], arithmetic=arithmetic, set_choices=set_choices([poses], origin, "loop file: camera"))

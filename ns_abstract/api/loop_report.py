@@ -17,7 +17,7 @@ from ns_abstract.reach.learned import LearnedDynamics
 from ns_abstract.reach.page import loop_page
 from ns_abstract.reach.search import QUESTIONS, Question, SimulatedRun, sampled_disturbances, simulate
 from ns_abstract.reach.tubes import Dependence, Tube
-from ns_abstract.report.certificate import SCENE_MARGIN
+from ns_abstract.report.certificate import SCENE_MARGIN, search_figures
 from ns_abstract.report.outside import SceneDrawing
 from ns_abstract.report.run import CommandRun, file_stamp, plain
 from ns_abstract.verify.search_results import Verdict
@@ -53,16 +53,7 @@ class LoopReport:
 
     def __init__(self, job: LoopJob, settings: Mapping[str, Any], command: tuple[str, ...]) -> None:
         self.job = job
-        self.about = CommandRun(
-            guarantee=job.job.method.guarantee,
-            renderer={name: job.job.method.program[name] for name in ("name", "version")},
-            scene=job.job.describe(),
-            assumptions=job.assumptions,
-            settings=settings,
-            fingerprint=job.fingerprint,
-            command=command,
-            plan=job.job.plan,
-        )
+        self.about = CommandRun.of(job.job, settings, command, fingerprint=job.fingerprint, assumptions=job.assumptions)
         self.simulated: list[SimulatedRun] = []
         self.tubes: list[dict[str, Any]] = []
         self.examples: list[dict[str, Any]] = []
@@ -171,11 +162,7 @@ class LoopReport:
                 "film": self.film,
                 "scene_margin": search.scene_margin,
                 "falsifying": self.examples,
-                "trace": store.points,
-                "seconds": store.seconds,
-                "effort": store.effort,
-                "unknown_because": store.reasons,
-                "cells_seal": {"rows": store.seal.rows, "sum": store.seal.text},
+                **search_figures(store),
             }
             | self.about.tail(state, METRICS)
         )

@@ -41,12 +41,9 @@ _TUNING = NearbyTuning()
 
 @dataclass(frozen=True)
 class DrawnElements:
-    """What a box shows on the pixels of one frame that are not settled.
+    """What a box shows on the ``pixels`` [t, side, side] of one frame that are not settled.
 
-    Attributes:
-        tiles: [t] numbers of the tiles that hold these pixels.
-        pixels: [t, side, side] these pixels.
-        context: Of the box, for bounds of cells inside.
+    ``tiles`` [t] are numbers of the tiles that hold them; ``context`` of the box is for bounds of cells inside.
     """
 
     tiles: np.ndarray
@@ -56,12 +53,9 @@ class DrawnElements:
 
 @dataclass(frozen=True)
 class KnownBox:
-    """Bounds of all pictures over a box.
+    """Bounds ``lower``, ``upper`` [H, W, C] float32 of all pictures over a box.
 
-    Attributes:
-        lower, upper: [H, W, C] float32.
-        open: [H, W] bool, the pixels that are not settled.
-        elements: By frame of weights; None: every pixel is settled.
+    ``open`` [H, W] are the pixels that are not settled; ``elements`` by frame of weights; None: every pixel is settled.
     """
 
     lower: np.ndarray
@@ -85,11 +79,8 @@ Weights = Sequence[tuple[ElementFrame, Sequence[int]]]
 class KnownBoxes:
     """What is known of boxes around cells (Q5).
 
-    Args:
-        pictures: The pictures: blending weights alone.
-        weights: What bounds and draws them.
-        wanted: [H, W] the pixels that are read.
-        measures: All that the claim reads of them.
+    ``pictures`` are blending weights alone, which ``weights`` bounds and draws; ``wanted`` [H, W] are the pixels that
+    are read; ``measures`` all that the claim reads of them.
     """
 
     def __init__(
@@ -180,12 +171,8 @@ class KnownBoxes:
 class NearbyPictures:
     """Pictures [H, W, C] of cells inside of a box; see `ns_abstract.verify.protocol.FrameImages`.
 
-    Args:
-        pictures: The pictures of the set.
-        weights: What bounds and draws them.
-        box_bounds: What is known of the box.
-        draws: By frame, what draws the pixels that are not settled; empty where there are none.
-        measures: All that the claim reads of them.
+    Arguments as of `KnownBoxes`; ``box_bounds`` is what is known of the box, ``draws`` by frame what draws the pixels
+    that are not settled; empty where there are none.
     """
 
     def __init__(

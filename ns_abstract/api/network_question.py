@@ -16,7 +16,6 @@ from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.refine.protocol import Method
 from ns_abstract.report.run import file_stamp
-from ns_abstract.verify.camera_response import CameraResponse
 from ns_abstract.verify.eight_bit import Picture
 from ns_abstract.verify.model import NetworkModel
 from ns_abstract.verify.network import NetworkArithmetic, load_network
@@ -29,11 +28,7 @@ if TYPE_CHECKING:
 
 
 class Question:
-    """A network and the property to prove of it.
-
-    Raises:
-        InputError: A file or a field cannot be used.
-    """
+    """A network and the property to prove of it. Raises InputError where a file or a field cannot be used."""
 
     #: Pixels that the picture moves by over a first cell: with one parameter, and with more.
     motion = (0.08, 0.5)
@@ -86,16 +81,9 @@ class Question:
             raise InputError("takes whole numbers from 0 to 255", file=self.model, field="input", fix=fix)
         return NetworkModel(self.network, self.property.preprocess, memory, arithmetic)
 
-    def pictures(
-        self,
-        method: Method,
-        poses: PoseBox,
-        picture: Picture,
-        response: CameraResponse | None = None,
-        sheared: bool = False,
-    ) -> FramePictures:
+    def pictures(self, method: Method, poses: PoseBox, picture: Picture) -> FramePictures:
         """The pictures of a set that are shown to the network."""
-        return FramePictures(method, poses, picture, response, sheared)
+        return FramePictures(method, poses, picture)
 
     @property
     def name(self) -> str:

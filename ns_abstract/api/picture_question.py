@@ -40,8 +40,7 @@ from ns_abstract.refine.protocol import (
     WeightMethod,
     WeightPlane,
 )
-from ns_abstract.report.planes import planes_picture
-from ns_abstract.verify.camera_response import CameraResponse
+from ns_abstract.report.picture import planes_picture
 from ns_abstract.verify.eight_bit import Picture
 from ns_abstract.verify.network import NetworkArithmetic
 from ns_abstract.verify.picture_properties import FARTHEST, MeasureModel, PictureProperty, parse_picture_property
@@ -337,14 +336,7 @@ class PictureQuestion:
             raise InputError("is what a network is shown, and there is none", field="--picture", fix="leave it out")
         return self.property.model(*self._size)
 
-    def pictures(
-        self,
-        method: Method,
-        poses: PoseBox,
-        picture: Picture,
-        response: CameraResponse | None = None,
-        sheared: bool = False,
-    ) -> PlanePictures:
+    def pictures(self, method: Method, poses: PoseBox, picture: Picture) -> PlanePictures:
         """The pictures of a set with what is read."""
         return PlanePictures(method, poses, self.property)
 

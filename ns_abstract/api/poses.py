@@ -211,11 +211,7 @@ class PoseSet:
 
 
 def pose_set(value: PoseSet | PinholeCamera, field: str = "poses") -> PoseSet:
-    """``value`` as a set of poses: a camera is the set of its one pose.
-
-    Raises:
-        InputError: It is neither.
-    """
+    """``value`` as a set of poses: a camera is the set of its one pose. Raises InputError where it is neither."""
     if isinstance(value, PinholeCamera):
         return PoseSet(value)
     if not isinstance(value, PoseSet):

@@ -42,11 +42,7 @@ class SceneSource:
         return replace(self, file=self.file.absolute(), options=replace(self.options, occupancy_grid=grid))
 
     def open(self) -> Scene:
-        """Read it.
-
-        Raises:
-            InputError: A file or an option cannot be used.
-        """
+        """Read it. Raises InputError where a file or an option cannot be used."""
         return Scene(self)
 
 
@@ -131,11 +127,7 @@ class Scene:
 
 
 def checked_scene(value: Any) -> Scene:
-    """``value``, which is a scene.
-
-    Raises:
-        InputError: It is none.
-    """
+    """``value``, which is a scene. Raises InputError where it is none."""
     if not isinstance(value, Scene):
         fix = "give what ns_abstract.load_scene returns"
         raise InputError(f"found {type(value).__name__}", field="scene", fix=fix)

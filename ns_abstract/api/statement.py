@@ -25,11 +25,9 @@ def statement(folder: Path) -> tuple[dict[str, Any], list[str]]:
     """Return the in-toto Statement (v1) of the certificate in ``folder``, and notes.
 
     Its subjects are the scene, the network and the property or loop, each with the SHA-256 that the certificate was
-    made for. Files that lie where they did are named too, if they still are what was certified.
-
-    Raises:
-        InputError: The folder holds no certificate, its cells are not those of its report, or an advisory speaks
-            against the version that made it.
+    made for. Files that lie where they did are named too, if they still are what was certified. Raises InputError where
+    the folder holds no certificate, its cells are not those of its report, or an advisory speaks against the version
+    that made it.
     """
     try:
         report = read_report(folder)

@@ -66,12 +66,8 @@ class InstanceFolder:
     def add(self, job: Certification, frame: int, parts: Sequence[int], name: str = "") -> None:
         """Cut the set of poses of ``frame`` into boxes and write an instance of each.
 
-        Args:
-            parts: Boxes along each parameter; empty: one.
-            name: Of the network, in the names of the instances.
-
-        Raises:
-            InputError: The property or the network cannot be written, or an instance of this name is there.
+        ``parts``: boxes along each parameter; empty: one. ``name``: of the network, in the names of the instances.
+        Raises InputError where the property or the network cannot be written, or an instance of this name is there.
         """
         box = job.job.pose_sets[frame].box
         parts = tuple(parts) or (1,) * box.dimensions

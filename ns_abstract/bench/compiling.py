@@ -24,12 +24,7 @@ _NAMED = 3
 
 @dataclass
 class _Running:
-    """A function that is being compiled.
-
-    Attributes:
-        wall, processor: Clocks when it began, seconds.
-        inner: Processor seconds of the functions that were compiled for it.
-    """
+    """A function that is being compiled: its clocks when it began, and processor seconds ``inner`` compiled for it."""
 
     name: str
     wall: float
@@ -134,12 +129,8 @@ def _without_kernels() -> Iterator[None]:
 def compile_times(job: PathJob, name: str, frame: int) -> list[dict[str, Any]]:
     """Seconds that each kernel of a frame takes to compile in one new process, stage by stage, and all together.
 
-    Args:
-        name: Of the set of poses; see `sets.SETS`.
-
-    Returns:
-        By kernel: its stage, how many functions it is linked from, seconds by the clock, of the processor, and inside
-        LLVM, and what took most of it.
+    ``name``: of the set of poses; see `sets.SETS`. Returns by kernel: its stage, how many functions it is linked from,
+    seconds by the clock, of the processor, and inside LLVM, and what took most of it.
     """
     with _without_kernels(), ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         rows = pool.submit(_measured, job.recipe, pose_set(job, name, frame)).result()

@@ -8,24 +8,42 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ns_abstract.api.certifying import CertifyProgress, certify
 from ns_abstract.api.loop_job import LoopJob, open_loop
 from ns_abstract.api.loop_report import widths
+from ns_abstract.api.poses import PoseSet
 from ns_abstract.api.reaching import ReachCell, ReachProgress, ReachResult, reach
 from ns_abstract.api.scenes import Scene
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.reach.search import QUESTIONS, SimulatedRun, first_outside, sampled_disturbances, simulate
 from ns_abstract.reach.tubes import Dependence, Tube
 
 #: What tubes keep, by how a table calls it.
 _MODES: dict[Dependence, str] = {"kept": "kept", "step": "within a step", "none": "none"}
+#: Seconds between two words of where a search stands.
+_SAID = 10.0
+#: Sets by name, as a perturbation file writes them.
+SETS: dict[str, dict[str, Any]] = {
+    "x": {"translation": {"x": 0.05}},
+    "xyz": {"translation": {"x": 0.05, "y": 0.05, "z": 0.05}},
+    "xyz-small": {"translation": {"x": 0.01, "y": 0.01, "z": 0.01}},
+    "six": {
+        "translation": {"x": 0.005, "y": 0.005, "z": 0.005},
+        "rotation": {"yaw": 0.005, "pitch": 0.005, "roll": 0.005},
+    },
+    "six-wide": {
+        "translation": {"x": 0.05, "y": 0.05, "z": 0.05},
+        "rotation": {"yaw": 0.02, "pitch": 0.02, "roll": 0.02},
+    },
+}
 
 
 class LoopTables(NamedTuple):
-    """Rows of a benchmark.
+    """Rows of a benchmark, of its ``search`` and of its ``steps``.
 
-    Attributes:
-        search: One row: certified fraction by time, the part of random runs that go well, states compared with tubes.
-        steps: A row by step: mean widths of a certified cell's tubes, and of the hull of runs from it.
+    ``search`` is one row: certified fraction by time, the part of random runs that go well, states compared with tubes.
+    ``steps`` is a row by step: mean widths of a certified cell's tubes, and of the hull of runs from it.
     """
 
     search: list[dict[str, Any]]
@@ -44,10 +62,8 @@ def measure(
 ) -> LoopTables:
     """Search a loop, then attack its certified cells and compare one of them with simulated runs.
 
-    Args:
-        runs: Random runs from the whole initial box, each compared with the tube of its cell; and as many from one
-            cell.
-        marks: Seconds at which the certified fraction is told.
+    ``runs``: random runs from the whole initial box, each compared with the tube of its cell; and as many from one
+    cell. ``marks``: seconds at which the certified fraction is told.
     """
     points: list[ReachProgress] = []
     said(f"searching for {seconds:g} s")
@@ -56,11 +72,8 @@ def measure(
     question = QUESTIONS[job.questions[-1]]
     cells = [cell for cell in result.cells if cell.question == question]
     row: dict[str, Any] = {"question": question, "seconds": result.seconds}
-    for mark in marks:
-        fractions = [getattr(point, question) for point in points if point.seconds <= mark]
-        row[f"at {mark:g} s"] = (
-            getattr(result, question) if result.seconds <= mark else fractions[-1] if fractions else 0.0
-        )
+    told = [(point.seconds, getattr(point, question)) for point in points]
+    row |= _at_marks(marks, told, result.seconds, getattr(result, question))
     said(f"{runs} runs from the whole box")
     row |= _attack(job, result, cells, runs, rng)
     certified = [cell for cell in cells if cell.verdict == "certified"]
@@ -72,6 +85,16 @@ def measure(
     row["violations"] += outside
     row["states compared"] += runs * (job.loop.steps + 1)
     return LoopTables([row], steps)
+
+
+def _at_marks(
+    marks: Sequence[float], told: Sequence[tuple[float, float]], seconds: float, last: float
+) -> dict[str, float]:
+    """The fraction at each of ``marks``, by what was ``told`` (seconds, fraction); after all ``seconds`` the last."""
+    return {
+        f"at {mark:g} s": last if seconds <= mark else next((f for t, f in reversed(told) if t <= mark), 0.0)
+        for mark in marks
+    }
 
 
 def _box(job: LoopJob, cell: ReachCell) -> ParameterBox:
@@ -139,3 +162,61 @@ def _by_step(job: LoopJob, box: ParameterBox, count: int, rng: np.random.Generat
             row[name] = tube_widths[step] if step < len(tube_widths) else float("inf")
         rows.append(row | {"kept / simulated": row["kept"] / float(width)})
     return rows, outside
+
+
+def curve(
+    scene: Scene,
+    camera: PinholeCamera,
+    name: str,
+    specification: dict[str, Any],
+    model: Path,
+    prop: Path,
+    seconds: float,
+    workers: int,
+    marks: Sequence[float],
+    said: Callable[[str], object] = lambda text: None,
+    following: PinholeCamera | None = None,
+) -> dict[str, Any]:
+    """Search one set for ``seconds``.
+
+    Args:
+        marks: Times, in seconds from the call, at which the certified fraction is told; kernels have to be loaded, and
+            compiled at the first time, within them.
+        said: Told from time to time where the search stands.
+        following: The camera after ``camera`` on its path, for sets that sweep segments.
+
+    Returns:
+        A row: certified fraction at the marks and at the end, falsified and unknown ones, cells bounded by the network,
+        worker seconds by bounded cell.
+    """
+    points: list[CertifyProgress] = []
+    said(f"{name}: searching for {seconds:g} s")
+    due = _SAID
+
+    def on_progress(point: CertifyProgress) -> None:
+        nonlocal due
+        points.append(point)
+        if point.seconds >= due:
+            due = point.seconds + _SAID
+            said(
+                f"{name}: {point.seconds:.0f} s, certified {point.certified:.2%}, falsified {point.falsified:.2%}, "
+                f"unknown {point.unknown:.2%}"
+            )
+
+    certificate = certify(
+        scene, PoseSet.from_json(camera, specification, following=following), model, prop,
+        time_budget=seconds, workers=workers, on_progress=on_progress,
+    )  # fmt: skip
+    effort = certificate.report["effort"]
+    bounded = effort["cells_bounded"]
+    row: dict[str, Any] = {"set": name, "parameters": len(certificate.parameters), "network": model.stem}
+    told = [(point.seconds, point.certified) for point in points]
+    row |= _at_marks(marks, told, certificate.seconds, certificate.certified)
+    return row | {
+        "seconds": certificate.seconds,
+        "certified": certificate.certified,
+        "falsified": certificate.falsified,
+        "unknown": certificate.unknown,
+        "bounded": bounded,
+        "worker s / bounded": effort["worker_seconds"] / bounded if bounded else float("nan"),
+    }

@@ -109,20 +109,11 @@ def _scene_of_pixel(splats: Splats, weights: Float64Array, most: int) -> Splats 
 def compare(
     job: PathJob, name: str, frame: int, parts: int, pixels: int, most: int, seed: int = 0
 ) -> list[dict[str, object]]:
-    """Mean gaps of all rules over sampled pixels, for the middle one of ``parts`` equal cells of a set.
+    """Mean gaps of all rules over sampled pixels, for the middle one of ``parts`` equal cells of a set by axis.
 
-    Args:
-        job: The scene.
-        name: Set of poses.
-        frame: Entry of the camera path.
-        parts: Cells by axis that the set is cut into.
-        pixels: Pixels drawn from those where Gaussians take at least half of the light.
-        most: Gaussians of a pixel's scene: those with the largest weights at the cell's middle.
-        seed: Of the draw.
-
-    Returns:
-        One row for each rule: gap (length over RGB) relative to that of renders within the cell, its
-        largest value over the pixels, and milliseconds by pixel.
+    ``pixels`` are drawn from those where Gaussians take at least half of the light; a pixel's scene has at most
+    ``most`` Gaussians, those with the largest weights at the cell's middle. Returns one row for each rule: gap (length
+    over RGB) relative to that of renders within the cell, its largest value over the pixels, and milliseconds by pixel.
     """
     splats = activate(splat_of(job).scene, PAPER)
     poses = pose_set(job, name, frame)

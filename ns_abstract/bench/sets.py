@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.api.files import PathJob, Settings, open_job
+from ns_abstract.api.files import pose_set as path_pose_set
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.overrides import Overrides
@@ -53,10 +54,7 @@ def open_jobs(
 
     Without ``arithmetic`` it is the strongest that the method has; ``program`` draws the scenes, ``overrides`` stand in
     place of what the files say. Without ``camera_path`` each run's own ``camera_path.json``, in the folder that holds
-    the method's folder, is used.
-
-    Raises:
-        InputError: A file cannot be used.
+    the method's folder, is used. Raises InputError where a file cannot be used.
     """
     if not load_config:
         from ns_abstract.demo.writing import write_demo
@@ -76,11 +74,7 @@ def open_jobs(
 
 
 def splat_of(job: PathJob) -> SplatMethod:
-    """The method of a splat scene.
-
-    Raises:
-        InputError: The run is of another method.
-    """
+    """The method of a splat scene. Raises InputError where the run is of another method."""
     if not isinstance(job.method, SplatMethod):
         raise InputError("not a splat scene", file=job.settings.load_config, fix="give a run of splatfacto")
     return job.method
@@ -112,4 +106,4 @@ def pose_set(job: PathJob, name: str, frame: int, scale: float = 1.0) -> PoseBox
     perturbation = replace(
         perturbation, translation=scaled(perturbation.translation), rotation=scaled(perturbation.rotation)
     )
-    return job.pose_set(frame, perturbation)
+    return path_pose_set(job.path, frame, perturbation)

@@ -106,17 +106,10 @@ def run_case(
 ) -> Outcome:
     """Refine one case for a fixed number of cells, then attack it through all renderers.
 
-    The compiled renderer and the float64 reference attack both arithmetics, the reference in float32
-    attacks "float32".
-
-    Args:
-        arithmetic: "real" or "float32".
-        cells: Most cells bounded; the work ends there unless the bounds are as tight as the witnesses.
-        seconds: Limit of the refinement and of each attack; reaching it makes the outcome depend on
-            the machine.
-        poses: Images by the compiled renderer.
-        reference_poses: Images by each reference.
-        frame: What bounds and renders: called like `SplatFrame`.
+    The compiled renderer and the float64 reference attack both arithmetics, the reference in float32 attacks "float32".
+    The work ends after ``cells`` unless the bounds are as tight as the witnesses; ``seconds`` limit the refinement and
+    each attack, and reaching that makes the outcome depend on the machine. ``poses`` are images by the compiled
+    renderer, ``reference_poses`` by each reference. ``frame``: what bounds and renders, called like `SplatFrame`.
     """
     began = time.perf_counter()
     pose_set = case.pose_set()

@@ -25,15 +25,10 @@ _NEEDLE = (1.0, 1e-6, 1e-6)
 
 @dataclass(frozen=True)
 class Case:
-    """One scene, camera and set.
+    """One scene, camera and set, with a short unique name; at most about a thousand Gaussians and 48x48 pixels.
 
-    Attributes:
-        name: Short name, unique.
-        scene: At most about a thousand Gaussians.
-        camera: At most 48x48 pixels.
-        spec: A perturbation object (the file's version 1).
-        following: End of the segment, where the sweep is over segments.
-        blank: Whether every pose shows nothing but the background.
+    ``spec`` is a perturbation object (the file's version 1), ``following`` the end of the segment where the sweep is
+    over segments. ``blank``: whether every pose shows nothing but the background.
     """
 
     name: str
@@ -69,17 +64,11 @@ def _scene(
     antialiased: bool = False,
     model: Literal["sh", "sigmoid"] = "sh",
 ) -> SplatScene:
-    """A scene of Gaussians with standard deviations, opacities and colours as given.
+    """A scene of Gaussians with standard deviations, opacities and colours as given, or what broadcasts to it.
 
-    Args:
-        means: [N, 3].
-        scales: [N, 3] or what broadcasts to it.
-        opacity: [N] or one, in [0, 1).
-        colors: [N, 3] or what broadcasts to it, logits for ``model`` "sigmoid"; random if None.
-        quats: [N, 4] or one.
-        bands: [N, K - 1, 3] coefficients beyond band 0.
-        antialiased: Whether opacities are compensated for the blur.
-        model: "sh" or "sigmoid".
+    ``means`` and ``scales`` are [N, 3], ``opacity`` [N] in [0, 1), ``colors`` [N, 3], logits for ``model`` "sigmoid",
+    random if None; ``quats`` [N, 4]; ``bands`` [N, K - 1, 3] coefficients beyond band 0. ``antialiased``: whether
+    opacities are compensated for the blur.
     """
     means = np.asarray(means, np.float64).reshape(-1, 3)
     n = means.shape[0]

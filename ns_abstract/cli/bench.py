@@ -26,7 +26,7 @@ from ns_abstract.cli.bench_options import (
     Vnnlib,
 )
 from ns_abstract.cli.common import BAD_INPUT, DONE, command, run
-from ns_abstract.cli.options import ProgramOptions
+from ns_abstract.cli.sets import ProgramOptions
 from ns_abstract.io.errors import InputError
 
 if TYPE_CHECKING:
@@ -148,9 +148,8 @@ def stiff(options: Stiff) -> int:
 
 def scale(options: ScaleBenchmark) -> int:
     """Measure how cost grows; the table and the picture are written after every row."""
-    from ns_abstract.bench.plots import save_scale
     from ns_abstract.bench.scale import curve
-    from ns_abstract.bench.tables import Table
+    from ns_abstract.bench.tables import Table, save_scale
 
     if len(options.load_config) != 1:
         problem = f"found {len(options.load_config)} runs"
@@ -169,7 +168,7 @@ def scale(options: ScaleBenchmark) -> int:
 def certificates(options: Certificates) -> int:
     """Measure how fast sets are certified; the table is written after every row."""
     from ns_abstract.api.scenes import SceneSource
-    from ns_abstract.bench.certificates import SETS, curve
+    from ns_abstract.bench.loops import SETS, curve
     from ns_abstract.bench.tables import Table
     from ns_abstract.geometry.camera_path import load_camera_path
 
@@ -223,7 +222,7 @@ def rows_of(
 ) -> list[dict[str, Any]]:
     """What a benchmark without curves finds for one scene and set of poses."""
     if isinstance(options, CellBenchmark):
-        from ns_abstract.bench.cell import cell_cost
+        from ns_abstract.bench.scale import cell_cost
 
         return [cell_cost(job, name, options.frame, options.repeats)]
     if isinstance(options, Compile):
@@ -231,7 +230,7 @@ def rows_of(
 
         return compile_times(job, name, options.frame)
     if isinstance(options, Soundness):
-        from ns_abstract.bench.soundness import attack
+        from ns_abstract.bench.tightness import attack
 
         return [
             attack(
@@ -318,7 +317,7 @@ def bench(options: Any) -> int:
             else:
                 table.add(*rows_of(options, job, name))
     if results:
-        from ns_abstract.bench.plots import save_curves
+        from ns_abstract.bench.tables import save_curves
 
         save_curves(options.output_dir / "tightness.png", results)
     for number, ours in tables.items():

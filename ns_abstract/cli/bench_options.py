@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from ns_abstract.cli.options import Overrides, SceneOverrides
+from ns_abstract.cli.sets import Overrides, SceneOverrides
 
 if TYPE_CHECKING:
     pass

@@ -17,11 +17,7 @@ from ns_abstract.io.errors import InputError
 
 
 def certify(options: Certify) -> int:
-    """Run the command; returns the exit code.
-
-    Raises:
-        InputError: A file, a field or an option cannot be used.
-    """
+    """Run the command; returns the exit code."""
     if options.time_budget is not None:
         positive(options.time_budget, "--time-budget")
     options.where.check()
@@ -29,7 +25,7 @@ def certify(options: Certify) -> int:
     stop = SignalStop()
     with stop.installed():
         with stop.at_once():
-            from ns_abstract.cli.certifying import certify_path
+            from ns_abstract.cli.searching import certify_path
         complete = certify_path(options, stop)
     return DONE if complete and not stop() else INTERRUPTED
 
@@ -49,11 +45,7 @@ class ExplainNetwork:
 
 
 def explain(options: ExplainNetwork) -> int:
-    """Print what a network consists of; returns the exit code.
-
-    Raises:
-        InputError: The file cannot be used.
-    """
+    """Print what a network consists of; returns the exit code."""
     from ns_abstract.execution.threads import use_threads
     from ns_abstract.verify.network.explain import explain as explained
     from ns_abstract.verify.network.load import load_network

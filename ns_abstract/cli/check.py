@@ -41,11 +41,7 @@ class Check:
 
 
 def check(options: Check) -> int:
-    """Run the command; returns the exit code.
-
-    Raises:
-        InputError: A file, a field or an option cannot be used.
-    """
+    """Run the command; returns the exit code."""
     from ns_abstract.api.checking import check as audited
 
     audit = audited(

@@ -9,8 +9,16 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from ns_abstract.cli.options import EngineOptions, Overrides, Program, ProgramOptions, SceneOverrides, Where
-from ns_abstract.cli.sets import GivenSet, given_set
+from ns_abstract.cli.sets import (
+    EngineOptions,
+    GivenSet,
+    Overrides,
+    Program,
+    ProgramOptions,
+    SceneOverrides,
+    Where,
+    given_set,
+)
 from ns_abstract.io.errors import InputError
 
 if TYPE_CHECKING:
@@ -74,11 +82,7 @@ class Render(_PathCommand):
 
     @property
     def settings(self) -> Settings:
-        """The files, and what is bounded.
-
-        Raises:
-            InputError: Options do not go together.
-        """
+        """The files, and what is bounded. Raises InputError: options do not go together."""
         return _files(self, downscale_factor=self.downscale_factor, seed=self.seed, outputs=self.outputs)
 
 
@@ -117,11 +121,7 @@ class Certify(_PathCommand):
 
     @cached_property
     def settings(self) -> CertifySettings:
-        """The files, and what is certified.
-
-        Raises:
-            InputError: Options do not go together.
-        """
+        """The files, and what is certified. Raises InputError: options do not go together."""
         from ns_abstract.api.certification import CertifySettings
 
         return CertifySettings(_files(self), self.model, self.property, self.network_arithmetic, self.picture)
@@ -166,11 +166,7 @@ class Compare(_PathCommand):
 
     @property
     def settings(self) -> Settings:
-        """Scene A and the sets of poses.
-
-        Raises:
-            InputError: Options do not go together.
-        """
+        """Scene A and the sets of poses. Raises InputError: options do not go together."""
         return _files(self, downscale_factor=self.downscale_factor, seed=self.seed)
 
     @property
@@ -235,11 +231,7 @@ class Locate(_PathCommand):
 
     @property
     def settings(self) -> LocateSettings:
-        """The files, and what a picture may miss.
-
-        Raises:
-            InputError: Options do not go together.
-        """
+        """The files, and what a picture may miss. Raises InputError: options do not go together."""
         from ns_abstract.api.location import LocateSettings, PhotoOptions
 
         if (self.image is None) == (self.image_sequence is None):
@@ -257,11 +249,7 @@ class Locate(_PathCommand):
 
 
 def _files(options: _PathCommand, **more: Any) -> Settings:
-    """The files of a command, and what is bounded of them.
-
-    Raises:
-        InputError: Options do not go together.
-    """
+    """The files of a command, and what is bounded of them. Raises InputError: options do not go together."""
     from ns_abstract.api.files import Settings
 
     return Settings(

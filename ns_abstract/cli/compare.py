@@ -9,11 +9,7 @@ from ns_abstract.io.errors import InputError
 
 
 def compare(options: Compare) -> int:
-    """Run the command; returns the exit code.
-
-    Raises:
-        InputError: A file, a field or an option cannot be used.
-    """
+    """Run the command; returns the exit code."""
     if options.seed < 0:
         raise InputError(f"found {options.seed}", field="--seed", fix="give a number of at least 0")
     options.where.check()
@@ -21,7 +17,7 @@ def compare(options: Compare) -> int:
     stop = SignalStop()
     with stop.installed():
         with stop.at_once():
-            from ns_abstract.cli.comparing import compare_path
+            from ns_abstract.cli.rendering import compare_path
         complete = compare_path(options, stop)
     return DONE if complete and not stop() else INTERRUPTED
 

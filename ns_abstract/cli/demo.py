@@ -28,11 +28,7 @@ class Demo:
 
 
 def demo(options: Demo) -> int:
-    """Run the command; returns the exit code.
-
-    Raises:
-        InputError: The folder cannot be written.
-    """
+    """Run the command; returns the exit code."""
     from rich.console import Console
 
     from ns_abstract.demo.writing import write_demo, write_loop_demo, write_nerf_demo, write_nerfacto_demo

@@ -6,13 +6,12 @@ import re
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, Union
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Union
 
 import tyro
 
 from ns_abstract.cli.common import DONE, command, run
-from ns_abstract.cli.options import Overrides, ProgramOptions, SceneOverrides
-from ns_abstract.cli.sets import GivenSet, given_set
+from ns_abstract.cli.sets import GivenSet, Overrides, ProgramOptions, SceneOverrides, given_set
 from ns_abstract.io.errors import InputError, visible
 
 if TYPE_CHECKING:
@@ -218,18 +217,11 @@ _PARTS = {
     "statement": Statement, "ply": Ply, "vnnlib": ExportVnnLib, "occupancy": Occupancy, "schemas": Schemas,
 }  # fmt: skip
 Command = Union[tuple(Annotated[kind, tyro.conf.subcommand(name)] for name, kind in _PARTS.items())]  # noqa: UP007
-Options = (
-    Npz | Png | Mp4 | Exr | Safetensors | Rrd | Viser | Statement | Ply | ExportVnnLib | Occupancy | Schemas
-)  # fmt: skip
 
 
-def export(options: Options) -> int:
-    """Run the command; returns the exit code.
-
-    Raises:
-        InputError: A file or an option cannot be used.
-    """
-    target = getattr(options, "output_dir", None) or options.output_filename  # pyright: ignore[reportAttributeAccessIssue]
+def export(options: Any) -> int:
+    """Run the command; returns the exit code."""
+    target = getattr(options, "output_dir", None) or options.output_filename
     try:
         if hasattr(options, "output_filename"):
             target.parent.mkdir(parents=True, exist_ok=True)
@@ -255,7 +247,7 @@ def export(options: Options) -> int:
 
 def _ply(options: Ply) -> list[str]:
     from ns_abstract.methods.splat.load import load_scene
-    from ns_abstract.methods.splat.ply import write_ply
+    from ns_abstract.methods.splat.write import write_ply
 
     scene = load_scene(options.load_config, options.overrides)
     notes = [f"left out: {count:,} Gaussians with {reason}" for reason, count in scene.dropped.items()]
@@ -358,7 +350,7 @@ def _vnnlib(options: ExportVnnLib) -> list[str]:
 
 def _path(options: Npz | Png | Mp4 | Exr | Safetensors | Rrd | Viser) -> list[str]:
     from ns_abstract.report.export import Results, write_archive, write_pictures, write_video
-    from ns_abstract.report.interchange import write_exr, write_safetensors
+    from ns_abstract.report.recordings import write_exr, write_safetensors
 
     results = Results(options.input_dir)
     if isinstance(options, Npz):

@@ -9,11 +9,7 @@ from ns_abstract.io.errors import InputError
 
 
 def locate(options: Locate) -> int:
-    """Run the command; returns the exit code.
-
-    Raises:
-        InputError: A file, a field or an option cannot be used.
-    """
+    """Run the command; returns the exit code."""
     if options.time_budget is not None and not 0.0 < options.time_budget < float("inf"):
         raise InputError(f"found {options.time_budget}", field="--time-budget", fix="give a positive number")
     options.where.check()
@@ -21,7 +17,7 @@ def locate(options: Locate) -> int:
     stop = SignalStop()
     with stop.installed():
         with stop.at_once():
-            from ns_abstract.cli.locating import locate_photos
+            from ns_abstract.cli.searching import locate_photos
         locate_photos(options, stop)
     return INTERRUPTED if stop() else DONE
 

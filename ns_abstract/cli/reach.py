@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import tyro
 
 from ns_abstract.cli.common import DONE, INTERRUPTED, SignalStop, command, plain_console, run
-from ns_abstract.cli.options import EngineOptions, Overrides, Program, ProgramOptions, SceneOverrides, Where, stated
+from ns_abstract.cli.sets import EngineOptions, Overrides, Program, ProgramOptions, SceneOverrides, Where, stated
 from ns_abstract.io.arguments import positive
 
 
@@ -51,23 +51,18 @@ class Reach:
 
 
 def reach(options: Reach) -> int:
-    """Run the command; returns the exit code.
-
-    Raises:
-        InputError: A file, a field or an option cannot be used.
-    """
+    """Run the command; returns the exit code."""
     positive(options.time_budget, "--time-budget")
     options.where.check()
     stop = SignalStop()
     with stop.installed():
         with stop.at_once():
-            from ns_abstract.api.cell_search import CellSearch, Request
-            from ns_abstract.api.compiling import compile_beside
+            from ns_abstract.api.cell_search import Request
             from ns_abstract.api.reaching import LoopQuestion, open_loop
             from ns_abstract.api.scenes import SceneSource
+            from ns_abstract.cli.searching import searched
             from ns_abstract.reach.page import runs_text
             from ns_abstract.report.figures import percent
-            from ns_abstract.report.progress import ProgressBar
 
             scene = SceneSource(options.load_config, options.program, options.overrides).open()
             workers = options.where.processes
@@ -75,20 +70,11 @@ def reach(options: Reach) -> int:
             command = ("ns-abstract-reach", *sys.argv[1:])
             question = LoopQuestion(job, stated(options), command, film=options.film)
         console = plain_console()
-        progress = ProgressBar(console)
-        document = CellSearch(question, options.output_dir).run(
-            lambda stack: stack.enter_context(options.where.started(workers)),
-            stop,
-            Request(
-                options.time_budget,
-                options.resume,
-                scene_margin=options.scene_margin,
-                on_open=lambda store: compile_beside(job.job, 0) if options.where.engine == "local" else None,
-                on_progress=progress,
-                on_margin=lambda margin: console.print(f"scene margin: {margin.sentence}"),
-            ),
-        )
-        progress.close()
+        document = searched(
+            question, options.output_dir, options.where, stop, console, job.job, 0,
+            Request(options.time_budget, options.resume, scene_margin=options.scene_margin),
+            lambda store: f"{store.count} cells kept from before, {store.open_blocks} blocks still to be examined",
+        )  # fmt: skip
         for name, entry in document["questions"].items():
             console.print(
                 f"{name}: certified {percent(entry['certified'])}, falsified {percent(entry['falsified'])}, "

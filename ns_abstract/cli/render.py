@@ -15,11 +15,7 @@ _EXPLAINED_S = 30.0
 
 
 def explain(options: Render) -> int:
-    """Bound and explain frame by frame; returns the exit code.
-
-    Raises:
-        InputError: A file, a field or an option cannot be used.
-    """
+    """Bound and explain frame by frame; returns the exit code."""
     from ns_abstract.api.bounding import bound_frames
     from ns_abstract.api.explaining import check_explained
     from ns_abstract.api.explaining import explain as explained
@@ -43,11 +39,7 @@ def explain(options: Render) -> int:
 
 
 def describe(options: Render) -> int:
-    """Print what is about to be bounded; returns the exit code.
-
-    Raises:
-        InputError: A file, a field or an option cannot be used.
-    """
+    """Print what is about to be bounded; returns the exit code."""
     from ns_abstract.api.describe import describe as described
     from ns_abstract.api.files import open_job
     from ns_abstract.api.job import check_frames
@@ -62,11 +54,7 @@ def describe(options: Render) -> int:
 
 
 def render(options: Render) -> int:
-    """Run the command; returns the exit code.
-
-    Raises:
-        InputError: A file, a field or an option cannot be used.
-    """
+    """Run the command; returns the exit code."""
     if options.describe:
         return describe(options)
     if options.output_dir is None:

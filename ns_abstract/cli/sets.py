@@ -2,14 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
+import tyro
+
+from ns_abstract.execution.engine_options import EngineOptions
 from ns_abstract.io.errors import InputError
+from ns_abstract.methods.overrides import Overrides
+from ns_abstract.methods.program_options import ProgramOptions
 
 #: Keys of a perturbation file, in the order of the options' numbers.
 _AXES = {"translation": ("x", "y", "z"), "rotation": ("yaw", "pitch", "roll")}
+_BESIDE = tyro.conf.arg(name="")
+#: What the user says of the scene in place of its files.
+SceneOverrides = Annotated[Overrides, _BESIDE, tyro.conf.FlagCreatePairsOff]
+#: The program that draws the scene.
+Program = Annotated[ProgramOptions, _BESIDE]
+#: Where the work is done.
+Where = Annotated[EngineOptions, _BESIDE]
 
 
 @dataclass(kw_only=True)
@@ -49,3 +61,12 @@ def given_set(options: GivenSet) -> dict[str, Any] | None:
             raise InputError(f"found {len(radii)} numbers", field=f"--{name}", fix=fix)
         perturbation[name] = dict(zip(axes, radii if len(radii) == 3 else radii * 3, strict=True))
     return perturbation
+
+
+def stated(options: Any) -> dict[str, Any]:
+    """All options of a command by name, as reports state them."""
+    options_by_name: dict[str, Any] = {}
+    for entry in fields(options):
+        value = getattr(options, entry.name)
+        options_by_name |= stated(value) if is_dataclass(value) else {entry.name: value}
+    return options_by_name

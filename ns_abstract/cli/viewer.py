@@ -10,7 +10,7 @@ from typing import Literal
 import tyro
 
 from ns_abstract.cli.common import DONE, command, run
-from ns_abstract.cli.options import Overrides, SceneOverrides
+from ns_abstract.cli.sets import Overrides, SceneOverrides
 from ns_abstract.io.errors import InputError
 
 

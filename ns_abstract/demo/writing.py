@@ -23,8 +23,7 @@ from ns_abstract.demo.scenes import (
 from ns_abstract.geometry.camera_path import PinholeCamera, focal_length
 from ns_abstract.geometry.keyframe_cameras import KeyframeCamera
 from ns_abstract.io.atomic import write_json
-from ns_abstract.methods.nerf.nerfacto_write import write_nerfacto_run
-from ns_abstract.methods.nerf.write import write_nerf_run
+from ns_abstract.methods.nerf.write import write_nerf_run, write_nerfacto_run
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.render import Renderer

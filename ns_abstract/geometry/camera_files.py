@@ -22,12 +22,9 @@ _INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 
 @dataclass(frozen=True)
 class FileCamera:
-    """A camera as a file has it.
+    """A camera as a file has it: ``camera_to_world`` 3x4 numbers, OpenGL axes, and intrinsics in pixels.
 
-    Attributes:
-        camera_to_world: 3x4 numbers, OpenGL axes.
-        fx, fy, cx, cy: Pixels; numbers as the file has them, not checked but for being numbers.
-        width, height: Pixels, as the file has them.
+    Numbers are not checked but for being numbers, ``width`` and ``height`` not at all.
     """
 
     field: str
@@ -65,11 +62,8 @@ def inria_cameras(root: list[dict[str, Any]]) -> Iterator[FileCamera]:
 def transforms_cameras(root: Mapping[str, Any], frame: DataparserTransform | None) -> Iterator[FileCamera]:
     """The cameras of a data set's ``transforms.json``, in the frame of a run that was trained on it.
 
-    Args:
-        frame: The run's; None: the scene is no run.
-
-    Raises:
-        InputError: There is no run, a camera is not a plain perspective one, or a field is missing.
+    ``frame``: the run's; None: the scene is no run. Raises InputError where there is no run, a camera is not a plain
+    perspective one, or a field is missing.
     """
     if frame is None:
         problem = "is a data set's transforms.json, and the scene is no run whose frame could be told from it"

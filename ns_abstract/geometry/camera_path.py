@@ -41,15 +41,11 @@ class PinholeCamera:
     """A pinhole camera.
 
     Attributes:
-        camera_to_world: [3, 4] float64, read-only, OpenGL axes (x right, y up, z back), in the
-            normalised frame of the run. The rotation is kept as written: it is orthonormal
-            within 1e-3.
-        fx: Focal length, pixels.
-        fy: Focal length, pixels.
-        cx: Principal point from the left edge, pixels.
-        cy: Principal point from the top edge, pixels.
-        width: Image width, pixels.
-        height: Image height, pixels.
+        camera_to_world: [3, 4] float64, read-only, OpenGL axes (x right, y up, z back), in the normalised frame of the
+            run. The rotation is kept as written: it is orthonormal within 1e-3.
+        fx, fy: Focal lengths, pixels.
+        cx, cy: Principal point from the left and the top edge, pixels.
+        width, height: Image size, pixels.
     """
 
     camera_to_world: NDArray[np.float64]
@@ -68,11 +64,9 @@ class PinholeCamera:
     def rescaled(self, downscale_factor: float) -> PinholeCamera:
         """The camera of an image ``downscale_factor`` times smaller; sides are rounded down.
 
-        Uses the arithmetic of nerfstudio's ``Cameras.rescale_output_resolution``, which holds
-        the factor and the principal point in float32, so that sizes agree with ns-render.
-
-        Raises:
-            InputError: The factor is not a positive finite number, or a side leaves 1..16384.
+        Uses the arithmetic of nerfstudio's ``Cameras.rescale_output_resolution``, which holds the factor and the
+        principal point in float32, so that sizes agree with ns-render. Raises InputError where the factor is not a
+        positive finite number, or a side leaves 1..16384.
         """
         field = "--downscale-factor"
         if not is_number(downscale_factor) or not downscale_factor > 0:
@@ -204,11 +198,7 @@ def _photo_path(file_cameras: Iterable[FileCamera], source: str, downscale_facto
 
 
 def focal_pixels(value: Any, field: str) -> float:
-    """``value`` as a focal length in pixels.
-
-    Raises:
-        InputError: It is no moderate number above 0.
-    """
+    """``value`` as a focal length in pixels. Raises InputError where it is no moderate number above 0."""
     if not is_moderate(value) or not value > 0:
         raise InputError(f"found {show(value)}", field=field, fix="write a number of pixels above 0")
     return float(value)
@@ -359,11 +349,7 @@ def _keyframe_matrix(value: Any, field: str) -> Any:
 
 
 def checked_side(value: Any, name: str) -> int:
-    """A number of pixels, from the field ``name``.
-
-    Raises:
-        InputError: It is no integer from 1 to `SIDE_LIMIT`.
-    """
+    """A number of pixels, from the field ``name``. Raises InputError where it is no integer from 1 to `SIDE_LIMIT`."""
     # The viewer may write 1080.0.
     if not is_number(value) or value != math.floor(value) or not 1 <= value <= SIDE_LIMIT:
         problem = "missing" if value is None else f"found {show(value)}"

@@ -58,13 +58,10 @@ def around(
 def path_json(
     views: Sequence[KeyframeCamera], *, seconds: float = 2.0, fps: int = 24, perturbation: dict[str, Any] | None = None
 ) -> dict[str, Any]:
-    """A camera path with one frame and one keyframe per view.
+    """A camera path with one frame and one keyframe per view; all ``views`` are of the first one's size.
 
-    Args:
-        views: At least one; all of the first one's size.
-        seconds: Duration that ns-render gives the video.
-        fps: Frame rate that the viewer shows.
-        perturbation: Stored under "perturbation" when given.
+    ``seconds`` is the duration that ns-render gives the video, ``fps`` the frame rate that the viewer shows;
+    ``perturbation`` is stored under "perturbation" when given.
     """
     first = views[0]
     if any((v.height, v.width) != (first.height, first.width) for v in views):

@@ -114,13 +114,8 @@ def axis_angle(rotation: Float64Array) -> tuple[Float64Array, float]:
 class PoseForms:
     """Forms of the world-to-camera transform over one box of parameters.
 
-    ``x_camera = rotation (x_world - origin) + offset``; the camera stands at ``position``.
-
-    Attributes:
-        rotation: [3, 3] forms.
-        offset: [3] forms.
-        position: [3] forms, world.
-        origin: [3] the exact world point that coordinates are taken from.
+    ``x_camera = rotation (x_world - origin) + offset``, with forms [3, 3] and [3]; the camera stands at ``position``
+    [3], world. ``origin`` [3] is the exact world point that coordinates are taken from.
     """
 
     rotation: FormArray
@@ -191,13 +186,9 @@ class PoseBox:
     def registered(self, names: tuple[str, ...], radius: float) -> PoseBox:
         """The same poses as seen from a scene that stands elsewhere as a whole (design.md, P3).
 
-        Args:
-            names: `SCENE_SHIFTS`, normalised units; or `SCENE_TURNS`, radians: the scene is turned about the world
-                axes through the origin, z first and x last.
-            radius: Each is from its negative to it; above 0.
-
-        Returns:
-            The set with these parameters behind its own.
+        ``names``: `SCENE_SHIFTS`, normalised units; or `SCENE_TURNS`, radians: the scene is turned about the world axes
+        through the origin, z first and x last. These parameters stand behind the set's own, each from the negative of
+        ``radius`` to it; above 0.
         """
         box, unit = self.box, "normalised units" if names == SCENE_SHIFTS else "rad"
         count = len(names)

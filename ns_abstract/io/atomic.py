@@ -15,14 +15,9 @@ def write_atomic(
 ) -> None:
     """Write a file under a temporary name on the same file system, then move it into place.
 
-    Whoever opens ``path`` sees the old file or the whole new one, also after a crash, a kill or
-    a loss of power between the two.
-
-    Args:
-        scratch: Folder of the temporary file, on the same file system; the file's own by default.
-
-    Raises:
-        OSError: The folder cannot be written; ``path`` is as before.
+    Whoever opens ``path`` sees the old file or the whole new one, also after a crash, a kill or a loss of power between
+    the two. ``scratch``: folder of the temporary file, on the same file system; the file's own by default. Raises
+    OSError: the folder cannot be written; ``path`` is as before.
     """
     path = Path(path)
     temporary = (scratch or path.parent) / f".{path.name}.{secrets.token_hex(4)}.part"
@@ -40,9 +35,7 @@ def write_atomic(
 def write_json(path: str | os.PathLike[str], value: Any) -> Path:
     """Write a value as JSON that people can read, and return the file.
 
-    Raises:
-        OSError: As `write_atomic`.
-        TypeError: JSON has no such value.
+    Raises OSError: as `write_atomic`. Raises TypeError: JSON has no such value.
     """
     text = json.dumps(value, indent=1) + "\n"
     write_atomic(path, lambda stream: stream.write(text.encode()))

@@ -39,12 +39,9 @@ _FIXES = {
 def claim(folder: Path) -> BinaryIO:
     """Create a result folder, or take one over, for one command.
 
-    Returns:
-        An open file; the folder is locked until it is closed, or its process ends.
-
-    Raises:
-        InputError: Another command writes there, the folder cannot be written, or files that this program did not
-            write stand where results would.
+    Returns an open file; the folder is locked until it is closed, or its process ends. Raises InputError where another
+    command writes there, the folder cannot be written, or files that this program did not write stand where results
+    would.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -90,12 +90,8 @@ def is_moderate(value: Any) -> TypeGuard[int | float]:
 def file_size(path: Path, what: str, fix: str | None = None) -> int:
     """Size in bytes of a regular file.
 
-    Args:
-        what: What the file should be, for messages, such as "checkpoint".
-        fix: What to do when it is absent.
-
-    Raises:
-        InputError: The file is absent, not accessible or not a regular file.
+    ``what``: what the file should be, for messages, such as "checkpoint". ``fix``: what to do when it is absent. Raises
+    InputError where the file is absent, not accessible or not a regular file.
     """
     try:
         status = path.stat()
@@ -188,11 +184,8 @@ def load_json(path: Path, what: str = "JSON file", limit: int = JSON_BYTES_LIMIT
 def parse_json(text: str, file: str | Path | None = None, depth: int = JSON_DEPTH_LIMIT) -> Any:
     """Parse JSON strictly: no repeated keys, no NaN or infinity, bounded nesting and numbers.
 
-    Returns:
-        dict, list, str, bool, None, int or float; every number is finite in float64.
-
-    Raises:
-        InputError: With the line number of the first fault.
+    Returns dict, list, str, bool, None, int or float; every number is finite in float64. Raises InputError: with the
+    line number of the first fault.
     """
     strict = _Strict()
     try:

@@ -76,11 +76,7 @@ class KeyTable:
     ) -> list[str]:
         """The dotted names of keys of ``section`` that are not in the table.
 
-        Args:
-            mapping: The mapping that a value holds, or None.
-
-        Raises:
-            InputError: A key has a value that is refused.
+        ``mapping``: the mapping that a value holds, or None. Raises InputError where a key has a value that is refused.
         """
 
         def walk(inner: Mapping[Any, Any], above: str) -> Iterator[str]:

@@ -14,11 +14,7 @@ _CHUNK = 1 << 20
 
 
 def unpacked(path: Path, limit: int) -> Iterator[bytes]:
-    """Contents of a .gz file in parts.
-
-    Raises:
-        InputError: It is damaged, or grows past ``limit`` bytes.
-    """
+    """Contents of a .gz file in parts. Raises InputError where it is damaged, or grows past ``limit`` bytes."""
     total = 0
     file_size(path, "file")
     try:

@@ -74,11 +74,7 @@ def read_mask(file: Path, size: tuple[int, int], field: str = "--mask") -> np.nd
 
 
 def read_grey_mask(file: Path) -> np.ndarray:
-    """Return [H, W] bool: the white pixels of a .png.
-
-    Raises:
-        InputError: It cannot be read, or is no .png.
-    """
+    """Return [H, W] bool: the white pixels of a .png. Raises InputError where it cannot be read, or is no .png."""
     from PIL import Image
 
     data = read_bytes(file, "mask", _MOST_MASK_BYTES)

@@ -23,11 +23,8 @@ def computed_by() -> dict[str, Any]:
 def stale(stored: Mapping[str, Any], current: Mapping[str, Any]) -> str | None:
     """Return a note if ``stored`` was computed by another version or other rules than ``current`` names.
 
-    Args:
-        current: Fingerprint that it must agree with; keys that it lacks are not compared.
-
-    Returns:
-        The end of a sentence about the result; None where version and rules agree.
+    ``current``: fingerprint that it must agree with; keys that it lacks are not compared. Returns the end of a sentence
+    about the result; None where version and rules agree.
     """
     if all(stored.get(key) == current[key] for key in _KEYS if key in current):
         return None

@@ -81,12 +81,8 @@ class StoredTensor:
     def float32(self, file: Path, field: str, finite: bool = True) -> NDArray[np.float32]:
         """Its values, copied out of the file.
 
-        Args:
-            finite: Whether values that are not finite are refused.
-
-        Raises:
-            InputError: Not a dense tensor of float16, bfloat16, float32 or float64, or a value is not finite in
-                float32.
+        ``finite``: whether values that are not finite are refused. Raises InputError: not a dense tensor of float16,
+        bfloat16, float32 or float64, or a value is not finite in float32.
         """
         if self.kind not in _FLOATS or self.storage is None:
             fix = "save it as a dense float32 tensor"
@@ -138,9 +134,7 @@ def read_checkpoint(path: Path) -> Any:
     """Return the content of a checkpoint: mappings, lists and plain values with `StoredTensor` in them.
 
     Checksums of all members are compared first. What else torch and numpy put there (random states, devices) is None.
-
-    Raises:
-        InputError: The file is damaged, or asks for other Python objects.
+    Raises InputError where the file is damaged, or asks for other Python objects.
     """
     size = file_size(path, "checkpoint")
     refuse_other_kind(path)

@@ -207,12 +207,9 @@ TABLES = (SPLATFACTO, VANILLA_NERF, NERFACTO, RUN)
 def check_keys(run: runs.RunConfig, model: KeyTable, refuse_unknown: bool = True) -> tuple[str, ...]:
     """Notes on the keys of a run's config.yml that nothing is known of, and that are not used.
 
-    Args:
-        model: The keys of ``pipeline.model``: `SPLATFACTO`, `VANILLA_NERF` or `NERFACTO`.
-        refuse_unknown: Whether a key of ``pipeline.model`` that is in no table is refused, or named in the notes.
-
-    Raises:
-        InputError: A key of ``pipeline.model`` is unknown, or a key has a value that is refused.
+    ``model``: the keys of ``pipeline.model``: `SPLATFACTO`, `VANILLA_NERF` or `NERFACTO`. ``refuse_unknown``: whether a
+    key of ``pipeline.model`` that is in no table is refused, or named in the notes. Raises InputError where a key of
+    ``pipeline.model`` is unknown, or a key has a value that is refused.
     """
     try:
         names = RUN.unknown(run.root, "", runs.as_mapping)

@@ -21,11 +21,7 @@ REPRESENTATIONS: list[Representation] = [NERF, NERFACTO, SPLAT]
 def open_scene(path: str | os.PathLike[str], overrides: Overrides | None = None) -> tuple[Representation, Any]:
     """Read the scene of a run (by the method that its config.yml names) or of a 3DGS ``.ply``.
 
-    Returns:
-        The representation, and its scene.
-
-    Raises:
-        InputError: For any content of the files that cannot be used.
+    Returns the representation, and its scene. Raises InputError: for any content of the files that cannot be used.
     """
     source: runs.RunConfig | Path = Path(path)
     folder = os.path.isdir(path) and scene_file(Path(path), None) is None

@@ -57,11 +57,7 @@ class Overrides:
             raise InputError(f"found {show(step)}", field="--load-step", fix="give the number of a step")
 
     def refuse(self, names: Iterable[str], problem: str) -> None:
-        """Refuse what does not go with the scene.
-
-        Raises:
-            InputError: One of ``names`` is given.
-        """
+        """Refuse what does not go with the scene. Raises InputError where one of ``names`` is given."""
         for name in names:
             if getattr(self, name) not in (None, False):
                 raise InputError(problem, field="--" + name.replace("_", "-"), fix="leave it out")

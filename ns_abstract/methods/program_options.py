@@ -32,11 +32,7 @@ class ProgramOptions:
     """NeRF. cuda: bound the field on a GPU, in float64. Default: cpu."""
 
     def refuse(self, names: tuple[str, ...], problem: str) -> None:
-        """Refuse options of other representations.
-
-        Raises:
-            InputError: One of ``names`` is given.
-        """
+        """Refuse options of other representations. Raises InputError where one of ``names`` is given."""
         for name in names:
             if getattr(self, name) is not None:
                 raise InputError(problem, field="--" + name.replace("_", "-"), fix="leave it out")

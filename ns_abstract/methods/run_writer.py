@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import struct
-import zlib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from string import Template
@@ -94,11 +92,7 @@ def _template(name: str, **values: Any) -> str:
 
 
 def _run_folder(folder: Path, method: str, timestamp: str, experiment_name: str) -> Path:
-    """Make the folder of a run.
-
-    Raises:
-        InputError: ``timestamp`` or ``experiment_name`` is not a plain folder name.
-    """
+    """Make the folder of a run. Raises InputError: ``timestamp`` or ``experiment_name`` is not a plain folder name."""
     for field, value in (("timestamp", timestamp), ("experiment_name", experiment_name)):
         if not value or value in {".", ".."} or any(c in value for c in "/\\\0\n"):
             raise InputError(f"{value!r} is not a folder name", fix="use letters, digits, _ and -", field=field)
@@ -125,10 +119,8 @@ def background_name(colour: NDArray[np.float32]) -> str:
 def optimizer_lines(kind: str, eps: str, groups: Mapping[str, tuple[str, tuple[str, str, int] | None]]) -> str:
     """What config.yml says of the optimizers, from "optimizers:" to the line before "output_dir:".
 
-    Args:
-        kind: "Adam" or "RAdam".
-        groups: Learning rate of each group of parameters, and of its schedule the last rate, the first one and the
-            steps of warming up; numbers as YAML spells them.
+    ``kind``: "Adam" or "RAdam". ``groups``: learning rate of each group of parameters, and of its schedule the last
+    rate, the first one and the steps of warming up; numbers as YAML spells them.
     """
     lines = ["optimizers:"]
     target = f"&id001 !!python/name:torch.optim.{kind.lower()}.{kind} ''"
@@ -245,18 +237,8 @@ def write_dataset(
 
 def _png(image: NDArray[Any]) -> bytes:
     """An 8-bit RGB PNG of [H, W, 3] values in [0, 1]."""
-    pixels = np.rint(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
-    height, width, _ = pixels.shape
-    rows = np.zeros((height, 1 + 3 * width), np.uint8)  # a leading 0 per row: no filter
-    rows[:, 1:] = pixels.reshape(height, -1)
+    from PIL import Image
 
-    def chunk(kind: bytes, data: bytes) -> bytes:
-        return struct.pack(">I", len(data)) + kind + data + struct.pack(">I", zlib.crc32(kind + data))
-
-    header = struct.pack(">IIBBBBB", width, height, 8, 2, 0, 0, 0)
-    return (
-        b"\x89PNG\r\n\x1a\n"
-        + chunk(b"IHDR", header)
-        + chunk(b"IDAT", zlib.compress(rows.tobytes(), 6))
-        + chunk(b"IEND", b"")
-    )
+    buffer = io.BytesIO()
+    Image.fromarray(np.rint(np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)).save(buffer, "png")
+    return buffer.getvalue()

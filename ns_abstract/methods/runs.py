@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path, PurePosixPath, PureWindowsPath
@@ -40,6 +40,14 @@ CONFIG_DEPTH_LIMIT = 64
 NUMBER_CHARACTERS_LIMIT = 300
 TRANSFORMS_BYTES_LIMIT = 2**20
 
+#: Modules of every model that draw nothing in evaluation, and what they are for.
+IDLE_MODULES = {
+    "device_indicator_param": "no values",
+    "lpips.": "a metric",
+    "psnr.": "a metric",
+    "ssim.": "a metric",
+    "camera_optimizer.": "poses of the training pictures, used in training alone",
+}
 _PYTHON_TAG = "tag:yaml.org,2002:python/"
 _MERGE_TAG = "tag:yaml.org,2002:merge"
 _NUMBER_TAGS = {f"tag:yaml.org,2002:{python}{kind}" for python in ("", "python/") for kind in ("int", "long", "float")}
@@ -234,6 +242,21 @@ def step_assumption(run: RunConfig, checkpoint: Path, requested: int | None) -> 
     return assumption_of("load_step", requested, "--load-step", default, "default: the highest step there is")
 
 
+def idle_assumptions(state: Collection[str], idle: Mapping[str, str]) -> tuple[Assumption, ...]:
+    """Which of the ``idle`` modules a checkpoint's ``state`` holds, which are left out."""
+    return tuple(
+        Assumption(f"module {prefix.rstrip('.')}", f"left out: {why}", "checkpoint")
+        for prefix, why in idle.items()
+        if why != "no values" and any(key.startswith(prefix) for key in state)
+    )
+
+
+def units_assumption(transform: DataparserTransform, assumed: bool) -> Assumption:
+    """The units of the data set; ``assumed``: the run does not say them."""
+    origin = "default: dataparser_transforms.json is missing" if assumed else "dataparser_transforms.json"
+    return Assumption("units", f"1 of the data set is {transform.scale:.9g}", origin)
+
+
 def target_class(run: RunConfig) -> str:
     """Dotted name of the model's class that config.yml names; "" where it names none."""
     target = run.model.get("_target")
@@ -247,11 +270,8 @@ def target_class(run: RunConfig) -> str:
 def read_dataparser_transform(run: RunConfig) -> tuple[DataparserTransform, tuple[str, ...]]:
     """Read ``dataparser_transforms.json`` beside ``config.yml``.
 
-    Returns:
-        The transform, and notes about what was assumed: without the file it is the identity.
-
-    Raises:
-        InputError: The file exists and is not what Nerfstudio writes.
+    Returns the transform, and notes about what was assumed: without the file it is the identity. Raises InputError
+    where the file exists and is not what Nerfstudio writes.
     """
     path = run.folder / TRANSFORMS_NAME
     if not os.path.lexists(path):
@@ -288,16 +308,9 @@ def read_dataparser_transform(run: RunConfig) -> tuple[DataparserTransform, tupl
 def read_model_state(path: Path) -> dict[str, Any]:
     """The model's tensors (`StoredTensor`) in a checkpoint, read without running code in the file.
 
-    Args:
-        path: A ``step-*.ckpt`` file.
-
-    Returns:
-        The state of the model: keys as in ``Model.state_dict()``, that is without the
-        ``_model.`` prefix of the pipeline and the ``module.`` of distributed training.
-
-    Raises:
-        InputError: The file is damaged, holds other Python objects than tensors and plain
-            values, or has no ``pipeline``.
+    ``path``: a ``step-*.ckpt`` file. Returns the state of the model: keys as in ``Model.state_dict()``, that is without
+    the ``_model.`` prefix of the pipeline and the ``module.`` of distributed training. Raises InputError where the file
+    is damaged, holds other Python objects than tensors and plain values, or has no ``pipeline``.
     """
     root = read_checkpoint(path)
     pipeline = root.get("pipeline") if isinstance(root, dict) else None

@@ -75,15 +75,10 @@ def lpips_known(metric: torch.nn.Module) -> bool:
 def check_tags(value: Any, file: Path) -> None:
     """Refuse a configuration that names other Python objects than nerfstudio's own runs do.
 
-    nerfstudio reads config.yml with a loader that imports and calls what the file names. What its runs name are
-    classes of nerfstudio, of this package and of torch.optim, members of nerfstudio's enumerations, paths, and the
-    function in `_FUNCTIONS`.
-
-    Args:
-        value: What `ns_abstract.methods.runs` has read, without running anything.
-
-    Raises:
-        InputError: Names the first other object.
+    nerfstudio reads config.yml with a loader that imports and calls what the file names. What its runs name are classes
+    of nerfstudio, of this package and of torch.optim, members of nerfstudio's enumerations, paths, and the function in
+    `_FUNCTIONS`. ``value``: what `ns_abstract.methods.runs` has read, without running anything. Raises InputError:
+    names the first other object.
     """
     if isinstance(value, Tagged):
         if _is_member(value):

@@ -20,7 +20,6 @@ from nerfstudio.utils.colors import COLORS_DICT
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.load import field_weights
 from ns_abstract.methods.nerf.scene import NerfScene
-from ns_abstract.methods.nerf.smoothness import log_lipschitz
 from ns_abstract.nerfstudio.outputs import AbstractConfig, AbstractOutputs, resampled
 from ns_abstract.nerfstudio.panel import camera_of
 from ns_abstract.viewer.views import NerfSource
@@ -183,3 +182,14 @@ class AbstractNerfModel(AbstractOutputs, NeRFModel):
 def with_depth(outputs: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     """The outputs and ``depth``, without which the viewer's render thread ends (render_state_machine.py:198)."""
     return {**outputs, "depth": outputs["depth_fine"]}
+
+
+def log_lipschitz(module: torch.nn.Module) -> torch.Tensor:
+    """Sum over the linear layers of the logarithm of their norm from maximum to maximum.
+
+    The exponential bounds how much a network of these layers and of activations that are no steeper
+    than 1 stretches a box, up to skip connections (H.-T. D. Liu et al., "Learning smooth neural
+    functions via Lipschitz regularization", 2022, eq. 5); interval bounds widen by just these norms (design.md, W5).
+    """
+    norms = [layer.weight.abs().sum(dim=1).max() for layer in module.modules() if isinstance(layer, torch.nn.Linear)]
+    return torch.stack(norms).log().sum()

@@ -227,11 +227,7 @@ class AbstractPanel(torch.nn.Module):
 
     @property
     def perturbation(self) -> Perturbation:
-        """The set that the panel describes.
-
-        Raises:
-            InputError: The selection cannot be read.
-        """
+        """The set that the panel describes. Raises InputError where the selection cannot be read."""
         return perturbation_of(self.radii, str(self._select.value))
 
     def select_middle(self) -> None:

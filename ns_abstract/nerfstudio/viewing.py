@@ -47,12 +47,8 @@ def view(
 ) -> None:
     """Open the run and serve the viewer until the process is interrupted.
 
-    Args:
-        options: Of its ``ViewerConfig``.
-        abstract: Of splats' `AbstractConfig`.
-
-    Raises:
-        InputError: The run cannot be opened.
+    ``options``: of its ``ViewerConfig``. ``abstract``: of splats' `AbstractConfig`. Raises InputError where the run
+    cannot be opened.
     """
     overrides = overrides or Overrides()
     with tempfile.TemporaryDirectory(prefix="ns-abstract-viewer-") as scratch:
@@ -91,13 +87,8 @@ def open_run(
     config.yml is read by nerfstudio's own loader, which can run code, so it is read before by ours, which runs none,
     and so is the checkpoint: what names other objects than runs of nerfstudio do is refused. ``abstract`` are options
     of splats' `AbstractConfig`; ``overrides`` are set in the configuration. A model that is not known to draw what
-    Splatfacto or vanilla-nerf draws is refused.
-
-    Returns:
-        Configuration, pipeline and training step.
-
-    Raises:
-        InputError: The run cannot be opened.
+    Splatfacto or vanilla-nerf draws is refused. Returns configuration, pipeline and training step. Raises InputError
+    where the run cannot be opened.
     """
     run = read_config(config_file)
     check_tags(run.root, run.file)

@@ -44,12 +44,10 @@ _GOLDEN = 0.6180339887498949
 
 @dataclass(frozen=True)
 class CellCamera:
-    """The camera at the middle of a cell.
+    """The camera at the middle of a cell, which is number ``row`` of its frame.
 
-    Attributes:
-        row: Position of the cell in its frame.
-        pose: [3, 4] camera-to-world, normalised frame.
-        rays: [4, 3] unit vectors through the picture's corners, in order around it, world axes.
+    ``pose`` [3, 4] is camera-to-world in the normalised frame; ``rays`` [4, 3] are unit vectors through the picture's
+    corners, in order around it, world axes.
     """
 
     frame: int
@@ -73,12 +71,8 @@ def cell_cameras(
 ) -> tuple[list[CellCamera], int]:
     """Cameras at the middles of cells, the widest cells first.
 
-    Args:
-        rows: By frame, cells: lower, upper, verdict.
-        names: Of all parameters, in the order of the cells' ends.
-
-    Returns:
-        At most `MOST` cameras, some of every verdict, and the number of cells that are left out.
+    ``rows``: by frame, cells: lower, upper, verdict. ``names``: of all parameters, in the order of the cells' ends.
+    Returns at most `MOST` cameras, some of every verdict, and the number of cells that are left out.
     """
     keys = [(frame, k) for frame, frame_rows in rows.items() for k in range(len(frame_rows))]
     width = np.concatenate(
@@ -153,11 +147,9 @@ def cameras_entry(cameras: Sequence[CellCamera], left_out: int) -> dict[str, Any
 
 @dataclass(frozen=True)
 class CameraPlot:
-    """A drawing of cameras in a plane.
+    """A drawing of cameras in a plane; ``nearest`` as in `ns_abstract.report.outside.SceneDrawing.picture`.
 
-    Attributes:
-        nearest: As `ns_abstract.report.outside.SceneDrawing.picture` has it.
-        shapes: Cameras and the corners of their frusta, normalised units, in the order in which they are drawn.
+    ``shapes`` are cameras and the corners of their frusta, normalised units, in the order in which they are drawn.
     """
 
     title: str
@@ -170,10 +162,9 @@ class CameraPlot:
 class CameraDrawings:
     """The drawings of cameras on a page.
 
-    Attributes:
-        ends: [3], [3] ends of a box about where cameras stand, normalised units.
-        outside: Draws the scene behind them; None: it has no elements with a place of their own.
-        up: The axis from whose tip the plan is drawn; see `upward`.
+    ``ends`` [3], [3] bound a box about where cameras stand, normalised units. ``outside`` draws the scene behind them;
+    None: it has no elements with a place of their own. ``up`` is the axis from whose tip the plan is drawn; see
+    `upward`.
     """
 
     cells: Sequence[CellCamera]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -41,24 +40,6 @@ METRICS = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class CertifiedRun(CommandRun):
-    """What a command certifies.
-
-    Attributes:
-        network_guarantee: What holds of the network, one sentence each.
-        model: The network: ``name``, ``sha256``, shapes.
-        sentence: The property in words, as the end of "on every image ...".
-        picture: "float" or "8-bit": what the network is shown.
-    """
-
-    network_guarantee: tuple[str, ...]
-    model: Mapping[str, Any]
-    property: Mapping[str, Any]
-    sentence: str
-    picture: str = "float"
-
-
 def coverage(frames: Sequence[Mapping[str, Any]]) -> dict[str, float]:
     """Mean over the frames' sets: certified, falsified, unknown (with what was not examined), not_examined."""
     names = ("certified", "falsified", "unknown", "not_examined")
@@ -74,29 +55,38 @@ def verdict(frames: Sequence[Mapping[str, Any]]) -> str:
     return "certified" if done else "unknown"
 
 
+def search_figures(store: Any) -> dict[str, Any]:
+    """What report.json says of the work of a search: over time, in all, why cells are unknown, and the cells' seal."""
+    return {
+        "trace": store.points,
+        "seconds": store.seconds,
+        "effort": store.effort,
+        "unknown_because": store.reasons,
+        "cells_seal": {"rows": store.seal.rows, "sum": store.seal.text},
+    }
+
+
 def certificate_document(
-    run: CertifiedRun,
+    run: CommandRun,
+    claim: Mapping[str, Any],
     frames: Sequence[Mapping[str, Any]],
+    figures: Mapping[str, Any],
     *,
     state: str,
-    trace: Sequence[Mapping[str, float]],
-    seconds: float,
-    effort: Mapping[str, float],
-    reasons: Mapping[str, int],
-    cells_seal: Mapping[str, Any],
     scene_margin: Mapping[str, Any],
-    cameras: Mapping[str, Any] | None = None,
+    cameras: Mapping[str, Any],
 ) -> dict[str, Any]:
     """Content of report.json.
 
     Args:
+        run: The command's run.
+        claim: What is claimed, and of what: keys of report.json.
         frames: One mapping by frame: index, parameters, coverage, cells, sampled, partition, least_margin,
             counterexamples.
+        figures: See `search_figures`.
         state: "running", "done", "budget" or "interrupted".
-        seconds: Wall time, earlier runs included.
-        cells_seal: Number of rows of ``cells`` with a verdict, and the sum of their hashes.
         scene_margin: Largest variations of the scene for which what is certified holds.
-        cameras: Where cameras of cells stand; None: of none.
+        cameras: Where cameras of cells stand.
     """
     covered = coverage(frames)
     poses = sum(entry["sampled"]["poses"] for entry in frames)
@@ -107,11 +97,7 @@ def certificate_document(
         run.head()
         | {
             "verdict": verdict(frames),
-            "property": run.property,
-            "property_text": run.sentence,
-            "network_guarantee": run.network_guarantee,
-            "picture": run.picture,
-            "model": run.model,
+            **claim,
             "coverage": covered,
             "sampled": {"poses": poses, "right": right, "sampled_right": right / poses if poses else None},
             "certified_of_sampled_right": covered["certified"] * poses / right if right else None,
@@ -124,13 +110,9 @@ def certificate_document(
             if total
             else None,
             "frames": frames,
-            "trace": trace,
-            "seconds": seconds,
-            "effort": effort,
-            "unknown_because": reasons,
-            "cells_seal": cells_seal,
+            **figures,
             "scene_margin": scene_margin,
-            "cameras": cameras or {"cells": [], "left_out": 0},
+            "cameras": cameras,
             "limits": run.limits,
         }
         | run.tail(state, METRICS)
@@ -150,11 +132,8 @@ class LastReport:
     def write(self, document: dict[str, Any], page: Callable[[], str]) -> None:
         """Write both.
 
-        Args:
-            document: Content of report.json; its keys ``state`` and ``first_command`` are set here.
-
-        Raises:
-            InputError: The folder cannot be written.
+        ``document``: content of report.json; its keys ``state`` and ``first_command`` are set here. Raises InputError
+        where the folder cannot be written.
         """
         if self.first_command:
             document["first_command"] = self.first_command
@@ -173,11 +152,7 @@ class LastReport:
 
 
 def write_certificate(folder: Path, document: Mapping[str, Any], page: str) -> None:
-    """Write report.json and report.html.
-
-    Raises:
-        InputError: The folder cannot be written.
-    """
+    """Write report.json and report.html. Raises InputError where the folder cannot be written."""
     text = json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False)
     try:
         write_atomic(folder / "report.json", lambda stream: stream.write(f"{text}\n".encode()))

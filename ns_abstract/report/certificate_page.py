@@ -13,11 +13,10 @@ from markupsafe import Markup, escape
 from ns_abstract.report.cameras import CameraDrawings
 from ns_abstract.report.figures import ShownUnits, is_ring, number, percent, unit_of_axis
 from ns_abstract.report.html import set_of, uri, whole_page
-from ns_abstract.report.regions import FailureRegion, PoseImage, regions_html
+from ns_abstract.report.regions import FailureRegion, PoseImage, WalkPose, regions_html, walk_html
 from ns_abstract.report.run import plain
 from ns_abstract.report.svg import PlotAxis, draw_line, draw_plot, draw_svg
 from ns_abstract.report.verdict_maps import free_parameters, maps_of, matrix_svg, mixed, pixels
-from ns_abstract.report.walk import WalkPose, walk_html
 
 _VERDICTS = ("certified", "falsified", "unknown")
 _STATES = {
@@ -38,9 +37,8 @@ _FINE, _MOST_MARKS, _MOST_MATRICES = 160, 400, 4
 class CertificateDetails:
     """Details that were computed when a search ended: regions of failure, poses with pictures.
 
-    Attributes:
-        pictures: Of the first of them: a counterexample, and the nearest pose that was seen to be right.
-        why: Why there are no more pictures, as the end of a sentence; empty if there were not to be more.
+    ``pictures`` show of the first regions a counterexample, and the nearest pose that was seen to be right. ``why``
+    says why there are no more, as the end of a sentence; empty if there were not to be more.
     """
 
     regions: Sequence[FailureRegion] = ()
@@ -57,16 +55,11 @@ def certificate_page(
     cameras: CameraDrawings | None = None,
     closer: CertificateDetails | None = None,
 ) -> str:
-    """The page of a certificate.
+    """The page of a certificate: HTML, self-contained; every text of the document is escaped.
 
-    Args:
-        cells: By frame, rows lower, upper, verdict in the order of ``document``'s parameters.
-        pictures: ``title``, ``text`` and ``png`` of images to show, in order.
-        seen: ``text`` and ``png`` of a pose in a cell, by frame and position of the cell in it.
-        closer: Regions and poses that were looked at more closely.
-
-    Returns:
-        HTML, self-contained; every text of the document is escaped.
+    ``cells`` are by frame rows lower, upper, verdict in the order of ``document``'s parameters; ``pictures`` have
+    ``title``, ``text`` and ``png``; ``seen`` are ``text`` and ``png`` of a pose in a cell, by frame and position of the
+    cell in it; ``closer`` are regions and poses that were looked at more closely.
     """
     name, units = str(document["scene"].get("name", "scene")), ShownUnits.of(document["scene"])
     numbers, closer = _numbered(document, cells), closer or CertificateDetails()

@@ -3,34 +3,32 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ns_abstract.io.atomic import write_atomic
 from ns_abstract.refine.result import FrameResult
 from ns_abstract.report.figures import ShownUnits, number
-from ns_abstract.report.files import frame_name, load_frame
+from ns_abstract.report.files import frame_name
 from ns_abstract.report.html import counted, set_of, whole_page
 from ns_abstract.report.picture import (
     GAP_COLORS,
-    bare_axes,
     color_stops,
     heat,
+    panels_figure,
     preview,
+    save_figure,
     to_bytes,
 )
-from ns_abstract.report.record import PAGE_FRAMES, Report, RunRecord
+from ns_abstract.report.record import PAGE_FRAMES, PREVIEW_PIXELS, Report, RunRecord
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 #: A frame is done where its largest bound is at most so much above what was rendered, whatever the ratio.
 LEAST_ROOM = 1e-3
-_PREVIEW_PIXELS = 256
 _FRAME_FIGURES = ("mpg", "xpg", "mpg_witness", "xpg_witness", "ratio", "seconds_to_ratio")
 #: [H, W, 3] pictures of A and B of a frame at parameter values [d].
 Pictures = Callable[[int, Sequence[float]], tuple[np.ndarray, np.ndarray]]
@@ -82,12 +80,8 @@ def overall(verdicts: Sequence[str], complete: bool) -> str:
 class ComparisonReport(Report):
     """Writes a comparison's results as they come; see `Report`.
 
-    Args:
-        output_dir: Made if it is absent.
-        tolerance: Difference of which is asked whether any picture exceeds it, or None.
-
-    Raises:
-        InputError: The folder cannot be written, or holds other results that were to be kept.
+    ``output_dir``: made if it is absent. ``tolerance``: difference of which is asked whether any picture exceeds it, or
+    None. Raises InputError where the folder cannot be written, or holds other results that were to be kept.
     """
 
     def __init__(
@@ -139,14 +133,9 @@ class ComparisonReport(Report):
             document["verdict"] = overall(verdicts, indices >= set(self.run.frames))
         return document
 
-    def _draw(self, result: FrameResult) -> None:
+    def _draw_files(self, result: FrameResult) -> None:
         figure = difference_figure(result, self._panels(result), str(self.run.scene.get("name", "")), self.tolerance)
-        path = self.folder / frame_name(result.index, "png")
-        write_atomic(
-            path, lambda stream: figure.savefig(stream, format="png", dpi=120, metadata={"Software": "ns_abstract"})
-        )
-        self._previews[result.index] = self._small(result)
-        self._undrawn.discard(result.index)
+        save_figure(self.folder / frame_name(result.index, "png"), figure, 120)
 
     def _panels(self, result: FrameResult) -> list[tuple[str, np.ndarray, bool]]:
         """Titles, pictures [H, W, 3] or greatest differences over the channels [H, W], and whether it is the latter."""
@@ -164,57 +153,34 @@ class ComparisonReport(Report):
     def _small(self, result: FrameResult) -> Mapping[str, bytes]:
         top = float(result.upper.max())
         return {
-            title: preview(heat(image, top) if hot else to_bytes(image), _PREVIEW_PIXELS)
+            title: preview(heat(image, top) if hot else to_bytes(image), PREVIEW_PIXELS)
             for title, image, hot in self._panels(result)
         }
-
-    def _preview(self, index: int) -> Mapping[str, bytes]:
-        if index not in self._previews:
-            path = self.folder / frame_name(index, "npz")
-            self._previews[index] = self._small(load_frame(path, leaves=False).result)
-        return self._previews[index]
 
     def _played(self, result: FrameResult) -> str | None:
         return None
 
-    def _write_page(self, document: dict[str, Any]) -> None:
-        begin = time.monotonic()
+    def _page(self, document: dict[str, Any]) -> str:
         frames = sorted(document["frames"], key=lambda entry: -entry["largest_upper"])[:PAGE_FRAMES]
         ordered = sorted(frames, key=lambda entry: entry["index"])
-        text = comparison_page(document, {entry["index"]: self._preview(entry["index"]) for entry in ordered})
-        write_atomic(self.folder / "report.html", lambda stream: stream.write(text.encode()))
-        self._page_due = time.monotonic() + max(10.0, 20.0 * (time.monotonic() - begin))
+        return comparison_page(document, {entry["index"]: self._preview(entry["index"]) for entry in ordered})
 
 
 def difference_figure(
     result: FrameResult, panels: Sequence[tuple[str, np.ndarray, bool]], about: str, tolerance: float | None
 ) -> Figure:
     """The picture of one frame: both scenes at the worst pose, their difference, and the maps, of one colour scale."""
-    from matplotlib.figure import Figure
-
-    height, width = result.upper.shape[:2]
-    side = 2.6
-    figure = Figure(
-        figsize=(len(panels) * side + 1.0, side * min(1.5, max(0.25, height / width)) + 0.9), facecolor="white",
-        layout="constrained",
-    )  # fmt: skip
-    axes: Any = figure.subplots(1, len(panels))
     top = float(result.upper.max()) or 1.0
-    for place, (title, image, hot) in zip(axes, panels, strict=True):
-        place.imshow(
-            image if hot else to_bytes(image), cmap=GAP_COLORS if hot else None, vmin=0.0, vmax=top,
-            interpolation="antialiased",
-        )  # fmt: skip
-        bare_axes(place)
-        place.set_title(title, fontsize=8.5)
-    figure.colorbar(axes[-1].images[0], ax=axes[-1], fraction=0.05, pad=0.02).ax.tick_params(labelsize=7.5)
     figures = difference_figures(result)
     text = (
         f"Frame {result.index}  ·  {about}  ·  largest difference between {number(figures['largest_lower'])} and "
         f"{number(figures['largest_upper'])}"
     )
-    figure.suptitle(text if tolerance is None else f"{text}  ·  tolerance {number(tolerance)}", fontsize=10.5)
-    return figure
+    text = text if tolerance is None else f"{text}  ·  tolerance {number(tolerance)}"
+    pictures = [
+        (title, image, GAP_COLORS, top) if hot else (title, to_bytes(image), None, top) for title, image, hot in panels
+    ]
+    return panels_figure(pictures, text, bars=[len(panels) - 1])
 
 
 _TITLES = {

@@ -95,13 +95,9 @@ class Results:
             sides = zip(box.names, box.units, box.lower, box.upper, strict=True)
             self.parameters.append([dict(zip(("name", "unit", "lower", "upper"), s, strict=True)) for s in sides])
 
-    def __iter__(self) -> Iterable[FrameResult]:
+    def __iter__(self) -> Iterator[FrameResult]:
         """The frames in order, each read when it is its turn."""
         return (load_frame(file, leaves=False).result for file in self.files.values())
-
-    def picture(self, result: FrameResult, name: str) -> np.ndarray:
-        """[H, W, 3] uint8 of one of `PICTURES`; bounds are rounded outward, gaps share one scale."""
-        return picture(result, name, self.largest)
 
 
 def picture(result: FrameResult, name: str, largest: float) -> np.ndarray:
@@ -140,7 +136,7 @@ def write_archive(results: Results, file: Path) -> None:
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
                     header = {"descr": "<f4", "fortran_order": False, "shape": shape}
                     np.lib.format.write_array_header_1_0(member, header)
-                    for result in results:  # pyright: ignore[reportGeneralTypeIssues]
+                    for result in results:
                         member.write(np.ascontiguousarray(getattr(result, name), "<f4").tobytes())
 
     write_atomic(file, write)
@@ -152,10 +148,10 @@ def write_pictures(results: Results, folder: Path, names: Sequence[str]) -> list
 
     folder.mkdir(parents=True, exist_ok=True)
     written = []
-    for result in results:  # pyright: ignore[reportGeneralTypeIssues]
+    for result in results:
         for name in names:
             file = folder / f"{name}_{result.index:05d}.png"
-            image = Image.fromarray(results.picture(result, name))
+            image = Image.fromarray(picture(result, name, results.largest))
             write_atomic(file, lambda stream, image=image: image.save(stream, "png"))
             written.append(file)
     return written
@@ -195,10 +191,7 @@ def _figures(results: Results, result: FrameResult, names: Sequence[str]) -> str
 def write_video(results: Results, file: Path, names: Sequence[str], fps: float, labelled: bool = False) -> None:
     """An H.264 video (mp4) of the pictures ``names`` side by side, one frame of the path after the other.
 
-    ``labelled``: as `panels`.
-
-    Raises:
-        InputError: PyAV is missing.
+    ``labelled``: as `panels`. Raises InputError: PyAV is missing.
     """
     if not (math.isfinite(fps) and 0.1 <= fps <= 1000.0):
         raise InputError(f"found {fps}", field="--fps", fix="give a number from 0.1 to 1000")
@@ -206,11 +199,11 @@ def write_video(results: Results, file: Path, names: Sequence[str], fps: float, 
         raise InputError("needs the package av", field="mp4", fix="pip install 'ns-abstract[video]'")
 
     def rows() -> Iterator[np.ndarray]:
-        for result in results:  # pyright: ignore[reportGeneralTypeIssues]
+        for result in results:
             if labelled:
                 yield panels(result, names, results.largest, _figures(results, result, names))
             else:
-                yield np.concatenate([results.picture(result, name) for name in names], axis=1)
+                yield np.concatenate([picture(result, name, results.largest) for name in names], axis=1)
 
     write_atomic(file, lambda stream: encode_mp4(stream, rows(), fps))
 

@@ -18,10 +18,9 @@ _RUNS = 8
 def metrics(result: FrameResult) -> dict[str, float | None]:
     """The figures of one frame.
 
-    Returns:
-        ``mpg``, ``xpg``: mean and maximum over the pixels of the length over RGB of upper - lower
-        (the paper's metrics); ``mpg_witness``, ``xpg_witness``: the same of what was rendered;
-        ``ratio``: mpg / mpg_witness, None where that is no finite number.
+    ``mpg``, ``xpg``: mean and maximum over the pixels of the length over RGB of upper - lower (the paper's metrics);
+    ``mpg_witness``, ``xpg_witness``: the same of what was rendered; ``ratio``: mpg / mpg_witness, None where that is no
+    finite number.
     """
     mpg = mean_pixel_gap(result.lower, result.upper)
     witness = mean_pixel_gap(result.witness_lower, result.witness_upper)
@@ -36,11 +35,10 @@ def metrics(result: FrameResult) -> dict[str, float | None]:
 
 
 def layer_metrics(result: FrameResult) -> dict[str, dict[str, float | None]]:
-    """The figures of a frame's further outputs, by name.
+    """The figures of a frame's further outputs, by name; None where a number is not finite.
 
-    Returns:
-        ``mean_gap``: mean over the pixels of upper - lower, in the output's unit; ``mean_gap_witness``: the same of
-        what was rendered; ``ratio``: of the two; None where a number is not finite.
+    ``mean_gap``: mean over the pixels of upper - lower, in the output's unit; ``mean_gap_witness``: the same of what
+    was rendered; ``ratio``: of the two.
     """
     metrics_by_name: dict[str, dict[str, float | None]] = {}
     for name, layer in result.layers.items():
@@ -111,10 +109,8 @@ class _OtherUnit(NamedTuple):
 class ShownUnits:
     """Units that a set of poses was stated in: people read ranges in these, with the other unit beside them.
 
-    Attributes:
-        translation: "normalised" or "dataset".
-        angle: "radians" or "degrees".
-        dataset_scale: Normalised units per unit of the data set.
+    ``translation``: "normalised" or "dataset"; ``angle``: "radians" or "degrees"; ``dataset_scale``: normalised units
+    per unit of the data set.
     """
 
     translation: str = "normalised"

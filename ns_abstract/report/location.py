@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from html import escape
 from typing import Any
 
@@ -15,18 +15,17 @@ from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.refine.protocol import SceneElements
 from ns_abstract.report.cameras import CameraDrawings, cell_cameras, standing
 from ns_abstract.report.figures import number, unit_of_axis
-from ns_abstract.report.html import uri, whole_page
+from ns_abstract.report.html import whole_page
 from ns_abstract.report.outside import SceneDrawing
 from ns_abstract.report.picture import heat, preview, to_bytes
 from ns_abstract.report.run import CommandRun, plain
-from ns_abstract.report.svg import draw_svg
-from ns_abstract.report.verdict_maps import NONE, OPEN, pixels
+from ns_abstract.report.verdict_maps import LEFT, NONE, OPEN, pairs_svg
 
 Row = Mapping[str, Any]
 #: Longest side of pictures on the page, and the difference that its scale ends at.
 _PIXELS, _LARGEST = 384, 0.25
-#: Places along a parameter of a map; pixels of the whole matrix, between its maps and beside them.
-_BINS, _WIDTH, _GAP, _LEFT, _BELOW, _PANEL = 48, 760, 10, 62, 34, 190
+#: Places along a parameter of a map.
+_BINS = 48
 #: Colours of what may have made the photo, and of where the best pose is.
 _POSSIBLE, _BEST = (29, 116, 64), (179, 38, 30)
 
@@ -47,49 +46,30 @@ _HEADINGS = {
 }
 
 
-@dataclass(frozen=True, kw_only=True)
-class LocatedRun(CommandRun):
-    """What a command looked for.
-
-    Attributes:
-        photo: Its file, or None.
-        levels: [H, W, 3] uint8 the photo.
-        noise, outliers: What a picture may miss.
-        counted: Number of pixels that count.
-        allowed: Number of them that may show anything.
-        more: What else report.json says of the photo: "brightness", "calibration".
-    """
-
-    photo: str | None
-    levels: NDArray[np.uint8]
-    noise: float
-    outliers: float
-    counted: int
-    allowed: int
-    more: Mapping[str, Any]
-
-
 def location_document(
-    run: LocatedRun,
+    run: CommandRun,
+    photo: Mapping[str, Any],
     parameters: Sequence[tuple[str, str]],
     sets: Mapping[int, PoseBox],
     rows: Mapping[int, Sequence[Row]],
     poses: Mapping[int, Sequence[Any]],
+    figures: Mapping[str, Any],
     *,
     state: str,
-    seconds: float,
-    effort: Mapping[str, float],
-    trace: Sequence[Mapping[str, float]],
 ) -> dict[str, Any]:
     """Content of report.json.
 
     Args:
+        run: The command's run.
+        photo: The photo and what a picture may miss of it: keys of report.json.
         parameters: Names and units of the table ``parameters``.
+        sets: By frame, the poses.
+        rows: By frame, the cells.
         poses: Rendered poses by frame, the best first, with ``values`` and ``outliers``.
+        figures: See `ns_abstract.report.certificate.search_figures`.
         state: "done", "budget" or "interrupted".
-        seconds: Wall time, earlier runs included.
     """
-    frames = [_frame(run, parameters, frame, sets[frame], rows[frame], poses[frame]) for frame in sorted(rows)]
+    frames = [_frame(parameters, frame, sets[frame], rows[frame], poses[frame]) for frame in sorted(rows)]
     hulls = [entry["hull"] for entry in frames if entry["hull"] is not None]
     bests = [dict(entry["best"], frame=entry["index"]) for entry in frames if entry["best"] is not None]
     best = min(bests, key=lambda entry: entry["outliers"], default=None)
@@ -102,7 +82,7 @@ def location_document(
     if not hulls:
         answer = "none"
     else:
-        answer = "possible" if best is not None and best["outliers"] <= run.allowed else "unknown"
+        answer = "possible" if best is not None and best["outliers"] <= photo["allowed"] else "unknown"
     return plain(
         run.head()
         | {
@@ -110,25 +90,17 @@ def location_document(
             "possible_volume": sum(entry["possible_volume"] for entry in frames) / max(1, len(frames)),
             "hull": hull,
             "best": best,
-            "photo": {
-                "file": run.photo,
-                "noise": run.noise,
-                "outliers": run.outliers,
-                "counted": run.counted,
-                "allowed": run.allowed,
-                **run.more,
-            },
+            "photo": photo,
             "frames": frames,
-            "trace": [{"seconds": p["seconds"], "searched_left": 1.0 - p["certified"]} for p in trace],
-            "seconds": seconds,
-            "effort": effort,
+            "trace": [{"seconds": p["seconds"], "searched_left": 1.0 - p["certified"]} for p in figures["trace"]],
+            "seconds": figures["seconds"],
+            "effort": figures["effort"],
         }
         | run.tail(state, METRICS)
     )
 
 
 def _frame(
-    run: LocatedRun,
     parameters: Sequence[tuple[str, str]],
     index: int,
     poses: PoseBox,
@@ -233,40 +205,27 @@ def pair_svg(entry: Mapping[str, Any], rows: Sequence[Row]) -> Markup | None:
     whole = np.array([[parameters[k][end] for k in free] for end in ("lower", "upper")], np.float64)
     hull = np.array([entry["hull"]["lower"], entry["hull"]["upper"]], np.float64)[:, free]
     best = None if entry["best"] is None else np.array(entry["best"]["pose"], np.float64)[free]
-    d = len(free)
-    panel = min(_PANEL, (_WIDTH - _LEFT - (d - 1) * _GAP) // d)
-    step = panel + _GAP
-    marks = []
-    for i in range(d):
-        for j in range(d):
-            if i == j:
-                continue
-            window = whole if i > j else hull
-            image = _touched(ends[:, :, (j, i)], possible, window[:, (j, i)], None if best is None else best[[j, i]])
-            names = escape(f"{parameters[free[i]]['name']} over {parameters[free[j]]['name']}")
-            what = "the set" if i > j else "the hull"
-            x, y = _LEFT + j * step, 8 + i * step
-            marks.append(
-                f'<image class="pixels" x="{x}" y="{y}" width="{panel}" height="{panel}" preserveAspectRatio="none" '
-                f'href="{uri(pixels(image))}"><title>{what}: {names}</title></image>'
-                f'<rect class="frame" x="{x}" y="{y}" width="{panel}" height="{panel}"/>'
-            )
-    bottom = 8 + d * step - _GAP
-    for k in range(d):
-        p = parameters[free[k]]
-        x, y = _LEFT + k * step, 8 + k * step
+    shown = [parameters[k] for k in free]
+    pictures = {}
+    for i, j in itertools.permutations(range(len(free)), 2):
+        window = whole if i > j else hull
+        image = _touched(ends[:, :, (j, i)], possible, window[:, (j, i)], None if best is None else best[[j, i]])
+        pictures[i, j] = image, "the set" if i > j else "the hull"
+
+    def labels(k: int, x: float, y: float, panel: int, bottom: float) -> list[str]:
+        p = shown[k]
         label = escape(f"{p['name']} ({unit_of_axis(p['unit'])})")
         middle = f'x="{x + 0.5 * panel:.0f}" text-anchor="middle"'
-        marks += [
+        return [
             f'<text {middle} y="{bottom + 13}">{label}</text>',
             f'<text {middle} y="{bottom + 28}">{number(whole[0, k], 3)} to {number(whole[1, k], 3)}</text>',
-            f'<text x="{_LEFT - 4}" y="{y + 0.5 * panel + 4:.0f}" text-anchor="end">{escape(str(p["name"]))}</text>',
+            f'<text x="{LEFT - 4}" y="{y + 0.5 * panel + 4:.0f}" text-anchor="end">{escape(str(p["name"]))}</text>',
             f'<text {middle} y="{y + 0.5 * panel:.0f}">left:</text>',
             f'<text {middle} y="{y + 0.5 * panel + 14:.0f}">{number(hull[0, k], 3)}</text>',
             f'<text {middle} y="{y + 0.5 * panel + 28:.0f}">{number(hull[1, k], 3)}</text>',
         ]
-    title = "What is left over pairs of parameters"
-    return draw_svg(_LEFT + d * step - _GAP + 8, bottom + _BELOW, title, "".join(marks), kind="pairs")
+
+    return pairs_svg("What is left over pairs of parameters", shown, pictures, labels)
 
 
 def _touched(

@@ -44,12 +44,9 @@ ABOVE = PLANS[2]
 
 @dataclass(frozen=True)
 class PlotWindow:
-    """The window of a plot: the part of a plane that is shown, at one scale.
+    """The window of a plot: the part of a plane that is shown, at one scale, ``size`` pixels wide and high.
 
-    Attributes:
-        axes: The world's axes to the right and up.
-        low, high: [2] ends along them, normalised units.
-        size: Width and height in pixels.
+    ``axes`` are the world's axes to the right and up, ``low`` and ``high`` [2] the ends along them, normalised units.
     """
 
     axes: tuple[int, int]
@@ -91,13 +88,10 @@ class SceneDrawing:
         return visible[np.argsort(depth[visible], kind="stable")]
 
     def window(self, axes: tuple[int, int], low: Float64, high: Float64, nearest: float, width: int) -> PlotWindow:
-        """A window about the box [2] to [2] that shows some of the scene about it.
+        """A window about the box ``low`` [2] to ``high`` [2], normalised units, that shows some of the scene about it.
 
-        Args:
-            axes: The world's axes to the right and up.
-            low, high: The box, normalised units.
-            nearest: As `picture` has it.
-            width: Of the picture, pixels.
+        ``axes`` are the world's axes to the right and up; ``nearest`` as `picture` has it; ``width`` of the picture in
+        pixels.
         """
         key = axes, *low.tolist(), *high.tolist(), nearest, width
         return _remembered(self._windows, key, lambda: self._window(axes, low, high, nearest, width))
@@ -115,11 +109,7 @@ class SceneDrawing:
         return framed(axes, low, high, width)
 
     def picture(self, window: PlotWindow, nearest: float = np.inf) -> bytes:
-        """PNG of the elements in a window.
-
-        Args:
-            nearest: Coordinate towards who looks beyond which elements are left out: those in front.
-        """
+        """PNG of the elements in a window but for those in front, beyond ``nearest`` towards who looks."""
         return _remembered(self._pictures, (window, nearest), lambda: self._picture(window, nearest))
 
     def _picture(self, window: PlotWindow, nearest: float) -> bytes:
@@ -192,12 +182,9 @@ def plane_axes(window: PlotWindow) -> tuple[PlotAxis, PlotAxis]:
 
 
 def draw_plane(outside: SceneDrawing | None, window: PlotWindow, nearest: float, marks: str, title: str) -> Markup:
-    """SVG of a window: the scene, if it has elements, and ``marks`` over it.
+    """SVG of a window: the scene, if ``outside`` draws one, and ``marks`` over it, in the coordinates of `plane_axes`.
 
-    Args:
-        outside: Draws the scene.
-        nearest: As `SceneDrawing.picture` has it.
-        marks: SVG, in the coordinates of `plane_axes`.
+    ``nearest`` as `SceneDrawing.picture` has it.
     """
     (left, right, above, below), (width, height) = _ROOM, window.size
     if outside is not None:

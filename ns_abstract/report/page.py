@@ -11,6 +11,7 @@ from markupsafe import Markup
 
 from ns_abstract.report.figures import MARKS, ShownUnits, number
 from ns_abstract.report.html import counted, set_of, whole_page
+from ns_abstract.report.picture import color_stops, color_table
 from ns_abstract.report.play import play_moves
 from ns_abstract.report.svg import PlotAxis, draw_legend, draw_line, draw_plot, stairs, through
 
@@ -43,15 +44,11 @@ def render_page(
     pictures: Mapping[int, Mapping[str, bytes]],
     plays: Mapping[int, str] | None = None,
 ) -> str:
-    """The page of a report.
+    """The page of a report: HTML, self-contained; every text of the document is escaped.
 
-    Args:
-        document: Content of report.json (`ns_abstract.report.record.Report.document`).
-        pictures: For the frames shown, by number: PNGs lower, upper, gap, witness and image.
-        plays: Frames to play with, by number, as `ns_abstract.report.play.play_data` gives them.
-
-    Returns:
-        HTML, self-contained; every text of the document is escaped.
+    ``document`` is the content of report.json (`ns_abstract.report.record.Report.document`). Of the frames shown, by
+    number, ``pictures`` are PNGs lower, upper, gap, witness and image, and ``plays`` what
+    `ns_abstract.report.play.play_data` gives.
     """
     name, frames = str(document["scene"].get("name", "scene")), document["frames"]
     sampled = document["guarantee"] == "sampled"
@@ -79,8 +76,8 @@ def render_page(
         set_of=sides,
         plays=plays,
         moves=any(play_moves(text) for text in plays.values()),
-        colors=_colors,
-        gradient=_gradient,
+        colors=color_table,
+        gradient=lambda: ", ".join(color_stops()),
         overview=_overview(frames),
         path_curve=path_curve,
         reached=[f"ratio {mark:g}: {_reached(frames, f'{mark:g}')}" for mark in MARKS]
@@ -94,18 +91,6 @@ def render_page(
         stats=_STATS,
         notes=notes,
     )
-
-
-def _colors() -> str:
-    from ns_abstract.report.picture import color_table
-
-    return color_table()
-
-
-def _gradient() -> str:
-    from ns_abstract.report.picture import color_stops
-
-    return ", ".join(color_stops())
 
 
 def _verdict(document: Mapping[str, Any]) -> dict[str, Any]:
@@ -239,17 +224,14 @@ def _path_curve(frames: Sequence[Mapping[str, Any]]) -> Markup | None:
     x, y = PlotAxis(times[0], end, 52, 988, log=True), PlotAxis(min(positive), max(positive), 236, 26, log=True)
     marks = ""
     for kind, frame_values in lines.items():
-        for values, strength in (*((values, " one") for values in frame_values), (_means(frame_values), "")):
+        mean = [sum(same) / len(same) for same in zip(*frame_values, strict=True)]
+        for values, strength in (*((values, " one") for values in frame_values), (mean, "")):
             points = [(t, v) for t, v in zip(times, values, strict=True) if v > 0.0]
             if points:
                 marks += draw_line([(x(t), y(v)) for t, v in stairs(points, end)], f"{kind}{strength}", False)
     marks += draw_legend((("outer", "bounds (MPG)"), ("inner", "MPG of renders")), 988)
     labels = ("seconds of work on each frame (log)", "mean pixel gap (log)")
     return draw_plot(x, y, labels, marks, size=(1000, 276), title="Mean pixel gap of the path against run time")
-
-
-def _means(lines: Sequence[Sequence[float]]) -> list[float]:
-    return [sum(values) / len(values) for values in zip(*lines, strict=True)]
 
 
 def _reached(frames: Sequence[Mapping[str, Any]], mark: str) -> str:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -38,6 +38,10 @@ _PANEL_PIXELS_MAX = 1000
 _MARGIN, _GUTTER, _LABEL, _LINE, _BAR, _BAR_TEXT = 0.14, 0.12, 0.24, 0.19, 0.09, 0.50
 _INK, _SOFT, _WARN = "#1a1a1a", "#555555", "#a32a12"
 _TITLE_POINTS, _TEXT_POINTS, _LABEL_POINTS, _TICK_POINTS = 10.5, 8.0, 8.5, 7.5
+#: Columns of white between two pictures, and most planes that are drawn.
+_GAP, _MOST = 2, 3
+#: What pixels that are not read are darkened to, and the colours of planes.
+_DIM, _MAP = 0.35, "viridis"
 
 
 def to_bytes(image: NDArray[np.floating]) -> NDArray[np.uint8]:
@@ -101,11 +105,8 @@ def frame_figure(
 ) -> Figure:
     """The picture of one frame: lower | upper | gap heat map with colour bar | one render.
 
-    Panels show whole pixels, several screen pixels each for small images.
-
-    Args:
-        guarantee: Shown in the title; see `ns_abstract.report.figures.short_guarantee`.
-        about: More for the title, such as the scene's name.
+    Panels show whole pixels, several screen pixels each for small images. ``guarantee``: shown in the title; see
+    `ns_abstract.report.figures.short_guarantee`. ``about``: more for the title, such as the scene's name.
     """
     from matplotlib.figure import Figure
 
@@ -182,45 +183,52 @@ def layer_figure(result: FrameResult, name: str) -> Figure:
     Args:
         name: Of `ns_abstract.refine.result.EXTRA_OUTPUTS`; its colour scale ends where what is known ends.
     """
-    from matplotlib.figure import Figure
-
     layer = result.layers[name]
-    height, width = layer.lower.shape
-    panel = _PANEL_INCHES, _PANEL_INCHES * min(1.5, max(0.25, height / width))
-    figure = Figure(figsize=(4.0 * panel[0] + 1.2, panel[1] + 0.8), facecolor="white", layout="constrained")
-    axes: Any = figure.subplots(1, 4)
     finite = layer.upper[np.isfinite(layer.upper)]
     top = float(max(finite.max(initial=0.0), layer.image.max(initial=0.0))) or 1.0
     length = np.where(np.isfinite(layer.upper), layer.upper.astype(np.float64) - layer.lower, np.nan)
-    panels = (
-        ("lower bound", layer.lower), ("upper bound", np.minimum(layer.upper, np.float32(top))),
-        ("upper − lower", length),
-        ("render at the middle" if result.box.dimensions else "render", layer.image),
-    )  # fmt: skip
-    for place, (label, image) in zip(axes, panels, strict=True):
-        whole = float(np.nan_to_num(length).max(initial=0.0)) or 1.0 if image is length else top
-        heat_map = place.imshow(
-            image, cmap=GAP_COLORS if image is length else _LAYER_COLORS, vmin=0.0, vmax=whole,
-            interpolation="antialiased",
-        )  # fmt: skip
+    middle = "render at the middle" if result.box.dimensions else "render"
+    panels = [
+        ("lower bound", layer.lower, _LAYER_COLORS, top),
+        ("upper bound", np.minimum(layer.upper, np.float32(top)), _LAYER_COLORS, top),
+        ("upper − lower", length, GAP_COLORS, float(np.nan_to_num(length).max(initial=0.0)) or 1.0),
+        (middle, layer.image, _LAYER_COLORS, top),
+    ]
+    unit = " (units of the normalised frame)" if name == "depth" else ""
+    return panels_figure(panels, f"Frame {result.index}  ·  {_LAYER_TITLES[name]}{unit}", bars=range(4))
+
+
+def panels_figure(
+    panels: Sequence[tuple[str, NDArray[Any], str | None, float]], title: str, bars: Iterable[int]
+) -> Figure:
+    """Pictures side by side below a title.
+
+    Args:
+        panels: Label, picture, and the colours of its scale and where that ends; no colours: it has its own.
+        bars: Numbers of the panels that have a colour bar.
+    """
+    from matplotlib.figure import Figure
+
+    height, width = panels[0][1].shape[:2]
+    panel_height = _PANEL_INCHES * min(1.5, max(0.25, height / width))
+    figure = Figure(
+        figsize=(len(panels) * _PANEL_INCHES + 1.2, panel_height + 0.9), facecolor="white", layout="constrained"
+    )
+    axes: Any = figure.subplots(1, len(panels))
+    for k, (place, (label, image, colors, top)) in enumerate(zip(axes, panels, strict=True)):
+        shown = place.imshow(image, cmap=colors, vmin=0.0, vmax=top, interpolation="antialiased")
         bare_axes(place)
         place.set_title(label, fontsize=_LABEL_POINTS, color=_INK)
-        figure.colorbar(heat_map, ax=place, fraction=0.05, pad=0.02).ax.tick_params(labelsize=_TICK_POINTS)
-    unit = " (units of the normalised frame)" if name == "depth" else ""
-    figure.suptitle(f"Frame {result.index}  ·  {_LAYER_TITLES[name]}{unit}", fontsize=_TITLE_POINTS, color=_INK)
+        if k in bars:
+            figure.colorbar(shown, ax=place, fraction=0.05, pad=0.02).ax.tick_params(labelsize=_TICK_POINTS)
+    figure.suptitle(title, fontsize=_TITLE_POINTS, color=_INK)
     return figure
 
 
-def save_layer_picture(path: str | os.PathLike[str], result: FrameResult, name: str) -> None:
-    """Write `layer_figure` as PNG, whole or not at all.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
-    figure = layer_figure(result, name)
-    write_atomic(
-        path, lambda stream: figure.savefig(stream, format="png", dpi=120, metadata={"Software": "ns_abstract"})
-    )
+def save_figure(path: str | os.PathLike[str], figure: Figure, dpi: int | None = None) -> None:
+    """Write a figure as PNG, whole or not at all. Raises OSError where the file cannot be written."""
+    about = {"Software": "ns_abstract"}
+    write_atomic(path, lambda stream: figure.savefig(stream, format="png", dpi=dpi or "figure", metadata=about))
 
 
 def bare_axes(axes: Axes) -> None:
@@ -248,13 +256,8 @@ def _color_bar(figure: Figure, shown: Any, side: Axes, inches: float) -> None:
 
 
 def save_picture(path: str | os.PathLike[str], result: FrameResult, **labels: Any) -> None:
-    """Write `frame_figure` with ``labels`` as PNG, whole or not at all.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
-    figure = frame_figure(result, **labels)
-    write_atomic(path, lambda stream: figure.savefig(stream, format="png", metadata={"Software": "ns_abstract"}))
+    """Write `frame_figure` with ``labels``; see `save_figure`."""
+    save_figure(path, frame_figure(result, **labels))
 
 
 def heat(length: NDArray[np.floating], top: float, colors: str = GAP_COLORS) -> NDArray[np.uint8]:
@@ -318,3 +321,24 @@ def previews(result: FrameResult, side: int) -> Mapping[str, bytes]:
             images[f"{name}_{kind}"] = heat(array, whole, _LAYER_COLORS)
         images[f"{name}_gap"] = heat(length, float(length.max(initial=0.0)))
     return {name: preview(image, side) for name, image in images.items()}
+
+
+def planes_picture(image: np.ndarray, wanted: np.ndarray, depth: int | None) -> np.ndarray:
+    """Return a picture [h, w, 3] of bytes: the colours with what is not read darkened, then the planes side by side.
+
+    Args:
+        image: [H, W, C] colours, then planes in [0, 1]; one of them may be depths.
+        wanted: [H, W] the pixels that are read.
+        depth: Channel of the depths, or None.
+    """
+    colors = np.clip(image[..., :3], 0.0, 1.0)
+    images = [to_bytes(np.where(wanted[..., None], colors, _DIM * colors))]
+    for channel in range(3, min(image.shape[2], 3 + _MOST)):
+        plane, top = image[..., channel], 1.0
+        if channel == depth:
+            near = plane < np.max(plane)
+            top = float(plane[near].max(initial=0.0)) or 1.0
+        images.append(heat(np.clip(plane, 0.0, top), top, _MAP))
+    gap = np.full((image.shape[0], _GAP, 3), 255, np.uint8)
+    parts = [part for one in images for part in (one, gap)][:-1]
+    return np.concatenate(parts, axis=1)

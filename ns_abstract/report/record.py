@@ -26,6 +26,7 @@ from ns_abstract.report.files import (
     load_frame,
     save_frame,
 )
+from ns_abstract.report.picture import layer_figure, previews, save_figure, save_picture
 from ns_abstract.report.run import CommandRun, differences, file_stamp, guarantee_text, plain
 
 Status = Literal["done", "partial", "missing"]
@@ -34,7 +35,8 @@ Outcome = Literal["done", "budget", "interrupted"]
 _JSON_LIMIT = 2**30
 # The page is written again when this much time has passed, or this many times what it takes.
 _PAGE_SECONDS, _PAGE_SHARE = 10.0, 20.0
-_PREVIEW_PIXELS = 256
+#: Longest side of a picture on a page.
+PREVIEW_PIXELS = 256
 #: Most frames that the page shows pictures of; its table has all.
 PAGE_FRAMES = 60
 #: Characters of the page that its numbers may take, all frames together, and most bytes of a frame file that is read
@@ -88,14 +90,11 @@ def failed_self_check(problem: str) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class RunRecord(CommandRun):
-    """A command's run.
+    """A command's run over ``frames``, numbers of the camera path's entries that were asked for.
 
-    Attributes:
-        frames: Numbers of the camera path's entries that were asked for.
-        settings: The command's options; ``target_ratio`` decides when a frame is done, and with a true
-            ``save_cells`` stored frames without leaf cells are computed again.
-        size: Height and width of the pictures; None: any that stored frames have.
-        intrinsics: By frame the pictures' `Intrinsics`.
+    Of its ``settings``, ``target_ratio`` decides when a frame is done, and with a true ``save_cells`` stored frames
+    without leaf cells are computed again. ``size`` is height and width of the pictures; None: any that stored frames
+    have. ``intrinsics`` has by frame the pictures' `Intrinsics`.
     """
 
     frames: tuple[int, ...]
@@ -110,37 +109,19 @@ class Report:
 
     Args:
         output_dir: Made if it is absent.
-        keep_stored: See `resume`.
+        keep_stored: Continue in the folder: frames stored with the same fingerprint are kept, asked for or not.
+            Truncated, damaged or foreign frame files are not used; see ``ignored``.
 
     Attributes:
         kept: Numbers of the frames taken over from an earlier run.
         ignored: Stored frames that were not, with the reason, one sentence each.
 
     Raises:
-        InputError: The folder cannot be written.
+        InputError: The folder cannot be written, or its report, which is to be kept, has another fingerprint.
     """
 
     def __init__(self, output_dir: str | os.PathLike[str], run: RunRecord, *, keep_stored: bool = False) -> None:
-        self._start(Path(output_dir), run)
-        self._first_command = first_command(self.folder) if keep_stored else None
-        if keep_stored:
-            self._keep()
-        self._publish(page=True)
-
-    @classmethod
-    def resume(cls, output_dir: str | os.PathLike[str], run: RunRecord) -> Report:
-        """Continue in a folder: frames stored with the same fingerprint are kept, asked for or not.
-
-        A folder without results starts afresh. Truncated, damaged or foreign frame files are not used;
-        see ``ignored``.
-
-        Raises:
-            InputError: The folder's report has another fingerprint, or the folder cannot be written.
-        """
-        return cls(output_dir, run, keep_stored=True)
-
-    def _start(self, folder: Path, run: RunRecord) -> None:
-        self.folder, self.run = folder, run
+        folder = self.folder = Path(output_dir)
         self.kept: list[int] = []
         self.ignored: list[str] = []
         self._entries: dict[int, dict[str, Any]] = {}
@@ -160,6 +141,10 @@ class Report:
             self._present = sorted(path.name for kind in ("npz", "png") for path in folder.glob(f"frame_*.{kind}"))
         except OSError as error:
             raise unwritable(folder, error) from None
+        self._first_command = first_command(self.folder) if keep_stored else None
+        if keep_stored:
+            self._keep()
+        self._publish(page=True)
 
     def _describe(self, run: RunRecord) -> None:
         """Take ``run`` for what report.json and the files of frames say from now on."""
@@ -279,23 +264,14 @@ class Report:
         self._publish(page=time.monotonic() >= self._page_due)
 
     def add(self, result: FrameResult, status: Status | None = None, *, picture: bool = True) -> dict[str, Any]:
-        """Write one frame and bring the report up to date.
+        """Write one frame and bring the report up to date; returns the frame's entry in report.json.
 
-        May be called again as a frame gets tighter: ``seconds``, ``cells`` and ``trace`` are those of
-        this command so far. Bounds are intersected with those on disk (`merged`), which holds for the
-        frames of an earlier command too; its time and trace are put in front.
-
-        Args:
-            status: "done", or "partial" where the work ended before its target; decided by
-                ``target_ratio`` if None. A frame without bounds is always "missing".
-            picture: Whether to draw the PNG now; otherwise `draw` or `finish` does.
-
-        Returns:
-            The frame's entry in report.json.
-
-        Raises:
-            ValueError: As `ns_abstract.report.files.check_frame`: nothing unsound is written.
-            InputError: A file cannot be written.
+        May be called again as a frame gets tighter: ``seconds``, ``cells`` and ``trace`` are those of this command so
+        far. Bounds are intersected with those on disk (`merged`), which holds for the frames of an earlier command too;
+        its time and trace are put in front. ``status``: "done", or "partial" where the work ended before its target;
+        decided by ``target_ratio`` if None. A frame without bounds is always "missing". ``picture``: whether to draw
+        the PNG now; otherwise `draw` or `finish` does. Raises ValueError as `ns_abstract.report.files.check_frame`, so
+        that nothing unsound is written, and InputError where a file cannot be written.
         """
         check_frame(result)
         if result.problems:
@@ -347,25 +323,27 @@ class Report:
             raise unwritable(self.folder, error) from None
 
     def _draw(self, result: FrameResult) -> None:
-        from ns_abstract.report.picture import previews, save_layer_picture, save_picture
+        self._draw_files(result)
+        self._previews[result.index] = self._small(result)
+        self._undrawn.discard(result.index)
 
+    def _draw_files(self, result: FrameResult) -> None:
         name = str(self.run.scene.get("name", ""))
         path = self.folder / frame_name(result.index, "png")
         guarantee = short_guarantee(self.run.guarantee, self.run.scene.get("bounded"))
         save_picture(path, result, guarantee=guarantee, about=name, units=ShownUnits.of(self.run.scene))
         for layer in result.layers:
-            save_layer_picture(self.folder / layer_name(result.index, layer), result, layer)
-        self._previews[result.index] = previews(result, _PREVIEW_PIXELS)
-        self._undrawn.discard(result.index)
+            save_figure(self.folder / layer_name(result.index, layer), layer_figure(result, layer), 120)
+
+    def _small(self, result: FrameResult) -> Mapping[str, bytes]:
+        """PNGs of a frame for the page."""
+        return previews(result, PREVIEW_PIXELS)
 
     def finish(self, outcome: Outcome) -> dict[str, Any]:
         """Write the last report.json and report.html.
 
-        Args:
-            outcome: "done", "budget" (the time ended first) or "interrupted" (by a signal).
-
-        Returns:
-            The content of report.json.
+        ``outcome``: "done", "budget" (the time ended first) or "interrupted" (by a signal). Returns the content of
+        report.json.
         """
         self._state = outcome
         # first what must not be lost
@@ -454,17 +432,20 @@ class Report:
             raise unwritable(self.folder, error) from None
 
     def _write_page(self, document: dict[str, Any]) -> None:
+        begin = time.monotonic()
+        text = self._page(document)
+        write_atomic(self.folder / "report.html", lambda stream: stream.write(text.encode()))
+        took = time.monotonic() - begin
+        self._page_due = time.monotonic() + max(_PAGE_SECONDS, _PAGE_SHARE * took)
+
+    def _page(self, document: dict[str, Any]) -> str:
         from ns_abstract.report.page import render_page, shown_frames
 
-        begin = time.monotonic()
         pictures = {}
         for entry in shown_frames(document["frames"], PAGE_FRAMES):
             pictures[entry["index"]] = self._preview(entry["index"])
         plays = {index: play for index in pictures if (play := self._play(index)) is not None}
-        text = render_page(document, pictures, plays)
-        write_atomic(self.folder / "report.html", lambda stream: stream.write(text.encode()))
-        took = time.monotonic() - begin
-        self._page_due = time.monotonic() + max(_PAGE_SECONDS, _PAGE_SHARE * took)
+        return render_page(document, pictures, plays)
 
     def _played(self, result: FrameResult) -> str | None:
         from ns_abstract.report.play import play_data
@@ -482,8 +463,6 @@ class Report:
 
     def _preview(self, index: int) -> Mapping[str, bytes]:
         if index not in self._previews:
-            from ns_abstract.report.picture import previews
-
             result = load_frame(self.folder / frame_name(index, "npz"), leaves=False).result
-            self._previews[index] = previews(result, _PREVIEW_PIXELS)
+            self._previews[index] = self._small(result)
         return self._previews[index]

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
+import json
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -13,9 +16,10 @@ from numpy.typing import NDArray
 
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.io.atomic import write_atomic
-from ns_abstract.report.export import Results
+from ns_abstract.io.errors import InputError
+from ns_abstract.report.export import Results, picture
 from ns_abstract.report.figures import metrics
-from ns_abstract.report.interchange import optional_package
+from ns_abstract.report.files import IMAGES, LEAVES, frame_name, load_frame
 
 #: Gaussians in a recording at most: those that are largest and most opaque.
 _GAUSSIANS = 200_000
@@ -50,10 +54,8 @@ def write_rerun(results: Results, cameras: Sequence[PinholeCamera], scene: Recor
     """Write a Rerun recording (.rrd).
 
     Its timeline "frame" shows the bounds, their gap and a render of every frame, and the figures of the report. With
-    ``cameras``, those of the path by frame, pictures stand in the scene at their cameras.
-
-    Raises:
-        InputError: The package rerun-sdk is missing.
+    ``cameras``, those of the path by frame, pictures stand in the scene at their cameras. Raises InputError where the
+    package rerun-sdk is missing.
     """
     rerun: Any = optional_package("rerun", "rerun", "rrd")
     recording = rerun.RecordingStream("ns-abstract")
@@ -67,7 +69,7 @@ def write_rerun(results: Results, cameras: Sequence[PinholeCamera], scene: Recor
             colors = np.concatenate([scene.colors, scene.opacities[:, None]], axis=1)
             points = rerun.Points3D(scene.means, radii=radii, colors=np.round(255.0 * colors).astype(np.uint8))
             recording.log("scene/gaussians", points, static=True)
-        for result in results:  # pyright: ignore[reportGeneralTypeIssues]
+        for result in results:
             recording.set_time("frame", sequence=result.index)
             if cameras:
                 camera = cameras[result.index]
@@ -81,10 +83,10 @@ def write_rerun(results: Results, cameras: Sequence[PinholeCamera], scene: Recor
                         width=results.size[1], height=results.size[0],
                     ),
                 )  # fmt: skip
-                recording.log("scene/camera/image", rerun.Image(results.picture(result, "image")))
+                recording.log("scene/camera/image", rerun.Image(picture(result, "image", results.largest)))
             for name in ("lower", "upper", "image"):
                 recording.log(f"bounds/{name}", rerun.Image(getattr(result, name)))
-            recording.log("bounds/gap", rerun.Image(results.picture(result, "gap")))
+            recording.log("bounds/gap", rerun.Image(picture(result, "gap", results.largest)))
             for name, value in metrics(result).items():
                 if isinstance(value, (int, float)):
                     recording.log(f"figures/{name}", rerun.Scalars(float(value)))
@@ -115,12 +117,12 @@ def write_viser(
                 rgbs=scene.colors.astype(np.float32), opacities=scene.opacities[:, None].astype(np.float32),
             )  # fmt: skip
         frustum: Any = None
-        for result in results:  # pyright: ignore[reportGeneralTypeIssues]
+        for result in results:
             camera = cameras[result.index]
             former, rotation = frustum, camera.camera_to_world[:3, :3] @ _FLIP
             frustum = server.scene.add_camera_frustum(
                 f"/frames/{result.index:05d}", fov=2.0 * float(np.arctan2(0.5 * camera.height, camera.fy)),
-                aspect=camera.width / camera.height, scale=0.15, image=results.picture(result, "gap"),
+                aspect=camera.width / camera.height, scale=0.15, image=picture(result, "gap", results.largest),
                 wxyz=viser.transforms.SO3.from_matrix(rotation).wxyz, position=camera.camera_to_world[:3, 3],
             )  # fmt: skip
             if former is not None:
@@ -143,3 +145,75 @@ def _server(viser: Any) -> Iterator[Any]:
         yield server
     finally:
         server.stop()
+
+
+def optional_package(module: str, extra: str, command: str) -> ModuleType:
+    """Return the imported ``module``, which the extra ``extra`` installs.
+
+    Raises:
+        InputError: It is missing; the error names the line for pip.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError:
+        fix = f"pip install 'ns-abstract[{extra}]'"
+        raise InputError(f"needs the package {module.partition('.')[0]}", field=command, fix=fix) from None
+
+
+def write_exr(results: Results, folder: Path) -> list[Path]:
+    """Write ``frame_00000.exr`` for every frame, and return the files.
+
+    Its parts ``lower``, ``upper``, ``witness_lower``, ``witness_upper`` and ``image`` hold RGB as float32, bit for bit
+    those of the npz: display-referred values in [0, 1], not linear light. Raises InputError where the package OpenEXR
+    is missing.
+    """
+    exr: Any = optional_package("OpenEXR", "exr", "exr")
+    folder.mkdir(parents=True, exist_ok=True)
+    files = []
+    for result in results:
+        header = {
+            "compression": exr.ZIP_COMPRESSION,
+            "type": exr.scanlineimage,
+            "comments": "display-referred values in [0, 1] as the renderer returns them, not linear light",
+        }
+        parts = [exr.Part(dict(header), {"RGB": np.ascontiguousarray(getattr(result, n))}, n) for n in IMAGES]
+        file = folder / frame_name(result.index, "exr")
+        # the library writes to a name, not to a stream
+        scratch = folder / f".{file.name}.part.exr"
+        try:
+            exr.File(parts).write(str(scratch))
+            scratch.replace(file)
+        finally:
+            scratch.unlink(missing_ok=True)
+        files.append(file)
+    return files
+
+
+def write_safetensors(results: Results, folder: Path) -> list[Path]:
+    """Write ``frame_00000.safetensors`` for every frame, and return the files.
+
+    They hold the arrays of the npz by the same names: the bounds, and of leaf cells ``box_lower``, ``box_upper``,
+    ``tile``, ``A_lower``, ``b_lower``, ``A_upper`` and ``b_upper``. The metadata are texts: ``format``, ``guarantee``,
+    and ``parameters`` as JSON. Raises InputError where the package safetensors is missing, or a frame keeps no linear
+    sets.
+    """
+    safetensors: Any = optional_package("safetensors.numpy", "safetensors", "safetensors")
+    folder.mkdir(parents=True, exist_ok=True)
+    files = []
+    for place, (index, source) in enumerate(results.files.items()):
+        stored = load_frame(source)
+        leaves = stored.result.leaves
+        if leaves is None:
+            raise InputError("keeps no linear sets", file=source, fix="run ns-abstract-render with --save-cells")
+        arrays = {name: np.ascontiguousarray(getattr(stored.result, name)) for name in IMAGES}
+        arrays |= {name: np.ascontiguousarray(getattr(leaves, name)) for name in LEAVES}
+        about = {
+            "format": "ns-abstract frame 1",
+            "guarantee": str(stored.about.get("guarantee", "unknown")),
+            "parameters": json.dumps(results.parameters[place]),
+        }
+        content = safetensors.save(arrays, about)
+        file = folder / frame_name(index, "safetensors")
+        write_atomic(file, lambda stream, content=content: stream.write(content))
+        files.append(file)
+    return files

@@ -1,4 +1,4 @@
-"""Regions where a property fails: falsified cells that touch, and the nearest pose where it is proved."""
+"""Closer looks on a certificate's page: regions where a property fails, and a slider of poses along a set."""
 
 from __future__ import annotations
 
@@ -10,25 +10,24 @@ import numpy as np
 from markupsafe import Markup
 from numpy.typing import NDArray
 
-from ns_abstract.report.figures import ShownUnits, number
+from ns_abstract.report.figures import ShownUnits, number, unit_of_axis
 from ns_abstract.report.html import fill
 
 Float64 = NDArray[np.float64]
 
 #: Regions with pictures; boxes that look for neighbours together; outputs that are told.
 MOST, _TOGETHER, _OUTPUTS = 6, 64, 10
+#: Pictures of the slider.
+MOST_STOPS = 24
+_FULL_TURN = 2.0 * np.pi
 
 
 @dataclass(frozen=True)
 class FailureRegion:
-    """A connected region of falsified cells of a frame.
+    """A connected region of falsified ``cells``, positions in their frame, of ``share`` of the set's volume.
 
-    Attributes:
-        cells: Positions of the cells in their frame.
-        share: Part of the set's volume.
-        lower, upper: [n] ends of the box around them, all parameters.
-        pose: [n] the counterexample with the least margin.
-        margin: Its margin; None where that is no number.
+    ``lower`` and ``upper`` [n] are ends of the box around them, all parameters. ``pose`` [n] is the counterexample with
+    the least ``margin``; None where that is no number.
     """
 
     frame: int
@@ -42,12 +41,9 @@ class FailureRegion:
 
 @dataclass(frozen=True)
 class PoseImage:
-    """A picture with the network's outputs for it.
+    """A picture at ``values`` [n] of all parameters, the network's ``outputs`` [m] and the property's ``margin``.
 
-    Attributes:
-        values: [n] all parameters.
-        outputs: [m] the network's.
-        margin: The property's; None where that is no number.
+    A margin that is no number is None.
     """
 
     title: str
@@ -86,9 +82,8 @@ def falsified_regions(
 ) -> list[FailureRegion]:
     """The regions of all frames, the largest parts of their sets first, single poses last.
 
-    Args:
-        entries: Frames of report.json: index and parameters (name, lower, upper).
-        rows: By frame, its cells: lower, upper, verdict, margin, counterexample.
+    ``entries`` are frames of report.json: index and parameters (name, lower, upper); ``rows`` are by frame its cells:
+    lower, upper, verdict, margin, counterexample.
     """
     regions = []
     for entry in entries:
@@ -138,11 +133,9 @@ def nearest(
     parameters: Sequence[Mapping[str, Any]],
     count: int = 1,
 ) -> list[tuple[int, list[float]]]:
-    """The cells of a verdict that are nearest to a pose, and the nearest pose of each; the nearest first.
+    """The cells of a verdict that are nearest to a pose [n], and the nearest pose of each; the nearest first.
 
-    Args:
-        pose: [n] all parameters.
-        parameters: Names and ends of all parameters; distances are in units of their ranges.
+    Distances are in units of the ranges of ``parameters``, which have names and ends.
     """
     some = [k for k, row in enumerate(rows) if row["verdict"] == verdict]
     if not some:
@@ -205,3 +198,98 @@ def reported_outputs(broken: Sequence[float], right: Sequence[float] | None, mos
 
 def _value(value: float) -> str:
     return number(value) if np.isfinite(value) else "not finite"
+
+
+@dataclass(frozen=True)
+class WalkPose:
+    """A pose, ``values`` [n] of all parameters, that the slider shows.
+
+    ``verdict`` is that of the cell that it lies in; "unknown" where there is none. ``proven`` is the proved lower bound
+    of the margin, where it is certified.
+    """
+
+    frame: int
+    values: tuple[float, ...]
+    verdict: str
+    proven: float | None
+    at: str
+
+
+def direction(parameters: Sequence[Mapping[str, Any]]) -> int | None:
+    """Position of the parameter to walk along: the way along a path, around an orbit, else the first that varies."""
+    free = [k for k, p in enumerate(parameters) if p["lower"] < p["upper"]]
+    named = {parameters[k]["name"]: k for k in reversed(free)}
+    return next((named[name] for name in ("segment", "azimuth") if name in named), free[0] if free else None)
+
+
+def stops(
+    entries: Sequence[Mapping[str, Any]],
+    rows: Mapping[int, Sequence[Mapping[str, Any]]],
+    units: ShownUnits | None = None,
+    most: int = MOST_STOPS,
+) -> list[WalkPose]:
+    """Poses along every frame's set in turn, evenly spread, the other parameters in the middle.
+
+    Args:
+        entries: Frames of report.json: index and parameters (name, unit, lower, upper).
+        most: Most poses; of more frames some, evenly spread.
+    """
+    if len(entries) > most:
+        entries = [entries[k * (len(entries) - 1) // (most - 1)] for k in range(most)]
+    each, units = most // max(1, len(entries)), units or ShownUnits()
+    poses = []
+    for position, entry in enumerate(entries):
+        parameters = entry["parameters"]
+        axis = direction(parameters)
+        middle = [0.5 * (p["lower"] + p["upper"]) for p in parameters]
+        if axis is None or each < 2:
+            poses.append(_stop(entry, rows, units, middle, None))
+            continue
+        low, high = parameters[axis]["lower"], parameters[axis]["upper"]
+        name = parameters[axis]["name"]
+        # the end is the next one's beginning, or its own
+        follows = position + 1 < len(entries) and name == "segment"
+        closed = name == "azimuth" and high - low >= _FULL_TURN * (1.0 - 1e-9)
+        for value in np.linspace(low, high, each, endpoint=not (follows or closed)).tolist():
+            poses.append(_stop(entry, rows, units, [*middle[:axis], value, *middle[axis + 1 :]], axis))
+    return poses
+
+
+def _stop(
+    entry: Mapping[str, Any],
+    rows: Mapping[int, Sequence[Mapping[str, Any]]],
+    units: ShownUnits,
+    values: list[float],
+    axis: int | None,
+) -> WalkPose:
+    row = cell_at(rows.get(entry["index"], ()), values)
+    at = f"frame {entry['index']}"
+    if axis is not None:
+        p = entry["parameters"][axis]
+        unit, factor = units.axis(p["unit"])
+        at += f", {p['name']} = {number(values[axis] * factor, 4)} {unit_of_axis(unit)}"
+    verdict = "unknown" if row is None else row["verdict"]
+    return WalkPose(
+        entry["index"], tuple(values), verdict, row["margin"] if row and verdict == "certified" else None, at
+    )
+
+
+def cell_at(rows: Sequence[Mapping[str, Any]], values: Sequence[float]) -> Mapping[str, Any] | None:
+    """The cell that holds a pose; where several meet a certified one, which holds for its ends, too."""
+    if not rows:
+        return None
+    lower, upper = (np.array([row[key] for row in rows], np.float64) for key in ("lower", "upper"))
+    inside = np.flatnonzero(((lower <= values) & (upper >= values)).all(axis=1)).tolist()
+    order = ("certified", "falsified", "unknown")
+    return min((rows[k] for k in inside), key=lambda row: order.index(row["verdict"]), default=None)
+
+
+def coarse_first(count: int) -> list[int]:
+    """0 to ``count`` - 1 in an order whose every beginning is spread over the whole."""
+    bits = max(1, (count - 1).bit_length())
+    return sorted(range(count), key=lambda k: int(f"{k:0{bits}b}"[::-1], 2))
+
+
+def walk_html(poses: Sequence[tuple[WalkPose, PoseImage]]) -> Markup:
+    """The page's part: all pictures; `walk.js` shows one at a time, as the slider stands."""
+    return fill("walk.html", stops=poses) if len(poses) > 1 else Markup()

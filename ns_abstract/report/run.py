@@ -32,12 +32,8 @@ _PROGRAMS = {"gsplat": "gsplat's formulas give", "paper": "the paper's Algorithm
 def guarantee_text(guarantee: str, renderer: str = "gsplat", bounded: str | None = None) -> str:
     """Return the text of a guarantee, as the end of a sentence about an abstract image.
 
-    Args:
-        guarantee: "float32-sound", "real-sound" or "sampled".
-        bounded: What of the scene is bounded, such as "of the Gaussians alone"; None: all of it.
-
-    Raises:
-        ValueError: The guarantee is not one of the three.
+    ``guarantee``: "float32-sound", "real-sound" or "sampled". ``bounded``: what of the scene is bounded, such as "of
+    the Gaussians alone"; None: all of it. Raises ValueError where the guarantee is not one of the three.
     """
     program = _PROGRAMS.get(renderer, f"{renderer} gives")
     texts = {
@@ -139,6 +135,18 @@ class CommandRun:
     limits: tuple[str, ...] = ()
     assumptions: tuple[Assumption, ...] = ()
     started: str = field(default_factory=now)
+
+    @classmethod
+    def of(cls, job: Any, settings: Mapping[str, Any], command: tuple[str, ...], **more: Any) -> CommandRun:
+        """That of a command that searches the sets of a job; ``more`` replaces what the job says."""
+        told = {
+            "guarantee": job.method.guarantee,
+            "renderer": {name: job.method.program[name] for name in ("name", "version")},
+            "scene": job.describe(),
+            "assumptions": job.assumptions,
+            "plan": job.plan,
+        }
+        return cls(settings=settings, command=command, **(told | more))
 
     def head(self) -> dict[str, Any]:
         """The first keys of report.json: format, guarantee, renderer, scene, assumptions."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from itertools import combinations
@@ -28,17 +28,15 @@ _UNIT = float(np.finfo(np.float64).eps)
 GOOD, BAD, OPEN, NONE = (29, 116, 64), (179, 38, 30), (154, 160, 166), (250, 250, 247)
 _LEAST, _MOST = 0.1, 0.85
 #: Pixels of the whole matrix, between its maps, and beside them.
-_WIDTH, _GAP, _LEFT, _BELOW, _TOP, _PANEL = 760, 10, 62, 34, 8, 190
+_WIDTH, _GAP, LEFT, _BELOW, _TOP, _PANEL = 760, 10, 62, 34, 8, 190
 
 
 @dataclass(frozen=True)
 class PairMaps:
     """Certified and falsified shares of a set's volume by bin; no share exceeds the true one.
 
-    Attributes:
-        certified, falsified: By pair (i, j), i < j, of positions of parameters: [bins, bins] parts of the volume over
-            the other parameters, place of i first.
-        along_certified, along_falsified: [d, bins] the same for one parameter.
+    Those of two parameters, by pair (i, j), i < j, of their positions, are [bins, bins] parts of the volume over the
+    other parameters, place of i first; ``along_certified`` and ``along_falsified`` [d, bins] are the same for one.
     """
 
     certified: Mapping[tuple[int, int], Float64]
@@ -71,13 +69,9 @@ def pair_maps(
 ) -> PairMaps:
     """What part of every place of two parameters, and of one, is certified and falsified (docs/dev/design.md, V16).
 
-    Args:
-        lower, upper: [n, d] ends of cells that do not overlap.
-        verdicts: [n] "certified", "falsified" or anything else.
-        ends: [d], [d] ends of the set; every one has a width.
-
-    Returns:
-        Parts rounded downward, but exactly 1 where the cells of one verdict are all of a place.
+    ``lower`` and ``upper`` [n, d] are ends of cells that do not overlap, ``verdicts`` [n] "certified", "falsified" or
+    anything else; ``ends`` [d], [d] are those of the set, each with a width. Parts are rounded downward, but exactly 1
+    where the cells of one verdict are all of a place.
     """
     count, d = lower.shape
     low, high = ends
@@ -179,33 +173,52 @@ def maps_of(rows: Sequence[Mapping[str, Any]], entry: Mapping[str, Any], bins: i
 
 def matrix_svg(maps: PairMaps, parameters: Sequence[Mapping[str, Any]]) -> Markup:
     """All pairs of parameters as one plot, for those that vary (their names, units and ends)."""
-    d = len(parameters)
-    panel = min(_PANEL, (_WIDTH - _LEFT - (d - 1) * _GAP) // d)
-    step = panel + _GAP
-    marks = []
-    for row, pictures in enumerate(matrix_rows(maps, d)):
-        for column, picture in enumerate(pictures):
-            names = escape(f"{parameters[row]['name']} over {parameters[column]['name']}")
-            what = "along" if row == column else "certified" if row > column else "falsified"
-            x, y = _LEFT + column * step, _TOP + row * step
-            marks.append(
-                f'<image class="pixels" x="{x}" y="{y}" width="{panel}" height="{panel}" preserveAspectRatio="none" '
-                f'href="{uri(pixels(picture))}"><title>{what}: {names}</title></image>'
-                f'<rect class="frame" x="{x}" y="{y}" width="{panel}" height="{panel}"/>'
-            )
-    bottom = _TOP + d * step - _GAP
-    for k, p in enumerate(parameters):
+    pictures = {
+        (i, j): (picture, "along" if i == j else "certified" if i > j else "falsified")
+        for i, row in enumerate(matrix_rows(maps, len(parameters)))
+        for j, picture in enumerate(row)
+    }
+
+    def labels(k: int, x: float, y: float, panel: int, bottom: float) -> list[str]:
+        p = parameters[k]
         label = escape(f"{p['name']} ({unit_of_axis(p['unit'])})")
-        x, y = _LEFT + k * step, _TOP + k * step
         low, high = number(p["lower"], 3), number(p["upper"], 3)
         middle = x + 0.5 * panel
-        marks += [
+        return [
             f'<text x="{x}" y="{bottom + 13}">{low}</text>',
             f'<text x="{x + panel}" y="{bottom + 13}" text-anchor="end">{high}</text>',
             f'<text x="{middle:.0f}" y="{bottom + 28}" text-anchor="middle">{label}</text>',
-            f'<text x="{_LEFT - 4}" y="{y + panel}" text-anchor="end">{low}</text>',
-            f'<text x="{_LEFT - 4}" y="{y + 9}" text-anchor="end">{high}</text>',
-            f'<text x="{_LEFT - 4}" y="{y + 0.5 * panel + 4:.0f}" text-anchor="end">{escape(str(p["name"]))}</text>',
+            f'<text x="{LEFT - 4}" y="{y + panel}" text-anchor="end">{low}</text>',
+            f'<text x="{LEFT - 4}" y="{y + 9}" text-anchor="end">{high}</text>',
+            f'<text x="{LEFT - 4}" y="{y + 0.5 * panel + 4:.0f}" text-anchor="end">{escape(str(p["name"]))}</text>',
         ]
-    width, height = _LEFT + d * step - _GAP + 8, bottom + _BELOW
-    return draw_svg(width, height, "Verdicts over pairs of parameters", "".join(marks), kind="pairs")
+
+    return pairs_svg("Verdicts over pairs of parameters", parameters, pictures, labels)
+
+
+def pairs_svg(
+    title: str,
+    parameters: Sequence[Mapping[str, Any]],
+    pictures: Mapping[tuple[int, int], tuple[NDArray[np.uint8], str]],
+    labels: Callable[[int, float, float, int, float], list[str]],
+) -> Markup:
+    """A square of maps by pairs of parameters.
+
+    ``pictures``: by row and column, a map and what it shows. ``labels``: SVG of a parameter: takes its number, where
+    its map on the diagonal begins, the side of a map, and where the square ends below.
+    """
+    d = len(parameters)
+    panel = min(_PANEL, (_WIDTH - LEFT - (d - 1) * _GAP) // d)
+    step = panel + _GAP
+    marks = []
+    for (row, column), (picture, what) in pictures.items():
+        names = escape(f"{parameters[row]['name']} over {parameters[column]['name']}")
+        place = f'x="{LEFT + column * step}" y="{_TOP + row * step}" width="{panel}" height="{panel}"'
+        marks.append(
+            f'<image class="pixels" {place} preserveAspectRatio="none" href="{uri(pixels(picture))}">'
+            f'<title>{what}: {names}</title></image><rect class="frame" {place}/>'
+        )
+    bottom = _TOP + d * step - _GAP
+    for k in range(d):
+        marks += labels(k, LEFT + k * step, _TOP + k * step, panel, bottom)
+    return draw_svg(LEFT + d * step - _GAP + 8, bottom + _BELOW, title, "".join(marks), kind="pairs")

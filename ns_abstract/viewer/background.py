@@ -34,11 +34,9 @@ _Key = tuple[Any, ...]
 
 @dataclass(frozen=True)
 class Status:
-    """The state of the background process.
+    """The background's ``state``: "off" (nothing to bound), "starting", "working", "idle" or "failed".
 
-    Attributes:
-        state: "off" (nothing to bound), "starting", "working", "idle" or "failed".
-        detail: For people; empty where the state says all.
+    ``detail`` is for people; empty where the state says all.
     """
 
     state: str

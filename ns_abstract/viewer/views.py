@@ -101,12 +101,9 @@ class ViewRequest:
 class Snapshot:
     """The bounds of a view at one size.
 
-    Attributes:
-        lower, upper: [h, w, 3] float32 bounds.
-        witness_lower, witness_upper: [h, w, 3] float32 extremes of real renders.
-        figures: As `ns_abstract.report.figures.metrics`.
-        guarantee: "float32-sound", "real-sound" or "sampled".
-        depth: [2, h, w] float32 bounds of the expected depth, normalised units, if it was bounded.
+    ``lower``, ``upper``, ``witness_lower`` and ``witness_upper``, extremes of real renders, are [h, w, 3] float32;
+    ``figures`` as `ns_abstract.report.figures.metrics`; ``guarantee``: "float32-sound", "real-sound" or "sampled";
+    ``depth`` [2, h, w] float32 bounds the expected depth, normalised units, if it was bounded.
     """
 
     lower: np.ndarray
@@ -173,11 +170,9 @@ class SceneFrame(Frame, Protocol):
 class Source(Protocol):
     """A scene that frames can be made of; crosses to the worker process.
 
-    Attributes:
-        ladder: Longest sides of previews and the seconds that each may take.
-        most: Longest side that is worth bounding, or None.
-        patience: Seconds that a worker may go on with an outdated request before another takes over.
-        about: What is bounded where that is not the picture on screen, for people; or "".
+    ``ladder``: longest sides of previews and the seconds that each may take. ``most``: longest side that is worth
+    bounding, or None. ``patience``: seconds that a worker may go on with an outdated request before another takes over.
+    ``about``: what is bounded where that is not the picture on screen, for people; or "".
     """
 
     @property
@@ -212,14 +207,9 @@ class Source(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class SplatSource:
-    """A splat scene as it is shown.
+    """A splat scene as it is shown: activated ``splats`` with the background, and the stored ``scene`` for selections.
 
-    Attributes:
-        splats: The activated Gaussians, with the background that is shown.
-        scene: The same Gaussians as stored, which selections look at.
-        renderer: "gsplat" or "paper".
-        version: gsplat's; None: 1.4.0.
-        arithmetic: "float32" or "real".
+    ``renderer``: "gsplat" or "paper"; ``version``: gsplat's; None: 1.4.0; ``arithmetic``: "float32" or "real".
     """
 
     splats: Splats
@@ -313,11 +303,7 @@ class NerfSource:
         return f"of the fine field at {s.samples} uniform samples by ray, not of the picture with importance samples"
 
     def frame(self, camera: PinholeCamera, perturbation: Perturbation) -> NerfFrame:
-        """The frame of ``camera`` and a set of poses around it.
-
-        Raises:
-            InputError: Gaussians are to vary.
-        """
+        """The frame of ``camera`` and a set of poses around it. Raises InputError: Gaussians are to vary."""
         self._method.prepare([perturbation])
         return self._method.frame(PoseBox.around(camera, perturbation))
 

@@ -34,10 +34,7 @@ def check_device(device: str | None) -> str:
 def processes_that_fit(needed: int, most: int) -> int:
     """Return how many processes, at most ``most``, fit into a GPU's memory at ``needed`` bytes each.
 
-    Found once: what they hold afterwards is no longer free.
-
-    Raises:
-        InputError: Not one fits.
+    Found once: what they hold afterwards is no longer free. Raises InputError where not one fits.
     """
     import torch
 

@@ -102,12 +102,8 @@ def division_for(
 ) -> Division | None:
     """Return the subdivision whose cells keep samples within ``displacement``; ``moves`` [n, samples, d] over the box.
 
-    Args:
-        finer: See `Division`.
-        swept: Whether the last axis is a sample's own interval, which is as wide in any box.
-
-    Returns:
-        None where there would be more than ``most`` parts and narrower boxes would need fewer.
+    ``finer``: see `Division`. ``swept``: whether the last axis is a sample's own interval, which is as wide in any box.
+    Returns None where there would be more than ``most`` parts and narrower boxes would need fewer.
     """
     d = moves.shape[2]
     if d == 0:

@@ -19,11 +19,7 @@ def encode(x: Tensor, encoding: Encoding) -> Tensor:
 
 
 class Field:
-    """A field on one device.
-
-    Args:
-        dtype: Of all arithmetic. The bounds are those of float64 and of real numbers.
-    """
+    """A field on one device. ``dtype``: of all arithmetic. The bounds are those of float64 and of real numbers."""
 
     def __init__(
         self, weights: FieldWeights, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu"

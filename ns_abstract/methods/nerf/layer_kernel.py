@@ -22,14 +22,9 @@ BLOCK = 36
 
 @njit(cache=True, error_model="numpy")
 def multiply(x, live, weight, rest, out):
-    """``out[r] = sum_i x[r, live[i]] weight[live[i]]``.
+    """``out[r] = sum_i x[r, live[i]] weight[live[i]]`` for ``x`` [R, inputs] and ``live`` [k] of the inputs.
 
-    Args:
-        x: [R, inputs].
-        live: [k] inputs.
-        weight: [inputs, n and more, to whole pairs of lines].
-        rest: [ROWS, two lines] scratch.
-        out: [R, n].
+    ``weight`` is [inputs, n and more, to whole pairs of lines], ``out`` [R, n], ``rest`` [ROWS, two lines] scratch.
     """
     (count, n), (inputs, stride) = out.shape, weight.shape
     line, k = LINE // weight.itemsize, live.shape[0]
@@ -121,12 +116,9 @@ class LayerOutput(NamedTuple):
 def _columns(b, z, first, new, live, weights, scratch, out, place):
     """Columns of the piece ``b`` behind a layer, from ``place`` on, and their sums.
 
-    Args:
-        first, new: Where its columns, and those of one neuron, begin in ``z``.
-        scratch: [BLOCK, inputs], [inputs] and [ROWS, two lines] of the columns' type.
-
-    Returns:
-        Where those of the next piece begin, in ``z`` and behind the layer.
+    ``first``, ``new``: where its columns, and those of one neuron, begin in ``z``. ``scratch``: [BLOCK, inputs],
+    [inputs] and [ROWS, two lines] of the columns' type. Returns where those of the next piece begin, in ``z`` and
+    behind the layer.
     """
     scaled, slope, rest = scratch
     # arrays of a record are counted each time they are taken out of it

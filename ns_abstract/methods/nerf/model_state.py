@@ -28,14 +28,7 @@ _BACKGROUNDS = {
     "blue": (0.0, 0.0, 1.0),
 }
 LAST_SAMPLE = "last_sample"
-#: Modules that draw nothing in evaluation, and what they are for.
-_IDLE = {
-    "device_indicator_param": "no values",
-    "lpips.": "a metric",
-    "psnr.": "a metric",
-    "ssim.": "a metric",
-    "camera_optimizer.": "poses of the training pictures, used in training alone",
-}
+_IDLE = runs.IDLE_MODULES
 _SHOWN = 8
 _SPLATS = ("rasterize_mode", "assume_splatfacto", "drop_nan_gaussians")
 
@@ -103,12 +96,8 @@ def check_model(run: runs.RunConfig, overrides: Overrides, classes: Sequence[str
 def background(run: runs.RunConfig, overrides: Overrides, default: str) -> tuple[Assumption, NDArray[np.float32] | str]:
     """The record of the background's choice, and its colour [3] or `LAST_SAMPLE`.
 
-    Args:
-        run: Its ``background_color`` is read.
-        overrides: ``background`` takes its place.
-
-    Raises:
-        InputError: No such background.
+    ``run``: its ``background_color`` is read. ``overrides``: ``background`` takes its place. Raises InputError: no such
+    background.
     """
     named, origin = "background_color" in run.model, "config.yml: pipeline.model.background_color"
     stored: Any = LAST_SAMPLE
@@ -141,14 +130,9 @@ def records(
     """
     target = runs.target_class(run)
     whose = "config.yml: pipeline.model._target" if target else "default: config.yml names no class"
-    units = "default: dataparser_transforms.json is missing" if assumed_units else "dataparser_transforms.json"
     return (
         runs.step_assumption(run, checkpoint, overrides.load_step),
         Assumption("model", target or stock.rpartition(".")[2], whose),
-        *(
-            Assumption(f"module {prefix.rstrip('.')}", f"left out: {why}", "checkpoint")
-            for prefix, why in _IDLE.items()
-            if why != "no values" and any(key.startswith(prefix) for key in state)
-        ),
-        Assumption("units", f"1 of the data set is {transform.scale:.9g}", units),
+        *runs.idle_assumptions(state, _IDLE),
+        runs.units_assumption(transform, assumed_units),
     )

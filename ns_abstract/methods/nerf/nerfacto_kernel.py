@@ -179,13 +179,10 @@ def sample_weights(distances, densities, weights):
 
 @njit(cache=True, error_model="numpy")
 def next_places(places, weights, quantiles, out):
-    """Write the places [m] of the next round's edges (ray_samplers.py:305-354, outside training).
+    """Write the places ``out`` [m] of the next round's edges (ray_samplers.py:305-354, outside training).
 
-    Args:
-        places: [n + 1] edges of this round, from 0 to 1.
-        weights: [n] of its intervals.
-        quantiles: [m] ascending in (0, 1).
-        out: [m] overwritten.
+    ``places`` [n + 1] are the edges of this round, from 0 to 1, ``weights`` [n] those of its intervals, ``quantiles``
+    [m] ascending in (0, 1).
     """
     count = weights.size
     total = 0.0
@@ -206,16 +203,10 @@ def next_places(places, weights, quantiles, out):
 
 @njit(cache=True, error_model="numpy")
 def place_samples(grid, net, factor, ray, ends, piecewise, places, quantiles, buffers):
-    """Return the places of the next round's edges on one ray, by one round of a proposal field.
+    """Return the places of the next round's edges on one ray, by one round of a proposal field: ``grid, net, factor``.
 
-    Args:
-        grid, net, factor: The field.
-        ray: [2, 3] origin and direction.
-        ends: Near and far, as `distance_at` takes them.
-        piecewise: See `distance_at`.
-        places: [n + 1] edges of this round.
-        quantiles: [m] of the next one's.
-        buffers: [2, most neurons] overwritten.
+    ``ray`` [2, 3] is origin and direction; ``ends`` and ``piecewise`` as `distance_at` takes them; ``places`` [n + 1]
+    the edges of this round, ``quantiles`` [m] of the next one's; ``buffers`` [2, most neurons] are overwritten.
     """
     count = places.size - 1
     distances, densities = np.empty(count + 1), np.empty(count)
@@ -234,15 +225,10 @@ def place_samples(grid, net, factor, ray, ends, piecewise, places, quantiles, bu
 
 @njit(cache=True, error_model="numpy")
 def color_samples(grid, density_net, color_net, factor, ray, distances, last, buffers, weights, colors):
-    """Write weights [n] and colours [n, 3] of the picture's samples on one ray.
+    """Write ``weights`` [n] and ``colors`` [n, 3] of the picture's samples on one ray; 0 without weight.
 
-    Args:
-        grid, density_net, color_net, factor: The field.
-        ray: [2, 3] origin and direction.
-        distances: [n + 1] edges.
-        last: Whether the last sample's colour counts whatever its weight.
-        buffers: [3, most neurons] overwritten.
-        weights, colors: Overwritten; colours of samples without weight are 0.
+    ``ray`` [2, 3] is origin and direction, ``distances`` [n + 1] the edges. With ``last`` the last sample's colour
+    counts whatever its weight; ``buffers`` [3, most neurons] are overwritten.
     """
     count = weights.size
     densities, features = np.empty(count), np.empty((count, density_net.widths[-1]))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.device import check_device
-from ns_abstract.methods.nerf.hash_bounds.frame import NerfactoFrame
+from ns_abstract.methods.nerf.hash_bounds.bounds import NerfactoFrame
 from ns_abstract.methods.nerf.hash_field import NerfactoScene
 from ns_abstract.methods.nerf.ray_pictures import (
     FieldMethod,
@@ -34,11 +34,8 @@ _OTHERS = {
 class NerfactoMethod(FieldMethod):
     """A nerfacto and Nerfstudio's own picture of it, in real numbers and in float64.
 
-    Args:
-        arithmetic: "real" or None: float32 evaluations are not enclosed.
-
-    Raises:
-        InputError: An option does not go with nerfacto.
+    ``arithmetic``: "real" or None: float32 evaluations are not enclosed. Raises InputError where an option does not go
+    with nerfacto.
     """
 
     def __init__(
@@ -84,11 +81,7 @@ class NerfactoMethod(FieldMethod):
         return f"nerfacto, {self.scene.field.text}"
 
     def frame(self, poses: PoseBox, sheared: bool = False, layers: bool = False) -> NerfactoFrame:
-        """One frame.
-
-        Raises:
-            InputError: Layers are asked for: a NeRF's depth is a median.
-        """
+        """One frame. Raises InputError: layers are asked for: a NeRF's depth is a median."""
         refuse_layers(layers)
         return NerfactoFrame(self.scene, poses, self.workers)
 

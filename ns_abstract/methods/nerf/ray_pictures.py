@@ -166,11 +166,7 @@ class FieldMethod:
         return iter(())
 
     def prepare(self, perturbations: Sequence[Perturbation]) -> None:
-        """Refuse what needs Gaussians.
-
-        Raises:
-            InputError: A set varies the scene.
-        """
+        """Refuse what needs Gaussians. Raises InputError where a set varies the scene."""
         if any(perturbation.scene for perturbation in perturbations):
             raise InputError("a NeRF has no Gaussians", field="scene", fix="leave the key out")
 

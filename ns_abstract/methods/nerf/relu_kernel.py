@@ -367,9 +367,7 @@ def _open(poly, rho, box, failed, grid, slope, size, which, neuron, error):
 def relu(z, grid, limit, out):
     """max(0, z) in place (design.md, F5); returns the number of new error terms.
 
-    Args:
-        limit: Error terms of a piece beyond which it fails.
-        out: `ReluOutput`, filled.
+    ``limit``: error terms of a piece beyond which it fails. ``out``: `ReluOutput`, filled.
     """
     # arrays of a record are counted each time they are taken out of it
     poly, sums, box, old_failed, old_count = z

@@ -114,11 +114,8 @@ class SampleLines:
 class SamplePaths:
     """Bounds of a scene's rays by following their samples.
 
-    Args:
-        coarse: The coarse pass' field, by pose.
-        fine: The fine field, by pose and one more parameter.
-        sampling: Hierarchical.
-        occupancy: Where density is declared 0.
+    The ``coarse`` pass' field is by pose, the ``fine`` one by pose and one more parameter; the ``sampling`` is
+    hierarchical; ``occupancy`` tells where density is declared 0.
     """
 
     def __init__(
@@ -318,11 +315,8 @@ class BundleBounds:
 class FollowedSamples:
     """Bounds of the samples of several cells: densities and colours by part.
 
-    Args:
-        rays: Origins and directions [k, nodes, 3] at the fine field's nodes.
-        radii: What they are off by.
-        low, high: [k, parts, S + 1] the samples' edges.
-        counts: Parts by axis.
+    ``rays``: origins and directions [k, nodes, 3] at the fine field's nodes, off by ``radii``; ``low``, ``high`` [k,
+    parts, S + 1]: the samples' edges; ``counts``: parts by axis.
     """
 
     def __init__(

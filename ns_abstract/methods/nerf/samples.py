@@ -14,9 +14,7 @@ from ns_abstract.methods.nerf.render import HISTOGRAM_PADDING, Sampling
 def edge_bounds(alpha_low: np.ndarray, alpha_high: np.ndarray, sampling: Sampling) -> tuple[np.ndarray, np.ndarray]:
     """Bounds [r, S + 1] of the sorted distances between which the fine field is sampled (design.md, F14).
 
-    Args:
-        alpha_low, alpha_high: [r, samples] opacities of the coarse pass.
-        sampling: Hierarchical; S is its ``samples + importance + 1``.
+    ``alpha_low``, ``alpha_high`` [r, samples] are opacities of the coarse pass; S is ``samples + importance + 1``.
     """
     rows, bins = alpha_low.shape
     rounding = EDGE_ROUNDING * (bins + EDGE_BINS)
@@ -81,11 +79,8 @@ def field_hulls(edges_low, edges_high, start, step, densities, colors, density, 
 def composite(edges_low, edges_high, density, color, lower, upper):
     """Return bounds of rays' colours from bounds of their sample positions and of the field there (design.md, F14).
 
-    Args:
-        edges_low, edges_high: [r, S + 1] of `edge_bounds`.
-        density: [2, r, S] least and largest in the middle of the samples.
-        color: [2, r, S, 3]; crossed where it does not count.
-        lower, upper: [r, 3] the background; overwritten.
+    ``edges_low``, ``edges_high`` [r, S + 1]: of `edge_bounds`. ``density`` [2, r, S] and ``color`` [2, r, S, 3],
+    crossed where it does not count, are least and largest. ``lower``, ``upper`` [r, 3]: the background; overwritten.
     """
     count = edges_low.shape[1] - 1
     ends = np.empty(2 * count + 2)

@@ -1,4 +1,4 @@
-"""Writes a NeRF as a run folder of ``ns-train vanilla-nerf`` (Nerfstudio 1.1.5), without importing Nerfstudio."""
+"""Writes NeRFs as run folders of ``ns-train`` (Nerfstudio 1.1.5), without importing Nerfstudio."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from ns_abstract.geometry.keyframe_cameras import KeyframeCamera
+from ns_abstract.methods.nerf.hash_field import DenseNet, HashEncoding, NerfactoScene
 from ns_abstract.methods.nerf.scene import FieldWeights, NerfScene
 from ns_abstract.methods.run_writer import background_name, checkpoint_bytes, optimizer_lines, write_run
 
@@ -25,13 +27,8 @@ def write_nerf_run(
     """Write ``scene`` as a vanilla-nerf run.
 
     Files and arguments are those of `ns_abstract.methods.splat.write.write_splatfacto_run`. Nerfstudio itself loads the
-    checkpoint where the fields have its own sizes (8 x 256, head 2 x 128).
-
-    Returns:
-        The path of config.yml.
-
-    Raises:
-        InputError: ``timestamp`` or ``experiment_name`` is not a plain folder name.
+    checkpoint where the fields have its own sizes (8 x 256, head 2 x 128). Returns the path of config.yml. Raises
+    InputError: ``timestamp`` or ``experiment_name`` is not a plain folder name.
     """
     config = {
         "optimizers": _OPTIMIZERS,
@@ -78,3 +75,104 @@ steps_per_eval_all_images: 25000
 steps_per_eval_batch: 500
 steps_per_eval_image: 500
 steps_per_save: 1000"""
+
+
+def write_nerfacto_run(
+    scene: NerfactoScene,
+    folder: str | Path,
+    *,
+    timestamp: str,
+    experiment_name: str,
+    views: Sequence[KeyframeCamera] | None = None,
+    render: Callable[[KeyframeCamera], ArrayLike] | None = None,
+) -> Path:
+    """Write ``scene`` as a nerfacto run of the torch implementation; the grids begin at resolution 16 or the scene's.
+
+    Files and arguments are those of `ns_abstract.methods.splat.write.write_splatfacto_run`. Proposal fields are written
+    one by round, each with two layers; the appearance embedding is a part of the colours' bias. Returns the path of
+    config.yml. Raises InputError: ``timestamp`` or ``experiment_name`` is not a plain folder name.
+    """
+    field = scene.field
+    grid = _grid(field.encoding)
+    proposals = [
+        {"hidden_dim": one.net.weights[0].shape[0], **_grid(one.encoding), "use_linear": False}
+        for one in field.proposals
+    ]
+    behind = field.background
+    config = dict(
+        optimizers=_NERFACTO_OPTIMIZERS,
+        background=behind if isinstance(behind, str) else background_name(behind.astype(np.float32)),
+        far=repr(float(field.far)),
+        density=repr(float(field.average_init_density)),
+        hidden=field.density_net.weights[0].shape[0],
+        color=field.color_net.weights[0].shape[0],
+        spacing=field.spacing,
+        rounds=len(field.proposals),
+        nerf_samples=field.samples[-1],
+        samples=list(field.samples[:-1]),
+        proposals="".join(f"\n    - {one!r}".replace("'", "").replace("False", "false") for one in proposals),
+        **grid,
+    )
+    return write_run(
+        _Shown(scene), Path(folder), "nerfacto", timestamp, experiment_name, data=f"data-{experiment_name}",
+        checkpoint=checkpoint_bytes(_arrays(scene), field_states(("fields", "proposal_networks")), {}), config=config,
+        steps=STEPS, views=views, render=render,
+    )  # fmt: skip
+
+
+class _Shown:
+    """What a data set shows of a scene."""
+
+    def __init__(self, scene: NerfactoScene) -> None:
+        behind = scene.field.background
+        self.background = np.zeros(3, np.float32) if isinstance(behind, str) else behind.astype(np.float32)
+        self.dataparser = scene.dataparser
+
+
+def _grid(encoding: HashEncoding) -> dict[str, int]:
+    """The sizes of a grid, of which the greatest resolution is the least that gives its own."""
+    from ns_abstract.methods.nerf.nerfacto_load import resolutions
+
+    levels, rows, features = encoding.table.shape
+    least, most = int(encoding.resolutions[0]), int(encoding.resolutions[-1])
+    for greatest in (most, most + 1):
+        if np.array_equal(resolutions(levels, least, greatest), encoding.resolutions):
+            break
+    else:
+        raise ValueError("resolutions are not those of Nerfstudio's growth")
+    return {
+        "num_levels": levels, "base_res": least, "max_res": greatest, "log2_hashmap_size": rows.bit_length() - 1,
+        "features_per_level": features,
+    }  # fmt: skip
+
+
+def _arrays(scene: NerfactoScene) -> dict[str, ArrayLike]:
+    """The arrays of the fields under Nerfstudio's names, float32."""
+    field = scene.field
+    arrays: dict[str, ArrayLike] = {"field.aabb": np.array([[-1.0] * 3, [1.0] * 3], np.float32)}
+
+    def net(name: str, layers: DenseNet) -> None:
+        for k, (weight, bias) in enumerate(zip(layers.weights, layers.biases, strict=True)):
+            arrays[f"{name}.layers.{k}.weight"] = weight.astype(np.float32)
+            arrays[f"{name}.layers.{k}.bias"] = bias.astype(np.float32)
+
+    def grid(name: str, encoding: HashEncoding) -> np.ndarray:
+        sizes = _grid(encoding)
+        for key in ("max_res", "num_levels", "log2_hashmap_size"):
+            arrays[f"{name}.{key}"] = np.array(sizes[key])
+        return encoding.table.reshape(-1, encoding.table.shape[2]).astype(np.float32)
+
+    arrays["field.mlp_base.model.0.hash_table"] = grid("field", field.encoding)
+    net("field.mlp_base.model.1", field.density_net)
+    net("field.mlp_head", field.color_net)
+    for k, one in enumerate(field.proposals):
+        name = f"proposal_networks.{k}"
+        arrays[f"{name}.aabb"] = arrays["field.aabb"]
+        arrays[f"{name}.encoding.hash_table"] = arrays[f"{name}.mlp_base.0.hash_table"] = grid(name, one.encoding)
+        net(f"{name}.mlp_base.1", one.net)
+    return arrays
+
+
+_NERFACTO_OPTIMIZERS = optimizer_lines(
+    "Adam", "1.0e-15", {"fields": ("0.01", None), "proposal_networks": ("0.01", None)}
+)

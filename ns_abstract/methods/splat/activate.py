@@ -19,15 +19,14 @@ class Splats:
 
     Attributes:
         means: [N, 3], world.
-        axes: [N, 3, 3] ``B = R(q) diag(s)``: columns are the principal axes scaled by their
-            standard deviations, so the covariance is ``B B^T``.
+        axes: [N, 3, 3] ``B = R(q) diag(s)``: columns are the principal axes scaled by their standard deviations, so the
+            covariance is ``B B^T``.
         opacity: [N] in [0, 1].
         sh: [N, K, 3] coefficients, or [N, 1, 3] final colours when ``degree`` is 0.
         degree: Highest SH band that is not zero for some Gaussian and that the rasteriser uses.
         background: [3].
         antialiased: Whether opacity is compensated for the blur.
-        color_shift: [N, 3] added to the activated colours, which are then clamped to [0, ``color_max``];
-            or [0, 3].
+        color_shift: [N, 3], or [0, 3], added to the activated colours, which are then clamped to [0, ``color_max``].
         color_max: Largest colour the activation can give: 1 for a sigmoid, else infinite.
     """
 

@@ -316,14 +316,10 @@ def moving_colors(
 ) -> None:  # fmt: skip
     """Colours over a cell in which the camera moves, as forms (design.md, C2, C3, S4).
 
-    Args:
-        indices: [n, 2] row of ``colors`` and number of the Gaussian in the scene.
-        scene: The Gaussians.
-        position: [rows, 3] forms of the camera position, world, centred at ``origin`` [3].
-        position_error: Bound of the float error of the camera position, world units.
-        charges: For the program's rounding.
-        shape: Of the forms of ``position``.
-        colors: [., 3 (m + 1)] output: coefficients and radius by channel.
+    ``indices`` [n, 2] are rows of ``colors`` and numbers of Gaussians in the scene. ``position`` [rows, 3] are forms,
+    of ``shape``, of the camera position, world, centred at ``origin`` [3] and off by at most ``position_error``, world
+    units. ``colors`` [., 3 (m + 1)] receives coefficients and radius by channel; ``charges`` are for the program's
+    rounding.
     """
     run_in_chunks(
         _moving_worker, indices.shape[0], indices, scene, position, origin, position_error, charges, shape, colors

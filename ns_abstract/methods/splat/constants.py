@@ -140,12 +140,9 @@ def installed_gsplat() -> Rasteriser:
 class RasterRules(NamedTuple):
     """A `Rasteriser` and a run's mode as kernels take them; lengths in pixels, depths in world units.
 
-    Attributes:
-        tile_size: 0: every Gaussian reaches every pixel.
-        alpha_min: The threshold, or the numerical cut-off where there is none.
-        work_tile: Side of the tiles that pictures are computed in.
-        tile_room, ellipse_tiles: See `Rasteriser`.
-        antialiased: Whether opacity is compensated for the blur.
+    ``tile_size`` 0: every Gaussian reaches every pixel. ``alpha_min`` is the threshold, or the numerical cut-off where
+    there is none. Pictures are computed in tiles of the side ``work_tile``. ``antialiased`` tells whether opacity is
+    compensated for the blur. ``tile_room``, ``ellipse_tiles``: see `Rasteriser`.
     """
 
     near: float

@@ -39,23 +39,14 @@ class StoredGaussians:
 def drawable(
     rows: StoredGaussians, file: Path, fields: dict[str, str], drop_nan: bool = False
 ) -> tuple[StoredGaussians, dict[str, Any]]:
-    """Return the Gaussians that gsplat may draw, and the notes about those left out.
+    """Return the Gaussians that gsplat may draw, and the notes about those left out (design.md, Limits).
 
-    gsplat's kernels never draw a Gaussian of which the mean or the quaternion is not finite, or a scale is NaN: its
-    depth is then infinite, and culled, or its projected covariance is NaN in every entry. The radius, a function of
-    the covariance, is then NaN, and becomes the integer 0 (PTX ISA, cvt: NaN becomes zero), which hits no tile. An
-    opacity of NaN is drawn: min(0.999, NaN) is 0.999 in CUDA. Infinite scales and colours that are not finite are
-    drawn, too.
-
-    Logits of opacities may be infinite (opacities of exactly 0 and 1), and logarithms of scales -inf (a scale of
-    exactly 0).
-
-    Args:
-        fields: Names in the file of means, scales, quats, opacities and colours.
-        drop_nan: Whether Gaussians that would be drawn with values that are not finite are left out.
-
-    Raises:
-        InputError: A Gaussian cannot be bounded, or none is left.
+    gsplat draws no Gaussian of which the mean or the quaternion is not finite, or a scale is NaN: its radius is NaN,
+    which becomes the integer 0. An opacity of NaN is drawn: min(0.999, NaN) is 0.999 in CUDA. Infinite scales and
+    colours that are not finite are drawn, too. Logits of opacities may be infinite, and logarithms of scales -inf.
+    ``fields``: names in the file of means, scales, quats, opacities and colours. ``drop_nan``: whether Gaussians that
+    would be drawn with values that are not finite are left out. Raises InputError where a Gaussian cannot be bounded,
+    or none is left.
     """
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         scales = np.exp(rows.log_scales.astype(np.float64))

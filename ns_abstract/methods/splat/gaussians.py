@@ -44,11 +44,8 @@ from ns_abstract.methods.splat.work_sharing import CHUNK, run_in_chunks
 def covariance_noise(axes: np.ndarray, charges: Charges) -> np.ndarray:
     """Float error of each world covariance and of the products made with it (design.md, G6).
 
-    Args:
-        axes: [N, 3, 3] scaled principal axes.
-
-    Returns:
-        [N, 12]: the error bounds and the absolute values of the entries 00, 11, 22, 01, 02, 12.
+    ``axes``: [N, 3, 3] scaled principal axes. Returns [N, 12]: the error bounds and the absolute values of the entries
+    00, 11, 22, 01, 02, 12.
     """
     size = np.abs(axes)
     scale = np.sqrt(np.sum(axes * axes, axis=1))  # [N, 3]

@@ -72,12 +72,10 @@ def summed_area(chosen):
 
 @njit(cache=True, error_model="numpy")
 def touching(indices, rectangles, table):
-    """Those of ``indices`` whose rectangle holds a place that was chosen.
+    """Those of ``indices`` (rows of ``rectangles``) whose rectangle holds a place that was chosen.
 
-    Args:
-        indices: Rows of ``rectangles``.
-        rectangles: [n, >= 4] columns first and past, rows first and past, of tiles or pixels.
-        table: `summed_area` of what was chosen of these.
+    ``rectangles`` [n, >= 4] are columns first and past, rows first and past, of tiles or pixels; ``table`` is the
+    `summed_area` of what was chosen of these.
     """
     out = np.empty_like(indices)
     count = 0
@@ -93,14 +91,9 @@ def touching(indices, rectangles, table):
 def visible_again(marks, numbers, box, tiles, side):
     """Return the ``numbers`` whose mark is not 0, and the pixel rectangles on which they may be drawn (design.md, R2).
 
-    Args:
-        marks, numbers: [n].
-        box: [n, 4] least and largest x, least and largest y that they reach, pixels; NaN: not known.
-        tiles: [n, >= 4] their ranges of tiles, see `tile_lists`; what they reach elsewhere is not drawn.
-        side: Of a tile.
-
-    Returns:
-        [k], and [k, 4] int32 columns first and past, rows first and past.
+    ``box`` [n, 4] is the least and largest x, least and largest y that they reach, pixels; NaN: not known. ``tiles``
+    [n, >= 4] are their ranges of tiles of a ``side``, see `tile_lists`; what they reach elsewhere is not drawn. Returns
+    [k], and [k, 4] int32 columns first and past, rows first and past.
     """
     count = 0
     for k in range(marks.size):

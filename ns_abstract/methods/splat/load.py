@@ -23,9 +23,18 @@ from ns_abstract.methods import config_keys, runs
 from ns_abstract.methods.checkpoint import to_float32
 from ns_abstract.methods.overrides import MODES, Overrides, assumption_of
 from ns_abstract.methods.splat.drawable import StoredGaussians, coordinates_note, drawable
-from ns_abstract.methods.splat.formats.decoded import scene_of
+from ns_abstract.methods.splat.formats import inria
+from ns_abstract.methods.splat.formats.compressed_ply import decode_compressed_ply, is_compressed
+from ns_abstract.methods.splat.formats.decoded import DecodedSplats, float32_rows, scene_of
 from ns_abstract.methods.splat.formats.readers import decoder_of, scene_file
-from ns_abstract.methods.splat.ply_read import load_ply
+from ns_abstract.methods.splat.ply_header import (
+    FILTER,
+    GROUPS,
+    PlyHeader,
+    read_declaration,
+    read_elements,
+    standard_header,
+)
 from ns_abstract.methods.splat.scene import Float32Array, SplatScene
 
 # nerfstudio/models/splatfacto.py: SplatfactoModel.load_state_dict sets this step.
@@ -43,21 +52,14 @@ _MODEL_DEFAULTS: dict[str, Any] = {
 }
 _PARAMETERS = ("means", "scales", "quats", "features_dc", "features_rest", "opacities")
 
-#: Modules of a Splatfacto model that draw nothing in evaluation (nerfstudio/models/splatfacto.py), and what they are
-#: for; the camera optimiser and the bilateral grid act only while training (lines 545 and 631).
-_IDLE = {
-    "device_indicator_param": "no values",
-    "lpips.": "a metric",
-    "psnr.": "a metric",
-    "ssim.": "a metric",
-    "camera_optimizer.": "poses of the training pictures, used in training alone",
-    "bil_grids.": "a bilateral grid, used in training alone",
-}
+#: See `runs.IDLE_MODULES`; camera optimiser and bilateral grid: nerfstudio/models/splatfacto.py:545, 631.
+_IDLE = runs.IDLE_MODULES | {"bil_grids.": "a bilateral grid, used in training alone"}
 #: Classes that draw in evaluation what Splatfacto draws.
 _CLASSES = ("nerfstudio.models.splatfacto.SplatfactoModel", "ns_abstract.nerfstudio.splat.AbstractSplatfactoModel")
 #: Unknown modules that are named.
 _SHOWN = 8
 _FIX = "give the config.yml of a run, its folder, or a scene file such as a .ply"
+_FIELDS = {"scales": "vertex.scale_*", "quats": "vertex.rot_*", "opacities": "vertex.opacity", "colours": "vertex.f_*"}
 
 
 def load_scene(path: str | os.PathLike[str], overrides: Overrides | None = None) -> SplatScene:
@@ -65,12 +67,12 @@ def load_scene(path: str | os.PathLike[str], overrides: Overrides | None = None)
 
     Args:
         path: ``config.yml`` of a run, the run folder that holds it, or a file or folder of another program
-            (docs/formats.md): a .ply, a SOG, SPZ or .splat file, a checkpoint of gsplat's trainer, Inria's folder.
+            (docs/formats.md).
         overrides: What the user says in place of the files.
 
     Returns:
-        The stored parameters; world is the run's normalised frame, or that of the ``.ply``.
-        ``sh`` keeps the bands up to the degree that Nerfstudio evaluates after loading.
+        The stored parameters; world is the run's normalised frame, or that of the ``.ply``. ``sh`` keeps the bands up
+        to the degree that Nerfstudio evaluates after loading.
 
     Raises:
         InputError: For any content of the files, or an override, that cannot be used.
@@ -112,13 +114,9 @@ def scene_from_parameters(
 ) -> SplatScene:
     """The scene that a loaded Splatfacto model holds, checked as one that is read from files.
 
-    Args:
-        parameters: means [N, 3], scales [N, 3], quats [N, 4], features_dc [N, 3], features_rest
-            [N, K - 1, 3] and opacities [N, 1], arrays.
-        name, color_model, sh_degree, rasterize_mode, background: As in `SplatScene`.
-
-    Raises:
-        InputError: A value is not finite or cannot be drawn.
+    ``parameters``: means [N, 3], scales [N, 3], quats [N, 4], features_dc [N, 3], features_rest [N, K - 1, 3] and
+    opacities [N, 1], arrays. ``name``, ``color_model``, ``sh_degree``, ``rasterize_mode``, ``background``: as in
+    `SplatScene`. Raises InputError where a value is not finite or cannot be drawn.
     """
     stored_arrays = {key: np.array(parameters[key], np.float32) for key in _PARAMETERS}
     rest = stored_arrays["features_rest"][:, : (sh_degree + 1) ** 2 - 1]
@@ -166,13 +164,8 @@ def load_run(run: runs.RunConfig, overrides: Overrides) -> SplatScene:
     fields = {"scales": "scales", "quats": "quats", "opacities": "opacities", "colours": "features_dc"}
     fields = {name: _run_field(field) for name, field in fields.items()}
     arrays, dropped = drawable(arrays, checkpoint, fields, overrides.drop_nan_gaussians)
-    units = "dataparser_transforms.json" if not notes else "default: dataparser_transforms.json is missing"
     return SplatScene(
-        means=arrays.means,
-        log_scales=arrays.log_scales,
-        quats=arrays.quats,
-        opacity_logits=arrays.opacity_logits,
-        sh=arrays.sh,
+        **vars(arrays),
         color_model="sh" if degree_stored > 0 else "sigmoid",
         sh_degree=degree,
         rasterize_mode=cast(Literal["classic", "antialiased"], choices[0].value),
@@ -186,7 +179,7 @@ def load_run(run: runs.RunConfig, overrides: Overrides) -> SplatScene:
             *choices,
             runs.step_assumption(run, checkpoint, overrides.load_step),
             *model_assumptions,
-            Assumption("units", f"1 of the data set is {transform.scale:.9g}", units),
+            runs.units_assumption(transform, bool(notes)),
         ),
         gaussians_alone=gaussians_alone,
     )
@@ -241,12 +234,7 @@ def _check_model(
     if gaussians_alone:
         left = f", without {visible(', '.join(unknown[:_SHOWN]))}" if unknown else ""
         records.append(Assumption("bounded", f"the Gaussians alone{left}", "--assume-splatfacto"))
-    records += [
-        Assumption(f"module {prefix.rstrip('.')}", f"left out: {why}", "checkpoint")
-        for prefix, why in _IDLE.items()
-        if why != "no values" and any(key.startswith(prefix) for key in state)
-    ]
-    return gaussians_alone, tuple(records)
+    return gaussians_alone, (*records, *runs.idle_assumptions(state, _IDLE))
 
 
 def _known(key: str) -> bool:
@@ -331,3 +319,85 @@ def _row_count(means: Any, file: Path) -> int:
         problem = f"shape {_shape(shape)}, expected [N, 3] with N at least 1"
         raise InputError(problem, file=file, field=_run_field("means"), fix="give a run of splatfacto")
     return shape[0]
+
+
+def load_ply(path: Path, overrides: Overrides) -> SplatScene:
+    """The scene of a standard or compressed ``.ply``.
+
+    A ``cfg_args`` in the folder that the file was trained in says the background. Raises InputError: for any content of
+    the file, or an override, that cannot be used.
+    """
+    overrides.refuse(("load_step", "assume_splatfacto"), "is for runs, this file is a .ply")
+    declared = read_declaration(path, overrides.rasterize_mode is not None)
+    if is_compressed(declared.elements):
+        decoded = decode_compressed_ply(path, declared.elements, declared.mode, declared.comment)
+    else:
+        decoded = _decode(path, standard_header(declared, path))
+    arguments = inria.arguments_beside(path)
+    if arguments is not None:
+        background = inria.background(inria.read_arguments(arguments), arguments)
+        decoded = replace(
+            decoded,
+            background=background,
+            background_origin=f"{inria.ARGUMENTS}: white_background" if background else "",
+        )
+    return scene_of(decoded, overrides)
+
+
+def _decode(path: Path, header: PlyHeader) -> DecodedSplats:
+    vertex = read_elements(path, [header.vertex])[header.vertex.name]
+    arrays = {name: _columns(vertex, columns) for name, columns in GROUPS.items()}
+    count, bands = arrays["means"].shape[0], header.bands
+    rest = _columns(vertex, tuple(f"f_rest_{i}" for i in range(3 * (bands - 1))))
+    # f_rest is channel-major: f_rest[c * (K - 1) + k].
+    rest = rest.reshape(count, 3, bands - 1).transpose(0, 2, 1)
+    scales, opacities = arrays["scales"], arrays["opacity"].reshape(count)
+    notes = [f"not used: {visible(', '.join(header.unused))}"] if header.unused else []
+    if FILTER in header.vertex.types:
+        scales, opacities = filtered(scales, opacities, _columns(vertex, (FILTER,))[:, 0])
+        notes.append(
+            f"{FILTER} is applied to scales and opacities, as mip-splatting does on export; its own rasteriser blurs "
+            "by 0.1 square pixels and compensates opacities, gsplat blurs by 0.3"
+        )
+    return DecodedSplats(
+        "a .ply",
+        (path,),
+        float32_rows(arrays["means"], scales, arrays["quats"], opacities, arrays["f_dc"], rest),
+        _FIELDS,
+        mode=header.mode,
+        mode_origin=f"comment in the file: {visible(header.comment)}" if header.mode else "",
+        notes=tuple(notes),
+    )
+
+
+def filtered(
+    log_scales: Float32Array, opacity_logits: Float32Array, width: Float32Array
+) -> tuple[Float32Array, Float32Array]:
+    """Scales and opacities with mip-splatting's 3-D filter, as its ``save_fused_ply`` stores them.
+
+    With s the scales and f the filter's ``width`` [N], the scales become sqrt(s^2 + f^2) and the opacity is multiplied
+    by sqrt(prod(s^2) / prod(s^2 + f^2)). Takes logarithms [N, 3] and logits [N]; computed in float64 and rounded once
+    to float32; rows of width 0 stay as they are.
+    """
+    with np.errstate(all="ignore"):
+        square = np.square(np.exp(log_scales.astype(np.float64)))
+        total = square + np.square(width.astype(np.float64))[:, None]
+        weight = np.sqrt(np.prod(square / total, axis=1))
+        opacity = weight / (1.0 + np.exp(-opacity_logits.astype(np.float64)))
+        scales_and_opacities = (
+            (0.5 * np.log(total)).astype(np.float32),
+            (np.log(opacity) - np.log1p(-opacity)).astype(np.float32),
+        )
+    same = width == 0
+    return np.where(same[:, None], log_scales, scales_and_opacities[0]), np.where(
+        same, opacity_logits, scales_and_opacities[1]
+    )
+
+
+def _columns(vertex: Any, names: tuple[str, ...]) -> Float32Array:
+    """Columns of the vertex table as [N, len(names)] float32."""
+    array = np.empty((len(vertex), len(names)), np.float32)
+    for i, name in enumerate(names):
+        with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+            array[:, i] = vertex[name]
+    return array

@@ -4,25 +4,27 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ns_abstract.arithmetic.rounding import Arithmetic, charges
+from ns_abstract.arithmetic.rounding import REAL, Arithmetic, charges
 from ns_abstract.arithmetic.rounding import arithmetic as arithmetic_named
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseBox
+from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseBox, PoseForms
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.representation import ProgramOptions, Representation
 from ns_abstract.methods.runs import RunConfig
 from ns_abstract.methods.splat.activate import SH_C0, Splats, activate
-from ns_abstract.methods.splat.bounds import SceneSums
+from ns_abstract.methods.splat.bounds import SceneSums, SplatBounds
 from ns_abstract.methods.splat.constants import VERSIONS, Rasteriser, raster_rules, rasteriser_named
 from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.load import load_run, load_scene
 from ns_abstract.methods.splat.scene import SplatScene
+from ns_abstract.methods.splat.stage_data import ProjectedGaussians, ViewingAxes
 from ns_abstract.methods.splat.variations import VariedSplats, vary
 from ns_abstract.methods.splat.weights import SplatWeightFrame, WhiteGaussians, plane_mask
 from ns_abstract.perturbation.specification import Perturbation
@@ -42,6 +44,7 @@ _BYTES_BY_GAUSSIAN = 1200
 _BYTES_BY_VARIED = 400
 #: Sets of scenes at hand.
 _KEPT = 8
+_WITH_TILES = "the alpha threshold and tiles"
 
 
 class SplatMethod:
@@ -96,11 +99,7 @@ class SplatMethod:
         return f"{self.scene.count:,} Gaussians{alone}"
 
     def frame(self, poses: PoseBox, sheared: bool = False, layers: bool = False) -> SplatFrame:
-        """One frame, ready for refinement; ``sheared``, ``layers``: see `SplatFrame`.
-
-        Raises:
-            InputError: Layers of the paper's renderer, which has none.
-        """
+        """One frame, ready for refinement; ``sheared``, ``layers``: see `SplatFrame`; the paper's has no layers."""
         if layers and self.rasteriser.name != "gsplat":
             raise InputError("the paper's renderer has no depth", field="--outputs", fix="leave it out")
         varied = self.varied(poses.perturbation.scene)
@@ -124,14 +123,10 @@ class SplatMethod:
 
     def ablations(self, poses: PoseBox) -> Iterator[tuple[str, SplatFrame]]:
         """See `Method.ablations`."""
-        from ns_abstract.methods.splat.ablations import ablations
-
         return ablations(self.scene, self.rasteriser, self.arithmetic, poses, self.varied(poses.perturbation.scene))
 
     def attribution(self, frame: Frame, box: ParameterBox, tile: int, count: int) -> list[tuple[int, float]]:
         """See `Method.attribution`."""
-        from ns_abstract.methods.splat.ablations import attribution
-
         assert isinstance(frame, SplatFrame)
         return attribution(frame, box, tile, count)
 
@@ -254,3 +249,86 @@ def _method(scene: SplatScene, options: ProgramOptions, arithmetic: str | None, 
 
 # what no other representation reads is a splat's
 SPLAT = Representation(lambda source: True, _load, _method)
+
+
+@dataclass(frozen=True)
+class CauseTuning:
+    """What stands for the absence of a rule, and how many Gaussians are looked at; no bound of a picture uses them."""
+
+    #: The threshold that stands for none: a jump by this part of it is not seen.
+    threshold_part: float = 2.0**-5
+    #: Groups of Gaussians that are left out in turn, and of them what is looked at closer.
+    groups: int = 12
+    closer: int = 3
+
+
+_TUNING = CauseTuning()
+
+
+class _OrderedBounds(SplatBounds):
+    """Bounds that assume the depth order of the cell's middle."""
+
+    def _viewing_axes(
+        self, forms: PoseForms, rotation_magnitude: np.ndarray, gaussians: ProjectedGaussians
+    ) -> ViewingAxes:
+        axes = super()._viewing_axes(forms, rotation_magnitude, gaussians)
+        gaussians.depth_error[:] = 0.0
+        axes.depth[1:] = 0.0
+        return axes
+
+
+def ablations(
+    scene: SplatScene, rasteriser: Rasteriser, arithmetic: Arithmetic, poses: PoseBox, varied: VariedSplats
+) -> Iterator[tuple[str, SplatFrame]]:
+    """Return the causes of looseness that the scene has, each with the frame without it."""
+
+    def frame(rules: Rasteriser = rasteriser, computed: Arithmetic = arithmetic, fixed: bool = False) -> SplatFrame:
+        splats = activate(scene, rules)
+        scenes = None
+        if varied.varies and not fixed:
+            scenes = vary(scene, splats, poses.perturbation.scene)
+        return SplatFrame(splats, rules, computed, poses, varied=scenes)
+
+    if arithmetic.name != REAL.name:
+        yield "rounding of float32", frame(computed=REAL)
+    ordered = frame()
+    ordered.bounds = _OrderedBounds(ordered.bounds.splats, rasteriser, arithmetic, ordered.varied)
+    yield "the order of depth", ordered
+    if rasteriser.transmittance_min > 0.0:
+        yield "the stop where little light is left", frame(replace(rasteriser, transmittance_min=-1.0))
+    if rasteriser.tile_size and rasteriser.alpha_min > 0.0:
+        smaller = replace(
+            rasteriser, tile_size=0, axis_sigmas=0.0, alpha_min=_TUNING.threshold_part * rasteriser.alpha_min
+        )
+        # later versions miss no tile in which alpha reaches the threshold
+        names = "the alpha threshold" if rasteriser.axis_sigmas or rasteriser.ellipse_tiles else _WITH_TILES
+        yield names, frame(smaller)
+    if ordered.bounds.splats.degree > 0:
+        yield "colours that depend on the view", frame(replace(rasteriser, view_dependent=False))
+    if varied.varies:
+        yield "variations of the scene", frame(fixed=True)
+
+
+def attribution(frame: SplatFrame, box: ParameterBox, tile: int, count: int) -> list[tuple[int, float]]:
+    """Return the Gaussians that cost a tile the most mean gap over a cell, and how much each costs.
+
+    Groups are left out in turn, and those that matter are looked at closer, so Gaussians that matter only together
+    may be missed.
+    """
+    forms, tiles = frame.pose_set.enclosure(box, frame.order), np.array([tile])
+
+    def gap(candidates: np.ndarray | None) -> tuple[float, np.ndarray]:
+        cell = frame.bounds.cell(frame.camera, forms, tiles, candidates)
+        return float((cell.upper - cell.lower).mean()), cell.visible
+
+    whole, visible = gap(None)
+    groups = [visible.astype(np.int32)]
+    while True:
+        pieces = [
+            piece for group in groups for piece in np.array_split(group, min(_TUNING.groups, group.size)) if piece.size
+        ]
+        gains = [whole - gap(np.setdiff1d(visible, piece).astype(np.int32))[0] for piece in pieces]
+        best = np.argsort(gains)[::-1][: max(_TUNING.closer, count)]
+        groups = [pieces[k] for k in best]
+        if all(group.size <= 1 for group in groups):
+            return [(int(pieces[k][0]), gains[k]) for k in best[:count] if gains[k] > 0.0]

@@ -12,6 +12,7 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import file_size, show
 from ns_abstract.io.kinds import refuse_other_kind
 from ns_abstract.io.memory import check_memory
+from ns_abstract.methods.splat.formats.decoded import RENDER_ELSEWHERE, TWO_D
 
 FIX = "export the scene again as a standard, uncompressed 3DGS .ply"
 #: Bands of spherical harmonics by the number of f_rest columns.
@@ -35,30 +36,28 @@ _SIZES = {
     **dict.fromkeys(("double", "float64"), 8),
 }
 _FLOATS = ("float", "float32", "double", "float64")
-_RASTERISER = "render it with the program that trained it, or train Gaussians that gsplat's rasteriser draws"
 #: Beginnings of columns of Gaussians that are drawn in another way, and what they are.
 _FAMILIES = (
-    ("sg_", "Gaussians with lobes of spherical Gaussians", _RASTERISER),
-    ("f_asg", "Gaussians with anisotropic spherical Gaussians", _RASTERISER),
-    ("sb_", "beta kernels with spherical betas", _RASTERISER),
-    ("beta", "beta kernels", _RASTERISER),
-    ("shape", "generalised exponential kernels", _RASTERISER),
-    ("trbf_", "Gaussians that move in time", _RASTERISER),
-    ("motion_", "Gaussians that move in time", _RASTERISER),
-    ("omega_", "Gaussians that move in time", _RASTERISER),
-    ("scale_t", "Gaussians that move in time", _RASTERISER),
-    ("t_scale", "Gaussians that move in time", _RASTERISER),
-    ("rot_r_", "Gaussians that move in time", _RASTERISER),
-    ("f_offset", "anchors of neural Gaussians", _RASTERISER),
-    ("f_anchor_feat", "anchors of neural Gaussians", _RASTERISER),
-    ("tex_", "textured Gaussians", _RASTERISER),
-    ("texture_", "textured Gaussians", _RASTERISER),
-    ("albedo", "Gaussians of materials, which a shader lights", _RASTERISER),
-    ("base_color", "Gaussians of materials, which a shader lights", _RASTERISER),
-    ("roughness", "Gaussians of materials, which a shader lights", _RASTERISER),
-    ("metallic", "Gaussians of materials, which a shader lights", _RASTERISER),
+    ("sg_", "Gaussians with lobes of spherical Gaussians", RENDER_ELSEWHERE),
+    ("f_asg", "Gaussians with anisotropic spherical Gaussians", RENDER_ELSEWHERE),
+    ("sb_", "beta kernels with spherical betas", RENDER_ELSEWHERE),
+    ("beta", "beta kernels", RENDER_ELSEWHERE),
+    ("shape", "generalised exponential kernels", RENDER_ELSEWHERE),
+    ("trbf_", "Gaussians that move in time", RENDER_ELSEWHERE),
+    ("motion_", "Gaussians that move in time", RENDER_ELSEWHERE),
+    ("omega_", "Gaussians that move in time", RENDER_ELSEWHERE),
+    ("scale_t", "Gaussians that move in time", RENDER_ELSEWHERE),
+    ("t_scale", "Gaussians that move in time", RENDER_ELSEWHERE),
+    ("rot_r_", "Gaussians that move in time", RENDER_ELSEWHERE),
+    ("f_offset", "anchors of neural Gaussians", RENDER_ELSEWHERE),
+    ("f_anchor_feat", "anchors of neural Gaussians", RENDER_ELSEWHERE),
+    ("tex_", "textured Gaussians", RENDER_ELSEWHERE),
+    ("texture_", "textured Gaussians", RENDER_ELSEWHERE),
+    ("albedo", "Gaussians of materials, which a shader lights", RENDER_ELSEWHERE),
+    ("base_color", "Gaussians of materials, which a shader lights", RENDER_ELSEWHERE),
+    ("roughness", "Gaussians of materials, which a shader lights", RENDER_ELSEWHERE),
+    ("metallic", "Gaussians of materials, which a shader lights", RENDER_ELSEWHERE),
 )
-_TWO_D = "2-D Gaussians, drawn by another rasteriser"
 _MODES = {"mip": "antialiased", "default": "classic"}
 _COMPENSATED = {"0": "classic", "1": "antialiased", "false": "classic", "true": "antialiased"}
 
@@ -111,12 +110,8 @@ class PlyDeclaration:
 def read_declaration(path: Path, mode_given: bool) -> PlyDeclaration:
     """What the header of ``path`` declares.
 
-    Args:
-        mode_given: Whether the user says how to rasterise, so that a comment that cannot be understood does not
-            matter.
-
-    Raises:
-        InputError: It is not the header of a .ply of splats, or the file is cut off.
+    ``mode_given``: whether the user says how to rasterise, so that a comment that cannot be understood does not matter.
+    Raises InputError where it is not the header of a .ply of splats, or the file is cut off.
     """
     size = file_size(path, ".ply")
     refuse_other_kind(path)
@@ -151,11 +146,7 @@ def read_declaration(path: Path, mode_given: bool) -> PlyDeclaration:
 
 
 def standard_header(declared: PlyDeclaration, path: Path) -> PlyHeader:
-    """The header of a standard 3DGS .ply.
-
-    Raises:
-        InputError: Its columns are not those of one.
-    """
+    """The header of a standard 3DGS .ply. Raises InputError where its columns are not those of one."""
     vertex = next((element for element in declared.elements if element.name == "vertex"), None)
     if vertex is None or vertex.count < 1:
         raise InputError("no Gaussians", file=path, field="element vertex", fix=FIX)
@@ -168,11 +159,7 @@ def standard_header(declared: PlyDeclaration, path: Path) -> PlyHeader:
 
 
 def read_elements(path: Path, elements: list[PlyElement]) -> dict[str, Any]:
-    """Tables of the named elements, as numpy's structured arrays.
-
-    Raises:
-        InputError: The file is damaged.
-    """
+    """Tables of the named elements, as numpy's structured arrays. Raises InputError where the file is damaged."""
     import plyfile
 
     try:
@@ -203,7 +190,7 @@ def _comments(text: str, path: Path, mode_given: bool) -> tuple[str | None, str]
         value = match[2].strip().strip("'\"").lower()
         if match[1].lower() == "splatrendermode":
             if value == "2dgs":
-                raise InputError(_TWO_D, file=path, field="comment SplatRenderMode", fix=_RASTERISER)
+                raise InputError(TWO_D, file=path, field="comment SplatRenderMode", fix=RENDER_ELSEWHERE)
             options = _MODES
         else:
             options = _COMPENSATED
@@ -231,7 +218,7 @@ def _refuse_other_splats(vertex: PlyElement, path: Path) -> None:
                 )
     scales = [name for name in GROUPS["scales"] if name in vertex.types]
     if scales == ["scale_0", "scale_1"]:
-        raise InputError(_TWO_D, file=path, field="vertex.scale_2", fix=_RASTERISER)
+        raise InputError(TWO_D, file=path, field="vertex.scale_2", fix=RENDER_ELSEWHERE)
     if not scales and "opacity" not in vertex.types and set("xyz") <= set(vertex.types):
         raise InputError(
             "a point cloud: it has no scales and opacities",

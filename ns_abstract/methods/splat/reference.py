@@ -72,10 +72,8 @@ def rotations(quats: Tensor) -> Tensor:
 def sh_colors(degree: int, directions: Tensor, sh: Tensor) -> Tensor:
     """``max(0, 0.5 + sum_k Y_k(direction) sh_k)`` [n, 3] (rendering.py:382-392 of gsplat).
 
-    Args:
-        degree: 0 to 3.
-        directions: [n, 3] from the camera, of any length, world axes.
-        sh: [n, K, 3] with K >= (degree + 1)^2.
+    ``directions`` [n, 3] lead from the camera, of any length, world axes; ``sh`` is [n, K, 3] with K >= (degree + 1)^2,
+    for a ``degree`` from 0 to 3.
     """
     x, y, z = (directions / directions.norm(dim=1, keepdim=True)).unbind(1)
     basis = [torch.full_like(x, 0.28209479177387814)]
@@ -106,9 +104,7 @@ def sh_colors(degree: int, directions: Tensor, sh: Tensor) -> Tensor:
 class Reference:
     """Renders one scene.
 
-    Args:
-        dtype: What to compute with. ``torch.float32`` gives one of the pictures that a float32
-            rasteriser may output.
+    ``dtype``: what to compute with. ``torch.float32`` gives one of the pictures that a float32 rasteriser may output.
     """
 
     def __init__(
@@ -147,12 +143,9 @@ class Reference:
         return other
 
     def project(self, camera: PinholeCamera, camera_to_world: Tensor, subset: Tensor | None = None) -> Projection:
-        """Project the scene (fully_fused_projection_fwd.cu, isect_tiles.cu).
+        """Project the scene (fully_fused_projection_fwd.cu, isect_tiles.cu); arguments as for `image`.
 
-        Args:
-            camera: Intrinsics and size; its own pose is not used.
-            camera_to_world: [3, 4], OpenGL axes.
-            subset: Numbers of Gaussians that are known to be drawn: these, without culling; all if None.
+        ``subset``: numbers of Gaussians that are known to be drawn: these, without culling; all if None.
         """
         r = self.rules
         pose = camera_to_world.to(self.dtype)
@@ -317,12 +310,7 @@ class Reference:
         return color, light
 
     def image(self, camera: PinholeCamera, camera_to_world: Tensor) -> Tensor:
-        """The picture [H, W, 3] in [0, 1].
-
-        Args:
-            camera: Intrinsics and size; its own pose is not used.
-            camera_to_world: [3, 4], OpenGL axes.
-        """
+        """The picture [H, W, 3] in [0, 1] from ``camera_to_world`` [3, 4], OpenGL axes, not from the camera's pose."""
         return self._picture(camera, camera_to_world, self._blend)
 
     def layers(self, camera: PinholeCamera, camera_to_world: Tensor) -> Tensor:
@@ -348,13 +336,7 @@ class Reference:
         return torch.cat(rows)
 
     def pixels(self, camera: PinholeCamera, camera_to_world: Tensor, pixels: Tensor) -> Tensor:
-        """Colours [k, 3] of some pixels; gradients cost only the Gaussians that reach them.
-
-        Args:
-            camera: Intrinsics and size; its own pose is not used.
-            camera_to_world: [3, 4], OpenGL axes.
-            pixels: [k, 2] row and column.
-        """
+        """As `image`, of ``pixels`` [k, 2] (row, column) alone: [k, 3]; gradients cost only the Gaussians there."""
         with torch.no_grad():
             p = self.project(camera, camera_to_world)
             order = torch.argsort(p.depths, stable=True)

@@ -167,15 +167,8 @@ def _ratio_limits(camera, margin):
 def _project_worker(counter_, scene, rotation, position, eye, camera, rules, out):
     """One thread's Gaussians; see `ns_abstract.methods.splat.constants` for the rules' sources.
 
-    Args:
-        counter_: See `run_in_chunks`.
-        scene: `_SceneArrays`.
-        rotation: [3, 3] world to camera, OpenCV axes.
-        position: [3] camera, world.
-        eye: [3] where colours are seen from, world.
-        camera: `Intrinsics`.
-        rules: `RasterRules`.
-        out: `_Projected`, the output.
+    ``counter_``: see `run_in_chunks`. The ``rotation`` [3, 3] is from world to camera, OpenCV axes; the camera's
+    ``position`` and ``eye``, where colours are seen from, are [3], world. ``out``: `_Projected`, the output.
     """
     counter = pointer(counter_)
     means, axes, opacity = borrowed(scene.means), borrowed(scene.axes), borrowed(scene.opacity)
@@ -307,17 +300,10 @@ def _blend_block(numbers, pixels, x0, y0, record, box, rules, state):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _rasterise_worker(share, lists, sets_, record_, box_, camera, rules, background, image_):
-    """Blend one thread's tiles of ``lists.wanted``.
+    """Blend one thread's tiles of ``lists.wanted`` into ``image_`` [t, side, side, 3], in [0, 1].
 
-    Args:
-        share: `ThreadShare`.
-        lists: `TileLists`.
-        sets_: [t, blocks] int64, of each block the pixels that are wanted; the others show the background.
-        record_, box_: Of `_Projected`.
-        camera: `Intrinsics`.
-        rules: `RasterRules`.
-        background: [3].
-        image_: [t, side, side, 3] output, in [0, 1].
+    ``sets_`` [t, blocks] int64 holds of each block the pixels that are wanted; the others show the ``background`` [3].
+    ``record_`` and ``box_`` are those of `_Projected`.
     """
     sequence, counter = borrowed(share.sequence), pointer(share.counter)
     record, box, image, sets = borrowed(record_), borrowed(box_), borrowed(image_), borrowed(sets_)

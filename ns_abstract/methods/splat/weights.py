@@ -33,11 +33,7 @@ if TYPE_CHECKING:
 
 
 def plane_mask(scene: SplatScene, opacity: Float64Array, plane: WeightPlane) -> np.ndarray:
-    """[N] bool: the Gaussians that the plane's selection picks.
-
-    Raises:
-        InputError: It picks none.
-    """
+    """[N] bool: the Gaussians that the plane's selection picks. Raises InputError where it picks none."""
     if plane.select is None:
         return np.ones(scene.count, bool)
     try:

@@ -36,10 +36,8 @@ def run_by_tiles(kernel: Callable[..., object], sequence: np.ndarray, count: int
 def run_in_chunks(kernel: Callable[..., object], count: int, *arguments: object) -> None:
     """Run ``kernel(counter, *arguments)`` in as many threads as there is work for.
 
-    Args:
-        kernel: Takes chunks of `CHUNK` Gaussians by the number that it takes from the counter, an int64 [1].
-        count: Gaussians.
-        arguments: The kernel's other ones.
+    The kernel takes chunks of `CHUNK` of the ``count`` Gaussians by the number that it takes from the counter, int64
+    [1].
     """
     counter = np.zeros(1, np.int64)
     side_by_side(lambda _: kernel(counter, *arguments), max(1, min(threads(), -(-count // CHUNK))))

@@ -7,6 +7,7 @@ commands in the folder given to ``write_splatfacto_run``. The whole folder can b
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,12 +16,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ns_abstract.geometry.keyframe_cameras import KeyframeCamera
+from ns_abstract.io.atomic import write_atomic
 from ns_abstract.methods.run_writer import (
     background_name,
     checkpoint_bytes,
     optimizer_lines,
     write_run,
 )
+from ns_abstract.methods.splat.activate import SH_C0
 from ns_abstract.methods.splat.scene import SplatScene
 
 _REST_BANDS = 15  # features_rest of SH degree 3
@@ -33,6 +36,25 @@ _LEARNING_RATES = {
     "features_rest": 0.000125,
     "opacities": 0.05,
 }
+_OPTIMIZERS = optimizer_lines(
+    "Adam",
+    "1.0e-15",
+    {
+        "bilateral_grid": ("0.002", ("0.0001", "0", 1000)),
+        "camera_opt": ("0.0001", ("5.0e-07", "0", 1000)),
+        "features_dc": ("0.0025", None),
+        "features_rest": ("0.000125", None),
+        "means": ("0.00016", ("1.6e-06", "1.0e-08", 0)),
+        "opacities": ("0.05", None),
+        "quats": ("0.001", None),
+        "scales": ("0.005", None),
+    },
+)
+_STEPS = """\
+steps_per_eval_all_images: 1000
+steps_per_eval_batch: 0
+steps_per_eval_image: 100
+steps_per_save: 2000"""
 
 
 def write_splatfacto_run(
@@ -44,23 +66,20 @@ def write_splatfacto_run(
     views: Sequence[KeyframeCamera] | None = None,
     render: Callable[[KeyframeCamera], ArrayLike] | None = None,
 ) -> Path:
-    """Write ``scene`` as a Splatfacto run, and a small data set beside it.
+    """Write ``scene`` as a Splatfacto run, and a small data set beside it; returns the path of config.yml.
 
     Files: ``FOLDER/EXPERIMENT/splatfacto/TIMESTAMP/{config.yml, dataparser_transforms.json,
-    nerfstudio_models/step-000029999.ckpt}`` and ``FOLDER/data/{transforms.json, images/*.png}``.
-    Every file is replaced as a whole and config.yml comes last, so a run with a config is complete.
-    Nerfstudio builds its pipeline from the data set; the Gaussians come from the checkpoint alone.
+    nerfstudio_models/step-000029999.ckpt}`` and ``FOLDER/data/{transforms.json, images/*.png}``. Every file is replaced
+    as a whole and config.yml comes last, so a run with a config is complete. Nerfstudio builds its pipeline from the
+    data set; the Gaussians come from the checkpoint alone.
 
     Args:
         scene: SH is stored padded with zeros to degree 3.
         folder: Nerfstudio's working directory for this run; made if missing.
         timestamp: Name of the run, as in "2026-11-21_120000".
+        experiment_name: Name of the folder of its experiment.
         views: Cameras of the data set, normalised frame, at least two of one size and field of view.
-        render: Gives the image [H, W, 3] in [0, 1] of a view; without it the images hold only the
-            background colour.
-
-    Returns:
-        The path of config.yml.
+        render: Gives the image [H, W, 3] in [0, 1] of a view; without it images hold only the background colour.
 
     Raises:
         InputError: ``timestamp`` or ``experiment_name`` is not a plain folder name.
@@ -129,22 +148,47 @@ def _scheduler_state(rate: float) -> dict[str, Any]:
     }
 
 
-_OPTIMIZERS = optimizer_lines(
-    "Adam",
-    "1.0e-15",
-    {
-        "bilateral_grid": ("0.002", ("0.0001", "0", 1000)),
-        "camera_opt": ("0.0001", ("5.0e-07", "0", 1000)),
-        "features_dc": ("0.0025", None),
-        "features_rest": ("0.000125", None),
-        "means": ("0.00016", ("1.6e-06", "1.0e-08", 0)),
-        "opacities": ("0.05", None),
-        "quats": ("0.001", None),
-        "scales": ("0.005", None),
-    },
-)
-_STEPS = """\
-steps_per_eval_all_images: 1000
-steps_per_eval_batch: 0
-steps_per_eval_image: 100
-steps_per_save: 2000"""
+def write_ply(scene: SplatScene, file: Path) -> tuple[str, ...]:
+    """Write ``scene``; `ns_abstract.methods.splat.load.load_scene` reads the same numbers back.
+
+    A comment says how the scene is rasterised. The file holds what the standard has room for: means in the run's
+    normalised frame, logarithms of scales, logits of opacities, quaternions as stored, spherical harmonics channel by
+    channel. Returns what it has no room for, one sentence each. Raises OSError where the file cannot be written.
+    """
+    import plyfile
+
+    sh, lost = scene.sh, []
+    if scene.color_model == "sigmoid":
+        colors = 1.0 / (1.0 + np.exp(-sh.astype(np.float64)))
+        sh = ((colors - 0.5) / SH_C0).astype(np.float32)
+        lost.append("colours were turned from logits into spherical harmonics of degree 0, rounded to float32")
+    if scene.rasterize_mode != "classic":
+        lost.append(
+            f"rasterize_mode {scene.rasterize_mode} but as a comment: programs that do not read it draw the scene as "
+            "classic"
+        )
+    if np.any(scene.background):
+        red, green, blue = (float(value) for value in scene.background)
+        lost.append(
+            f"the background ({red:.3g}, {green:.3g}, {blue:.3g}): this package takes black for a .ply unless "
+            "--background says it"
+        )
+    columns: dict[str, np.ndarray] = dict(zip("xyz", scene.means.T, strict=True))
+    columns |= {name: np.zeros(scene.count, np.float32) for name in ("nx", "ny", "nz")}
+    columns |= {f"f_dc_{c}": sh[:, 0, c] for c in range(3)}
+    rest = sh[:, 1:].transpose(0, 2, 1).reshape(scene.count, -1)
+    columns |= {f"f_rest_{k}": rest[:, k] for k in range(rest.shape[1])}
+    columns["opacity"] = scene.opacity_logits
+    columns |= {f"scale_{k}": scene.log_scales[:, k] for k in range(3)}
+    columns |= {f"rot_{k}": scene.quats[:, k] for k in range(4)}
+    table = np.empty(scene.count, [(name, "<f4") for name in columns])
+    for name, column in columns.items():
+        table[name] = column
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        mode = "mip" if scene.rasterize_mode == "antialiased" else "default"
+        content = plyfile.PlyData(
+            [plyfile.PlyElement.describe(table, "vertex")], byte_order="<", comments=[f"SplatRenderMode: {mode}"]
+        )
+    write_atomic(file, content.write)
+    return tuple(lost)

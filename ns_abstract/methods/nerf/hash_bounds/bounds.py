@@ -2,18 +2,43 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ns_abstract.arithmetic.outward import outward
-from ns_abstract.execution.cancellation import check_cancelled
+from ns_abstract.arithmetic.simd.lanes import LINE
+from ns_abstract.arithmetic.simd.products import ROWS
+from ns_abstract.execution.cancellation import WorkCancelledError, check_cancelled
+from ns_abstract.execution.threads import each
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.nerf.division import Division, division_for
+from ns_abstract.methods.nerf.frame import FieldFrame
 from ns_abstract.methods.nerf.hash_bounds import pieces
-from ns_abstract.methods.nerf.hash_bounds.arrays import field_arrays, piece_room
-from ns_abstract.methods.nerf.hash_field import NerfactoField
+from ns_abstract.methods.nerf.hash_bounds.edges import edges_of
+from ns_abstract.methods.nerf.hash_bounds.features import feature_room
+from ns_abstract.methods.nerf.hash_bounds.forms import form_width
+from ns_abstract.methods.nerf.hash_bounds.light import light_of
+from ns_abstract.methods.nerf.hash_bounds.network import (
+    HeadWeights,
+    LayerZonotope,
+    NetWeights,
+    head_weights,
+    net_weights,
+    zonotope,
+)
+from ns_abstract.methods.nerf.hash_bounds.pieces import DensityArrays, FieldArrays, PieceRoom
+from ns_abstract.methods.nerf.hash_field import LAYERS_LIMIT, DenseNet, HashEncoding, NerfactoField, NerfactoScene
+from ns_abstract.methods.nerf.nerfacto_render import NerfactoRenderer
 from ns_abstract.methods.nerf.ray_bundle import TAYLOR, RayBundle
 from ns_abstract.methods.nerf.ray_field import BoundedRays, RayBounds, RayRequest
+
+#: Harmonics of a direction.
+HARMONICS = 16
+#: Rays that are bounded together, and shares of a worker between two looks at the goal. Preferences.
+_SHARE, _SHARES = 4, 4
 
 
 @dataclass(frozen=True)
@@ -136,3 +161,89 @@ class HashBounds(BoundedRays):
             return displacement
         factor = _TUNING.wider * (first / max(finite, 1)) ** (1.0 / self.dimensions)
         return max(_TUNING.least_displacement, displacement * min(max(factor, 0.25), 2.0))
+
+
+def _density(encoding: HashEncoding, net: DenseNet, scale: float) -> DensityArrays:
+    table = np.ascontiguousarray(encoding.table, np.float64)
+    ranges = np.stack([table.min(axis=1), table.max(axis=1)], axis=1)
+    resolutions = np.ascontiguousarray(encoding.resolutions, np.int64)
+    return DensityArrays(table, resolutions, ranges, net_weights(net), float(scale))
+
+
+def spacing_of(field: NerfactoField) -> tuple[bool, float, float]:
+    """Whether distances are piecewise, and the ends of rays in the units in which edges are equally spaced."""
+    if field.spacing == "uniform":
+        return False, float(field.near), float(field.far)
+    first, last = (x / 2.0 if x < 1.0 else 1.0 - 1.0 / (2.0 * x) for x in (field.near, field.far))
+    return True, first, last
+
+
+def field_arrays(field: NerfactoField) -> FieldArrays:
+    """The arrays of ``field`` for kernels."""
+    last = isinstance(field.background, str)
+    return FieldArrays(
+        tuple(_density(one.encoding, one.net, one.average_init_density) for one in field.proposals),
+        _density(field.encoding, field.density_net, field.average_init_density),
+        head_weights(field.color_net, HARMONICS),
+        np.zeros(3) if last else np.ascontiguousarray(field.background, np.float64),
+        last,
+        spacing_of(field),
+    )
+
+
+def _rooms(net: NetWeights, symbols: int, layers: int = 0) -> tuple[LayerZonotope, ...]:
+    """Neurons of every layer, at least ``layers``; ``symbols`` rows before its first ReLU."""
+    rows = symbols + int(net.sizes[1:-1].sum())
+    rooms = tuple(zonotope(rows, int(n)) for n in net.sizes[1:])
+    return rooms + (zonotope(1, 1),) * (layers - len(rooms))
+
+
+def piece_room(field: NerfactoField, arrays: FieldArrays, dimensions: int) -> PieceRoom:
+    """Scratch of one thread for sets of so many parameters."""
+    n = form_width(dimensions)
+    densities = (*arrays.proposals, arrays.density)
+    features = [one.table.shape[0] * one.table.shape[2] for one in densities]
+    pairs = zip(densities, features, strict=True)
+    rooms = tuple(_rooms(one.net, n + 2 + count, LAYERS_LIMIT) for one, count in pairs)
+    head: HeadWeights = arrays.head
+    neurons = int(head.net.sizes[1])
+    most = max(int(net.sizes.max()) for net in (head.net, *(one.net for one in densities)))
+    forms, count = np.zeros((3, n + 3)), field.samples[-1]
+    return PieceRoom(
+        (np.zeros((24, n + 3)), np.zeros((2, n + 4))),
+        (forms, forms.copy(), np.zeros((3, 3, n + 3)), np.zeros((3, 3, n + 3)), np.zeros(3, np.bool_)),
+        (np.zeros((HARMONICS, n + 3)), np.zeros((n + 2, neurons)), np.zeros(neurons)),
+        np.zeros((max(features), n + 3)),
+        feature_room(max(one.table.shape[2] for one in densities)),
+        tuple(edges_of(count, n) for count in field.samples),
+        tuple(light_of(count, n) for count in field.samples),
+        rooms,
+        _rooms(head.net, rooms[-1][0].rows.shape[0]),
+        (np.zeros((count, 3, n + 4)), np.zeros((2, count, 3)), np.zeros((2, count, 3))),
+        np.zeros(most, np.int64),
+        np.zeros((ROWS, 2 * LINE // 8)),
+    )  # fmt: skip
+
+
+class NerfactoFrame(FieldFrame):
+    """Bounds and renders one frame's set of poses of a nerfacto.
+
+    Args:
+        workers: Threads that bound rays side by side; results do not depend on their number.
+    """
+
+    def __init__(self, scene: NerfactoScene, pose_set: PoseBox, workers: int = 1) -> None:
+        bounds = HashBounds(scene.field, pose_set.geometry.box.dimensions)
+        at_once = workers * _SHARE * _SHARES
+        super().__init__(pose_set, NerfactoRenderer(scene.field), bounds, _SHARE, at_once, workers)
+
+    def _tried(self, calls: Sequence[Sequence[Any]]) -> list[RayBounds | None]:
+        """See `FieldFrame`; in threads."""
+
+        def bounded(call: Sequence[Any]) -> RayBounds | None:
+            try:
+                return self.bounds.rays(*call)
+            except WorkCancelledError:
+                return None
+
+        return each(bounded, calls) if self.workers > 1 else [bounded(call) for call in calls]

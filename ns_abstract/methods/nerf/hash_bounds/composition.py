@@ -22,11 +22,8 @@ from ns_abstract.methods.nerf.hsv import shift_box
 def interval_colors(light, count, low, high, background, last, out):
     """Bounds ``out`` [2, 3] of a ray's colour from those of its samples alone (design.md, F8).
 
-    Args:
-        low, high: [N, 3] bounds of colours.
-        background: [3] behind the last sample; not looked at with ``last``.
-        last: Whether the last sample's colour stands behind it.
-        out: [2, 3]; overwritten.
+    ``low`` and ``high`` [N, 3] bound the colours. With ``last``, the last sample's colour stands behind it, and the
+    ``background`` [3] is not looked at.
     """
     for c in range(3):
         out[0, c] = low[count - 1, c] if last else background[c]
@@ -48,13 +45,8 @@ def interval_colors(light, count, low, high, background, last, out):
 def shifted_interval_colors(light, count, colors, shift, background, last, room, out):
     """`interval_colors` [2, 3] where hue and saturation are added to all samples' colours (design.md, F9).
 
-    Args:
-        light, count: `Light` and N.
-        colors: [2, N, 3] bounds of colours before the shift.
-        shift: [2, 2] intervals of hue (turns) and saturation.
-        background, last: See `interval_colors`.
-        room: [2, N, 3] scratch.
-        out: [2, 3] in [0, 1]; overwritten.
+    ``colors`` [2, N, 3] are bounds of colours before the ``shift`` [2, 2], intervals of hue (turns) and saturation;
+    ``room`` [2, N, 3] is scratch, ``out`` [2, 3] in [0, 1].
     """
     for i in range(count):
         shift_box(colors[0, i], colors[1, i], shift[0], shift[1], room[0, i], room[1, i])
@@ -108,13 +100,10 @@ def _products(light, count, i, whole, color, line):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def form_color(light, count, colors, background, last, line, out):
-    """One channel of a ray's colour as a form (design.md, H7).
+    """One channel of a ray's colour as a form (design.md, H7); ``last``, ``background``: see `interval_colors`.
 
-    Args:
-        colors: [N, n + 4] forms with the symbols of the samples' starts and ends, and radii.
-        background: Behind the last sample; not looked at with ``last``.
-        last: Whether the last sample's colour stands behind it.
-        out: [n + 3] centre, pose symbols, and the radius in the last place; overwritten.
+    ``colors`` [N, n + 4] are forms with the symbols of the samples' starts and ends, and radii; ``out`` [n + 3]
+    receives the centre, pose symbols, and the radius in the last place.
     """
     n = colors.shape[1] - 4
     out[:] = 0.0

@@ -48,9 +48,7 @@ def edges_of(count: int, n: int) -> Edges:
 def space(edges, j, spacing, line, work):
     """Fill in the distance of edge ``j`` (design.md, H2).
 
-    Args:
-        spacing: Whether it is piecewise; the ray's ends in its units.
-        work: [4, n + 3].
+    ``spacing``: whether it is piecewise; the ray's ends in its units. ``work``: [4, n + 3].
     """
     piecewise, first, last = spacing
     place, out, low, high = edges.place[j], edges.distance[j], edges.low[j], edges.high[j]

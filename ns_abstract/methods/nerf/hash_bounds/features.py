@@ -81,12 +81,8 @@ def _across(nodes, i, j, k, y, z, f):
 def _slopes(nodes, counts, place, low, high, f, kept, slopes):
     """The value of a feature at ``place`` and its slopes [2, 3] between there and the box (design.md, H3).
 
-    Args:
-        nodes: [6, 6, 6, F] values.
-        counts: [3] nodes by axis, at least 2.
-        place, low, high: [3] in cells from the first node on.
-        kept: [2, 6, 6, 6] scratch.
-        slopes: [2, 3] least and largest; overwritten.
+    ``nodes`` [6, 6, 6, F] are values, ``counts`` [3] of them by axis, at least 2. ``place``, ``low`` and ``high`` [3]
+    are in cells from the first node on. ``slopes`` receives the least and largest; ``kept`` [2, 6, 6, 6] is scratch.
     """
     nx, ny, nz = counts
     cx = min(max(int(math.floor(place[0])), 0), nx - 2)
@@ -139,14 +135,10 @@ def _slopes(nodes, counts, place, low, high, f, kept, slopes):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def level_features(table, resolution, point, ranges, out, room):
-    """Forms of one level's features at a contracted point (design.md, H3).
+    """Forms ``out`` [F, n + 3] of one level's features at a contracted ``point`` [3, n + 3] in [0, 1] (design.md, H3).
 
-    Args:
-        table: [2^T, F] values of the level.
-        resolution: Cells by axis.
-        point: [3, n + 3] forms in [0, 1].
-        ranges: [2, F] least and largest value of the level.
-        out: [F, n + 3].
+    ``table`` [2^T, F] holds the level's values, ``ranges`` [2, F] their least and largest; ``resolution``: cells by
+    axis.
     """
     features, width = out.shape
     first, counts = room.cells[0], room.cells[1]

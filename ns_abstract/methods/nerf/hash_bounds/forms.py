@@ -148,10 +148,8 @@ def scale_add(a, factor, b, shift, out):
 def compose(a, derivatives, line, out, scratch):
     """``out = f(a)`` by Taylor's formula of order 2 about the centre (design.md, A3).
 
-    Args:
-        derivatives: f, f', f'' / 2 at the centre, and a bound of ``|f'''| / 6`` over the range.
-        line: Whether the pose symbols are those of one parameter.
-        scratch: [2, n + 3].
+    ``derivatives`` are f, f', f'' / 2 at the centre, and a bound of ``|f'''| / 6`` over the range; ``line`` tells
+    whether the pose symbols are those of one parameter; ``scratch`` is [2, n + 3].
     """
     k = a.shape[0] - 1
     f0, f1, f2, f3 = derivatives
@@ -187,12 +185,9 @@ def reciprocal(a, line, out, scratch):
 def exp_band(center, low, high):
     """A polynomial and a rest that enclose ``exp`` on an interval (design.md, H5).
 
-    Args:
-        center, low, high: ``low <= center <= high``.
-
-    Returns:
-        v, slope, curvature, rest: ``|exp(center + t) - v - slope t - curvature t^2| <= rest`` where ``center + t`` is
-        in the interval; the curvature is not negative. All infinite where the function may overflow.
+    ``center``, ``low``, ``high``: ``low <= center <= high``. Returns v, slope, curvature, rest: ``|exp(center + t) - v
+    - slope t - curvature t^2| <= rest`` where ``center + t`` is in the interval; the curvature is not negative. All
+    infinite where the function may overflow.
     """
     if not (high < _MOST and low <= high):
         return 0.0, 0.0, 0.0, np.inf

@@ -74,15 +74,8 @@ def times(a, b):
 def add_depth(edges, i, density, bounds, shares, line, light, work):
     """Fill in interval ``i`` and its end from the form of its ``density`` (design.md, H6).
 
-    Args:
-        i: The interval; those before it are filled in.
-        density: [n + 3] with the place symbol of the interval's middle.
-        bounds: Least and largest density.
-        shares: Those of `middle_of`.
-        work: [2, n + 4].
-
-    Returns:
-        Whether something is known.
+    The intervals before it are filled in. ``density`` [n + 3] has the place symbol of the interval's middle and lies in
+    ``bounds``; ``shares`` are those of `middle_of`; ``work`` is [2, n + 4]. Returns whether anything is known.
     """
     a, b = edges.distance[i], edges.distance[i + 1]
     n = a.shape[0] - 3
@@ -204,13 +197,9 @@ def give_up(light, first, count):
 def depths_functional(light, count, k, at_end, at_start, behind, own, scale):
     """Sum of the absolute coefficients of ``scale (at_end dS_N + at_start dS_k + behind dS_k+1) + own symbols``.
 
-    dS is what a sum of depths deviates by, without its pose symbols (design.md, H6).
-
-    Args:
-        k: An edge below N.
-        at_end, at_start, behind: Factors; 0 where the light is an interval.
-        own: Coefficients of the symbols of the edges k and k + 1 that are added.
-        scale: A factor.
+    dS is what a sum of depths deviates by, without its pose symbols (design.md, H6); ``k`` is an edge below N. The
+    factors are 0 where the light is an interval; ``own`` are coefficients of the symbols of the edges k and k + 1 that
+    are added.
     """
     n = light.depth.shape[1] - 4
     start = light.depth[k - 1, n + 2] if k > 0 else 0.0

@@ -106,12 +106,8 @@ def from_features(features, weights, out):
 def relu(z, count, n, live):
     """max(0, z) of ``n`` neurons in ``count`` rows, in place (design.md, H4).
 
-    Args:
-        count, n: Rows and neurons.
-        live: [n] numbers of the neurons that may be above 0; overwritten.
-
-    Returns:
-        The number of rows, and that of live neurons.
+    ``count``, ``n``: rows and neurons. ``live``: [n] numbers of the neurons that may be above 0; overwritten. Returns
+    the number of rows, and that of live neurons.
     """
     rows, radius, size = z.rows, z.radius, z.size
     # at first the spreads
@@ -151,16 +147,11 @@ def relu(z, count, n, live):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def linear(z, count, live, weight, absolute, bias, rounding, out, rest):
-    """Neurons ``out`` [n] of a layer.
+    """Neurons ``out`` [n] of a layer, from those ``z`` of its inputs, ``count`` rows, that are ``live`` [k].
 
-    Args:
-        z: `LayerZonotope` of the layer's inputs, ``count`` rows.
-        live: [k] those of them that are looked at.
-        weight: [inputs, n and more, to whole pairs of lines].
-        absolute, bias: Absolute weights, and [n and more].
-        rounding: Relative error of the layer's sums.
-        out: `LayerZonotope`; its radius may hold what others add.
-        rest: [ROWS, two lines] scratch.
+    ``weight`` [inputs, n and more, to whole pairs of lines], ``absolute`` weights and ``bias`` [n and more];
+    ``rounding`` is the relative error of the layer's sums. ``out`` may hold in its radius what others add; ``rest``
+    [ROWS, two lines] is scratch.
     """
     rows, radius = out.rows, out.radius
     n = rows.shape[1]
@@ -187,11 +178,8 @@ def linear(z, count, live, weight, absolute, bias, rounding, out, rest):
 def finish(rooms, count, weights, live, rest):
     """The layers behind the first one, whose neurons before their ReLU are in ``rooms[0]``; returns the rows.
 
-    Args:
-        rooms: `LayerZonotope` of every layer, and more.
-        count: Rows of the first.
-        live: [most neurons] scratch.
-        rest: [ROWS, two lines] scratch.
+    ``rooms``: `LayerZonotope` of every layer, and more; ``count``: rows of the first. ``live`` [most neurons] and
+    ``rest`` [ROWS, two lines] are scratch.
     """
     for layer in range(1, weights.sizes.shape[0] - 1):
         z = rooms[layer - 1]
@@ -245,9 +233,7 @@ def head_weights(net: DenseNet, harmonics: int) -> HeadWeights:
 def look_at_direction(forms, head, rows, radius):
     """What the first layer of the ``head`` adds up of a direction's harmonics ``forms`` [16, n + 3].
 
-    Args:
-        rows: [n + 2, neurons]; overwritten.
-        radius: [neurons]; overwritten.
+    ``rows``: [n + 2, neurons]; overwritten. ``radius``: [neurons]; overwritten.
     """
     count, width = forms.shape
     rows[:] = 0.0
@@ -264,12 +250,8 @@ def look_at_direction(forms, head, rows, radius):
 def colors(z, count, seen, head, rooms, live, rest):
     """Neurons of colours before the sigmoid in ``rooms[-1]`` from those of the density's network; returns the rows.
 
-    Args:
-        z: `LayerZonotope` of the density's network, ``count`` rows.
-        seen: What `look_at_direction` made: rows and radius.
-        rooms: `LayerZonotope` of every layer.
-        live: [most neurons] scratch.
-        rest: [ROWS, two lines] scratch.
+    ``z`` is the `LayerZonotope` of the density's network, ``count`` rows; ``seen`` what `look_at_direction` made.
+    Others: see `finish`.
     """
     sizes_of(z, count)
     n = z.rows.shape[1]

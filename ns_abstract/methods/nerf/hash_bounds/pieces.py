@@ -361,11 +361,8 @@ def _on_part(form, line, low, high):
 def _keep(out, counts, place, cells, found, shown, line, low, high):
     """Unite the bounds of a piece with those ``out`` [parts, 2, 3] of all parts that it meets.
 
-    Args:
-        counts: [d] parts by axis.
-        place, cells: [d] the piece is number ``place`` of ``cells`` by axis.
-        found, shown: What `bound_piece` made.
-        low, high: [d] scratch.
+    ``counts`` [d] are parts by axis; the piece is number ``place`` of ``cells`` [d] by axis; ``found`` and ``shown``
+    are what `bound_piece` made; ``low`` and ``high`` [d] are scratch.
     """
     d = counts.shape[0]
     first, past, at = np.empty(d, np.int64), np.empty(d, np.int64), np.empty(d, np.int64)
@@ -476,13 +473,6 @@ def bound_ray(field, rays, ray, cells, deepest, most, goal, limits, shifts, room
 
 @njit(cache=True, error_model="numpy", nogil=True, **COUNTED)
 def bound_rays(field, rays, cells, deepest, most, goal, limits, shifts, room, counts, out, pieces):
-    """`bound_ray` of all rays.
-
-    Args:
-        cells: [r, d].
-        goal: [r, 3, 3].
-        out: [r, s or 1, parts, 2, 3]; overwritten.
-        pieces: [r, 3] what `bound_ray` returns; overwritten.
-    """
+    """`bound_ray` of r rays: ``cells`` [r, d], ``goal`` [r, 3, 3], ``out`` [r, ., parts, 2, 3], ``pieces`` [r, 3]."""
     for k in range(cells.shape[0]):
         pieces[k] = bound_ray(field, rays, k, cells[k], deepest, most, goal[k], limits, shifts, room, counts, out[k])

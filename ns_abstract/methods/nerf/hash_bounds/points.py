@@ -22,15 +22,10 @@ _ALONG = 0.25
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def line_form(coefficients, exponents, radius, middle, half, line, out):
-    """The polynomial ``sum_a c_a p^a`` on the box ``middle + half q`` as a form of ``q`` (design.md, H1).
+    """The polynomial ``sum_a c_a p^a`` on the box ``middle + half q`` as a form ``out`` of ``q`` (design.md, H1).
 
-    Args:
-        coefficients: [M].
-        exponents: [M, d].
-        radius: What the polynomial is off by.
-        middle, half: [d], inside of [-1, 1].
-        line: Whether second-order terms are followed: one parameter.
-        out: [n + 3].
+    ``coefficients`` [M], ``exponents`` [M, d]; the polynomial is off by ``radius``. ``middle`` and ``half`` [d] are
+    inside of [-1, 1]; ``line``: one parameter, so that second-order terms are followed.
     """
     terms, d = exponents.shape
     out[:] = 0.0
@@ -73,12 +68,9 @@ def line_form(coefficients, exponents, radius, middle, half, line, out):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def harmonics(direction, line, out, work):
-    """The 16 harmonics of ``(direction + 1) / 2`` as forms [16, n + 3] (``components_from_spherical_harmonics``).
+    """The 16 harmonics ``out`` of ``(direction + 1) / 2`` as forms (``components_from_spherical_harmonics``).
 
-    Args:
-        direction: [3, n + 3] forms.
-        out: [16, n + 3].
-        work: [9, n + 3].
+    ``direction`` [3, n + 3], ``out`` [16, n + 3] and ``work`` [9, n + 3] are forms.
     """
     x, y, z, nothing = work[0], work[1], work[2], work[3]
     xx, yy, zz, t, r = work[4], work[5], work[6], work[7], work[8]
@@ -134,11 +126,8 @@ def _negate(a, out):
 def quotients(origin, direction, line, ratios, shifts, along, work):
     """Forms by which far points are followed, by axis j: ``d_i / d_j`` and ``o_i - o_j d_i / d_j`` (design.md, H2).
 
-    Args:
-        origin, direction: [3, n + 3].
-        ratios, shifts: [3 (j), 3 (i), n + 3].
-        along: [3] whether those of an axis are made; overwritten.
-        work: [4, n + 3].
+    ``origin`` and ``direction`` are [3, n + 3]; ``ratios`` and ``shifts`` [3 (j), 3 (i), n + 3] and ``along`` [3],
+    whether those of an axis are made, are overwritten; ``work`` is [4, n + 3].
     """
     inverse, product = work[0], work[1]
     for j in range(3):
@@ -252,16 +241,10 @@ def _largest(x, axis, positive, room, line, difference):
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
 def point(ray, distance, line, out, work):
-    """Contracted point at ``distance`` as forms of ``(v + 2) / 4`` in [0, 1]^3 (design.md, H2).
+    """Contracted point ``out`` at ``distance`` as forms of ``(v + 2) / 4`` in [0, 1]^3 (design.md, H2).
 
-    Args:
-        ray: origin, direction [3, n + 3], and what `quotients` makes of them.
-        distance: [n + 3] with the place symbol.
-        out: [3, n + 3].
-        work: [13, n + 3].
-
-    Returns:
-        Whether the point surely lies inside of (0, 1)^3.
+    ``ray``: origin and direction [3, n + 3], and what `quotients` makes of them; ``distance`` [n + 3] has the place
+    symbol; ``work`` is [13, n + 3]. Returns whether the point surely lies inside of (0, 1)^3.
     """
     origin, direction, ratios, shifts, along = ray
     x, t = work[:3], work[3]

@@ -46,12 +46,8 @@ def is_compressed(elements: list[PlyElement]) -> bool:
 def decode_compressed_ply(path: Path, elements: list[PlyElement], mode: str | None, comment: str) -> DecodedSplats:
     """The Gaussians of a compressed .ply.
 
-    Args:
-        elements: What its header declares, checked against the file's size.
-        mode: "classic" or "antialiased" where a comment says it.
-
-    Raises:
-        InputError: The elements are not those of the format, or the file is damaged.
+    ``elements``: what its header declares, checked against the file's size. ``mode``: "classic" or "antialiased" where
+    a comment says it. Raises InputError where the elements are not those of the format, or the file is damaged.
     """
     count, bands = _check(elements, path)
     reserve(count, bands, path, 32 * count)

@@ -116,12 +116,8 @@ def float32_rows(
 ) -> StoredGaussians:
     """Rows rounded once to float32.
 
-    Args:
-        means, log_scales: [N, 3].
-        quats: [N, 4], (w, x, y, z).
-        opacity_logits: [N].
-        colors: [N, 3] coefficients of band 0.
-        rest: [N, K - 1, 3] coefficients of the other bands; None: there are none.
+    ``means`` and ``log_scales`` are [N, 3], ``quats`` [N, 4] (w, x, y, z), ``opacity_logits`` [N], ``colors`` [N, 3]
+    coefficients of band 0, ``rest`` [N, K - 1, 3] those of the other bands; None: there are none.
     """
     count = len(means)
     bands = 0 if rest is None else rest.shape[1]
@@ -144,11 +140,9 @@ def opacity_logits(values: Bytes) -> NDArray[np.float64]:
 
 
 def smallest_three(parts: NDArray[np.float64], largest: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Unit quaternions [N, 4] of which the largest component is left out.
+    """Unit quaternions [N, 4] of which the ``largest`` [N] component, 0 to 3, is left out; it is not negative.
 
-    Args:
-        parts: [N, 3] the other components, in the order of their places.
-        largest: [N] place of the component left out, 0 to 3; it is not negative.
+    ``parts`` [N, 3] are the other components, in the order of their places.
     """
     quats = np.empty((len(parts), 4))
     # places of the three others, by the place left out

@@ -45,11 +45,8 @@ def is_gsplat_checkpoint(path: Path) -> bool:
 def checkpoint(folder: Path, step: int | None) -> Path | None:
     """The first rank of a checkpoint in a folder or its ``ckpts``; None where there is none.
 
-    Args:
-        step: Whose checkpoint is wanted; None: the last one.
-
-    Raises:
-        InputError: There are checkpoints, but not of this step.
+    ``step``: whose checkpoint is wanted; None: the last one. Raises InputError where there are checkpoints, but not of
+    this step.
     """
     for inner in (folder, folder / "ckpts"):
         names = (_NAME.fullmatch(file.name) for file in inner.iterdir()) if inner.is_dir() else ()

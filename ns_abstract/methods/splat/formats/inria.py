@@ -20,11 +20,7 @@ _BACKGROUNDS = {True: (1.0, 1.0, 1.0), False: (0.0, 0.0, 0.0)}
 
 
 def point_cloud(folder: Path, iteration: int | None) -> Path:
-    """The .ply of a trained folder: of ``iteration``, or of the last one.
-
-    Raises:
-        InputError: There is none.
-    """
+    """The .ply of a trained folder: of ``iteration``, or of the last one. Raises InputError where there is none."""
     clouds = {}
     outer = folder / "point_cloud"
     for inner in outer.iterdir() if outer.is_dir() else ():
@@ -50,11 +46,7 @@ def arguments_beside(ply: Path) -> Path | None:
 
 
 def read_arguments(file: Path) -> dict[str, Any]:
-    """The names and literals of ``cfg_args``.
-
-    Raises:
-        InputError: It is not the text of a Namespace of literals.
-    """
+    """The names and literals of ``cfg_args``. Raises InputError where it is not the text of a Namespace of literals."""
     text = read_text(file, ARGUMENTS, _LIMIT)
     try:
         call = ast.parse(text.strip(), mode="eval").body

@@ -58,12 +58,8 @@ def decoder_of(path: Path) -> Decoder | None:
 def scene_file(folder: Path, iteration: int | None) -> Path | None:
     """The scene's file in a folder that another program wrote; None where there is none, so that it may be a run's.
 
-    Args:
-        folder: Of Inria's training, of a SOG scene, or of gsplat's trainer (or its ``ckpts``).
-        iteration: Whose result is wanted; None: the last one.
-
-    Raises:
-        InputError: The iteration is not there.
+    The ``folder`` is of Inria's training, of a SOG scene, or of gsplat's trainer (or its ``ckpts``). ``iteration``:
+    whose result is wanted; None: the last one. Raises InputError where the iteration is not there.
     """
     if (folder / "config.yml").is_file():
         return None

@@ -56,14 +56,9 @@ def is_archive(path: Path) -> bool:
 
 
 def decode_sog(path: Path, overrides: Overrides) -> DecodedSplats:
-    """The Gaussians of a SOG scene.
+    """The Gaussians of a SOG scene: an archive, its ``meta.json`` outside an archive, or the folder that holds it.
 
-    Args:
-        path: The archive, its ``meta.json`` outside an archive, or the folder that holds it.
-        overrides: ``rasterize_mode`` is given where the file's own cannot be understood.
-
-    Raises:
-        InputError: Of another version or model, or damaged.
+    Raises InputError where it is of another version or model, or damaged.
     """
     if path.is_dir() or path.suffix.lower() == ".json":
         file = path / META if path.is_dir() else path
