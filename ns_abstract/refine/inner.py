@@ -55,7 +55,7 @@ class InnerBound:
         return picture
 
     def render_middle(self) -> None:
-        """Render the pose in the middle of the set, which becomes `input_planes`."""
+        """Render the pose in the middle of the set, which becomes `image`."""
         self.image = self.render(self.tiles.frame.box.middle)
 
     def render_scenes(self, over: Callable[[], bool]) -> None:

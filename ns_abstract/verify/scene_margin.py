@@ -29,7 +29,7 @@ Outcome = Literal["holds", "falsified", "unknown"]
 class MarginTuning:
     """How a margin is searched for; what is claimed is what was proved of the last radius that held."""
 
-    #: Bisection ends where the ends are this close, by their quotient; radii tried first grow and shrink by `_STRIDE`.
+    #: Bisection ends where the ends are this close, by their quotient; radii tried first grow and shrink by `stride`.
     close: float = 1.1
     stride: float = 4.0
     #: A radius below this part of the first one is called 0.

@@ -127,7 +127,7 @@ class Store(StoreFile):
             self._seals.blocks.add((self._base.execute(query, row).lastrowid, *row))
 
     def pending(self, taken: set[int], count: int) -> list[CellBlock]:
-        """Up to ``count`` open blocks that are not in ``known``: those nearest to a proof, now and then the largest."""
+        """Up to ``count`` open blocks that are not in ``taken``: those nearest to a proof, now and then the largest."""
         blocks: list[CellBlock] = []
         for _ in range(count):
             self._turn += 1

@@ -75,7 +75,7 @@ def _shifted_square(s, n, left, factor, shift):
 
 @njit(cache=True, error_model="numpy")
 def basis_line(s, n, k):
-    """Basis function ``k`` >= 1 into its slot (`colors._basis_form`)."""
+    """Basis function ``k`` >= 1 into its slot (`colors.sh_basis`)."""
     if k == 1:
         _multiple(s, n, _Y, -0.48860251190292)
     elif k == 2:

@@ -158,7 +158,7 @@ class ThresholdCrossings(NamedTuple):
     Attributes:
         entries: [capacity] where they stand in the pixel's list.
         distances: [capacity, 8] by channel, the least and then the greatest of its colour minus what is behind.
-        rows: [jump_rows, room] numbers of each, see `threshold_crossings`.
+        rows: [R, room] numbers of each, in the R rows that `threshold_crossings` lists.
         room: Whole lanes.
     """
 

@@ -85,7 +85,7 @@ def pixels_once(k, listed, entries, per_pixel):
 
 @njit(cache=True, error_model="numpy")
 def pixels_at(lanes, pixels):
-    """The set of the pixels that stand in the lanes ``found``."""
+    """The set of the pixels that stand in ``pixels`` in these ``lanes``, a set of bits."""
     at = 0
     while lanes != 0:
         at |= 1 << int(pixels[lowest_bit(lanes)])

@@ -314,7 +314,7 @@ class Reference:
         return self._picture(camera, camera_to_world, self._blend)
 
     def layers(self, camera: PinholeCamera, camera_to_world: Tensor) -> Tensor:
-        """Accumulation and expected depth [H, W, 2], NaN where nothing is drawn; arguments as for `input_planes`."""
+        """Accumulation and expected depth [H, W, 2], NaN where nothing is drawn; arguments as for `image`."""
         return self._picture(camera, camera_to_world, self._blend_layers)
 
     def _picture(

@@ -97,7 +97,10 @@ class WeightBounds(SplatBounds):
     def _depth_range(
         self, forms: PoseForms, camera_magnitude: np.ndarray, candidates: np.ndarray, alive: np.ndarray
     ) -> tuple[Float64Array, Float64Array]:
-        """[k] bounds of the depths of candidates ``alive`` over the cell, in every evaluation of the program."""
+        """[k] bounds of the depths of candidates ``alive`` over the cell, in every evaluation of the program.
+
+        They are zeros where no channel asks for depths; `WhiteGaussians.between` looks at none then.
+        """
         if np.isinf(self.white.nearer).all():
             return np.zeros(alive.size), np.zeros(alive.size)
         m = forms.rotation.basis.monomials

@@ -54,7 +54,7 @@ class NeuronSelection:
     ) -> NodeForm:
         """The form of node ``index`` with better bounds of what is open before an activation or a product (None).
 
-        ``apart``: how far lines or planes are apart, as a part of what is between; None where ``open_`` says all.
+        ``apart``: how far lines or planes are apart, as a part of what is between; None where ``unstable`` says all.
         """
         form, unstable, apart = self.sharing.refinable(index, form, unstable, apart, layer)
         if self.network.depth[index] < 2:
