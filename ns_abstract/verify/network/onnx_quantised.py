@@ -9,8 +9,11 @@ from ns_abstract.arithmetic.network_charges import LEAST_DIVISOR
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network.composite_activations import Quantised
 from ns_abstract.verify.network.constant_enclosures import EnclosedConstant, exact_constant, scaled_integers
+from ns_abstract.verify.network.onnx_choices import without_choices
 from ns_abstract.verify.network.onnx_graph import Attributes, OnnxReader
 
+#: Operators that lay a matrix out otherwise and do not change its numbers.
+_LAID_OUT = ("Transpose", "Identity", "Reshape", "Squeeze", "Unsqueeze", "Flatten", "Cast")
 _RANGES = {
     np.dtype(kind): (np.iinfo(kind).min, np.iinfo(kind).max) for kind in (np.int8, np.uint8, np.int16, np.uint16)
 }
@@ -26,6 +29,8 @@ def dequantize(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
         q = r.weight(node, 0)
         if q.dtype.kind not in "iu":
             raise InputError(f"reads type {q.dtype}", fix="store integers")
+        if q.dtype.itemsize == 1:
+            _refuse_products(r, node)
         number = q.astype(np.int64) - (0 if zero is None else _along(zero.astype(np.int64), q.ndim, axis))
         dequantised = scaled_integers(number, exact_constant(_along(scale, q.ndim, axis)))
         if isinstance(dequantised, EnclosedConstant):
@@ -37,6 +42,29 @@ def dequantize(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     if quantised is None or quantised != own:
         raise InputError("has another scale than the QuantizeLinear before it", fix="quantise with one scale a value")
     r.values[node.output[0]] = r.values[node.input[0]]
+
+
+def _refuse_products(r: OnnxReader, node: onnx.NodeProto) -> None:
+    """Refuse a matrix of stored bytes that multiplies values in float32: onnxruntime rounds these to 8 bits, too.
+
+    It does so for MatMul, and for Gemm without transB (N25). Where the values are rounded to steps themselves, it
+    multiplies what the file says.
+    """
+    names, stepped = set(node.output), set[str]()
+    for reader in without_choices(r.graph):
+        if reader.op_type == "DequantizeLinear" and reader.input[0] not in r.constants:
+            stepped.update(reader.output)
+        read = names.intersection(reader.input)
+        if not read:
+            continue
+        if reader.op_type in _LAID_OUT:
+            names.update(reader.output)
+        straight = reader.op_type == "Gemm" and any(a.name == "transB" and a.i for a in reader.attribute)
+        straight = straight and not read.isdisjoint(node.output)
+        if reader.op_type in ("MatMul", "Gemm") and not straight and stepped.isdisjoint(reader.input[:2]):
+            problem = f"gives 8-bit weights to {reader.op_type} {reader.name or reader.output[0]}"
+            fix = "onnxruntime rounds what they multiply to 8 bits, too: store these weights as floats"
+            raise InputError(problem, fix=fix)
 
 
 def quantize(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
