@@ -55,7 +55,6 @@ def rescale(config: Path, scale: float) -> None:
     write_json(file, content | {"scale": scale})
 
 
-@pytest.mark.slow
 def test_certificates_know_constants_beside_the_network(blobs: Inputs, tmp_path: Path) -> None:
     net, prop = classifier(tmp_path / "net.onnx"), write_json(tmp_path / "prop.json", CLASSES)
     assert "model_data" not in certified(blobs, net, prop)

@@ -10,6 +10,22 @@ _FLUSHED = _TESTS + "test_flushed_numbers"
 
 NETWORKS = (
     Fault(
+        "epsilons before a mean are read",
+        "verify/network/onnx_epsilons.py",
+        "refuse_lost_epsilons",
+        "(second and not first)",
+        "False",
+        "test_network_epsilons.py::test_lost_epsilons_are_refused[epsilon first]",
+    ),
+    Fault(
+        "epsilons that callers may replace are read",
+        "verify/network/onnx_epsilons.py",
+        "refuse_lost_epsilons",
+        "node.input[1] in replaceable",
+        "False",
+        "test_network_epsilons.py::test_lost_epsilons_are_refused[epsilon given by callers]",
+    ),
+    Fault(
         "stored bytes multiply values of float32",
         "verify/network/onnx_quantised.py",
         "dequantize",
