@@ -53,6 +53,7 @@ RESULTS = (
         "self.job.method.dataset_scale",
         "1.0",
         f"{_FILES}::test_distances_of_loops_are_those_of_one_data_set",
+        compiled=True,
     ),
     Fault(
         "fingerprints leave out the numbers of Gaussians in their source",
