@@ -1,4 +1,4 @@
-"""Docstrings cite what exists: names in single backticks are those of the package, its files, or words that it reads."""
+"""Docstrings cite what exists: names in single backticks are of the package, its files, or words that it reads."""
 
 from __future__ import annotations
 

@@ -556,6 +556,47 @@ def test_values_that_are_rounded_to_steps_are_contained(seed: int, tmp_path: Pat
         assert (low <= value).all() and (value <= high).all() and (high - low < 1.0).all()
 
 
+def bytes_times_values(file: Path, through: str, product: str, integers: type = np.int8) -> Path:
+    """Values near 1/2 times a matrix of stored integers, and a constant that hides small differences."""
+    f, rng = OnnxFile((8,)), np.random.default_rng(0)
+    # the first that stores 16 bits
+    f.opset = 21 if integers is np.int16 else f.opset
+    x = f.node("Sigmoid")
+    if through == "steps":
+        x = quantised(f, x, 1.0 / 255.0, 0)
+    given = [f.constant(rng.integers(-128, 128, (8, 8)), integers), f.constant(0.001), f.constant(0, integers)]
+    w = f.node("DequantizeLinear", *given)
+    if through not in ("", "steps"):
+        w = f.node(through, w)
+    if product == "Gemm transB":
+        f.node("Gemm", x, w, transB=1)
+    else:
+        f.node(product, x, w)
+    f.node("Add", f.last, f.constant(np.full(8, 10.0)))
+    return f.write(file)
+
+
+@pytest.mark.parametrize("through, product", [("", "MatMul"), ("", "Gemm"), ("Transpose", "MatMul"),
+    ("Identity", "MatMul"), ("Transpose", "Gemm transB")])  # fmt: skip
+def test_bytes_that_multiply_values_are_refused(through: str, product: str, tmp_path: Path) -> None:
+    """There onnxruntime rounds the values, too, and its outputs leave the bounds."""
+    with pytest.raises(InputError, match="8-bit weights"):
+        load_network(bytes_times_values(tmp_path / "net.onnx", through, product))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("through, product, integers", [("", "Gemm transB", np.int8), ("steps", "MatMul", np.int8),
+    ("steps", "MatMul", np.uint8), ("", "MatMul", np.int16)])  # fmt: skip
+def test_integers_that_multiply_as_stored_are_contained(
+    through: str, product: str, integers: type, tmp_path: Path
+) -> None:
+    file = bytes_times_values(tmp_path / "net.onnx", through, product, integers)
+    for point in np.random.default_rng(1).normal(size=(20, 8)).astype(np.float32):
+        low, high = at(file, point)
+        value = run(file, point)
+        assert (low <= value).all() and (value <= high).all()
+
+
 def test_integers_that_are_read_as_values_are_refused(tmp_path: Path) -> None:
     f = OnnxFile((4,))
     x = f.last

@@ -10,6 +10,46 @@ _FLUSHED = _TESTS + "test_flushed_numbers"
 
 NETWORKS = (
     Fault(
+        "epsilons before a mean are read",
+        "verify/network/onnx_epsilons.py",
+        "refuse_lost_epsilons",
+        "(second and not first)",
+        "False",
+        "test_network_epsilons.py::test_lost_epsilons_are_refused[epsilon first]",
+    ),
+    Fault(
+        "epsilons that callers may replace are read",
+        "verify/network/onnx_epsilons.py",
+        "refuse_lost_epsilons",
+        "node.input[1] in replaceable",
+        "False",
+        "test_network_epsilons.py::test_lost_epsilons_are_refused[epsilon given by callers]",
+    ),
+    Fault(
+        "stored bytes multiply values of float32",
+        "verify/network/onnx_quantised.py",
+        "dequantize",
+        "q.dtype.itemsize == 1",
+        "False",
+        "test_network_reading.py::test_bytes_that_multiply_values_are_refused[-MatMul]",
+    ),
+    Fault(
+        "stored bytes are not followed through a transposition",
+        "verify/network/onnx_quantised.py",
+        "_refuse_products",
+        "reader.op_type in _LAID_OUT",
+        "False",
+        "test_network_reading.py::test_bytes_that_multiply_values_are_refused[Transpose-MatMul]",
+    ),
+    Fault(
+        "a transposed matrix of stored bytes is taken for one that Gemm transposes",
+        "verify/network/onnx_quantised.py",
+        "_refuse_products",
+        "straight and not read.isdisjoint(node.output)",
+        "straight",
+        "test_network_reading.py::test_bytes_that_multiply_values_are_refused[Transpose-Gemm transB]",
+    ),
+    Fault(
         "norm: variances of one pass are not negative",
         _NETWORK + "sparse_layers.py",
         "Variance.least",

@@ -2,7 +2,7 @@
 
 from planted.fault import Fault
 
-_VERSION = "io/version.py"
+_VERSION, _FILES = "io/version.py", "test_fingerprints.py"
 
 RESULTS = (
     Fault(
@@ -12,6 +12,56 @@ RESULTS = (
         '{**computed_by(), **self.method.fingerprint, **more, "poses": sets.hexdigest()}',
         '{**self.method.fingerprint, **more, "poses": sets.hexdigest()}',
         "test_stale.py::test_fingerprint_of_images_and_numbers_of_rules",
+    ),
+    Fault(
+        "fingerprints leave out constants beside a network",
+        "api/network_stamp.py",
+        "network_stamp",
+        "network.data",
+        "()",
+        f"{_FILES}::test_certificates_know_constants_beside_the_network",
+    ),
+    Fault(
+        "fingerprints of loops name the network's own file alone",
+        "api/loop_job.py",
+        "LoopJob._fingerprint",
+        'network_prints("network", self.network)',
+        '{"network": network_prints("network", self.network)["network"]}',
+        f"{_FILES}::test_loops_know_constants_beside_the_network",
+        compiled=True,
+    ),
+    Fault(
+        "checks leave out constants beside a network",
+        "check/verdicts.py",
+        "SeeingNetwork.__init__",
+        'report["model"].get("data") or {}',
+        "_digests(model)[1]",
+        f"{_FILES}::test_checks_know_constants_beside_the_network",
+    ),
+    Fault(
+        "fingerprints leave out the unit of a property's distances",
+        "api/picture_question.py",
+        "PictureQuestion.fingerprint",
+        "self._dataset_scale",
+        "1.0",
+        f"{_FILES}::test_distances_of_properties_are_those_of_one_data_set",
+    ),
+    Fault(
+        "fingerprints of loops leave out the unit of their pictures' distances",
+        "api/loop_job.py",
+        "LoopJob._fingerprint",
+        "self.job.method.dataset_scale",
+        "1.0",
+        f"{_FILES}::test_distances_of_loops_are_those_of_one_data_set",
+        compiled=True,
+    ),
+    Fault(
+        "fingerprints leave out the numbers of Gaussians in their source",
+        "methods/splat/method.py",
+        "SplatMethod.fingerprint",
+        "scene.stored is None",
+        "True",
+        f"{_FILES}::test_numbers_of_gaussians_in_their_source_are_compared",
     ),
     Fault(
         "the rules of images are not compared",

@@ -17,6 +17,7 @@ from ns_abstract.api.certification import MEMORY
 from ns_abstract.api.files import resized
 from ns_abstract.api.frame_pictures import PropertySource
 from ns_abstract.api.job import Job, require_sound_platform
+from ns_abstract.api.network_stamp import network_prints
 from ns_abstract.api.picture_question import PlanePictures
 from ns_abstract.api.scenes import Scene
 from ns_abstract.arithmetic.forms import MAX_DIMENSIONS
@@ -31,7 +32,6 @@ from ns_abstract.reach.loop import Loop, load_loop, parse_loop, within_field
 from ns_abstract.reach.pictures import Pictures, PropertyView
 from ns_abstract.reach.search import QUESTIONS, LoopBlockResult, LoopSearch
 from ns_abstract.reach.tubes import ControlBounds, Dependence, TubeBuilder
-from ns_abstract.report.run import file_stamp
 from ns_abstract.verify.camera_response import CameraResponse
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.model import NetworkModel
@@ -174,15 +174,17 @@ class LoopJob:
     def _fingerprint(self) -> dict[str, Any]:
         text = json.dumps(self.loop.value, sort_keys=True)
         law = self.loop.dynamics
-        learned = {"dynamics": file_stamp(law.file)["sha256"]} if isinstance(law, LearnedDynamics) else {}
+        learned = network_prints("dynamics", law.network) if isinstance(law, LearnedDynamics) else {}
         if self.loop.views:
             # masks and lists of Gaussians are files of their own
             stated = [self.loop.value.get(key) for key in ("unsafe", "goal")]
             learned["views"] = PropertySource(stated, self.loop.network.absolute()).stamped
+            # distances may be stated in units of the data set
+            learned["dataset_scale"] = self.job.method.dataset_scale
         return {
             **self.job.fingerprint,
             **learned,
-            "network": file_stamp(self.loop.network)["sha256"],
+            **network_prints("network", self.network),
             "loop": hashlib.sha256(text.encode()).hexdigest(),
             "network_arithmetic": self.model.arithmetic,
             "rules": _RULES,

@@ -10,6 +10,7 @@ import numpy as np
 
 from ns_abstract.api.cell_search import CellSearch, Row
 from ns_abstract.api.loop_job import LoopJob
+from ns_abstract.api.network_stamp import network_stamp
 from ns_abstract.execution.cancellation import Deadline, WorkCancelledError, cancel_when
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.reach.film import along, film_size, made
@@ -19,7 +20,7 @@ from ns_abstract.reach.search import QUESTIONS, Question, SimulatedRun, sampled_
 from ns_abstract.reach.tubes import Dependence, Tube
 from ns_abstract.report.certificate import SCENE_MARGIN, search_figures
 from ns_abstract.report.outside import SceneDrawing
-from ns_abstract.report.run import CommandRun, file_stamp, plain
+from ns_abstract.report.run import CommandRun, plain
 from ns_abstract.verify.search_results import Verdict
 from ns_abstract.verify.store import Store, Tally, fractions
 
@@ -140,7 +141,7 @@ class LoopReport:
         learned: dict[str, Any] = {}
         if isinstance(loop.dynamics, LearnedDynamics):
             law = loop.dynamics
-            learned = {"dynamics_model": file_stamp(law.file), "dynamics_guarantee": law.network.guarantee()}
+            learned = {"dynamics_model": network_stamp(law.network), "dynamics_guarantee": law.network.guarantee()}
         return plain(
             self.about.head()
             | {
@@ -149,7 +150,7 @@ class LoopReport:
                 "questions": entries,
                 "network_guarantee": job.network.guarantee(job.model.arithmetic),
                 "intrinsics": job.job.pose_sets[0].camera.intrinsics._asdict(),
-                "model": file_stamp(loop.network),
+                "model": network_stamp(job.network),
                 "loop": loop.value,
                 "dynamics": loop.dynamics.about,
                 **learned,

@@ -11,11 +11,11 @@ from ns_abstract.api.assumptions import choice
 from ns_abstract.api.files import resized
 from ns_abstract.api.frame_pictures import FramePictures, PropertySource
 from ns_abstract.api.job import Job
+from ns_abstract.api.network_stamp import network_prints, network_stamp
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.refine.protocol import Method
-from ns_abstract.report.run import file_stamp
 from ns_abstract.verify.eight_bit import Picture
 from ns_abstract.verify.model import NetworkModel
 from ns_abstract.verify.network import NetworkArithmetic, load_network
@@ -110,11 +110,11 @@ class Question:
     def describe(self) -> dict[str, Any]:
         """The network for reports."""
         shapes = {"input": self.network.input_shape, "output": self.network.output_shape}
-        return {**file_stamp(self.model), **shapes}
+        return {**network_stamp(self.network), **shapes}
 
     def fingerprint(self, arithmetic: NetworkArithmetic) -> dict[str, Any]:
         """What a stored search must agree with beside the property."""
-        return {"model": file_stamp(self.model)["sha256"], "network_arithmetic": arithmetic}
+        return {**network_prints("model", self.network), "network_arithmetic": arithmetic}
 
     def choices(self, arithmetic: NetworkArithmetic, picture: Picture) -> tuple[Assumption, ...]:
         """What verdicts about the network rest on, and where each choice came from."""

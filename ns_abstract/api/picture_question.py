@@ -292,6 +292,7 @@ class PictureQuestion:
 
     def __init__(self, source: PropertySource) -> None:
         self.source = source
+        self._dataset_scale = 1.0
         self.property = self._parsed(1.0)
 
     def _parsed(self, dataset_scale: float) -> PictureProperty:
@@ -311,7 +312,8 @@ class PictureQuestion:
         Raises:
             InputError: A region reaches beyond the pictures, or a selection picks nothing.
         """
-        self.property = self._parsed(job.method.dataset_scale)
+        self._dataset_scale = job.method.dataset_scale
+        self.property = self._parsed(self._dataset_scale)
         sizes = {(poses.camera.height, poses.camera.width) for poses in job.pose_sets}
         if len(sizes) > 1:
             raise self.source.within(
@@ -359,8 +361,8 @@ class PictureQuestion:
         return {"name": self.name}
 
     def fingerprint(self, arithmetic: NetworkArithmetic) -> dict[str, Any]:
-        """Nothing beside the property, whose files it names."""
-        return {"model": None}
+        """What a stored search must agree with beside the property: the length of a unit of the data set."""
+        return {"model": None, "dataset_scale": self._dataset_scale}
 
     def choices(self, arithmetic: NetworkArithmetic, picture: Picture) -> tuple[Assumption, ...]:
         """What verdicts rest on."""

@@ -44,6 +44,9 @@ def statement(folder: Path) -> tuple[dict[str, Any], list[str]]:
     subjects = [scene, *_run_files(report, notes)]
     if report.get("model"):
         subjects.append(_subject(report["model"]["name"], report["model"]["sha256"], of="the network's file"))
+    for name in ("model_data", "network_data", "dynamics_data"):
+        for file, digest in prints.get(name, {}).items():
+            subjects.append(_subject(file, digest, of="a file of constants beside the network"))
     if "dynamics" in prints:
         subjects.append(_subject("dynamics", prints["dynamics"], of="the file of the dynamics"))
     for name in ("property", "loop"):

@@ -192,6 +192,8 @@ class SplatMethod:
             "renderer": self.rasteriser.name,
             "version": self.rasteriser.version,
             "arithmetic": self.arithmetic.name,
+            # selections name Gaussians by their numbers in the source
+            **({} if scene.stored is None else {"stored": hashlib.sha256(scene.stored.tobytes()).hexdigest()}),
             **({"bounded": "Gaussians alone"} if scene.gaussians_alone else {}),
         }
 

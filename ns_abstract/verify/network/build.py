@@ -62,8 +62,11 @@ class NetworkBuilder:
                 break
             self.nodes[k - 1] = replace(self.nodes[k - 1], name=name, op=op)
 
-    def network(self, output: int, name: str = "", whole_numbers: bool = False) -> Network:
-        """The network whose output is node ``output``, called ``name``, without nodes that it does not need."""
+    def network(self, output: int, name: str = "", whole_numbers: bool = False, data: Sequence[Path] = ()) -> Network:
+        """The network whose output is node ``output``, called ``name``, without nodes that it does not need.
+
+        ``data`` names the files beside the model that hold constants.
+        """
         needed = {output}
         for k in range(output, 0, -1):
             if k in needed:
@@ -83,7 +86,7 @@ class NetworkBuilder:
             nodes_kept.pop()
             if len(shape) == 1 and len(before) == 3:
                 shape = before
-        return Network(self.path, self.input_shape, nodes_kept, shape, name, whole_numbers)
+        return Network(self.path, self.input_shape, nodes_kept, shape, name, whole_numbers, data)
 
     def _check_size(self, shape: Sequence[int]) -> None:
         if any(v < 1 for v in shape) or int(np.prod([float(v) for v in shape])) > _LARGEST:

@@ -62,6 +62,7 @@ class Network:
         output_shape: One item of the last node, as the file says it.
         output: The output's name in the file.
         whole_numbers: Whether it takes whole numbers from 0 to 255 alone.
+        data: Files beside ``source`` that hold some of its constants.
     """
 
     def __init__(
@@ -72,6 +73,7 @@ class Network:
         output_shape: Shape,
         output: str = "",
         whole_numbers: bool = False,
+        data: Sequence[Path] = (),
     ) -> None:
         self.source = source
         self.input_shape = tuple(input_shape)
@@ -79,9 +81,10 @@ class Network:
         self.output_shape = tuple(output_shape)
         self.output = output
         self.whole_numbers = whole_numbers
+        self.data = tuple(data)
 
     def __getstate__(self) -> dict[str, Any]:
-        fields = ("source", "input_shape", "nodes", "output_shape", "output", "whole_numbers")
+        fields = ("source", "input_shape", "nodes", "output_shape", "output", "whole_numbers", "data")
         return {name: self.__dict__[name] for name in fields}
 
     @property

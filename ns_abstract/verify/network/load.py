@@ -13,6 +13,7 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import file_size, show
 from ns_abstract.verify.network.comparison import Evaluate, compare, levels, probes
 from ns_abstract.verify.network.graph import Network
+from ns_abstract.verify.network.onnx_epsilons import refuse_lost_epsilons
 from ns_abstract.verify.network.onnx_graph import OnnxReader, ReadRequest, operator_set
 from ns_abstract.verify.network.onnx_rules import RULES
 from ns_abstract.verify.network.onnx_tensors import PACKED, parse_model, unpacked_model
@@ -68,6 +69,7 @@ def read_onnx(path: Path, asked: ReadRequest | None = None) -> Network:
         InputError: The file cannot be read, or uses what is not supported; names node, operator and attribute.
     """
     model = parse_model(path)
+    refuse_lost_epsilons(model.graph, path)
     return OnnxReader(path, model.graph, operator_set(model, path), RULES, asked or ReadRequest()).network()
 
 

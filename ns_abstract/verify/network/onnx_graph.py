@@ -254,7 +254,7 @@ class OnnxReader:
             raise InputError(f"output {name!r} holds integers", file=self.path, field="graph.output")
         if name in self.dropped:
             raise InputError(f"output {name!r} holds minus infinity", file=self.path, field="graph.output")
-        return self.builder.network(self.values[name].index, name, self.whole_numbers)
+        return self.builder.network(self.values[name].index, name, self.whole_numbers, self.stored.files)
 
     def _chosen(self, asked: str | None) -> str:
         """The name of the output that is read: the one asked for, or the only one of scores.

@@ -11,12 +11,11 @@ import onnx
 from ns_abstract.arithmetic.network_charges import LEAST_DIVISOR
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import activations
-from ns_abstract.verify.network.composite_activations import Quantised
 from ns_abstract.verify.network.composite_layers import CompositeBuilder
-from ns_abstract.verify.network.constant_enclosures import EnclosedConstant, exact_constant, scaled_integers
 from ns_abstract.verify.network.onnx_arithmetic import ARITHMETIC_RULES
 from ns_abstract.verify.network.onnx_graph import Attributes, OnnxReader, Rule
 from ns_abstract.verify.network.onnx_norms import NORM_RULES
+from ns_abstract.verify.network.onnx_quantised import dequantize, quantize
 from ns_abstract.verify.network.onnx_shapes import SHAPE_RULES
 from ns_abstract.verify.network.onnx_windows import WINDOW_RULES
 from ns_abstract.verify.network.scalar_function import ScalarFunction
@@ -133,67 +132,6 @@ def _number(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     r.fold(node, np.array(math.prod(r.value(node).whole), np.int64))
 
 
-# ---------------------------------------------------------------- quantised files (N25)
-
-_RANGES = {
-    np.dtype(kind): (np.iinfo(kind).min, np.iinfo(kind).max) for kind in (np.int8, np.uint8, np.int16, np.uint16)
-}
-
-
-def _dequantize(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
-    """``(q - zero) scale``: of constants a constant, of values what their `_quantize` has left."""
-    axis = int(a.get("axis", 1))
-    a.only("block_size", 0)
-    a.ignore("output_dtype")
-    scale, zero = r.weight(node, 1), r.constant(node, 2)
-    if node.input[0] in r.constants:
-        q = r.weight(node, 0)
-        if q.dtype.kind not in "iu":
-            raise InputError(f"reads type {q.dtype}", fix="store integers")
-        number = q.astype(np.int64) - (0 if zero is None else _along(zero.astype(np.int64), q.ndim, axis))
-        dequantised = scaled_integers(number, exact_constant(_along(scale, q.ndim, axis)))
-        if isinstance(dequantised, EnclosedConstant):
-            r.enclosed[node.output[0]] = dequantised
-        r.fold(node, dequantised.value if isinstance(dequantised, EnclosedConstant) else dequantised)
-        return
-    quantised = r.quantised.get(node.input[0])
-    own = _scalar(scale), 0 if zero is None else int(np.reshape(zero, -1)[0])
-    if quantised is None or quantised != own:
-        raise InputError("has another scale than the QuantizeLinear before it", fix="quantise with one scale a value")
-    r.values[node.output[0]] = r.values[node.input[0]]
-
-
-def _quantize(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
-    """A value rounded to steps; what reads it must dequantise it."""
-    a.ignore("axis", "saturate", "output_dtype")
-    a.only("block_size", 0)
-    x, scale, zero = r.value(node), r.weight(node, 1), r.constant(node, 2)
-    step = _scalar(scale)
-    kind = np.dtype(np.uint8) if zero is None else zero.dtype
-    if kind not in _RANGES or not LEAST_DIVISOR < step < 1.0 / LEAST_DIVISOR or (zero is not None and zero.size != 1):
-        raise InputError(f"scale {step:g} of type {kind}", fix="use 8 or 16 bits and one positive scale")
-    offset = 0 if zero is None else int(np.reshape(zero, -1)[0])
-    low, high = (step * (end - offset) for end in _RANGES[kind])
-    index = r.builder.curve(x.index, Quantised, least=low, most=high, step=step)
-    r.result(node, index, x.whole)
-    r.quantised[node.output[0]] = step, offset
-
-
-def _scalar(scale: np.ndarray) -> float:
-    if scale.size != 1 or scale.dtype.kind != "f":
-        raise InputError(f"scales of shape {list(scale.shape)}", fix="quantise values with one scale")
-    return float(scale.reshape(-1)[0])
-
-
-def _along(value: np.ndarray, rank: int, axis: int) -> np.ndarray:
-    """A number for each place along an axis, spread to ``rank`` axes; a single one as it is."""
-    if value.size == 1:
-        return value.reshape(())
-    if value.ndim != 1 or not -rank <= axis < rank:
-        raise InputError(f"scales of shape {list(value.shape)}", fix="give one, or one for each place along an axis")
-    return value.reshape([-1 if k == axis % rank else 1 for k in range(rank)])
-
-
 #: The rule of every operator that is read.
 RULES: dict[str, Rule] = {
     "Abs": _curve(activations.Abs),
@@ -201,7 +139,7 @@ RULES: dict[str, Rule] = {
     "Celu": _unary(_celu),
     "Clip": _clip,
     "Constant": _constant,
-    "DequantizeLinear": _dequantize,
+    "DequantizeLinear": dequantize,
     "Dropout": _dropout,
     "Elu": _unary(_elu),
     "Erf": _curve(activations.Erf),
@@ -215,7 +153,7 @@ RULES: dict[str, Rule] = {
     "Mish": _curve(activations.Mish),
     "Neg": _unary(lambda b, x, a: b.scale(x, -np.ones(()), None)),
     "PRelu": _prelu,
-    "QuantizeLinear": _quantize,
+    "QuantizeLinear": quantize,
     "Reciprocal": _unary(lambda b, x, a: b.reciprocal(x)),
     "Relu": _unary(lambda b, x, a: b.leaky_relu(x, 0.0)),
     "Selu": _unary(_selu),

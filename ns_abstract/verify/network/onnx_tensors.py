@@ -139,6 +139,11 @@ class StoredTensors:
         self._sizes: dict[Path, int] = {}
         self._taken = 0
 
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Files beside the model from which tensors were read."""
+        return tuple(self._sizes)
+
     def array(self, tensor: onnx.TensorProto, field: str) -> np.ndarray:
         """A stored constant; InputError if it claims more than is stored, or cannot be used."""
         count = 1

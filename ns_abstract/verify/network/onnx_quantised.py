@@ -1,0 +1,98 @@
+"""Quantised ONNX files: weights stored as integers, and values that are rounded to steps on the way (N25)."""
+
+from __future__ import annotations
+
+import numpy as np
+import onnx
+
+from ns_abstract.arithmetic.network_charges import LEAST_DIVISOR
+from ns_abstract.io.errors import InputError
+from ns_abstract.verify.network.composite_activations import Quantised
+from ns_abstract.verify.network.constant_enclosures import EnclosedConstant, exact_constant, scaled_integers
+from ns_abstract.verify.network.onnx_choices import without_choices
+from ns_abstract.verify.network.onnx_graph import Attributes, OnnxReader
+
+#: Operators that lay a matrix out otherwise and do not change its numbers.
+_LAID_OUT = ("Transpose", "Identity", "Reshape", "Squeeze", "Unsqueeze", "Flatten", "Cast")
+_RANGES = {
+    np.dtype(kind): (np.iinfo(kind).min, np.iinfo(kind).max) for kind in (np.int8, np.uint8, np.int16, np.uint16)
+}
+
+
+def dequantize(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
+    """``(q - zero) scale``: of constants a constant, of values what their `quantize` has left."""
+    axis = int(a.get("axis", 1))
+    a.only("block_size", 0)
+    a.ignore("output_dtype")
+    scale, zero = r.weight(node, 1), r.constant(node, 2)
+    if node.input[0] in r.constants:
+        q = r.weight(node, 0)
+        if q.dtype.kind not in "iu":
+            raise InputError(f"reads type {q.dtype}", fix="store integers")
+        if q.dtype.itemsize == 1:
+            _refuse_products(r, node)
+        number = q.astype(np.int64) - (0 if zero is None else _along(zero.astype(np.int64), q.ndim, axis))
+        dequantised = scaled_integers(number, exact_constant(_along(scale, q.ndim, axis)))
+        if isinstance(dequantised, EnclosedConstant):
+            r.enclosed[node.output[0]] = dequantised
+        r.fold(node, dequantised.value if isinstance(dequantised, EnclosedConstant) else dequantised)
+        return
+    quantised = r.quantised.get(node.input[0])
+    own = _scalar(scale), 0 if zero is None else int(np.reshape(zero, -1)[0])
+    if quantised is None or quantised != own:
+        raise InputError("has another scale than the QuantizeLinear before it", fix="quantise with one scale a value")
+    r.values[node.output[0]] = r.values[node.input[0]]
+
+
+def _refuse_products(r: OnnxReader, node: onnx.NodeProto) -> None:
+    """Refuse a matrix of stored bytes that multiplies values in float32: onnxruntime rounds these to 8 bits, too.
+
+    It does so for MatMul, and for Gemm without transB (N25). Where the values are rounded to steps themselves, it
+    multiplies what the file says.
+    """
+    names, stepped = set(node.output), set[str]()
+    for reader in without_choices(r.graph):
+        if reader.op_type == "DequantizeLinear" and reader.input[0] not in r.constants:
+            stepped.update(reader.output)
+        read = names.intersection(reader.input)
+        if not read:
+            continue
+        if reader.op_type in _LAID_OUT:
+            names.update(reader.output)
+        straight = reader.op_type == "Gemm" and any(a.name == "transB" and a.i for a in reader.attribute)
+        straight = straight and not read.isdisjoint(node.output)
+        if reader.op_type in ("MatMul", "Gemm") and not straight and stepped.isdisjoint(reader.input[:2]):
+            problem = f"gives 8-bit weights to {reader.op_type} {reader.name or reader.output[0]}"
+            fix = "onnxruntime rounds what they multiply to 8 bits, too: store these weights as floats"
+            raise InputError(problem, fix=fix)
+
+
+def quantize(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
+    """A value rounded to steps; what reads it must dequantise it."""
+    a.ignore("axis", "saturate", "output_dtype")
+    a.only("block_size", 0)
+    x, scale, zero = r.value(node), r.weight(node, 1), r.constant(node, 2)
+    step = _scalar(scale)
+    kind = np.dtype(np.uint8) if zero is None else zero.dtype
+    if kind not in _RANGES or not LEAST_DIVISOR < step < 1.0 / LEAST_DIVISOR or (zero is not None and zero.size != 1):
+        raise InputError(f"scale {step:g} of type {kind}", fix="use 8 or 16 bits and one positive scale")
+    offset = 0 if zero is None else int(np.reshape(zero, -1)[0])
+    low, high = (step * (end - offset) for end in _RANGES[kind])
+    index = r.builder.curve(x.index, Quantised, least=low, most=high, step=step)
+    r.result(node, index, x.whole)
+    r.quantised[node.output[0]] = step, offset
+
+
+def _scalar(scale: np.ndarray) -> float:
+    if scale.size != 1 or scale.dtype.kind != "f":
+        raise InputError(f"scales of shape {list(scale.shape)}", fix="quantise values with one scale")
+    return float(scale.reshape(-1)[0])
+
+
+def _along(value: np.ndarray, rank: int, axis: int) -> np.ndarray:
+    """A number for each place along an axis, spread to ``rank`` axes; a single one as it is."""
+    if value.size == 1:
+        return value.reshape(())
+    if value.ndim != 1 or not -rank <= axis < rank:
+        raise InputError(f"scales of shape {list(value.shape)}", fix="give one, or one for each place along an axis")
+    return value.reshape([-1 if k == axis % rank else 1 for k in range(rank)])

@@ -1,0 +1,133 @@
+"""Stored results go on, and are checked, only with the files that they were computed from."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import pytest
+from certifying import classifier
+from conftest import Inputs, blob_scene
+from onnx.external_data_helper import convert_model_to_external_data
+
+import ns_abstract as nsa
+from ns_abstract.api.certification import CertifySettings, open_certification
+from ns_abstract.api.files import Settings
+from ns_abstract.api.reaching import open_loop
+from ns_abstract.check.inputs import BadInput
+from ns_abstract.check.verdicts import SeeingNetwork
+from ns_abstract.demo.writing import write_loop_demo
+from ns_abstract.io.atomic import write_json
+from ns_abstract.methods.splat.drawable import StoredGaussians, drawable
+from ns_abstract.methods.splat.method import SplatMethod
+from ns_abstract.report.run import file_stamp
+
+CLASSES = {"type": "classification", "label": 0, "preprocess": {"resize": [16, 16]}}
+#: Of the picture, at a distance in units of the data set.
+DISTANCE = {"type": "clear", "distance": 0.5, "units": "dataset", "preprocess": {"resize": [16, 16]}}
+
+
+def apart(file: Path) -> Path:
+    """Move a network's constants into a file beside it; returns that file."""
+    model = onnx.load(str(file))
+    convert_model_to_external_data(model, location=f"{file.stem}.bin", size_threshold=0)
+    onnx.save(model, str(file))
+    return file.with_suffix(".bin")
+
+
+def nudge(file: Path) -> None:
+    """Change one number of a file of float32, and nothing else of the file."""
+    numbers = np.fromfile(file, np.float32)
+    numbers[np.argmax(np.abs(numbers))] *= 1.5
+    file.write_bytes(numbers.tobytes())
+
+
+def certified(blobs: Inputs, net: Path | None, prop: Path) -> dict[str, Any]:
+    return open_certification(CertifySettings(Settings(blobs.config, blobs.path, blobs.spec), net, prop)).fingerprint
+
+
+def rescale(config: Path, scale: float) -> None:
+    file = config.parent / "dataparser_transforms.json"
+    content = json.loads(file.read_text())
+    write_json(file, content | {"scale": scale})
+
+
+def test_certificates_know_constants_beside_the_network(blobs: Inputs, tmp_path: Path) -> None:
+    net, prop = classifier(tmp_path / "net.onnx"), write_json(tmp_path / "prop.json", CLASSES)
+    assert "model_data" not in certified(blobs, net, prop)
+    data = apart(net)
+    before, model = certified(blobs, net, prop), net.read_bytes()
+    assert certified(blobs, net, prop) == before and list(before.get("model_data", {})) == [data.name]
+    nudge(data)
+    after = certified(blobs, net, prop)
+    assert net.read_bytes() == model and after["model"] == before["model"] and after != before
+
+
+@pytest.mark.slow
+def test_loops_know_constants_beside_the_network(tmp_path: Path) -> None:
+    config, loop = write_loop_demo(tmp_path)
+    data = apart(loop.parent / json.loads(loop.read_text())["network"])
+    prints = []
+    for _ in range(2):
+        prints.append(open_loop(nsa.load_scene(config), loop).fingerprint)
+        nudge(data)
+    assert prints[0] != prints[1] and prints[0]["network"] == prints[1]["network"]
+
+
+def test_checks_know_constants_beside_the_network(tmp_path: Path) -> None:
+    net = classifier(tmp_path / "net.onnx")
+    data = apart(net)
+    stamp = {"sha256": file_stamp(net)["sha256"]}
+    sums = {data.name: file_stamp(data)["sha256"]}
+    report = {"model": stamp | {"data": sums}, "fingerprint": {}}
+    scene: Any = None
+    SeeingNetwork(scene, report, net, {})
+    with pytest.raises(BadInput, match="is not the network of the result"):
+        SeeingNetwork(scene, report | {"model": stamp}, net, {})
+    nudge(data)
+    with pytest.raises(BadInput, match="is not the network of the result"):
+        SeeingNetwork(scene, report, net, {})
+    data.unlink()
+    with pytest.raises(BadInput, match="lacks a file"):
+        SeeingNetwork(scene, report, net, {})
+
+
+def test_distances_of_properties_are_those_of_one_data_set(make_blobs: Any, tmp_path: Path) -> None:
+    blobs = make_blobs()
+    prop = write_json(tmp_path / "prop.json", DISTANCE)
+    prints = []
+    for scale in (0.5, 0.5, 0.25):
+        rescale(blobs.config, scale)
+        prints.append(certified(blobs, None, prop))
+    assert prints[0] == prints[1] != prints[2]
+
+
+@pytest.mark.slow
+def test_distances_of_loops_are_those_of_one_data_set(tmp_path: Path) -> None:
+    config, loop = write_loop_demo(tmp_path)
+    content = json.loads(loop.read_text())
+    write_json(loop, content | {"unsafe": [*content["unsafe"], DISTANCE]})
+    prints = []
+    for scale in (0.5, 0.25):
+        rescale(config, scale)
+        prints.append(open_loop(nsa.load_scene(config), loop).fingerprint)
+    assert prints[0] != prints[1]
+
+
+def test_numbers_of_gaussians_in_their_source_are_compared() -> None:
+    """Selections name Gaussians so: the same ones behind one that is never drawn have other numbers."""
+    scene = blob_scene(4)
+    prints = []
+    for place in (0, 2):
+        keep = np.insert(np.arange(4), place, 0)
+        arrays = {name: getattr(scene, name)[keep] for name in ("means", "log_scales", "quats", "opacity_logits", "sh")}
+        arrays["means"][place] = np.nan
+        rows, dropped = drawable(
+            StoredGaussians(**arrays), Path("a.ply"), dict.fromkeys(("scales", "quats", "opacities", "colours"), "")
+        )
+        again = type(scene)(**{**vars(scene), **vars(rows), **dropped})
+        prints.append(SplatMethod(again, None, None).fingerprint)
+    assert prints[0]["scene"] == prints[1]["scene"] and prints[0] != prints[1]
