@@ -149,7 +149,7 @@ class Disc:
         self.box, self.lie, self.bounded = interval(2), lie, 0
         self.radii = np.linspace(0.4, 0.9, PIXELS)
 
-    def image(self, values: np.ndarray) -> np.ndarray:
+    def image(self, values: np.ndarray, member: Any = None) -> np.ndarray:
         return (0.5 + self.radii**2 - values @ values).reshape(1, PIXELS, 1).astype(np.float32)
 
     def sets(self, box: ParameterBox) -> Any:
