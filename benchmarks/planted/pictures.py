@@ -137,11 +137,6 @@ PICTURES = (
         "test_part_proofs.py::test_parts_are_attacked",
     ),
     Fault(
-        "proved parts: cells with a failing pose are not bounded", "verify/search.py", "Search.examine",
-        "[k for k in broken if samples[k].hopeless]", "broken",
-        "test_part_proofs.py::test_cells_are_certified_in_parts",
-    ),
-    Fault(
         "near cells: settled pixels have their lower bounds", _NEARBY, "NearbyPictures.sets",
         "box_bounds.upper.copy()", "box_bounds.lower.copy()", _NEAR,
     ),
