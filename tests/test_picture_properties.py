@@ -26,7 +26,7 @@ from ns_abstract.io.atomic import write_json
 from ns_abstract.io.errors import InputError
 from ns_abstract.refine.protocol import WeightPlane
 from ns_abstract.verify.network import OutputBounds
-from ns_abstract.verify.picture_measures import CellParts, Measure, PlaneSets, ranked
+from ns_abstract.verify.picture_measures import CellParts, Measure, PlaneSets, ranked, shared_counts
 from ns_abstract.verify.picture_properties import FARTHEST, PictureClaim, parse_picture_property
 
 SWEEP = {"version": 1, "translation": {"x": 0.15}}
@@ -82,7 +82,7 @@ def test_measures_stay_inside(d: int) -> None:
             0.3 if k == 7 else math.inf,
         )  # fmt: skip
         first = 0 if k % 2 else 1
-        parts = CellParts.along(rng.uniform(0.1, 1.0, d), 16)
+        parts = CellParts.equal(shared_counts(rng.uniform(0.1, 1.0, d), 16))
         low, high = measure.bounds(sets, first, parts)
         for _ in range(6):
             p = rng.choice([-1.0, 1.0], d) if rng.random() < 0.3 else rng.uniform(-1.0, 1.0, d)
@@ -114,12 +114,12 @@ def test_parts_follow_the_pose() -> None:
     a, b = np.array([[[1.0]], [[-1.0]]], np.float32), np.zeros((2, 1), np.float32)
     sets = PlaneSets((a, b, a, b), np.full((2, 1), -1.0), np.full((2, 1), 1.0))
     measure = Measure("depth", (1.0,), 1, np.arange(2))
-    assert measure.bounds(sets, 0, CellParts.along(np.ones(1), 1))[0].min() < -0.99
-    assert -0.07 < measure.bounds(sets, 0, CellParts.along(np.ones(1), 32))[0].min() <= 0.0
+    assert measure.bounds(sets, 0, CellParts.equal(np.array([1])))[0].min() < -0.99
+    assert -0.07 < measure.bounds(sets, 0, CellParts.equal(np.array([32])))[0].min() <= 0.0
     # what both regions do together cancels
     same = PlaneSets((np.abs(a), b, np.abs(a), b), sets.lower, sets.upper)
     both = Measure("depth", (1.0,), None, np.zeros(1, int), minus=np.ones(1, int))
-    low, high = both.bounds(same, 0, CellParts.along(np.ones(1), 1))
+    low, high = both.bounds(same, 0, CellParts.equal(np.array([1])))
     assert -1e-9 < low.min() <= 0.0 <= high.max() < 1e-9
 
 

@@ -14,6 +14,7 @@ _DEPTHS = "test_picture_properties.py::test_depths_where_nothing_may_be_drawn"
 _SETTLED, _ENCLOSING, _NEARBY = (
     "verify/settled_pixels.py", "verify/enclosing_boxes.py", "api/nearby_pictures.py",
 )  # fmt: skip
+_PARTS, _HOLD = "verify/part_proofs.py", "test_part_proofs.py::test_parts_that_are_proved_hold_everywhere[2]"
 _CHANGE = "test_nearby_pictures.py::test_settled_pixels_change_no_verdict"
 _NEAR = "test_nearby_pictures.py::test_pictures_near_a_cell_are_those_of_the_set"
 _RAYS = "test_picture_weights.py::test_the_brightest_rays_are_bounded_first"
@@ -107,6 +108,33 @@ PICTURES = (
         "cells: compared cuts are not made", "verify/search.py", "Search._verdicts",
         "scene.cut_gains(cell.box) if isinstance(scene, ComparedCuts) else cell.slopes", "cell.slopes",
         "test_certify_search.py::test_cells_are_cut_where_bounds_narrow_most",
+    ),
+    Fault(
+        "proved parts: what misses a proof by little is proved", _PARTS, "partly_proved", "margins > 0.0",
+        "margins > -0.05", _HOLD,
+    ),
+    Fault(
+        "proved parts: the best of some parts counts for all", _PARTS, "_tiled",
+        "margins[meeting(cell, np.array(proved.shape), part)].min()",
+        "margins[meeting(cell, np.array(proved.shape), part)].max()",
+        "test_part_proofs.py::test_a_part_s_margin_is_its_least",
+    ),
+    Fault(
+        "proved parts: they end at grid lines that are rounded", _PARTS, "partly_proved",
+        "not resolved(box, counts)", "False", "test_part_proofs.py::test_parts_overlap",
+    ),
+    Fault(
+        "proved parts: they do not overlap", _MEASURES, "CellParts.equal", "halves + overlap", "halves",
+        "test_part_proofs.py::test_parts_overlap",
+    ),
+    Fault(
+        "proved parts: those of the other end are meant", _PROPERTIES, "MeasureModel.bound_parts",
+        "rows.reshape(len(rows), -1)", "rows[::-1].reshape(len(rows), -1)", _HOLD,
+    ),
+    Fault(
+        "proved parts: they are not attacked", "verify/search.py", "Search._verdicts",
+        "cell.check_proof(self.grid.box_of(part.cell), part.margin)", "pass",
+        "test_part_proofs.py::test_parts_are_attacked",
     ),
     Fault(
         "near cells: settled pixels have their lower bounds", _NEARBY, "NearbyPictures.sets",

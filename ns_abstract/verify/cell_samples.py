@@ -12,7 +12,9 @@ from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.refine.protocol import SceneSample
 from ns_abstract.verify.cells import Cell
+from ns_abstract.verify.part_proofs import CellPart
 from ns_abstract.verify.protocol import FrameImages
+from ns_abstract.verify.search_results import ContradictionError
 
 #: A pose, and the scene of the set that is shown; None: the stored one, or the nearest to it.
 Sample = tuple[np.ndarray, "SceneSample | None"]
@@ -28,6 +30,7 @@ class CellSamples:
         slopes: [d] what a cut along each parameter may gain.
         cost: The part of the margin that the width of the sets costs, about; NaN: nobody knows.
         cuts: Into how many parts to cut the cell along each parameter; empty: as slopes say.
+        parts: That tile the cell, where some of them are proved.
     """
 
     cell: Cell
@@ -41,6 +44,7 @@ class CellSamples:
     slopes: np.ndarray = field(init=False)
     cost: float = math.nan
     cuts: tuple[int, ...] = ()
+    parts: list[CellPart] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self.slopes = np.zeros(self.box.dimensions)
@@ -88,6 +92,28 @@ class CellSamples:
     def holds(self) -> bool:
         """Whether the property was seen to hold at the first pose, the middle, for all scenes."""
         return self.samples[0][0].tobytes() not in self._where(_spoilt)
+
+    def fresh_poses(self, generator: np.random.Generator, corners: int, random: int) -> list[np.ndarray]:
+        """At most so many corners and random poses that no sample has been yet."""
+        box = self.box
+        if not box.dimensions:
+            return []
+        poses = [np.where(generator.random(box.dimensions) < 0.5, box.lower, box.upper) for _ in range(corners)]
+        fresh = {pose.tobytes(): pose for pose in (*poses, *box.sample(random, generator))}
+        return [pose for key, pose in fresh.items() if key not in self.poses]
+
+    def check_proof(self, box: ParameterBox, bound: float) -> None:
+        """Compare the samples in ``box`` with a lower bound of the margin there (Q8).
+
+        Raises:
+            ContradictionError: The property fails at one of them: a proof and a counterexample cannot both be right.
+        """
+        for (pose, _), margin in zip(self.samples, self.margins, strict=True):
+            if _fails(margin) and box.contains(pose):
+                raise ContradictionError(
+                    f"internal error: margin proved to be at least {bound} on {box.lower} to {box.upper}, "
+                    f"found {margin} at {pose.tolist()}"
+                )
 
 
 def _fails(margin: float) -> bool:

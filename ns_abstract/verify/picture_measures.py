@@ -7,6 +7,7 @@ pixels bound it, over a cell part by part, where the pixels' linear bounds hold.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -18,6 +19,7 @@ from ns_abstract.arithmetic.network_charges import OWN_MARGIN
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.photos import read_grey_mask
 from ns_abstract.refine.protocol import WeightPlane
+from ns_abstract.verify.network import ImageSets
 
 #: What a measure is read off: the picture's colours, its expected depths, or weights.
 Plane = Literal["colors", "depth"] | WeightPlane
@@ -169,6 +171,14 @@ def ranked(values: np.ndarray, place: int) -> np.ndarray:
     return np.partition(some, place - first, axis=1)[:, place - first]
 
 
+def shared_counts(effects: np.ndarray, most: int) -> np.ndarray:
+    """Return [d] numbers of parts, powers of two, ``most`` together or fewer, more where ``effects`` [d] are larger."""
+    counts = np.ones(len(effects), np.int64)
+    while effects.size and np.max(effects / counts) > 0.0 and 2 * counts.prod() <= most:
+        counts[int(np.argmax(effects / counts))] *= 2
+    return counts
+
+
 @dataclass(frozen=True)
 class CellParts:
     """Equal parts of a cell in its parameters, each scaled to [-1, 1]: middles and half widths [s, d]."""
@@ -182,18 +192,15 @@ class CellParts:
         return self.middles.shape[1]
 
     @classmethod
-    def along(cls, effects: np.ndarray, most: int) -> CellParts:
-        """At most so many parts, more of them along parameters with larger ``effects`` [d]."""
-        counts = np.ones(len(effects), np.int64)
-        while effects.size and np.max(effects / counts) > 0.0 and 2 * counts.prod() <= most:
-            counts[int(np.argmax(effects / counts))] *= 2
+    def equal(cls, counts: np.ndarray, overlap: float = 0.0) -> CellParts:
+        """``counts`` [d] parts along the parameters, powers of two, that reach by ``overlap`` beyond their ends."""
         middles, halves = np.zeros((1, 0)), np.zeros((1, 0))
         for count in counts.tolist():
             # powers of two: these are exact
             places = (2.0 * np.arange(count) + 1.0) / count - 1.0
             middles = np.concatenate([np.repeat(middles, count, 0), np.tile(places, len(middles))[:, None]], axis=1)
             halves = np.concatenate([np.repeat(halves, count, 0), np.full((len(middles), 1), 1.0 / count)], axis=1)
-        return cls(middles, halves)
+        return cls(middles, halves + overlap)
 
 
 @dataclass(frozen=True)
@@ -219,3 +226,12 @@ class PlaneSets:
             nearest = np.maximum(line, flat) if sign < 0.0 else np.minimum(line, flat)
             ends.append(nearest + sign * OWN_MARGIN * size)
         return ends[0], ends[1]
+
+
+def planes_of(images: ImageSets, channels: int) -> Iterator[PlaneSets]:
+    """Yield the planes of each cell, whose pictures have so many channels."""
+    arrays = (images.a_lower, images.b_lower, images.a_upper, images.b_upper, images.lower, images.upper)
+    for a_lower, b_lower, a_upper, b_upper, lower, upper in zip(*arrays, strict=True):
+        shape = len(lower) // channels, channels, a_lower.shape[-1]
+        flat = [part.reshape(-1, channels) for part in (b_lower, b_upper, lower, upper)]
+        yield PlaneSets((a_lower.reshape(shape), flat[0], a_upper.reshape(shape), flat[1]), flat[2], flat[3])

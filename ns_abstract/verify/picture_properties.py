@@ -31,6 +31,8 @@ from ns_abstract.verify.picture_measures import (
     Plane,
     PlaneSets,
     Region,
+    planes_of,
+    shared_counts,
 )
 from ns_abstract.verify.pixel_parts import fewest_reaching
 from ns_abstract.verify.preprocess import parse_preprocess
@@ -240,23 +242,38 @@ class MeasureModel:
 
     def bound(self, images: ImageSets, query: Query) -> OutputBounds:
         """Lower bounds of values and of their negatives over parts of cells, a row for each [parts, 2, leaves]."""
-        rows, c = [], self.channels
-        arrays = (images.a_lower, images.b_lower, images.a_upper, images.b_upper, images.lower, images.upper)
-        for a_lower, b_lower, a_upper, b_upper, lower, upper in zip(*arrays, strict=True):
-            shape = len(lower) // c, c, a_lower.shape[-1]
-            flat = [part.reshape(-1, c) for part in (b_lower, b_upper, lower, upper)]
-            linear = a_lower.reshape(shape), flat[0], a_upper.reshape(shape), flat[1]
-            rows.append(self._cell(PlaneSets(linear, flat[2], flat[3])))
+        rows = [
+            self._over(planes, CellParts.equal(self._counts(planes, _PARTS)))
+            for planes in planes_of(images, self.channels)
+        ]
         # as many rows for every cell: cells of fewer parts repeat them
         most = max(len(row) for row in rows)
         lower = np.stack([np.resize(row, (most, *row.shape[1:])).ravel() for row in rows])
         return OutputBounds(lower, np.zeros((*lower.shape, 1)), lower)
 
-    def _cell(self, planes: PlaneSets) -> np.ndarray:
+    def part_counts(self, images: ImageSets, most: int) -> np.ndarray:
+        """[d] numbers of parts of one cell, at most ``most`` together, more where its pictures change more."""
+        (planes,) = planes_of(images, self.channels)
+        return self._counts(planes, most)
+
+    def bound_parts(self, images: ImageSets, counts: np.ndarray, overlap: float) -> OutputBounds:
+        """`bound` of equal parts of one cell, ``counts`` [d] along its parameters, each as if it were a cell (Q8).
+
+        They reach by ``overlap`` of the cell's half-widths beyond their ends.
+        """
+        (planes,) = planes_of(images, self.channels)
+        rows = self._over(planes, CellParts.equal(counts, overlap))
+        lower = rows.reshape(len(rows), -1)
+        return OutputBounds(lower, np.zeros((*lower.shape, 1)), lower)
+
+    def _counts(self, planes: PlaneSets, most: int) -> np.ndarray:
+        """[d] numbers of parts of a cell, ``most`` together or fewer where there are many pixels."""
         read = np.unique(np.concatenate([m.pixels for m in self.measures]))
         effects = np.abs(planes.linear[0][read].astype(np.float64)).sum(axis=(0, 1))
-        most = max(1, min(_PARTS, _NUMBERS // read.size))
-        parts = CellParts.along(effects, most)
+        return shared_counts(effects, max(1, min(most, _NUMBERS // read.size)))
+
+    def _over(self, planes: PlaneSets, parts: CellParts) -> np.ndarray:
+        """[parts, 2, leaves] lower bounds of values and of their negatives."""
         ends = [m.bounds(planes, first, parts) for m, first in zip(self.measures, self.places, strict=True)]
         low, high = (np.stack(side, axis=1) for side in zip(*ends, strict=True))
         return np.stack([low, -high], axis=1)

@@ -81,6 +81,19 @@ class Model(Protocol):
         ...
 
 
+@runtime_checkable
+class PartsModel(Protocol):
+    """An optional interface of `Model`: bounds of parts of a cell cost next to nothing beside its sets."""
+
+    def part_counts(self, images: ImageSets, most: int) -> np.ndarray:
+        """[d] into how many parts one cell is best divided along its parameters, powers of two."""
+        ...
+
+    def bound_parts(self, images: ImageSets, counts: np.ndarray, overlap: float) -> OutputBounds:
+        """Bounds of the query's rows over equal parts of one cell, a row for each, the last parameter's first."""
+        ...
+
+
 class SharedBounds(Protocol):
     """Bounds of a cell, and of others with its coefficients (`SharedCoefficients`)."""
 

@@ -23,11 +23,12 @@ from ns_abstract.refine.protocol import SceneSample
 from ns_abstract.verify.cell_samples import CellSamples, Sample, drawn, sample_key
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.margin_descent import descend
+from ns_abstract.verify.part_proofs import partly_proved
 from ns_abstract.verify.picture_sets import PictureSets
 from ns_abstract.verify.properties import Claim, LinearClaim
-from ns_abstract.verify.protocol import ComparedCuts, FrameImages, Model, NearImages
-from ns_abstract.verify.search_results import FAILURES, BlockResult, ContradictionError, FinishedCell, failure_text
-from ns_abstract.verify.subboxes import PixelWeights, SubBoxProof
+from ns_abstract.verify.protocol import ComparedCuts, FrameImages, Model, NearImages, PartsModel
+from ns_abstract.verify.search_results import FAILURES, BlockResult, FinishedCell, failure_text
+from ns_abstract.verify.subboxes import PixelWeights, SubBoxProof, margin_weights
 
 #: Most cells examined together.
 BLOCK = 8
@@ -120,10 +121,15 @@ class Search:
         boxes = [self.grid.box_of(cell) for cell in block]
         samples = [CellSamples(cell, box, self._near(box)) for cell, box in zip(block, boxes, strict=True)]
         self._sample(samples, self._early)
-        open_cells = [cell for cell in samples if not (cell.broken or cell.undecided)]
+        by_parts = isinstance(self.model, PartsModel)
+        if by_parts:
+            # parts of broken cells may hold
+            self._sample([cell for cell in samples if cell.broken], self._corners)
+        open_cells = [c for c in samples if not (c.undecided or (c.broken and (c.hopeless or not by_parts)))]
         self._bound(open_cells)
         self._sample([cell for cell in open_cells if cell.proved], self._attack)
-        failing = [cell for cell in open_cells if not cell.proved]
+        self._sample([cell for cell in samples if cell.parts], self._attack_parts)
+        failing = [cell for cell in open_cells if not (cell.proved or cell.broken)]
         if not self.costly:
             self._sample([cell for cell in samples if not cell.proved], self._corners)
         # a cell is falsified as a whole where nothing else is seen
@@ -152,8 +158,9 @@ class Search:
         return [(cell.box.middle, None), *(self._corners(cell) if self.costly else ())]
 
     def _corners(self, cell: CellSamples) -> list[Sample]:
-        """Two opposite corners."""
-        return [(np.array(end), None) for end in (cell.box.lower, cell.box.upper) if end]
+        """Those of two opposite corners that no sample has been yet."""
+        ends = [np.array(end) for end in (cell.box.lower, cell.box.upper) if end]
+        return [(end, None) for end in ends if end.tobytes() not in cell.poses]
 
     def _attack(self, cell: CellSamples) -> list[Sample]:
         """A random pose and scene: no proof is believed without."""
@@ -164,18 +171,19 @@ class Search:
         member = next(itertools.islice(self._members(cell), int(generator.integers(_ATTACKERS)), None))
         return [(pose, member) for pose in poses or [cell.box.middle]]
 
+    def _attack_parts(self, cell: CellSamples) -> list[Sample]:
+        """A random pose of one of the parts that are proved."""
+        generator = _generator(cell.cell)
+        proved = [part.cell for part in cell.parts if part.margin is not None]
+        box = self.grid.box_of(proved[int(generator.integers(len(proved)))])
+        return [(pose, None) for pose in box.sample(1, generator)]
+
     def _members(self, cell: CellSamples) -> Iterator[SceneSample]:
         return self.scene.scene_samples(int(_generator(cell.cell).integers(1 << 31)))
 
     def _late(self, cell: CellSamples) -> list[Sample]:
         """Corners and random poses that no sample has been yet."""
-        box = cell.box
-        if not box.dimensions:
-            return []
-        generator = _generator(cell.cell)
-        poses = [np.where(generator.random(box.dimensions) < 0.5, box.lower, box.upper) for _ in range(_LATE)]
-        fresh = {pose.tobytes(): pose for pose in (*poses, *box.sample(_RANDOM, generator))}
-        return [(pose, None) for key, pose in fresh.items() if key not in cell.poses]
+        return [(pose, None) for pose in cell.fresh_poses(_generator(cell.cell), _LATE, _RANDOM)]
 
     def _sample(self, cells: Sequence[CellSamples], choose: Callable[[CellSamples], list[Sample]]) -> None:
         """Add samples to the cells."""
@@ -286,6 +294,9 @@ class Search:
             margins = np.array(self.claim.proved(query, self.model.bound(inputs, query), boxes), np.float64)
             for place, cell in enumerate(usable):
                 groups = self._branching(cell, float(margins[place]))
+                if isinstance(self.model, PartsModel) and not margins[place] > 0.0 and self._splittable(cell.cell):
+                    one = inputs[place : place + 1]
+                    cell.parts = partly_proved(self.claim, self.model, query, one, cell.cell, cell.box)
                 if groups:
                     better = self.model.branch(inputs[place : place + 1], query, groups, _BRANCHES)
                     margins[place] = max(margins[place], better)
@@ -334,16 +345,7 @@ class Search:
         values = cell.box.middle
         image = self._latest.get(sample_key((values, None)))
         image = drawn(self.scene, (values, None)) if image is None else image
-        try:
-            picture = torch.from_numpy(image.astype(np.float64)).requires_grad_(True)
-            margin = self.claim.margin(self.model.differentiable(picture[None]), torch.from_numpy(values)[None])[0]
-            if not margin.requires_grad:
-                return None
-            (gradient,) = torch.autograd.grad(margin, picture)
-        except FAILURES:
-            return None
-        here = float(margin.detach())
-        return PixelWeights(gradient.numpy() / here, here) if here > 0.0 else None
+        return margin_weights(self.model, self.claim, image, values)
 
     def _branching(self, cell: CellSamples, margin: float) -> Sequence[Sequence[int]]:
         """The claim's groups, if branches may prove a cell that cannot be cut any more, and nothing else can (N16)."""
@@ -362,19 +364,22 @@ class Search:
         children: list[tuple[float, Cell]] = []
         for cell in cells:
             if cell.bound is not None and cell.bound > 0.0:
-                if cell.broken:
-                    # a proof and a counterexample cannot both be right
-                    raise ContradictionError(
-                        f"internal error: margin proved to be at least {cell.bound} on {cell.box.lower} to "
-                        f"{cell.box.upper}, found {cell.margins[cell.worst]} at {cell.samples[cell.worst][0].tolist()}"
-                    )
+                cell.check_proof(cell.box, cell.bound)
                 if not cell.undecided:
                     leaves.append(FinishedCell(cell.cell, "certified", cell.bound, 0.0))
                     continue
             bound, reason = (None, NO_NUMBER) if cell.undecided else (cell.bound, cell.reason or "the finest cell")
+            rank = self._rank(cell, bound)
+            for part in cell.parts:
+                if part.margin is None or cell.undecided:
+                    children.append((rank, part.cell))
+                    continue
+                cell.check_proof(self.grid.box_of(part.cell), part.margin)
+                leaves.append(FinishedCell(part.cell, "certified", part.margin, 0.0))
+            if cell.parts:
+                continue
             hopeless = cell.hopeless and not self.every_unit
             if self._splittable(cell.cell) and not hopeless:
-                rank = self._rank(cell, bound)
                 if cell.cuts and not cell.broken:
                     parts = self.grid.cut(cell.cell, cell.cuts)
                 else:

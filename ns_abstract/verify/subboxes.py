@@ -13,6 +13,7 @@ from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
+import torch
 
 from ns_abstract.arithmetic.rounding import NONZERO
 from ns_abstract.execution.cancellation import check_cancelled
@@ -21,6 +22,7 @@ from ns_abstract.verify.network import ImageSets, OutputBounds
 from ns_abstract.verify.picture_sets import PictureSets, hull_of_sets
 from ns_abstract.verify.properties import Claim, Query
 from ns_abstract.verify.protocol import FrameImages, Model, SharedBounds, SharedBoundsModel
+from ns_abstract.verify.search_results import FAILURES
 
 #: The power of the width that sets cost.
 _POWER = 1.6
@@ -81,6 +83,20 @@ class PixelWeights:
         """[d] how much the pixels that matter move with each parameter."""
         middle = 0.5 * (sets.linear[0].astype(np.float64) + sets.linear[2])
         return np.tensordot(np.abs(self.slopes), np.abs(middle), 3)
+
+
+def margin_weights(model: Model, claim: Claim, image: np.ndarray, values: np.ndarray) -> PixelWeights | None:
+    """Return the margin's gradient at a picture [H, W, C] of parameters ``values`` [d]; None where it is no number."""
+    try:
+        picture = torch.from_numpy(image.astype(np.float64)).requires_grad_(True)
+        margin = claim.margin(model.differentiable(picture[None]), torch.from_numpy(values)[None])[0]
+        if not margin.requires_grad:
+            return None
+        (gradient,) = torch.autograd.grad(margin, picture)
+    except FAILURES:
+        return None
+    here = float(margin.detach())
+    return PixelWeights(gradient.numpy() / here, here) if here > 0.0 else None
 
 
 @dataclass(frozen=True)
