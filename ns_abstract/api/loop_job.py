@@ -40,7 +40,7 @@ from ns_abstract.verify.network.explain import check_cell
 from ns_abstract.verify.scene_margin import REGISTRATION, CellOutcome, ProveCell, VariationKind
 
 #: Of the search's rules: results of different ones are not mixed.
-_RULES = 3
+_RULES = 4
 
 
 class LoopJob:

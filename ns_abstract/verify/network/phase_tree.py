@@ -31,6 +31,7 @@ class TreeTuning:
         root_steps, steps, last_steps: Steps towards better slopes and multipliers, of the whole cell, of a branch, and
             of one without unstable neurons.
         first: The first step's size.
+        multipliers: That of multipliers, in sizes of coefficients: with steps as for slopes they hardly move in so few.
         tried: Neurons that cost a row most, of which one is chosen.
         bounded: Of those whose halves were bounded often before: so many, the best by what they gained, are again.
         often: How often.
@@ -43,6 +44,7 @@ class TreeTuning:
     steps: int = 3
     last_steps: int = 60
     first: float = 0.2
+    multipliers: float = 2.0
     tried: int = 20
     bounded: int = 5
     often: int = 4
@@ -213,7 +215,8 @@ class PhaseTree:
             phases[node][place * g : (place + 1) * g, at] = side
         held, places = self._held(phases)
         lines = {k: self.intermediate.relaxations[-1].lines[k][:, 0] for k in self.choices}
-        ascent = DualAscent(self.choices, lines, len(number), held, phases, self.tuning.first)
+        steps = self.tuning.first, self.tuning.multipliers
+        ascent = DualAscent(self.choices, lines, len(number), held, phases, *steps)
         if branches[0].parameters:
             for k, own in ascent.parameters.items():
                 for choice in range(len(own)):

@@ -107,6 +107,7 @@ class DualAscent:
         held: Numbers of the cell whose signs are assumed, by node.
         phases: By node, what rows assume of the neurons of its first choice [R, U]: 1, -1, or 0 for nothing.
         step: The first step.
+        multiplier_step: The first step of multipliers, in sizes of coefficients; None: that of slopes.
     """
 
     def __init__(
@@ -117,6 +118,7 @@ class DualAscent:
         held: Mapping[int, SplitNeurons] | None = None,
         phases: Mapping[int, NDArray[np.int8]] | None = None,
         step: float = FIRST_STEP,
+        multiplier_step: float | None = None,
     ) -> None:
         self.choices, self.split, self.phases = choices, dict(held or {}), dict(phases or {})
         self._lines = {k: np.repeat(lines[k][:, None], count, 1) for k in choices}
@@ -127,7 +129,7 @@ class DualAscent:
         self.multipliers = {k: np.zeros((count, len(v.flat)), np.float32) for k, v in self.split.items()}
         self._steps = {k: [_Adam(v.shape) for v in own] for k, own in self.parameters.items()}
         self._multipliers = {k: _Adam(v.shape) for k, v in self.multipliers.items()}
-        self._step = step
+        self._step, self._multiplier_step = step, step if multiplier_step is None else multiplier_step
 
     def keep(self, rows: np.ndarray) -> None:
         """Go on with these rows alone."""
@@ -165,9 +167,11 @@ class DualAscent:
                 moved = self.parameters[k][number] + self._step * self._steps[k][number].step(slopes[k][number])
                 self.parameters[k][number] = choice.within(moved)
         for k in self.split:
-            moved = self.multipliers[k] + self._step * size.get(k, 0.0) * self._multipliers[k].step(forces[k])
+            step = self._multiplier_step * size.get(k, 0.0)
+            moved = self.multipliers[k] + step * self._multipliers[k].step(forces[k])
             self.multipliers[k] = np.maximum(moved, 0.0).astype(np.float32)
         self._step *= _DECAY
+        self._multiplier_step *= _DECAY
 
 
 def slope_derivatives(
