@@ -11,6 +11,7 @@ import json
 import math
 import struct
 import zipfile
+import zlib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -354,6 +355,18 @@ def picture_bytes(texels: np.ndarray, kind: str = "WEBP", **options: Any) -> byt
     options = options or ({"lossless": True, "exact": True} if kind == "WEBP" else {})
     Image.fromarray(texels).save(stream, kind, **options)
     return stream.getvalue()
+
+
+def deep_png(texels: np.ndarray) -> bytes:
+    """A PNG of RGB with 16 bits by channel, of texels [H, W, 3] uint16."""
+
+    def chunk(name: bytes, data: bytes) -> bytes:
+        return struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+
+    height, width, _ = texels.shape
+    lines = b"".join(b"\0" + row.astype(">u2").tobytes() for row in texels)
+    head = struct.pack(">IIBBBBB", width, height, 16, 2, 0, 0, 0)
+    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(lines)) + chunk(b"IEND", b"")
 
 
 def _texture(rows: list[list[int]], width: int) -> np.ndarray:

@@ -18,6 +18,7 @@ import torch
 from conftest import blob_scene
 from scene_files import origin_of, picture, refused, shows
 from splat_files import (
+    deep_png,
     glb_parts,
     picture_bytes,
     read_compressed,
@@ -429,6 +430,7 @@ BAD: dict[str, tuple[Callable[[Path], Path], tuple[str, ...]]] = {
     "sog: cut picture": (_image("sh0.webp", lambda d: d[:30]), ("sh0.webp",)),
     "sog: JPEG": (_image("sh0.webp", lambda d: b"\xff\xd8\xff" + d), ("neither", "sh0.webp")),
     "sog: grey PNG": (_image("sh0.webp", lambda d: picture_bytes(np.zeros((4, 4), np.uint8), "PNG")), ("sh0.webp",)),
+    "sog: 16 bits": (_image("sh0.webp", lambda d: deep_png(np.zeros((4, 4, 3), np.uint16))), ("8 bits",)),
     "sog: empty picture": (_image("sh0.webp", lambda d: b""), ("sh0.webp",)),
     "sog: zip bomb": (_bomb, ("bytes unpacked",)),
     "sog: cut": (lambda folder: _cut(_meta(lambda m: None)(folder), 900), ("damaged archive",)),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from pathlib import Path
 from typing import Any
 
@@ -91,6 +92,18 @@ def read_grey_mask(file: Path) -> np.ndarray:
         raise InputError(f"no .png: {text}", file=file, fix="write a .png, white where pixels count") from None
 
 
+def other_bits(image: Any) -> bool:
+    """Whether Pillow makes bytes of values of another range: of an opened image whose pixels are not read yet.
+
+    It cuts 16 bits to their upper 8 and spreads 5, and says RGB of all.
+    """
+    for codec, _, _, arguments in image.tile:
+        raw, *more = arguments if isinstance(arguments, tuple) else (arguments,)
+        if re.search(r";\d\d", str(raw)) or (codec.startswith("ppm") and more != [255]):
+            return True
+    return False
+
+
 def _opened(file: Path, field: str) -> Any:
     from PIL import Image
 
@@ -101,6 +114,10 @@ def _opened(file: Path, field: str) -> Any:
             if image.width * image.height > _MOST_PIXELS:
                 raise InputError(
                     f"has {image.width} x {image.height} pixels", file=file, field=field, fix="give a smaller one"
+                )
+            if other_bits(image):
+                raise InputError(
+                    "does not hold 8 bits by channel", file=file, field=field, fix="save it as a PNG of 8 bits"
                 )
             image.load()
             return image.copy()

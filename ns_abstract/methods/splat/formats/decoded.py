@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError, visible
 from ns_abstract.io.memory import check_memory
+from ns_abstract.io.photos import other_bits
 from ns_abstract.methods.overrides import UNSAID, Overrides, assumption_of
 from ns_abstract.methods.splat.drawable import StoredGaussians, coordinates_note, drawable
 from ns_abstract.methods.splat.scene import DataparserTransform, SplatScene
@@ -179,8 +180,8 @@ def lossless_picture(data: bytes, name: str, least: int, most: int, file: Path) 
         raise InputError(problem, file=file, field=name, fix=again)
     try:
         with Image.open(io.BytesIO(data), formats=(kind,)) as picture:
-            if picture.size != (width, height) or picture.mode not in ("RGB", "RGBA"):
-                raise ValueError(f"{picture.mode} of {picture.size}")
+            if picture.size != (width, height) or picture.mode not in ("RGB", "RGBA") or other_bits(picture):
+                raise ValueError(f"{picture.mode} of {picture.size}, or not 8 bits by channel")
             texels = np.asarray(picture.convert("RGBA"), np.uint8)
     except MemoryError:
         raise
