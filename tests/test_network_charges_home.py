@@ -43,7 +43,7 @@ NETWORK = Path(ns_abstract.__file__).parent / "verify" / "network"
 DESIGN = Path(__file__).resolve().parents[1] / "docs" / "dev" / "design.md"
 CONSTANTS = {name: value for name, value in vars(network_charges).items() if name.isupper()}
 #: Names of the modules above that are no layers by themselves.
-BASES = {"Activation", "LibraryFunction", "ScalarFunction", "Weighted", "LinearRelaxation", "ResizeAxis"}
+BASES = {"Activation", "LibraryFunction", "ScalarFunction", "Weighted", "LinearRelaxation", "ResizeAxis", "WindowLayer"}
 #: Numbers that no proof rests on: defaults of torch's operators, limits of what is read, sizes of memory.
 PREFERENCES = re.compile(
     r"a\.get\(\"eps|LEAST_DIVISOR < value <|GiB|2\*\*31|_LARGE|normal\(size=shape\)|"

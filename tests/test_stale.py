@@ -119,7 +119,7 @@ def test_frame_of_another_version_is_not_kept(blobs: Inputs, tmp_path: Path) -> 
     document = json.loads((tmp_path / "report.json").read_text())
     (tmp_path / "report.json").write_text(json.dumps(document | {"fingerprint": now}))
     run = record_of(now)
-    report = Report.resume(tmp_path, run)
+    report = Report(tmp_path, run, keep_stored=True)
     assert report.kept == [] and "ns-abstract 0.1.9" in report.ignored[0]
 
 
@@ -129,7 +129,7 @@ def test_same_version_is_resumed_and_exported(blobs: Inputs, tmp_path: Path, in_
     assert in_process(export_command.main, export)[0] == 0
     now = open_job(Settings(blobs.config, blobs.path, blobs.spec)).fingerprint
     run = record_of(now)
-    assert Report.resume(tmp_path / "out", run).kept == [0]
+    assert Report(tmp_path / "out", run, keep_stored=True).kept == [0]
 
 
 @pytest.mark.slow_cases

@@ -32,10 +32,10 @@ RESULTS = (
     ),
     Fault(
         "checks leave out constants beside a network",
-        "check/verdicts.py",
-        "SeeingNetwork.__init__",
-        'report["model"].get("data") or {}',
-        "_digests(model)[1]",
+        "check/inputs.py",
+        "same_network",
+        'stated.get("data") or {}',
+        "{str(f.relative_to(folder)): _sha256(f) for f in files}",
         f"{_FILES}::test_checks_know_constants_beside_the_network",
     ),
     Fault(

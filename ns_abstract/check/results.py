@@ -48,6 +48,8 @@ class StoredCells:
 
 def read_report(folder: Path) -> dict[str, Any]:
     """The report of a finished result."""
+    if not folder.is_dir():
+        raise BadInput("no such folder", folder, fix=_WHERE)
     file = folder / "report.json"
     report = read_json(file, "report", _WHERE)
     if report.get("version") != 1:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -12,7 +11,7 @@ import numpy as np
 
 from ns_abstract.check.claims import BoxClaim, ClaimMargins, Claims
 from ns_abstract.check.forms import Affine, Array, U
-from ns_abstract.check.inputs import BadInput, reading
+from ns_abstract.check.inputs import BadInput, same_network
 from ns_abstract.check.networks import read_network
 from ns_abstract.check.poses import CameraForms, CheckedCamera, Poses
 from ns_abstract.check.results import StoredCells
@@ -76,31 +75,12 @@ def in_float32(report: dict[str, Any]) -> bool:
     return report["fingerprint"].get("network_arithmetic") == "float32"
 
 
-def _digests(model: Path) -> tuple[str, dict[str, str]]:
-    """SHA-256 of a network's file, and by name of the files beside it that hold its constants."""
-    import onnx
-
-    with reading(model, "is not a network that can be read"):
-        tensors = onnx.load(str(model), load_external_data=False).graph.initializer
-        places = {e.value for t in tensors for e in t.external_data if e.key == "location"}
-        folder = model.resolve().parent
-        files = {(folder / place).resolve() for place in places}
-        if not all(file.is_file() for file in files):
-            raise BadInput("lacks a file of its constants", model, fix="say with --model where it lies now")
-        data = {str(file.relative_to(folder)): _sha256(file.read_bytes()) for file in files}
-        return _sha256(model.read_bytes()), data
-
-
-def _sha256(data: bytes) -> str:
-    return hashlib.sha256(data).hexdigest()
-
-
 class SeeingNetwork:
     """A network that sees pictures of the scene, by the ``preprocess`` of a property or loop."""
 
     def __init__(self, scene: ActivatedScene, report: dict[str, Any], model: Path, about: dict[str, Any]) -> None:
         self.scene, self.shape = scene, about.get("preprocess") or {}
-        if not model.is_file() or _digests(model) != (report["model"]["sha256"], report["model"].get("data") or {}):
+        if not same_network(model, report["model"]):
             raise BadInput("is not the network of the result (sha256)", model, fix="say with --model where it lies now")
         if self.shape.get("layout", "NCHW") != "NCHW":
             raise BadInput("takes pictures that this program does not make", model, "preprocess.layout")

@@ -139,8 +139,8 @@ def explain(network: Network, dimensions: int = 2) -> Iterator[str]:
         yield f"{k:5d}  {kind:22s} {item(node.layer.shape):>14s}  of {inputs:12s} {node.op} {node.name}"
     work = sum(multiplications(network, k) for k in range(1, len(network.nodes) + 1))
     yield f"{len(network.nodes)} layers, {network.neuron_count:,} numbers, {work:,.0f} products an evaluation"
-    memory = cell_bytes(network, dimensions) / 2**30
-    yield f"one cell in {dimensions} parameters: about {memory:.2f} GiB; one core, smooth pictures in [0, 1]:"
+    memory = cell_bytes(network, dimensions)
+    yield f"one cell in {dimensions} parameters: about {memory / 2**30:.2f} GiB; one core, smooth pictures in [0, 1]:"
     yield from measured(network, dimensions)
     if cost_model_of(network).planned:
         yield "deep: backward passes end on the way, where that leaves nothing known they are given up after seconds"
