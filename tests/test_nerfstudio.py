@@ -507,7 +507,7 @@ def test_requests_that_are_lost_are_made_again(nerfstudio: SimpleNamespace) -> N
         if len(made) == 4:
             heeded.set()
 
-    redraw = nerfstudio.panel.Insistent(draw, heeded.is_set, 0.01)
+    redraw = nerfstudio.panel.RedrawUntilCurrent(draw, heeded.is_set, 0.01)
     redraw()
     assert heeded.wait(60.0)
     time.sleep(0.2)

@@ -27,7 +27,7 @@ CHECKS = (
     Fault(
         "checker: an open depth order is that of the middle",
         "check/blending.py",
-        "_swaps",
+        "_reordering_bounds",
         "((back[:, k:] <= dhigh[:, :-k]) & inside[:, k:]).any()",
         "False",
         "test_check.py::test_a_change_of_order_is_enclosed",

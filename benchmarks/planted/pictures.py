@@ -34,11 +34,11 @@ PICTURES = (
         "low[:, None] < self.nearer", _CROSS,
     ),
     Fault(
-        "weights: what depths have in common does not move", _WEIGHTS, "WeightBounds._depth_range",
+        "weights: what depths have in common does not move", _WEIGHTS, "WeightBounds._camera_depth_bounds",
         "forms.offset.data[:m + 1, 2]", "forms.offset.data[0, 2] * (np.arange(m + 1) == 0)", _CROSS,
     ),
     Fault(
-        "weights: the depth's own rounding is forgotten", _WEIGHTS, "WeightBounds._depth_range",
+        "weights: the depth's own rounding is forgotten", _WEIGHTS, "WeightBounds._camera_depth_bounds",
         "np.abs(depths[:, 1:]).sum(axis=1)", "np.abs(depths[:, 1:m]).sum(axis=1)",
         "test_picture_weights.py::test_depths_are_rounded",
     ),

@@ -74,7 +74,7 @@ def save_curves(path: Path, results: Mapping[str, FrameResult]) -> None:
     figure.savefig(path, dpi=130)
 
 
-def save_scale(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
+def plot_scaling(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
     """Left: nanoseconds by Gaussian-pixel pair against Gaussians, by size of the picture. Right: peak memory."""
     figure, left, right = _two_panels()
     for size in dict.fromkeys(row["size"] for row in rows):

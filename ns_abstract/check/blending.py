@@ -63,7 +63,7 @@ def blended(
     inside = (place[:, :-1] < end) & (ah > 0.0)
     form = from_the_back(alpha, color, inside, background, unit)
     # other orders than that of the centres, and earlier stops
-    lower, upper = _swaps((low, high, front, back), inside, most, ah, cl, ch)
+    lower, upper = _reordering_bounds((low, high, front, back), inside, most, ah, cl, ch)
     at = ((place[:, :-1] >= begin) & (place[:, :-1] < end))[..., None]
     room = 1.0 + ROOM + 8.0 * n * unit
     light = np.where(at[..., 0], STOP * room / np.maximum(1.0 - ah, 1e-3), 0.0).max(axis=1, initial=0.0)
@@ -107,7 +107,7 @@ def from_the_back(alpha: Affine, color: Affine, inside: Array, background: Array
     return Affine(c, g, np.where(np.isfinite(r), r, np.inf)).wider((4.0 * drawn + 16.0 * (drawn > 0)) * unit * size)
 
 
-def _swaps(depths: Any, inside: Array, most: Array, ah: Array, cl: Array, ch: Array) -> tuple[Array, Array]:
+def _reordering_bounds(depths: Any, inside: Array, most: Array, ah: Array, cl: Array, ch: Array) -> tuple[Array, Array]:
     """What other orders than that of the centres may change: [B, 3] least and largest.
 
     Sorting by exchanges of neighbours exchanges each inverted pair once; an exchange changes the colour by the

@@ -149,7 +149,7 @@ def stiff(options: Stiff) -> int:
 def scale(options: ScaleBenchmark) -> int:
     """Measure how cost grows; the table and the picture are written after every row."""
     from ns_abstract.bench.scale import curve
-    from ns_abstract.bench.tables import Table, save_scale
+    from ns_abstract.bench.tables import Table, plot_scaling
 
     if len(options.load_config) != 1:
         problem = f"found {len(options.load_config)} runs"
@@ -161,7 +161,7 @@ def scale(options: ScaleBenchmark) -> int:
         options.overrides,
     ):  # fmt: skip
         table.add(row)
-        save_scale(options.output_dir / "scale.png", table.rows)
+        plot_scaling(options.output_dir / "scale.png", table.rows)
     return DONE
 
 

@@ -144,7 +144,7 @@ def read_checkpoint(path: Path) -> Any:
             if stream.read(4) != b"PK\x03\x04":
                 raise InputError("not a PyTorch checkpoint", file=path, fix=RECOPY)
         with zipfile.ZipFile(path) as archive:
-            index = _check_members(archive, path, size)
+            index = _validated_pickle_member(archive, path, size)
             data = archive.read(index)
             _check_instructions(data, path)
             return _CheckedUnpickler(data, _Storages(path, archive, index.filename.removesuffix("data.pkl"))).load()
@@ -157,7 +157,7 @@ def read_checkpoint(path: Path) -> Any:
         raise InputError(f"damaged checkpoint: {first_line(error)}", file=path, fix=RECOPY) from None
 
 
-def _check_members(archive: zipfile.ZipFile, path: Path, size: int) -> zipfile.ZipInfo:
+def _validated_pickle_member(archive: zipfile.ZipFile, path: Path, size: int) -> zipfile.ZipInfo:
     """The pickle of an archive that torch.save wrote."""
     members = archive.infolist()
     names = Counter(member.filename.casefold() for member in members)

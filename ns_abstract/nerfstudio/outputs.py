@@ -16,7 +16,7 @@ from nerfstudio.utils.rich_utils import CONSOLE
 from ns_abstract.arithmetic.selfcheck import check_functions
 from ns_abstract.io.errors import InputError
 from ns_abstract.nerfstudio.loading import lpips_known
-from ns_abstract.nerfstudio.panel import AbstractPanel, Insistent, camera_of
+from ns_abstract.nerfstudio.panel import AbstractPanel, RedrawUntilCurrent, camera_of
 from ns_abstract.perturbation.specification import ROTATIONS, TRANSLATIONS
 from ns_abstract.perturbation.variations import VARIATIONS
 from ns_abstract.refine.engine import Refinement, RefinementGoal
@@ -147,7 +147,7 @@ class AbstractOutputs(_Base):
             refine=lambda seconds: (model := here()) and model._background.more(seconds),
         )
         self._background = Background(lambda: (model := here()) and model._news())
-        self._redraw = Insistent(
+        self._redraw = RedrawUntilCurrent(
             lambda: (model := here()) and model.abstract.control.draw(),
             lambda: (model := here()) is None or model._current(),
         )

@@ -117,7 +117,7 @@ class Attached(ViewerControl):
             machine.action(RenderAction("step", self.viewer.get_camera_state(machine.client)))
 
 
-class Insistent:
+class RedrawUntilCurrent:
     """Redraws until the screen shows the latest snapshot.
 
     nerfstudio's render thread loses a request that comes while it takes up another (render_state_machine.py, run:

@@ -100,8 +100,8 @@ def decide(
     search = _BoxSearch(network, run, deadline, memory, arithmetic)
     try:
         with deadline.enforced():
-            for family in _families(regions):
-                if search.decide(family):
+            for shared in _by_property(regions):
+                if search.decide(shared):
                     return Decision("sat", *search.found, search.boxes)
     except WorkCancelledError:
         return Decision("timeout", boxes=search.boxes)
@@ -109,7 +109,7 @@ def decide(
 
 
 @dataclass(frozen=True)
-class _Family:
+class _SharedProperty:
     """Regions, of ends [m, n], of which the same functions of the outputs are asked, with offsets [m, k]."""
 
     regions: Sequence[InputRegion]
@@ -130,7 +130,7 @@ class _Family:
         return torch.stack(groups).amin(0) if groups else torch.zeros(len(rows), dtype=rows.dtype)
 
 
-def _families(regions: Sequence[InputRegion]) -> Iterator[_Family]:
+def _by_property(regions: Sequence[InputRegion]) -> Iterator[_SharedProperty]:
     """The regions that are not empty, those together that ask for the same."""
     kinds: dict[tuple[bytes, Any], list[InputRegion]] = {}
     for region in regions:
@@ -138,7 +138,7 @@ def _families(regions: Sequence[InputRegion]) -> Iterator[_Family]:
             kinds.setdefault((region.unsafe.rows.tobytes(), region.unsafe.groups), []).append(region)
     for kind in kinds.values():
         lower, upper = (np.stack([getattr(region, name) for region in kind]) for name in ("lower", "upper"))
-        yield _Family(kind, lower, upper, np.stack([region.unsafe.offset for region in kind]))
+        yield _SharedProperty(kind, lower, upper, np.stack([region.unsafe.offset for region in kind]))
 
 
 #: A box and the region that it is part of.
@@ -168,37 +168,37 @@ class _BoxSearch:
         self.descended = 0
         self.found: tuple[np.ndarray, np.ndarray] = (np.zeros(0), np.zeros(0))
 
-    def decide(self, family: _Family) -> bool:
+    def decide(self, shared: _SharedProperty) -> bool:
         """Whether a region has a counterexample, which `found` then is; `undecided` if that is not known."""
         start, self.descended = self.deadline.left, 0
-        if self._attack(family, np.arange(len(family.regions)), _TUNING.starts, _TUNING.steps):
+        if self._attack(shared, np.arange(len(shared.regions)), _TUNING.starts, _TUNING.steps):
             return True
         self.by_input = max(_TUNING.least_seconds, (start - self.deadline.left) / max(1, self.descended))
-        if not all(family.unsafe.groups):
+        if not all(shared.unsafe.groups):
             # any output is unsafe, and no input could be shown to have one
             self.undecided = True
             return False
         if self.arithmetic == "real":
-            middle = torch.from_numpy(0.5 * (family.lower[0] + family.upper[0]))
+            middle = torch.from_numpy(0.5 * (shared.lower[0] + shared.upper[0]))
             self.bounded = centred(self.network, middle.reshape(1, *self.network.input_shape))
-        if int((family.upper > family.lower).sum(1).max()) <= _TUNING.cut:
-            return self._bisect(family)
-        return any(self._assume(family, which) for which in range(len(family.regions)))
+        if int((shared.upper > shared.lower).sum(1).max()) <= _TUNING.cut:
+            return self._bisect(shared)
+        return any(self._assume(shared, which) for which in range(len(shared.regions)))
 
     # ------------------------------------------------------------ proofs
 
-    def _bisect(self, family: _Family) -> bool:
+    def _bisect(self, shared: _SharedProperty) -> bool:
         """`decide` by cutting boxes in halves."""
-        waiting: list[_Box] = list(zip(range(len(family.regions)), family.lower, family.upper, strict=True))
+        waiting: list[_Box] = list(zip(range(len(shared.regions)), shared.lower, shared.upper, strict=True))
         most = _WAITING + len(waiting)
         while waiting:
             check_cancelled()
             boxes, waiting = waiting[-self.together :], waiting[: -self.together]
-            bounds = self._bound(family, boxes)
-            proved = proves(bounds, family.unsafe.groups)
+            bounds = self._bound(shared, boxes)
+            proved = proves(bounds, shared.unsafe.groups)
             self.boxes += len(boxes)
             left = np.flatnonzero(~proved)
-            if len(left) and self._probe(family, [(boxes[k], bounds.a[k]) for k in left]):
+            if len(left) and self._probe(shared, [(boxes[k], bounds.a[k]) for k in left]):
                 return True
             for k in left:
                 halves = _cut(*boxes[k][1:], bounds.a[k])
@@ -208,31 +208,31 @@ class _BoxSearch:
                 waiting += [(boxes[k][0], *half) for half in halves]
         return False
 
-    def _assume(self, family: _Family, which: int) -> bool:
+    def _assume(self, shared: _SharedProperty, which: int) -> bool:
         """`decide` of one region by cutting it across inputs that dominate, and assuming phases of neurons (N16)."""
-        waiting = [(family.lower[which], family.upper[which], family.unsafe.groups)]
+        waiting = [(shared.lower[which], shared.upper[which], shared.unsafe.groups)]
         attacked = False
         while waiting:
             check_cancelled()
             lower, upper, groups = waiting.pop()
             images = self._images(lower[None], upper[None])
-            tree, left = self._tree(family, which, images, 0, groups)
+            tree, left = self._tree(shared, which, images, 0, groups)
             if left and not attacked:
-                if self._attack(family, np.array([which]), *self._later(len(left)), left):
+                if self._attack(shared, np.array([which]), *self._later(len(left)), left):
                     return True
                 attacked = True
             halves = self._dominated(lower, upper) if left else None
             if halves is not None:
                 # what is proved of the whole holds in both
                 waiting += [(*half, left) for half in halves]
-            elif not self._phases(family, which, images, tree, left, 1 + len(waiting)):
+            elif not self._prove_by_branching(shared, which, images, tree, left, 1 + len(waiting)):
                 self.undecided = True
                 return False
         return False
 
-    def _phases(
+    def _prove_by_branching(
         self,
-        family: _Family,
+        shared: _SharedProperty,
         which: int,
         images: ImageSets,
         tree: PhaseTree,
@@ -249,14 +249,14 @@ class _BoxSearch:
         if left and steps > 0:
             try:
                 with self.deadline.within(allowed).enforced():
-                    tree, left = self._tree(family, which, images, steps, left)
+                    tree, left = self._tree(shared, which, images, steps, left)
             except WorkCancelledError:
                 # what is known without goes on
                 check_cancelled()
         for group in left:
             result = tree.prove(group, _BRANCHES)
             self.boxes += result.branches
-            if not result.proved and not self._anew(family, which, images, group):
+            if not result.proved and not self._prove_with_fresh_bounds(shared, which, images, group):
                 return False
         return True
 
@@ -269,16 +269,16 @@ class _BoxSearch:
         return _halves(lower, upper, at) if parts[at] > _TUNING.dominant else None
 
     def _tree(
-        self, family: _Family, which: int, images: ImageSets, steps: int, groups: Sequence[tuple[int, ...]]
+        self, shared: _SharedProperty, which: int, images: ImageSets, steps: int, groups: Sequence[tuple[int, ...]]
     ) -> tuple[PhaseTree, list[tuple[int, ...]]]:
         """A tree over bounds with so many steps for intermediate ones, and the groups that its root leaves open."""
         start = self.deadline.left
         cells = NetworkBounds(
             self.bounded, images, "everywhere", self.memory, self.arithmetic, 1, intermediate_steps=steps,
-            asked=family.unsafe.rows, coarse=True,
+            asked=shared.unsafe.rows, coarse=True,
         )  # fmt: skip
         self.by_bounds = start - self.deadline.left
-        tree, left = PhaseTree(cells, family.unsafe.rows, family.offset[which]), []
+        tree, left = PhaseTree(cells, shared.unsafe.rows, shared.offset[which]), []
         for group in groups:
             result = tree.prove(group, 1)
             self.boxes += result.branches
@@ -286,13 +286,15 @@ class _BoxSearch:
                 left.append(group)
         return tree, left
 
-    def _anew(self, family: _Family, which: int, images: ImageSets, group: Sequence[int]) -> bool:
+    def _prove_with_fresh_bounds(
+        self, shared: _SharedProperty, which: int, images: ImageSets, group: Sequence[int]
+    ) -> bool:
         """Whether a group is proved by branches with intermediate bounds of their own."""
         branching = branch(
             self.bounded,
             images,
-            family.unsafe.rows,
-            family.offset[which],
+            shared.unsafe.rows,
+            shared.offset[which],
             [group],
             _BRANCHES,
             memory=self.memory,
@@ -319,14 +321,14 @@ class _BoxSearch:
         a[cell, at, (np.cumsum(varies, 1) - 1)[cell, at]] = half[cell, at]
         return ImageSets(a, np.where(varies, middle, lower), a, np.where(varies, middle, upper), lower, upper)
 
-    def _bound(self, family: _Family, boxes: Sequence[_Box]) -> OutputBounds:
+    def _bound(self, shared: _SharedProperty, boxes: Sequence[_Box]) -> OutputBounds:
         """Bounds of boxes, with slopes by all inputs."""
         which, lower, upper = (np.stack(ends) for ends in zip(*boxes, strict=True))
         bounds = bound_outputs(
             self.bounded,
             self._images(lower, upper),
-            family.unsafe.rows,
-            family.offset[which],
+            shared.unsafe.rows,
+            shared.offset[which],
             memory=self.memory,
             arithmetic=self.arithmetic,
         )
@@ -339,14 +341,14 @@ class _BoxSearch:
     # ------------------------------------------------------------ counterexamples
 
     def _value(
-        self, family: _Family, x: torch.Tensor, which: np.ndarray, group: Sequence[int] | None = None
+        self, shared: _SharedProperty, x: torch.Tensor, which: np.ndarray, group: Sequence[int] | None = None
     ) -> torch.Tensor:
-        """`_Family.value` of inputs."""
-        return family.value(self.network(x.reshape(-1, *self.network.input_shape)), which, group)
+        """`_SharedProperty.value` of inputs."""
+        return shared.value(self.network(x.reshape(-1, *self.network.input_shape)), which, group)
 
     def _attack(
         self,
-        family: _Family,
+        shared: _SharedProperty,
         regions: np.ndarray,
         starts: int,
         steps: int,
@@ -360,14 +362,14 @@ class _BoxSearch:
         step = max(1, self.attacked // starts)
         for first in range(0, len(regions), step):
             which = regions[first : first + step]
-            ends = family.lower[which], family.upper[which]
+            ends = shared.lower[which], shared.upper[which]
             lower, upper = (torch.from_numpy(end).repeat_interleave(starts, 0) for end in ends)
             part = torch.rand((len(which), starts, lower.shape[1]), generator=generator, dtype=torch.float64)
             part[:, 0] = 0.5
             part[:, 1 : starts // 2] = (part[:, 1 : starts // 2] < 0.5).double()
             x = lower + part.flatten(0, 1) * (upper - lower)
             for group in groups or [None]:
-                if self._descend(family, np.repeat(which, starts), x, (lower, upper), steps, group):
+                if self._descend(shared, np.repeat(which, starts), x, (lower, upper), steps, group):
                     return True
         return False
 
@@ -380,7 +382,7 @@ class _BoxSearch:
 
     def _descend(
         self,
-        family: _Family,
+        shared: _SharedProperty,
         which: np.ndarray,
         x: torch.Tensor,
         ends: tuple[torch.Tensor, torch.Tensor],
@@ -394,8 +396,8 @@ class _BoxSearch:
             check_cancelled()
             self.descended += len(x)
             x = x.detach().requires_grad_()
-            value = self._value(family, x, which, group)
-            if self._any(family, x.detach(), which, value.detach()):
+            value = self._value(shared, x, which, group)
+            if self._any(shared, x.detach(), which, value.detach()):
                 return True
             if not value.requires_grad:
                 break
@@ -404,7 +406,7 @@ class _BoxSearch:
             size *= 0.001 ** (1.0 / steps)
         return False
 
-    def _probe(self, family: _Family, boxes: Sequence[tuple[_Box, np.ndarray]]) -> bool:
+    def _probe(self, shared: _SharedProperty, boxes: Sequence[tuple[_Box, np.ndarray]]) -> bool:
         """The middles of boxes (with slopes of planes below), and the corners where the planes are least."""
         x, which = [], []
         for (region, lower, upper), slopes in boxes:
@@ -413,15 +415,15 @@ class _BoxSearch:
             which += [region] * (1 + len(slopes))
         with torch.no_grad():
             tried, regions = torch.from_numpy(np.stack(x)), np.array(which)
-            return self._any(family, tried, regions, self._value(family, tried, regions))
+            return self._any(shared, tried, regions, self._value(shared, tried, regions))
 
-    def _any(self, family: _Family, x: torch.Tensor, which: np.ndarray, value: torch.Tensor) -> bool:
+    def _any(self, shared: _SharedProperty, x: torch.Tensor, which: np.ndarray, value: torch.Tensor) -> bool:
         """Whether one of the inputs that look unsafe is, for the program that counts."""
         order = torch.argsort(value)[:2].tolist()
         for k in order:
             if not float(value[k]) <= _TUNING.near * (1.0 + abs(float(value[k]))):
                 continue
-            region = family.regions[int(which[k])]
+            region = shared.regions[int(which[k])]
             point = np.clip(x[k].numpy(), region.lower, region.upper)
             y = run_once(self.network, self.run, point)
             if bool(np.isfinite(y).all()) and region.holds(y):

@@ -347,7 +347,7 @@ class _Examination:
                 if self._settled(known):
                     return False
                 if tiled.allowed < number < tuning.hopeful * search.photo.counted.sum():
-                    self._approach(box, known.linear)
+                    self._render_best_fit(box, known.linear)
             if not self._contracted(box, known):
                 return False
             if last or self.cell.volume <= (1.0 - tuning.worth) * before:
@@ -409,7 +409,7 @@ class _Examination:
         self._shrink(between(box, least, most))
         return True
 
-    def _approach(self, box: ParameterBox, linear: LinearSets) -> None:
+    def _render_best_fit(self, box: ParameterBox, linear: LinearSets) -> None:
         """Render the pose at which the linear bounds' middle explains most (weighted least squares)."""
         search, counted = self.search, self.search.tiled.counted
         a = 0.5 * (linear[0].astype(np.float64) + linear[2])[counted].reshape(-1, box.dimensions)

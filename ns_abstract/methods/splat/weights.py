@@ -89,12 +89,12 @@ class WeightBounds(SplatBounds):
     ) -> np.ndarray:
         """[n, 6] centres and radii by channel (design.md, Q2)."""
         numbers = candidates[alive]
-        low, high = self.white.between(numbers, *self._depth_range(forms, camera_magnitude, candidates, alive))
+        low, high = self.white.between(numbers, *self._camera_depth_bounds(forms, camera_magnitude, candidates, alive))
         colors = np.zeros((n, 6))
         colors[alive, 0::2], colors[alive, 1::2] = 0.5 * (low + high), 0.5 * (high - low)
         return colors
 
-    def _depth_range(
+    def _camera_depth_bounds(
         self, forms: PoseForms, camera_magnitude: np.ndarray, candidates: np.ndarray, alive: np.ndarray
     ) -> tuple[Float64Array, Float64Array]:
         """[k] bounds of the depths of candidates ``alive`` over the cell, in every evaluation of the program.

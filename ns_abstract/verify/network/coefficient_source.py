@@ -44,7 +44,7 @@ class CoefficientSource:
         """Slopes [1, *shape] of rows of another cell on node ``k``, not negative and negative ones."""
         return None
 
-    def refinable(
+    def reuse_bounds(
         self,
         index: int,
         form: NodeForm,

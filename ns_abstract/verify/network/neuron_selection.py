@@ -56,7 +56,7 @@ class NeuronSelection:
 
         ``apart``: how far lines or planes are apart, as a part of what is between; None where ``unstable`` says all.
         """
-        form, unstable, apart = self.sharing.refinable(index, form, unstable, apart, layer)
+        form, unstable, apart = self.sharing.reuse_bounds(index, form, unstable, apart, layer)
         if self.network.depth[index] < 2:
             return form
         if self.used is not None:

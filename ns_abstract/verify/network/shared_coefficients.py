@@ -138,7 +138,7 @@ class _ReferenceCell(CoefficientSource):
         self.winners[k] = winner
         return winner
 
-    def refinable(
+    def reuse_bounds(
         self,
         index: int,
         form: NodeForm,
@@ -314,7 +314,7 @@ class _ReusingCells(CoefficientSource):
         ends = np.where(turned, -upper, lower), np.where(turned, -lower, upper)
         return _ReusedBounds(np.moveaxis(slopes, 0, -1) * stored.sign[:, None], middle * stored.sign, half, *ends)
 
-    def refinable(
+    def reuse_bounds(
         self,
         index: int,
         form: NodeForm,
