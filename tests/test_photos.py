@@ -11,7 +11,7 @@ from PIL import Image
 from splat_files import deep_png
 
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.photos import read_mask, read_photo
+from ns_abstract.io.photos import read_grey_mask, read_mask, read_photo
 
 DEEP = np.random.default_rng(0).integers(0, 1 << 16, (5, 7, 3)).astype(np.uint16)
 
@@ -48,3 +48,13 @@ def test_bytes_are_read_as_they_are(kind: str, tmp_path: Path) -> None:
     file, values = tmp_path / f"photo.{kind.lower()}", (DEEP >> 8).astype(np.uint8)
     Image.fromarray(values).save(file, kind, **({"lossless": True} if kind == "WEBP" else {}))
     np.testing.assert_array_equal(read_photo(file), values)
+
+
+def test_grey_masks_of_16_bits_are_refused(tmp_path: Path) -> None:
+    file = tmp_path / "mask.png"
+    Image.fromarray(DEEP[..., 0]).save(file)
+    with pytest.raises(InputError, match="8 bits by channel"):
+        read_grey_mask(file)
+    values = (DEEP[..., 0] >> 8).astype(np.uint8)
+    Image.fromarray(values).save(file)
+    np.testing.assert_array_equal(read_grey_mask(file), values >= 128)

@@ -35,7 +35,7 @@ RESULTS = (
         "check/inputs.py",
         "same_network",
         'stated.get("data") or {}',
-        "{str(f.relative_to(folder)): _sha256(f) for f in files}",
+        "{str(f.relative_to(folder)): sha256(f) for f in files}",
         f"{_FILES}::test_checks_know_constants_beside_the_network",
     ),
     Fault(

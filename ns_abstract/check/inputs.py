@@ -136,19 +136,23 @@ def same_network(model: Path, stated: dict[str, Any]) -> bool:
     """Whether a network, and the files beside it that hold its constants, are those of the stated digests."""
     import onnx
 
-    if not model.is_file() or _sha256(model) != stated["sha256"]:
+    if not model.is_file() or sha256(model) != stated["sha256"]:
         return False
     with reading(model, "is not a network that can be read"):
         tensors, folder = onnx.load(str(model), load_external_data=False).graph.initializer, model.resolve().parent
-        places = {e.value for t in tensors for e in t.external_data if e.key == "location"}
-        files = {(folder / place).resolve() for place in places}
+        files = {(folder / e.value).resolve() for t in tensors for e in t.external_data if e.key == "location"}
         if not all(file.is_file() for file in files):
             raise BadInput("lacks a file of its constants", model, fix="say with --model where it lies now")
-        return {str(f.relative_to(folder)): _sha256(f) for f in files} == (stated.get("data") or {})
+        return {str(f.relative_to(folder)): sha256(f) for f in files} == (stated.get("data") or {})
 
 
-def _sha256(file: Path) -> str:
-    return hashlib.sha256(file.read_bytes()).hexdigest()
+def sha256(file: Path) -> str:
+    """The digest of a file's content."""
+    content = hashlib.sha256()
+    with file.open("rb") as stream:
+        while block := stream.read(1 << 24):
+            content.update(block)
+    return content.hexdigest()
 
 
 def _color(value: Any) -> tuple[float, ...]:

@@ -136,7 +136,7 @@ def _of_pictures(f: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[Array],
 
     def mapped(a: Array) -> Array:
         lead, rest = a.shape[:-3], a.shape[-3:]
-        found = f(torch.from_numpy(np.array(a, np.float64).reshape(math.prod(lead), *rest))).numpy()
-        return found.reshape(*lead, *found.shape[1:])
+        maps = f(torch.from_numpy(np.array(a, np.float64).reshape(math.prod(lead), *rest))).numpy()
+        return maps.reshape(*lead, *maps.shape[1:])
 
     return mapped

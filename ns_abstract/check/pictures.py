@@ -27,7 +27,7 @@ class ClaimedBounds(NamedTuple):
         Pictures are the ``form`` clamped to [0, 1].
         """
         middle, span = 0.5 * (low + high), np.where(self.high > self.low, 0.5 * (self.high - self.low), 1.0)
-        half, found = np.maximum(high - middle, middle - low), []
+        half, excesses = np.maximum(high - middle, middle - low), []
         for sign, flat, (slope, height) in zip((1.0, -1.0), self.flat, self.planes, strict=True):
             value = height + ((middle - 0.5 * (self.low + self.high)) / span) @ slope
             # middles are off by U times the parameters, the rest by less than 32 roundings; nothing where nothing moves
@@ -38,8 +38,8 @@ class ClaimedBounds(NamedTuple):
                 # of upper bounds everything is negated: values lie in [-1, 0]
                 bound, seen, least = (bound, form, 0.0) if sign > 0.0 else (-bound, -form, -1.0)
                 ends = ((bound - e).range() for e in (seen, least, least + 1.0))
-                found.append([np.maximum(np.minimum(a, b), c) for a, b, c in zip(*ends, strict=True)])
-        surely, perhaps = np.moveaxis(np.array(found), 1, 0)
+                excesses.append([np.maximum(np.minimum(a, b), c) for a, b, c in zip(*ends, strict=True)])
+        surely, perhaps = np.moveaxis(np.array(excesses), 1, 0)
         # what is not a number is not known
         return np.where(np.isnan(surely), -np.inf, surely), np.where(np.isnan(perhaps), np.inf, perhaps)
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ns_abstract.check.inputs import BadInput, read_json, reading
+from ns_abstract.check.inputs import BadInput, read_json, reading, sha256
 
 Array = Any
 
@@ -50,8 +50,7 @@ def read_report(folder: Path) -> dict[str, Any]:
     """The report of a finished result."""
     if not folder.is_dir():
         raise BadInput("no such folder", folder, fix=_WHERE)
-    file = folder / "report.json"
-    report = read_json(file, "report", _WHERE)
+    report = read_json(file := folder / "report.json", "report", _WHERE)
     if report.get("version") != 1:
         raise BadInput(f"found {report.get('version')!r}", file, "version", "this program reads version 1")
     for name in ("settings", "fingerprint", "scene", "renderer"):
@@ -62,12 +61,9 @@ def read_report(folder: Path) -> dict[str, Any]:
 
 def read_cells(folder: Path, name: str, index: int, digest: object) -> StoredCells:
     """A frame file, checked before anything in it is unpacked."""
-    file, content = folder / name, hashlib.sha256()
+    file = folder / name
     with reading(file, "cannot be read as a frame file", _AGAIN):
-        with file.open("rb") as stream:
-            while block := stream.read(1 << 24):
-                content.update(block)
-        if content.hexdigest() != digest:
+        if sha256(file) != digest:
             raise BadInput("is not the file that the report names (sha256)", file, fix=_AGAIN)
         with zipfile.ZipFile(file) as archive:
             if sum(entry.file_size for entry in archive.infolist()) > _MOST:
@@ -145,8 +141,8 @@ def structure(cells: StoredCells, report: dict[str, Any]) -> list[str]:
     entry = next(f for f in report["frames"] if f["index"] == cells.index)
     gaps = [np.linalg.norm(a[f"{k}upper"] - a[f"{k}lower"], axis=-1).mean(dtype=float) for k in ("", "witness_")]
     # there is no ratio where no picture differs
-    gaps.append(entry["mpg"] / (entry["mpg_witness"] or np.inf))
-    for name, gap in zip(("mpg", "mpg_witness", "ratio"), gaps, strict=True):
+    ratio = entry["mpg"] / (entry["mpg_witness"] or np.inf)
+    for name, gap in (("mpg", gaps[0]), ("mpg_witness", gaps[1]), ("ratio", ratio)):
         if not abs(gap - (entry[name] or 0.0)) <= 1e-6 + 1e-5 * gap:
             wrong.append(f"{name} is {gap:.9g}, the report says {entry[name]}")
     places = {(r, c) for r in range(0, height, side) for c in range(0, width, side)}

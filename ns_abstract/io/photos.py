@@ -84,6 +84,7 @@ def read_grey_mask(file: Path) -> np.ndarray:
             width, height = image.size
             if width * height > _MOST_PIXELS:
                 raise InputError(f"{width} x {height} pixels", file=file, fix="give a mask of the picture's size")
+            _refuse_other_bits(image, file)
             return np.asarray(image.convert("L")) >= _WHITE
     except InputError:
         raise
@@ -104,6 +105,11 @@ def other_bits(image: Any) -> bool:
     return False
 
 
+def _refuse_other_bits(image: Any, file: Path, field: str | None = None) -> None:
+    if other_bits(image):
+        raise InputError("does not hold 8 bits by channel", file=file, field=field, fix="save it as a PNG of 8 bits")
+
+
 def _opened(file: Path, field: str) -> Any:
     from PIL import Image
 
@@ -115,10 +121,7 @@ def _opened(file: Path, field: str) -> Any:
                 raise InputError(
                     f"has {image.width} x {image.height} pixels", file=file, field=field, fix="give a smaller one"
                 )
-            if other_bits(image):
-                raise InputError(
-                    "does not hold 8 bits by channel", file=file, field=field, fix="save it as a PNG of 8 bits"
-                )
+            _refuse_other_bits(image, file, field)
             image.load()
             return image.copy()
     except InputError:
