@@ -120,14 +120,25 @@ def test_processes_that_fail_leave_the_work_to_this_one(blobs: Inputs, monkeypat
     compiling.compile_beside(job, 0, 2)
     assert started == [["pixel_stage"], ["gaussian_stage", "moving_colors", "render"]]
 
-    def refuse(*_: Any, **__: Any) -> None:
-        raise OSError("no more processes")
+    waiting: list[Any] = []
+    ends: list[Any] = []
 
-    monkeypatch.setattr(compiling.subprocess, "Popen", refuse)
+    def one_only(command: list[str], **more: Any) -> Any:
+        if waiting:
+            raise OSError("no more processes")
+        waiting.append(popen([sys.executable, "-c", "import time; time.sleep(600)"], **more))
+        return waiting[0]
+
+    def pipe() -> Any:
+        ends.extend(both := multiprocessing.Pipe())
+        return both
+
+    monkeypatch.setattr(compiling.subprocess, "Popen", one_only)
+    monkeypatch.setattr(compiling, "Pipe", pipe)
     # what no process compiles is compiled here later: nothing is raised, and nothing is left behind
-    began = list(started)
     compiling.compile_beside(job, 0, 2)
-    assert started == began and not multiprocessing.active_children()
+    assert len(waiting) == 1 and waiting[0].poll() is not None
+    assert len(ends) == 4 and all(end.closed for end in ends)
 
 
 _BUSY = """
