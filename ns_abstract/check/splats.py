@@ -2,7 +2,7 @@
 
 The picture is blended from the back by forms in the pose. What depends on decisions that are open within a box
 (threshold, tile, depth order, stop) is enclosed with both outcomes. With ``unit`` 0 that is the picture in real
-numbers; with ``FLOAT`` every evaluation of gsplat's formulas in float32 lies within the enclosure, too (docs/check.md).
+numbers; with ``FLOAT`` every evaluation of gsplat's formulas in float32 lies within the enclosure, too (docs/dev/checker.md).
 """
 
 from __future__ import annotations
@@ -250,7 +250,7 @@ def _fragments(
 def _rounded(det: Affine, squares: Any, h: list[Array], sizes: Array) -> tuple[list[Array], Array, Array]:
     """Errors in float32 of the covariance's entries (xx, yy, xy), of the exponent (relative) and of determinants.
 
-    Where kappa is not below 1/8 nothing is known of the exponent; docs/check.md derives the charges.
+    Where kappa is not below 1/8 nothing is known of the exponent; docs/dev/checker.md derives the charges.
     """
     square, (hx, hy) = (sizes * sizes).sum(axis=-1) * (1.0 + _LIBRARY), h
     a, c = (e.size() + BLUR for e in squares)
@@ -306,7 +306,7 @@ def _kept(p: ProjectedForms, ellipses: bool) -> tuple[Array, Array]:
     """Where float32 tiles from 1.5 on lose no pixel whose alpha is above the threshold by a factor, and the factor.
 
     The box (1.5.3) and the ellipse (1.6.0) of this level are computed from the floats that alpha is computed from, and
-    pixels' centres lie half a pixel from every tile's edge: what rounds there moves the level (docs/check.md).
+    pixels' centres lie half a pixel from every tile's edge: what rounds there moves the level (docs/dev/checker.md).
     """
     (_, a), (_, c), _ = (e.range() for e in p.squares)
     a, c = a + BLUR, c + BLUR
