@@ -54,7 +54,7 @@ def answer(
 
 @pytest.fixture(autouse=True)
 def proofs_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(box_decisions._BoxSearch, "_attack", lambda *given: False)
+    monkeypatch.setattr(box_decisions._BoxSearch, "_attack", lambda *given, **more: False)
 
 
 def test_parts_are_those_of_the_first_layer(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import dataclasses
 import gzip
 import itertools
 import re
@@ -12,6 +13,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 from onnx_files import OnnxFile, session
 
 from ns_abstract.bench import vnnlib as module
@@ -199,6 +201,28 @@ def test_time_is_kept(tmp_path: Path) -> None:
     regions = load_query(tmp_path / "a", 2, 2, text("(<= Y_0 -1e9)"))[0]
     answer = box_decisions.decide(load_network(file), session(file), regions, Deadline(request=lambda: True))
     assert answer.word == "timeout"
+
+
+def test_the_first_attack_leaves_time_for_proofs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """After its part of the time inputs are evaluated and not moved: none is left out, and no gradient is asked for."""
+    file = net(tmp_path, 1)
+    low, high = (v[0].item() for v in (grid_outputs(file).min(0), grid_outputs(file).max(0)))
+    network, run = load_network(file), session(file)
+    conditions = {"unsat": f"(<= Y_0 {low - (high - low)!r})", "sat": f"(<= Y_0 {high + 1.0!r})"}
+
+    def words() -> list[str]:
+        regions = [load_query(tmp_path / "a", 2, 2, text(condition))[0] for condition in conditions.values()]
+        return [box_decisions.decide(network, run, one, Deadline(60.0)).word for one in regions]
+
+    assert words() == list(conditions)
+    moved: list[int] = []
+    gradient = torch.autograd.grad
+    monkeypatch.setattr(torch.autograd, "grad", lambda *given, **more: [moved.append(1), gradient(*given, **more)][1])
+    assert words() == list(conditions) and len(moved) == box_decisions._TUNING.steps - 1
+    moved.clear()
+    tuning = dataclasses.replace(box_decisions._TUNING, first=0.0)
+    monkeypatch.setattr(box_decisions, "_TUNING", tuning)
+    assert words() == list(conditions) and not moved
 
 
 @pytest.mark.parametrize(

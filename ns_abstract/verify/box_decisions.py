@@ -43,9 +43,10 @@ class BoxTuning:
     """Preferences of the search over boxes; a verdict needs a proof or a run."""
 
     #: Starts and steps of the first attack on a region, and of the one on groups that resist a proof; what is no
-    #: further from unsafe, relative to one, is run.
+    #: further from unsafe, relative to one, is run. After that part of the time the first attack descends no more.
     starts: int = 12
     steps: int = 25
+    first: float = 0.1
     later: tuple[int, int] = (64, 60)
     near: float = 1e-5
     #: Part of the time that is left for the later attack; it never has less starts and steps than these.
@@ -171,7 +172,8 @@ class _BoxSearch:
     def decide(self, shared: _SharedProperty) -> bool:
         """Whether a region has a counterexample, which `found` then is; `undecided` if that is not known."""
         start, self.descended = self.deadline.left, 0
-        if self._attack(shared, np.arange(len(shared.regions)), _TUNING.starts, _TUNING.steps):
+        descent = self.deadline.within(_TUNING.first * start)
+        if self._attack(shared, np.arange(len(shared.regions)), _TUNING.starts, _TUNING.steps, descent=descent):
             return True
         self.by_input = max(_TUNING.least_seconds, (start - self.deadline.left) / max(1, self.descended))
         if not all(shared.unsafe.groups):
@@ -353,8 +355,12 @@ class _BoxSearch:
         starts: int,
         steps: int,
         groups: Sequence[Sequence[int]] | None = None,
+        descent: Deadline | None = None,
     ) -> bool:
-        """Gradient descent by signs from middles, corners and random inputs; of several groups, each alone."""
+        """Gradient descent by signs from middles, corners and random inputs; of several groups, each alone.
+
+        What is begun after ``descent`` is evaluated and not moved.
+        """
         # a few steps where there are many regions: most are tiny
         steps = min(steps, max(3, 4 * self.attacked // len(regions)))
         starts = max(2, min(starts, self.attacked, _TUNING.attacked // len(regions)))
@@ -369,7 +375,8 @@ class _BoxSearch:
             part[:, 1 : starts // 2] = (part[:, 1 : starts // 2] < 0.5).double()
             x = lower + part.flatten(0, 1) * (upper - lower)
             for group in groups or [None]:
-                if self._descend(shared, np.repeat(which, starts), x, (lower, upper), steps, group):
+                moves = 1 if descent is not None and descent.late else steps
+                if self._descend(shared, np.repeat(which, starts), x, (lower, upper), moves, group):
                     return True
         return False
 
@@ -389,13 +396,13 @@ class _BoxSearch:
         steps: int,
         group: Sequence[int] | None,
     ) -> bool:
-        """Whether descent from inputs of regions ``which`` finds a counterexample."""
+        """Whether descent from inputs of regions ``which``, with so many evaluations, finds a counterexample."""
         lower, upper = ends
         size = 0.25
-        for _ in range(steps):
+        for left in reversed(range(steps)):
             check_cancelled()
             self.descended += len(x)
-            x = x.detach().requires_grad_()
+            x = x.detach().requires_grad_(left > 0)
             value = self._value(shared, x, which, group)
             if self._any(shared, x.detach(), which, value.detach()):
                 return True
