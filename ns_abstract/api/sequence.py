@@ -19,8 +19,9 @@ from ns_abstract.io.atomic import write_json
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import load_json
 from ns_abstract.io.photos import read_mask, read_photo, sequence_photos
+from ns_abstract.io.stamps import file_stamp
 from ns_abstract.perturbation.specification import ROTATIONS, TRANSLATIONS, load_perturbation
-from ns_abstract.report.run import file_stamp, plain
+from ns_abstract.report.run import plain
 
 Range = tuple[float, float]
 _REPORT = "report.json"
