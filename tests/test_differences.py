@@ -526,6 +526,35 @@ def test_a_run_and_its_export(blobs: Inputs, tmp_path: Path, in_process: InProce
     assert code == 0 and "falsified" in said, said
 
 
+def lighter(scene: SplatScene, by: float) -> SplatScene:
+    """The scene with more light in every band of degree 0."""
+    bands = np.where(np.arange(scene.sh.shape[1]) == 0, np.float32(by), np.float32(0.0))
+    return replace(scene, sh=scene.sh + bands[:, None])
+
+
+@pytest.mark.slow
+def test_another_question_is_worked_on_when_it_is_resumed(blobs: Inputs, tmp_path: Path, in_process: InProcess) -> None:
+    """What is tight enough for a tolerance need not be for a ratio, and the other way round."""
+    other = write(tmp_path / "other", lighter(blob_scene(), 0.5), "lighter")
+    options = blobs.options(tmp_path / "out", other=other, time_budget=5, target_ratio=1, frames=[0])
+    again = [["--resume"], ["--resume", "--tolerance", "0.9"]]
+    for more, worked in zip([["--tolerance", "0.9"], *again], (True, True, False), strict=True):
+        code, _, said = in_process(main, [*options, *more])
+        assert code == 0 and ("frame 0: largest" in said) == worked, said
+
+
+@pytest.mark.slow
+def test_a_tolerance_is_decided_whatever_its_float32_is(tmp_path: Path) -> None:
+    """Bounds are brought below it, also where they are near enough to renders, and its float32 is above it."""
+    plain, given, tolerance = blob_scene(), ring()[0], 0.016
+    scenes = {"a": plain, "b": lighter(plain, 0.05)}
+    first, second = (nsa.load_scene(write(tmp_path / name, scene, name)) for name, scene in scenes.items())
+    poses = nsa.PoseSet(nsa.Camera(given.camera_to_world, given.fov, 8, 8), translation={"x": 0.02})
+    assert float(np.float32(tolerance)) > tolerance
+    found = nsa.compare(first, second, poses, tolerance=tolerance, target_ratio=3.0, time_budget=60.0)
+    assert found.verdict == "certified" and 0.01 < found.largest_lower <= found.largest_upper <= tolerance
+
+
 def test_the_python_function(tmp_path: Path) -> None:
     scene = nsa.load_scene(write(tmp_path, blob_scene(count=10), "blobs"))
     given = ring()[0]
