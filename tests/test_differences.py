@@ -373,6 +373,17 @@ def test_floors_leave_nothing_out(change: float) -> None:
     assert (found.witness_upper < found.largest.value).mean() > 0.5
 
 
+def test_a_tolerance_is_not_rounded_up() -> None:
+    """Bounds come down to it though its float32 is larger, and though they are near enough to renders before."""
+    most = check_passes(parabolas(change=0.1), RefinementGoal(1.05, 60.0, 400)).largest
+    assert most is not None
+    tolerance = float(np.nextafter(np.float64(np.float32(1.03 * most.value)), 0.0))
+    assert float(np.float32(tolerance)) > tolerance
+    whole = parabolas(change=0.1)
+    found = LargestDifference(whole, whole, 0, RefinementGoal(3.0, 60.0, 4000), tolerance=tolerance).run()
+    assert most.value < float(found.upper.max()) <= tolerance
+
+
 def test_a_pass_ends_where_narrower_cells_gain_nothing() -> None:
     whole = parabolas(change=0.1, unsure=0.9)
     found = check_passes(whole, RefinementGoal(1.05, 600.0, 4000), LargestTuning(patience=(2.0, 30)))
