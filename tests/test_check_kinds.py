@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import onnx
 import onnxruntime
 import pytest
 import torch
@@ -38,9 +39,9 @@ from ns_abstract.api.checking import check
 from ns_abstract.check import inputs
 from ns_abstract.check.audit import _together
 from ns_abstract.check.fields import CheckedField
-from ns_abstract.check.forms import Affine
+from ns_abstract.check.forms import Affine, parameters
 from ns_abstract.check.inputs import BadInput, read_poses, read_scene
-from ns_abstract.check.loops import _lifted
+from ns_abstract.check.loops import LoopRuns, _lifted
 from ns_abstract.check.networks import read_network
 from ns_abstract.check.poses import CheckedCamera, Poses
 from ns_abstract.check.results import StoredCells, read_verdicts
@@ -255,6 +256,62 @@ def rewrite(folder: Path, change: str) -> None:
 
 
 @pytest.mark.slow
+def test_frames_that_the_report_leaves_out_are_named(copy: Path, certificate: Path) -> None:
+    """Who drops a frame in which the property fails claims a verdict of all."""
+    path = json.loads((certificate.parent / "path.json").read_text())
+    two = write_json(copy / "two.json", path | {"camera_path": 2 * path["camera_path"]})
+    found = check(copy, claims=1, seconds=60, camera_path=two)
+    assert found.unclaimed == [1] and found.exit_code == 1
+    assert found.structure == ["the verdict is unknown, the report says certified"]
+
+
+@pytest.mark.slow
+def test_sets_in_units_of_another_data_set_are_refused(copy: Path) -> None:
+    spec = write_json(copy / "spec.json", {"version": 1, "units": "dataset", "translation": {"x": 0.002}})
+    file = copy / "report.json"
+    document = json.loads(file.read_text())
+    document["settings"]["translation"] = None
+    file.write_text(json.dumps(document))
+    assert check(copy, claims=1, seconds=60, perturbation=spec).proved == 1
+    document["scene"]["units"]["dataset_scale"] = 2.0
+    file.write_text(json.dumps(document))
+    with pytest.raises(nsa.InputError, match="another set of poses"):
+        check(copy, claims=1, perturbation=spec)
+
+
+@pytest.mark.slow
+def test_a_report_that_cannot_be_followed_is_one_line(copy: Path, in_process: InProcess) -> None:
+    file = copy / "report.json"
+    document = json.loads(file.read_text())
+    document["model"]["output"] = [4]
+    file.write_text(json.dumps(document))
+    code, _, err = in_process(check_command.main, [str(copy), "--claims", "1"])
+    assert code == 2 and "cannot follow" in err and len(err.splitlines()) == 1
+
+
+def test_operators_are_those_of_the_format(tmp_path: Path) -> None:
+    """A local function may be called Relu, and a node may state an attribute twice."""
+    file = classifier(tmp_path / "net.onnx", size=8)
+    assert len(read_network(file, None, 0.0).layers) == 6
+    model, plain = onnx.load(str(file)), file.read_bytes()
+    negated = [helper.make_node("Neg", ["x"], ["y"])]
+    for domain in ("mine", ""):
+        model.ParseFromString(plain)
+        model.graph.node[1].domain = domain
+        if not domain:
+            opset = helper.make_opsetid("", 17)
+            model.functions.append(helper.make_function("", "Relu", ["x"], ["y"], negated, [opset]))
+        onnx.save(model, str(file))
+        with pytest.raises(ValueError, match="domain"):
+            read_network(file, None, 0.0)
+    model.ParseFromString(plain)
+    model.graph.node[0].attribute.append(helper.make_attribute("strides", [1, 1]))
+    onnx.save(model, str(file))
+    with pytest.raises(ValueError, match="strides"):
+        read_network(file, None, 0.0)
+
+
+@pytest.mark.slow
 def test_a_certificate_is_proved_again(copy: Path) -> None:
     found = check(copy, claims=3, seconds=120)
     assert (found.claims, found.proved, found.float32, found.exit_code) == (3, 3, 3, 0)
@@ -272,8 +329,16 @@ def test_a_margin_that_is_too_large_is_refuted(copy: Path, in_process: InProcess
 def test_another_class_is_refuted(copy: Path) -> None:
     file = copy / "report.json"
     document = json.loads(file.read_text())
+    stated = document["settings"]["property"]
     document["property"]["label"] = (document["property"]["label"] + 1) % 3
     file.write_text(json.dumps(document))
+    with pytest.raises(nsa.InputError, match="is not the property of the result"):
+        check(copy, claims=1)
+    # as who forges a certificate would
+    document["settings"]["property"] = None
+    file.write_text(json.dumps(document))
+    with pytest.raises(nsa.InputError, match="is not the property of the result"):
+        check(copy, claims=1, property=stated)
     found = check(copy, claims=1, seconds=60)
     assert found.refuted == 1 and found.refutations[0]["margin"] < 0.0
 
@@ -331,6 +396,7 @@ def test_headlines_are_those_of_the_cells() -> None:
     assert _together(report | {"coverage": {"certified": 0.5}}, parts) == [
         "the report says 0.5 of all sets are certified, its frames do not"
     ]
+    assert _together(report, parts, {0, 1}) == ["the verdict is unknown, the report says certified"]
     twice = report | {"frames": [frame, frame | {"index": 1}], "verdict": "unknown"}
     assert _together(twice, parts) == ["frame 1: no cells"]
     # a question of a loop that is answered for all of its cells
@@ -397,6 +463,7 @@ def test_a_statement_is_proved_again_and_others_are_not(statement: Path, tmp_pat
     file = folder / "report.json"
     document = json.loads(file.read_text())
     document["property"]["all"][0]["max"] -= 0.03
+    document["settings"]["property"] = None
     file.write_text(json.dumps(document))
     assert check(folder, claims=1, seconds=60).refuted == 1
     document["property"]["all"][0]["mask"] = "mask.png"
@@ -465,7 +532,9 @@ def test_a_loop_is_proved_again_and_other_sets_are_not(tmp_path: Path) -> None:
     config, loop = write_loop_demo(tmp_path / "course")
     about = json.loads(loop.read_text()) | {"steps": 3}
     about["initial"] |= {"along": 0.0, "across": [0.1, 0.104], "up": 0.0}
-    del about["goal"]
+    # keys that may be left out
+    del about["goal"], about["camera"]["position"]["offset"]
+    about["camera"] |= {"yaw": {"row": [0.0, 0.01, 0.0, 0.0, 0.0]}, "pitch": {"offset": 0.001}}
     loop.write_text(json.dumps(about))
     out = tmp_path / "out"
     nsa.reach(nsa.load_scene(config), loop, time_budget=60.0, output_dir=out)
@@ -484,8 +553,23 @@ def test_a_loop_is_proved_again_and_other_sets_are_not(tmp_path: Path) -> None:
     document["loop"]["initial"] = initial
     # a half-space that runs do enter
     document["loop"]["unsafe"] = [{"half_space": {"normal": [0.0, 1.0, 0.0, 0.0, 0.0], "at_least": 0.05}}]
-    file.write_text(json.dumps(document))
+    for stated in (loop, loop.with_name("gone.json")):
+        document["settings"]["loop"] = str(stated)
+        file.write_text(json.dumps(document))
+        with pytest.raises(nsa.InputError, match="is not the loop of the result"):
+            check(out, claims=1, loop=loop)
     assert check(out, claims=1, seconds=5).proved == 0
+
+
+def test_controls_without_a_gain_are_the_outputs_less_the_goal(monkeypatch: pytest.MonkeyPatch) -> None:
+    runs = LoopRuns.__new__(LoopRuns)
+    runs.names = ["place"]
+    runs.loop = {"dynamics": {"A": [[1.0]], "B": [[1.0]]}, "disturbance": {"place": None}}
+    monkeypatch.setattr(runs, "_outputs", lambda x, unit: [x[0] * 0.0 + 1.0])
+    for control, expected in (({"goal": [0.25]}, 2.75), ({"goal": [0.25], "gain": [[2.0]]}, 3.5), ({}, 3.0)):
+        runs.loop["control"] = control
+        (after,) = runs._next(parameters(np.full((1, 1), 2.0), np.zeros((1, 1))), 0.0)
+        assert abs(after.c[0] - expected) < 1e-9 and after.width[0] < 1e-9
 
 
 def test_cells_of_a_loop_are_of_all_its_initial_states(tmp_path: Path) -> None:

@@ -45,6 +45,7 @@ from ns_abstract.api.files import Settings, open_job
 from ns_abstract.geometry.keyframe_cameras import path_json
 from ns_abstract.io.atomic import write_json
 from ns_abstract.io.folder import MARK, claim
+from ns_abstract.io.stamps import file_stamp
 from ns_abstract.methods.nerf.occupancy import OccupancyGrid
 from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.methods.splat.load import load_scene
@@ -52,7 +53,6 @@ from ns_abstract.methods.splat.write import write_ply, write_splatfacto_run
 from ns_abstract.refine.result import FrameResult, TracePoint
 from ns_abstract.report.certificate import write_certificate
 from ns_abstract.report.record import Report, RunRecord
-from ns_abstract.report.run import file_stamp
 from ns_abstract.verify.search_results import BlockResult, FinishedCell
 
 SIZE = 16

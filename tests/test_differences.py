@@ -373,6 +373,17 @@ def test_floors_leave_nothing_out(change: float) -> None:
     assert (found.witness_upper < found.largest.value).mean() > 0.5
 
 
+def test_a_tolerance_is_not_rounded_up() -> None:
+    """Bounds come down to it though its float32 is larger, and though they are near enough to renders before."""
+    most = check_passes(parabolas(change=0.1), RefinementGoal(1.05, 60.0, 400)).largest
+    assert most is not None
+    tolerance = float(np.nextafter(np.float64(np.float32(1.03 * most.value)), 0.0))
+    assert float(np.float32(tolerance)) > tolerance
+    whole = parabolas(change=0.1)
+    found = LargestDifference(whole, whole, 0, RefinementGoal(3.0, 60.0, 4000), tolerance=tolerance).run()
+    assert most.value < float(found.upper.max()) <= tolerance
+
+
 def test_a_pass_ends_where_narrower_cells_gain_nothing() -> None:
     whole = parabolas(change=0.1, unsure=0.9)
     found = check_passes(whole, RefinementGoal(1.05, 600.0, 4000), LargestTuning(patience=(2.0, 30)))
@@ -524,6 +535,35 @@ def test_a_run_and_its_export(blobs: Inputs, tmp_path: Path, in_process: InProce
     # behind B is another colour now
     code, _, said = in_process(main, [*options, "--other-background", "0.9", "0.9", "0.9"])
     assert code == 0 and "falsified" in said, said
+
+
+def lighter(scene: SplatScene, by: float) -> SplatScene:
+    """The scene with more light in every band of degree 0."""
+    bands = np.where(np.arange(scene.sh.shape[1]) == 0, np.float32(by), np.float32(0.0))
+    return replace(scene, sh=scene.sh + bands[:, None])
+
+
+@pytest.mark.slow
+def test_another_question_is_worked_on_when_it_is_resumed(blobs: Inputs, tmp_path: Path, in_process: InProcess) -> None:
+    """What is tight enough for a tolerance need not be for a ratio, and the other way round."""
+    other = write(tmp_path / "other", lighter(blob_scene(), 0.5), "lighter")
+    options = blobs.options(tmp_path / "out", other=other, time_budget=5, target_ratio=1, frames=[0])
+    again = [["--resume"], ["--resume", "--tolerance", "0.9"]]
+    for more, worked in zip([["--tolerance", "0.9"], *again], (True, True, False), strict=True):
+        code, _, said = in_process(main, [*options, *more])
+        assert code == 0 and ("frame 0: largest" in said) == worked, said
+
+
+@pytest.mark.slow
+def test_a_tolerance_is_decided_whatever_its_float32_is(tmp_path: Path) -> None:
+    """Bounds are brought below it, also where they are near enough to renders, and its float32 is above it."""
+    plain, given, tolerance = blob_scene(), ring()[0], 0.016
+    scenes = {"a": plain, "b": lighter(plain, 0.05)}
+    first, second = (nsa.load_scene(write(tmp_path / name, scene, name)) for name, scene in scenes.items())
+    poses = nsa.PoseSet(nsa.Camera(given.camera_to_world, given.fov, 8, 8), translation={"x": 0.02})
+    assert float(np.float32(tolerance)) > tolerance
+    found = nsa.compare(first, second, poses, tolerance=tolerance, target_ratio=3.0, time_budget=60.0)
+    assert found.verdict == "certified" and 0.01 < found.largest_lower <= found.largest_upper <= tolerance
 
 
 def test_the_python_function(tmp_path: Path) -> None:

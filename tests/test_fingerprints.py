@@ -21,9 +21,10 @@ from ns_abstract.check.inputs import BadInput
 from ns_abstract.check.verdicts import SeeingNetwork
 from ns_abstract.demo.writing import write_loop_demo
 from ns_abstract.io.atomic import write_json
+from ns_abstract.io.stamps import file_stamp
 from ns_abstract.methods.splat.drawable import StoredGaussians, drawable
 from ns_abstract.methods.splat.method import SplatMethod
-from ns_abstract.report.run import file_stamp
+from ns_abstract.verify.network import load
 
 CLASSES = {"type": "classification", "label": 0, "preprocess": {"resize": [16, 16]}}
 #: Of the picture, at a distance in units of the data set.
@@ -64,6 +65,37 @@ def test_certificates_know_constants_beside_the_network(blobs: Inputs, tmp_path:
     nudge(data)
     after = certified(blobs, net, prop)
     assert net.read_bytes() == model and after["model"] == before["model"] and after != before
+
+
+def test_reports_name_the_network_that_was_read(blobs: Inputs, tmp_path: Path) -> None:
+    """A file that is replaced while its network is certified gives no name to the verdicts, and runs no picture."""
+    net, prop = classifier(tmp_path / "net.onnx"), write_json(tmp_path / "prop.json", CLASSES)
+    data = apart(net)
+    for change in (lambda: nudge(data), lambda: classifier(net, seed=1), net.unlink):
+        job = open_certification(CertifySettings(Settings(blobs.config, blobs.path, blobs.spec), net, prop))
+        told = job.question.describe()
+        change()
+        assert job.question.describe() == told and told["sha256"] == job.fingerprint["model"]
+        with pytest.raises(nsa.InputError, match="was replaced" if net.exists() else "onnxruntime refuses it"):
+            job.model.outputs(np.zeros((1, 16, 16, 3)))
+
+
+def test_a_network_that_is_replaced_while_it_is_read_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    net, read = classifier(tmp_path / "net.onnx"), load.read_onnx
+    numbers = net.read_bytes()
+
+    def replaced(path: Path, asked: Any) -> Any:
+        network = read(path, asked)
+        # a last bit of a weight: no comparison with onnxruntime would see it
+        classifier(path, gain=4.0 * (1.0 + 2e-7))
+        return network
+
+    monkeypatch.setattr(load, "read_onnx", replaced)
+    with pytest.raises(nsa.InputError, match="was replaced"):
+        load.load_network(net)
+    assert net.read_bytes() != numbers
 
 
 @pytest.mark.slow

@@ -20,6 +20,7 @@ from ns_abstract.cli.locate import main
 from ns_abstract.geometry.camera_path import load_camera_path
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
+from ns_abstract.io.folder import claim
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.verify.photo import Brightness, Photo
 
@@ -207,6 +208,43 @@ def test_a_sequence_is_followed_and_resumed(
     for more, words in ((["--noise", "0.01"], "is of other inputs"), (["--outliers", "0.2"], "is of other inputs")):
         code, _, err = in_process(main, [*options, *more, "--resume"])
         assert code == 2 and words in err and err.count("\n") == 1
+    # what others have changed is not continued, nor are other photos, nor a folder in which a command works
+    for name, change in CHANGES.items():
+        changed = change(json.loads(json.dumps(again)))
+        (folder / "report.json").write_text(json.dumps(changed))
+        code, _, err = in_process(main, [*options, "--resume"])
+        assert code == 2 and "were changed since" in err and err.count("\n") == 1, name
+        assert json.loads((folder / "report.json").read_text()) == changed
+    (folder / "report.json").write_text(json.dumps(again))
+    photos = Path(options[options.index("--image-sequence") + 1])
+    for photo in sorted(photos.iterdir())[2:]:
+        photo.unlink()
+    code, _, err = in_process(main, [*options, "--resume"])
+    assert code == 2 and "2.png is missing" in err and err.count("\n") == 1
+    with claim(folder):
+        code, _, err = in_process(main, options)
+    assert code == 2 and "locked by a command" in err and json.loads((folder / "report.json").read_text()) == again
+
+
+#: What others may make of a sequence's report.
+CHANGES: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
+    "no images": lambda r: {key: value for key, value in r.items() if key != "images"},
+    "no list": lambda r: r | {"images": {}},
+    "no entry": lambda r: r | {"images": [1]},
+    "no state": lambda r: r | {"images": [{k: v for k, v in r["images"][0].items() if k != "state"}]},
+    "another hull": lambda r: r["images"][1]["frames"][0]["hull"].update(lower=[0.2], upper=[0.3]) or r,
+}
+
+
+def test_files_of_others_are_not_replaced_by_a_sequence(
+    travelled: tuple[list[str], np.ndarray, Path], in_process: InProcess
+) -> None:
+    options, _, folder = travelled
+    folder.mkdir()
+    (folder / "report.json").write_text("mine")
+    code, _, err = in_process(main, options)
+    assert code == 2 and "was not written by this program" in err
+    assert [file.name for file in folder.iterdir()] == ["report.json"]
 
 
 @pytest.mark.parametrize(

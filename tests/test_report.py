@@ -25,12 +25,13 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.folder import first_command, remove_parts
+from ns_abstract.io.stamps import file_stamp
 from ns_abstract.refine.result import FrameResult, Leaves, TracePoint, merged
 from ns_abstract.report import files, page, picture, record
 from ns_abstract.report.figures import interval, metrics, number
 from ns_abstract.report.files import IMAGES, LEAVES, check_frame, frame_name, load_frame, save_frame
 from ns_abstract.report.record import Report, RunRecord
-from ns_abstract.report.run import differences, file_stamp, guarantee_text, plain
+from ns_abstract.report.run import differences, guarantee_text, plain
 
 ROOT = Path(__file__).resolve().parents[1]
 EVIL = '<script>alert("x")</script>&$a_b$'

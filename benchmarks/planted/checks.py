@@ -3,7 +3,7 @@
 from planted.fault import Fault
 
 _AUDIT, _FORMS, _RESULTS, _SPLATS = "check/audit.py", "check/forms.py", "check/results.py", "check/splats.py"
-_PICTURES, _NETWORKS = "check/pictures.py", "check/networks.py"
+_PICTURES, _NETWORKS, _KINDS = "check/pictures.py", "check/networks.py", "test_check_kinds.py"
 _STATEMENTS, _CLAIMS = "check/statements.py", "check/claims.py"
 _PIXELS = "test_check.py::test_pixels_contain_pictures_of_another_renderer[classic-1.4.0]"
 
@@ -55,6 +55,56 @@ CHECKS = (
         "np.minimum(most, rules.cap)",
         "most",
         "test_check.py::test_a_capped_alpha_lets_light_through",
+    ),
+    Fault(
+        "checker: local functions are the operators that they are called after",
+        _NETWORKS,
+        "read_network",
+        'node.domain in ("", "ai.onnx") and not model.functions',
+        "True",
+        f"{_KINDS}::test_operators_are_those_of_the_format",
+    ),
+    Fault(
+        "checker: of an attribute that stands twice the last counts",
+        _NETWORKS,
+        "read_network",
+        "given.count(k) > 1",
+        "False",
+        f"{_KINDS}::test_operators_are_those_of_the_format",
+    ),
+    Fault(
+        "checker: a control without a gain has no goal",
+        "check/loops.py",
+        "LoopRuns._next",
+        'control.get("goal") or [0.0] * len(u)',
+        '(control.get("gain") and control.get("goal")) or [0.0] * len(u)',
+        f"{_KINDS}::test_controls_without_a_gain_are_the_outputs_less_the_goal",
+    ),
+    Fault(
+        "checker: frames that the report leaves out do not count",
+        _AUDIT,
+        "_together",
+        "len(frames or entries)",
+        "len(entries)",
+        f"{_KINDS}::test_headlines_are_those_of_the_cells",
+    ),
+    Fault(
+        "checker: the property's file may say something else",
+        _AUDIT,
+        "_opened",
+        "read_json(stated, key) != report[key]",
+        "False",
+        f"{_KINDS}::test_another_class_is_refuted",
+        compiled=True,
+    ),
+    Fault(
+        "checker: units may be those of another data set",
+        _AUDIT,
+        "_opened",
+        'scale == report["scene"]["units"]["dataset_scale"]',
+        "True",
+        f"{_KINDS}::test_sets_in_units_of_another_data_set_are_refused",
+        compiled=True,
     ),
     Fault(
         "checker: cells may leave gaps",

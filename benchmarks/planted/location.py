@@ -12,6 +12,7 @@ _SLABS = "test_locate.py::test_slabs_and_the_inner_cell_tile_a_cell"
 _EMPTY = "test_locate.py::test_sub_boxes_that_are_left_are_kept"
 _LINES = "test_locate.py::test_numbers_of_sub_boxes_divide_the_units"
 _HEIRS = "test_pixel_rounds.py::test_a_part_inherits_what_excludes_all_of_it"
+_SEQUENCE, _FOLLOWED = "api/sequence.py", "test_locate_sequence.py::test_a_sequence_is_followed_and_resumed"
 _KNOWN = "test_locate.py::test_known_outliers_exclude_a_cell_without_bounds"
 _BOXES = "test_locate.py::test_a_cover_holds_every_pose_of_sheared_boxes"
 
@@ -147,5 +148,20 @@ LOCATION = (
     Fault(
         "location: a shear moves the ends of boxes one way",
         _COVER, "ShearedBoxes.within", "least + np.minimum(a, b)", "least + np.maximum(a, b)", _BOXES,
+    ),
+    Fault(
+        "a sequence goes on with what others have made of its report",
+        _SEQUENCE, "PhotoSequence._stored", 'e.get("sha256") == _seal(e)', "True", _FOLLOWED, compiled=True,
+    ),
+    Fault(
+        "a sequence goes on without photos that it had",
+        _SEQUENCE, "PhotoSequence._stored", "itertools.zip_longest(entries, self.images[: len(entries)])",
+        "zip(entries, self.images, strict=False)", _FOLLOWED, compiled=True,
+    ),
+    Fault(
+        "a sequence replaces files of others",
+        _SEQUENCE, "PhotoSequence.follow", "claim(self.folder)",
+        "__import__('contextlib').nullcontext(self.folder.mkdir(exist_ok=True))",
+        "test_locate_sequence.py::test_files_of_others_are_not_replaced_by_a_sequence", compiled=True,
     ),
 )  # fmt: skip

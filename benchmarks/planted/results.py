@@ -2,7 +2,7 @@
 
 from planted.fault import Fault
 
-_VERSION, _FILES = "io/version.py", "test_fingerprints.py"
+_VERSION, _LOAD, _FILES = "io/version.py", "verify/network/load.py", "test_fingerprints.py"
 
 RESULTS = (
     Fault(
@@ -15,11 +15,35 @@ RESULTS = (
     ),
     Fault(
         "fingerprints leave out constants beside a network",
-        "api/network_stamp.py",
+        _LOAD,
         "network_stamp",
         "network.data",
         "()",
         f"{_FILES}::test_certificates_know_constants_beside_the_network",
+    ),
+    Fault(
+        "reports name the network that lies there when they are written",
+        "api/network_question.py",
+        "Question.describe",
+        "self.network.stamp",
+        "__import__(Question.__module__).verify.network.load.network_stamp(self.network)",
+        f"{_FILES}::test_reports_name_the_network_that_was_read",
+    ),
+    Fault(
+        "pictures are shown to the network that lies there",
+        "verify/model.py",
+        "NetworkModel._run",
+        "require_unchanged(self.network)",
+        "pass",
+        f"{_FILES}::test_reports_name_the_network_that_was_read",
+    ),
+    Fault(
+        "a network may be replaced while it is read",
+        _LOAD,
+        "load_network",
+        "{**network.stamp, **before} != network.stamp",
+        "False",
+        f"{_FILES}::test_a_network_that_is_replaced_while_it_is_read_is_refused",
     ),
     Fault(
         "fingerprints of loops name the network's own file alone",

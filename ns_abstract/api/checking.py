@@ -83,6 +83,7 @@ def check(
     camera_path: str | os.PathLike[str] | None = None,
     perturbation: str | os.PathLike[str] | None = None,
     model: str | os.PathLike[str] | None = None,
+    property: str | os.PathLike[str] | None = None,
     loop: str | os.PathLike[str] | None = None,
     on_progress: Callable[[Audit], object] | None = None,
 ) -> Audit:
@@ -94,8 +95,8 @@ def check(
         claims: Number of claims to draw; a claim is one channel of a pixel over one cell, or one certified cell.
         seconds: Time for all of them.
         seed: Of the draws.
-        load_config, camera_path, perturbation, model, loop: Where files lie that have been moved since; None: where the
-            report says.
+        load_config, camera_path, perturbation, model, property, loop: Where files lie that have been moved since; None:
+            where the report says.
         on_progress: Called after every claim; returning False ends the audit.
 
     Raises:
@@ -110,6 +111,7 @@ def check(
         "camera_path_filename": camera_path,
         "perturbation_filename": perturbation,
         "model": model,
+        "property": property,
         "loop": loop,
     }
     files = {name: None if file is None else file_path(file, name) for name, file in moved.items()}

@@ -16,9 +16,9 @@ from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import load_json
+from ns_abstract.io.stamps import file_stamp
 from ns_abstract.refine.protocol import Frame, Method, RayFrame, SceneSample
 from ns_abstract.report.picture import to_bytes
-from ns_abstract.report.run import file_stamp
 from ns_abstract.verify.camera_response import CameraResponse, response_sets
 from ns_abstract.verify.eight_bit import Picture, rounded, rounded_sets
 

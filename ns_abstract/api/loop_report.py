@@ -10,7 +10,6 @@ import numpy as np
 
 from ns_abstract.api.cell_search import CellSearch, Row
 from ns_abstract.api.loop_job import LoopJob
-from ns_abstract.api.network_stamp import network_stamp
 from ns_abstract.execution.cancellation import Deadline, WorkCancelledError, cancel_when
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.reach.film import along, film_size, made
@@ -141,7 +140,7 @@ class LoopReport:
         learned: dict[str, Any] = {}
         if isinstance(loop.dynamics, LearnedDynamics):
             law = loop.dynamics
-            learned = {"dynamics_model": network_stamp(law.network), "dynamics_guarantee": law.network.guarantee()}
+            learned = {"dynamics_model": law.network.stamp, "dynamics_guarantee": law.network.guarantee()}
         return plain(
             self.about.head()
             | {
@@ -150,7 +149,7 @@ class LoopReport:
                 "questions": entries,
                 "network_guarantee": job.network.guarantee(job.model.arithmetic),
                 "intrinsics": job.job.pose_sets[0].camera.intrinsics._asdict(),
-                "model": network_stamp(job.network),
+                "model": job.network.stamp,
                 "loop": loop.value,
                 "dynamics": loop.dynamics.about,
                 **learned,

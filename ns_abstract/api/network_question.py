@@ -11,7 +11,7 @@ from ns_abstract.api.assumptions import choice
 from ns_abstract.api.files import resized
 from ns_abstract.api.frame_pictures import FramePictures, PropertySource
 from ns_abstract.api.job import Job
-from ns_abstract.api.network_stamp import network_prints, network_stamp
+from ns_abstract.api.network_stamp import network_prints
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
@@ -110,7 +110,7 @@ class Question:
     def describe(self) -> dict[str, Any]:
         """The network for reports."""
         shapes = {"input": self.network.input_shape, "output": self.network.output_shape}
-        return {**network_stamp(self.network), **shapes}
+        return {**self.network.stamp, **shapes}
 
     def fingerprint(self, arithmetic: NetworkArithmetic) -> dict[str, Any]:
         """What a stored search must agree with beside the property."""

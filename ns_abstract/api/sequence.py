@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import itertools
 import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -17,10 +18,12 @@ from ns_abstract.api.location import LocateSettings, Location, open_location
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.atomic import write_json
 from ns_abstract.io.errors import InputError
+from ns_abstract.io.folder import claim
 from ns_abstract.io.jsonio import load_json
 from ns_abstract.io.photos import read_mask, read_photo, sequence_photos
+from ns_abstract.io.stamps import file_stamp
 from ns_abstract.perturbation.specification import ROTATIONS, TRANSLATIONS, load_perturbation
-from ns_abstract.report.run import file_stamp, plain
+from ns_abstract.report.run import plain
 
 Range = tuple[float, float]
 _REPORT = "report.json"
@@ -67,6 +70,12 @@ def grown(poses: PoseBox, hull: Mapping[str, Range], motion: Mapping[str, Range]
     return poses.within(box)
 
 
+def _seal(entry: Mapping[str, Any]) -> str:
+    """SHA-256 of what is known of a photo, without which a report that others have changed would be continued."""
+    known = {name: value for name, value in entry.items() if name != "sha256"}
+    return hashlib.sha256(json.dumps(plain(known), sort_keys=True).encode()).hexdigest()
+
+
 @dataclass
 class PhotoSequence:
     """A sequence of photos that is followed, and its report.
@@ -109,11 +118,15 @@ class PhotoSequence:
             raise InputError(
                 "is of other inputs", file=file, field="--resume", fix="give the same ones, or another --output-dir"
             )
-        entries = [entry for entry in document["images"] if entry["state"] != "interrupted"]
-        for entry, image in zip(entries, self.images, strict=False):
-            if entry["image"] != file_stamp(image):
-                problem = f"{entry['image']['name']} was another photo then"
-                raise InputError(problem, file=image, field="--resume", fix="give the same photos")
+        stored = document.get("images")
+        if not isinstance(stored, list) or not all(isinstance(e, dict) and e.get("sha256") == _seal(e) for e in stored):
+            fix = "run without --resume to search again"
+            raise InputError("its images were changed since it was written", file=file, field="--resume", fix=fix)
+        entries = [entry for entry in stored if entry["state"] != "interrupted"]
+        for entry, image in itertools.zip_longest(entries, self.images[: len(entries)]):
+            if image is None or entry["image"] != file_stamp(image):
+                problem = f"{entry['image']['name']} {'is missing' if image is None else 'was another photo then'}"
+                raise InputError(problem, file=image or file, field="--resume", fix="give the same photos")
         return entries
 
     def follow(self, search: Callable[[Location, tuple[int, ...], Path], dict[str, Any]]) -> dict[str, Any]:
@@ -121,19 +134,29 @@ class PhotoSequence:
 
         Args:
             search: Locates a photo in sets of some numbers, into a folder; returns its report.
+
+        Raises:
+            InputError: Another command works in the folder, it holds files of others, or a photo cannot be read.
         """
+        with claim(self.folder):
+            return self._followed(search)
+
+    def _followed(self, search: Callable[[Location, tuple[int, ...], Path], dict[str, Any]]) -> dict[str, Any]:
         for k in range(len(self.entries), len(self.images)):
             alive = self._sets(k)
             if not alive:
                 break
             folder = f"{k:05d}_{self.images[k].stem}"
             numbers, poses = tuple(alive), tuple(alive.values())
-            document = search(self._location(k, poses), tuple(range(len(poses))), self.folder / folder)
+            stamp, location = file_stamp(self.images[k]), self._location(k, poses)
+            if file_stamp(self.images[k]) != stamp:
+                fix = "give a copy that nothing writes to"
+                raise InputError("was replaced meanwhile", file=self.images[k], fix=fix)
+            document = search(location, tuple(range(len(poses))), self.folder / folder)
             frames = [{**frame, "index": numbers[frame["index"]]} for frame in document["frames"]]
             reported = ("answer", "possible_volume", "hull", "best", "seconds", "state")
             self.entries.append(
-                {"image": file_stamp(self.images[k]), "folder": folder, **{name: document[name] for name in reported}}
-                | {"frames": frames}
+                {"image": stamp, "folder": folder, **{name: document[name] for name in reported}} | {"frames": frames}
             )
             self._write()
             if document["state"] == "interrupted":
@@ -169,13 +192,12 @@ class PhotoSequence:
                 "kind": "sequence",
                 "answer": "none" if any(entry["answer"] == "none" for entry in entries) else entries[-1]["answer"],
                 "motion": self.ranges,
-                "images": entries,
+                "images": [entry | {"sha256": _seal(entry)} for entry in entries],
                 "not_examined": left,
                 "state": state,
                 "fingerprint": self.fingerprint,
             }
         )
-        self.folder.mkdir(parents=True, exist_ok=True)
         write_json(self.folder / _REPORT, document)
         return document
 

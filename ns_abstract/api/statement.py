@@ -9,8 +9,8 @@ from ns_abstract.check.inputs import BadInput, read_scene
 from ns_abstract.check.results import read_report, read_verdicts
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import load_json
+from ns_abstract.io.stamps import file_stamp
 from ns_abstract.io.version import ADVISORY, computed_by, stale
-from ns_abstract.report.run import file_stamp
 
 STATEMENT, PREDICATE = "https://in-toto.io/Statement/v1", "urn:ns-abstract:certificate:1"
 #: What of report.json is the statement's predicate.

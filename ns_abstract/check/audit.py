@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ns_abstract.check.claims import Claims
-from ns_abstract.check.inputs import BadInput, dataset_scale, given_set, read_poses, read_scene, reading
+from ns_abstract.check.inputs import BadInput, dataset_scale, given_set, read_json, read_poses, read_scene, reading
 from ns_abstract.check.loops import LoopRuns
 from ns_abstract.check.pictures import Picture
 from ns_abstract.check.results import StoredCells, entries_of, read_cells, read_report, read_verdicts, structure
@@ -21,8 +21,7 @@ from ns_abstract.check.verdicts import Verdicts, of_class, of_statement
 class ClaimOutcome(NamedTuple):
     """What came of a claim: True: proved; False: refuted; None: open when its time was over.
 
-    ``float32``: of every float32 evaluation, else of the picture in real numbers. ``uniform``: it was drawn uniformly.
-    ``found``: of a refuted one frame, cell, pose, and what is wrong.
+    ``float32``: of every float32 evaluation, else of real numbers. ``uniform``: drawn so. ``found``: what is wrong.
     """
 
     verdict: bool | None
@@ -34,25 +33,21 @@ class ClaimOutcome(NamedTuple):
 def opened(folder: Path, moved: dict[str, Path | None]) -> tuple[list[str], list[Claims], list[int]]:
     """What is wrong (cells that tile no set, pixels without bounds, figures that do not fit), and a result's claims.
 
-    The third are frames of which nothing is claimed: those that are missing, or whose cells do not cover the set.
-    ``moved`` says by the name of a setting where a file lies that has been moved since.
-
-    Raises:
-        BadInput: A file cannot be used.
+    The third are frames of which nothing is claimed: they are missing, or no cells cover them. ``moved`` says by the
+    name of a setting where a file lies that has been moved since. Raises BadInput where a file cannot be used.
     """
     report, name = read_report(folder), folder / "report.json"
     with reading(name, "is not the report of a result", "make the result again"):
-        parts, subjects = _opened(folder, report, moved)
+        parts, subjects, frames = _opened(folder, report, moved)
         wrong = [f"frame {c.index}: {text}" for c in parts for text in structure(c, report)]
-        wrong += [] if not parts or parts[0].verdicts is None else _together(report, parts)
+        wrong += [] if not parts or parts[0].verdicts is None else _together(report, parts, frames)
         if not subjects and not wrong:
             raise BadInput("claims nothing: no cell has a result or verdict", name, fix="finish it: --resume")
-        indices = [] if report.get("kind") == "loop" else [f["index"] for f in report["frames"]]
-    return wrong, subjects, sorted({*indices}.difference(c.index for c in parts))
+    return wrong, subjects, sorted(frames.difference(c.index for c in parts))
 
 
-def _together(report: dict[str, Any], parts: list[StoredCells]) -> list[str]:
-    """What the report says of all frames or questions together, or of those without cells, and their cells do not."""
+def _together(report: dict[str, Any], parts: list[StoredCells], frames: Collection[int] | None = None) -> list[str]:
+    """What the report says of all ``frames`` asked for or questions, or of those without cells, and no cell does."""
     entries, kinds = entries_of(report), {c.index: {v[0] for v in c.verdicts or ()} for c in parts}
     wrong = [f"frame {k}: no cells" for k, e in entries.items() if k not in kinds and e["certified"] + e["falsified"]]
     for kind, said in (report.get("coverage") or {}).items():
@@ -63,7 +58,7 @@ def _together(report: dict[str, Any], parts: list[StoredCells]) -> list[str]:
         verdict = "falsified"
     elif report.get("kind") == "loop" and whole:
         verdict = ("safe", "reaches")[whole[-1]]
-    elif report.get("kind") != "loop" and len(whole) == len(entries) == len(report["frames"]):
+    elif report.get("kind") != "loop" and len(whole) == len(report["frames"]) == len(frames or entries):
         verdict = "certified"
     if report["verdict"] != verdict:
         wrong.append(f"the verdict is {verdict}, the report says {report['verdict']}")
@@ -77,14 +72,13 @@ def outcomes(subjects: list[Claims], claims: int, seconds: float, seed: int) -> 
     for number in range(claims):
         subject, start = subjects[int(rng.choice(len(subjects), p=sizes / sizes.sum()))], time.monotonic()
         claim, share = subject.draw(rng, hunted=number % 2 == 1), 4.0 * (end - start) / (claims - number)
-        settled = subject.settle(claim, min(start + share, end)) if start < end else (None, False, {})
+        with reading("report.json", "says what this program cannot follow", "make the result again"):
+            settled = subject.settle(claim, min(start + share, end)) if start < end else (None, False, {})
         refutation = {"frame": subject.cells.index, **subject.place(claim), **settled[2]} if settled[0] is False else {}
         yield ClaimOutcome(*settled[:2], number % 2 == 0, refutation)
 
 
-def _opened(
-    folder: Path, report: dict[str, Any], moved: dict[str, Path | None]
-) -> tuple[list[StoredCells], list[Claims]]:
+def _opened(folder: Path, report: dict[str, Any], moved: dict[str, Path | None]) -> tuple[Any, ...]:
     settings, renderer, name = report["settings"], report["renderer"], folder / "report.json"
     if not (renderer["name"] == "gsplat" and renderer["version"] in RULES) and renderer["name"] != "nerf-uniform":
         problem = f"found {renderer['name']} {renderer.get('version')}, and this program checks gsplat and nerf-uniform"
@@ -100,12 +94,19 @@ def _opened(
 
     config = file("load_config")
     scene, scale = read_scene(config, report), dataset_scale(config)
+    # in units of another data set nothing is claimed
+    scale = scale if scale == report["scene"]["units"]["dataset_scale"] else float("nan")
     certificate, subjects = (folder / "cells.sqlite").exists(), []
     parts = read_verdicts(folder, report) if certificate else _frames(folder, report)
+    for key in {"property", "loop"} & report.keys():
+        stated = Path(moved.get(key) or settings.get(key) or folder)
+        # a file that is gone says nothing, unless it is given
+        if (moved.get(key) or stated.is_file()) and read_json(stated, key) != report[key]:
+            raise BadInput(f"is not the {key} of the result", stated, fix=f"say with --{key} where that lies now")
     if report.get("kind") == "loop":
         model = moved.get("model") or file("loop").parent / report["loop"]["network"]
         subjects = [Verdicts(c, scene, report, LoopRuns(c, scene, report, model).bounds) for c in parts]
-        return parts, [s for s in subjects if s.count]
+        return parts, [s for s in subjects if s.count], set()
     path, perturbation = file("camera_path_filename"), given_set(settings, moved.get("perturbation_filename"))
     for cells in parts:
         poses, free = read_poses(path, perturbation, cells.index, settings, scale)
@@ -120,7 +121,8 @@ def _opened(
             subjects.append(Verdicts(cells, scene, report, of_class(scene, poses, report, file("model"))))
         else:
             subjects.append(Verdicts(cells, scene, report, of_statement(scene, poses, report, scale)))
-    return parts, [s for s in subjects if s.count]
+    asked = settings["frames"] if settings.get("frames") else range(len(read_json(path, "camera path")["camera_path"]))
+    return parts, [s for s in subjects if s.count], {*asked, *(f["index"] for f in report["frames"])}
 
 
 def _frames(folder: Path, report: dict[str, Any]) -> list[StoredCells]:

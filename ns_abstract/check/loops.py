@@ -23,7 +23,8 @@ class LoopRuns:
         if loop["dynamics"].get("type") != "affine":
             problem = "has dynamics that this program does not follow"
             raise BadInput(problem, "report.json", "loop.dynamics.type", "audit an affine loop")
-        areas = [area for area in [*(loop.get("unsafe") or []), loop.get("goal") or {}] if area]
+        # nothing is reached without a goal
+        areas = [*(loop.get("unsafe") or []), *([loop["goal"]] if cells.index else [])]
         if not all("box" in area or "half_space" in area for area in areas):
             problem = "has properties of the picture, which this program does not follow along a loop"
             raise BadInput(problem, "report.json", "loop.unsafe", "audit a loop whose areas are boxes or half-spaces")
@@ -32,9 +33,9 @@ class LoopRuns:
         pose = np.array(loop["camera"]["camera_to_world"], np.float64)[:3]
         self.camera = CheckedCamera(pose, *stated, int(width), int(height))
         self.steps, self.names = int(loop["steps"]), list(loop["state"])
-        empty = {"offset": [0.0] * 3, "matrix": [[0.0] * len(self.names)] * 3}
-        self.position = loop["camera"].get("position") or empty
-        self.turns = {name: loop["camera"][name] for name in TURNS if loop["camera"].get(name)}
+        self.position = {"offset": [0.0] * 3} | loop["camera"]["position"]
+        still = {"offset": 0.0, "row": [0.0] * len(self.names)}
+        self.turns = {name: still | loop["camera"][name] for name in TURNS if loop["camera"].get(name)}
         rows = [*self.position["matrix"], *(about["row"] for about in self.turns.values())]
         self.seen = [k for k in range(len(self.names)) if any(row[k] for row in rows)]
 
@@ -53,8 +54,7 @@ class LoopRuns:
     def _outputs(self, x: list[Affine], unit: float) -> list[Affine]:
         """The network's outputs in the symbols of the state.
 
-        They are bounded by forms in the states that the camera sees, over their box, whose symbols are these states
-        themselves, scaled.
+        They are bounded by forms in the states that the camera sees, over their box; these, scaled, are the symbols.
         """
         low, high = (np.stack([e.range()[k] for e in x], axis=-1) for k in (0, 1))
         middle = 0.5 * (low + high)
@@ -69,14 +69,14 @@ class LoopRuns:
     def _next(self, x: list[Affine], unit: float) -> list[Affine]:
         law, control, x = self.loop["dynamics"], self.loop.get("control") or {}, _lifted(x)
         u = self._outputs(x, unit)
+        u = [a + -float(b) for a, b in zip(u, control.get("goal") or [0.0] * len(u), strict=True)]
         if control.get("gain"):
-            error = [a + -float(b) for a, b in zip(u, control.get("goal") or [0.0] * len(u), strict=True)]
-            u = [_affine(row, error, 0.0) for row in control["gain"]]
+            u = [_affine(row, u, 0.0) for row in control["gain"]]
         if control.get("clip"):
             u = [a.clamped(*map(float, ends)) for a, ends in zip(u, control["clip"], strict=True)]
         states = []
-        for a, b, c, name in zip(law["A"], law["B"], law["c"], self.names, strict=True):
-            push = (self.loop.get("disturbance") or {}).get(name, 0.0)
+        for a, b, c, name in zip(law["A"], law["B"], law.get("c") or [0.0] * len(x), self.names, strict=True):
+            push = (self.loop.get("disturbance") or {}).get(name) or 0.0
             least, most = (-push, push) if isinstance(push, (int, float)) else push
             e = _affine([*a, *b], [*x, *u], float(c)) + 0.5 * (least + most)
             # float64 evaluations of the law, too

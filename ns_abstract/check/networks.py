@@ -70,16 +70,15 @@ def _lifted(form: Affine) -> Affine:
 def read_network(file: Path, output: str | None, unit: float) -> CheckedNetwork:
     """A network of convolutions, products, average pooling, ReLU and sums from an .onnx file.
 
-    ``output`` names the output that counts; None: the only one. ``unit`` is that of `CheckedNetwork`.
-
-    Raises:
-        ValueError: It cannot be read, or holds another operator.
+    ``output`` names the output that counts; None: the only one. ``unit`` is that of `CheckedNetwork`. Raises ValueError
+    where it cannot be read, or holds another operator.
     """
     import onnx
 
     if file.stat().st_size > _MOST_BYTES:
         raise ValueError("the network is too large")
-    graph = onnx.load(str(file)).graph
+    model = onnx.load(str(file))
+    graph = model.graph
     read = {t.name: np.array(onnx.numpy_helper.to_array(t), np.float64) for t in graph.initializer}
     names = [o.name for o in graph.output]
     if (output is None and len(names) != 1) or output not in (None, *names):
@@ -90,9 +89,11 @@ def read_network(file: Path, output: str | None, unit: float) -> CheckedNetwork:
         options = {a.name: onnx.helper.get_attribute_value(a) for a in node.attribute}
         constants = [read[name] for name in node.input if name in read]
         inputs = [name for name in node.input if name and name not in read]
-        wrong = [k for k, v in options.items() if k not in _USED and _PLAIN.get(k) != v]
-        if wrong or not made.issuperset(inputs) or not inputs or list(node.input[: len(inputs)]) != inputs:
-            raise ValueError(f"has {node.op_type} with {wrong or 'inputs'} that this program does not read")
+        # runtimes may take the first of two, and a local function may have the name of any operator
+        given, own = [a.name for a in node.attribute], node.domain in ("", "ai.onnx") and not model.functions
+        wrong = [k for k, v in options.items() if given.count(k) > 1 or (k not in _USED and _PLAIN.get(k) != v)]
+        if wrong or not own or not made.issuperset(inputs) or not inputs or list(node.input[: len(inputs)]) != inputs:
+            raise ValueError(f"has {node.op_type} with {wrong or 'inputs or a domain'} that this program does not read")
         layers.append(CheckedLayer(inputs, node.output[0], _layer(node.op_type, options, constants, len(inputs), unit)))
         made.add(node.output[0])
     return CheckedNetwork(layers, source, output or names[0], unit)

@@ -36,6 +36,8 @@ class Check:
     """The perturbation file, if it has been moved since."""
     model: Path | None = None
     """The network's .onnx file, if it has been moved since."""
+    property: Path | None = None
+    """The property file, if it has been moved since."""
     loop: Path | None = None
     """LOOP.json, if it has been moved since."""
 
@@ -53,6 +55,7 @@ def check(options: Check) -> int:
         camera_path=options.camera_path_filename,
         perturbation=options.perturbation_filename,
         model=options.model,
+        property=options.property,
         loop=options.loop,
     )
     for text in audit.structure:

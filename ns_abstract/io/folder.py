@@ -79,7 +79,7 @@ def _is_report(file: Path) -> bool:
         content = load_json(file, "report", limit=_REPORT_LIMIT)
     except InputError:
         return False
-    return isinstance(content, dict) and content.keys() >= _REPORT_KEYS
+    return isinstance(content, dict) and (content.keys() >= _REPORT_KEYS or content.get("kind") == "sequence")
 
 
 def _locked(folder: Path) -> BinaryIO:

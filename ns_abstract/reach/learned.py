@@ -11,7 +11,7 @@ from ns_abstract.arithmetic.rounding import LARGEST32, STORED_FLUSH, STORED_ROUN
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.model import parametric
 from ns_abstract.verify.network import ImageSets, OutputBounds, bound_outputs, load_network
-from ns_abstract.verify.network.load import onnx_runner
+from ns_abstract.verify.network.load import onnx_runner, require_unchanged
 
 Float64 = NDArray[np.float64]
 
@@ -51,6 +51,7 @@ class LearnedDynamics:
         self.controls = shape[0] - states
         self.about = f"x' = {file.name}(x, u), evaluated in float32"
         self._run = onnx_runner(file, self.network.output, self.network.input_shape)
+        require_unchanged(self.network)
 
     def step(self, x: Float64, u: Float64) -> Float64:
         """[n] the next state as onnxruntime computes it, from a state [n] and a control [m]."""

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ns_abstract.arithmetic.outward import outward
 from ns_abstract.execution.cancellation import WorkCancelledError, cancel_when
 from ns_abstract.geometry.tiles import assemble, in_tiles
 from ns_abstract.refine.difference import DifferenceFrame
@@ -225,8 +226,11 @@ class LargestDifference:
         self, accepted: float, time_share: float, enough: Callable[[Refinement], bool] = lambda refinement: False
     ) -> None:
         """One pass over the tiles above the accepted value, in a part of the time left, or until ``enough``."""
-        camera, least = self.frame.camera, np.float32(accepted)
-        loose = self.upper > np.maximum(self.goal.ratio * self.rendered, least)
+        # what is rounded up would stay above the accepted value
+        camera, (least,) = self.frame.camera, outward(np.array([accepted]), np.zeros(1))[0]
+        # nothing above the accepted value is to be left open; where it is 0, means are measured
+        ratio = self.goal.ratio if accepted == 0.0 else 1.0
+        loose = self.upper > np.maximum(ratio * self.rendered, least)
         some = (loose & self.inside[..., None])[self.tiles].any(axis=(1, 2, 3))
         first = not self._cover
         tiles = self.tiles if first else self.tiles[some]
@@ -248,9 +252,8 @@ class LargestDifference:
 
         watch = GainWatch(self.tuning)
         others = self._most(np.where(np.isin(np.arange(len(self.upper)), tiles)[:, None, None, None], 0.0, self.upper))
-        # nothing above the accepted value is to be left open; where it is 0, means are measured
-        goal = replace(self.goal, ratio=self.goal.ratio if accepted == 0.0 else 1.0, seconds=time_share * self._left())
-        frame = self.frame.above(accepted)
+        goal = replace(self.goal, ratio=ratio, seconds=time_share * self._left())
+        frame = self.frame.above(float(least))
         refinement = Refinement(
             frame, self.index, goal, seed=self.seed,
             stopped=lambda: (

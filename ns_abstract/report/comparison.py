@@ -11,7 +11,7 @@ import numpy as np
 
 from ns_abstract.refine.result import FrameResult
 from ns_abstract.report.figures import ShownUnits, number
-from ns_abstract.report.files import frame_name
+from ns_abstract.report.files import StoredFrame, frame_name
 from ns_abstract.report.html import counted, set_of, whole_page
 from ns_abstract.report.picture import (
     GAP_COLORS,
@@ -102,6 +102,12 @@ class ComparisonReport(Report):
         figures, target = difference_figures(result), self.run.settings["target_ratio"]
         largest = figures["largest_lower"]
         return result.bounded and figures["largest_upper"] <= max(target * largest, largest + LEAST_ROOM)
+
+    def _stored_status(self, stored: StoredFrame) -> str:
+        """Status under the present question, whatever was asked before."""
+        if not stored.result.bounded:
+            return "missing"
+        return "done" if self._reached(stored.result) else "partial"
 
     def _entry(self, result: FrameResult, status: str) -> dict[str, Any]:
         entry = super()._entry(result, status)

@@ -17,13 +17,13 @@ import numpy as np
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import load_json
+from ns_abstract.io.stamps import file_stamp
 from ns_abstract.io.version import ADVISORY, computed_by, stale
 from ns_abstract.refine.result import FrameResult, gap
 from ns_abstract.report.figures import metrics, number, short_guarantee
 from ns_abstract.report.files import IMAGES, frame_index, load_frame
 from ns_abstract.report.picture import heat, to_bytes
 from ns_abstract.report.record import frame_digests
-from ns_abstract.report.run import file_stamp
 
 PICTURES = ("lower", "upper", "gap", "witness", "image")
 _LABELS = {

@@ -14,6 +14,7 @@ from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.folder import first_command, remove_parts, unwritable
 from ns_abstract.io.jsonio import is_number, load_json
+from ns_abstract.io.stamps import file_stamp
 from ns_abstract.io.version import ADVISORY, stale
 from ns_abstract.refine.result import FrameResult, TracePoint, merged
 from ns_abstract.report.figures import ShownUnits, layer_metrics, metrics, seconds_to, short_guarantee
@@ -27,7 +28,7 @@ from ns_abstract.report.files import (
     save_frame,
 )
 from ns_abstract.report.picture import layer_figure, previews, save_figure, save_picture
-from ns_abstract.report.run import CommandRun, differences, file_stamp, guarantee_text, plain
+from ns_abstract.report.run import CommandRun, differences, guarantee_text, plain
 
 Status = Literal["done", "partial", "missing"]
 Outcome = Literal["done", "budget", "interrupted"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib.metadata
 import math
 import os
@@ -11,20 +10,15 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ns_abstract.io.assumptions import Assumption
-from ns_abstract.io.errors import InputError
-from ns_abstract.io.jsonio import file_size
 from ns_abstract.io.version import VERSION as PACKAGE
 
 #: Of the format of report.json.
 VERSION = 1
-#: Bytes that are read at a time.
-_CHUNK = 2**20
 
 _PROGRAMS = {"gsplat": "gsplat's formulas give", "paper": "the paper's Algorithm 1 gives"}
 
@@ -70,24 +64,6 @@ def plain(value: Any) -> Any:
     if isinstance(value, os.PathLike):
         return os.fspath(value)
     raise TypeError(f"{type(value).__name__} has no JSON form")
-
-
-def file_stamp(path: str | os.PathLike[str]) -> dict[str, Any]:
-    """Identity of a file by content: ``name``, ``bytes`` and ``sha256``; a moved file keeps it.
-
-    Raises:
-        InputError: The file is absent or cannot be read.
-    """
-    path = Path(path)
-    size = file_size(path, "file")
-    digest = hashlib.sha256()
-    try:
-        with path.open("rb") as stream:
-            while chunk := stream.read(_CHUNK):
-                digest.update(chunk)
-    except OSError as error:
-        raise InputError(f"cannot be read: {error.strerror}", file=path, fix="check the permissions") from None
-    return {"name": path.name, "bytes": size, "sha256": digest.hexdigest()}
 
 
 @cache

@@ -19,7 +19,7 @@ from ns_abstract.verify.network import (
     reusable_anywhere,
 )
 from ns_abstract.verify.network.branching import branch
-from ns_abstract.verify.network.load import onnx_runner
+from ns_abstract.verify.network.load import onnx_runner, require_unchanged
 from ns_abstract.verify.preprocess import Preprocess
 from ns_abstract.verify.properties import Query
 
@@ -35,8 +35,10 @@ class NetworkModel:
 
     @cached_property
     def _run(self) -> Callable[[np.ndarray], np.ndarray]:
-        """Runs the file in onnxruntime."""
-        return onnx_runner(self.network.source, self.network.output, self.network.input_shape)
+        """Runs the file in onnxruntime. Raises InputError where it is another one than was read."""
+        run = onnx_runner(self.network.source, self.network.output, self.network.input_shape)
+        require_unchanged(self.network)
+        return run
 
     def outputs(self, images: np.ndarray) -> np.ndarray:
         """[B, n] of onnxruntime in float32, picture by picture.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -63,7 +63,12 @@ class Network:
         output: The output's name in the file.
         whole_numbers: Whether it takes whole numbers from 0 to 255 alone.
         data: Files beside ``source`` that hold some of its constants.
+
+    Attributes:
+        stamp: Identity of the files as they were read (`ns_abstract.verify.network.load.network_stamp`).
     """
+
+    stamp: Mapping[str, Any]
 
     def __init__(
         self,
@@ -82,9 +87,10 @@ class Network:
         self.output = output
         self.whole_numbers = whole_numbers
         self.data = tuple(data)
+        self.stamp = {}
 
     def __getstate__(self) -> dict[str, Any]:
-        fields = ("source", "input_shape", "nodes", "output_shape", "output", "whole_numbers", "data")
+        fields = ("source", "input_shape", "nodes", "output_shape", "output", "whole_numbers", "data", "stamp")
         return {name: self.__dict__[name] for name in fields}
 
     @property

@@ -5,12 +5,14 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import onnxruntime
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import file_size, show
+from ns_abstract.io.stamps import file_stamp
 from ns_abstract.verify.network.comparison import Evaluate, compare, levels, probes
 from ns_abstract.verify.network.graph import Network
 from ns_abstract.verify.network.onnx_epsilons import refuse_lost_epsilons
@@ -45,21 +47,51 @@ def load_network(
         shown: Inputs [1, *input_shape] to compare besides, for an input shape: what the network will be given.
 
     Raises:
-        InputError: The file cannot be read, uses what is not supported, or computes something else elsewhere.
+        InputError: The file cannot be read, uses what is not supported, or computes something else elsewhere; or it
+            was replaced meanwhile.
     """
     path = Path(path)
     file_size(path, "network")
     name = path.name.lower()
     if not name.endswith((".onnx", PACKED)):
         raise InputError(f"has the ending {path.suffix!r}", file=path, fix=_instead(path))
+    before = file_stamp(path)
     network = read_onnx(path, ReadRequest(output, vector, picture, layout == "NHWC", whole_numbers))
+    network.stamp = network_stamp(network)
     run = onnx_runner(path, network.output, network.input_shape)
     usual, strange = probes(network)
     compare(network, run, usual)
     if shown is not None:
         strange = itertools.chain(shown(network.input_shape), strange)
     compare(network, run, strange, usual=False)
+    if {**network.stamp, **before} != network.stamp:
+        raise _replaced(path)
+    require_unchanged(network)
     return network
+
+
+def network_stamp(network: Network) -> dict[str, Any]:
+    """``name``, ``bytes`` and ``sha256`` of the network's file; ``data``: sums of files beside it with its constants.
+
+    ``data`` is left out where the file holds all constants.
+
+    Raises:
+        InputError: A file is absent or cannot be read.
+    """
+    folder = network.source.resolve().parent
+    data = {str(file.relative_to(folder)): file_stamp(file)["sha256"] for file in network.data}
+    return {**file_stamp(network.source), **({"data": data} if data else {})}
+
+
+def require_unchanged(network: Network) -> None:
+    """Raise InputError where the network's files are others than those that were read."""
+    if network_stamp(network) != network.stamp:
+        raise _replaced(network.source)
+
+
+def _replaced(path: Path) -> InputError:
+    fix = "give a copy that nothing writes to"
+    return InputError("was replaced while the command was at work", file=path, fix=fix)
 
 
 def read_onnx(path: Path, asked: ReadRequest | None = None) -> Network:
