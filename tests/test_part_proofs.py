@@ -15,9 +15,10 @@ from test_certify_search import drive, interval, volume
 from ns_abstract.arithmetic.rounding import SUB_BOX_OVERLAP
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.verify.cells import Cell, CellGrid
-from ns_abstract.verify.part_proofs import CellPart, partly_proved
+from ns_abstract.verify.part_proofs import CellPart, PartQuestion
 from ns_abstract.verify.picture_measures import CellParts, Measure, shared_counts
 from ns_abstract.verify.picture_properties import MeasureModel, parse_picture_property
+from ns_abstract.verify.properties import Claim
 from ns_abstract.verify.search import Search
 from ns_abstract.verify.search_results import ContradictionError
 
@@ -48,46 +49,54 @@ def _grid(d: int) -> CellGrid:
     return CellGrid(box, (48, 96, 32)[:d], (3, 3, 1)[:d])
 
 
-def _holds(sets: tuple[np.ndarray, ...], box: ParameterBox, pose: np.ndarray) -> bool:
-    """Whether the claim holds of the darkest picture of the sets at a pose, in rational numbers."""
+def _holds(sets: tuple[np.ndarray, ...], box: ParameterBox, pose: np.ndarray, brightest: bool = False) -> bool:
+    """Whether the claim holds of the darkest, or the brightest, picture of the sets at a pose, in rational numbers."""
     p = []
     for value, low, high in zip(pose.tolist(), box.lower, box.upper, strict=True):
         middle, half = (Fraction(low) + Fraction(high)) / 2, (Fraction(high) - Fraction(low)) / 2
         p.append((Fraction(value) - middle) / half)
     bright = 0
-    for a, b, least in zip(
-        sets[0][0, :, 0].tolist(), sets[1][0, :, 0].tolist(), sets[4][0, :, 0].tolist(), strict=True
-    ):
+    slopes, offsets, ends = (sets[k][0, :, 0].tolist() for k in ((2, 3, 5) if brightest else (0, 1, 4)))
+    for a, b, end in zip(slopes, offsets, ends, strict=True):
         line = Fraction(b) + sum((Fraction(s) * x for s, x in zip(a, p, strict=True)), Fraction(0))
-        bright += max(line, Fraction(least)) >= Fraction(1, 2)
+        bright += (min if brightest else max)(line, Fraction(end)) >= Fraction(1, 2)
     return bright >= RANK
 
 
-def _provable(sets: tuple[np.ndarray, ...]) -> float:
-    """The share of sixty-four parts of a cell over which enough pixels are bright, each by itself."""
+def _decidable(sets: tuple[np.ndarray, ...]) -> np.ndarray:
+    """The shares of sixty-four parts of a cell over which enough pixels are bright, each by itself, and of its halves
+    along all divided parameters over which enough are dark."""
     a = sets[0][0, :, 0].astype(np.float64)
-    parts = CellParts.equal(shared_counts(np.abs(a).sum(axis=0), 64))
-    darkest = parts.middles @ a.T + sets[1][0, :, 0] - parts.halves @ np.abs(a).T
-    return float(((np.maximum(darkest, sets[4][0, :, 0]) > 0.5).sum(axis=1) >= RANK).mean())
+    counts = shared_counts(np.abs(a).sum(axis=0), 64)
+    parts = CellParts.equal(counts)
+    middle, reach = parts.middles @ a.T, parts.halves @ np.abs(a).T
+    darkest = np.maximum(middle + sets[1][0, :, 0] - reach, sets[4][0, :, 0])
+    brightest = np.minimum(middle + sets[3][0, :, 0] + reach, sets[5][0, :, 0])
+    bright, dark = (darkest > 0.5).sum(axis=1) >= RANK, (brightest < 0.5).sum(axis=1) > PIXELS - RANK
+    dark = dark.reshape(counts)
+    for axis, count in enumerate(counts.tolist()):
+        if count > 1:
+            dark = np.stack([half.all(axis=axis) for half in np.split(dark, 2, axis)], axis)
+    return np.array([bright.mean(), dark.mean()])
 
 
 def _parts(sets: tuple[np.ndarray, ...], cell: Cell, box: ParameterBox) -> list[CellPart]:
     model, claim = _model(), _claim()
     images = model.input_sets(sets[:4], sets[4], sets[5])
-    return partly_proved(claim, model, claim.query(np.zeros((1, 1))), images, cell, box)
+    return PartQuestion(claim, model, claim.query(np.zeros((1, 1)))).parts(images, cell, box)
 
 
 @pytest.mark.parametrize("d", [2, 3])
-def test_parts_that_are_proved_hold_everywhere(d: int) -> None:
-    rng, grid = np.random.default_rng(d), _grid(d)
-    proved, provable = 0.0, 0.0
+def test_parts_that_are_decided_are_so_everywhere(d: int) -> None:
+    rng, poses, grid = np.random.default_rng(d), np.random.default_rng(17), _grid(d)
+    decided, decidable = np.zeros(2), np.zeros(2)
     for _ in range(60):
         sets = _sets(rng, d)
         first = [int(rng.integers(0, 3)) * 16 for _ in range(d)]
         cell = Cell(tuple(first[:2] + [0] * (d - 2)), tuple(a + 16 for a in first[:2] + [0] * (d - 2)))
         box = grid.box_of(cell)
         parts = _parts(sets, cell, box)
-        provable += _provable(sets)
+        decidable += _decidable(sets)
         if not parts:
             continue
         # they tile the cell
@@ -97,33 +106,46 @@ def test_parts_that_are_proved_hold_everywhere(d: int) -> None:
         inside = np.zeros(grid.units, int)
         inside[tuple(slice(a, b) for a, b in zip(cell.first, cell.past, strict=True))] = 1
         np.testing.assert_array_equal(owned, inside)
-        # none that is left is as large as the cell
-        assert max(part.cell.volume for part in parts) <= cell.volume // 2
         for part in parts:
-            if part.margin is None:
+            share = part.cell.volume / cell.volume
+            if part.verdict is None:
+                # none that is left is as large as the cell
+                assert share <= 0.5
                 continue
-            assert part.margin > 0.0
+            fails = part.verdict == "falsified"
+            assert part.margin <= 0.0 if fails else part.margin > 0.0
             within = grid.box_of(part.cell)
-            for pose in (*within.corners(), *within.sample(6, rng)):
-                assert _holds(sets, box, pose)
-        proved += sum(part.cell.volume for part in parts if part.margin is not None) / cell.volume
+            for pose in (*within.corners(), *within.sample(6, poses if fails else rng)):
+                assert _holds(sets, box, pose, brightest=fails) is not fails
+            decided[int(fails)] += share
     # what is left out are parts among others that are left
-    assert provable > 1.0 and proved > 0.6 * provable, (proved, provable)
+    assert decidable[0] > 1.0 and decided[0] > 0.6 * decidable[0], (decided, decidable)
+    assert decidable[1] > 0.5 and decided[1] > 0.99 * decidable[1], (decided, decidable)
 
 
 def test_a_part_s_margin_is_its_least() -> None:
-    """One pixel of twelve decides: the bound over a part is that of its darkest end."""
+    """One pixel of twelve decides: bounds over a part are those of its darkest end, or of its brightest."""
     d, grid = 2, _grid(2)
-    a, b = np.zeros((1, PIXELS, 1, d), np.float32), np.full((1, PIXELS, 1), 0.9, np.float32)
-    b[0, RANK:], a[0, RANK - 1, 0, 0], b[0, RANK - 1] = 0.1, 0.25, 0.625
-    reach = np.abs(a).sum(axis=-1)
     cell = Cell((0, 0), (16, 32))
-    parts = _parts((a, b, a, b, b - reach, b + reach), cell, grid.box_of(cell))
-    assert {part.margin is None for part in parts} == {True, False}
-    for part in parts:
-        if part.margin is not None:
+
+    def parts(middle: float) -> list[CellPart]:
+        a, b = np.zeros((1, PIXELS, 1, d), np.float32), np.full((1, PIXELS, 1), 0.9, np.float32)
+        b[0, RANK:], a[0, RANK - 1, 0, 0], b[0, RANK - 1] = 0.1, 0.25, middle
+        reach = np.abs(a).sum(axis=-1)
+        return _parts((a, b, a, b, b - reach, b + reach), cell, grid.box_of(cell))
+
+    proved = parts(0.625)
+    assert {part.verdict for part in proved} == {"certified", None}
+    for part in proved:
+        if part.verdict == "certified":
             darkest = 0.625 + 0.25 * (2.0 * part.cell.first[0] / 16.0 - 1.0) - 0.5
             assert darkest - 1e-6 < part.margin <= darkest
+    # a half that fails everywhere is one part, what is left beside what is proved is not cut further
+    refuted = [part for part in parts(0.4375) if part.verdict == "falsified"]
+    assert refuted and {(part.cell.first[0], part.cell.past[0]) for part in refuted} == {(0, 8)}
+    assert all(-0.0625 <= part.margin < -0.0625 + 1e-6 for part in refuted)
+    (whole,) = parts(0.125)
+    assert whole.cell == cell and whole.verdict == "falsified" and -0.125 <= whole.margin < -0.125 + 1e-6
 
 
 def test_parts_overlap() -> None:
@@ -146,10 +168,11 @@ class Disc:
     """Pictures of `PIXELS` pixels that are bright inside of a circle, each with a radius of its own."""
 
     def __init__(self, lie: float = 0.0) -> None:
-        self.box, self.lie, self.bounded = interval(2), lie, 0
+        self.box, self.lie, self.bounded, self.drawn = interval(2), lie, 0, 0
         self.radii = np.linspace(0.4, 0.9, PIXELS)
 
     def image(self, values: np.ndarray, member: Any = None) -> np.ndarray:
+        self.drawn += 1
         return (0.5 + self.radii**2 - values @ values).reshape(1, PIXELS, 1).astype(np.float32)
 
     def sets(self, box: ParameterBox) -> Any:
@@ -190,8 +213,11 @@ def test_cells_are_certified_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
             assert abs(np.sqrt(box.middle @ box.middle) - radius) < 4.0 * np.sqrt(2.0) / 128.0
     assert volume(leaves, "certified") > 0.9 * np.pi / 4.0 * radius**2 * grid.volume
     # without parts, the same is certified by more cells
+    monkeypatch.setattr(PartQuestion, "bounded", lambda *_: [])
+    scene = Disc()
+    leaves, _ = drive(_search(scene))
     whole = Disc()
-    monkeypatch.setattr("ns_abstract.verify.search.partly_proved", lambda *_: [])
+    monkeypatch.setattr(PartQuestion, "parts", lambda *_: [])
     others, _ = drive(_search(whole))
     assert volume(leaves, "certified") >= volume(others, "certified")
     assert scene.bounded < 0.8 * whole.bounded, (scene.bounded, whole.bounded)
@@ -201,3 +227,71 @@ def test_parts_are_attacked() -> None:
     """Sets that miss the pictures by a little prove parts in which the property fails at a corner or a random pose."""
     with pytest.raises(ContradictionError, match="internal error"):
         drive(_search(Disc(lie=0.1)))
+
+
+class Spots(Disc):
+    """Those of `Disc`, with bounds that say less than the truth: that no picture is bright."""
+
+    def sets(self, box: ParameterBox) -> Any:
+        (a, low, _, _), lower, _, slopes = super().sets(box)
+        top = np.full_like(low, 0.4)
+        return (a, np.minimum(low, 0.3), 0.0 * a, top), np.minimum(lower, 0.3), top, slopes
+
+
+def test_parts_that_are_refuted_are_attacked() -> None:
+    """At the middle of such a part the property fails as it was drawn, or the program has a fault."""
+    with pytest.raises(ContradictionError, match="margin proved to be at most"):
+        drive(_search(Spots()))
+
+
+def test_refuted_parts_are_falsified_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same is decided by fewer pictures; units of a fixed partition are decided one by one."""
+    scene = Disc()
+    leaves, _ = drive(_search(scene))
+    monkeypatch.setattr("ns_abstract.verify.picture_properties.PictureClaim.refuted", Claim.refuted)
+    blind = Disc()
+    others, _ = drive(_search(blind))
+    for verdict in ("certified", "falsified"):
+        assert volume(leaves, verdict) > 0.999 * volume(others, verdict)
+    assert scene.drawn < 0.9 * blind.drawn, (scene.drawn, blind.drawn)
+    monkeypatch.undo()
+    scene = Disc()
+    grid = CellGrid.fixed(scene.box, (32, 32), (2, 2))
+    leaves, _ = drive(Search(scene, _model(), _claim(), grid, costly=False, every_unit=True))
+    assert volume(leaves) == grid.volume
+    assert all(leaf.cell.volume == 1 for leaf in leaves if leaf.verdict == "falsified")
+
+
+def test_parts_that_are_left_are_bounded_by_themselves(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same is decided by fewer pictures, and no part is said to be certified that is not."""
+    scene = Disc()
+    leaves, _ = drive(_search(scene))
+    monkeypatch.setattr(PartQuestion, "bounded", lambda *_: [])
+    once = Disc()
+    others, _ = drive(_search(once))
+    for verdict in ("certified", "falsified"):
+        assert volume(leaves, verdict) > 0.99 * volume(others, verdict)
+    assert scene.drawn < 0.96 * once.drawn, (scene.drawn, once.drawn)
+    radius = np.sort(scene.radii)[::-1][RANK - 1]
+    for leaf in leaves:
+        if leaf.verdict == "certified":
+            box = _search(scene).grid.box_of(leaf.cell)
+            far = np.maximum(np.abs(box.lower), np.abs(box.upper))
+            assert far @ far <= radius**2
+
+
+@pytest.mark.parametrize("name", ["exception", "no number", "crossed"])
+def test_sets_of_a_part_that_cross_decide_nothing(name: str) -> None:
+    """Where a part has no sets of its own it is left to the search, which says why."""
+
+    class Bad(Disc):
+        def sets(self, box: ParameterBox) -> Any:
+            if name == "exception":
+                raise RuntimeError("planted")
+            linear, lower, upper, slopes = super().sets(box)
+            return linear, upper + 0.1 if name == "crossed" else lower * np.nan, upper, slopes
+
+    question = PartQuestion(_claim(), _model(), _claim().query(np.zeros((1, 1))))
+    grid, cell = _search(Disc()).grid, Cell((44, 44), (60, 60))
+    assert {part.verdict for part in question.bounded(Disc(), grid, cell)} == {"certified"}
+    assert question.bounded(Bad(), grid, cell) == []

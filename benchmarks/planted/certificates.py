@@ -415,7 +415,7 @@ CERTIFICATES = (
     ),
     Fault(
         "search: counterexamples are not rendered again",
-        _SEARCH, "Search._counterexample", "not -math.inf < margin <= 0.0 or not cell.box.contains(values)", "False",
+        _SEARCH, "Search._counterexample", "not -math.inf < margin <= 0.0 or not box.contains(values)", "False",
         "test_certify_search.py::test_unconfirmed_counterexample_is_unknown",
     ),
     Fault(

@@ -14,7 +14,7 @@ _DEPTHS = "test_picture_properties.py::test_depths_where_nothing_may_be_drawn"
 _SETTLED, _ENCLOSING, _NEARBY = (
     "verify/settled_pixels.py", "verify/enclosing_boxes.py", "api/nearby_pictures.py",
 )  # fmt: skip
-_PARTS, _HOLD = "verify/part_proofs.py", "test_part_proofs.py::test_parts_that_are_proved_hold_everywhere[2]"
+_PARTS, _HOLD = "verify/part_proofs.py", "test_part_proofs.py::test_parts_that_are_decided_are_so_everywhere[2]"
 _CHANGE = "test_nearby_pictures.py::test_settled_pixels_change_no_verdict"
 _NEAR = "test_nearby_pictures.py::test_pictures_near_a_cell_are_those_of_the_set"
 _RAYS = "test_picture_weights.py::test_the_brightest_rays_are_bounded_first"
@@ -110,17 +110,29 @@ PICTURES = (
         "test_certify_search.py::test_cells_are_cut_where_bounds_narrow_most",
     ),
     Fault(
-        "proved parts: what misses a proof by little is proved", _PARTS, "partly_proved", "margins > 0.0",
-        "margins > -0.05", _HOLD,
+        "proved parts: what misses a proof by little is proved", _PARTS, "PartQuestion.parts", "low > 0.0",
+        "low > -0.05", _HOLD,
+    ),
+    Fault(
+        "proved parts: what misses a refutation by little is refuted", _PARTS, "PartQuestion.parts", "high <= 0.0",
+        "high <= 0.05", _HOLD,
+    ),
+    Fault(
+        "proved parts: lower bounds refute, too", _PROPERTIES, "PictureClaim.refuted",
+        "[-fall - low]", "[rise - low]", _HOLD,
     ),
     Fault(
         "proved parts: the best of some parts counts for all", _PARTS, "_tiled",
-        "margins[meeting(cell, np.array(proved.shape), part)].min()",
-        "margins[meeting(cell, np.array(proved.shape), part)].max()",
+        "margins[0][equal].min()", "margins[0][equal].max()",
         "test_part_proofs.py::test_a_part_s_margin_is_its_least",
     ),
     Fault(
-        "proved parts: they end at grid lines that are rounded", _PARTS, "partly_proved",
+        "proved parts: the worst of some parts counts for all that are refuted", _PARTS, "_tiled",
+        "margins[1][equal].max()", "margins[1][equal].min()",
+        "test_part_proofs.py::test_a_part_s_margin_is_its_least",
+    ),
+    Fault(
+        "proved parts: they end at grid lines that are rounded", _PARTS, "PartQuestion.parts",
         "not resolved(box, counts)", "False", "test_part_proofs.py::test_parts_overlap",
     ),
     Fault(
@@ -133,8 +145,22 @@ PICTURES = (
     ),
     Fault(
         "proved parts: they are not attacked", "verify/search.py", "Search._verdicts",
-        "cell.check_proof(self.grid.box_of(part.cell), part.margin)", "pass",
-        "test_part_proofs.py::test_parts_are_attacked",
+        "cell.check_proof(within, part.margin)", "pass", "test_part_proofs.py::test_parts_are_attacked",
+    ),
+    Fault(
+        "proved parts: refuted ones are not attacked", "verify/cell_samples.py", "CellSamples.check_refutation",
+        "0.0 < self.margins[k] < math.inf", "False",
+        "test_part_proofs.py::test_parts_that_are_refuted_are_attacked",
+    ),
+    Fault(
+        "proved parts: sets of a part that are no numbers decide it", _PARTS, "PartQuestion.bounded",
+        "not sane(linear, lower, upper)", "False",
+        "test_part_proofs.py::test_sets_of_a_part_that_cross_decide_nothing",
+    ),
+    Fault(
+        "proved parts: units of a fixed partition are refuted together", "verify/search.py", "Search._decided",
+        "not self.every_unit", "True",
+        "test_part_proofs.py::test_refuted_parts_are_falsified_at_once",
     ),
     Fault(
         "near cells: settled pixels have their lower bounds", _NEARBY, "NearbyPictures.sets",
@@ -167,15 +193,15 @@ PICTURES = (
     ),
     Fault(
         "claims: any part of a cell will do", _PROPERTIES, "PictureClaim.proved",
-        "_joined(self.statement, iter(margins), np.minimum, np.maximum).min(axis=1)",
-        "_joined(self.statement, iter(margins), np.minimum, np.maximum).max(axis=1)",
+        "_joined(self.statement, iter(lower), np.minimum, np.maximum).min(axis=1)",
+        "_joined(self.statement, iter(lower), np.minimum, np.maximum).max(axis=1)",
         "test_picture_properties.py::test_parts_of_a_cell_must_all_hold",
     ),
     Fault(
         "claims: all is any", _PROPERTIES, "_joined", "least if statement.all else most", "most", _TREES,
     ),
     Fault(
-        "claims: what is no number proves something", _PROPERTIES, "PictureClaim.proved",
+        "claims: what is no number proves something", _PROPERTIES, "PictureClaim._ends",
         "np.where(np.isnan(side), -np.inf, side)", "np.nan_to_num(side)", _TREES,
     ),
     Fault(

@@ -30,7 +30,7 @@ class CellSamples:
         slopes: [d] what a cut along each parameter may gain.
         cost: The part of the margin that the width of the sets costs, about; NaN: nobody knows.
         cuts: Into how many parts to cut the cell along each parameter; empty: as slopes say.
-        parts: That tile the cell, where some of them are proved.
+        parts: That tile the cell, where some of them are decided.
     """
 
     cell: Cell
@@ -114,6 +114,21 @@ class CellSamples:
                     f"internal error: margin proved to be at least {bound} on {box.lower} to {box.upper}, "
                     f"found {margin} at {pose.tolist()}"
                 )
+
+    def check_refutation(self, box: ParameterBox, bound: float) -> Sample:
+        """The first sample in ``box``, on which the margin is proved to be at most ``bound`` (Q8).
+
+        Raises:
+            ContradictionError: The property holds at one of them.
+        """
+        inside = [k for k, (pose, _) in enumerate(self.samples) if box.contains(pose)]
+        for k in inside:
+            if 0.0 < self.margins[k] < math.inf:
+                raise ContradictionError(
+                    f"internal error: margin proved to be at most {bound} on {box.lower} to {box.upper}, "
+                    f"found {self.margins[k]} at {self.samples[k][0].tolist()}"
+                )
+        return self.samples[inside[0]]
 
 
 def _fails(margin: float) -> bool:

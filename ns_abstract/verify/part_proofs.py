@@ -1,20 +1,26 @@
-"""Parts of a cell that are proved where the whole is not (docs/dev/design.md, Q8)."""
+"""Parts of a cell that are decided where the whole is not (docs/dev/design.md, Q8)."""
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from ns_abstract.arithmetic.rounding import SUB_BOX_OVERLAP
+from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.io.errors import InputError
 from ns_abstract.verify.cell_boxes import divided, meeting, resolved, sub_box_counts
-from ns_abstract.verify.cells import Cell
+from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.network import ImageSets
+from ns_abstract.verify.picture_sets import sane
 from ns_abstract.verify.properties import Claim, Query
-from ns_abstract.verify.protocol import PartsModel
+from ns_abstract.verify.protocol import FrameImages, PartsModel
+from ns_abstract.verify.search_results import FAILURES
 
 
 @dataclass(frozen=True)
@@ -35,42 +41,96 @@ class CellPart:
 
     Attributes:
         cell: The part.
-        margin: Proven lower bound of the margin; None: it is to be examined.
+        verdict: "certified": the property holds at every pose; "falsified": at none; None: it is to be examined.
+        margin: Proven lower bound of the margin of a certified part, proven upper bound of a falsified one's.
     """
 
     cell: Cell
-    margin: float | None
+    verdict: Literal["certified", "falsified"] | None
+    margin: float = math.nan
 
 
-def partly_proved(
-    claim: Claim, model: PartsModel, query: Query, images: ImageSets, cell: Cell, box: ParameterBox
-) -> list[CellPart]:
-    """Return parts that tile a cell, by whether its linear sets prove them (Q8); empty if they prove none.
+@dataclass(frozen=True)
+class PartQuestion:
+    """What is asked of the parts of cells.
 
-    Args:
+    Attributes:
         claim: What is to be proved.
         model: What bounds it.
         query: The claim's.
-        images: The sets of the one cell.
-        cell: The cell.
-        box: Its parameters.
+        refute: Whether parts are looked for in which the property surely fails everywhere.
     """
-    counts = sub_box_counts(cell, model.part_counts(images, _TUNING.parts))
-    if not resolved(box, counts):
-        return []
-    bounds = model.bound_parts(images, counts, SUB_BOX_OVERLAP)
-    margins = np.asarray(claim.proved(query, bounds, [box] * int(counts.prod())), np.float64).reshape(counts)
-    parts = list(_tiled(cell, margins, np.isfinite(margins) & (margins > 0.0)))
-    return parts if any(part.margin is not None for part in parts) else []
+
+    claim: Claim
+    model: PartsModel
+    query: Query
+    refute: bool = True
+
+    def parts(self, images: ImageSets, cell: Cell, box: ParameterBox, halves: bool = True) -> list[CellPart]:
+        """Parts that tile a cell, by what its linear sets ``images`` decide of them (Q8); empty if they decide none.
+
+        ``box``: the cell's parameters. ``halves``: whether halves of it are refuted, too, and not all of it alone.
+        """
+        counts = sub_box_counts(cell, self.model.part_counts(images, _TUNING.parts))
+        if not resolved(box, counts):
+            return []
+        bounds, boxes = self.model.bound_parts(images, counts, SUB_BOX_OVERLAP), [box] * int(counts.prod())
+        low, high = (
+            np.asarray(margins, np.float64).reshape(counts)
+            for margins in (
+                self.claim.proved(self.query, bounds, boxes),
+                self.claim.refuted(self.query, bounds, boxes),
+            )
+        )
+        decided = np.isfinite(low) & (low > 0.0), np.isfinite(high) & (high <= 0.0) & self.refute
+        if decided[1].all():
+            return [CellPart(cell, "falsified", float(high.max()))]
+        decided = decided[0], decided[1] & halves
+        return list(_tiled(cell, (low, high), decided)) if np.any(decided) else []
+
+    def bounded(self, scene: FrameImages, grid: CellGrid, cell: Cell) -> list[CellPart]:
+        """`parts` by sets over the cell itself (Q8); its halves where they decide none; empty where it has no sets.
+
+        A part of a cell is bounded without any picture of it: what a search does with a cell takes several times as
+        long as its sets. Small parts are not refuted, each of which would cost a picture.
+        """
+        check_cancelled()
+        box = grid.box_of(cell)
+        try:
+            linear, lower, upper, slopes = scene.sets(box)
+        except InputError:
+            raise
+        except FAILURES:
+            # the same happens to it as a cell, with a reason
+            return []
+        if not sane(linear, lower, upper):
+            return []
+        images = self.model.input_sets(tuple(side[None] for side in linear), lower[None], upper[None])
+        return self.parts(images, cell, box, halves=False) or [
+            CellPart(half, None) for half in grid.divide(cell, slopes, 0.5, 2)
+        ]
 
 
-def _tiled(cell: Cell, margins: np.ndarray, proved: np.ndarray) -> Iterator[CellPart]:
-    """Parts that tile a cell, none larger than a half along each parameter that is divided."""
+def _tiled(
+    cell: Cell, margins: tuple[np.ndarray, np.ndarray], decided: tuple[np.ndarray, np.ndarray]
+) -> Iterator[CellPart]:
+    """Parts that tile a cell, none larger than a half along each parameter that is divided.
+
+    ``margins`` and ``decided`` [counts]: lower and upper bounds by equal part, and what is proved by either. Falsified
+    parts cost a picture each, so that none is cut off from what is left.
+    """
+    proved, refuted = decided
+    counts = np.array(proved.shape)
     units = [(b - a) // n for a, b, n in zip(cell.first, cell.past, proved.shape, strict=True)]
     halves = [[(0, n)] if n == 1 else [(0, n // 2), (n // 2, n)] for n in proved.shape]
     for spans in itertools.product(*halves):
         ends = [[a + unit * span[k] for a, unit, span in zip(cell.first, units, spans, strict=True)] for k in (0, 1)]
         half, within = Cell(tuple(ends[0]), tuple(ends[1])), tuple(slice(*span) for span in spans)
         for part, open_ in divided(half, ~proved[within], _TUNING.filled):
-            margin = None if open_ else float(margins[meeting(cell, np.array(proved.shape), part)].min())
-            yield CellPart(part, margin)
+            equal = meeting(cell, counts, part)
+            if not open_:
+                yield CellPart(part, "certified", float(margins[0][equal].min()))
+            elif refuted[equal].all():
+                yield CellPart(part, "falsified", float(margins[1][equal].max()))
+            else:
+                yield CellPart(part, None)

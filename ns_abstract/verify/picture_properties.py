@@ -150,16 +150,35 @@ class PictureClaim(Claim):
         return Query(np.concatenate([unit, -unit]), np.zeros(2 * len(unit)))
 
     def proved(self, query: Query, bounds: OutputBounds, boxes: Sequence[ParameterBox]) -> np.ndarray:
-        # [m, parts, 2, leaves] lower bounds of values and of their negatives over parts of the cells
+        margins = [
+            np.min([rise - low] * math.isfinite(low) + [fall + high] * math.isfinite(high), axis=0)
+            for (rise, fall), (low, high) in zip(self._ends(bounds, boxes), self.limits, strict=True)
+        ]
+        lower = [margin - self._rounding(margin) for margin in margins]
+        return _joined(self.statement, iter(lower), np.minimum, np.maximum).min(axis=1)
+
+    def refuted(self, query: Query, bounds: OutputBounds, boxes: Sequence[ParameterBox]) -> np.ndarray:
+        """See `Claim.refuted` (docs/dev/design.md, Q8)."""
+        # the value is at most -fall, and its negative at most -rise
+        margins = [
+            np.min([-fall - low] * math.isfinite(low) + [high - rise] * math.isfinite(high), axis=0)
+            for (rise, fall), (low, high) in zip(self._ends(bounds, boxes), self.limits, strict=True)
+        ]
+        upper = [margin + self._rounding(margin) for margin in margins]
+        return _joined(self.statement, iter(upper), np.minimum, np.maximum).max(axis=1)
+
+    def _ends(self, bounds: OutputBounds, boxes: Sequence[ParameterBox]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """By leaf, lower bounds [m, parts] of its value and of the negative, over parts of the cells."""
         lower = bounds.lower.reshape(len(boxes), -1, 2, len(self.limits))
-        margins = []
-        for k, (low, high) in enumerate(self.limits):
+        for k in range(len(self.limits)):
             # what is not known is as bad as can be, whatever it is combined with
             rise, fall = (np.where(np.isnan(side), -np.inf, side) for side in (lower[..., 0, k], lower[..., 1, k]))
-            sides = [rise - low] * math.isfinite(low) + [fall + high] * math.isfinite(high)
-            margin = np.min(sides, axis=0)
-            margins.append(margin - OWN_MARGIN * (1.0 + np.abs(np.where(np.isfinite(margin), margin, 0.0))))
-        return _joined(self.statement, iter(margins), np.minimum, np.maximum).min(axis=1)
+            yield rise, fall
+
+    @staticmethod
+    def _rounding(margin: np.ndarray) -> np.ndarray:
+        """Of a margin's own sums."""
+        return OWN_MARGIN * (1.0 + np.abs(np.where(np.isfinite(margin), margin, 0.0)))
 
 
 @dataclass(frozen=True)

@@ -62,6 +62,10 @@ class Claim(ABC):
     def proved(self, query: Query, bounds: OutputBounds, boxes: Sequence[ParameterBox]) -> np.ndarray:
         """[m] lower bounds of the margin over the cells ``boxes``; -inf where nothing is known."""
 
+    def refuted(self, query: Query, bounds: OutputBounds, boxes: Sequence[ParameterBox]) -> np.ndarray:
+        """[m] upper bounds of the margin over the cells ``boxes``; infinite where nothing is known."""
+        return np.full(len(boxes), np.inf)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Property(ABC):

@@ -82,7 +82,7 @@ class Model(Protocol):
 
 
 @runtime_checkable
-class PartsModel(Protocol):
+class PartsModel(Model, Protocol):
     """An optional interface of `Model`: bounds of parts of a cell cost next to nothing beside its sets."""
 
     def part_counts(self, images: ImageSets, most: int) -> np.ndarray:

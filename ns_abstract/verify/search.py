@@ -23,9 +23,10 @@ from ns_abstract.refine.protocol import SceneSample
 from ns_abstract.verify.cell_samples import CellSamples, Sample, drawn, sample_key
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.margin_descent import descend
-from ns_abstract.verify.part_proofs import partly_proved
+from ns_abstract.verify.network import ImageSets
+from ns_abstract.verify.part_proofs import CellPart, PartQuestion
 from ns_abstract.verify.picture_sets import PictureSets
-from ns_abstract.verify.properties import Claim, LinearClaim
+from ns_abstract.verify.properties import Claim, LinearClaim, Query
 from ns_abstract.verify.protocol import ComparedCuts, FrameImages, Model, NearImages, PartsModel
 from ns_abstract.verify.search_results import FAILURES, BlockResult, FinishedCell, failure_text
 from ns_abstract.verify.subboxes import PixelWeights, SubBoxProof, margin_weights
@@ -103,9 +104,13 @@ class Search:
     ) -> tuple[np.ndarray, np.ndarray]:
         """[s] concrete margins and [s, n] outputs at poses, drawn by ``scenes`` or the set's pictures."""
         drawn_by = [self.scene] * len(samples) if scenes is None else scenes
-        images = np.stack([drawn(scene, sample) for scene, sample in zip(drawn_by, samples, strict=True)])
+        images = [drawn(scene, sample) for scene, sample in zip(drawn_by, samples, strict=True)]
         self._latest = {sample_key(sample): image for sample, image in zip(samples, images, strict=True)}
-        outputs = np.asarray(self.model.outputs(images), np.float64)
+        return self._judged(samples, images)
+
+    def _judged(self, samples: Sequence[Sample], images: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """`margins` of samples whose pictures are ``images``."""
+        outputs = np.asarray(self.model.outputs(np.stack(images)), np.float64)
         with torch.no_grad():
             margin = self.claim.margin(torch.from_numpy(outputs), torch.from_numpy(np.stack([p for p, _ in samples])))
         return margin.numpy(), outputs
@@ -130,8 +135,6 @@ class Search:
         self._sample([cell for cell in open_cells if cell.proved], self._attack)
         self._sample([cell for cell in samples if cell.parts], self._attack_parts)
         failing = [cell for cell in open_cells if not (cell.proved or cell.broken)]
-        if not self.costly:
-            self._sample([cell for cell in samples if not cell.proved], self._corners)
         # a cell is falsified as a whole where nothing else is seen
         self._sample(failing if self.costly else [c for c in samples if c.broken and c.hopeless], self._late)
         self._descend_worst_cell(failing)
@@ -172,11 +175,14 @@ class Search:
         return [(pose, member) for pose in poses or [cell.box.middle]]
 
     def _attack_parts(self, cell: CellSamples) -> list[Sample]:
-        """A random pose of one of the parts that are proved."""
+        """A random pose of one of the parts that are proved, and the middle of every part that is refuted."""
         generator = _generator(cell.cell)
-        proved = [part.cell for part in cell.parts if part.margin is not None]
-        box = self.grid.box_of(proved[int(generator.integers(len(proved)))])
-        return [(pose, None) for pose in box.sample(1, generator)]
+        proved = [part.cell for part in cell.parts if part.verdict == "certified"]
+        refuted = [self.grid.box_of(part.cell) for part in cell.parts if part.verdict == "falsified"]
+        poses = [box.middle for box in refuted]
+        if proved:
+            poses += list(self.grid.box_of(proved[int(generator.integers(len(proved)))]).sample(1, generator))
+        return [(pose, None) for pose in poses if pose.tobytes() not in cell.poses]
 
     def _members(self, cell: CellSamples) -> Iterator[SceneSample]:
         return self.scene.scene_samples(int(_generator(cell.cell).integers(1 << 31)))
@@ -295,8 +301,7 @@ class Search:
             for place, cell in enumerate(usable):
                 groups = self._branching(cell, float(margins[place]))
                 if isinstance(self.model, PartsModel) and not margins[place] > 0.0 and self._splittable(cell.cell):
-                    one = inputs[place : place + 1]
-                    cell.parts = partly_proved(self.claim, self.model, query, one, cell.cell, cell.box)
+                    cell.parts = self._decided(cell, query, inputs[place : place + 1])
                 if groups:
                     better = self.model.branch(inputs[place : place + 1], query, groups, _BRANCHES)
                     margins[place] = max(margins[place], better)
@@ -312,6 +317,16 @@ class Search:
                 cell.bound = margin
             else:
                 cell.reason = reason
+
+    def _decided(self, cell: CellSamples, query: Query, images: ImageSets) -> list[CellPart]:
+        """Parts that tile a cell, where some of them are decided (Q8); what is left is bounded once more by itself."""
+        assert isinstance(self.model, PartsModel)
+        question = PartQuestion(self.claim, self.model, query, refute=not self.every_unit)
+        parts: list[CellPart] = []
+        for part in question.parts(images, cell.cell, cell.box):
+            finer = [] if part.verdict else question.bounded(cell.scene, self.grid, part.cell)
+            parts += finer or [part]
+        return parts
 
     def _too_wide(self, cell: CellSamples, sets: PictureSets) -> bool:
         """Whether the network's bounds would be wasted on the sets: a guess by the margin's gradient at the middle."""
@@ -370,13 +385,18 @@ class Search:
                     continue
             bound, reason = (None, NO_NUMBER) if cell.undecided else (cell.bound, cell.reason or "the finest cell")
             rank = self._rank(cell, bound)
-            for part in cell.parts:
-                if part.margin is None or cell.undecided:
+            # where no number is known of a picture, bounds decide nothing
+            parts = [] if cell.undecided else cell.parts
+            for part in parts:
+                within = self.grid.box_of(part.cell)
+                if part.verdict is None:
                     children.append((rank, part.cell))
-                    continue
-                cell.check_proof(self.grid.box_of(part.cell), part.margin)
-                leaves.append(FinishedCell(part.cell, "certified", part.margin, 0.0))
-            if cell.parts:
+                elif part.verdict == "certified":
+                    cell.check_proof(within, part.margin)
+                    leaves.append(FinishedCell(part.cell, "certified", part.margin, 0.0))
+                else:
+                    leaves.append(self._counterexample(part.cell, within, cell.check_refutation(within, part.margin)))
+            if parts:
                 continue
             hopeless = cell.hopeless and not self.every_unit
             if self._splittable(cell.cell) and not hopeless:
@@ -388,7 +408,7 @@ class Search:
                     parts = self.grid.divide(cell.cell, gains, *self._cuts(cell, bound))
                 children += [(rank, part) for part in parts]
             elif cell.broken:
-                leaves.append(self._counterexample(cell))
+                leaves.append(self._counterexample(cell.cell, cell.box, cell.samples[cell.worst]))
             else:
                 undecided = cell.undecided > 0
                 leaves.append(FinishedCell(cell.cell, "unknown", bound, 0.0, reason=reason, undecided=undecided))
@@ -428,18 +448,16 @@ class Search:
         # bounds between here and a proof would be wasted
         return max(_NARROWEST, min(0.5, (_LEFT * margin / (margin - bound)) ** (1.0 / _POWER))), _MOST_PARTS
 
-    def _counterexample(self, cell: CellSamples) -> FinishedCell:
-        """The worst pose, rendered and classified once more."""
-        values, member = cell.samples[cell.worst]
-        image = drawn(self.scene, (values, member))
-        margins, outputs = self.margins([(values, member)])
+    def _counterexample(self, cell: Cell, box: ParameterBox, sample: Sample) -> FinishedCell:
+        """What a sample in ``box`` says of a cell, rendered and classified once more."""
+        values, member = sample
+        image = drawn(self.scene, sample)
+        margins, outputs = self._judged([sample], [image])
         margin = float(margins[0])
-        if not -math.inf < margin <= 0.0 or not cell.box.contains(values):
-            return FinishedCell(
-                cell.cell, "unknown", None, 0.0, reason="a counterexample was not confirmed", undecided=True
-            )
+        if not -math.inf < margin <= 0.0 or not box.contains(values):
+            return FinishedCell(cell, "unknown", None, 0.0, reason="a counterexample was not confirmed", undecided=True)
         return FinishedCell(
-            cell.cell,
+            cell,
             "falsified",
             margin,
             0.0,
