@@ -36,7 +36,6 @@ from ns_abstract.verify.eight_bit import Picture
 from ns_abstract.verify.model import NetworkModel, parametric
 from ns_abstract.verify.network import NetworkArithmetic
 from ns_abstract.verify.picture_properties import PICTURE_TYPES, MeasureModel, is_of_picture
-from ns_abstract.verify.pixel_costs import pixel_weights
 from ns_abstract.verify.properties import Claim, LinearClaim, Property
 from ns_abstract.verify.protocol import FrameImages as SearchedScene
 from ns_abstract.verify.protocol import Model as SearchedModel
@@ -44,7 +43,7 @@ from ns_abstract.verify.registration import RegisteredImages, RegisteredModel
 from ns_abstract.verify.scene_margin import KINDS, CellOutcome, ProveCell, VariationKind, bounded_kinds
 from ns_abstract.verify.search import BLOCK, Search
 from ns_abstract.verify.search_results import BlockResult, ContradictionError
-from ns_abstract.verify.subboxes import SubBoxProof
+from ns_abstract.verify.subboxes import SubBoxProof, pixel_costs
 
 if TYPE_CHECKING:
     from ns_abstract.verify.interop import Form, LibraryVersion
@@ -237,7 +236,7 @@ class Certification:
             pictures = self.pictures(index)
             every_unit = self.property.partitions is not None
             claim = self.claim(pictures)
-            pictures.weigh = partial(pixel_weights, pictures, self.model, claim)
+            pictures.weigh = partial(pixel_costs, pictures, self.model, claim)
             cover = self._cover(pictures)
             costly = isinstance(self.model, NetworkModel)
             self._searches[key] = Search(

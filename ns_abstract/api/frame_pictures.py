@@ -96,7 +96,7 @@ class FramePictures:
     ) -> None:
         self._rounded, self._response = picture == "8-bit", response
         self.frame: Frame = self._frame(method, poses, sheared)
-        #: What pixels of a cell cost, where pictures are made ray by ray: see `pixel_weights`.
+        #: What pixels of a cell cost, where pictures are made ray by ray: see `pixel_costs`.
         self.weigh: Callable[[ParameterBox], np.ndarray | None] = lambda box: None
         self._images: dict[bytes, np.ndarray] = {}
         self.box = self.frame.box

@@ -267,9 +267,6 @@ def connected(address: str | None, workers: int = 1, tls: Tls | None = None) -> 
 
     That cluster has ``workers`` processes of one thread, and listens on the loopback interface alone. ``tls`` encrypts
     the connection to ``address``, and both ends prove who they are.
-
-    Raises:
-        InputError: Dask is missing or its scheduler does not answer.
     """
     try:
         from dask import config

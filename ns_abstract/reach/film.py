@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.execution.cancellation import check_cancelled
-from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.reach.pictures import Pictures
 from ns_abstract.reach.tubes import Tube, TubeBuilder
 from ns_abstract.refine.protocol import Method
@@ -82,9 +81,6 @@ def along(reacher: TubeBuilder, method: Method, size: tuple[int, int], tube: Tub
     """Yield, step by step, bounds of all pictures that the camera may take, and the picture at the middle pose.
 
     The bounds are those of one cell, as tubes have them.
-
-    Raises:
-        WorkCancelledError: There is no time for more.
     """
     camera = reacher.loop.camera
     poses = camera.poses(size)
@@ -96,7 +92,7 @@ def along(reacher: TubeBuilder, method: Method, size: tuple[int, int], tube: Tub
         outer = poses.box
         if not pose.finite or not ((low >= outer.lower) & (high <= outer.upper)).all():
             return
-        box = ParameterBox(outer.names, outer.units, tuple(low.tolist()), tuple(high.tolist()))
+        box = outer.with_ends(low, high)
         _, lower, upper, _ = view.sets(box)
         image = view.image(np.clip(camera.values(tube.sets[step].center), low, high))
         seconds = time.perf_counter() - begin

@@ -404,9 +404,7 @@ class TubeBuilder:
             low, high = np.concatenate([low, -place]), np.concatenate([high, place])
             none = np.zeros((place.size, pose.generators.shape[1]))
             pose = pose.beside(AffineSet(np.zeros(place.size), none, place, pose.first))
-        names, units = self.view.pose_set.box.names, self.view.pose_set.box.units
-        box = ParameterBox(names, units, tuple(low.tolist()), tuple(high.tolist()))
-        return box, _scaled(pose, *middle_half(low, high))
+        return self.view.pose_set.box.with_ends(low, high), _scaled(pose, *middle_half(low, high))
 
     def _view_margins(self, state: AffineSet, step: int) -> tuple[Float64, Float64]:
         """[properties] lower bounds of their margins at a step (L7), and how much the pictures move by generator."""

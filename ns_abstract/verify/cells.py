@@ -65,11 +65,7 @@ class CellGrid:
 
     @classmethod
     def fixed(cls, box: ParameterBox, partitions: Sequence[int], coarse: Sequence[int]) -> CellGrid:
-        """The grid of a fixed partition, as in the paper.
-
-        Raises:
-            InputError: The partition does not fit the parameters.
-        """
+        """The grid of a fixed partition, as in the paper."""
         if len(partitions) != box.dimensions:
             raise InputError(
                 f"{len(partitions)} numbers, the set has {box.dimensions} parameters: {', '.join(box.names) or 'none'}",

@@ -157,11 +157,7 @@ class LocationSearch:
         return (below + above).max(axis=-1)
 
     def examine(self, cells: Sequence[Cell]) -> LocationResult:
-        """Exclude the cells, or cut them.
-
-        Raises:
-            WorkCancelledError: There is no time for it.
-        """
+        """Exclude the cells, or cut them."""
         begin = time.perf_counter()
         reports = [_Examination(self, cell, self.tiled.chosen(cell.outliers)) for cell in cells]
         for report in reports:

@@ -106,8 +106,7 @@ def cover(box: ParameterBox, boxes: ShearedBoxes, most: int = MOST) -> PoseCover
         if not chosen.size:
             excluded.append(cell)
             return
-        hull = _replaced(box, lower.min(axis=0), upper.max(axis=0))
-        inner = inner_cell(grid, cell, hull)
+        inner = inner_cell(grid, cell, box.with_ends(lower.min(axis=0), upper.max(axis=0)))
         excluded.extend(slabs(cell, inner))
         count += 1
         filled = float(np.prod(upper - lower, axis=1).sum())
@@ -142,7 +141,3 @@ def _hull_volume(grid: CellGrid, boxes: ShearedBoxes, parts: list[Cell], chosen:
         if some.size:
             total += float(np.prod(upper.max(axis=0) - lower.min(axis=0)))
     return total
-
-
-def _replaced(box: ParameterBox, lower: Float64Array, upper: Float64Array) -> ParameterBox:
-    return ParameterBox(box.names, box.units, tuple(lower.tolist()), tuple(upper.tolist()))

@@ -92,7 +92,7 @@ class NetworkModel:
 
 @dataclasses.dataclass(frozen=True)
 class ModelSharedBounds:
-    """Bounds of a cell, and of others with its coefficients; see `ns_abstract.verify.protocol.SharedBounds`."""
+    """Bounds of a cell, and of others with its coefficients; `fresh` ones bound the last activation anew."""
 
     shared_bounds: SharedCoefficients
 

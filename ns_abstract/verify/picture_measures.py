@@ -41,11 +41,7 @@ class Region:
     name: str = "region"
 
     def pixels(self, height: int, width: int) -> np.ndarray:
-        """[H, W] bool.
-
-        Raises:
-            InputError: It reaches beyond the picture, the mask has another size or nothing white.
-        """
+        """[H, W] bool."""
         chosen = np.ones((height, width), bool)
         if self.mask is not None:
             chosen = read_grey_mask(self.mask)

@@ -92,28 +92,3 @@ class PartsModel(Protocol):
     def bound_parts(self, images: ImageSets, counts: np.ndarray, overlap: float) -> OutputBounds:
         """Bounds of the query's rows over equal parts of one cell, a row for each, the last parameter's first."""
         ...
-
-
-class SharedBounds(Protocol):
-    """Bounds of a cell, and of others with its coefficients (`SharedCoefficients`)."""
-
-    def first(self, query: Query) -> OutputBounds:
-        """Bounds of the query's rows over the cell."""
-        ...
-
-    def others(self, images: ImageSets, query: Query, *, fresh: bool = False) -> OutputBounds:
-        """The same over other cells."""
-        ...
-
-
-class SharedBoundsModel(Protocol):
-    """A network whose backward coefficients can be reused across cells."""
-
-    @property
-    def reusable_anywhere(self) -> bool:
-        """Whether rows of a cell serve for others that are no parts of it."""
-        ...
-
-    def shared_bounds(self, images: ImageSets) -> SharedBounds:
-        """Bounds of one cell, whose rows are to serve for others."""
-        ...

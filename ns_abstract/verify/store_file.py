@@ -277,11 +277,7 @@ class StoreFile:
         self.keep(f"{name}.npz", data)
 
     def keep(self, name: str, data: bytes) -> Path:
-        """Write a file and return it; one of that name that is not ours stays, and ours gets another name.
-
-        Raises:
-            InputError: It cannot be written.
-        """
+        """Write a file and return it; one of that name that is not ours stays, and ours gets another name."""
         file, number = self._place(name), 1
         wanted = file
 
@@ -349,6 +345,13 @@ class StoreFile:
             if self._base.in_transaction:
                 self._base.execute("ROLLBACK")
             raise
+
+    def _insert(self, table: str, row: tuple[Any, ...], seal: TableChecksum | None) -> int:
+        """Add a row of ``table``, sealed unless it stands for an open block; returns its number."""
+        number = self._base.execute(f"INSERT INTO {table} VALUES ({', '.join('?' * len(row))})", row).lastrowid
+        if seal is not None:
+            seal.add(row)
+        return number
 
     def _put(self, key: str, value: Any) -> None:
         self._base.execute("INSERT OR REPLACE INTO search_state VALUES (?, ?)", (key, json.dumps(value)))

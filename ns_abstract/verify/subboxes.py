@@ -18,10 +18,11 @@ import torch
 from ns_abstract.arithmetic.rounding import NONZERO
 from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.verify.model import ModelSharedBounds, NetworkModel
 from ns_abstract.verify.network import ImageSets, OutputBounds
 from ns_abstract.verify.picture_sets import PictureSets, hull_of_sets
 from ns_abstract.verify.properties import Claim, Query
-from ns_abstract.verify.protocol import FrameImages, Model, SharedBounds, SharedBoundsModel
+from ns_abstract.verify.protocol import FrameImages, Model
 from ns_abstract.verify.search_results import FAILURES
 
 #: The power of the width that sets cost.
@@ -99,6 +100,12 @@ def margin_weights(model: Model, claim: Claim, image: np.ndarray, values: np.nda
     return PixelWeights(gradient.numpy() / here, here) if here > 0.0 else None
 
 
+def pixel_costs(scene: FrameImages, model: Model, claim: Claim, box: ParameterBox) -> np.ndarray | None:
+    """What part of the margin in the middle of a cell a unit of each pixel may cost (an estimate); None: unknown."""
+    weights = margin_weights(model, claim, scene.image(box.middle), box.middle)
+    return None if weights is None or not np.isfinite(weights.slopes).all() else np.abs(weights.slopes)
+
+
 @dataclass(frozen=True)
 class SubBoxOutcome:
     """The result of a cell.
@@ -151,7 +158,7 @@ class _CellWork:
     asked: int = 0
     done: float = 0.0
     margins: list[float] = field(default_factory=list)
-    rows: SharedBounds | None = None
+    rows: ModelSharedBounds | None = None
 
     def learn(self, cost: float, margin: float) -> None:
         """Take notice of the margin that own rows prove for a part that costs so much."""
@@ -197,7 +204,7 @@ class SubBoxProof:
 
     scene: FrameImages
     model: Model
-    sharing: SharedBoundsModel
+    sharing: NetworkModel
     claim: Claim
     frame: Parametrisation = own_parameters
     most: int = 64
@@ -283,11 +290,7 @@ class SubBoxProof:
         return picture_sets if picture_sets.sane else None
 
     def _all(self, work: _CellWork, node: _PendingBox) -> None:
-        """Prove a box, in groups of parts.
-
-        Raises:
-            _StoppedError: It takes too many, or one cannot be proved.
-        """
+        """Prove a box, in groups of parts."""
         counts = divisions(node.effects, node.cost, work.aim, self.most)
         if math.prod(counts) > (_GROUP if self.sharing.reusable_anywhere else _JOINED):
             for half in node.parts(int(np.argmax(counts)), 2):
@@ -310,11 +313,7 @@ class SubBoxProof:
         return feasible_boxes
 
     def _group(self, work: _CellWork, nodes: Sequence[_PendingBox]) -> None:
-        """Prove neighbouring parts.
-
-        Raises:
-            _StoppedError: It takes too many parts, or one cannot be proved.
-        """
+        """Prove neighbouring parts."""
         nodes = self._feasible(work, nodes)
         if not nodes:
             return
@@ -356,7 +355,9 @@ class SubBoxProof:
             self._lent(work, rows, parts, margins)
         return margins
 
-    def _lent(self, work: _CellWork, rows: SharedBounds, parts: Sequence[PictureSets], margins: np.ndarray) -> None:
+    def _lent(
+        self, work: _CellWork, rows: ModelSharedBounds, parts: Sequence[PictureSets], margins: np.ndarray
+    ) -> None:
         """Prove those of ``parts`` without a margin by rows of another, in place."""
         for fresh in (False, True):
             # before, nothing is known of some
@@ -398,11 +399,7 @@ class SubBoxProof:
     def _left(
         self, work: _CellWork, nodes: Sequence[_PendingBox], margins: np.ndarray
     ) -> list[tuple[int, _PendingBox]]:
-        """Those of ``nodes`` that have no proof, by number; the others are done with.
-
-        Raises:
-            _StoppedError: One cannot be cut any further.
-        """
+        """Those of ``nodes`` that have no proof, by number; the others are done with."""
         work.margins += [float(margin) for margin in margins if margin > 0.0]
         work.done += sum(node.share for node, margin in zip(nodes, margins, strict=True) if margin > 0.0)
         left = [(k, node) for k, node in enumerate(nodes) if not margins[k] > 0.0]
