@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -126,6 +128,32 @@ def division_for(
         axes.append(axis)
         widest[axis] *= 0.5
     return Division(tuple(axes), d, finer)
+
+
+@dataclass(frozen=True)
+class RayCells:
+    """Cells of one level, each of a ray and perhaps of one of its samples: [k] numbers."""
+
+    ray: np.ndarray
+    cell: np.ndarray
+    sample: Any = None
+
+    def __len__(self) -> int:
+        return self.ray.size
+
+    def take(self, which: np.ndarray | slice) -> RayCells:
+        """Some of them."""
+        return RayCells(*(None if part is None else part[which] for part in vars(self).values()))
+
+    def chunks(self, size: int) -> Iterator[RayCells]:
+        """At most ``size`` at a time."""
+        return (self.take(slice(start, start + size)) for start in range(0, len(self), size))
+
+
+def join_cells(parts: Sequence[RayCells]) -> RayCells:
+    """All cells of ``parts``, one at least, of samples or of whole rays."""
+    columns = zip(*(vars(part).values() for part in parts), strict=True)
+    return RayCells(*(None if column[0] is None else np.concatenate(column) for column in columns))
 
 
 #: What lower and upper bounds of several parts become.

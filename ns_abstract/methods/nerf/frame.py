@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import secrets
 import time
 from collections.abc import Callable, Sequence
@@ -20,9 +19,10 @@ from ns_abstract.execution.engines import Processes
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseBox
 from ns_abstract.methods.nerf.bounds import NerfBounds
+from ns_abstract.methods.nerf.hsv import shift_ends, shift_parts
 from ns_abstract.methods.nerf.ray_field import BoundedRays, RayBounds, Shifts, typical_displacement
-from ns_abstract.methods.nerf.ray_pictures import PixelRenderer, RayPictures
-from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
+from ns_abstract.methods.nerf.ray_pictures import RayPictures
+from ns_abstract.methods.nerf.render import NerfRenderer, RayRenderer, Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.nerf.strips import PoseStrips
 from ns_abstract.refine.protocol import LinearSets
@@ -132,7 +132,7 @@ class FieldFrame(RayPictures):
     """
 
     def __init__(
-        self, pose_set: PoseBox, renderer: PixelRenderer, bounds: BoundedRays, share: int, at_once: int, workers: int
+        self, pose_set: PoseBox, renderer: RayRenderer, bounds: BoundedRays, share: int, at_once: int, workers: int
     ) -> None:
         super().__init__(pose_set, renderer)
         self._geometry = pose_set.geometry
@@ -249,11 +249,7 @@ class FieldFrame(RayPictures):
         return [parts[i : i + each] for i in range(0, len(parts), each)]
 
     def _run(self, calls: Sequence[Sequence[Any]]) -> list[RayBounds]:
-        """`BoundedRays.rays` with the arguments of each call, side by side where there are several.
-
-        Raises:
-            WorkCancelledError: There is no time for all of them.
-        """
+        """`BoundedRays.rays` with the arguments of each call, side by side where there are several."""
         parts = [part for part in self._tried(calls) if part is not None]
         if len(parts) < len(calls):
             raise WorkCancelledError
@@ -280,9 +276,6 @@ class FieldFrame(RayPictures):
             most: Rays that are bounded, about, the first of `rays`; the others are left at [0, 1]. All if None.
             weigh: Gives [H, W, 3] what part of the margin a unit of each pixel's width may cost, or None; asked only
                 where rays could be refined.
-
-        Raises:
-            WorkCancelledError: There is no time for it.
         """
 
         def weights() -> np.ndarray | None:
@@ -358,18 +351,7 @@ class FieldFrame(RayPictures):
 
     def _shifts(self, box: ParameterBox) -> list[Shifts]:
         """Equal parts of the box's shifts of colours, which cost nothing to tell apart; empty: there are none."""
-        ranges = []
-        for name in COLOR_SHIFTS:
-            if name in box.names:
-                low, high = (side[box.names.index(name)] for side in (box.lower, box.upper))
-            else:
-                low = high = self.pose_set.fixed.get(name, 0.0)
-            ends = np.linspace(low, high, _SHIFT_PARTS + 1 if low < high else 2).tolist()
-            ends[0], ends[-1] = low, high
-            ranges.append(list(itertools.pairwise(ends)))
-        if not any(low or high for cuts in ranges for low, high in cuts):
-            return []
-        return list(itertools.product(*ranges))
+        return shift_parts(shift_ends(box, self.pose_set.fixed, _SHIFT_PARTS))
 
     def _tolerance(self, box: ParameterBox) -> float:
         """Narrower boxes are asked for when the bounds of wider ones are not good enough."""

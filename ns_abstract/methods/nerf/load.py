@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.jsonio import is_number, show
+from ns_abstract.io.jsonio import is_number, show, unusable
 from ns_abstract.methods import config_keys, runs
 from ns_abstract.methods.nerf import model_state
 from ns_abstract.methods.nerf.model_state import ModelState
@@ -44,11 +44,7 @@ def holds_nerf(run: runs.RunConfig) -> bool:
 
 
 def load_nerf(run: runs.RunConfig, overrides: Overrides | None = None) -> NerfScene:
-    """Read the fields and what evaluation needs besides.
-
-    Raises:
-        InputError: For any content of the files, or an override, that cannot be used.
-    """
+    """Read the fields and what evaluation needs besides."""
     overrides = overrides or Overrides()
     model_state.check_model(run, overrides, (_STOCK, _OURS), "vanilla-nerf", _FIX)
     unused = config_keys.check_keys(run, config_keys.VANILLA_NERF)
@@ -113,11 +109,11 @@ def _encodings(run: runs.RunConfig) -> tuple[tuple[float, float], tuple[int | No
         return _EXPONENTS, (None, None)
     highest = run.model.get("max_frequency_exponent", _MAX_EXPONENT)
     if not is_number(highest) or not 0.0 <= highest <= _MAX_EXPONENT_LIMIT:
-        raise InputError(
-            f"found {show(highest)}",
-            file=run.file,
+        raise unusable(
+            highest,
             field="pipeline.model.max_frequency_exponent",
             fix=f"write a number from 0 to {_MAX_EXPONENT_LIMIT:g}",
+            file=run.file,
         )
     return (float(highest), direction - 1.0), (position, direction)
 
@@ -126,11 +122,8 @@ def _far_plane(run: runs.RunConfig) -> float:
     params = runs.as_mapping(run.model.get("collider_params", _PLANES))
     value = None if params is None else params.get("far_plane", _PLANES["far_plane"])
     if not is_number(value) or not 0.0 < value < 1e6:  # pyright: ignore[reportOperatorIssue]
-        raise InputError(
-            f"found {show(value)}",
-            file=run.file,
-            field="pipeline.model.collider_params.far_plane",
-            fix="write a distance above 0",
+        raise unusable(
+            value, field="pipeline.model.collider_params.far_plane", fix="write a distance above 0", file=run.file
         )
     return float(value)  # pyright: ignore[reportArgumentType]
 
@@ -148,9 +141,6 @@ def field_weights(
         name: "field_coarse" or "field_fine".
         exponents: Highest exponents of the frequencies of positions and directions; the lowest are 0.
         counts: Numbers of these frequencies; None: what the layers' widths say.
-
-    Raises:
-        InputError: The layers do not fit each other or the encodings.
     """
 
     def layer(key: str, skip: bool = False) -> Layer:

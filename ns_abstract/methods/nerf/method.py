@@ -47,9 +47,6 @@ class NerfMethod(FieldMethod):
         workers: Processes that bound rays; on a GPU, as many of them as have room there.
         occupancy: Declared as part of the scene: density is 0 outside of its occupied voxels.
         device: Where the field is bounded and drawn: "cpu" (None: the same) or "cuda".
-
-    Raises:
-        InputError: An option does not go with a NeRF, or the device is not there.
     """
 
     def __init__(
@@ -117,20 +114,12 @@ class NerfMethod(FieldMethod):
         return f"vanilla NeRF, {self.scene.fine.text}"
 
     def frame(self, poses: PoseBox, sheared: bool = False, layers: bool = False) -> NerfFrame:
-        """One frame, ready for refinement; its cells are never ``sheared``.
-
-        Raises:
-            InputError: Layers are asked for: a NeRF's depth is a median.
-        """
+        """One frame, ready for refinement; its cells are never ``sheared``."""
         refuse_layers(layers)
         return NerfFrame(self.scene, self.sampling, poses, self.device, self._processes(poses.geometry.box.dimensions))
 
     def weight_frame(self, poses: PoseBox, planes: Sequence[WeightPlane], pixels: np.ndarray) -> NerfWeightFrame:
-        """See `ns_abstract.refine.protocol.WeightMethod`: weights of samples in boxes, distances along the rays.
-
-        Raises:
-            InputError: A selection is one of Gaussians, or the sampling is hierarchical.
-        """
+        """See `ns_abstract.refine.protocol.WeightMethod`: weights of samples in boxes, distances along the rays."""
         workers = self._processes(poses.geometry.box.dimensions)
         return NerfWeightFrame(self.scene, self.sampling, poses, planes, pixels, self.device, workers)
 

@@ -60,11 +60,7 @@ class ModelState(dict[str, Any]):
 def read_linear(
     state: Mapping[str, Any], key: str, file: Path, fix: str
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Weight [out, in] and bias [out] of a linear layer.
-
-    Raises:
-        InputError: One is missing, or their shapes are not those of a linear layer.
-    """
+    """Weight [out, in] and bias [out] of a linear layer."""
     where = f"pipeline._model.{key}"
     for part in ("weight", "bias"):
         if f"{key}.{part}" not in state:
@@ -77,11 +73,7 @@ def read_linear(
 
 
 def check_model(run: runs.RunConfig, overrides: Overrides, classes: Sequence[str], method: str, fix: str) -> None:
-    """Refuse options of splats, and model classes whose picture may not be that of ``method``.
-
-    Raises:
-        InputError: Names the class, which is none of ``classes``, or the option.
-    """
+    """Refuse options of splats, and model classes whose picture may not be that of ``method``."""
     overrides.refuse(_SPLATS, "is for splats, this run is a NeRF")
     target = runs.target_class(run)
     if target and target not in classes:

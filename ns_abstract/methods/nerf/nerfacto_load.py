@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.jsonio import is_number, show
+from ns_abstract.io.jsonio import is_number, show, unusable
 from ns_abstract.io.memory import check_memory
 from ns_abstract.methods import config_keys, runs
 from ns_abstract.methods.checkpoint import StoredTensor, to_float32
@@ -84,11 +84,7 @@ def holds_nerfacto(run: runs.RunConfig) -> bool:
 
 
 def load_nerfacto(run: runs.RunConfig, overrides: Overrides | None = None) -> NerfactoScene:
-    """Read the fields and what evaluation needs besides.
-
-    Raises:
-        InputError: For any content of the files, or an override, that cannot be used.
-    """
+    """Read the fields and what evaluation needs besides."""
     overrides = overrides or Overrides()
     model_state.check_model(run, overrides, (_STOCK,), "nerfacto", _FIX)
     unused = config_keys.check_keys(run, config_keys.NERFACTO)
@@ -206,7 +202,7 @@ def _positive(run: runs.RunConfig, name: str, default: float, most: float) -> fl
     value: Any = run.model.get(name, default)
     if not is_number(value) or not 0.0 < value < most:
         fix = "write a number above 0" + (f" and below {most:g}" if math.isfinite(most) else "")
-        raise InputError(f"found {show(value)}", file=run.file, field=_MODEL + name, fix=fix)
+        raise unusable(value, field=_MODEL + name, fix=fix, file=run.file)
     return float(value)
 
 
@@ -232,11 +228,11 @@ def _samples(run: runs.RunConfig) -> tuple[int, ...]:
     wanted = range(1, _SAMPLES_LIMIT + 1)
     fits = isinstance(value, (list, tuple)) and all(type(one) is int and one in wanted for one in value)
     if not fits or len(value) < rounds:
-        raise InputError(
-            f"found {show(value)}",
-            file=run.file,
+        raise unusable(
+            value,
             field=_MODEL + "num_proposal_samples_per_ray",
             fix=f"write {rounds} numbers from 1 to {_SAMPLES_LIMIT}, one for every proposal iteration",
+            file=run.file,
         )
     return (*value[:rounds], run.integer("num_nerf_samples_per_ray", 48, 1, _SAMPLES_LIMIT))
 
@@ -248,12 +244,10 @@ def _proposal_arguments(run: runs.RunConfig) -> list[dict[str, int]]:
     entries = [runs.as_mapping(one) for one in value] if isinstance(value, (list, tuple)) else []
     same = run.model.get("use_same_proposal_network", False)
     if not isinstance(same, bool):
-        raise InputError(
-            f"found {show(same)}", file=run.file, field=_MODEL + "use_same_proposal_network", fix="write true or false"
-        )
+        raise unusable(same, field=_MODEL + "use_same_proposal_network", fix="write true or false", file=run.file)
     if not entries or None in entries or (same and len(entries) != 1):
         fix = "write one mapping" if same else "write a list of mappings"
-        raise InputError(f"found {show(value)}", file=run.file, field=name, fix=fix)
+        raise unusable(value, field=name, fix=fix, file=run.file)
     arguments = []
     for entry in entries:
         assert entry is not None
@@ -360,7 +354,7 @@ def _color_net(run: runs.RunConfig, state: ModelState, file: Path) -> DenseNet:
     average = run.model.get("use_average_appearance_embedding", True)
     for name, value in (("use_appearance_embedding", use), ("use_average_appearance_embedding", average)):
         if not isinstance(value, bool):
-            raise InputError(f"found {show(value)}", file=run.file, field=_MODEL + name, fix="write true or false")
+            raise unusable(value, field=_MODEL + name, fix="write true or false", file=run.file)
     length = run.integer("appearance_embed_dim", 32, 0, _WIDTH_LIMIT) if use else 0
     width = run.integer("hidden_dim_color", 64, 1, _WIDTH_LIMIT)
     inputs = HARMONICS + FEATURES

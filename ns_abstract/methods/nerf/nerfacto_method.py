@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from ns_abstract.geometry.poses import PoseBox
@@ -11,6 +10,7 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.device import check_device
 from ns_abstract.methods.nerf.hash_bounds.bounds import NerfactoFrame
 from ns_abstract.methods.nerf.hash_field import NerfactoScene
+from ns_abstract.methods.nerf.nerfacto_render import NerfactoRenderer
 from ns_abstract.methods.nerf.ray_pictures import (
     FieldMethod,
     arrays_digest,
@@ -128,7 +128,4 @@ class NerfactoMethod(FieldMethod):
 
     def differentiable(self, poses: PoseBox) -> Callable[[torch.Tensor], torch.Tensor]:
         """Parameter values [d] to the picture [H, W, 3], in torch."""
-        from ns_abstract.methods.nerf.nerfacto_torch import DifferentiableNerfacto
-        from ns_abstract.methods.nerf.render import differentiable_picture
-
-        return picture_of_parameters(poses, partial(differentiable_picture, DifferentiableNerfacto(self.scene.field)))
+        return picture_of_parameters(poses, NerfactoRenderer(self.scene.field).picture)

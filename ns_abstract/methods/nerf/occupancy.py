@@ -116,11 +116,7 @@ class OccupancyGrid:
 
 
 def load_grid(path: Path) -> OccupancyGrid:
-    """Read a grid from an npz with ``occupied`` [X, Y, Z] bool and ``aabb`` [2, 3] (normalised units).
-
-    Raises:
-        InputError: The file cannot be read or does not hold a grid.
-    """
+    """Read a grid from an npz with ``occupied`` [X, Y, Z] bool and ``aabb`` [2, 3] (normalised units)."""
     with open_archive(path, "occupancy grid", "give an .npz with occupied and aabb") as file:
         for name in ("occupied", "aabb"):
             if name not in file.declared:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,10 +13,10 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseBox
 from ns_abstract.geometry.tiles import tile_grid
-from ns_abstract.geometry.transform import DataparserTransform
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.hsv import color_shift
-from ns_abstract.methods.nerf.render import Shift
+from ns_abstract.methods.nerf.render import RayRenderer
+from ns_abstract.methods.nerf.scene import FieldScene
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.refine.protocol import Frame, SceneSample
 
@@ -37,16 +37,6 @@ class MotionTuning:
 _MOTION_STEP, _SHIFT_MOTION = MotionTuning.step, MotionTuning.shift
 
 
-class PixelRenderer(Protocol):
-    """Draws rays of a field."""
-
-    def pixels(
-        self, camera: PinholeCamera, pose: np.ndarray, pixels: np.ndarray, shift: Shift | None = None
-    ) -> np.ndarray:
-        """Colours [n, 3] float64 of ``pixels`` [n, 2] (row, column) from camera-to-world ``pose`` [3, 4]."""
-        ...
-
-
 class RayPictures:
     """Renders one frame's set of poses. Every ray is a tile of its own."""
 
@@ -60,7 +50,7 @@ class RayPictures:
     #: A distance that is typical of what a ray meets, normalised units; subclasses set it.
     typical_distance: float
 
-    def __init__(self, pose_set: PoseBox, renderer: PixelRenderer) -> None:
+    def __init__(self, pose_set: PoseBox, renderer: RayRenderer) -> None:
         self.pose_set, self.camera, self.box = pose_set, pose_set.camera, pose_set.box
         self.side = 1
         self.across, self.down = tile_grid(self.camera, 1)
@@ -117,19 +107,6 @@ class RayPictures:
         return pose[:, 3] - distance * pose[:, 2]
 
 
-class FieldScene(Protocol):
-    """The properties of a scene that reports name."""
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def notes(self) -> tuple[str, ...]: ...
-
-    @property
-    def dataparser(self) -> DataparserTransform: ...
-
-
 class FieldMethod:
     """What `ns_abstract.refine.protocol.Method` says of any field."""
 
@@ -147,7 +124,7 @@ class FieldMethod:
     @property
     def notes(self) -> tuple[str, ...]:
         """What was assumed on reading the scene."""
-        return tuple(self._named.notes)
+        return self._named.notes
 
     @property
     def dataset_scale(self) -> float:

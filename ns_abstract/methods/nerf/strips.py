@@ -20,9 +20,10 @@ from ns_abstract.arithmetic.rounding import PART_END_ROUNDING
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseBox
 from ns_abstract.methods.nerf.division import Division
+from ns_abstract.methods.nerf.hsv import shift_ends, shift_parts
 from ns_abstract.methods.nerf.planes import fit_planes
 from ns_abstract.methods.nerf.ray_bundle import RayBundle
-from ns_abstract.methods.nerf.ray_field import BoundedRays, RayBounds, Shifts
+from ns_abstract.methods.nerf.ray_field import BoundedRays, RayBounds
 
 #: Rays that are bounded together by compiled kernels, and by torch alone, which wants many cells at a time.
 _GROUP, _GROUP_ON_DEVICE = 8, 64
@@ -165,31 +166,14 @@ class PoseStrips:
 
     def _shift_ends(self, level: int) -> list[np.ndarray]:
         """Edges of the parts of hue and saturation of a level; two where it is fixed."""
-        ends_by_shift = []
-        for name in COLOR_SHIFTS:
-            if name in self.shifting:
-                axis = self.pose_set.box.names.index(name)
-                low, high = self.pose_set.box.lower[axis], self.pose_set.box.upper[axis]
-                ends = np.linspace(low, high, _SHIFT_PARTS * _SHIFT_FINER**level + 1)
-                ends[0], ends[-1] = low, high
-            else:
-                ends = np.full(2, self.pose_set.fixed.get(name, 0.0))
-            ends_by_shift.append(ends)
-        return ends_by_shift
-
-    def _shifts(self, level: int) -> list[Shifts]:
-        """Parts of hue and saturation, the latter running faster; empty: nothing is shifted."""
-        ranges = [list(itertools.pairwise(ends.tolist())) for ends in self._shift_ends(level)]
-        if not any(low or high for cuts in ranges for low, high in cuts):
-            return []
-        return [(hue, saturation) for hue, saturation in itertools.product(*ranges)]
+        return shift_ends(self.pose_set.box, self.pose_set.fixed, _SHIFT_PARTS * _SHIFT_FINER**level)
 
     # ---------------------------------------------------------------- strips
 
     def _call(
         self, strip: ParameterBox, pixels: np.ndarray, layout: StripLayout, level: int, known: np.ndarray | None
     ) -> tuple:
-        shifts = self._shifts(level)
+        shifts = shift_parts(self._shift_ends(level))
         return self.geometry, strip, pixels, TOLERANCES[level], known, None, shifts, layout.division
 
     def _ensure(self, level: int, place: tuple[int, ...], groups: Sequence[int]) -> list[_StripBounds]:

@@ -31,7 +31,7 @@ from ns_abstract.methods.nerf.hash_bounds.network import (
 )
 from ns_abstract.methods.nerf.hash_bounds.pieces import DensityArrays, FieldArrays, PieceRoom
 from ns_abstract.methods.nerf.hash_field import LAYERS_LIMIT, DenseNet, HashEncoding, NerfactoField, NerfactoScene
-from ns_abstract.methods.nerf.nerfacto_render import NerfactoRenderer
+from ns_abstract.methods.nerf.nerfacto_render import NerfactoRenderer, spacing
 from ns_abstract.methods.nerf.ray_bundle import TAYLOR, RayBundle
 from ns_abstract.methods.nerf.ray_field import BoundedRays, RayBounds, RayRequest
 
@@ -170,24 +170,17 @@ def _density(encoding: HashEncoding, net: DenseNet, scale: float) -> DensityArra
     return DensityArrays(table, resolutions, ranges, net_weights(net), float(scale))
 
 
-def spacing_of(field: NerfactoField) -> tuple[bool, float, float]:
-    """Whether distances are piecewise, and the ends of rays in the units in which edges are equally spaced."""
-    if field.spacing == "uniform":
-        return False, float(field.near), float(field.far)
-    first, last = (x / 2.0 if x < 1.0 else 1.0 - 1.0 / (2.0 * x) for x in (field.near, field.far))
-    return True, first, last
-
-
 def field_arrays(field: NerfactoField) -> FieldArrays:
     """The arrays of ``field`` for kernels."""
-    last = isinstance(field.background, str)
+    last, piecewise = isinstance(field.background, str), field.spacing == "piecewise"
+    place = spacing if piecewise else float
     return FieldArrays(
         tuple(_density(one.encoding, one.net, one.average_init_density) for one in field.proposals),
         _density(field.encoding, field.density_net, field.average_init_density),
         head_weights(field.color_net, HARMONICS),
         np.zeros(3) if last else np.ascontiguousarray(field.background, np.float64),
         last,
-        spacing_of(field),
+        (piecewise, place(field.near), place(field.far)),
     )
 
 
