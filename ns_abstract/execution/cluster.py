@@ -181,7 +181,6 @@ class Tls:
 
     Attributes:
         ca_file: Who signs the others' certificates.
-        cert, key: This client's own.
     """
 
     ca_file: Path

@@ -109,7 +109,6 @@ class CameraPath:
     """The cameras of a path and the perturbations written beside them.
 
     Attributes:
-        cameras: One per entry of ``camera_path``.
         perturbation: Top-level ``perturbation`` object as parsed from JSON, or None.
         overrides: Per camera, the entry's own ``perturbation`` object, or None.
         fps: Frames per second, or None if the file does not say.

@@ -64,15 +64,7 @@ UNSAID = "default: the file says nothing"
 
 
 def assumption_of(name: str, requested: object, flag: str, stored: object, origin: str) -> Assumption:
-    """Return the record of a choice: an option wins, and the record names what it replaces.
-
-    Args:
-        name: Of the choice.
-        requested: The value of the option ``flag``; None where it is not given.
-        flag: The option.
-        stored: The value that the scene's files, or a default, would give.
-        origin: Where ``stored`` is from.
-    """
+    """Return the record of a choice: an option wins, and the record names what it replaces."""
     if requested is None:
         return Assumption(name, _text(stored), origin)
     return Assumption(name, _text(requested), f"{flag} (in place of {_text(stored)}, {origin})")

@@ -70,7 +70,6 @@ class RunConfig:
 
     Attributes:
         method_name: Name given to ns-train, such as "splatfacto"; "unknown" if absent.
-        experiment_name: Name of the experiment, or the folder's name if absent.
         model: ``pipeline.model`` as a mapping; Python objects in it are :class:`Tagged`.
     """
 

@@ -33,7 +33,6 @@ class Film:
 
     Attributes:
         about: For report.json: cell, verdict, size of pictures; of every step gaps and the box of camera parameters.
-        steps: The images, ``index`` is the step.
     """
 
     about: dict[str, Any]

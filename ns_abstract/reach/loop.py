@@ -165,7 +165,6 @@ class Loop:
         control: What comes behind it; None until the network's outputs are known.
         unsafe: Closed sets, each given by faces: outside where any of them is above 0.
         required: Properties of the picture: a state is unsafe where its picture lacks one of them.
-        goal: Or None.
     """
 
     names: tuple[str, ...]

@@ -94,7 +94,6 @@ def simulate(
     """One run with the real renderer and the deployed network, in float64 but for these.
 
     Args:
-        start: [n] initial state.
         disturbances: [steps, n], added to every next state.
         member: The scene that is seen throughout; None: the stored one.
         off: Where the scene stands throughout, as `TubeBuilder.seen_from` has it; None: at its place.

@@ -222,7 +222,6 @@ def between(bounds: OutputBounds, count: int, shift: Float64, room: Float64) -> 
     """Return the affine set between planes: the first ``count`` rows and their negatives, of one cell (L3).
 
     Args:
-        bounds: Lower bounds [1, 2 count or more]; places are the parameters.
         shift: [count] what is taken off.
         room: [count] how far values may be off beside that.
 
@@ -296,7 +295,6 @@ class TubeBuilder:
     """Tubes of a loop.
 
     Attributes:
-        pilot: Its network and control.
         registration: How far the scene may stand from its place along every world axis, all of a run through; needs a
             camera that moves along all of them. Otherwise the view's set may tell where the scene stands
             (`PoseBox.registered`).

@@ -29,11 +29,7 @@ class LeafCell:
 
 
 class FrameTiles:
-    """Some tiles of a frame, numbered by their place in the list; measures are those of their pixels (R6).
-
-    Args:
-        tiles: The frame's numbers of the tiles, ascending; None: all.
-    """
+    """Some tiles of a frame, numbered by their place in the list; measures are those of their pixels (R6)."""
 
     def __init__(self, frame: Frame, tiles: np.ndarray | None = None, keep_linear: bool = False) -> None:
         self.frame, self.keep_linear = frame, keep_linear
@@ -73,9 +69,7 @@ class FrameTiles:
         """Bounds of each cell in the tiles at ``places``.
 
         Args:
-            cells: Parts of ``parent``.
             parent: A cell that was bounded in these tiles before, or None.
-            places: [t] which tiles.
             pixels: [t, side, side] which pixels are wanted, of those that were wanted of ``parent``; None: all.
         """
         within = None if parent is None else parent.context

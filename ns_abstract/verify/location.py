@@ -73,12 +73,7 @@ class LocationTuning:
 
 @dataclass(frozen=True)
 class FoundPose:
-    """A rendered pose.
-
-    Attributes:
-        values: Parameters of the set.
-        outliers: Counted pixels that it does not explain.
-    """
+    """A rendered pose."""
 
     values: tuple[float, ...]
     outliers: int
@@ -101,9 +96,6 @@ class LocationSearch:
     Args:
         frame: What is searched and bounded; its parameters may be sheared.
         plain: The same set in its own parameters, for renders.
-        photo: The photo.
-        contract: Whether cells are contracted before they are cut.
-        tuning: Preferences.
     """
 
     def __init__(
@@ -305,11 +297,6 @@ class _Examination:
 
     def _whole(self, box: ParameterBox, picture: np.ndarray, number: int) -> bool:
         """Bound the cell without sub-boxes, in rounds of pixels, and exclude it or contract it by these (U8).
-
-        Args:
-            box: The cell.
-            picture: Tiles of the render in its middle.
-            number: Pixels that this does not explain.
 
         Returns:
             Whether the cell was contracted.

@@ -20,13 +20,7 @@ MOST, SPARE = 1500, 1.3
 
 @dataclass(frozen=True)
 class PoseCover:
-    """A set cut into cells that tile it: those that hold what is left, and those that hold none of it.
-
-    Attributes:
-        grid: The set.
-        left: Cells that hold all poses that are left.
-        excluded: The others.
-    """
+    """A set cut into cells that tile it: those that hold what is left, and those that hold none of it."""
 
     grid: CellGrid
     left: tuple[Cell, ...]
@@ -51,8 +45,6 @@ class ShearedBoxes:
     """Boxes of sheared parameters, and where they are in the set's own.
 
     Args:
-        lower, upper: [n, d] ends of the boxes.
-        names: [d] of the parameters.
         shear: As of `PoseBox`: name to other to factor.
     """
 

@@ -34,7 +34,6 @@ class CellPart:
     """A part of a cell, in whole units.
 
     Attributes:
-        cell: The part.
         margin: Proven lower bound of the margin; None: it is to be examined.
     """
 
@@ -45,16 +44,7 @@ class CellPart:
 def partly_proved(
     claim: Claim, model: PartsModel, query: Query, images: ImageSets, cell: Cell, box: ParameterBox
 ) -> list[CellPart]:
-    """Return parts that tile a cell, by whether its linear sets prove them (Q8); empty if they prove none.
-
-    Args:
-        claim: What is to be proved.
-        model: What bounds it.
-        query: The claim's.
-        images: The sets of the one cell.
-        cell: The cell.
-        box: Its parameters.
-    """
+    """Return parts that tile a cell, by whether its linear sets prove them (Q8); empty if they prove none."""
     counts = sub_box_counts(cell, model.part_counts(images, _TUNING.parts))
     if not resolved(box, counts):
         return []

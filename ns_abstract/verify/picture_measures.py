@@ -83,7 +83,6 @@ class Measure:
         channels: [c] how much each channel of the plane counts, not negative.
         rank: The so many-th largest of the region's pixels; None: their mean.
         pixels: [n] places of the region's pixels, row by row.
-        least: Whether ``rank`` counts from the smallest pixel on.
         minus: [k] places of a second region, the same statistic of which is subtracted; None: nothing is.
         cap: Pixels above it count as it.
     """

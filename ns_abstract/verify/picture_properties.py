@@ -60,8 +60,6 @@ class Leaf:
         plane, statistic, region, minus: What is measured; see `Measure`.
         channels: How much each channel of the plane counts.
         pixels: The so many-th largest pixel, for the statistic "rank": a number, or a part of the region.
-        low, high: Limits; infinite where there is none.
-        cap: See `Measure`.
     """
 
     sentence: str

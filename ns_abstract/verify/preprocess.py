@@ -31,8 +31,6 @@ class Preprocess:
     Attributes:
         resize: Height and width of the network's input, or None where the camera path has them already.
         mean, std: Three numbers each, for the channels as the network sees them.
-        layout: "NCHW" or "NHWC".
-        channels: "RGB" or "BGR".
         range: What the picture's 0 and 1 become before mean and std.
     """
 

@@ -155,7 +155,6 @@ class SceneMargin:
         radius: All that was certified holds for all scenes this far from the stored one; 0: nothing more is known.
         reached, part: Radius at which the part of the certified volume holds that was looked at.
         state: "done", or "ended": by the time, or by a request to stop.
-        trials: Runs, in order.
         cells: How many are certified.
         example: Arrays that tell the scene of the smallest falsified radius, or None.
     """

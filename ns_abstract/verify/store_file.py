@@ -95,11 +95,6 @@ class _Checksums:
 class StoreFile:
     """An open ``cells.sqlite`` whose rows are those that were written.
 
-    Args:
-        fingerprint: What a stored search must agree with to be continued.
-        parameters: Names and units of the parameters of all frames together.
-        resume: Whether to go on with what is there; otherwise it is replaced.
-
     Raises:
         InputError: The folder cannot be written, or the stored search is another one or damaged.
     """

@@ -113,7 +113,6 @@ class SubBoxOutcome:
     Attributes:
         margin: Proven lower bound of the margin on all of it; None: there is none.
         cuts: [d] into how many parts it should be cut along each parameter if there is none.
-        parts: Parts that were bounded.
     """
 
     margin: float | None
@@ -139,11 +138,7 @@ class _CellWork:
     """The state of the proof of one cell.
 
     Attributes:
-        feasible: See `Parametrisation`.
-        weights: Of the cell's middle.
-        query: What the network is asked.
         aim: What parts may cost, by what was found so far.
-        parts: Parts that were bounded.
         asked: Those of which the network was asked.
         done: What part of the box is proved, or holds no pose.
         margins: Lower bounds of the margin over what is proved.
@@ -191,10 +186,7 @@ class SubBoxProof:
     """Proves cells of several parameters sub-box by sub-box.
 
     Args:
-        scene: Pictures, in the parameters of ``frame``.
-        model: The network.
         sharing: The network, as it bounds neighbours together.
-        claim: What is to hold, in these parameters.
         frame: From cells to boxes of these parameters.
         most: Most parts of a cell, about; one that would take more is cut first.
         block: Most cells that are examined together.
@@ -216,9 +208,7 @@ class SubBoxProof:
         """Try to prove a cell, if it takes few enough parts.
 
         Args:
-            cell: The cell.
             outputs: [n] outputs seen in it.
-            weights: Of its middle.
         """
         return self._chosen._prove(cell, outputs, weights)
 

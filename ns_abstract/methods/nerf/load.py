@@ -138,7 +138,6 @@ def field_weights(
     """One field of a model's state.
 
     Args:
-        name: "field_coarse" or "field_fine".
         exponents: Highest exponents of the frequencies of positions and directions; the lowest are 0.
         counts: Numbers of these frequencies; None: what the layers' widths say.
     """

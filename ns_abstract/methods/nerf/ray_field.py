@@ -129,7 +129,6 @@ class BoundedRays(ABC):
     Attributes:
         displacement: Half the way of a sample over a first cell, as learned from earlier rays.
         distances, lengths: [samples] distances, and lengths of bins around them.
-        taylor: Degree of the Taylor models of poses.
     """
 
     displacement: float

@@ -37,8 +37,6 @@ class Sampling:
     """Where a ray is sampled.
 
     Attributes:
-        kind: "uniform" or "hierarchical".
-        near, far: Ends of the rays, normalised units.
         samples: Bins of equal length; of the coarse pass where the sampling is hierarchical.
         importance: Samples that the coarse weights place (hierarchical only).
     """

@@ -84,7 +84,6 @@ class PoseStrips:
     Args:
         pose_set: The frame's set; parameters that shift colours come last in its box.
         pixels: [t, 2] rows and columns of the rays.
-        run: Bounds groups of rays, here or in other processes.
     """
 
     def __init__(self, bounds: BoundedRays, pose_set: PoseBox, pixels: np.ndarray, run: BoundBatches) -> None:

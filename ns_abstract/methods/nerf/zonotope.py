@@ -167,7 +167,6 @@ class FieldBounds:
             nodes: [B, nodes, 3] the vector's polynomial at the basis' nodes. Its degree by variable is at most
                 the basis' and `VECTOR_DEGREE`.
             radius: [B, 3] distance of the vector from the polynomial.
-            seen: ``position`` or ``direction``.
 
         Returns:
             [B, m, k] coefficients, [B, k] remainders, of the columns seen.

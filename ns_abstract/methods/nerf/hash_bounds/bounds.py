@@ -219,11 +219,7 @@ def piece_room(field: NerfactoField, arrays: FieldArrays, dimensions: int) -> Pi
 
 
 class NerfactoFrame(FieldFrame):
-    """Bounds and renders one frame's set of poses of a nerfacto.
-
-    Args:
-        workers: Threads that bound rays side by side; results do not depend on their number.
-    """
+    """Bounds and renders one frame's set of poses of a nerfacto."""
 
     def __init__(self, scene: NerfactoScene, pose_set: PoseBox, workers: int = 1) -> None:
         bounds = HashBounds(scene.field, pose_set.geometry.box.dimensions)
