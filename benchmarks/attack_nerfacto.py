@@ -315,7 +315,7 @@ def main() -> None:
     parser.add_argument("--own", action="store_true")
     options = parser.parse_args()
     # many pieces would only make bounds tighter than they need to be here
-    bounds._TUNING = dataclasses.replace(bounds._TUNING, deeper=4, most=64)
+    bounds._TUNING = dataclasses.replace(bounds._TUNING, deeper=4, most_pieces=64)
     attack, seed, start = Attack(), options.seed, time.perf_counter()
     while attack.compared < options.comparisons:
         attack_once(seed, attack, own=options.own)

@@ -152,7 +152,7 @@ class Disc:
     def image(self, values: np.ndarray, member: Any = None) -> np.ndarray:
         return (0.5 + self.radii**2 - values @ values).reshape(1, PIXELS, 1).astype(np.float32)
 
-    def sets(self, box: ParameterBox) -> Any:
+    def linear_sets(self, box: ParameterBox) -> Any:
         self.bounded += 1
         half, middle = 0.5 * (np.array(box.upper) - np.array(box.lower)), box.middle
         a = np.broadcast_to(-2.0 * middle * half, (1, PIXELS, 1, 2))

@@ -10,7 +10,7 @@ _SPECIFICATION = "perturbation/specification.py"
 _POSES = "geometry/poses.py"
 _ENGINE = "refine/engine.py"
 _LEAVES = "refine/leaves.py"
-_SUB_BOXES = "refine/sub_boxes.py"
+_SPLITTER = "refine/box_splitter.py"
 _BOX = "geometry/box.py"
 _LINE_FORMS = "arithmetic/line_forms.py"
 _WIDE_FORMS = "arithmetic/simd/wide_forms.py"
@@ -250,7 +250,7 @@ FORMS = (
     ),
     Fault(
         "a part is dropped where some of its poses are none of the set's",
-        _SUB_BOXES,
+        _SPLITTER,
         "BoxSplitter.cut",
         "inside is not None",
         "inside == box",

@@ -13,13 +13,14 @@ _PICTURE = "test_nerfacto.py::test_empty_rays_show_the_last_samples_colour"
 HASH_FIELDS = (
     Fault(
         "nerfacto: resolutions are rounded to the nearest",
-        _LOAD, "resolutions", "torch.floor(least * powers)", "torch.round(least * powers)", _RESOLUTIONS,
+        _LOAD, "resolutions", "torch.floor(coarsest * powers)", "torch.round(coarsest * powers)", _RESOLUTIONS,
     ),
     Fault(
         "nerfacto: resolutions are computed in float64",
         _LOAD, "resolutions",
-        "torch.pow(torch.tensor(_growth(levels, least, most)).float(), torch.arange(levels).float())",
-        "torch.tensor([_growth(levels, least, most) ** k for k in range(levels)], dtype=torch.float64)", _RESOLUTIONS,
+        "torch.pow(torch.tensor(_growth(levels, coarsest, finest)).float(), torch.arange(levels).float())",
+        "torch.tensor([_growth(levels, coarsest, finest) ** k for k in range(levels)], dtype=torch.float64)",
+        _RESOLUTIONS,
     ),
     Fault(
         "nerfacto: the hash has the primes of y and z exchanged",

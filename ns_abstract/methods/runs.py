@@ -87,14 +87,14 @@ class RunConfig:
         fits = isinstance(value, int) and not isinstance(value, bool)
         if not fits or value < least or (most is not None and value > most):
             wanted = f"at least {least}" if most is None else f"from {least} to {most}"
-            raise self._error(name, value, f"an integer {wanted}")
+            raise self.refused(name, value, f"an integer {wanted}")
         return value
 
     def choice(self, name: str, default: str, options: tuple[str, ...]) -> str:
         """Text field of ``pipeline.model`` out of ``options``; ``default`` if absent."""
         value = self.model.get(name, default)
         if not isinstance(value, str) or value not in options:
-            raise self._error(name, value, f"one of {', '.join(options)}")
+            raise self.refused(name, value, f"one of {', '.join(options)}")
         return value
 
     def color(self, name: str, default: str, names: Mapping[str, tuple[float, float, float]]) -> NDArray[np.float32]:
@@ -110,9 +110,17 @@ class RunConfig:
         elif isinstance(value, (list, tuple)) and len(value) == 3 and all(map(is_number, value)):
             if all(0 <= part <= 1 for part in value):
                 return np.array(value, np.float32)
-        raise self._error(name, value, f"{', '.join(names)} or three numbers from 0 to 1")
+        raise self.refused(name, value, f"{', '.join(names)} or three numbers from 0 to 1")
 
-    def _error(self, name: str, value: Any, wanted: str) -> InputError:
+    def flag(self, name: str, default: bool) -> bool:
+        """Boolean field of ``pipeline.model``; ``default`` if absent."""
+        value = self.model.get(name, default)
+        if not isinstance(value, bool):
+            raise self.refused(name, value, "true or false")
+        return value
+
+    def refused(self, name: str, value: Any, wanted: str) -> InputError:
+        """The error of a field of ``pipeline.model``."""
         return unusable(value, field=f"pipeline.model.{name}", fix=f"write {wanted}", file=self.file)
 
 

@@ -25,11 +25,12 @@ from ns_abstract.perturbation.specification import TRANSLATIONS
 from ns_abstract.reach.dynamics import middle_half
 from ns_abstract.reach.learned import LearnedDynamics
 from ns_abstract.reach.loop import Control, HalfSpace, Loop
-from ns_abstract.reach.pictures import LoopPictures, PropertyView
+from ns_abstract.reach.pictures import PropertyView
 from ns_abstract.verify.model import NetworkModel
 from ns_abstract.verify.network import OutputBounds
 from ns_abstract.verify.picture_sets import sane
 from ns_abstract.verify.properties import Query
+from ns_abstract.verify.scene_pictures import ScenePictures
 
 Float64 = NDArray[np.float64]
 #: What is kept from step to step: how states depend on the initial state and on earlier disturbances ("kept"); only how
@@ -268,13 +269,13 @@ class Tube:
     """States of all runs from a cell, step by step.
 
     Attributes:
-        sets: By step, from 0; as many as were found before the end or a reason to stop.
+        state_sets: By step, from 0; as many as were found before the end or a reason to stop.
         controls: [steps, 2, m] least and most control of every step.
         slopes: [m] how much pictures moved by initial parameter, summed over the steps: what a cut may gain.
         views: [sets, properties] lower bounds of the margins of `Loop.views` (L7); minus infinity: nothing is known.
     """
 
-    sets: tuple[AffineSet, ...]
+    state_sets: tuple[AffineSet, ...]
     controls: Float64
     slopes: Float64
     views: Float64
@@ -282,12 +283,12 @@ class Tube:
 
     def safe(self, loop: Loop) -> float:
         """Lower bound, over all steps, of the distance to unsafe sets along the best face (L4), and of margins."""
-        clearances = [clearance(step, loop.unsafe) for step in self.sets]
+        clearances = [clearance(step, loop.unsafe) for step in self.state_sets]
         return float(min([*clearances, *self.views[:, : len(loop.required)].ravel()], default=np.inf))
 
     def inside(self, step: int, faces: Sequence[HalfSpace]) -> float:
         """Lower bound of how deep all states of a step lie inside a box."""
-        return min(self.sets[step].least(face) for face in faces)
+        return min(self.state_sets[step].least(face) for face in faces)
 
 
 @dataclass
@@ -302,7 +303,7 @@ class TubeBuilder:
     """
 
     loop: Loop
-    view: LoopPictures
+    view: ScenePictures
     pilot: ControlBounds
     dependence: Dependence = "kept"
     registration: float = 0.0
@@ -422,7 +423,7 @@ class TubeBuilder:
         if poses is None:
             return "the camera may leave the range of poses"
         box, scaled = poses
-        linear, lower, upper, slopes = self.view.sets(box)
+        linear, lower, upper, slopes = self.view.linear_sets(box)
         if not sane(linear, lower, upper):
             return "the picture's bounds are not finite"
         controls = self.pilot.bound(linear, lower, upper)

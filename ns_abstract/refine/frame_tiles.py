@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.refine.box_splitter import SubBox
 from ns_abstract.refine.protocol import COLORS, DEPTH, Bounds, CellContext, Frame, PartsFrame
 from ns_abstract.refine.result import gap
-from ns_abstract.refine.sub_boxes import SubBox
 
 
 class LeafCell:

@@ -93,7 +93,8 @@ class CellContext(Protocol):
         ...
 
 
-class Bounds(Protocol):
+@dataclass(frozen=True)
+class Bounds:
     """Bounds of some tiles over one cell.
 
     Attributes:
@@ -105,27 +106,16 @@ class Bounds(Protocol):
             radius, before the clamp to [0, 1]; None: there are none.
     """
 
-    @property
-    def lower(self) -> np.ndarray: ...
-
-    @property
-    def upper(self) -> np.ndarray: ...
-
-    @property
-    def slopes(self) -> np.ndarray: ...
-
-    @property
-    def context(self) -> CellContext | None: ...
-
-    @property
-    def linear(self) -> LinearSets | None: ...
-
-    @property
-    def forms(self) -> np.ndarray | None: ...
+    lower: np.ndarray
+    upper: np.ndarray
+    slopes: np.ndarray
+    context: CellContext | None
+    linear: LinearSets | None = None
+    forms: np.ndarray | None = None
 
 
 class Frame(Protocol):
-    """One set of poses of a scene, ready to be rendered and bounded.
+    """One set of poses of a scene, ready to be rendered and bounded; a frame without varied scenes has the defaults.
 
     Attributes:
         pose_set: The poses; their parameters are those of ``box``.
@@ -141,45 +131,26 @@ class Frame(Protocol):
         witnesses: Poses rendered in every part of a cell of one parameter that is split.
     """
 
-    @property
-    def pose_set(self) -> PoseBox: ...
-
-    @property
-    def box(self) -> ParameterBox: ...
-
-    @property
-    def camera(self) -> PinholeCamera: ...
-
-    @property
-    def channels(self) -> int: ...
-
-    @property
-    def side(self) -> int: ...
-
-    @property
-    def across(self) -> int: ...
-
-    @property
-    def down(self) -> int: ...
-
-    @property
-    def tilewise(self) -> bool: ...
-
-    @property
-    def tiles_at_once(self) -> int | None: ...
-
-    @property
-    def witnesses(self) -> int: ...
+    pose_set: PoseBox
+    box: ParameterBox
+    camera: PinholeCamera
+    channels: int
+    side: int
+    across: int
+    down: int
+    tilewise: bool
+    tiles_at_once: int | None
+    witnesses: int
 
     @property
     def tile_count(self) -> int:
         """Number of tiles."""
-        ...
+        return self.across * self.down
 
     @property
     def stages(self) -> tuple[str, ...]:
         """Parts of the kernels that can be compiled apart, the slowest first; none: they cannot."""
-        ...
+        return ()
 
     def warm_up(self, stage: str | None = None) -> None:
         """Compile what is compiled at first use, all of it or one of `stages`."""
@@ -191,7 +162,7 @@ class Frame(Protocol):
 
     def scene_samples(self, seed: int) -> Iterator[SceneSample]:
         """Other scenes of the set; none where only poses vary."""
-        ...
+        return iter(())
 
     def bound(self, box: ParameterBox, tiles: np.ndarray, within: Any = None, keep_linear: bool = False) -> Bounds:
         """Bounds of ``tiles`` over ``box``; ``within`` is the context of these tiles and a box around it."""
@@ -210,15 +181,14 @@ class Frame(Protocol):
 
         None: elements have no place of their own.
         """
-        ...
+        return None
 
     def observe(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
         """Take the inner bounds [t, side, side, 3] of ``tiles`` [t] so far; a refinement calls it at every change."""
-        ...
 
     def set_tolerance(self, excess: float) -> float:
         """Let later bounds be looser by a small part of ``excess`` on average; returns what light is left out, or 0."""
-        ...
+        return 0.0
 
     def plan(self, visible: int | None, lower: np.ndarray, upper: np.ndarray) -> list[str]:
         """What was left out for this frame and why, one sentence each.
@@ -226,7 +196,7 @@ class Frame(Protocol):
         ``visible``: scene elements that some cell shows, if they are told apart; bounds [H, W, 3] are what refinement
         found.
         """
-        ...
+        return []
 
 
 @runtime_checkable
@@ -296,13 +266,13 @@ class PreciseFrame(Protocol):
 class RayFrame(Frame, Protocol):
     """A frame whose pictures are made ray by ray (`ns_abstract.methods.representation.Representation.rays`)."""
 
-    def sets(
-        self, box: ParameterBox, weigh: Callable[[], np.ndarray | None] | None = None, most: int | None = None
+    def cell_bounds(
+        self, box: ParameterBox, weigh: Callable[[], np.ndarray | None] | None = None, most_rays: int | None = None
     ) -> Bounds:
         """Bounds of all tiles over a cell with linear bounds, for certificates, whatever was bounded before.
 
         ``weigh``: [H, W, 3] what part of a margin a unit of each pixel's width may cost, or None; asked at most once.
-        ``most``: rays that are bounded, about, those that matter most first; others are left at [0, 1].
+        ``most_rays``: rays that are bounded, about, those that matter most first; others are left at [0, 1].
 
         Raises:
             WorkCancelledError: There is no time for it.
@@ -435,16 +405,16 @@ class Method(Protocol):
 
     def ablations(self, poses: PoseBox) -> Iterator[tuple[str, Frame]]:
         """What makes bounds of a set loose, in words, and its frame without that: not the one asked for."""
-        ...
+        return iter(())
 
     def attribution(self, frame: Frame, box: ParameterBox, tile: int, count: int) -> list[tuple[int, float]]:
         """Scene elements without which the mean gap of a tile over a cell is less, and by how much, in that order."""
-        ...
+        return []
 
     def elements(self) -> SceneElements | None:
         """What can be drawn of the scene as it is seen from outside; None: nothing has a place of its own."""
-        ...
+        return None
 
     def differentiable(self, poses: PoseBox) -> Callable[[torch.Tensor], torch.Tensor] | None:
         """Parameter values [d] to the picture [H, W, 3], differentiable; None: there are no certificates of it."""
-        ...
+        return None

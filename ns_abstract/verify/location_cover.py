@@ -83,8 +83,8 @@ class ShearedBoxes:
         return chosen[some], lower[some], upper[some]
 
 
-def cover(box: ParameterBox, boxes: ShearedBoxes, most: int = MOST) -> PoseCover:
-    """Tile a set by cells of its own parameters, about ``most`` of which hold what is in ``boxes``."""
+def cover(box: ParameterBox, boxes: ShearedBoxes, most_cells: int = MOST) -> PoseCover:
+    """Tile a set by cells of its own parameters, about ``most_cells`` of which hold what is in ``boxes``."""
     d = box.dimensions
     grid = CellGrid(box, (1 << UNITS,) * d, (1,) * d)
     excluded: list[Cell] = []
@@ -109,7 +109,7 @@ def cover(box: ParameterBox, boxes: ShearedBoxes, most: int = MOST) -> PoseCover
             heapq.heappush(queue, (-inner.volume, count, inner, chosen))
 
     add(Cell((0,) * d, grid.units), np.arange(len(boxes.lower)))
-    while queue and len(queue) + len(finished) < most:
+    while queue and len(queue) + len(finished) < most_cells:
         _, _, cell, chosen = heapq.heappop(queue)
         halves = min(
             (grid.cut(cell, [2 if k == axis else 1 for k in range(d)]) for axis in range(d)),

@@ -245,10 +245,10 @@ class MeasureModel:
         lower = np.stack([np.resize(row, (most, *row.shape[1:])).ravel() for row in rows])
         return OutputBounds(lower, np.zeros((*lower.shape, 1)), lower)
 
-    def part_counts(self, images: ImageSets, most: int) -> np.ndarray:
-        """[d] numbers of parts of one cell, at most ``most`` together, more where its pictures change more."""
+    def part_counts(self, images: ImageSets, most_parts: int) -> np.ndarray:
+        """[d] numbers of parts of one cell, at most ``most_parts`` together, more where its pictures change more."""
         (planes,) = planes_of(images, self.channels)
-        return self._counts(planes, most)
+        return self._counts(planes, most_parts)
 
     def bound_parts(self, images: ImageSets, counts: np.ndarray, overlap: float) -> OutputBounds:
         """`bound` of equal parts of one cell, ``counts`` [d] along its parameters, each as if it were a cell (Q8).
@@ -260,11 +260,11 @@ class MeasureModel:
         lower = rows.reshape(len(rows), -1)
         return OutputBounds(lower, np.zeros((*lower.shape, 1)), lower)
 
-    def _counts(self, planes: PlaneSets, most: int) -> np.ndarray:
-        """[d] numbers of parts of a cell, ``most`` together or fewer where there are many pixels."""
+    def _counts(self, planes: PlaneSets, most_parts: int) -> np.ndarray:
+        """[d] numbers of parts of a cell, ``most_parts`` together or fewer where there are many pixels."""
         read = np.unique(np.concatenate([m.pixels for m in self.measures]))
         effects = np.abs(planes.linear[0][read].astype(np.float64)).sum(axis=(0, 1))
-        return shared_counts(effects, max(1, min(most, _NUMBERS // read.size)))
+        return shared_counts(effects, max(1, min(most_parts, _NUMBERS // read.size)))
 
     def _over(self, planes: PlaneSets, parts: CellParts) -> np.ndarray:
         """[parts, 2, leaves] lower bounds of values and of their negatives."""
@@ -272,7 +272,7 @@ class MeasureModel:
         low, high = (np.stack(side, axis=1) for side in zip(*ends, strict=True))
         return np.stack([low, -high], axis=1)
 
-    def branch(self, images: ImageSets, query: Query, groups: Sequence[Sequence[int]], most: int) -> float:
+    def branch(self, images: ImageSets, query: Query, groups: Sequence[Sequence[int]], most_branches: int) -> float:
         """Nothing: there are no activations."""
         return -math.inf
 

@@ -42,7 +42,7 @@ def flatter_where_better(
 
 @dataclass(frozen=True)
 class PictureSets:
-    """Linear sets of pictures over a box, from `ns_abstract.verify.protocol.FrameImages.sets`."""
+    """Linear sets of pictures over a box, from `ns_abstract.verify.protocol.FrameImages.linear_sets`."""
 
     box: ParameterBox
     linear: tuple[np.ndarray, ...]

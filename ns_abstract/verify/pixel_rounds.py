@@ -178,9 +178,9 @@ class BoundedPixels:
 
 
 def telling_order(
-    gaps: Float64Array, likely: Float64Array, loose: Float64Array, counted: np.ndarray, most: int
+    gaps: Float64Array, likely: Float64Array, loose: Float64Array, counted: np.ndarray, most_pixels: int
 ) -> tuple[np.ndarray, int]:
-    """Numbers of the pixels to bound, at most ``most``, and how many of them are likely to exclude the cell.
+    """Numbers of the pixels to bound, at most ``most_pixels``, and how many of them are likely to exclude the cell.
 
     Args:
         gaps: [T, side, side] by how much the picture in the cell's middle misses the photo there.
@@ -192,4 +192,4 @@ def telling_order(
     first, rest = np.flatnonzero(sure), np.flatnonzero(some)
     order = [first[np.argsort((loose - likely).reshape(-1)[first], kind="stable")]]
     order.append(rest[np.argsort(-gaps.reshape(-1)[rest], kind="stable")])
-    return np.concatenate(order)[:most], first.size
+    return np.concatenate(order)[:most_pixels], first.size

@@ -101,7 +101,7 @@ class Preprocess:
         values = (images * constants[1] + constants[0] - constants[2]) / constants[3]
         return values.permute(0, 3, 1, 2) if self.layout == "NCHW" else values
 
-    def sets(
+    def input_sets(
         self,
         linear: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
         lower: np.ndarray,

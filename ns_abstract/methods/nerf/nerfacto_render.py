@@ -61,9 +61,9 @@ def harmonics(direction: Tensor) -> Tensor:
     return torch.stack(parts, dim=-1)
 
 
-def even(most: float, count: int) -> Tensor:
-    """[count] float64 numbers from 0 to ``most``."""
-    return torch.linspace(0.0, most, count, dtype=torch.float64)
+def even(end: float, count: int) -> Tensor:
+    """[count] float64 numbers from 0 to ``end``."""
+    return torch.linspace(0.0, end, count, dtype=torch.float64)
 
 
 def quantiles(count: int) -> Tensor:

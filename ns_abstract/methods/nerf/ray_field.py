@@ -142,7 +142,7 @@ class BoundedRays(ABC):
         """Whether kernels for a processor bound rays, a few at a time."""
 
     @abstractmethod
-    def division(self, moves: np.ndarray, most: int = ..., deeper: int | None = None) -> Division | None:
+    def division(self, moves: np.ndarray, most_parts: int = ..., deeper: int | None = None) -> Division | None:
         """The cells of a box, as wide as bounds of the field bear; None: the box is too wide.
 
         Args:

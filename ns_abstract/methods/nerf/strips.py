@@ -230,19 +230,19 @@ class PoseStrips:
                     return level
         return len(TOLERANCES)
 
-    def sets(
-        self, box: ParameterBox, weigh: PixelWeightSource | None, most: int | None = None
+    def cell_bounds(
+        self, box: ParameterBox, weigh: PixelWeightSource | None, most_rays: int | None = None
     ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
         """Linear bounds (A_lower, b_lower, A_upper, b_upper) [t, 3, d] and [t, 3], and lower and upper [t, 3].
 
-        Of the first rays alone where not all are asked for: ``t`` is then ``most``, or a few more.
+        Of the first rays alone where not all are asked for: ``t`` is then ``most_rays``, or a few more.
 
         Args:
-            most: How many rays are asked for; all if None.
+            most_rays: How many rays are asked for; all if None.
             weigh: Gives [t, 3] which part of the margin a unit of each pixel's width may cost, about; None there, or
                 in its place: nothing is worth refining.
         """
-        groups = [group for group in self.groups if most is None or group.start < most]
+        groups = [group for group in self.groups if most_rays is None or group.start < most_rays]
         linear, lower, upper = self._level_sets(box, 0, np.arange(len(groups)))
         weights, levels = None, self.levels(box)
         for level in range(1, levels):

@@ -55,7 +55,7 @@ class HashTuning:
     most_first: int = 4096
     #: Halvings of first pieces by axis, and pieces of a ray beside 16 for each first one.
     deeper: int = 7
-    most: int = 512
+    most_pieces: int = 512
     #: Parts of the tolerance: a form's rest that is good, light behind which samples are left open (where samples are
     #: placed, and of a picture), and a weight whose colour is left open.
     rest: float = 0.25
@@ -89,10 +89,12 @@ class HashBounds(BoundedRays):
         """Rays are bounded one after another by compiled kernels."""
         return True
 
-    def division(self, moves: np.ndarray, most: int = _TUNING.most_first, deeper: int | None = None) -> Division | None:
+    def division(
+        self, moves: np.ndarray, most_parts: int = _TUNING.most_first, deeper: int | None = None
+    ) -> Division | None:
         """The parts for which bounds over a box are kept; None: the box is too wide. ``moves`` [n, samples, d]."""
         finer = _TUNING.finer if moves.shape[2] == 1 else 0
-        return division_for(moves, self.displacement, most, 0, finer)
+        return division_for(moves, self.displacement, most_parts, 0, finer)
 
     def bounded(self, request: RayRequest, division: Division | None) -> RayBounds:
         # opacities are not told, so those that are known are not looked at
@@ -144,7 +146,7 @@ class HashBounds(BoundedRays):
             rays = pieces.RayPolynomials(
                 bundle.origin, origin_radius, bundle.direction[some], direction_radius[some], bundle.exponents
             )
-            most = _TUNING.most + 16 * int(cells[some].prod(axis=1).max())
+            most = _TUNING.most_pieces + 16 * int(cells[some].prod(axis=1).max())
             pieces.bound_rays(
                 self.arrays, rays, cells[some], _TUNING.deeper * d, most, goal[some], limits, shifts, room,
                 counts, bounds_by_part[some], bounded[some],

@@ -37,7 +37,7 @@ class CoverTuning:
     #: open by it. Networks that bear more are told by boxes about the set's middle, of which the least is so small a
     #: part of it.
     opening: float = 42.0
-    least: float = 2.0**-9
+    least_share: float = 2.0**-9
 
 
 _TUNING = CoverTuning()
@@ -188,7 +188,7 @@ class SubBoxProof:
     Args:
         sharing: The network, as it bounds neighbours together.
         frame: From cells to boxes of these parameters.
-        most: Most parts of a cell, about; one that would take more is cut first.
+        most_parts: About, of a cell; one that would take more is cut first.
         block: Most cells that are examined together.
         aim: What the sets of parts may cost of the margin (`PixelWeights.loss`), at first.
         other: Another way to cover the same cells, taken where it needs fewer parts.
@@ -199,7 +199,7 @@ class SubBoxProof:
     sharing: NetworkModel
     claim: Claim
     frame: Parametrisation = own_parameters
-    most: int = 64
+    most_parts: int = 64
     block: int = 2
     aim: float = 0.26
     other: SubBoxProof | None = None
@@ -223,7 +223,7 @@ class SubBoxProof:
         if probe_sets is None:
             return SubBoxOutcome(None, self._cuts(cell, root, None, 1.0), 0)
         cost, effects = weights.loss(probe_sets, self.opening) * _PROBE**_POWER, weights.effects(probe_sets) * _PROBE
-        if math.prod(divisions(effects, cost, self.aim, self.most)) > self.most:
+        if math.prod(divisions(effects, cost, self.aim, self.most_parts)) > self.most_parts:
             return SubBoxOutcome(None, self._cuts(cell, root, effects, cost), 0)
         work = _CellWork(feasible, weights, self.claim.query(outputs[None]), self.aim)
         try:
@@ -244,14 +244,14 @@ class SubBoxProof:
         """
         whole, most = self.scene.box, _TUNING.opening
         outputs = self.model.outputs(self.scene.image(np.array(whole.middle))[None])
-        query, first, share = self.claim.query(outputs), math.nan, _TUNING.least
+        query, first, share = self.claim.query(outputs), math.nan, _TUNING.least_share
         while share <= 1.0:
             sets = self._sets(_about_middle(whole, share))
             if sets is None:
                 break
             rows = self.sharing.shared_bounds(self._images([sets]))
             margin = float(self._proved(query, rows.first(query), [sets])[0])
-            first = margin if share == _TUNING.least else first
+            first = margin if share == _TUNING.least_share else first
             if not (first > 0.0 and margin > _SPARE * first):
                 break
             most = min(most, self.aim / max(float(sets.widths.mean()), NONZERO))
@@ -275,13 +275,13 @@ class SubBoxProof:
 
     def _sets(self, box: ParameterBox) -> PictureSets | None:
         check_cancelled()
-        linear, lower, upper, _ = self.scene.sets(box)
+        linear, lower, upper, _ = self.scene.linear_sets(box)
         picture_sets = PictureSets(box, linear, lower, upper)
         return picture_sets if picture_sets.sane else None
 
     def _all(self, work: _CellWork, node: _PendingBox) -> None:
         """Prove a box, in groups of parts."""
-        counts = divisions(node.effects, node.cost, work.aim, self.most)
+        counts = divisions(node.effects, node.cost, work.aim, self.most_parts)
         if math.prod(counts) > (_GROUP if self.sharing.reusable_anywhere else _JOINED):
             for half in node.parts(int(np.argmax(counts)), 2):
                 self._all(work, half)
@@ -375,8 +375,8 @@ class SubBoxProof:
             _StoppedError: There are too many, or one has none.
         """
         work.parts += len(nodes)
-        late = work.asked > self.most // 2 and work.asked > _MORE * self.most * work.done
-        if late or work.parts > 2.0 * _MORE * self.most:
+        late = work.asked > self.most_parts // 2 and work.asked > _MORE * self.most_parts * work.done
+        if late or work.parts > 2.0 * _MORE * self.most_parts:
             raise _StoppedError
         parts: list[PictureSets] = []
         for node in nodes:
@@ -421,7 +421,7 @@ class SubBoxProof:
         goal = (self.aim / max(cost, self.aim)) ** (1.0 / _POWER) * float(effects.sum()) / d
         cuts = [1] * d
         for _ in range(_CUTS):
-            if not always and self._parts(cell, width, effects, goal) <= math.log2(self.most) and max(cuts) > 1:
+            if not always and self._parts(cell, width, effects, goal) <= math.log2(self.most_parts) and max(cuts) > 1:
                 break
             candidates = []
             for axis in range(d):
@@ -449,15 +449,15 @@ def _about_middle(box: ParameterBox, share: float | np.ndarray) -> ParameterBox:
     return inner
 
 
-def divisions(effects: np.ndarray, cost: float, aim: float, most: int) -> list[int]:
+def divisions(effects: np.ndarray, cost: float, aim: float, most_parts: int) -> list[int]:
     """Return into how many equal parts to divide each parameter so that their sets cost ``aim`` of the margin.
 
-    There is no use in many more parts than ``most``.
+    There is no use in many more parts than ``most_parts``.
     """
     gains = np.where(np.isfinite(effects), effects, 0.0) + NONZERO
     goal = (aim / cost) ** (1.0 / _POWER) * float(gains.sum()) if cost > aim else math.inf
     counts = np.ones(len(gains), np.int64)
-    while (gains / counts).sum() > goal and counts.prod() <= most:
+    while (gains / counts).sum() > goal and counts.prod() <= most_parts:
         # what a further part gains, by what it costs
         counts[np.argmax(gains / (counts * (counts + 1) * np.log1p(1.0 / counts)))] += 1
     return counts.tolist()
