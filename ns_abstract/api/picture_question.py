@@ -32,7 +32,6 @@ from ns_abstract.refine.protocol import (
     ElementFrame,
     Frame,
     Method,
-    PartsFrame,
     RayFrame,
     SceneSample,
     Score,
@@ -223,9 +222,7 @@ class PlanePictures(FramePictures):
             return cast("RayFrame", frame).cell_bounds(box, weigh, most_rays), np.arange(frame.tile_count)
         pixels = in_tiles(self.wanted, frame.side)
         tiles = np.flatnonzero(pixels.any(axis=(1, 2)))
-        if isinstance(frame, PartsFrame):
-            return frame.bound_parts([box], tiles, None, True, pixels[tiles])[0], tiles
-        return frame.bound(box, tiles, keep_linear=True), tiles
+        return frame.bound_parts([box], tiles, None, True, pixels[tiles])[0], tiles
 
     @cached_property
     def _limited(self) -> tuple[LimitedMeasure, ...]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -21,7 +20,6 @@ from ns_abstract.refine.protocol import (
     Frame,
     LinearSets,
     OrderedFrame,
-    PartsFrame,
     PreciseFrame,
 )
 from ns_abstract.refine.result import RenderedMaximum, greater
@@ -70,6 +68,7 @@ class DifferenceFrame(Frame):
         self.pose_set, self.box, self.camera = first.pose_set, first.box, first.camera
         self.side, self.across, self.down = first.side, first.across, first.down
         self.tilewise, self.tiles_at_once, self.witnesses = first.tilewise, first.tiles_at_once, first.witnesses
+        self.stages = tuple(dict.fromkeys((*first.stages, *second.stages)))
         self.largest: RenderedMaximum | None = None
         self._inside = pixels_inside(first)
         self.greatest = np.zeros((first.tile_count, first.side, first.side, COLORS), np.float32)
@@ -90,11 +89,6 @@ class DifferenceFrame(Frame):
     def shares_order(self) -> bool:
         """Whether elements of both scenes are taken to be drawn in one order (design.md, Y5)."""
         return self._shared is not None
-
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """Stages of both frames that can be compiled apart."""
-        return tuple(dict.fromkeys((*self.first.stages, *self.second.stages)))
 
     def warm_up(self, stage: str | None = None) -> None:
         """Compile what both frames need, with linear bounds."""
@@ -119,12 +113,6 @@ class DifferenceFrame(Frame):
         self.largest = greater(self.largest, rendered)
         return np.maximum(lower, self.floor)
 
-    def bound(
-        self, box: ParameterBox, tiles: np.ndarray, within: PairContext | None = None, keep_linear: bool = False
-    ) -> Bounds:
-        """Bounds of ``tiles`` over ``box``."""
-        return self.bound_parts([box], tiles, within, keep_linear, None)[0]
-
     def bound_parts(
         self,
         boxes: Sequence[ParameterBox],
@@ -135,7 +123,8 @@ class DifferenceFrame(Frame):
     ) -> list[Bounds]:
         contexts = (None, None) if within is None else (within.first, within.second)
         first, second = (
-            _bounds(frame, boxes, tiles, context, pixels) for frame, context in zip(self.both, contexts, strict=True)
+            frame.bound_parts(boxes, tiles, context, True, pixels)
+            for frame, context in zip(self.both, contexts, strict=True)
         )
         differences = []
         for box, a, b in zip(boxes, first, second, strict=True):
@@ -197,15 +186,6 @@ def _picture(frame: Frame, values: np.ndarray, tiles: np.ndarray | None) -> tupl
     if isinstance(frame, PreciseFrame):
         return frame.precise(values, tiles)[..., :COLORS], 0.0
     return frame.render(values, tiles)[..., :COLORS].astype(np.float64), UNIT32
-
-
-def _bounds(
-    frame: Frame, boxes: Sequence[ParameterBox], tiles: np.ndarray, within: Any, pixels: np.ndarray | None
-) -> Sequence[Bounds]:
-    """Linear bounds of one scene over each of ``boxes``."""
-    if isinstance(frame, PartsFrame):
-        return frame.bound_parts(boxes, tiles, within, True, pixels)
-    return [frame.bound(box, tiles, within, True) for box in boxes]
 
 
 def upper_of(a: Bounds, b: Bounds) -> np.ndarray:

@@ -8,7 +8,7 @@ import numpy as np
 
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.refine.box_splitter import SubBox
-from ns_abstract.refine.protocol import COLORS, DEPTH, Bounds, CellContext, Frame, PartsFrame
+from ns_abstract.refine.protocol import COLORS, DEPTH, Bounds, CellContext, Frame
 from ns_abstract.refine.result import gap
 
 
@@ -46,7 +46,7 @@ class FrameTiles:
     @property
     def by_pixel(self) -> bool:
         """Whether cells may be split for some of their pixels only: not where linear sets or layers are kept."""
-        return isinstance(self.frame, PartsFrame) and not self.keep_linear and self.frame.channels == COLORS
+        return not self.keep_linear and self.frame.channels == COLORS
 
     def numbers(self, places: np.ndarray | None) -> np.ndarray:
         """The frame's numbers of tiles; of all of these if None."""
@@ -74,9 +74,7 @@ class FrameTiles:
         """
         within = None if parent is None else parent.context
         boxes, numbers = [cell.box for cell in cells], self.numbers(places)
-        if isinstance(self.frame, PartsFrame):
-            return self.frame.bound_parts(boxes, numbers, within, self.keep_linear, pixels)
-        return [self.frame.bound(box, numbers, within, self.keep_linear) for box in boxes]
+        return self.frame.bound_parts(boxes, numbers, within, self.keep_linear, pixels)
 
     def mean_gap(self, lower: np.ndarray, upper: np.ndarray, places: np.ndarray | None = None) -> float:
         """MPG between [t, side, side, channels] values of the tiles at ``places`` [t]; None: all."""

@@ -129,6 +129,7 @@ class Frame(Protocol):
         tiles_at_once: Most tiles of one call while cells are split, so that time is looked at in between; None: all
             that a cell concerns.
         witnesses: Poses rendered in every part of a cell of one parameter that is split.
+        stages: Parts of the kernels that can be compiled apart, the slowest first; none: they cannot.
     """
 
     pose_set: PoseBox
@@ -141,16 +142,12 @@ class Frame(Protocol):
     tilewise: bool
     tiles_at_once: int | None
     witnesses: int
+    stages: tuple[str, ...] = ()
 
     @property
     def tile_count(self) -> int:
         """Number of tiles."""
         return self.across * self.down
-
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """Parts of the kernels that can be compiled apart, the slowest first; none: they cannot."""
-        return ()
 
     def warm_up(self, stage: str | None = None) -> None:
         """Compile what is compiled at first use, all of it or one of `stages`."""
@@ -166,6 +163,17 @@ class Frame(Protocol):
 
     def bound(self, box: ParameterBox, tiles: np.ndarray, within: Any = None, keep_linear: bool = False) -> Bounds:
         """Bounds of ``tiles`` over ``box``; ``within`` is the context of these tiles and a box around it."""
+        return self.bound_parts([box], tiles, within, keep_linear, None)[0]
+
+    def bound_parts(
+        self, boxes: Sequence[ParameterBox], tiles: np.ndarray, within: Any, keep_linear: bool,
+        pixels: np.ndarray | None,
+    ) -> Sequence[Bounds]:  # fmt: skip
+        """What `bound` returns of each of ``boxes``, at most `MOST_PARTS`, side by side.
+
+        ``within``: the context from a box around all cells. ``pixels`` [t, side, side]: which are wanted, others may be
+        left at [0, 1]; all if None.
+        """
         ...
 
     def feasible(self, box: ParameterBox) -> ParameterBox | None:
@@ -197,22 +205,6 @@ class Frame(Protocol):
         found.
         """
         return []
-
-
-@runtime_checkable
-class PartsFrame(Protocol):
-    """An optional interface of a `Frame`: bounds of several sub-boxes together, at chosen pixels only."""
-
-    def bound_parts(
-        self, boxes: Sequence[ParameterBox], tiles: np.ndarray, within: Any, keep_linear: bool,
-        pixels: np.ndarray | None,
-    ) -> Sequence[Bounds]:  # fmt: skip
-        """What `Frame.bound` returns of each of ``boxes``, at most `MOST_PARTS`.
-
-        ``within``: the context from a box around all cells. ``pixels`` [t, side, side]: which are wanted, others may be
-        left at [0, 1]; all if None.
-        """
-        ...
 
 
 @runtime_checkable
@@ -316,7 +308,7 @@ class WeightFrame(Frame, Protocol):
 
 
 @runtime_checkable
-class ElementFrame(WeightFrame, PartsFrame, Protocol):
+class ElementFrame(WeightFrame, Protocol):
     """An optional interface of a `WeightFrame`: pictures of few pixels, drawn by the elements that show there alone."""
 
     def drawn_alone(self, context: Any, tiles: np.ndarray, pixels: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
@@ -343,6 +335,9 @@ class WeightMethod(Protocol):
 class Method(Protocol):
     """A scene and the program whose pictures are bounded."""
 
+    #: What bounds of this program are called: "float32-sound" or "real-sound".
+    guarantee: str
+
     @property
     def name(self) -> str:
         """The scene's name."""
@@ -361,11 +356,6 @@ class Method(Protocol):
     @property
     def program(self) -> dict[str, Any]:
         """``name`` and ``version`` of the bounded program, and what else tells it from others."""
-        ...
-
-    @property
-    def guarantee(self) -> str:
-        """What bounds of this program are called: "float32-sound" or "real-sound"."""
         ...
 
     @property

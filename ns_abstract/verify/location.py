@@ -19,7 +19,7 @@ from ns_abstract.arithmetic.rounding import CUT_VALUE_ROUNDING, HALF_UP
 from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import Float64Array, ParameterBox
 from ns_abstract.geometry.tiles import assemble, in_tiles
-from ns_abstract.refine.protocol import Bounds, Frame, LinearSets, PartsFrame, SubBoxFrame
+from ns_abstract.refine.protocol import Bounds, Frame, LinearSets, SubBoxFrame
 from ns_abstract.verify.cell_boxes import aligned, divided, inner_cell, meeting, resolved, slabs, sub_box_counts
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.neighbouring_pixels import nearby, smoothed
@@ -370,10 +370,7 @@ class _Examination:
         """Bounds of ``tiles``, or of some of their ``pixels`` alone where the frame can leave out the others."""
         check_cancelled()
         self.bounded += 1
-        frame = self.search.frame
-        if pixels is not None and isinstance(frame, PartsFrame):
-            return frame.bound_parts([box], tiles, None, linear, pixels)[0]
-        return frame.bound(box, tiles, None, linear)
+        return self.search.frame.bound_parts([box], tiles, None, linear, pixels)[0]
 
     def _settled(self, known: BoundedPixels) -> bool:
         """Whether every pose of the cell explains the photo: it is finished then."""

@@ -127,6 +127,7 @@ class FieldFrame(Frame):
     tilewise = True
     channels = 3
     side = 1
+    tiles_at_once: int
     #: Poses rendered in every part of a cell that is split.
     witnesses = 8
 
@@ -190,20 +191,14 @@ class FieldFrame(Frame):
         self.bounds.rays(self._geometry, box.without(COLOR_SHIFTS), self._pixels(np.arange(1)), 1.0)
         self.render(box.middle, np.arange(1))
 
-    def bound(
-        self, box: ParameterBox, tiles: np.ndarray, within: RayContext | None = None, keep_linear: bool = False
-    ) -> Bounds:
-        """Bounds of the rays ``tiles`` over ``box``; ``within`` is the context of these rays and a box around it.
-
-        Rays that there is no time for any more (`ns_abstract.execution.cancellation`) are bounded by [0, 1].
-        """
-        return self.bound_parts([box], tiles, within, keep_linear)[0]
-
     def bound_parts(
         self, boxes: Sequence[ParameterBox], tiles: np.ndarray, within: RayContext | None = None,
         keep_linear: bool = False, pixels: np.ndarray | None = None,
     ) -> list[Bounds]:  # fmt: skip
-        """`bound` over each of ``boxes``, side by side; see `ns_abstract.refine.protocol.PartsFrame`."""
+        """Bounds of the rays ``tiles`` over each of ``boxes``; ``within``: of these rays and a box around them.
+
+        Rays that there is no time for any more (`ns_abstract.execution.cancellation`) are bounded by [0, 1].
+        """
         tiles = np.asarray(tiles)
         if self.box.dimensions > 0 and self.box in boxes:
             nothing = self._unknown(tiles.size)

@@ -52,10 +52,11 @@ class PostActivation(NamedTuple):
         place = torch.full_like(self.failed, -1, dtype=torch.int64)
         place[which] = torch.arange(which.numel(), device=which.device)
         owned, new = place[self.owner] >= 0, place[self.new_owner] >= 0
-        return PostActivation(
-            *(part[which] for part in self[:7]), self.columns[owned], place[self.owner[owned]],
+        pieces = (part[which] for part in self[:7])
+        return PostActivation._make((
+            *pieces, self.columns[owned], place[self.owner[owned]],
             place[self.new_owner[new]], self.new_neuron[new], self.new_size[new],
-        )  # fmt: skip
+        ))  # fmt: skip
 
 
 @dataclass

@@ -62,6 +62,7 @@ class SplatMethod(Method):
         self.scene = scene
         self.rasteriser: Rasteriser = rasteriser_named(renderer, version)
         self.arithmetic: Arithmetic = arithmetic_named(arithmetic or "float32")
+        self.guarantee = f"{self.arithmetic.name}-sound"
         self.splats: Splats = activate(scene, self.rasteriser)
         self._varied: dict[tuple[SceneVariation, ...], VariedSplats] = {}
         self._sums: dict[tuple[SceneVariation, ...], SceneSums] = {}
@@ -82,10 +83,6 @@ class SplatMethod(Method):
     @property
     def program(self) -> dict[str, Any]:
         return {"name": self.rasteriser.name, "version": self.rasteriser.version}
-
-    @property
-    def guarantee(self) -> str:
-        return f"{self.arithmetic.name}-sound"
 
     @property
     def content(self) -> str:
