@@ -153,8 +153,8 @@ def rays_of(pose_set: PoseBox, values: np.ndarray) -> np.ndarray:
 def labels_of(renderer: NerfactoRenderer, rays: np.ndarray, kinks: bool) -> np.ndarray:
     """[rays, samples, 3] cells of the finest level, or regions of the contraction [rays, samples, 1]."""
     finest, found = int(renderer.field.encoding.resolutions[-1]), []
-    for ray in rays:
-        edges = renderer.edges(ray)
+    every = renderer.edges(*torch.from_numpy(rays).unbind(dim=1)).numpy()
+    for ray, edges in zip(rays, every, strict=True):
         x = ray[0] + ray[1] * ((edges[1:] + edges[:-1]) / 2.0)[:, None]
         size = np.abs(x).max(axis=1)[:, None]
         if kinks:
@@ -286,7 +286,12 @@ def attack_once(seed: int, attack: Attack, side: int = 5, poses: int = 40, own: 
     renderer = NerfactoRenderer(field)
     special = crossings(rng, renderer, part, poses // 4)
     values = [box.middle, *box.corners(), *box.sample(poses, rng), *special]
-    draw = renderer.rays if own else nerfstudio_draw(field)
+    draw = nerfstudio_draw(field)
+    if own:
+
+        def draw(rays: np.ndarray) -> np.ndarray:
+            return renderer.colors(*torch.from_numpy(rays).unbind(dim=1)).numpy()
+
     shown = draw(np.concatenate([rays_of(pose_set, v) for v in values])).reshape(len(values), -1, 3)
     off = np.maximum(lower - shown, shown - upper)
     # a colour that is no number counts as outside
@@ -310,7 +315,7 @@ def main() -> None:
     parser.add_argument("--own", action="store_true")
     options = parser.parse_args()
     # many pieces would only make bounds tighter than they need to be here
-    bounds._TUNING = dataclasses.replace(bounds._TUNING, deeper=4, most=64)
+    bounds._TUNING = dataclasses.replace(bounds._TUNING, deeper=4, most_pieces=64)
     attack, seed, start = Attack(), options.seed, time.perf_counter()
     while attack.compared < options.comparisons:
         attack_once(seed, attack, own=options.own)

@@ -214,7 +214,7 @@ def margins(pictures: FramePictures, question: Question, parts: int, every: int)
 
     for part in boxes:
         tried = [None, *some, *(one.nearest.signed_gradient_step(part, part.middle, loss, 2.0)[1] for one in some[:1])]
-        linear, lower, upper, _ = pictures.sets(part)
+        linear, lower, upper, _ = pictures.linear_sets(part)
         sets.append((*linear, lower, upper))
         outputs = model.outputs(np.stack([pictures.image(part.middle, member) for member in tried])).astype(np.float64)
         values = torch.from_numpy(np.repeat(part.middle[None], len(tried), axis=0))

@@ -138,7 +138,7 @@ def attack(
     while compared < n:
         cell = cells[rng.integers(len(cells))]
         box = frame.box.replace(0, float(cell.lower[0]), float(cell.upper[0]))
-        bounds = frame.sets(box)
+        bounds = frame.cell_bounds(box)
         assert bounds.linear is not None
         a_lower, b_lower, a_upper, b_upper = (part.astype(np.float64) for part in bounds.linear)
         for p in (-1.0, 1.0, *rng.uniform(-1.0, 1.0, 6)):

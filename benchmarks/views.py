@@ -97,7 +97,7 @@ def cells(method: Method, poses: PoseBox, values: np.ndarray, half: np.ndarray, 
             box = box.replace(axis, max(low, v[axis] - half[axis]), min(high, v[axis] + half[axis]))
         box = shown.frame.feasible(box)
         assert box is not None, "no cell around a pose is empty"
-        linear, lower, upper, _ = shown.sets(box)
+        linear, lower, upper, _ = shown.linear_sets(box)
         a_lower, b_lower, a_upper, b_upper = (np.asarray(part, np.float64) for part in linear)
         slopes, middle = 0.5 * (a_lower + a_upper), 0.5 * (b_lower + b_upper)
         radius = 0.5 * (b_upper - b_lower) + 0.5 * np.abs(a_upper - a_lower).sum(axis=-1)

@@ -48,7 +48,7 @@ class Brightness:
         return float(self.scene.image(values)[1:3, 1:3].mean(dtype=np.float64)) - self.least
 
     def proved(self, box: ParameterBox) -> tuple[float, np.ndarray]:
-        (slopes, offsets, _, _), _, _, _ = self.scene.sets(box)
+        (slopes, offsets, _, _), _, _, _ = self.scene.linear_sets(box)
         slope = slopes[1:3, 1:3].mean(axis=(0, 1, 2))
         return float(offsets[1:3, 1:3].mean() - np.abs(slope).sum()) - self.least - 1e-6, np.abs(slope)
 

@@ -417,7 +417,7 @@ def test_sets_contain_what_float32_preprocessing_gives(channels: str, layout: st
     base, slope = rng.uniform(0.3, 0.7, (2, 5, 4, 3)), 0.1 * rng.uniform(-1.0, 1.0, (2, 5, 4, 3, 2))
     slack = 0.05 * rng.random((2, 5, 4, 3))
     reach = np.abs(slope).sum(-1) + slack
-    sets = pre.sets((slope, base - slack, slope, base + slack), base - reach, base + reach)
+    sets = pre.input_sets((slope, base - slack, slope, base + slack), base - reach, base + reach)
     for cell in range(2):
         for _ in range(200):
             p = rng.uniform(-1, 1, 2).round(1)
@@ -439,7 +439,7 @@ def test_sets_are_tight_and_contain_rounding() -> None:
     pre = Preprocess(mean=(0.4914, 0.4822, 0.4465), std=(0.2471, 0.2435, 0.2616))
     image = np.random.default_rng(0).random((1, 32, 32, 3)).astype(np.float32)
     zero, wide = np.zeros((*image.shape, 1)), image.astype(np.float64)
-    sets = pre.sets((zero, wide, zero, wide), wide, wide)
+    sets = pre.input_sets((zero, wide, zero, wide), wide, wide)
     y = pre.apply(torch.from_numpy(image)).numpy().reshape(1, -1).astype(np.float64)
     assert (sets.b_lower <= y).all() and (y <= sets.b_upper).all()
     assert (sets.lower <= y).all() and (y <= sets.upper).all()

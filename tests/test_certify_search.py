@@ -44,7 +44,7 @@ class Ramp:
     def image(self, values: np.ndarray) -> np.ndarray:
         return np.full((2, 2, 3), 0.5 + self.gains @ values, np.float32)
 
-    def sets(self, box: ParameterBox) -> Any:
+    def linear_sets(self, box: ParameterBox) -> Any:
         self.bounded += 1
         half = 0.5 * (np.array(box.upper) - np.array(box.lower))
         a = np.broadcast_to(self.gains * half, (2, 2, 3, len(half)))
@@ -229,7 +229,7 @@ def test_gradient_finds_what_samples_miss() -> None:
         def differentiable(self, values: torch.Tensor) -> torch.Tensor:
             return (0.2 + 0.1 * ((values - torch.from_numpy(spot)) ** 2).sum()).expand(2, 2, 3)
 
-        def sets(self, box: ParameterBox) -> Any:
+        def linear_sets(self, box: ParameterBox) -> Any:
             raise ValueError("no bounds")
 
     search = Search(Spot(2), Threshold(0.2004), CLAIM, CellGrid(interval(2), (1, 1), (1, 1)))
@@ -243,8 +243,8 @@ def test_gradient_finds_what_samples_miss() -> None:
 
 def spoilt(change: Callable[[Any], Any]) -> type[Ramp]:
     class Spoilt(Ramp):
-        def sets(self, box: ParameterBox) -> Any:
-            return change(super().sets(box))
+        def linear_sets(self, box: ParameterBox) -> Any:
+            return change(super().linear_sets(box))
 
     return Spoilt
 
@@ -343,7 +343,7 @@ def test_users_mistakes_and_lack_of_memory_end_the_run() -> None:
     for error in (InputError("planted"), MemoryError("planted"), KeyboardInterrupt()):
 
         class Spoilt(Ramp):
-            def sets(self, box: ParameterBox, error: BaseException = error) -> Any:
+            def linear_sets(self, box: ParameterBox, error: BaseException = error) -> Any:
                 raise error
 
         with pytest.raises(type(error)):
@@ -425,8 +425,8 @@ class Shaded(Ramp):
     def scene_samples(self, seed: int) -> Iterator[Any]:
         return itertools.repeat(Shade(self, 0.0))
 
-    def sets(self, box: ParameterBox) -> Any:
-        (a, low, _, high), lower, upper, slopes = super().sets(box)
+    def linear_sets(self, box: ParameterBox) -> Any:
+        (a, low, _, high), lower, upper, slopes = super().linear_sets(box)
         return (a, low - self.reach, a, high + self.reach), lower - self.reach, upper + self.reach, slopes
 
 
@@ -461,8 +461,8 @@ def test_networks_are_asked_only_where_that_may_prove() -> None:
     scene = Ramp(2, slack=0.0)
 
     class Wide(Ramp):
-        def sets(self, box: ParameterBox) -> Any:
-            (a, low, _, high), lower, upper, slopes = super().sets(box)
+        def linear_sets(self, box: ParameterBox) -> Any:
+            (a, low, _, high), lower, upper, slopes = super().linear_sets(box)
             # falls with the square of the width
             more = 0.04 * float(np.square(np.subtract(box.upper, box.lower)).sum())
             return (a, low - more, a, high + more), lower - more, upper + more, slopes
@@ -640,9 +640,9 @@ def test_deep_first_proves_early() -> None:
             super().__init__(2)
             self.gains = np.zeros(2)
 
-        def sets(self, box: ParameterBox) -> Any:
+        def linear_sets(self, box: ParameterBox) -> Any:
             self.slack = 0.125 * float(np.mean(np.array(box.upper) - np.array(box.lower)))
-            return super().sets(box)
+            return super().linear_sets(box)
 
     search = search_of(Even(), Threshold(0.48), (2, 2))
     roots = [(1e6, tuple(search.grid.roots()))]

@@ -35,7 +35,7 @@ from ns_abstract.verify.network.shared_coefficients import _ReusedBounds, _Reusi
 from ns_abstract.verify.picture_sets import PictureSets, hull_of_sets
 from ns_abstract.verify.properties import Query
 from ns_abstract.verify.search import Search
-from ns_abstract.verify.subboxes import PixelWeights, SubBoxProof, divisions
+from ns_abstract.verify.sub_box_proof import PixelWeights, SubBoxProof, divisions
 
 SHAPE = (2, 6, 6)
 
@@ -369,7 +369,7 @@ def test_joined_sets_of_what_is_linear_are_as_narrow() -> None:
 
 
 def _ramp_sets(scene: Ramp, box: ParameterBox) -> PictureSets:
-    linear, lower, upper, _ = scene.sets(box)
+    linear, lower, upper, _ = scene.linear_sets(box)
     return PictureSets(box, linear, lower, upper)
 
 
@@ -444,10 +444,10 @@ class Shared:
 class Curved(Ramp):
     """Pictures of brightness ``0.5 + 0.2 x + 0.1 y``; sets are loose by the square of the width."""
 
-    def sets(self, box: ParameterBox) -> Any:
+    def linear_sets(self, box: ParameterBox) -> Any:
         half = 0.5 * (np.array(box.upper) - np.array(box.lower))
         self.slack = 0.05 * float(half.max()) ** 2
-        return super().sets(box)
+        return super().linear_sets(box)
 
 
 #: A gradient that is the same at every pixel, and a margin.
@@ -499,8 +499,8 @@ def test_what_width_costs_is_found_about_the_middle() -> None:
 class Wider(Curved):
     """The same pictures, known half as well."""
 
-    def sets(self, box: ParameterBox) -> Any:
-        linear, lower, upper, slopes = super().sets(box)
+    def linear_sets(self, box: ParameterBox) -> Any:
+        linear, lower, upper, slopes = super().linear_sets(box)
         (a_lower, b_lower, a_upper, b_upper), room = linear, 0.5 * (upper - lower)
         return (a_lower, b_lower - room, a_upper, b_upper + room), lower - room, upper + room, slopes
 
@@ -524,7 +524,7 @@ def test_the_way_with_fewer_parts_is_taken(first_is_wider: bool) -> None:
 
 def test_one_part_without_a_proof_leaves_the_cell_without() -> None:
     """Whatever bounds say of the other parts."""
-    search, _ = covered(0.1, most=64)
+    search, _ = covered(0.1, most_parts=64)
     cell = search.grid.box_of(search.grid.roots()[0])
     weights = EVEN
     assert search.cover is not None
@@ -532,15 +532,15 @@ def test_one_part_without_a_proof_leaves_the_cell_without() -> None:
     assert good.margin is not None and good.margin > 0.0
 
     class Hole(Curved):
-        def sets(self, box: ParameterBox) -> Any:
-            linear, lower, upper, slopes = super().sets(box)
+        def linear_sets(self, box: ParameterBox) -> Any:
+            linear, lower, upper, slopes = super().linear_sets(box)
             if box.contains(np.array([-0.37, -0.61])):
                 linear = (*linear[:1], linear[1] - 0.6, *linear[2:])
                 lower = lower - 0.6
             return linear, lower, upper, slopes
 
     scene = Hole(2)
-    holed = replace(search.cover, scene=scene, most=1 << 12).prove(cell, np.array([0.5, 0.1]), weights)
+    holed = replace(search.cover, scene=scene, most_parts=1 << 12).prove(cell, np.array([0.5, 0.1]), weights)
     assert holed.margin is None and math.prod(holed.cuts) > 1
 
 
@@ -551,8 +551,8 @@ def test_bad_bounds_of_parts_certify_nothing(bad: float) -> None:
     weights = EVEN
 
     class Bad(Curved):
-        def sets(self, box: ParameterBox) -> Any:
-            linear, lower, upper, slopes = super().sets(box)
+        def linear_sets(self, box: ParameterBox) -> Any:
+            linear, lower, upper, slopes = super().linear_sets(box)
             if box.contains(np.array([-0.37, -0.61])):
                 upper = np.full_like(upper, bad)
             return linear, lower, upper, slopes
@@ -563,7 +563,7 @@ def test_bad_bounds_of_parts_certify_nothing(bad: float) -> None:
 
 def test_cells_that_take_too_many_parts_are_cut_where_that_helps() -> None:
     """A cut of what needs no cut leaves as many parts to be bounded."""
-    search, _ = covered(0.1, most=4)
+    search, _ = covered(0.1, most_parts=4)
     assert search.cover is not None
     box = search.grid.box
     weights = PixelWeights(np.full((2, 2, 3), 20.0 / 12.0), 0.4)

@@ -366,7 +366,10 @@ def test_ratio_falls_to_the_goal(dimensions: int, ratio: float, first: float) ->
 class Whole(Waves):
     """Does not take some pixels of a tile."""
 
-    bound_parts = None  # type: ignore[assignment]
+    def bound_parts(
+        self, boxes: Any, tiles: np.ndarray, within: Any, keep_linear: bool, pixels: np.ndarray | None
+    ) -> list[Any]:
+        return [self.bound(box, tiles, within, keep_linear) for box in boxes]
 
 
 @pytest.mark.parametrize("ratio", [1.0, 1.2])

@@ -16,7 +16,7 @@ WHOLE = {"test_browser.py", "test_tutorial.py"}
 #: Sources whose planted faults show alone in what takes seconds: a certified loop, kernels that are compiled anew,
 #: skipped fragments in every mode, a whole search of a network.
 LONG = {
-    "api/frame_pictures.py",
+    "verify/scene_pictures.py",
     "api/loop_job.py",
     "arithmetic/kernel_cache.py",
     "methods/splat/threshold_crossings.py",

@@ -37,7 +37,7 @@ def test_sets_of_poses_are_enclosed(name: str) -> None:
     frame = NerfactoFrame(scene, pose_set)
     tiles, rng = np.arange(4), np.random.default_rng(0)
     box = pose_set.box.split(0, 2)[0]
-    found, planes = frame.bound(box, tiles), frame.sets(box)
+    found, planes = frame.bound(box, tiles), frame.cell_bounds(box)
     assert float((found.upper - found.lower).mean()) < 0.3
     values = [box.middle, *box.corners(), *box.sample(12, rng)]
     low, high, half = np.array(box.lower), np.array(box.upper), 0.5

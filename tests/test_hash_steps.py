@@ -11,7 +11,6 @@ import pytest
 import torch
 from nerfactos import random_net
 
-from ns_abstract.methods.nerf import nerfacto_kernel as concrete
 from ns_abstract.methods.nerf.hash_bounds import (
     composition,
     distribution,
@@ -23,7 +22,8 @@ from ns_abstract.methods.nerf.hash_bounds import (
     points,
 )
 from ns_abstract.methods.nerf.hsv import shifted
-from ns_abstract.methods.nerf.render import HISTOGRAM_PADDING
+from ns_abstract.methods.nerf.nerfacto_render import next_places
+from ns_abstract.methods.nerf.render import HISTOGRAM_PADDING, interval_weights
 
 #: Draws of each step; interpreted kernels are slow.
 DRAWS = 40
@@ -194,7 +194,7 @@ def trilinear(table: np.ndarray, resolution: int, x: list[Fraction]) -> list[Fra
         for a in range(3):
             part = cells[a] - first[a]
             share *= part if corner[a] else 1 - part
-        row = concrete.hash_row(*(first[a] + corner[a] for a in range(3)), len(table))
+        row = features.hash_row(*(first[a] + corner[a] for a in range(3)), len(table))
         found = [f + share * Fraction(float(v)) for f, v in zip(found, table[row], strict=True)]
     return found
 
@@ -295,7 +295,8 @@ class Ray:
             pose = [Fraction(0)] * 2
         signs = rng.choice([-1.0, 1.0], self.count + 1) if rng.integers(2) else rng.uniform(-1.0, 1.0, self.count + 1)
         places = np.array([float(value(one, pose, s)) for one, s in zip(self.edges.place, signs, strict=True)])
-        distances = np.array([concrete.distance_at(s, 0.0, 0.99, True) for s in places])
+        along = 0.99 * places
+        distances = np.where(along < 0.5, 2.0 * along, 1.0 / (2.0 - 2.0 * along))
         densities = np.zeros(self.count)
         for i in range(self.count):
             middle = np.zeros(5)
@@ -309,6 +310,11 @@ class Ray:
         return pose, places, distances, densities
 
 
+def weights_of(distances: np.ndarray, densities: np.ndarray) -> torch.Tensor:
+    """[n] weights of intervals."""
+    return interval_weights(torch.from_numpy(densities)[None], torch.from_numpy(np.diff(distances))[None])[0]
+
+
 def test_light_and_places_of_samples_are_enclosed() -> None:
     tight = 0
     for seed in range(DRAWS):
@@ -319,12 +325,10 @@ def test_light_and_places_of_samples_are_enclosed() -> None:
         following = edges.edges_of(wanted - 1, POSES)
         if not distribution.follow(ray.light, ray.count, ray.edges, wanted, ray.line, following, np.zeros((3, 5))):
             continue
-        quantiles = (np.arange(wanted) + 0.5) / wanted
         for _ in range(6):
             pose, places, distances, densities = ray.draw()
-            weights, found = np.zeros(ray.count), np.zeros(wanted)
-            concrete.sample_weights(distances, densities, weights)
-            concrete.next_places(places, weights, quantiles, found)
+            weights = weights_of(distances, densities)
+            found = next_places(torch.from_numpy(places)[None], weights[None], wanted - 1)[0].numpy()
             left = np.exp(-np.append(0.0, np.cumsum(np.diff(distances) * densities)))
             assert np.all(ray.light.left[:, 0] <= left) and np.all(left <= ray.light.left[:, 1])
             for j in range(wanted):
@@ -362,8 +366,7 @@ def test_colours_of_rays_are_enclosed() -> None:
         )
         for _ in range(6):
             pose, _, distances, densities = ray.draw()
-            weights = np.zeros(count)
-            concrete.sample_weights(distances, densities, weights)
+            weights = weights_of(distances, densities).numpy()
             # symbols of the edges as they are
             edge = np.zeros(count + 1)
             for j in range(count + 1):

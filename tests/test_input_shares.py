@@ -111,8 +111,8 @@ def test_cutting_takes_fewer_bounds_than_assuming_phases(tmp_path: Path, monkeyp
     y, rows = outputs(network, inputs(lower, upper))[:, 0], np.array([[1.0, 0.0]])
     offset = [float(0.03 * (y.max() - y.min()) - y.min())]
     tuning, found = box_decisions.BoxTuning(), []
-    for dominant in (tuning.dominant, np.inf):
-        monkeypatch.setattr(box_decisions, "_TUNING", dataclasses.replace(tuning, dominant=dominant))
+    for dominant in (tuning.dominant_share, np.inf):
+        monkeypatch.setattr(box_decisions, "_TUNING", dataclasses.replace(tuning, dominant_share=dominant))
         found.append(answer(network, lower, upper, offset, rows))
     assert [one.word for one in found] == ["unsat", "unsat"]
     assert found[0].boxes < found[1].boxes

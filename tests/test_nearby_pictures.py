@@ -190,7 +190,7 @@ def _attack(job: Any, pictures: PlanePictures, cells: list[ParameterBox], poses:
         near = pictures.near(cell)
         assert isinstance(near, NearbyPictures)
         open_ = near._known.open
-        (a_low, b_low, a_high, b_high), lower, upper, _ = near.sets(cell)
+        (a_low, b_low, a_high, b_high), lower, upper, _ = near.linear_sets(cell)
         assert (lower <= upper).all()
         middle, half = cell.middle, 0.5 * (np.array(cell.upper) - cell.lower)
         for pose in (middle, *cell.corners(), *cell.sample(poses, rng)):
@@ -279,7 +279,7 @@ def test_pixels_that_are_not_wanted_take_no_light(blobs: Inputs, tmp_path: Path)
 
 def _widths(near: NearbyPictures, cell: ParameterBox) -> float:
     """The mean width of the sets of the pixels that are not settled."""
-    linear, lower, upper, _ = near.sets(cell)
+    linear, lower, upper, _ = near.linear_sets(cell)
     return float(PictureSets(cell, linear, lower, upper).widths[near._known.open][:, 3].mean())
 
 

@@ -76,7 +76,7 @@ def test_renders_lie_between_the_planes(name: str) -> None:
     frame = NerfFrame(tiny_scene(3), UNIFORM, poses(SETS[name]))
     for box in cells(frame.box):
         for weigh in (None, lambda: COSTLY):
-            found = frame.sets(box, weigh)
+            found = frame.cell_bounds(box, weigh)
             assert (found.upper - found.lower).mean() < 0.5, "nothing was bounded"
             assert outside(frame, box, found) == 0
 
@@ -87,7 +87,7 @@ def test_stiff_fields_lie_between_the_planes(seed: int) -> None:
     for changes in ({"density": 1e4}, {"color": 1e4}, {"rough": 20.0}):
         frame = NerfFrame(tiny_scene(seed, **changes), UNIFORM, poses({"rotation": {"yaw": 0.002}}))
         for box in cells(frame.box):
-            assert outside(frame, box, frame.sets(box, lambda: COSTLY)) == 0
+            assert outside(frame, box, frame.cell_bounds(box, lambda: COSTLY)) == 0
 
 
 @pytest.mark.slow
@@ -96,7 +96,7 @@ def test_any_choice_of_samples_lies_between_the_planes() -> None:
     camera = PinholeCamera(view().camera_to_world, 5.0, 5.0, 1.0, 0.5, 2, 1)
     frame = NerfFrame(tiny_scene(3), sampling, poses({"rotation": {"yaw": 1e-4}}, camera))
     for box in cells(frame.box):
-        found = frame.sets(box)
+        found = frame.cell_bounds(box)
         assert (found.upper - found.lower).mean() < 0.9, "nothing was bounded"
         assert outside(frame, box, found, 10) == 0
 
@@ -106,7 +106,7 @@ def test_planes_follow_the_pixels() -> None:
     """Most of how far pixels move over a cell goes into the slopes."""
     frame = NerfFrame(tiny_scene(3), UNIFORM, poses(SETS["orbit"]))
     box = frame.box.split(0, 8)[3]
-    found = frame.sets(box, lambda: COSTLY)
+    found = frame.cell_bounds(box, lambda: COSTLY)
     pictures = np.stack([frame.render(v) for v in np.linspace(box.lower, box.upper, 9)])
     moved = (pictures.max(axis=0) - pictures.min(axis=0)).mean()
     assert found.linear is not None
@@ -140,11 +140,11 @@ def test_planes_lie_beyond_every_part_exactly(counts: tuple[int, ...]) -> None:
 def test_what_a_cell_gets_does_not_depend_on_what_was_asked_before() -> None:
     scene, pose_set = tiny_scene(2), poses(SETS["orbit"])
     parts = pose_set.box.split(0, 16)
-    fresh = NerfFrame(scene, UNIFORM, pose_set).sets(parts[5], lambda: COSTLY)
+    fresh = NerfFrame(scene, UNIFORM, pose_set).cell_bounds(parts[5], lambda: COSTLY)
     used = NerfFrame(scene, UNIFORM, pose_set)
     for box in (parts[4], parts[6], pose_set.box):
-        used.sets(box, lambda: 3.0 * COSTLY)
-    again = used.sets(parts[5], lambda: COSTLY)
+        used.cell_bounds(box, lambda: 3.0 * COSTLY)
+    again = used.cell_bounds(parts[5], lambda: COSTLY)
     assert fresh.linear is not None and again.linear is not None
     for one, other in zip(
         (*fresh.linear, fresh.lower, fresh.upper), (*again.linear, again.lower, again.upper), strict=True
@@ -156,10 +156,10 @@ def test_what_a_cell_gets_does_not_depend_on_what_was_asked_before() -> None:
 def test_rays_that_cost_more_get_tighter_and_nothing_is_bounded_twice(monkeypatch: pytest.MonkeyPatch) -> None:
     frame = NerfFrame(tiny_scene(3), UNIFORM, poses(SETS["orbit"]))
     box = frame.box.split(0, 64)[20]
-    loose = frame.sets(box)
+    loose = frame.cell_bounds(box)
     costs = np.zeros((3, 4, 3))
     costs[0] = 30.0
-    tight = frame.sets(box, lambda: costs)
+    tight = frame.cell_bounds(box, lambda: costs)
     assert loose.linear is not None and tight.linear is not None
     before, after = (s[3] - s[1] for s in (loose.linear, tight.linear))
     # the first group of rays holds the first two rows of the picture
@@ -167,7 +167,7 @@ def test_rays_that_cost_more_get_tighter_and_nothing_is_bounded_twice(monkeypatc
     assert (after[8:] == before[8:]).all()
     monkeypatch.setattr(NerfFrame, "_run", None)
     for child in box.split(0, 2):
-        frame.sets(child)
+        frame.cell_bounds(child)
 
 
 # ---------------------------------------------------------------- planted faults
@@ -204,7 +204,7 @@ original_ends = strips_module.PoseStrips._part_ends
 def test_planted_faults_are_found(monkeypatch: pytest.MonkeyPatch, target: Any, name: str, fault: Any) -> None:
     def failed() -> int:
         frame = NerfFrame(tiny_scene(3, density=30.0), UNIFORM, poses({"rotation": {"yaw": 0.2}}))
-        return sum(outside(frame, box, frame.sets(box), 10) for box in frame.box.split(0, 64)[10:50:8])
+        return sum(outside(frame, box, frame.cell_bounds(box), 10) for box in frame.box.split(0, 64)[10:50:8])
 
     assert failed() == 0
     monkeypatch.setattr(target, name, fault)
@@ -342,7 +342,7 @@ def test_work_is_given_up_inside_a_ray() -> None:
         return len(asked) > 12
 
     with pytest.raises(WorkCancelledError), cancel_when(over):
-        frame.sets(frame.box)
+        frame.cell_bounds(frame.box)
     assert len(asked) == 13
     assert not frame._strips._known, "a ray that was given up is kept"
 

@@ -76,7 +76,7 @@ def test_cells_of_certificates(device: str) -> None:
     frame = NerfFrame(scene, UNIFORM, pose_set, device)
     frame.bounds = NerfBounds(scene, UNIFORM, 1, device, compiled=False)
     for box in cells(frame.box):
-        found = frame.sets(box, lambda: COSTLY)
+        found = frame.cell_bounds(box, lambda: COSTLY)
         assert (found.upper - found.lower).mean() < 0.5, "nothing was bounded"
         assert outside(frame, box, found) == 0
 

@@ -13,13 +13,13 @@ from nerfs import BINS, attack_first_rays, pixels_of, poses, tiny_scene
 
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.nerf.bounds import NerfBounds
-from ns_abstract.methods.nerf.division import ENDS, Division, regroup_parts
+from ns_abstract.methods.nerf.division import ENDS, Division, RayCells, regroup_parts
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.occupancy import OccupancyGrid
 from ns_abstract.methods.nerf.ray_bundle import RayBundle
 from ns_abstract.methods.nerf.ray_field import RayBounds
 from ns_abstract.methods.nerf.render import NerfRenderer, _filled, camera_rays, interval_weights
-from ns_abstract.methods.nerf.sample_paths import BundleBounds, FollowedSamples, RayCells, SampleLines, SamplePaths
+from ns_abstract.methods.nerf.sample_paths import BundleBounds, FollowedSamples, SampleLines, SamplePaths
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.refine.engine import Refinement, RefinementGoal
 

@@ -14,8 +14,8 @@ from ns_abstract.arithmetic.rounding import UNIT64
 from ns_abstract.arithmetic.simd.lanes import LINE
 from ns_abstract.methods.nerf import relu_kernel, zonotope
 from ns_abstract.methods.nerf.field_kernel import CHUNK
-from ns_abstract.methods.nerf.layer_kernel import BLOCK, LayerInput, LayerOutput, LayerWeights, linear
-from ns_abstract.methods.nerf.layer_polynomials import PreActivation
+from ns_abstract.methods.nerf.layer_kernel import BLOCK, LayerOutput, LayerWeights, linear
+from ns_abstract.methods.nerf.layer_polynomials import PostActivation, PreActivation
 from ns_abstract.methods.nerf.outputs import greatest, opacity
 from ns_abstract.methods.nerf.ray_field import basis_of
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer
@@ -162,7 +162,7 @@ def moved(columns: torch.Tensor, owner: torch.Tensor, signs: torch.Tensor, piece
     return torch.zeros(pieces, columns.shape[1], dtype=torch.float64).index_add_(0, owner, columns * signs[:, None])
 
 
-def compiled_relu(field: FieldBounds, z: PreActivation) -> zonotope.PostActivation:
+def compiled_relu(field: FieldBounds, z: PreActivation) -> PostActivation:
     """`FieldBounds._relu` by the compiled kernel."""
     assert field._grid is not None
     pieces, _, n = z.poly.shape
@@ -174,7 +174,7 @@ def compiled_relu(field: FieldBounds, z: PreActivation) -> zonotope.PostActivati
     behind = relu_kernel.ReluOutput(*(a.numpy() for a in (slope, size, spread, failed, count, piece, neuron, error)))
     found = relu_kernel.relu(before, field._grid, field.limit, behind)
     new = piece[:found], neuron[:found], error[:found]
-    return zonotope.PostActivation(z.poly, z.columns, z.owner, slope, *new, spread, z.box, size, failed, count)
+    return PostActivation(z.poly, size, spread, z.box, slope, failed, count, z.columns, z.owner, *new)
 
 
 #: An encoded vector of no number, for layers that see none.
@@ -268,8 +268,8 @@ def test_columns_in_float32_are_charged(scale: float) -> None:
     field = FieldBounds(tiny_weights(0), basis_of(1, tiny_weights(0)))
     layer = hidden_layer(field)
     pieces = field._relu(random_batch(field, layer.weight.shape[0], 5))
-    pieces = replace(
-        pieces, columns=scale * pieces.columns, new_size=scale * pieces.new_size, spread=scale * pieces.spread,
+    pieces = pieces._replace(
+        columns=scale * pieces.columns, new_size=scale * pieces.new_size, spread=scale * pieces.spread,
         box=0.0 * pieces.box, size=scale * pieces.size, poly=0.0 * pieces.poly,
     )  # fmt: skip
     after = field._linear(pieces, layer, NOTHING)
@@ -287,7 +287,7 @@ def test_columns_beyond_float32_fail() -> None:
     pieces = field._relu(random_batch(field, layer.weight.shape[0], 5))
     columns = pieces.columns.clone()
     columns[pieces.owner == 7] *= 1e39
-    after = field._relu(field._linear(replace(pieces, columns=columns), layer, NOTHING))
+    after = field._relu(field._linear(pieces._replace(columns=columns), layer, NOTHING))
     assert after.failed[7] and after.failed.sum() == 1
 
 
@@ -315,7 +315,7 @@ def test_products_leave_out_what_is_off(kind: type, inputs: int, live: int, outp
     )  # fmt: skip
     rest = np.where(off, np.nan, rng.uniform(size=(batch, inputs)))
     failed, none = np.zeros(batch, bool), np.zeros(batch, np.int64)
-    before = LayerInput(
+    before = PostActivation(
         poly, np.where(off, 0.0, 1.0), rest, rest, slope, failed, none, columns, owner, new_owner, neuron, sizes
     )
     # columns and rows of an encoded vector come first
@@ -387,8 +387,7 @@ def test_compiled_and_torch_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     assert found[0].new_size.numel() > 0
     for name in ("owner", "new_owner", "new_neuron", "failed", "count"):
         assert torch.equal(getattr(found[0], name), getattr(found[1], name)), name
-    for pieces in found:
-        pieces.poly = pieces.poly * (pieces.size != 0.0)[:, None]
+    found = [pieces._replace(poly=pieces.poly * (pieces.size != 0.0)[:, None]) for pieces in found]
     for name in ("poly", "columns", "slope", "new_size", "spread", "box", "size"):
         torch.testing.assert_close(getattr(found[0], name), getattr(found[1], name), rtol=1e-9, atol=1e-11)
 
@@ -454,8 +453,8 @@ def faulty_remainder(monkeypatch: pytest.MonkeyPatch) -> None:
 def faulty_columns(monkeypatch: pytest.MonkeyPatch) -> None:
     linear = FieldBounds._linear
 
-    def narrowed(self: FieldBounds, pieces: zonotope.PostActivation, *arguments: object) -> PreActivation:
-        return linear(self, replace(pieces, slope=0.1 * pieces.slope), *arguments)  # type: ignore[arg-type]
+    def narrowed(self: FieldBounds, pieces: PostActivation, *arguments: object) -> PreActivation:
+        return linear(self, pieces._replace(slope=0.1 * pieces.slope), *arguments)  # type: ignore[arg-type]
 
     monkeypatch.setattr(FieldBounds, "_linear", narrowed)
 

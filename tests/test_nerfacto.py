@@ -24,12 +24,21 @@ import ns_abstract as nsa
 from ns_abstract.geometry.keyframe_cameras import look_at
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.load import load_any
-from ns_abstract.methods.nerf import nerfacto_kernel as kernel
 from ns_abstract.methods.nerf import nerfacto_load
-from ns_abstract.methods.nerf.hash_field import NerfactoScene
+from ns_abstract.methods.nerf.hash_bounds.features import hash_row
+from ns_abstract.methods.nerf.hash_field import NerfactoField, NerfactoScene
 from ns_abstract.methods.nerf.nerfacto_load import resolutions, with_mean
-from ns_abstract.methods.nerf.nerfacto_render import NerfactoRenderer, even, quantiles
-from ns_abstract.methods.nerf.nerfacto_torch import DifferentiableNerfacto, grid_features, harmonics
+from ns_abstract.methods.nerf.nerfacto_render import (
+    NerfactoRenderer,
+    contracted,
+    evaluate_net,
+    even,
+    grid_features,
+    harmonics,
+    next_places,
+    quantiles,
+)
+from ns_abstract.methods.nerf.render import interval_weights
 from ns_abstract.methods.nerf.write import write_nerfacto_run
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.nerfstudio.torchvision_operators import declare_missing
@@ -46,6 +55,12 @@ def some_rays(count: int, seed: int = 3) -> np.ndarray:
     directions = rng.standard_normal((count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     return np.stack([0.9 * rng.standard_normal((count, 3)), directions], axis=1)
+
+
+def colors(field: NerfactoField, rays: np.ndarray) -> np.ndarray:
+    """[n, 3] of rays [n, 2, 3]."""
+    origins, directions = torch.from_numpy(rays).unbind(dim=1)
+    return NerfactoRenderer(field).colors(origins, directions).numpy()
 
 
 # ---------------------------------------------------------------- files
@@ -157,94 +172,100 @@ def test_resolutions_are_rounded_down_in_float32() -> None:
 def test_corners_have_the_rows_of_the_hash() -> None:
     for x, y, z in ((0, 0, 0), (1, 2, 3), (2047, 2047, 2046), (511, 0, 300)):
         wanted = (x ^ (y * 2654435761) ^ (z * 805459861)) % 2**19
-        assert kernel.hash_row(x, y, z, 2**19) == wanted
+        assert hash_row(x, y, z, 2**19) == wanted
 
 
-def test_features_are_those_of_torch() -> None:
+def test_features_are_interpolated_between_corners() -> None:
     """Also on faces of cells, where floor and ceiling agree."""
     encoding = tiny_nerfacto(2).field.encoding
-    x = np.random.default_rng(0).uniform(0.0, 1.0, (200, 3))
-    x[:40] = np.round(16.0 * x[:40]) / 16.0
-    wanted = grid_features(encoding, torch.from_numpy(x)).numpy()
-    found = np.empty(encoding.size)
-    for (px, py, pz), features in zip(x, wanted, strict=True):
-        kernel.grid_features(kernel.pack_grid(encoding), px, py, pz, found)
-        np.testing.assert_allclose(found, features, rtol=0.0, atol=2e-15)
+    x = np.random.default_rng(0).uniform(0.0, 1.0, (60, 3))
+    x[:20] = np.round(16.0 * x[:20]) / 16.0
+    for place, found in zip(x, grid_features(encoding, torch.from_numpy(x)).numpy(), strict=True):
+        features = []
+        for table, size in zip(encoding.table, encoding.resolutions, strict=True):
+            low = np.floor(place * size)
+            part, total = place * size - low, np.zeros(table.shape[1])
+            for corner in np.ndindex(2, 2, 2):
+                node = (int(a) + (c if p else 0) for a, c, p in zip(low, corner, part, strict=True))
+                share = np.prod([p if c else 1.0 - p for c, p in zip(corner, part, strict=True)])
+                total += share * table[hash_row(*node, len(table))]
+            features.append(total)
+        np.testing.assert_allclose(found, np.concatenate(features), rtol=0.0, atol=2e-15)
 
 
 def test_harmonics_are_of_shifted_directions() -> None:
     direction = np.array([0.48, -0.6, 0.64])
-    found = np.empty(16)
-    kernel.harmonics(direction[0], direction[1], direction[2], found)
+    found = harmonics(torch.from_numpy(direction)).numpy()
     # linear harmonics of (d + 1) / 2
     np.testing.assert_allclose(found[[3, 1, 2]], 0.4886025119029199 * (direction + 1.0) / 2.0, rtol=1e-15)
-    np.testing.assert_allclose(found, harmonics(torch.from_numpy(direction)).numpy(), rtol=0.0, atol=1e-15)
+
+
+def test_harmonics_are_orthonormal_on_the_sphere() -> None:
+    """Exact quadrature of polynomials of degree 6: Gauss's nodes along z, equal steps around it."""
+    z, weights = np.polynomial.legendre.leggauss(8)
+    turns = 2.0 * np.pi * np.arange(16) / 16
+    z, turn = (a.ravel() for a in np.meshgrid(z, turns, indexing="ij"))
+    points = np.stack([np.sqrt(1.0 - z * z) * np.cos(turn), np.sqrt(1.0 - z * z) * np.sin(turn), z], axis=1)
+    values = harmonics(torch.from_numpy(2.0 * points - 1.0)).numpy()
+    area = np.repeat(weights, 16) * 2.0 * np.pi / 16
+    np.testing.assert_allclose(values.T @ (area[:, None] * values), np.eye(16), rtol=0.0, atol=1e-12)
 
 
 def test_edges_are_quantiles_of_padded_weights() -> None:
     """Of an empty ray every bin is as likely: edges are equally spaced, from half a step on."""
     places, wanted = even(1.0, 33), quantiles(8)
     np.testing.assert_allclose(wanted, (np.arange(9) + 0.5) / 9, rtol=1e-15)
-    found = np.empty(9)
-    kernel.next_places(places, np.zeros(32), wanted, found)
-    np.testing.assert_allclose(found, wanted, rtol=1e-14)
+    found = next_places(places[None], torch.zeros(1, 32, dtype=torch.float64), 8)
+    np.testing.assert_allclose(found[0], wanted, rtol=1e-14)
     # all weight in one bin: it has 1.01 of 1.32, every other 0.01
     weights = np.zeros(32)
     weights[4] = 1.0
-    kernel.next_places(places, weights, wanted, found)
+    found = next_places(places[None], torch.from_numpy(weights)[None], 8)
     knots = np.concatenate([[0.0], np.cumsum(weights + 0.01) / 1.32])
-    np.testing.assert_allclose(found, np.interp(wanted, knots, places), rtol=1e-13)
+    np.testing.assert_allclose(found[0], np.interp(wanted, knots, places), rtol=1e-13)
 
 
 def test_weights_of_overflowing_densities_are_numbers() -> None:
-    weights = np.empty(3)
-    kernel.sample_weights(np.array([0.0, 1.0, 1.0, 2.0]), np.array([0.1, np.inf, 0.5]), weights)
-    assert weights[0] == -math.expm1(-0.1) or abs(weights[0] + math.expm1(-0.1)) < 1e-16
-    assert weights[1] == 0.0 and weights[2] == 0.0
-    kernel.sample_weights(np.array([0.0, 1.0, 2.0, 3.0]), np.array([0.0, np.inf, np.inf]), weights)
-    assert weights.tolist() == [0.0, 1.0, 0.0]
+    density = torch.tensor([[0.1, math.inf, 0.5], [0.0, math.inf, math.inf]], dtype=torch.float64)
+    lengths = torch.tensor([[1.0, 0.0, 1.0], [1.0, 1.0, 1.0]], dtype=torch.float64)
+    weights = interval_weights(density, lengths)
+    assert abs(weights[0, 0] + math.expm1(-0.1)) < 1e-16
+    assert weights[0, 1] == 0.0 and weights[0, 2] == 0.0
+    assert weights[1].tolist() == [0.0, 1.0, 0.0]
 
 
 @pytest.mark.parametrize("background", ["last_sample", None])
 @pytest.mark.parametrize("spacing", ["piecewise", "uniform"])
-def test_torch_shows_the_same_picture(background: str | None, spacing: str) -> None:
+def test_samples_without_weight_do_not_count(background: str | None, spacing: str) -> None:
+    """Their colours are left out where no slopes are asked for."""
     field = tiny_nerfacto(3).field
     field = dataclasses.replace(field, spacing=spacing, background=background or np.array([0.2, 0.5, 1.0]))
-    rays, shift = some_rays(20), (0.2, -0.1)
-    found = NerfactoRenderer(field).rays(rays, shift)
-    assert found.std(axis=0).min() > 0.02
-    for (origin, direction), color in zip(rays, found, strict=True):
-        pose = torch.eye(3, 4, dtype=torch.float64)
-        pose[:, 3] = torch.from_numpy(origin)
-        shown = DifferentiableNerfacto(field).rays(pose, torch.from_numpy(direction)[None], shift)
-        np.testing.assert_allclose(shown[0].numpy(), color, rtol=0.0, atol=1e-11)
+    origins, directions = torch.from_numpy(some_rays(20)).unbind(dim=1)
+    found = NerfactoRenderer(field).colors(origins, directions, (0.2, -0.1))
+    assert found.std(dim=0).min() > 0.02
+    shown = NerfactoRenderer(field).colors(origins.requires_grad_(), directions, (0.2, -0.1))
+    np.testing.assert_allclose(shown.detach(), found, rtol=0.0, atol=1e-14)
+    (slope,) = torch.autograd.grad(shown.sum(), origins)
+    assert bool(torch.isfinite(slope).all()) and float(slope.abs().max()) > 0.0
 
 
 def test_empty_rays_show_the_last_samples_colour() -> None:
-    field = tiny_nerfacto(3, density=-900.0).field
-    renderer = NerfactoRenderer(dataclasses.replace(field, background="last_sample"))
-    shown = renderer.rays(some_rays(5))
+    field = dataclasses.replace(tiny_nerfacto(3, density=-900.0).field, background="last_sample")
+    origins, directions = torch.from_numpy(some_rays(5)).unbind(dim=1)
+    shown, edges = colors(field, some_rays(5)), NerfactoRenderer(field).edges(origins, directions)
     assert shown.min() > 0.0
-    for ray, color in zip(some_rays(5), shown, strict=True):
-        distances = renderer.edges(ray)
-        x, y, z = kernel.contract(*(ray[0] + 0.5 * (distances[-2] + distances[-1]) * ray[1]))
-        dx, dy, dz = ray[1]
-        raw = np.empty(16)
-        inputs = np.empty(64)
-        kernel.grid_features(kernel.pack_grid(field.encoding), x, y, z, inputs)
-        kernel.evaluate_net(kernel.pack(field.density_net), inputs, raw)
-        kernel.harmonics(dx, dy, dz, inputs)
-        inputs[16:31] = raw[1:]
-        kernel.evaluate_net(kernel.pack(field.color_net), inputs, raw)
-        np.testing.assert_allclose(color, 1.0 / (1.0 + np.exp(-raw[:3])), rtol=1e-12)
+    points = contracted(origins + 0.5 * (edges[:, -2:].sum(dim=1, keepdim=True)) * directions)
+    raw = evaluate_net(field.density_net, grid_features(field.encoding, points))
+    wanted = torch.sigmoid(evaluate_net(field.color_net, torch.cat([harmonics(directions), raw[:, 1:]], dim=1)))
+    np.testing.assert_allclose(shown, wanted, rtol=1e-12)
 
 
 def test_pictures_of_the_interface_are_rendered(run: Path) -> None:
     scene, camera = nsa.load_scene(run), view()
     picture = nsa.render(scene, camera)
     grid = np.indices((camera.height, camera.width)).reshape(2, -1).T
-    colors = NerfactoRenderer(tiny_nerfacto(1).field).pixels(camera, camera.camera_to_world, grid)
-    np.testing.assert_array_equal(picture.reshape(-1, 3), colors)
+    wanted = NerfactoRenderer(tiny_nerfacto(1).field).pixels(camera, camera.camera_to_world, grid)
+    np.testing.assert_array_equal(picture.reshape(-1, 3), wanted)
 
 
 @pytest.mark.parametrize(
@@ -341,14 +362,14 @@ def test_nerfstudio_shows_the_same_picture_in_float64(tmp_path: Path, monkeypatc
 
         wanted = shown(1000)
         assert wanted.std(axis=0).min() > 0.02
-        np.testing.assert_allclose(NerfactoRenderer(field).rays(rays), wanted, rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(colors(field, rays), wanted, rtol=0.0, atol=1e-12)
         for name, color in (("random", 0.0), ("white", 1.0)):
             model.renderer_rgb.background_color = name
-            found = NerfactoRenderer(dataclasses.replace(field, background=np.full(3, color))).rays(rays[:50])
+            found = colors(dataclasses.replace(field, background=np.full(3, color)), rays[:50])
             np.testing.assert_allclose(found, shown(50), rtol=0.0, atol=1e-12)
         model.collider.far_plane, model.proposal_sampler.initial_sampler = 6.0, samplers.UniformSampler().eval()
         uniform = dataclasses.replace(field, background=np.ones(3), far=6.0, spacing="uniform")
-        np.testing.assert_allclose(NerfactoRenderer(uniform).rays(rays[:50]), shown(50), rtol=0.0, atol=1e-12)
+        np.testing.assert_allclose(colors(uniform, rays[:50]), shown(50), rtol=0.0, atol=1e-12)
     finally:
         torch.set_default_dtype(torch.float32)
 
@@ -369,4 +390,4 @@ def test_runs_that_nerfstudio_trains_are_read(tmp_path: Path) -> None:
     scene = load_any(tmp_path / "lego" / "abstract-nerfacto" / "trained")
     assert (scene.field.samples, scene.field.far, scene.dataparser.scale) == ((64, 32, 24), 5.0, 0.8)
     assert scene.field.encoding.table.shape == (3, 256, 2)
-    assert NerfactoRenderer(scene.field).rays(some_rays(3)).shape == (3, 3)
+    assert colors(scene.field, some_rays(3)).shape == (3, 3)

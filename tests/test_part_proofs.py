@@ -175,7 +175,7 @@ class Disc:
         self.drawn += 1
         return (0.5 + self.radii**2 - values @ values).reshape(1, PIXELS, 1).astype(np.float32)
 
-    def sets(self, box: ParameterBox) -> Any:
+    def linear_sets(self, box: ParameterBox) -> Any:
         self.bounded += 1
         half, middle = 0.5 * (np.array(box.upper) - np.array(box.lower)), box.middle
         a = np.broadcast_to(-2.0 * middle * half, (1, PIXELS, 1, 2))
@@ -232,8 +232,8 @@ def test_parts_are_attacked() -> None:
 class Spots(Disc):
     """Those of `Disc`, with bounds that say less than the truth: that no picture is bright."""
 
-    def sets(self, box: ParameterBox) -> Any:
-        (a, low, _, _), lower, _, slopes = super().sets(box)
+    def linear_sets(self, box: ParameterBox) -> Any:
+        (a, low, _, _), lower, _, slopes = super().linear_sets(box)
         top = np.full_like(low, 0.4)
         return (a, np.minimum(low, 0.3), 0.0 * a, top), np.minimum(lower, 0.3), top, slopes
 
@@ -285,10 +285,10 @@ def test_sets_of_a_part_that_cross_decide_nothing(name: str) -> None:
     """Where a part has no sets of its own it is left to the search, which says why."""
 
     class Bad(Disc):
-        def sets(self, box: ParameterBox) -> Any:
+        def linear_sets(self, box: ParameterBox) -> Any:
             if name == "exception":
                 raise RuntimeError("planted")
-            linear, lower, upper, slopes = super().sets(box)
+            linear, lower, upper, slopes = super().linear_sets(box)
             return linear, upper + 0.1 if name == "crossed" else lower * np.nan, upper, slopes
 
     question = PartQuestion(_claim(), _model(), _claim().query(np.zeros((1, 1))))

@@ -330,6 +330,6 @@ def test_masks_and_planes_are_read_where_they_should(blobs: Inputs, tmp_path: Pa
     luminance = image[..., :3].astype(np.float64) @ np.array([0.2126, 0.7152, 0.0722])
     assert values[1] == pytest.approx(luminance.mean() - luminance[:8, :8].mean(), abs=1e-12)
     # sets hold what is rendered, of every plane
-    (_, b_low, _, b_high), lower, upper, _ = pictures.sets(pictures.box.replace(0, 0.0, 1e-6))
+    (_, b_low, _, b_high), lower, upper, _ = pictures.linear_sets(pictures.box.replace(0, 0.0, 1e-6))
     assert (lower <= image).all() and (image <= upper).all() and (b_low <= b_high).all()
     assert isinstance(job.property.planes[0], WeightPlane)

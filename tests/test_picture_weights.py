@@ -214,7 +214,7 @@ def test_weights_of_samples_stay_inside(spec: dict[str, Any]) -> None:
     frame = method.weight_frame(around, planes, read)
     whole = frame.box
     for box in (whole, whole.split(0, 8)[2]):
-        found = frame.sets(box)
+        found = frame.cell_bounds(box)
         assert found.linear is not None
         lower, upper, a_low, b_low, a_high, b_high = (
             assemble(part, frame.camera).astype(np.float64) for part in (
@@ -237,7 +237,7 @@ def test_rays_that_are_not_read_are_not_bounded() -> None:
     some[1, 1:3] = True
     frame = method.weight_frame(around, [WeightPlane(nearer=2.0)], some)
     every = method.weight_frame(around, [WeightPlane(nearer=2.0)], np.ones((3, 4), bool))
-    found = frame.sets(frame.box)
+    found = frame.cell_bounds(frame.box)
     lower, upper = (assemble(part, frame.camera)[..., 0] for part in (found.lower, found.upper))
     assert not upper[~some].any() and (upper[some] > lower[some]).all()
     for point in frame.box.sample(5, np.random.default_rng(0)):
@@ -252,7 +252,7 @@ def test_the_brightest_rays_are_bounded_first() -> None:
     frame = method.weight_frame(around, [WeightPlane(nearer=2.0)], np.ones((3, 4), bool))
     middle = assemble(frame.of_sample(frame.box.middle, None), frame.camera)[..., 0].reshape(-1)
     assert sorted(frame.rays.tolist()) == list(range(12)) and (np.diff(middle[frame.rays]) <= 0.0).all()
-    every, some = frame.sets(frame.box), frame.sets(frame.box, None, 8)
+    every, some = frame.cell_bounds(frame.box), frame.cell_bounds(frame.box, None, 8)
     first = np.zeros(12, bool)
     first[frame.rays[:8]] = True
     assert every.linear is not None and some.linear is not None

@@ -266,7 +266,7 @@ def test_tubes_hold_every_run(tmp_path: Path, kind: str) -> None:
         for mode, tube in tubes.items():
             assert first_outside(tube, run) is None, mode
         # not only in the box, but where its initial state says
-        entry = tubes["kept"].sets[-1]
+        entry = tubes["kept"].state_sets[-1]
         if not tubes["kept"].reason:
             first, x0 = run.states[0], AffineSet.box(loop.lower, loop.upper)
             free = np.flatnonzero(loop.lower < loop.upper)
@@ -280,7 +280,9 @@ def test_tubes_hold_every_run(tmp_path: Path, kind: str) -> None:
                 assert abs(value - line - Fraction(entry.center[k])) <= rest + Fraction(entry.radius[k])
         states += len(run.states)
     assert states > 1000
-    last = {mode: np.subtract(*tube.sets[-1].hull()[::-1]).max() for mode, tube in tubes.items() if not tube.reason}
+    last = {
+        mode: np.subtract(*tube.state_sets[-1].hull()[::-1]).max() for mode, tube in tubes.items() if not tube.reason
+    }
     # an aeroplane hardly comes back in two seconds, so there is little to keep
     part = 1.0 if kind == "fixed wing" else 0.7
     assert last["kept"] < last.get("step", np.inf) and last["kept"] < part * last.get("none", np.inf)
@@ -296,7 +298,7 @@ def test_a_file_of_an_affine_law_gives_tubes_as_tight(tmp_path: Path) -> None:
     plain = reacher(tmp_path, value)
     box = plain.loop.box
     wide = [
-        np.array([np.subtract(*step.hull()[::-1]) for step in entry.tube(box, whole=True).sets])
+        np.array([np.subtract(*step.hull()[::-1]) for step in entry.tube(box, whole=True).state_sets])
         for entry in (plain, reacher(tmp_path, value | {"dynamics": {"type": "onnx", "file": "law.onnx"}}))
     ]
     assert wide[0].shape == wide[1].shape and len(wide[0]) > 10
@@ -309,7 +311,7 @@ def test_tubes_hold_runs_in_a_scene_that_stands_elsewhere(tmp_path: Path) -> Non
     found = replace(reacher(tmp_path, specification("affine")), registration=0.05)
     loop, box, rng = found.loop, found.loop.box, np.random.default_rng(9)
     tube = found.tube(box, whole=True)
-    assert len(tube.sets) > 10 and found.shift.tolist() == [0.05, 0.05, 0.05, 0.0]
+    assert len(tube.state_sets) > 10 and found.shift.tolist() == [0.05, 0.05, 0.05, 0.0]
     spread = set()
     for number, start in enumerate([*box.corners()[:20], *box.sample(20, rng)]):
         shift = found.shift * (rng.choice([-1.0, 1.0], 4) if number % 3 else rng.uniform(-1.0, 1.0, 4))
@@ -328,8 +330,8 @@ def test_tubes_hold_runs_in_a_scene_whose_place_the_view_tells(tmp_path: Path) -
     found = replace(base, view=view)
     loop, box = found.loop, found.loop.box
     tube, still = found.tube(box, whole=True), base.tube(box, whole=True)
-    assert len(tube.sets) > 10 and found.place.tolist() == [0.05] * 3 and not base.place.size
-    wide = [np.subtract(*entry.sets[5].hull()[::-1]) for entry in (tube, still)]
+    assert len(tube.state_sets) > 10 and found.place.tolist() == [0.05] * 3 and not base.place.size
+    wide = [np.subtract(*entry.state_sets[5].hull()[::-1]) for entry in (tube, still)]
     assert (wide[0] > wide[1])[:2].all()
     spread = set()
     for number, start in enumerate([*box.corners()[:20], *box.sample(20, rng)]):

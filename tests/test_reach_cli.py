@@ -33,10 +33,10 @@ from ns_abstract.io import memory
 from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.variations import SceneVariation, Selection
 from ns_abstract.reach.film import along
-from ns_abstract.reach.pictures import Pictures
 from ns_abstract.reach.search import SimulatedRun, first_outside, sampled_disturbances, simulate
 from ns_abstract.verify.camera_response import CameraResponse
 from ns_abstract.verify.scene_margin import CAMERA_KINDS
+from ns_abstract.verify.scene_pictures import ScenePictures
 
 MODULE = "ns_abstract.cli.reach"
 #: A part of the demo's box that takes seconds.
@@ -172,7 +172,7 @@ def test_a_film_encloses_what_runs_see(course: Course) -> None:
     loop, box, reacher, rng = part.loop, part.loop.box, part.reacher(), np.random.default_rng(4)
     steps = list(along(reacher, part.job.method, (24, 16), reacher.tube(box, whole=True)))
     assert [step.index for step in steps] == list(range(11)) and steps[0].image.shape == (24, 16, 3)
-    view = Pictures(part.job.method, loop.camera.poses((24, 16)))
+    view = ScenePictures(part.job.method.frame(loop.camera.poses((24, 16))))
     for number, start in enumerate([*box.corners(), *box.sample(4, rng)]):
         run = simulate(
             reacher, loop.state(box, start), sampled_disturbances(loop, rng, "ends" if number % 2 else "random")
@@ -259,7 +259,9 @@ def test_pictures_along_a_loop(course: Course, tmp_path: Path, in_process: InPro
         stored = np.load(file)
         again = simulate(job.reacher(), stored["states"][0], stored["disturbances"])
         assert (again.views == stored["views"]).all() and again.margin(job.loop, "reaches") <= 0.0
-        image = Pictures(job.job.method, job.job.pose_sets[0]).image(job.loop.camera.values(stored["states"][-1]))
+        image = ScenePictures(job.job.method.frame(job.job.pose_sets[0])).image(
+            job.loop.camera.values(stored["states"][-1])
+        )
         assert image[..., 0].mean() > 0.1
     wrong_values: tuple[tuple[str, Any, str], ...] = (
         ("unsafe", [clear | {"region": [0, 0, 9, 9]}], r"seen.json: unsafe\[0\].region: .* reaches beyond"),
@@ -290,16 +292,16 @@ def test_scene_margin(course: Course, tmp_path: Path) -> None:
             reacher = replace(job.reacher(), registration=radius)
             scenes = [(None, radius * rng.choice([-1.0, 1.0], 3)) for _ in range(24)]
         elif name == "turn":
-            view = Pictures(job.job.method, job.job.pose_sets[0].registered(SCENE_TURNS, radius))
+            view = ScenePictures(job.job.method.frame(job.job.pose_sets[0].registered(SCENE_TURNS, radius)))
             reacher = replace(job.reacher(), view=view)
             scenes = [(None, radius * rng.choice([-1.0, 1.0], 3)) for _ in range(24)]
         elif (of_camera := responses.get(name)) is not None:
-            view = Pictures(job.job.method, job.job.pose_sets[0], CameraResponse(of_camera, radius))
+            view = ScenePictures(job.job.method.frame(job.job.pose_sets[0]), CameraResponse(of_camera, radius))
             reacher = replace(job.reacher(), view=view)
             scenes = [(member, None) for member in itertools.islice(view.scene_samples(1), 24)]
         else:
             ends: dict[str, Any] = {name: (-radius, radius)}
-            view = Pictures(job.job.method, job.job.varied(0, SceneVariation(Selection(), **ends)))
+            view = ScenePictures(job.job.method.frame(job.job.varied(0, SceneVariation(Selection(), **ends))))
             reacher = replace(job.reacher(), view=view)
             scenes = [(member, None) for member in itertools.islice(reacher.view.scene_samples(1), 24)]
         tube = reacher.tube(box)

@@ -55,7 +55,7 @@ def test_bounds_hold_for_every_place_of_the_scene(tmp_path: Path, d: int) -> Non
     model = RegisteredModel(plain)
     assert scene.box.dimensions == d
     box, rng = scene.box, np.random.default_rng(1)
-    linear, lower, upper, slopes = scene.sets(box)
+    linear, lower, upper, slopes = scene.linear_sets(box)
     assert slopes.shape == (d,)
     rows = np.concatenate([np.eye(3), -np.eye(3)])
     images = model.input_sets(tuple(part[None] for part in linear), lower[None], upper[None])

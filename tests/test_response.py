@@ -42,7 +42,7 @@ def exact(response: CameraResponse, x: Fraction, value: float) -> Any:
 def test_every_camera_is_contained(name: ResponseName, radius: float, width: float) -> None:
     response, rng = CameraResponse(name, radius), np.random.default_rng(2)
     linear, lower, upper = linear_sets(width, 1)
-    (a, b, c, d), low, high = response.sets(linear, lower, upper)
+    (a, b, c, d), low, high = response.applied_to_sets(linear, lower, upper)
     compared = 0
     with mpmath.workprec(200):
         for pixel, channel in itertools.product(range(40), range(3)):
@@ -73,7 +73,7 @@ def test_sets_are_tight(name: ResponseName) -> None:
     response = CameraResponse(name, 0.1)
     x = np.full((40, 1, 3), 0.5, np.float32)
     still = np.zeros((*x.shape, 1), np.float32)
-    (_, below, _, above), low, high = response.sets((still, x, still, x), x, x)
+    (_, below, _, above), low, high = response.applied_to_sets((still, x, still, x), x, x)
     ends = [response.applied(x, np.full(3, value)) for value in (0.9, 1.1)]
     width = np.abs(ends[1] - ends[0])
     assert (high - low <= width * 1.0001).all() and (above - below <= width * 1.0001 + 1e-5).all()
@@ -82,7 +82,7 @@ def test_sets_are_tight(name: ResponseName) -> None:
 def test_sets_that_cross_or_are_no_numbers_stay_so() -> None:
     response = CameraResponse("brightness", 0.1)
     still, x = np.zeros((1, 1, 3, 1), np.float32), np.full((1, 1, 3), 0.5, np.float32)
-    _, low, _ = response.sets((still, x, still, x), x + np.float32(0.1), x)
+    _, low, _ = response.applied_to_sets((still, x, still, x), x + np.float32(0.1), x)
     assert np.isnan(low).all()
-    _, low, _ = response.sets((still, x, still, x), x * np.float32(np.nan), x)
+    _, low, _ = response.applied_to_sets((still, x, still, x), x * np.float32(np.nan), x)
     assert np.isnan(low).all()

@@ -68,7 +68,7 @@ def test_parts_that_are_not_proved_count() -> None:
 
 def test_no_radius_beyond_the_largest_is_claimed() -> None:
     found = largest_radius(KIND, cells(), lambda *_: CellOutcome("holds", "", np.ones(1)), lambda: False)
-    assert found.radius == KIND.most and found.failing is None and "no larger one was tried" in found.sentence
+    assert found.radius == KIND.largest and found.failing is None and "no larger one was tried" in found.sentence
 
 
 @pytest.mark.parametrize("asked", range(0, 24, 3))

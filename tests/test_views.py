@@ -22,7 +22,7 @@ from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.verify.model import NetworkModel
 from ns_abstract.verify.network import load_network
 from ns_abstract.verify.preprocess import Preprocess
-from ns_abstract.verify.subboxes import SubBoxOutcome, SubBoxProof
+from ns_abstract.verify.sub_box_proof import SubBoxOutcome, SubBoxProof
 
 NETWORKS = BENCHMARKS / "networks"
 

@@ -218,9 +218,9 @@ def test_the_first_attack_leaves_time_for_proofs(tmp_path: Path, monkeypatch: py
     moved: list[int] = []
     gradient = torch.autograd.grad
     monkeypatch.setattr(torch.autograd, "grad", lambda *given, **more: [moved.append(1), gradient(*given, **more)][1])
-    assert words() == list(conditions) and len(moved) == box_decisions._TUNING.steps - 1
+    assert words() == list(conditions) and len(moved) == box_decisions._TUNING.first_attack[1] - 1
     moved.clear()
-    tuning = dataclasses.replace(box_decisions._TUNING, first=0.0)
+    tuning = dataclasses.replace(box_decisions._TUNING, first_share=0.0)
     monkeypatch.setattr(box_decisions, "_TUNING", tuning)
     assert words() == list(conditions) and not moved
 

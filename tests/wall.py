@@ -112,6 +112,11 @@ class WallFrame:
         ])  # fmt: skip
         return WallBounds(lower, upper, slopes, (flat, lower, flat.copy(), upper) if keep_linear else None)
 
+    def bound_parts(
+        self, boxes: Sequence[ParameterBox], tiles: np.ndarray, within: Any, keep_linear: bool, pixels: Any
+    ) -> list[WallBounds]:
+        return [self.bound(box, tiles, within, keep_linear) for box in boxes]
+
     def feasible(self, box: ParameterBox) -> ParameterBox | None:
         return box
 

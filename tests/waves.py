@@ -25,7 +25,7 @@ class Waves:
     def image(self, values: np.ndarray, member: Any = None) -> np.ndarray:
         return (0.5 + 0.3 * self.slopes @ np.sin(values)).astype(np.float32)
 
-    def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
+    def linear_sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
         middle, half = box.middle, 0.5 * (np.array(box.upper) - np.array(box.lower))
         a = 0.3 * self.slopes * (np.cos(middle) * half)
         b = 0.5 + 0.3 * self.slopes @ np.sin(middle)

@@ -32,7 +32,7 @@ _TREE, _LINES = "verify/network/phase_tree.py", "verify/network/relu_lines.py"
 _HELD = "test_phase_tree.py::test_branches_hold_for_the_images_in_them[small-1.0]"
 _LEVELS = "test_eight_bit.py::test_sets_hold_rounded_pictures"
 
-_FAMILY, _COVER = "verify/network/shared_coefficients.py", "verify/subboxes.py"
+_FAMILY, _COVER = "verify/network/shared_coefficients.py", "verify/sub_box_proof.py"
 _HULL, _SAMPLES = "verify/picture_sets.py", "verify/cell_samples.py"
 _SHARED = "test_cover.py::test_rows_of_one_cell_hold_every_value"
 
@@ -159,17 +159,17 @@ CERTIFICATES = (
     ),
     Fault(
         "preprocessing: rounding is not charged",
-        _PREPROCESS, "Preprocess.sets.move", "PREPROCESS_ROUNDING * size + PREPROCESSED_ROUNDING * np.abs(b * factor)",
-        "0.0 * np.abs(b * factor)", _TIGHT,
+        _PREPROCESS, "Preprocess.input_sets.move",
+        "PREPROCESS_ROUNDING * size + PREPROCESSED_ROUNDING * np.abs(b * factor)", "0.0 * np.abs(b * factor)", _TIGHT,
     ),
     Fault(
         "preprocessing: the upper set is moved down",
-        _PREPROCESS, "Preprocess.sets", "move(b_upper, slopes[1], 1.0)", "move(b_upper, slopes[1], -1.0)", _TIGHT,
+        _PREPROCESS, "Preprocess.input_sets", "move(b_upper, slopes[1], 1.0)", "move(b_upper, slopes[1], -1.0)", _TIGHT,
     ),
     Fault(
         "preprocessing: slopes forget the range",
-        _PREPROCESS, "Preprocess.sets", "self._ordered(a, 1) * factor[:, None]", "self._ordered(a, 1) / std[:, None]",
-        _SETS,
+        _PREPROCESS, "Preprocess.input_sets", "self._ordered(a, 1) * factor[:, None]",
+        "self._ordered(a, 1) / std[:, None]", _SETS,
     ),
     Fault(
         "preprocessing: channels are not turned round",
@@ -430,8 +430,8 @@ CERTIFICATES = (
     ),
     Fault(
         "search: only the stored scene is shown",
-        "api/frame_pictures.py", "FramePictures.image", "member(values)",
-        "self.frame.render(values)", "test_certify_cli.py::test_a_variation_of_the_scene_breaks_what_poses_do_not",
+        "verify/scene_pictures.py", "ScenePictures.image", "self.frame.render if member is None else member",
+        "self.frame.render", "test_certify_cli.py::test_a_variation_of_the_scene_breaks_what_poses_do_not",
         compiled=True,
     ),
     Fault(

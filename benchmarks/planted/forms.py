@@ -10,7 +10,7 @@ _SPECIFICATION = "perturbation/specification.py"
 _POSES = "geometry/poses.py"
 _ENGINE = "refine/engine.py"
 _LEAVES = "refine/leaves.py"
-_SUB_BOXES = "refine/sub_boxes.py"
+_SPLITTER = "refine/box_splitter.py"
 _BOX = "geometry/box.py"
 _LINE_FORMS = "arithmetic/line_forms.py"
 _WIDE_FORMS = "arithmetic/simd/wide_forms.py"
@@ -187,9 +187,9 @@ FORMS = (
     Fault(
         "camera's translation in world axes",
         _POSES,
-        "PoseBox._enclosed",
+        "PoseBox.evaluated",
         "rotation[:, k] * shift",
-        "shift * np.eye(3)[k]",
+        "shift * array(np.eye(3)[k])",
         "test_poses.py::test_enclosure[translation-1]",
     ),
     Fault(
@@ -203,7 +203,7 @@ FORMS = (
     Fault(
         "orbit about the origin",
         _POSES,
-        "PoseBox._enclosed",
+        "PoseBox.evaluated",
         "turn @ (position - target) + target",
         "turn @ position",
         "test_poses.py::test_enclosure[orbit_six-2]",
@@ -211,9 +211,9 @@ FORMS = (
     Fault(
         "a scene that is shifted takes its camera along",
         _POSES,
-        "PoseBox._enclosed",
-        "position - parameter(name) * np.eye(3)[k]",
-        "position + parameter(name) * np.eye(3)[k]",
+        "PoseBox.evaluated",
+        "position - parameter(name) * array(np.eye(3)[k])",
+        "position + parameter(name) * array(np.eye(3)[k])",
         "test_poses.py::test_enclosure_of_a_scene_elsewhere",
     ),
     Fault(
@@ -227,7 +227,7 @@ FORMS = (
     Fault(
         "slanted cells are bounded upright",
         _POSES,
-        "PoseBox._enclosed.parameter",
+        "PoseBox.evaluated.parameter",
         "form + plain(other) * factor",
         "form - plain(other) * factor",
         "test_slanted.py::test_enclosure[six-1]",
@@ -250,7 +250,7 @@ FORMS = (
     ),
     Fault(
         "a part is dropped where some of its poses are none of the set's",
-        _SUB_BOXES,
+        _SPLITTER,
         "BoxSplitter.cut",
         "inside is not None",
         "inside == box",

@@ -2,7 +2,8 @@
 
 from planted.fault import Fault
 
-_KERNEL, _LOAD, _RENDER = (f"methods/nerf/nerfacto_{part}.py" for part in ("kernel", "load", "render"))
+_FEATURES, _WEIGHTS = "methods/nerf/hash_bounds/features.py", "methods/nerf/render.py"
+_LOAD, _RENDER = (f"methods/nerf/nerfacto_{part}.py" for part in ("load", "render"))
 _RESOLUTIONS = "test_nerfacto.py::test_resolutions_are_rounded_down_in_float32"
 _HASH = "test_nerfacto.py::test_corners_have_the_rows_of_the_hash"
 _EDGES = "test_nerfacto.py::test_edges_are_quantiles_of_padded_weights"
@@ -12,25 +13,26 @@ _PICTURE = "test_nerfacto.py::test_empty_rays_show_the_last_samples_colour"
 HASH_FIELDS = (
     Fault(
         "nerfacto: resolutions are rounded to the nearest",
-        _LOAD, "resolutions", "torch.floor(least * powers)", "torch.round(least * powers)", _RESOLUTIONS,
+        _LOAD, "resolutions", "torch.floor(coarsest * powers)", "torch.round(coarsest * powers)", _RESOLUTIONS,
     ),
     Fault(
         "nerfacto: resolutions are computed in float64",
         _LOAD, "resolutions",
-        "torch.pow(torch.tensor(_growth(levels, least, most)).float(), torch.arange(levels).float())",
-        "torch.tensor([_growth(levels, least, most) ** k for k in range(levels)], dtype=torch.float64)", _RESOLUTIONS,
+        "torch.pow(torch.tensor(_growth(levels, coarsest, finest)).float(), torch.arange(levels).float())",
+        "torch.tensor([_growth(levels, coarsest, finest) ** k for k in range(levels)], dtype=torch.float64)",
+        _RESOLUTIONS,
     ),
     Fault(
         "nerfacto: the hash has the primes of y and z exchanged",
-        _KERNEL, "hash_row", "x ^ (y * PRIME_Y) ^ (z * PRIME_Z)", "x ^ (y * PRIME_Z) ^ (z * PRIME_Y)", _HASH,
+        _FEATURES, "hash_row", "x ^ (y * PRIME_Y) ^ (z * PRIME_Z)", "x ^ (y * PRIME_Z) ^ (z * PRIME_Y)", _HASH,
     ),
     Fault(
         "nerfacto: weights are not padded before edges are placed",
-        _KERNEL, "next_places", "total += weights[i] + HISTOGRAM_PADDING", "total += weights[i] + 1e-9", _EDGES,
+        _RENDER, "next_places", "weights + HISTOGRAM_PADDING", "weights + 1e-9", _EDGES,
     ),
     Fault(
         "nerfacto: harmonics are of the direction itself",
-        _KERNEL, "harmonics", "(x + 1.0) / 2.0", "x", _HARMONICS,
+        _RENDER, "harmonics", "(direction + 1.0) / 2.0", "direction", _HARMONICS,
     ),
     Fault(
         "nerfacto: edges lie at the quantiles j / n",
@@ -39,11 +41,12 @@ HASH_FIELDS = (
     ),
     Fault(
         "nerfacto: the last sample's colour is forgotten where it has no weight",
-        _KERNEL, "color_samples", "last and i == count - 1", "False", _PICTURE,
+        _RENDER, "NerfactoRenderer.colors", "seen[:, -1] |= isinstance(f.background, str)", "pass", _PICTURE,
     ),
     Fault(
         "nerfacto: an interval of no length and infinite density has no number for a weight",
-        _KERNEL, "sample_weights", "0.0 if math.isnan(weight) else weight", "weight",
+        _WEIGHTS, "interval_weights", "torch.nan_to_num((1.0 - torch.exp(-depth)) * torch.exp(-before))",
+        "(1.0 - torch.exp(-depth)) * torch.exp(-before)",
         "test_nerfacto.py::test_weights_of_overflowing_densities_are_numbers",
     ),
     Fault(

@@ -163,7 +163,7 @@ PICTURES = (
         "test_part_proofs.py::test_refuted_parts_are_falsified_at_once",
     ),
     Fault(
-        "near cells: settled pixels have their lower bounds", _NEARBY, "NearbyPictures.sets",
+        "near cells: settled pixels have their lower bounds", _NEARBY, "NearbyPictures.linear_sets",
         "box_bounds.upper.copy()", "box_bounds.lower.copy()", _NEAR,
     ),
     Fault(
@@ -180,11 +180,11 @@ PICTURES = (
         "pixels >> q", "pixels >> (q ^ 1)", "test_nearby_pictures.py::test_pixels_that_are_not_wanted_take_no_light",
     ),
     Fault(
-        "rays: those that are left out are dark", "methods/nerf/frame.py", "FieldFrame.sets",
+        "rays: those that are left out are dark", "methods/nerf/frame.py", "FieldFrame.cell_bounds",
         "np.pad(upper, missing[:2], constant_values=1)", "np.pad(upper, missing[:2])", _RAYS,
     ),
     Fault(
-        "rays: planes of those that are left out are dark", "methods/nerf/frame.py", "FieldFrame.sets",
+        "rays: planes of those that are left out are dark", "methods/nerf/frame.py", "FieldFrame.cell_bounds",
         "k == 3", "k < 0", _RAYS,
     ),
     Fault(

@@ -407,7 +407,7 @@ VERDICTS = (
     Fault(
         "camera: the darkest factor is forgotten",
         _RESPONSE,
-        "CameraResponse.sets",
+        "CameraResponse.applied_to_sets",
         "low * (1.0 - r)",
         "low * 1.0",
         "test_response.py::test_every_camera_is_contained[0.3-0.01-brightness]",
@@ -415,7 +415,7 @@ VERDICTS = (
     Fault(
         "camera: lines are not scaled with the factor",
         _RESPONSE,
-        "CameraResponse.sets",
+        "CameraResponse.applied_to_sets",
         "b_upper * grow",
         "b_upper * 1.0",
         "test_response.py::test_every_camera_is_contained[0.3-0.3-white balance]",
@@ -423,7 +423,7 @@ VERDICTS = (
     Fault(
         "camera: lines do not fall with the power",
         _RESPONSE,
-        "CameraResponse.sets",
+        "CameraResponse.applied_to_sets",
         "b_lower * shrink - fall",
         "b_lower * shrink",
         "test_response.py::test_every_camera_is_contained[0.3-0.3-gamma]",
@@ -431,7 +431,7 @@ VERDICTS = (
     Fault(
         "camera: bounds that cross look like bounds",
         _RESPONSE,
-        "CameraResponse.sets",
+        "CameraResponse.applied_to_sets",
         "np.where(lower <= upper, least, np.nan)",
         "least",
         "test_response.py::test_sets_that_cross_or_are_no_numbers_stay_so",

@@ -36,7 +36,6 @@ from ns_abstract.verify.eight_bit import Picture
 from ns_abstract.verify.model import NetworkModel, parametric
 from ns_abstract.verify.network import NetworkArithmetic
 from ns_abstract.verify.picture_properties import PICTURE_TYPES, MeasureModel, is_of_picture
-from ns_abstract.verify.pixel_costs import pixel_weights
 from ns_abstract.verify.properties import Claim, LinearClaim, Property
 from ns_abstract.verify.protocol import FrameImages as SearchedScene
 from ns_abstract.verify.protocol import Model as SearchedModel
@@ -44,7 +43,7 @@ from ns_abstract.verify.registration import RegisteredImages, RegisteredModel
 from ns_abstract.verify.scene_margin import KINDS, CellOutcome, ProveCell, VariationKind, bounded_kinds
 from ns_abstract.verify.search import BLOCK, Search
 from ns_abstract.verify.search_results import BlockResult, ContradictionError
-from ns_abstract.verify.subboxes import SubBoxProof
+from ns_abstract.verify.sub_box_proof import SubBoxProof, pixel_costs
 
 if TYPE_CHECKING:
     from ns_abstract.verify.interop import Form, LibraryVersion
@@ -237,7 +236,7 @@ class Certification:
             pictures = self.pictures(index)
             every_unit = self.property.partitions is not None
             claim = self.claim(pictures)
-            pictures.weigh = partial(pixel_weights, pictures, self.model, claim)
+            pictures.weigh = partial(pixel_costs, pictures, self.model, claim)
             cover = self._cover(pictures)
             costly = isinstance(self.model, NetworkModel)
             self._searches[key] = Search(
@@ -265,7 +264,7 @@ class Certification:
 
         claim = self.claim(pictures, sheared.pose_set)
         return SubBoxProof(
-            sheared, model, model, claim, frame, most=_MOST_SHEARED, block=1, aim=_AIM_SHEARED, other=straight
+            sheared, model, model, claim, frame, most_parts=_MOST_SHEARED, block=1, aim=_AIM_SHEARED, other=straight
         )
 
     def places(self, kind: VariationKind) -> bool:
@@ -383,7 +382,7 @@ class Certification:
                 field="type",
                 fix="give a property of type classification or vnnlib",
             )
-        linear, lower, upper, _ = pictures.sets(box)
+        linear, lower, upper, _ = pictures.linear_sets(box)
         model = self.question.searched(self.memory, self.arithmetic, self.picture)
         images = parametric(model.input_sets(tuple(part[None] for part in linear), lower[None], upper[None]))
         network = self.question.network

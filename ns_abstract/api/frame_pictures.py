@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
@@ -13,14 +13,14 @@ import torch
 
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseBox
-from ns_abstract.geometry.tiles import assemble
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import load_json
 from ns_abstract.io.stamps import file_stamp
-from ns_abstract.refine.protocol import Frame, Method, RayFrame, SceneSample
+from ns_abstract.refine.protocol import Bounds, Frame, Method, RayFrame, SceneSample
 from ns_abstract.report.picture import to_bytes
-from ns_abstract.verify.camera_response import CameraResponse, response_sets
+from ns_abstract.verify.camera_response import CameraResponse
 from ns_abstract.verify.eight_bit import Picture, rounded, rounded_sets
+from ns_abstract.verify.scene_pictures import ScenePictures
 
 #: Pictures of a frame that are kept where they are made ray by ray.
 _IMAGES = 64
@@ -77,7 +77,7 @@ class PropertySource:
         return error if self.file is None else error.within(self.file)
 
 
-class FramePictures:
+class FramePictures(ScenePictures):
     """One frame's pictures, for `ns_abstract.verify.search.Search`.
 
     Args:
@@ -94,53 +94,37 @@ class FramePictures:
         response: CameraResponse | None = None,
         sheared: bool = False,
     ) -> None:
-        self._rounded, self._response = picture == "8-bit", response
-        self.frame: Frame = self._frame(method, poses, sheared)
-        #: What pixels of a cell cost, where pictures are made ray by ray: see `pixel_weights`.
+        super().__init__(self._frame(method, poses, sheared), response)
+        self._rounded = picture == "8-bit"
+        #: What pixels of a cell cost, where pictures are made ray by ray: see `pixel_costs`.
         self.weigh: Callable[[ParameterBox], np.ndarray | None] = lambda box: None
         self._images: dict[bytes, np.ndarray] = {}
-        self.box = self.frame.box
         self._method = method
-        self._tiles = np.arange(self.frame.tile_count)
 
     def _frame(self, method: Method, poses: PoseBox, sheared: bool) -> Frame:
         return method.frame(poses, sheared)
 
-    @property
-    def pose_set(self) -> PoseBox:
-        """The frame's poses."""
-        return self.frame.pose_set
-
     def image(self, values: np.ndarray, member: SceneSample | None = None) -> np.ndarray:
         values = np.asarray(values, np.float64)
-        if member is not None:
-            image = assemble(member(values), self.frame.camera)
-            return rounded(image) if self._rounded else image
         key = values.tobytes()
-        image = self._images.get(key)
+        image = None if member is not None else self._images.get(key)
         if image is None:
-            image = assemble(self.frame.render(values), self.frame.camera)
-            if self.frame.tilewise:
+            image = super().image(values, member)
+            if self.frame.tilewise and member is None:
                 # costly, and neighbouring cells share their ends
                 while len(self._images) >= _IMAGES:
                     self._images.pop(next(iter(self._images)))
                 self._images[key] = image
         return rounded(image) if self._rounded else image
 
-    def scene_samples(self, seed: int) -> Iterator[SceneSample]:
-        return (
-            self.frame.scene_samples(seed) if self._response is None else self._response.scene_samples(self.frame, seed)
-        )
-
-    def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
+    def _bounds(self, box: ParameterBox) -> Bounds:
         if self.frame.tilewise:
-            linear_sets = cast("RayFrame", self.frame).sets(box, partial(self.weigh, box))
-        else:
-            linear_sets = self.frame.bound(box, self._tiles, keep_linear=True)
-        linear, lower, upper = response_sets(linear_sets, self.frame.camera, self._response)
-        if self._rounded:
-            linear, lower, upper = rounded_sets(linear, lower, upper)
-        return linear, lower, upper, linear_sets.slopes
+            return cast("RayFrame", self.frame).cell_bounds(box, partial(self.weigh, box))
+        return super()._bounds(box)
+
+    def linear_sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
+        linear, lower, upper, slopes = super().linear_sets(box)
+        return (*rounded_sets(linear, lower, upper), slopes) if self._rounded else (linear, lower, upper, slopes)
 
     @cached_property
     def _differentiable(self) -> Callable[[torch.Tensor], torch.Tensor]:

@@ -29,7 +29,7 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.specification import TRANSLATIONS
 from ns_abstract.reach.learned import LearnedDynamics
 from ns_abstract.reach.loop import Loop, load_loop, parse_loop, within_field
-from ns_abstract.reach.pictures import Pictures, PropertyView
+from ns_abstract.reach.pictures import PropertyView
 from ns_abstract.reach.search import QUESTIONS, LoopBlockResult, LoopSearch
 from ns_abstract.reach.tubes import ControlBounds, Dependence, TubeBuilder
 from ns_abstract.verify.camera_response import CameraResponse
@@ -38,6 +38,7 @@ from ns_abstract.verify.model import NetworkModel
 from ns_abstract.verify.network import NetworkArithmetic, load_network
 from ns_abstract.verify.network.explain import check_cell
 from ns_abstract.verify.scene_margin import REGISTRATION, CellOutcome, ProveCell, VariationKind
+from ns_abstract.verify.scene_pictures import ScenePictures
 
 #: Of the search's rules: results of different ones are not mixed.
 _RULES = 4
@@ -70,7 +71,7 @@ class LoopJob:
 
     def reacher(self, dependence: Dependence = "kept") -> TubeBuilder:
         """Computes tubes of the loop."""
-        view = Pictures(self.job.method, self.job.pose_sets[0])
+        view = ScenePictures(self.job.method.frame(self.job.pose_sets[0]))
         return TubeBuilder(self.loop, view, ControlBounds(self.model, self.loop.control), dependence, views=self._seen)
 
     def _views(self, poses: PoseBox) -> tuple[PropertyView, ...]:
@@ -115,11 +116,11 @@ class LoopJob:
             return replace(self.reacher(), registration=radius)
         if kind.place:
             placed = poses.registered(kind.place, radius)
-            return replace(self.reacher(), view=Pictures(method, placed), views=self._views(placed))
+            return replace(self.reacher(), view=ScenePictures(method.frame(placed)), views=self._views(placed))
         if kind.response is not None:
-            view = Pictures(method, poses, CameraResponse(kind.response, radius))
+            view = ScenePictures(method.frame(poses), CameraResponse(kind.response, radius))
         else:
-            view = Pictures(method, self.job.varied(0, kind.variation(radius)))
+            view = ScenePictures(method.frame(self.job.varied(0, kind.variation(radius))))
         return replace(self.reacher(), view=view)
 
     def prover(self, kind: VariationKind) -> ProveCell:

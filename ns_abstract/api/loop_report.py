@@ -220,12 +220,12 @@ def shown_tube(job: LoopJob, lower: list[float], upper: list[float], runs: int) 
     ]
     states = np.stack([run.states for run in runs_from_cell])
     modes: tuple[Dependence, ...] = ("step", "none")
-    hulls = [entry.hull() for entry in tube.sets]
+    hulls = [entry.hull() for entry in tube.state_sets]
     return {
         "lower": list(box.lower),
         "upper": list(box.upper),
         "tube": [[low.tolist(), high.tolist()] for low, high in hulls],
-        "camera": [[end.tolist() for end in builder.places(entry)] for entry in tube.sets],
+        "camera": [[end.tolist() for end in builder.places(entry)] for entry in tube.state_sets],
         "runs": len(runs_from_cell),
         "hull": [
             [low.tolist(), high.tolist()] for low, high in zip(states.min(axis=0), states.max(axis=0), strict=True)
@@ -239,4 +239,4 @@ def shown_tube(job: LoopJob, lower: list[float], upper: list[float], runs: int) 
 
 def widths(tube: Tube) -> list[float]:
     """By step, the mean over the states of a tube's width; as far as the tube goes."""
-    return [float(np.mean(np.subtract(*entry.hull()[::-1]))) for entry in tube.sets]
+    return [float(np.mean(np.subtract(*entry.hull()[::-1]))) for entry in tube.state_sets]

@@ -205,7 +205,7 @@ class NearbyPictures:
         """Picture at parameter values [d], every pixel as it is."""
         return self._pictures.differentiable(values)
 
-    def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
+    def linear_sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
         """Sets over a cell: of settled pixels what holds over the box around it."""
         box_bounds, d = self._known, box.dimensions
         flat = [np.zeros((*box_bounds.lower.shape, d), np.float32) for _ in range(2)]

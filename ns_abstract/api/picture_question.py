@@ -32,7 +32,6 @@ from ns_abstract.refine.protocol import (
     ElementFrame,
     Frame,
     Method,
-    PartsFrame,
     RayFrame,
     SceneSample,
     Score,
@@ -172,7 +171,7 @@ class PlanePictures(FramePictures):
         steps = self._read == ("colors",)
         return (PlaneSample(sample, steps) for sample in self.frame.scene_samples(seed))
 
-    def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
+    def linear_sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
         """Sets of the planes [H, W, C]; pixels and channels that no measure reads have none: all zeros.
 
         Of rays only as many are bounded as decide what is claimed (Q6).
@@ -208,9 +207,9 @@ class PlanePictures(FramePictures):
         return linear, lower, upper, slopes
 
     def _bounded(
-        self, frame: Frame, box: ParameterBox, channels: list[int], most: int | None = None
+        self, frame: Frame, box: ParameterBox, channels: list[int], most_rays: int | None = None
     ) -> tuple[Bounds, np.ndarray]:
-        """Bounds of the tiles that hold pixels which are read, and their numbers; ``most``: see `RayFrame.sets`."""
+        """Bounds of the tiles that hold pixels which are read (see `RayFrame.cell_bounds`), and their numbers."""
         if frame.tilewise:
 
             def weigh() -> np.ndarray | None:
@@ -220,12 +219,10 @@ class PlanePictures(FramePictures):
                     costs[..., : len(channels)] = weights[..., channels]
                 return None if weights is None else costs
 
-            return cast("RayFrame", frame).sets(box, weigh, most), np.arange(frame.tile_count)
+            return cast("RayFrame", frame).cell_bounds(box, weigh, most_rays), np.arange(frame.tile_count)
         pixels = in_tiles(self.wanted, frame.side)
         tiles = np.flatnonzero(pixels.any(axis=(1, 2)))
-        if isinstance(frame, PartsFrame):
-            return frame.bound_parts([box], tiles, None, True, pixels[tiles])[0], tiles
-        return frame.bound(box, tiles, keep_linear=True), tiles
+        return frame.bound_parts([box], tiles, None, True, pixels[tiles])[0], tiles
 
     @cached_property
     def _limited(self) -> tuple[LimitedMeasure, ...]:

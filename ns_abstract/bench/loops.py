@@ -128,7 +128,7 @@ def _attack(
         tube = job.search.reacher.tube(_box(job, cells[number]))
         for run in runs:
             outside += first_outside(tube, run) is not None
-            compared += len(tube.sets)
+            compared += len(tube.state_sets)
             wrong += cells[number].verdict == "certified" and not run.margin(job.loop, question) > 0.0
     certified = getattr(found, question)
     return {

@@ -2,7 +2,7 @@
 
 The picture is blended from the back by forms in the pose. What depends on decisions that are open within a box
 (threshold, tile, depth order, stop) is enclosed with both outcomes. With ``unit`` 0 that is the picture in real
-numbers; with ``FLOAT`` every evaluation of gsplat's formulas in float32 lies within the enclosure, too (docs/dev/checker.md).
+numbers; with ``FLOAT`` every float32 evaluation of gsplat's formulas lies within it, too (docs/dev/checker.md).
 """
 
 from __future__ import annotations

@@ -181,7 +181,6 @@ class Tls:
 
     Attributes:
         ca_file: Who signs the others' certificates.
-        cert, key: This client's own.
     """
 
     ca_file: Path
@@ -267,9 +266,6 @@ def connected(address: str | None, workers: int = 1, tls: Tls | None = None) -> 
 
     That cluster has ``workers`` processes of one thread, and listens on the loopback interface alone. ``tls`` encrypts
     the connection to ``address``, and both ends prove who they are.
-
-    Raises:
-        InputError: Dask is missing or its scheduler does not answer.
     """
     try:
         from dask import config

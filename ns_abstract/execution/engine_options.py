@@ -50,11 +50,7 @@ class EngineOptions:
             raise InputError("given without --engine dask", field="--scheduler-address", fix="add --engine dask")
 
     def started(self, processes: int) -> AbstractContextManager[Engine]:
-        """The engine, closed at the end of the block; ``processes`` work on this machine.
-
-        Raises:
-            InputError: A file of the connection is missing, or no scheduler answers.
-        """
+        """The engine, closed at the end of the block; ``processes`` work on this machine."""
         from ns_abstract.execution.cluster import Tls
         from ns_abstract.execution.starting import started
 

@@ -14,11 +14,7 @@ EngineName = Literal["local", "dask"]
 
 @contextmanager
 def started(name: EngineName, address: str | None, workers: int, tls: Tls | None = None) -> Iterator[Engine]:
-    """An engine, closed at the end of the block: `connected` for "dask", else processes, or this one for one worker.
-
-    Raises:
-        InputError: As `connected`.
-    """
+    """An engine, closed at the end of the block: `connected` for "dask", else processes, or this one for one worker."""
     with ExitStack() as stack:
         if name == "dask":
             engine: Engine = Cluster(stack.enter_context(connected(address, workers, tls)))

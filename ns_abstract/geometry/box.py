@@ -63,6 +63,10 @@ class ParameterBox:
         ends = [low + (high - low) * (i / parts) for i in range(parts)] + [high]
         return [self.replace(axis, ends[i], ends[i + 1]) for i in range(parts)]
 
+    def with_ends(self, lower: Float64Array, upper: Float64Array) -> ParameterBox:
+        """The box of the same parameters with ends [d], [d]."""
+        return ParameterBox(self.names, self.units, tuple(lower.tolist()), tuple(upper.tolist()))
+
     def replace(self, axis: int, low: float, high: float) -> ParameterBox:
         """The box with another interval along ``axis``."""
         lower, upper = list(self.lower), list(self.upper)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from ns_abstract.geometry.transform import DataparserTransform
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.jsonio import InputTuning, is_number, show
+from ns_abstract.io.jsonio import InputTuning, is_number, show, unusable
 
 #: OpenCV axes (x right, y down, z forward) as OpenGL axes (x right, y up, z back).
 _OPENGL = np.diag([1.0, -1.0, -1.0])
@@ -43,11 +43,7 @@ def is_inria(root: Any) -> bool:
 
 
 def inria_cameras(root: list[dict[str, Any]]) -> Iterator[FileCamera]:
-    """The cameras of Inria's ``cameras.json``, in the frame of its .ply.
-
-    Raises:
-        InputError: A field is missing or no number.
-    """
+    """The cameras of Inria's ``cameras.json``, in the frame of its .ply."""
     for i, entry in enumerate(root):
         field = f"[{i}]"
         rotation = _matrix(entry.get("rotation"), 3, 3, f"{field}.rotation")
@@ -70,7 +66,7 @@ def transforms_cameras(root: Mapping[str, Any], frame: DataparserTransform | Non
         raise InputError(problem, fix="give the config.yml of a run trained on it, or make a camera path")
     frames = root.get("frames")
     if not isinstance(frames, list) or not frames:
-        raise InputError(f"found {show(frames)}", field="frames", fix="write a list of at least one camera")
+        raise unusable(frames, field="frames", fix="write a list of at least one camera")
     # the run's frame is that of the poses here after what was applied to them is undone
     applied = np.eye(4)
     if "applied_transform" in root:
@@ -79,12 +75,12 @@ def transforms_cameras(root: Mapping[str, Any], frame: DataparserTransform | Non
         raise InputError("a matrix that cannot be inverted", field="applied_transform", fix="write a rotation")
     applied_scale = _number(root.get("applied_scale", 1.0), "applied_scale")
     if not applied_scale > 0:
-        raise InputError(f"found {show(applied_scale)}", field="applied_scale", fix="write a number above 0")
+        raise unusable(applied_scale, field="applied_scale", fix="write a number above 0")
     undone = DataparserTransform(frame.matrix @ np.linalg.inv(applied), frame.scale / applied_scale)
     for i, entry in enumerate(frames):
         field = f"frames[{i}]"
         if not isinstance(entry, dict):
-            raise InputError(f"found {show(entry)}", field=field, fix="write an object")
+            raise unusable(entry, field=field, fix="write an object")
         values = {**root, **entry}
         _refuse_distorted(values, field)
         numbers = {key: _number(values.get(key), f"{field}.{key}") for key in _INTRINSICS if key not in ("fl_y",)}
@@ -114,7 +110,7 @@ def _matrix(value: Any, rows: int | None, columns: int, field: str) -> NDArray[n
     good = isinstance(value, list) and (len(value) == rows if rows else len(value) in (3, 4))
     good = good and all(isinstance(row, list) and len(row) == columns and all(map(is_number, row)) for row in value)
     if not good:
-        raise InputError(f"found {show(value)}", field=field, fix=f"write rows of {columns} finite numbers")
+        raise unusable(value, field=field, fix=f"write rows of {columns} finite numbers")
     return np.array(value, np.float64)
 
 

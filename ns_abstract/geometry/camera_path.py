@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ from ns_abstract.geometry.path_keys import ENTRY, KEYFRAME, PATH
 from ns_abstract.geometry.transform import DataparserTransform
 from ns_abstract.io.arguments import file_path
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.jsonio import InputTuning, is_moderate, is_number, load_json, parse_json, show
+from ns_abstract.io.jsonio import InputTuning, is_moderate, is_number, load_json, parse_json, show, unusable
 from ns_abstract.io.keys import sentence
 
 SIDE_LIMIT = 16384
@@ -70,7 +70,7 @@ class PinholeCamera:
         """
         field = "--downscale-factor"
         if not is_number(downscale_factor) or not downscale_factor > 0:
-            raise InputError(f"found {show(downscale_factor)}", field=field, fix="give a number above 0")
+            raise unusable(downscale_factor, field=field, fix="give a number above 0")
         if downscale_factor == 1:
             return self
         with np.errstate(over="ignore", under="ignore"):
@@ -84,8 +84,8 @@ class PinholeCamera:
                 fix=f"give a factor from {max(self.width, self.height) / SIDE_LIMIT:.3g}"
                 f" to {min(self.width, self.height)}",
             )
-        return PinholeCamera(
-            camera_to_world=self.camera_to_world,
+        return replace(
+            self,
             fx=self.fx * float(scale),
             fy=self.fy * float(scale),
             cx=float(np.float32(self.cx) * scale),
@@ -100,15 +100,8 @@ class PinholeCamera:
         Each direction has its own factor, so another aspect ratio squeezes the picture.
         """
         down, across = height / self.height, width / self.width
-        return PinholeCamera(
-            camera_to_world=self.camera_to_world,
-            fx=self.fx * across,
-            fy=self.fy * down,
-            cx=self.cx * across,
-            cy=self.cy * down,
-            width=width,
-            height=height,
-        )
+        stretched = self.fx * across, self.fy * down, self.cx * across, self.cy * down
+        return PinholeCamera(self.camera_to_world, *stretched, width, height)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +109,6 @@ class CameraPath:
     """The cameras of a path and the perturbations written beside them.
 
     Attributes:
-        cameras: One per entry of ``camera_path``.
         perturbation: Top-level ``perturbation`` object as parsed from JSON, or None.
         overrides: Per camera, the entry's own ``perturbation`` object, or None.
         fps: Frames per second, or None if the file does not say.
@@ -163,9 +155,6 @@ def load_camera_path(
         path: The file.
         downscale_factor: Images become this many times smaller.
         run_frame: From the data set's frame to the run's; without it a ``transforms.json`` is refused.
-
-    Raises:
-        InputError: The file or a field in it cannot be used.
     """
     path = file_path(path, "path")
     root = load_json(path, "camera path")
@@ -200,18 +189,14 @@ def _photo_path(file_cameras: Iterable[FileCamera], source: str, downscale_facto
 def focal_pixels(value: Any, field: str) -> float:
     """``value`` as a focal length in pixels. Raises InputError where it is no moderate number above 0."""
     if not is_moderate(value) or not value > 0:
-        raise InputError(f"found {show(value)}", field=field, fix="write a number of pixels above 0")
+        raise unusable(value, field=field, fix="write a number of pixels above 0")
     return float(value)
 
 
 def principal_place(value: Any, side: int, field: str) -> float:
-    """A coordinate of the principal point, pixels; without it the middle of a side.
-
-    Raises:
-        InputError: It is no moderate number.
-    """
+    """A coordinate of the principal point, pixels; without it the middle of a side."""
     if value is not None and not is_moderate(value):
-        raise InputError(f"found {show(value)}", field=field, fix="write a number of pixels")
+        raise unusable(value, field=field, fix="write a number of pixels")
     return side / 2 if value is None else float(value)
 
 
@@ -256,10 +241,10 @@ def _parse(root: dict[str, Any], source: str, downscale_factor: float) -> Camera
         overrides.append(_perturbation(entry, f"{field}.perturbation"))
     fps = root.get("fps")
     if fps is not None and (not is_number(fps) or not fps > 0):
-        raise InputError(f"found {show(fps)}", field="fps", fix="write a number above 0")
+        raise unusable(fps, field="fps", fix="write a number above 0")
     is_cycle = root.get("is_cycle")
     if is_cycle is not None and not isinstance(is_cycle, bool):
-        raise InputError(f"found {show(is_cycle)}", field="is_cycle", fix="write true or false")
+        raise unusable(is_cycle, field="is_cycle", fix="write true or false")
     return CameraPath(
         cameras=tuple(cameras),
         perturbation=_perturbation(root, "perturbation"),
@@ -311,7 +296,7 @@ def _entries(root: dict[str, Any], unknown: list[str]) -> list[tuple[str, dict[s
         for i, entry in enumerate(entries):
             field = f"{name}[{i}]"
             if not isinstance(entry, dict):
-                raise InputError(f"found {show(entry)}", field=field, fix="write an object")
+                raise unusable(entry, field=field, fix="write an object")
             unknown += [f"{name}[].{key}" for key in table.unknown(entry, f"{field}.")]
             fields_by_name[name].append((field, entry))
     if fields_by_name["camera_path"]:
@@ -376,7 +361,7 @@ def focal_length(fov: Any, height: int, field: str) -> float:
         InputError: It is no angle above 0 and below 180 degrees with a float32 focal length.
     """
     if not is_number(fov) or not 0 < fov < 180:
-        raise InputError(f"found {show(fov)}", field=field, fix="write degrees above 0 and below 180")
+        raise unusable(fov, field=field, fix="write degrees above 0 and below 180")
     # The expression of nerfstudio's three_js_perspective_camera_focal_length, for equal bits.
     with np.errstate(all="ignore"):
         focal = float((height / 2.0) / np.tan(float(fov) * (np.pi / 180.0) / 2.0))
@@ -404,7 +389,7 @@ def checked_pose(value: Any, field: str) -> NDArray[np.float64]:
     limit = float(np.finfo(np.float32).max)
     for i, number in enumerate(value):
         if not is_number(number) or abs(number) > limit:
-            raise InputError(f"found {show(number)}", field=f"{field}[{i}]", fix="write a number that float32 can hold")
+            raise unusable(number, field=f"{field}[{i}]", fix="write a number that float32 can hold")
     matrix = np.array(value, np.float64).reshape(4, 4)
     rotation = matrix[:3, :3]
     _refuse_scaled(matrix, field)
@@ -427,11 +412,7 @@ def checked_pose(value: Any, field: str) -> NDArray[np.float64]:
 
 
 def _refuse_scaled(matrix: NDArray[np.float64], field: str) -> None:
-    """Refuse a matrix [4, 4] whose last row is not (0, 0, 0, 1); Nerfstudio does not read that row.
-
-    Raises:
-        InputError: The row, and whether the matrix is scaled as a whole.
-    """
+    """Refuse a matrix [4, 4] whose last row is not (0, 0, 0, 1); Nerfstudio does not read that row."""
     row = matrix[3]
     if np.abs(row - (0, 0, 0, 1)).max() <= InputTuning.last_row:
         return
@@ -451,5 +432,5 @@ def _refuse_scaled(matrix: NDArray[np.float64], field: str) -> None:
 def _perturbation(holder: dict[str, Any], field: str) -> Mapping[str, Any] | None:
     value = holder.get("perturbation")
     if value is not None and not isinstance(value, dict):
-        raise InputError(f"found {show(value)}", field=field, fix="write an object")
+        raise unusable(value, field=field, fix="write an object")
     return value

@@ -19,7 +19,6 @@ class KeyframeCamera:
     Attributes:
         camera_to_world: [4, 4] float64, OpenGL axes (x right, y up, z back), normalised frame.
         fov: Vertical field of view in degrees.
-        height, width: Pixels.
     """
 
     camera_to_world: NDArray[np.float64]

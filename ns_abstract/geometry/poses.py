@@ -148,11 +148,7 @@ class PoseBox:
     def around(
         cls, camera: PinholeCamera, perturbation: Perturbation, following: PinholeCamera | None = None
     ) -> PoseBox:
-        """The set of one keyframe; ``following`` is the next one, used where the sweep is over segments.
-
-        Raises:
-            InputError: The two cameras of a segment differ in intrinsics, or one of their rotations is none.
-        """
+        """The set of one keyframe; ``following`` is the next one, used where the sweep is over segments."""
         ranges: dict[str, tuple[str, tuple[float, float]]] = {}
         for name in TRANSLATIONS:
             ranges[name] = ("normalised units", perturbation.translation.get(name, (0.0, 0.0)))
@@ -290,7 +286,7 @@ class PoseBox:
 
     def enclosure(self, box: ParameterBox, order: int = 1) -> PoseForms:
         """Forms that enclose the transform of every pose of ``box`` (design.md, P1)."""
-        rotation, position = self._enclosed(box, Basis(self.box.dimensions, order), FormArray, cos_sin)
+        rotation, position = self.evaluated(box, Basis(self.box.dimensions, order), FormArray, cos_sin)
         m = rotation.basis.monomials
         rounding, shift = self._rounding
         rotation.data[m] += rounding
@@ -303,7 +299,7 @@ class PoseBox:
     def taylor(self, box: ParameterBox, degree: int) -> tuple[TaylorArray, TaylorArray]:
         """Taylor models of the camera-to-world rotation [3, 3] and position [3] over ``box`` (P1, N1)."""
         basis = TaylorBasis(self.box.dimensions, degree)
-        rotation, position = self._enclosed(box, basis, TaylorArray, taylor_cos_sin)
+        rotation, position = self.evaluated(box, basis, TaylorArray, taylor_cos_sin)
         rounding, shift = self._rounding
         return rotation.widened(rounding), position.widened(shift)
 
@@ -321,8 +317,18 @@ class PoseBox:
             return TURNED_ROTATION * POSE_ROUNDING, TURNED_POSITION * shift
         return POSE_ROUNDING, shift
 
-    def _enclosed(self, box: ParameterBox, basis: Any, kind: Any, trigonometry: Callable[[Any], tuple]) -> tuple:
-        """Camera-to-world rotation and position over ``box`` in the arithmetic ``kind``, without rounding of `pose`."""
+    def evaluated(
+        self,
+        box: ParameterBox,
+        basis: Any,
+        kind: Any,
+        trigonometry: Callable[[Any], tuple],
+        array: Callable[[Float64Array], Any] = lambda numbers: numbers,
+    ) -> tuple[Any, Any]:
+        """Camera-to-world rotation and position over ``box`` in the arithmetic ``kind``, without rounding of `pose`.
+
+        ``array``: makes what the arithmetic combines with of plain numbers.
+        """
 
         def parameter(name: str) -> Any:
             form = plain(name)
@@ -342,18 +348,18 @@ class PoseBox:
         def turned(axis: Float64Array, angle: Any) -> Any:
             k = _cross_matrix(np.asarray(axis, np.float64))
             cosine, sine = trigonometry(angle)
-            return sine * k + (1.0 - cosine) * (k @ k) + np.eye(3)
+            return sine * array(k) + (1.0 - cosine) * array(k @ k) + array(np.eye(3))
 
         first, start, axis, angle, displacement = self._base
         rotation = kind.constant(basis, first)
         position = kind.constant(basis, start)
         if self.target_camera is not None:
             rotation = rotation @ turned(axis, parameter("segment") * angle)
-            position = position + parameter("segment") * displacement
+            position = position + parameter("segment") * array(displacement)
         orbit = self.perturbation.orbit
         if orbit is not None:
             turn = turned(np.array(orbit.axis) / np.linalg.norm(orbit.axis), parameter("azimuth"))
-            target = np.array(orbit.target)
+            target = array(np.array(orbit.target))
             rotation, position = turn @ rotation, turn @ (position - target) + target
         moving = [name for name in TRANSLATIONS if name in box.names or self.fixed[name] != 0.0]
         for name in moving:
@@ -362,7 +368,7 @@ class PoseBox:
             if self.perturbation.frame == "camera":
                 position = position + rotation[:, k] * shift
             else:
-                position = position + shift * np.eye(3)[k]
+                position = position + shift * array(np.eye(3)[k])
         for name in ROTATIONS:
             if name in box.names or self.fixed[name] != 0.0:
                 rotation = rotation @ turned(np.array(_CAMERA_AXES[name]), parameter(name))
@@ -372,7 +378,7 @@ class PoseBox:
                 rotation, position = turn @ rotation, turn @ position
         for k, name in enumerate(SCENE_SHIFTS):
             if name in box.names:
-                position = position - parameter(name) * np.eye(3)[k]
+                position = position - parameter(name) * array(np.eye(3)[k])
         return rotation, position
 
     def world_to_camera(self, values: Float64Array, beyond: bool = False) -> tuple[Float64Array, Float64Array]:

@@ -14,6 +14,11 @@ Vector = tuple[float, float, float]
 Fail = Callable[[str, str, str], InputError]
 
 
+def fail(name: str, problem: str, fix: str) -> InputError:
+    """The error of the field ``name``."""
+    return InputError(problem, field=name, fix=fix)
+
+
 def known(value: Mapping[str, Any], keys: Collection[str], prefix: str, fail: Fail) -> None:
     """Refuse a key of ``value`` that is none of ``keys``; editors write "$schema" at the top of a file."""
     for key in value:

@@ -112,8 +112,13 @@ def file_size(path: Path, what: str, fix: str | None = None) -> int:
     return status.st_size
 
 
-def file_beside(folder: Path, name: str) -> Path:
-    """The file that another one in ``folder`` names; it stays in there.
+def unusable(value: Any, *, field: str, fix: str, file: Path | None = None) -> InputError:
+    """The error of a field that holds a value which cannot be used."""
+    return InputError(f"found {show(value)}", file=file, field=field, fix=fix)
+
+
+def file_beside(folder: Path, name: str, field: str = "") -> Path:
+    """The file that another one in ``folder`` names under ``field``; it stays in there.
 
     Raises:
         InputError: The name leads out of the folder, also through links.
@@ -124,7 +129,8 @@ def file_beside(folder: Path, name: str) -> Path:
     except (OSError, ValueError, RuntimeError):
         good = False
     if not good or "\0" in name:
-        raise InputError(f"{show(name)} leads out of the folder", fix="put the file beside the one that names it")
+        problem = f"{show(name)} leads out of the folder"
+        raise InputError(problem, field=field or None, fix="put the file beside the one that names it")
     return folder / name
 
 

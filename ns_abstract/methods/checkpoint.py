@@ -103,11 +103,7 @@ class StoredTensor:
 
 
 def to_float32(value: Any, file: Path, field: str, finite: bool = True) -> NDArray[np.float32]:
-    """`StoredTensor.float32` of what a checkpoint holds under ``field``; arrays of float32 are checked alone.
-
-    Raises:
-        InputError: Also where that is neither.
-    """
+    """`StoredTensor.float32` of what a checkpoint holds under ``field``; arrays of float32 are checked alone."""
     if isinstance(value, np.ndarray) and value.dtype == np.float32:
         if finite:
             require_finite(value, file, field)

@@ -8,7 +8,7 @@ from typing import Literal, TypedDict
 
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.jsonio import is_number, show
+from ns_abstract.io.jsonio import is_number, unusable
 
 #: How Splatfacto can rasterise.
 MODES = ("classic", "antialiased")
@@ -27,11 +27,7 @@ class OverrideKeywords(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class Overrides:
-    """What the user says of a scene; None and False leave it to the scene's files.
-
-    Raises:
-        InputError: A value cannot be used.
-    """
+    """What the user says of a scene; None and False leave it to the scene's files."""
 
     rasterize_mode: Literal["classic", "antialiased"] | None = None
     """Splats: how they are rasterised, in place of what config.yml or the scene's file says."""
@@ -47,14 +43,14 @@ class Overrides:
     def __post_init__(self) -> None:
         mode, color, step = self.rasterize_mode, self.background, self.load_step
         if mode not in (None, *MODES):
-            raise InputError(f"found {show(mode)}", field="--rasterize-mode", fix=f"use {' or '.join(MODES)}")
+            raise unusable(mode, field="--rasterize-mode", fix=f"use {' or '.join(MODES)}")
         if color is not None:
             parts = list(color)
             if len(parts) != 3 or not all(is_number(part) and 0 <= part <= 1 for part in parts):
-                raise InputError(f"found {show(parts)}", field="--background", fix="give three numbers from 0 to 1")
+                raise unusable(parts, field="--background", fix="give three numbers from 0 to 1")
             object.__setattr__(self, "background", tuple(float(part) for part in parts))
         if step is not None and (isinstance(step, bool) or not isinstance(step, int) or not 0 <= step < _STEP_LIMIT):
-            raise InputError(f"found {show(step)}", field="--load-step", fix="give the number of a step")
+            raise unusable(step, field="--load-step", fix="give the number of a step")
 
     def refuse(self, names: Iterable[str], problem: str) -> None:
         """Refuse what does not go with the scene. Raises InputError where one of ``names`` is given."""
@@ -68,15 +64,7 @@ UNSAID = "default: the file says nothing"
 
 
 def assumption_of(name: str, requested: object, flag: str, stored: object, origin: str) -> Assumption:
-    """Return the record of a choice: an option wins, and the record names what it replaces.
-
-    Args:
-        name: Of the choice.
-        requested: The value of the option ``flag``; None where it is not given.
-        flag: The option.
-        stored: The value that the scene's files, or a default, would give.
-        origin: Where ``stored`` is from.
-    """
+    """Return the record of a choice: an option wins, and the record names what it replaces."""
     if requested is None:
         return Assumption(name, _text(stored), origin)
     return Assumption(name, _text(requested), f"{flag} (in place of {_text(stored)}, {origin})")

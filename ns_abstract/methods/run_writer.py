@@ -58,7 +58,6 @@ def write_run(
     """Write a run and a small data set beside it; config.yml comes last, so a run with a config is complete.
 
     Args:
-        config: What the method's part of config.yml leaves open.
         steps: Its last lines but those that every method has.
         views: Cameras of the data set, normalised frame, at least two of one size and field of view.
         render: Gives the image [H, W, 3] in [0, 1] of a view; without it images hold only the background colour.

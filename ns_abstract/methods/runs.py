@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from ns_abstract.geometry.transform import DataparserTransform
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError, first_line, visible
-from ns_abstract.io.jsonio import FIX_ACCESS, InputTuning, file_size, is_number, load_json, read_text, show
+from ns_abstract.io.jsonio import FIX_ACCESS, InputTuning, file_size, is_number, load_json, read_text, show, unusable
 from ns_abstract.io.kinds import refuse_other_kind
 from ns_abstract.methods.checkpoint import RECOPY, read_checkpoint
 from ns_abstract.methods.overrides import assumption_of
@@ -70,7 +70,6 @@ class RunConfig:
 
     Attributes:
         method_name: Name given to ns-train, such as "splatfacto"; "unknown" if absent.
-        experiment_name: Name of the experiment, or the folder's name if absent.
         model: ``pipeline.model`` as a mapping; Python objects in it are :class:`Tagged`.
     """
 
@@ -88,14 +87,14 @@ class RunConfig:
         fits = isinstance(value, int) and not isinstance(value, bool)
         if not fits or value < least or (most is not None and value > most):
             wanted = f"at least {least}" if most is None else f"from {least} to {most}"
-            raise self._error(name, value, f"an integer {wanted}")
+            raise self.refused(name, value, f"an integer {wanted}")
         return value
 
     def choice(self, name: str, default: str, options: tuple[str, ...]) -> str:
         """Text field of ``pipeline.model`` out of ``options``; ``default`` if absent."""
         value = self.model.get(name, default)
         if not isinstance(value, str) or value not in options:
-            raise self._error(name, value, f"one of {', '.join(options)}")
+            raise self.refused(name, value, f"one of {', '.join(options)}")
         return value
 
     def color(self, name: str, default: str, names: Mapping[str, tuple[float, float, float]]) -> NDArray[np.float32]:
@@ -111,18 +110,22 @@ class RunConfig:
         elif isinstance(value, (list, tuple)) and len(value) == 3 and all(map(is_number, value)):
             if all(0 <= part <= 1 for part in value):
                 return np.array(value, np.float32)
-        raise self._error(name, value, f"{', '.join(names)} or three numbers from 0 to 1")
+        raise self.refused(name, value, f"{', '.join(names)} or three numbers from 0 to 1")
 
-    def _error(self, name: str, value: Any, wanted: str) -> InputError:
-        return InputError(f"found {show(value)}", file=self.file, field=f"pipeline.model.{name}", fix=f"write {wanted}")
+    def flag(self, name: str, default: bool) -> bool:
+        """Boolean field of ``pipeline.model``; ``default`` if absent."""
+        value = self.model.get(name, default)
+        if not isinstance(value, bool):
+            raise self.refused(name, value, "true or false")
+        return value
+
+    def refused(self, name: str, value: Any, wanted: str) -> InputError:
+        """The error of a field of ``pipeline.model``."""
+        return unusable(value, field=f"pipeline.model.{name}", fix=f"write {wanted}", file=self.file)
 
 
 def read_config(path: str | os.PathLike[str]) -> RunConfig:
-    """Read ``config.yml``.
-
-    Raises:
-        InputError: The file is absent, not YAML, too large, or lacks ``pipeline.model``.
-    """
+    """Read ``config.yml``."""
     file = Path(path)
     if os.path.isdir(file):
         file = file / CONFIG_NAME
@@ -152,11 +155,7 @@ def _which_run(folder: Path) -> str:
 
 
 def read_mapping(file: Path, what: str) -> dict[str, Any]:
-    """What a YAML file of a mapping holds; Python objects in it are kept as `Tagged`, never built.
-
-    Raises:
-        InputError: The file is absent, not YAML, too large, or no mapping.
-    """
+    """What a YAML file of a mapping holds; Python objects in it are kept as `Tagged`, never built."""
     refuse_other_kind(file)
     root = as_mapping(_parse_yaml(read_text(file, what, CONFIG_BYTES_LIMIT), file))
     if root is None:
@@ -181,9 +180,6 @@ def find_checkpoint(run: RunConfig, step: int | None = None) -> Path:
         run: The run's configuration; ``load_step`` in it names a step. Nerfstudio's evaluation replaces ``load_dir``
             by the run's own folder and reads no ``load_checkpoint``.
         step: The step to read in place of that; without either it is the highest one.
-
-    Raises:
-        InputError: There is none, or the folder cannot be listed.
     """
     folder = run.model_folder
     try:
@@ -220,14 +216,10 @@ def find_checkpoint(run: RunConfig, step: int | None = None) -> Path:
 
 
 def load_step(run: RunConfig) -> int | None:
-    """The training step that config.yml names for evaluation; None: the highest one.
-
-    Raises:
-        InputError: It is not the number of a step.
-    """
+    """The training step that config.yml names for evaluation; None: the highest one."""
     value = run.root.get("load_step")
     if value is not None and (isinstance(value, bool) or not isinstance(value, int) or not 0 <= value < 10**18):
-        raise InputError(f"found {show(value)}", file=run.file, field="load_step", fix="write a step, or null")
+        raise unusable(value, field="load_step", fix="write a step, or null", file=run.file)
     return value
 
 
@@ -279,7 +271,7 @@ def read_dataparser_transform(run: RunConfig) -> tuple[DataparserTransform, tupl
         return DataparserTransform(), (note,)
     data = load_json(path, "dataparser transform", TRANSFORMS_BYTES_LIMIT)
     if not isinstance(data, dict):
-        raise InputError(f"found {show(data)}", file=path, field="top level", fix="write an object")
+        raise unusable(data, field="top level", fix="write an object", file=path)
     rows = data.get("transform")
     if not (isinstance(rows, list) and len(rows) == 3 and all(_is_list(row, 4) for row in rows)):
         fix = "write three rows of four numbers"
@@ -288,7 +280,7 @@ def read_dataparser_transform(run: RunConfig) -> tuple[DataparserTransform, tupl
         for j, value in enumerate(row):
             if not is_number(value):
                 field = f"transform[{i}][{j}]"
-                raise InputError(f"found {show(value)}", file=path, field=field, fix="write a finite number")
+                raise unusable(value, field=field, fix="write a finite number", file=path)
     matrix = np.array(rows, np.float64)
     with np.errstate(all="ignore"):
         determinant = float(np.linalg.det(matrix[:, :3]))
@@ -301,7 +293,7 @@ def read_dataparser_transform(run: RunConfig) -> tuple[DataparserTransform, tupl
         )
     scale = data.get("scale")
     if not is_number(scale) or not scale > 0:
-        raise InputError(f"found {show(scale)}", file=path, field="scale", fix="write a number above 0")
+        raise unusable(scale, field="scale", fix="write a number above 0", file=path)
     return DataparserTransform(matrix=matrix, scale=float(scale)), ()
 
 
@@ -346,7 +338,7 @@ def _name(root: dict[str, Any], key: str, default: str, file: Path) -> str:
     if value is None:
         return default
     if not isinstance(value, (str, int, float)) or isinstance(value, bool):
-        raise InputError(f"found {show(value)}", file=file, field=key, fix="write a name")
+        raise unusable(value, field=key, fix="write a name", file=file)
     text = value if isinstance(value, str) else show(value)
     return visible(" ".join(text.split()))[:120] or default
 

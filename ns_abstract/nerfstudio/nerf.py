@@ -18,7 +18,8 @@ from nerfstudio.models.vanilla_nerf import NeRFModel, VanillaModelConfig
 from nerfstudio.utils.colors import COLORS_DICT
 
 from ns_abstract.io.errors import InputError
-from ns_abstract.methods.nerf.load import field_weights
+from ns_abstract.methods.nerf.load import FIX, field_weights
+from ns_abstract.methods.nerf.model_state import ModelState
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.nerfstudio.outputs import AbstractConfig, AbstractOutputs, resampled
 from ns_abstract.nerfstudio.panel import camera_of
@@ -121,10 +122,9 @@ class AbstractNerfModel(AbstractOutputs, NeRFModel):
         exponents = (8.0, 4.0)
         if c.num_direction_frequencies:
             exponents = c.max_frequency_exponent, c.num_direction_frequencies - 1.0
-        state = {name: value.detach().cpu().float().numpy() for name, value in self.state_dict().items()}
-        coarse, fine = (
-            field_weights(state, name, Path("the loaded model"), exponents) for name in ("field_coarse", "field_fine")
-        )
+        arrays = {name: value.detach().cpu().float().numpy() for name, value in self.state_dict().items()}
+        state = ModelState(arrays, Path("the loaded model"), FIX)
+        coarse, fine = (field_weights(state, name, exponents) for name in ("field_coarse", "field_fine"))
         return NerfScene(
             coarse=coarse,
             fine=fine,

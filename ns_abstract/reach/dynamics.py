@@ -18,8 +18,7 @@ from ns_abstract.arithmetic.form_array import FormArray
 from ns_abstract.arithmetic.forms import MAX_DIMENSIONS, Basis
 from ns_abstract.arithmetic.rounding import HALF_UP, STEP_ROUNDINGS, STEP_UP, UNDERFLOW64, gamma
 from ns_abstract.arithmetic.trigonometry import cos_sin
-from ns_abstract.io.errors import InputError
-from ns_abstract.io.fields import known
+from ns_abstract.io.fields import fail, known
 from ns_abstract.io.jsonio import FIX_MODERATE, file_beside, is_moderate, show
 from ns_abstract.reach.learned import LearnedDynamics
 
@@ -260,11 +259,6 @@ KEYS = {
 }
 
 
-def fail(name: str, problem: str, fix: str) -> InputError:
-    """The error of a field, for `ns_abstract.io.fields`."""
-    return InputError(problem, field=name, fix=fix)
-
-
 def matrix(value: Any, name: str, rows: int, columns: int | None) -> Float64:
     """A [rows, columns] matrix of moderate numbers, or InputError; ``columns`` None: the first row's."""
     if columns is None and isinstance(value, list) and value and isinstance(value[0], list):
@@ -297,18 +291,11 @@ def named_file(value: Any, name: str, folder: Path) -> Path:
     """The .onnx file beside LOOP.json that a field names, or InputError."""
     if not isinstance(value, str) or not value:
         raise fail(name, f"found {show(value)}", "name an .onnx file beside this one")
-    try:
-        return file_beside(folder, value)
-    except InputError as error:
-        raise InputError(error.problem, fix=error.fix, field=name) from None
+    return file_beside(folder, value, name)
 
 
 def parse_dynamics(value: Any, states: int, dt: float, folder: Path) -> Dynamics | LearnedDynamics:
-    """The object under the key ``dynamics``; ``dt`` is the sampling time in seconds.
-
-    Raises:
-        InputError: A key is unknown, or a value cannot be used.
-    """
+    """The object under the key ``dynamics``; ``dt`` is the sampling time in seconds."""
     kinds = ", ".join(KEYS)
     if not isinstance(value, Mapping):
         raise fail("dynamics", f"found {show(value)}", f"write an object with a type: {kinds}")

@@ -10,14 +10,13 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.execution.cancellation import check_cancelled
-from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.reach.pictures import Pictures
 from ns_abstract.reach.tubes import Tube, TubeBuilder
 from ns_abstract.refine.protocol import Method
 from ns_abstract.refine.result import FrameResult
 from ns_abstract.report.export import encoded, panels, picture
 from ns_abstract.report.figures import metrics, number
 from ns_abstract.report.picture import preview
+from ns_abstract.verify.scene_pictures import ScenePictures
 
 #: Steps of a film and of the page at most; pictures a second.
 _MOST_STEPS, _MOST_SHOWN, _FPS = 100, 10, 4.0
@@ -34,7 +33,6 @@ class Film:
 
     Attributes:
         about: For report.json: cell, verdict, size of pictures; of every step gaps and the box of camera parameters.
-        steps: The images, ``index`` is the step.
     """
 
     about: dict[str, Any]
@@ -67,9 +65,9 @@ class Film:
         return strips
 
 
-def _some(count: int, most: int) -> list[int]:
-    """At most ``most`` of the first ``count`` numbers, with both ends."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)).tolist() if count else []
+def _some(count: int, most_steps: int) -> list[int]:
+    """At most ``most_steps`` of the first ``count`` numbers, with both ends."""
+    return np.unique(np.linspace(0, count - 1, min(count, most_steps)).round().astype(int)).tolist() if count else []
 
 
 def film_size(size: tuple[int, int]) -> tuple[int, int]:
@@ -82,23 +80,20 @@ def along(reacher: TubeBuilder, method: Method, size: tuple[int, int], tube: Tub
     """Yield, step by step, bounds of all pictures that the camera may take, and the picture at the middle pose.
 
     The bounds are those of one cell, as tubes have them.
-
-    Raises:
-        WorkCancelledError: There is no time for more.
     """
     camera = reacher.loop.camera
     poses = camera.poses(size)
-    view, begin = Pictures(method, poses), time.perf_counter()
-    for step in _some(len(tube.sets), _MOST_STEPS):
+    view, begin = ScenePictures(method.frame(poses)), time.perf_counter()
+    for step in _some(len(tube.state_sets), _MOST_STEPS):
         check_cancelled()
-        pose = reacher.poses(tube.sets[step])
+        pose = reacher.poses(tube.state_sets[step])
         low, high = pose.hull()
         outer = poses.box
         if not pose.finite or not ((low >= outer.lower) & (high <= outer.upper)).all():
             return
-        box = ParameterBox(outer.names, outer.units, tuple(low.tolist()), tuple(high.tolist()))
-        _, lower, upper, _ = view.sets(box)
-        image = view.image(np.clip(camera.values(tube.sets[step].center), low, high))
+        box = outer.with_ends(low, high)
+        _, lower, upper, _ = view.linear_sets(box)
+        image = view.image(np.clip(camera.values(tube.state_sets[step].center), low, high))
         seconds = time.perf_counter() - begin
         yield FrameResult(step, box, lower, upper, image, image, image, seconds, 1)
 

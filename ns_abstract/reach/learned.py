@@ -23,9 +23,6 @@ class LearnedDynamics:
     """``x' = f(x, u)`` of an ONNX file with one input [1, n + m] or [n + m], the n ``states`` before the controls.
 
     Its outputs are n numbers together, the next state.
-
-    Raises:
-        InputError: The file cannot be read, uses what is not supported, or its sizes do not fit.
     """
 
     name = "onnx"

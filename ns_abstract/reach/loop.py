@@ -16,13 +16,12 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import PinholeCamera, checked_pose, focal_length, stated_intrinsics
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.fields import interval, known
+from ns_abstract.io.fields import fail, interval, known
 from ns_abstract.io.jsonio import is_moderate, is_number, load_json, show
 from ns_abstract.perturbation.specification import ROTATIONS, TRANSLATIONS, Perturbation
 from ns_abstract.reach.dynamics import (
     MOST,
     Dynamics,
-    fail,
     matrix,
     named_file,
     number,
@@ -166,7 +165,6 @@ class Loop:
         control: What comes behind it; None until the network's outputs are known.
         unsafe: Closed sets, each given by faces: outside where any of them is above 0.
         required: Properties of the picture: a state is unsafe where its picture lacks one of them.
-        goal: Or None.
     """
 
     names: tuple[str, ...]
@@ -226,11 +224,7 @@ class Loop:
 
 
 def load_loop(path: str | Path) -> Loop:
-    """Read LOOP.json; the files that it names are looked for beside it.
-
-    Raises:
-        InputError: The file or a field in it cannot be used.
-    """
+    """Read LOOP.json; the files that it names are looked for beside it."""
     path = Path(path)
     value = load_json(path, "loop file")
     try:
@@ -244,9 +238,6 @@ def parse_loop(value: Any, folder: Path, dataset_scale: float = 1.0) -> Loop:
 
     Args:
         dataset_scale: Normalised units per unit of the data set, for distances in pictures.
-
-    Raises:
-        InputError: A key is unknown, or a value cannot be used.
     """
     if not isinstance(value, dict):
         raise fail("", f"found {show(value)}", "write an object")

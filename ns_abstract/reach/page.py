@@ -37,9 +37,6 @@ def loop_page(
     """The page: HTML, self-contained; every text of the ``document`` is escaped.
 
     Args:
-        document: Content of report.json.
-        rows: By number of the question, the cells: lower, upper, verdict.
-        loop: The loop.
         outside: Draws the scene behind the tubes; None: it has no elements with a place of their own.
         strips: Steps of the film and their PNGs.
     """

@@ -43,7 +43,6 @@ def plane_marks(
     """Cells, tubes and runs of a report in a plane.
 
     Args:
-        rows: Cells: lower, upper, verdict.
         matrix, offset: [2, n], [2]: states to the plane.
         axes: The world's axes that the plane has, for tubes of camera positions; None: others.
     """
@@ -86,9 +85,7 @@ def region(
     Those of the axis that is looked along are left out.
 
     Args:
-        half_spaces: Of the set.
         axes: The plane's axes of the world.
-        window: The plane.
         sign: 1: within where all half-spaces hold; -1: where all of their complements do.
     """
     matrix, offset = loop.camera.place

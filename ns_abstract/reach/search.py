@@ -94,7 +94,6 @@ def simulate(
     """One run with the real renderer and the deployed network, in float64 but for these.
 
     Args:
-        start: [n] initial state.
         disturbances: [steps, n], added to every next state.
         member: The scene that is seen throughout; None: the stored one.
         off: Where the scene stands throughout, as `TubeBuilder.seen_from` has it; None: at its place.
@@ -198,7 +197,11 @@ class LoopSearch:
 
     def proved(self, tube: Tube, question: Question) -> float:
         """Lower bound of the margin of all runs in a tube; minus infinity where nothing is known (L5)."""
-        if tube.reason or len(tube.sets) != self.loop.steps + 1 or not all(step.finite for step in tube.sets):
+        if (
+            tube.reason
+            or len(tube.state_sets) != self.loop.steps + 1
+            or not all(step.finite for step in tube.state_sets)
+        ):
             return -math.inf
         clearance = tube.safe(self.loop)
         if question == "reaches":
@@ -343,7 +346,7 @@ class LoopSearch:
             )
         slopes = tube.slopes if tube.slopes.any() else width
         # a tube that ends far from the end is far too wide
-        parts = _MANY if tube.reason and len(tube.sets) < _SOON * self.loop.steps else _FEW
+        parts = _MANY if tube.reason and len(tube.state_sets) < _SOON * self.loop.steps else _FEW
         return cell_runs, bound if bound > -math.inf else None, tube.reason, slopes, parts
 
     def _run(self, question: Question, cell_runs: _CellRuns, start: Float64, disturbances: Float64) -> float:
@@ -402,7 +405,7 @@ class LoopSearch:
 
 def first_outside(tube: Tube, run: SimulatedRun) -> str | None:
     """The first state or control of a run that is not in a tube, in words; None where all are (no tolerance)."""
-    for step, entry in enumerate(tube.sets):
+    for step, entry in enumerate(tube.state_sets):
         if not entry.finite:
             return None
         low, high = entry.hull()

@@ -25,11 +25,12 @@ from ns_abstract.perturbation.specification import TRANSLATIONS
 from ns_abstract.reach.dynamics import middle_half
 from ns_abstract.reach.learned import LearnedDynamics
 from ns_abstract.reach.loop import Control, HalfSpace, Loop
-from ns_abstract.reach.pictures import LoopPictures, PropertyView
+from ns_abstract.reach.pictures import PropertyView
 from ns_abstract.verify.model import NetworkModel
 from ns_abstract.verify.network import OutputBounds
 from ns_abstract.verify.picture_sets import sane
 from ns_abstract.verify.properties import Query
+from ns_abstract.verify.scene_pictures import ScenePictures
 
 Float64 = NDArray[np.float64]
 #: What is kept from step to step: how states depend on the initial state and on earlier disturbances ("kept"); only how
@@ -222,7 +223,6 @@ def between(bounds: OutputBounds, count: int, shift: Float64, room: Float64) -> 
     """Return the affine set between planes: the first ``count`` rows and their negatives, of one cell (L3).
 
     Args:
-        bounds: Lower bounds [1, 2 count or more]; places are the parameters.
         shift: [count] what is taken off.
         room: [count] how far values may be off beside that.
 
@@ -269,13 +269,13 @@ class Tube:
     """States of all runs from a cell, step by step.
 
     Attributes:
-        sets: By step, from 0; as many as were found before the end or a reason to stop.
+        state_sets: By step, from 0; as many as were found before the end or a reason to stop.
         controls: [steps, 2, m] least and most control of every step.
         slopes: [m] how much pictures moved by initial parameter, summed over the steps: what a cut may gain.
         views: [sets, properties] lower bounds of the margins of `Loop.views` (L7); minus infinity: nothing is known.
     """
 
-    sets: tuple[AffineSet, ...]
+    state_sets: tuple[AffineSet, ...]
     controls: Float64
     slopes: Float64
     views: Float64
@@ -283,12 +283,12 @@ class Tube:
 
     def safe(self, loop: Loop) -> float:
         """Lower bound, over all steps, of the distance to unsafe sets along the best face (L4), and of margins."""
-        clearances = [clearance(step, loop.unsafe) for step in self.sets]
+        clearances = [clearance(step, loop.unsafe) for step in self.state_sets]
         return float(min([*clearances, *self.views[:, : len(loop.required)].ravel()], default=np.inf))
 
     def inside(self, step: int, faces: Sequence[HalfSpace]) -> float:
         """Lower bound of how deep all states of a step lie inside a box."""
-        return min(self.sets[step].least(face) for face in faces)
+        return min(self.state_sets[step].least(face) for face in faces)
 
 
 @dataclass
@@ -296,7 +296,6 @@ class TubeBuilder:
     """Tubes of a loop.
 
     Attributes:
-        pilot: Its network and control.
         registration: How far the scene may stand from its place along every world axis, all of a run through; needs a
             camera that moves along all of them. Otherwise the view's set may tell where the scene stands
             (`PoseBox.registered`).
@@ -304,7 +303,7 @@ class TubeBuilder:
     """
 
     loop: Loop
-    view: LoopPictures
+    view: ScenePictures
     pilot: ControlBounds
     dependence: Dependence = "kept"
     registration: float = 0.0
@@ -404,9 +403,7 @@ class TubeBuilder:
             low, high = np.concatenate([low, -place]), np.concatenate([high, place])
             none = np.zeros((place.size, pose.generators.shape[1]))
             pose = pose.beside(AffineSet(np.zeros(place.size), none, place, pose.first))
-        names, units = self.view.pose_set.box.names, self.view.pose_set.box.units
-        box = ParameterBox(names, units, tuple(low.tolist()), tuple(high.tolist()))
-        return box, _scaled(pose, *middle_half(low, high))
+        return self.view.pose_set.box.with_ends(low, high), _scaled(pose, *middle_half(low, high))
 
     def _view_margins(self, state: AffineSet, step: int) -> tuple[Float64, Float64]:
         """[properties] lower bounds of their margins at a step (L7), and how much the pictures move by generator."""
@@ -426,7 +423,7 @@ class TubeBuilder:
         if poses is None:
             return "the camera may leave the range of poses"
         box, scaled = poses
-        linear, lower, upper, slopes = self.view.sets(box)
+        linear, lower, upper, slopes = self.view.linear_sets(box)
         if not sane(linear, lower, upper):
             return "the picture's bounds are not finite"
         controls = self.pilot.bound(linear, lower, upper)

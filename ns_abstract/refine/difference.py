@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
@@ -21,9 +20,7 @@ from ns_abstract.refine.protocol import (
     Frame,
     LinearSets,
     OrderedFrame,
-    PartsFrame,
     PreciseFrame,
-    SceneSample,
 )
 from ns_abstract.refine.result import RenderedMaximum, greater
 
@@ -49,20 +46,10 @@ class PairContext:
         return None
 
 
-@dataclass(frozen=True)
-class DifferenceBounds:
-    """Bounds of the absolute difference over one cell; see `ns_abstract.refine.protocol.Bounds`."""
-
-    lower: np.ndarray
-    upper: np.ndarray
-    slopes: np.ndarray
-    context: PairContext
-    linear: LinearSets | None = None
-    forms: None = None
-
-
-class DifferenceFrame:
+class DifferenceFrame(Frame):
     """Renders and bounds of |A - B| by pixel and channel, for two frames with the same parameters (design.md, Y4).
+
+    Nothing is left out by a tolerance: what is dim in both pictures is not the same.
 
     Args:
         first, second: The frames of A and B, of the same set of poses, camera and tiles.
@@ -81,6 +68,7 @@ class DifferenceFrame:
         self.pose_set, self.box, self.camera = first.pose_set, first.box, first.camera
         self.side, self.across, self.down = first.side, first.across, first.down
         self.tilewise, self.tiles_at_once, self.witnesses = first.tilewise, first.tiles_at_once, first.witnesses
+        self.stages = tuple(dict.fromkeys((*first.stages, *second.stages)))
         self.largest: RenderedMaximum | None = None
         self._inside = pixels_inside(first)
         self.greatest = np.zeros((first.tile_count, first.side, first.side, COLORS), np.float32)
@@ -101,16 +89,6 @@ class DifferenceFrame:
     def shares_order(self) -> bool:
         """Whether elements of both scenes are taken to be drawn in one order (design.md, Y5)."""
         return self._shared is not None
-
-    @property
-    def tile_count(self) -> int:
-        """Number of tiles."""
-        return self.first.tile_count
-
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """Stages of both frames that can be compiled apart."""
-        return tuple(dict.fromkeys((*self.first.stages, *self.second.stages)))
 
     def warm_up(self, stage: str | None = None) -> None:
         """Compile what both frames need, with linear bounds."""
@@ -135,16 +113,6 @@ class DifferenceFrame:
         self.largest = greater(self.largest, rendered)
         return np.maximum(lower, self.floor)
 
-    def scene_samples(self, seed: int) -> Iterator[SceneSample]:
-        """Nothing: only poses vary."""
-        return iter(())
-
-    def bound(
-        self, box: ParameterBox, tiles: np.ndarray, within: PairContext | None = None, keep_linear: bool = False
-    ) -> DifferenceBounds:
-        """Bounds of ``tiles`` over ``box``."""
-        return self.bound_parts([box], tiles, within, keep_linear, None)[0]
-
     def bound_parts(
         self,
         boxes: Sequence[ParameterBox],
@@ -152,22 +120,27 @@ class DifferenceFrame:
         within: PairContext | None,
         keep_linear: bool,
         pixels: np.ndarray | None,
-    ) -> list[DifferenceBounds]:
-        """See `ns_abstract.refine.protocol.PartsFrame`."""
+    ) -> list[Bounds]:
         contexts = (None, None) if within is None else (within.first, within.second)
         first, second = (
-            _bounds(frame, boxes, tiles, context, pixels) for frame, context in zip(self.both, contexts, strict=True)
+            frame.bound_parts(boxes, tiles, context, True, pixels)
+            for frame, context in zip(self.both, contexts, strict=True)
         )
         differences = []
         for box, a, b in zip(boxes, first, second, strict=True):
             difference = self._difference(a, b, pixels)
             if self._shared is not None and self.floor > 0.0:
-                self._share_order(box, tiles, difference, pixels)
+                self._share_order(box, tiles, difference, (a.context, b.context), pixels)
             differences.append(difference)
         return differences
 
     def _share_order(
-        self, box: ParameterBox, tiles: np.ndarray, difference: DifferenceBounds, pixels: np.ndarray | None
+        self,
+        box: ParameterBox,
+        tiles: np.ndarray,
+        difference: Bounds,
+        contexts: tuple[CellContext | None, CellContext | None],
+        pixels: np.ndarray | None,
     ) -> None:
         """Lower bounds above the floor where both scenes are drawn in one order, whichever it is (design.md, Y5)."""
         assert self._shared is not None
@@ -175,7 +148,6 @@ class DifferenceFrame:
         wanted &= True if pixels is None else pixels
         if not 0 < wanted.sum() <= _MOST_PIXELS:
             return
-        contexts = difference.context.first, difference.context.second
         for k in np.flatnonzero(wanted.any(axis=(1, 2))):
             pairs = self._shared.bounds(box, int(tiles[k]), wanted[k], contexts)
             if pairs is None:
@@ -186,7 +158,7 @@ class DifferenceFrame:
             lower = wanted[k][..., None] & (high < difference.upper[k])
             difference.upper[k][lower] = np.maximum(high, self.floor)[lower]
 
-    def _difference(self, a: Bounds, b: Bounds, pixels: np.ndarray | None) -> DifferenceBounds:
+    def _difference(self, a: Bounds, b: Bounds, pixels: np.ndarray | None) -> Bounds:
         """Bounds of one cell from those of both scenes."""
         upper = upper_of(a, b)
         _, high = outward(upper, upper)
@@ -195,12 +167,9 @@ class DifferenceFrame:
         if pixels is not None:
             # nothing is said of the others
             high[~pixels] = 1.0
-        return DifferenceBounds(
-            np.full_like(high, self.floor), high, a.slopes + b.slopes, PairContext(a.context, b.context)
-        )
+        return Bounds(np.full_like(high, self.floor), high, a.slopes + b.slopes, PairContext(a.context, b.context))
 
     def feasible(self, box: ParameterBox) -> ParameterBox | None:
-        """See `Frame.feasible`."""
         return self.first.feasible(box)
 
     def motion(self, box: ParameterBox) -> np.ndarray:
@@ -211,32 +180,12 @@ class DifferenceFrame:
         """Depths of elements of A."""
         return self.first.depths()
 
-    def observe(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
-        """Bounds do not depend on what was rendered."""
-
-    def set_tolerance(self, excess: float) -> float:
-        """Nothing is left out: what is dim in both pictures is not the same."""
-        return 0.0
-
-    def plan(self, visible: int | None, lower: np.ndarray, upper: np.ndarray) -> list[str]:
-        """Nothing was left out."""
-        return []
-
 
 def _picture(frame: Frame, values: np.ndarray, tiles: np.ndarray | None) -> tuple[np.ndarray, float]:
     """Colours of a render in float64, and by how much each may be rounded."""
     if isinstance(frame, PreciseFrame):
         return frame.precise(values, tiles)[..., :COLORS], 0.0
     return frame.render(values, tiles)[..., :COLORS].astype(np.float64), UNIT32
-
-
-def _bounds(
-    frame: Frame, boxes: Sequence[ParameterBox], tiles: np.ndarray, within: Any, pixels: np.ndarray | None
-) -> Sequence[Bounds]:
-    """Linear bounds of one scene over each of ``boxes``."""
-    if isinstance(frame, PartsFrame):
-        return frame.bound_parts(boxes, tiles, within, True, pixels)
-    return [frame.bound(box, tiles, within, True) for box in boxes]
 
 
 def upper_of(a: Bounds, b: Bounds) -> np.ndarray:

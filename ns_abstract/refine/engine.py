@@ -18,6 +18,7 @@ import numpy as np
 from ns_abstract.arithmetic.rounding import MEAN_DOWN
 from ns_abstract.execution.cancellation import WorkCancelledError, cancel_when
 from ns_abstract.geometry.tiles import in_tiles
+from ns_abstract.refine.box_splitter import BoxSplitter, SubBox
 from ns_abstract.refine.frame_tiles import FrameTiles, LeafCell, context_bytes, usable
 from ns_abstract.refine.goal import RefinementGoal
 from ns_abstract.refine.initial import InitialPartition, Partition
@@ -25,7 +26,6 @@ from ns_abstract.refine.inner import InnerBound, sampled_gap
 from ns_abstract.refine.leaves import BoundedCell, Change, LeafBounds, LeafSets
 from ns_abstract.refine.protocol import ACCUMULATION, COLORS, DEPTH, Bounds, Frame, Render
 from ns_abstract.refine.result import ExtraOutput, FrameResult, PartResult, TracePoint, joined
-from ns_abstract.refine.sub_boxes import BoxSplitter, SubBox
 from ns_abstract.refine.tuning import TUNING, Tuning
 
 #: Part of the gap beyond the witnesses that a goal allows which parts of a frame share by their pixels.

@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.refine.protocol import COLORS, DEPTH, Bounds, CellContext, Frame, PartsFrame
+from ns_abstract.refine.box_splitter import SubBox
+from ns_abstract.refine.protocol import COLORS, DEPTH, Bounds, CellContext, Frame
 from ns_abstract.refine.result import gap
-from ns_abstract.refine.sub_boxes import SubBox
 
 
 class LeafCell:
@@ -29,11 +29,7 @@ class LeafCell:
 
 
 class FrameTiles:
-    """Some tiles of a frame, numbered by their place in the list; measures are those of their pixels (R6).
-
-    Args:
-        tiles: The frame's numbers of the tiles, ascending; None: all.
-    """
+    """Some tiles of a frame, numbered by their place in the list; measures are those of their pixels (R6)."""
 
     def __init__(self, frame: Frame, tiles: np.ndarray | None = None, keep_linear: bool = False) -> None:
         self.frame, self.keep_linear = frame, keep_linear
@@ -50,7 +46,7 @@ class FrameTiles:
     @property
     def by_pixel(self) -> bool:
         """Whether cells may be split for some of their pixels only: not where linear sets or layers are kept."""
-        return isinstance(self.frame, PartsFrame) and not self.keep_linear and self.frame.channels == COLORS
+        return not self.keep_linear and self.frame.channels == COLORS
 
     def numbers(self, places: np.ndarray | None) -> np.ndarray:
         """The frame's numbers of tiles; of all of these if None."""
@@ -73,16 +69,12 @@ class FrameTiles:
         """Bounds of each cell in the tiles at ``places``.
 
         Args:
-            cells: Parts of ``parent``.
             parent: A cell that was bounded in these tiles before, or None.
-            places: [t] which tiles.
             pixels: [t, side, side] which pixels are wanted, of those that were wanted of ``parent``; None: all.
         """
         within = None if parent is None else parent.context
         boxes, numbers = [cell.box for cell in cells], self.numbers(places)
-        if isinstance(self.frame, PartsFrame):
-            return self.frame.bound_parts(boxes, numbers, within, self.keep_linear, pixels)
-        return [self.frame.bound(box, numbers, within, self.keep_linear) for box in boxes]
+        return self.frame.bound_parts(boxes, numbers, within, self.keep_linear, pixels)
 
     def mean_gap(self, lower: np.ndarray, upper: np.ndarray, places: np.ndarray | None = None) -> float:
         """MPG between [t, side, side, channels] values of the tiles at ``places`` [t]; None: all."""

@@ -9,12 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ns_abstract.refine.box_splitter import BoxSplitter, SubBox
 from ns_abstract.refine.frame_tiles import FrameTiles, context_bytes
 from ns_abstract.refine.goal import RefinementGoal
 from ns_abstract.refine.inner import InnerBound
 from ns_abstract.refine.leaves import linear_bytes
 from ns_abstract.refine.protocol import Bounds
-from ns_abstract.refine.sub_boxes import BoxSplitter, SubBox
 from ns_abstract.refine.tuning import TUNING, Tuning
 
 

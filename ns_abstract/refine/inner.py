@@ -8,10 +8,10 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.refine.box_splitter import SubBox
 from ns_abstract.refine.frame_tiles import FrameTiles, LeafCell, pixels_inside, usable
 from ns_abstract.refine.protocol import COLORS, DEPTH, Frame, Render
 from ns_abstract.refine.result import SampleImages, gap
-from ns_abstract.refine.sub_boxes import SubBox
 from ns_abstract.refine.tuning import TUNING, Tuning
 
 
@@ -155,11 +155,11 @@ def sampled_gap(frame: Frame, index: int, seed: int, tuning: Tuning = TUNING) ->
     return float(gap(least[..., :COLORS], most[..., :COLORS])[pixels_inside(frame)].mean())
 
 
-def _some_corners(box: ParameterBox, random: np.random.Generator, most: int) -> np.ndarray:
-    """Corners of a set [n, d], at most ``most`` of them by chance."""
+def _some_corners(box: ParameterBox, random: np.random.Generator, most_corners: int) -> np.ndarray:
+    """Corners of a set [n, d], at most ``most_corners`` of them by chance."""
     if not box.dimensions:
         return np.empty((0, 0))
     corners = box.corners()
-    if corners.shape[0] > most:
-        corners = corners[np.sort(random.choice(corners.shape[0], most, replace=False))]
+    if corners.shape[0] > most_corners:
+        corners = corners[np.sort(random.choice(corners.shape[0], most_corners, replace=False))]
     return corners

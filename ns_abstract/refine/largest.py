@@ -58,11 +58,7 @@ TUNING = LargestTuning()
 
 
 class GainWatch:
-    """Watches whether a pass still gains: what stays open in the narrowest cells takes ever more cells for nothing.
-
-    Attributes:
-        idle: Whether it gains no more.
-    """
+    """Watches whether a pass still gains: what stays open in the narrowest cells takes ever more cells for nothing."""
 
     def __init__(self, tuning: LargestTuning = TUNING) -> None:
         self.tuning, self.idle = tuning, False
@@ -126,7 +122,6 @@ class LargestDifference:
         tolerance: Value of which is asked whether all stay below it; the work ends once that is decided.
         progress: Called with (trace point, covered part of the set); ``mpg`` and ``mpg_witness`` of its points are
             the largest bound and the largest value rendered.
-        tiles: Numbers of the tiles; None: all.
     """
 
     def __init__(

@@ -83,7 +83,6 @@ class LeafBounds:
         earlier: [t, side, side, 3] bounds of the same set that hold anyway; None: there are none.
 
     Attributes:
-        lower, upper: [t, side, side, channels] float32, the outer bound of the set.
         bytes: Memory that open leaves hold, as `next_round` has counted it.
     """
 

@@ -93,7 +93,8 @@ class CellContext(Protocol):
         ...
 
 
-class Bounds(Protocol):
+@dataclass(frozen=True)
+class Bounds:
     """Bounds of some tiles over one cell.
 
     Attributes:
@@ -105,27 +106,16 @@ class Bounds(Protocol):
             radius, before the clamp to [0, 1]; None: there are none.
     """
 
-    @property
-    def lower(self) -> np.ndarray: ...
-
-    @property
-    def upper(self) -> np.ndarray: ...
-
-    @property
-    def slopes(self) -> np.ndarray: ...
-
-    @property
-    def context(self) -> CellContext | None: ...
-
-    @property
-    def linear(self) -> LinearSets | None: ...
-
-    @property
-    def forms(self) -> np.ndarray | None: ...
+    lower: np.ndarray
+    upper: np.ndarray
+    slopes: np.ndarray
+    context: CellContext | None
+    linear: LinearSets | None = None
+    forms: np.ndarray | None = None
 
 
 class Frame(Protocol):
-    """One set of poses of a scene, ready to be rendered and bounded.
+    """One set of poses of a scene, ready to be rendered and bounded; a frame without varied scenes has the defaults.
 
     Attributes:
         pose_set: The poses; their parameters are those of ``box``.
@@ -139,47 +129,25 @@ class Frame(Protocol):
         tiles_at_once: Most tiles of one call while cells are split, so that time is looked at in between; None: all
             that a cell concerns.
         witnesses: Poses rendered in every part of a cell of one parameter that is split.
+        stages: Parts of the kernels that can be compiled apart, the slowest first; none: they cannot.
     """
 
-    @property
-    def pose_set(self) -> PoseBox: ...
-
-    @property
-    def box(self) -> ParameterBox: ...
-
-    @property
-    def camera(self) -> PinholeCamera: ...
-
-    @property
-    def channels(self) -> int: ...
-
-    @property
-    def side(self) -> int: ...
-
-    @property
-    def across(self) -> int: ...
-
-    @property
-    def down(self) -> int: ...
-
-    @property
-    def tilewise(self) -> bool: ...
-
-    @property
-    def tiles_at_once(self) -> int | None: ...
-
-    @property
-    def witnesses(self) -> int: ...
+    pose_set: PoseBox
+    box: ParameterBox
+    camera: PinholeCamera
+    channels: int
+    side: int
+    across: int
+    down: int
+    tilewise: bool
+    tiles_at_once: int | None
+    witnesses: int
+    stages: tuple[str, ...] = ()
 
     @property
     def tile_count(self) -> int:
         """Number of tiles."""
-        ...
-
-    @property
-    def stages(self) -> tuple[str, ...]:
-        """Parts of the kernels that can be compiled apart, the slowest first; none: they cannot."""
-        ...
+        return self.across * self.down
 
     def warm_up(self, stage: str | None = None) -> None:
         """Compile what is compiled at first use, all of it or one of `stages`."""
@@ -191,10 +159,21 @@ class Frame(Protocol):
 
     def scene_samples(self, seed: int) -> Iterator[SceneSample]:
         """Other scenes of the set; none where only poses vary."""
-        ...
+        return iter(())
 
     def bound(self, box: ParameterBox, tiles: np.ndarray, within: Any = None, keep_linear: bool = False) -> Bounds:
         """Bounds of ``tiles`` over ``box``; ``within`` is the context of these tiles and a box around it."""
+        return self.bound_parts([box], tiles, within, keep_linear, None)[0]
+
+    def bound_parts(
+        self, boxes: Sequence[ParameterBox], tiles: np.ndarray, within: Any, keep_linear: bool,
+        pixels: np.ndarray | None,
+    ) -> Sequence[Bounds]:  # fmt: skip
+        """What `bound` returns of each of ``boxes``, at most `MOST_PARTS`, side by side.
+
+        ``within``: the context from a box around all cells. ``pixels`` [t, side, side]: which are wanted, others may be
+        left at [0, 1]; all if None.
+        """
         ...
 
     def feasible(self, box: ParameterBox) -> ParameterBox | None:
@@ -210,15 +189,14 @@ class Frame(Protocol):
 
         None: elements have no place of their own.
         """
-        ...
+        return None
 
     def observe(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
         """Take the inner bounds [t, side, side, 3] of ``tiles`` [t] so far; a refinement calls it at every change."""
-        ...
 
     def set_tolerance(self, excess: float) -> float:
         """Let later bounds be looser by a small part of ``excess`` on average; returns what light is left out, or 0."""
-        ...
+        return 0.0
 
     def plan(self, visible: int | None, lower: np.ndarray, upper: np.ndarray) -> list[str]:
         """What was left out for this frame and why, one sentence each.
@@ -226,23 +204,7 @@ class Frame(Protocol):
         ``visible``: scene elements that some cell shows, if they are told apart; bounds [H, W, 3] are what refinement
         found.
         """
-        ...
-
-
-@runtime_checkable
-class PartsFrame(Protocol):
-    """An optional interface of a `Frame`: bounds of several sub-boxes together, at chosen pixels only."""
-
-    def bound_parts(
-        self, boxes: Sequence[ParameterBox], tiles: np.ndarray, within: Any, keep_linear: bool,
-        pixels: np.ndarray | None,
-    ) -> Sequence[Bounds]:  # fmt: skip
-        """What `Frame.bound` returns of each of ``boxes``, at most `MOST_PARTS`.
-
-        ``within``: the context from a box around all cells. ``pixels`` [t, side, side]: which are wanted, others may be
-        left at [0, 1]; all if None.
-        """
-        ...
+        return []
 
 
 @runtime_checkable
@@ -296,13 +258,13 @@ class PreciseFrame(Protocol):
 class RayFrame(Frame, Protocol):
     """A frame whose pictures are made ray by ray (`ns_abstract.methods.representation.Representation.rays`)."""
 
-    def sets(
-        self, box: ParameterBox, weigh: Callable[[], np.ndarray | None] | None = None, most: int | None = None
+    def cell_bounds(
+        self, box: ParameterBox, weigh: Callable[[], np.ndarray | None] | None = None, most_rays: int | None = None
     ) -> Bounds:
         """Bounds of all tiles over a cell with linear bounds, for certificates, whatever was bounded before.
 
         ``weigh``: [H, W, 3] what part of a margin a unit of each pixel's width may cost, or None; asked at most once.
-        ``most``: rays that are bounded, about, those that matter most first; others are left at [0, 1].
+        ``most_rays``: rays that are bounded, about, those that matter most first; others are left at [0, 1].
 
         Raises:
             WorkCancelledError: There is no time for it.
@@ -346,7 +308,7 @@ class WeightFrame(Frame, Protocol):
 
 
 @runtime_checkable
-class ElementFrame(WeightFrame, PartsFrame, Protocol):
+class ElementFrame(WeightFrame, Protocol):
     """An optional interface of a `WeightFrame`: pictures of few pixels, drawn by the elements that show there alone."""
 
     def drawn_alone(self, context: Any, tiles: np.ndarray, pixels: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
@@ -373,6 +335,9 @@ class WeightMethod(Protocol):
 class Method(Protocol):
     """A scene and the program whose pictures are bounded."""
 
+    #: What bounds of this program are called: "float32-sound" or "real-sound".
+    guarantee: str
+
     @property
     def name(self) -> str:
         """The scene's name."""
@@ -391,11 +356,6 @@ class Method(Protocol):
     @property
     def program(self) -> dict[str, Any]:
         """``name`` and ``version`` of the bounded program, and what else tells it from others."""
-        ...
-
-    @property
-    def guarantee(self) -> str:
-        """What bounds of this program are called: "float32-sound" or "real-sound"."""
         ...
 
     @property
@@ -435,16 +395,16 @@ class Method(Protocol):
 
     def ablations(self, poses: PoseBox) -> Iterator[tuple[str, Frame]]:
         """What makes bounds of a set loose, in words, and its frame without that: not the one asked for."""
-        ...
+        return iter(())
 
     def attribution(self, frame: Frame, box: ParameterBox, tile: int, count: int) -> list[tuple[int, float]]:
         """Scene elements without which the mean gap of a tile over a cell is less, and by how much, in that order."""
-        ...
+        return []
 
     def elements(self) -> SceneElements | None:
         """What can be drawn of the scene as it is seen from outside; None: nothing has a place of its own."""
-        ...
+        return None
 
     def differentiable(self, poses: PoseBox) -> Callable[[torch.Tensor], torch.Tensor] | None:
         """Parameter values [d] to the picture [H, W, 3], differentiable; None: there are no certificates of it."""
-        ...
+        return None

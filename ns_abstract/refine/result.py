@@ -164,7 +164,6 @@ class PartResult(AbstractPicture):
     """Some tiles of a frame's abstract image; depths where anything is drawn, as a `Frame` has them.
 
     Attributes:
-        tiles: [t] numbers of the tiles.
         pixels: Number of the tiles' pixels that belong to the image, whose measures the trace has.
         shown: Scene elements that some cell shows in these tiles, or None.
         floor: What no more light comes to was left out of the first cover; 0: nothing.

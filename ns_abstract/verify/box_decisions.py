@@ -44,28 +44,27 @@ class BoxTuning:
 
     #: Starts and steps of the first attack on a region, and of the one on groups that resist a proof; what is no
     #: further from unsafe, relative to one, is run. After that part of the time the first attack descends no more.
-    starts: int = 12
-    steps: int = 25
-    first: float = 0.1
-    later: tuple[int, int] = (64, 60)
-    near: float = 1e-5
+    first_attack: tuple[int, int] = (12, 25)
+    first_share: float = 0.1
+    later_attack: tuple[int, int] = (64, 60)
+    nearly_unsafe: float = 1e-5
     #: Part of the time that is left for the later attack; it never has less starts and steps than these.
-    attack: float = 0.1
-    least: tuple[int, int] = (12, 20)
+    later_share: float = 0.1
+    least_attack: tuple[int, int] = (12, 20)
     #: Most inputs that are attacked at a time.
-    attacked: int = 1024
+    most_attacked: int = 1024
     #: Inputs that vary up to which a box is cut; phases are assumed in boxes of more. Of up to so many inputs a box is
     #: cut across one besides, if this has so large a part in what moves the neurons.
-    cut: int = 6
-    ranked: int = 64
-    dominant: float = 0.25
+    most_to_cut: int = 6
+    most_to_rank: int = 64
+    dominant_share: float = 0.25
     #: What the width of an input counts beside its slope.
-    width: float = 1e-9
+    width_share: float = 1e-9
     #: Part of the time that is left for lines of intermediate bounds. What a step towards these takes beside bounds
     #: with plain ones, and how many steps their first evaluation and those plain bounds amount to.
-    lines: float = 0.6
-    dear: float = 0.75
-    before: int = 3
+    lines_share: float = 0.6
+    step_cost: float = 0.75
+    steps_before: int = 3
     #: What a step, or the evaluation of an input, is taken to need at least.
     least_seconds: float = 1e-6
 
@@ -162,7 +161,7 @@ class _BoxSearch:
         self.boxes = 0
         total = sum(int(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1))
         self.together = min(_MOST, max(8, _TOGETHER // total))
-        self.attacked = min(_TUNING.attacked, max(4, _ATTACKED // total))
+        self.attacked = min(_TUNING.most_attacked, max(4, _ATTACKED // total))
         self.undecided = False
         # seconds of an input in the first attack, and of the latest bounds of all nodes
         self.by_input, self.by_bounds = _TUNING.least_seconds, 0.0
@@ -172,8 +171,8 @@ class _BoxSearch:
     def decide(self, shared: _SharedProperty) -> bool:
         """Whether a region has a counterexample, which `found` then is; `undecided` if that is not known."""
         start, self.descended = self.deadline.left, 0
-        descent = self.deadline.within(_TUNING.first * start)
-        if self._attack(shared, np.arange(len(shared.regions)), _TUNING.starts, _TUNING.steps, descent=descent):
+        descent = self.deadline.within(_TUNING.first_share * start)
+        if self._attack(shared, np.arange(len(shared.regions)), *_TUNING.first_attack, descent=descent):
             return True
         self.by_input = max(_TUNING.least_seconds, (start - self.deadline.left) / max(1, self.descended))
         if not all(shared.unsafe.groups):
@@ -183,7 +182,7 @@ class _BoxSearch:
         if self.arithmetic == "real":
             middle = torch.from_numpy(0.5 * (shared.lower[0] + shared.upper[0]))
             self.bounded = centred(self.network, middle.reshape(1, *self.network.input_shape))
-        if int((shared.upper > shared.lower).sum(1).max()) <= _TUNING.cut:
+        if int((shared.upper > shared.lower).sum(1).max()) <= _TUNING.most_to_cut:
             return self._bisect(shared)
         return any(self._assume(shared, which) for which in range(len(shared.regions)))
 
@@ -245,9 +244,9 @@ class _BoxSearch:
 
         ``boxes``: among so many is the time divided.
         """
-        by_step = max(_TUNING.least_seconds, _TUNING.dear * self.by_bounds)
-        allowed = _TUNING.lines * self.deadline.left / boxes
-        steps = min(_STEPS, int(min(1e6, allowed / by_step)) - _TUNING.before)
+        by_step = max(_TUNING.least_seconds, _TUNING.step_cost * self.by_bounds)
+        allowed = _TUNING.lines_share * self.deadline.left / boxes
+        steps = min(_STEPS, int(min(1e6, allowed / by_step)) - _TUNING.steps_before)
         if left and steps > 0:
             try:
                 with self.deadline.within(allowed).enforced():
@@ -264,11 +263,11 @@ class _BoxSearch:
 
     def _dominated(self, lower: np.ndarray, upper: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]] | None:
         """Two halves of a box [n], cut across the input that moves the neurons most; None if none dominates."""
-        if not 0 < int((upper > lower).sum()) <= _TUNING.ranked:
+        if not 0 < int((upper > lower).sum()) <= _TUNING.most_to_rank:
             return None
         parts = input_shares(self.network, lower, upper)
         at = int(parts.argmax())
-        return _halves(lower, upper, at) if parts[at] > _TUNING.dominant else None
+        return _halves(lower, upper, at) if parts[at] > _TUNING.dominant_share else None
 
     def _tree(
         self, shared: _SharedProperty, which: int, images: ImageSets, steps: int, groups: Sequence[tuple[int, ...]]
@@ -363,7 +362,7 @@ class _BoxSearch:
         """
         # a few steps where there are many regions: most are tiny
         steps = min(steps, max(3, 4 * self.attacked // len(regions)))
-        starts = max(2, min(starts, self.attacked, _TUNING.attacked // len(regions)))
+        starts = max(2, min(starts, self.attacked, _TUNING.most_attacked // len(regions)))
         generator = torch.Generator().manual_seed(0)
         step = max(1, self.attacked // starts)
         for first in range(0, len(regions), step):
@@ -382,10 +381,10 @@ class _BoxSearch:
 
     def _later(self, groups: int) -> tuple[int, int]:
         """Starts and steps of the later attack: fewer where all would take too much of the time that is left."""
-        starts, steps = _TUNING.later
-        allowed = _TUNING.attack * self.deadline.left / (self.by_input * groups)
+        starts, steps = _TUNING.later_attack
+        allowed = _TUNING.later_share * self.deadline.left / (self.by_input * groups)
         part = min(1.0, max(0.0, allowed) / (starts * steps)) ** 0.5
-        return max(_TUNING.least[0], int(part * starts)), max(_TUNING.least[1], int(part * steps))
+        return max(_TUNING.least_attack[0], int(part * starts)), max(_TUNING.least_attack[1], int(part * steps))
 
     def _descend(
         self,
@@ -428,7 +427,7 @@ class _BoxSearch:
         """Whether one of the inputs that look unsafe is, for the program that counts."""
         order = torch.argsort(value)[:2].tolist()
         for k in order:
-            if not float(value[k]) <= _TUNING.near * (1.0 + abs(float(value[k]))):
+            if not float(value[k]) <= _TUNING.nearly_unsafe * (1.0 + abs(float(value[k]))):
                 continue
             region = shared.regions[int(which[k])]
             point = np.clip(x[k].numpy(), region.lower, region.upper)
@@ -443,7 +442,7 @@ def _cut(lower: np.ndarray, upper: np.ndarray, slopes: np.ndarray) -> list[tuple
     """Return two halves of the box, cut across the most influential input by ``slopes`` [k, n]; None if too small."""
     width = upper - lower
     # slopes are by half widths
-    score = np.abs(slopes).max(0) + _TUNING.width * width
+    score = np.abs(slopes).max(0) + _TUNING.width_share * width
     return _halves(lower, upper, int(np.argmax(np.where(width > 0.0, score, -1.0))))
 
 

@@ -45,7 +45,7 @@ class CameraResponse:
             away = rng.uniform(-1.0, 1.0, count)
             yield ResponseSample(frame, self, np.broadcast_to(1.0 + self.radius * away, 3))
 
-    def sets(
+    def applied_to_sets(
         self, linear: LinearSets, lower: np.ndarray, upper: np.ndarray
     ) -> tuple[LinearSets, np.ndarray, np.ndarray]:
         """Sets that hold what every camera makes of the pictures that ``linear``, ``lower`` and ``upper`` hold (V14).
@@ -83,7 +83,7 @@ def response_sets(
     assert bounds.linear is not None
     whole = [assemble(part, camera) for part in (*bounds.linear, bounds.lower, bounds.upper)]
     sets = (whole[0], whole[1], whole[2], whole[3]), whole[4], whole[5]
-    return sets if response is None else response.sets(*sets)
+    return sets if response is None else response.applied_to_sets(*sets)
 
 
 @dataclass(frozen=True)

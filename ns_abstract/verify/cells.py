@@ -65,11 +65,7 @@ class CellGrid:
 
     @classmethod
     def fixed(cls, box: ParameterBox, partitions: Sequence[int], coarse: Sequence[int]) -> CellGrid:
-        """The grid of a fixed partition, as in the paper.
-
-        Raises:
-            InputError: The partition does not fit the parameters.
-        """
+        """The grid of a fixed partition, as in the paper."""
         if len(partitions) != box.dimensions:
             raise InputError(
                 f"{len(partitions)} numbers, the set has {box.dimensions} parameters: {', '.join(box.names) or 'none'}",
@@ -103,11 +99,11 @@ class CellGrid:
         spans = [list(itertools.pairwise(line)) for line in lines]
         return [Cell(tuple(a for a, _ in part), tuple(b for _, b in part)) for part in itertools.product(*spans)]
 
-    def divide(self, cell: Cell, slopes: np.ndarray, shrink: float, most: int) -> list[Cell]:
+    def divide(self, cell: Cell, slopes: np.ndarray, shrink: float, most_parts: int) -> list[Cell]:
         """The cell halved along the parameter with the largest slope, and so on; empty if it is one unit.
 
         ``slopes`` [d]: what a cut along each parameter may gain; there is one halving at least, until their sum is
-        ``shrink`` times smaller or there are ``most`` parts.
+        ``shrink`` times smaller or there are ``most_parts`` parts.
         """
         gains = np.where(np.isfinite(slopes), slopes, 0.0)
         sizes = np.array(cell.past, np.int64) - np.array(cell.first, np.int64)
@@ -119,7 +115,7 @@ class CellGrid:
         while True:
             free = np.flatnonzero(sizes > 1)
             count = math.prod(parts)
-            if not free.size or 2 * count > most or (count > 1 and gains.sum() <= goal * (1.0 + CutTuning.spare)):
+            if not free.size or 2 * count > most_parts or (count > 1 and gains.sum() <= goal * (1.0 + CutTuning.spare)):
                 break
             axis = int(free[np.lexsort((-sizes[free], -gains[free]))[0]])
             parts[axis] *= 2

@@ -55,9 +55,6 @@ def write_vnnlib(
             and Reshape, for verifiers that know little.
         groups: Row numbers of each group; None: every row is one.
         version: Of VNN-LIB; 2.0 asks about float32.
-
-    Raises:
-        InputError: The network cannot be extended.
     """
     network = load_network(model) if isinstance(model, Path) else model
     model = network.source

@@ -19,7 +19,7 @@ from ns_abstract.arithmetic.rounding import CUT_VALUE_ROUNDING, HALF_UP
 from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import Float64Array, ParameterBox
 from ns_abstract.geometry.tiles import assemble, in_tiles
-from ns_abstract.refine.protocol import Bounds, Frame, LinearSets, PartsFrame, SubBoxFrame
+from ns_abstract.refine.protocol import Bounds, Frame, LinearSets, SubBoxFrame
 from ns_abstract.verify.cell_boxes import aligned, divided, inner_cell, meeting, resolved, slabs, sub_box_counts
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.neighbouring_pixels import nearby, smoothed
@@ -73,12 +73,7 @@ class LocationTuning:
 
 @dataclass(frozen=True)
 class FoundPose:
-    """A rendered pose.
-
-    Attributes:
-        values: Parameters of the set.
-        outliers: Counted pixels that it does not explain.
-    """
+    """A rendered pose."""
 
     values: tuple[float, ...]
     outliers: int
@@ -101,9 +96,6 @@ class LocationSearch:
     Args:
         frame: What is searched and bounded; its parameters may be sheared.
         plain: The same set in its own parameters, for renders.
-        photo: The photo.
-        contract: Whether cells are contracted before they are cut.
-        tuning: Preferences.
     """
 
     def __init__(
@@ -157,11 +149,7 @@ class LocationSearch:
         return (below + above).max(axis=-1)
 
     def examine(self, cells: Sequence[Cell]) -> LocationResult:
-        """Exclude the cells, or cut them.
-
-        Raises:
-            WorkCancelledError: There is no time for it.
-        """
+        """Exclude the cells, or cut them."""
         begin = time.perf_counter()
         reports = [_Examination(self, cell, self.tiled.chosen(cell.outliers)) for cell in cells]
         for report in reports:
@@ -310,11 +298,6 @@ class _Examination:
     def _whole(self, box: ParameterBox, picture: np.ndarray, number: int) -> bool:
         """Bound the cell without sub-boxes, in rounds of pixels, and exclude it or contract it by these (U8).
 
-        Args:
-            box: The cell.
-            picture: Tiles of the render in its middle.
-            number: Pixels that this does not explain.
-
         Returns:
             Whether the cell was contracted.
         """
@@ -387,10 +370,7 @@ class _Examination:
         """Bounds of ``tiles``, or of some of their ``pixels`` alone where the frame can leave out the others."""
         check_cancelled()
         self.bounded += 1
-        frame = self.search.frame
-        if pixels is not None and isinstance(frame, PartsFrame):
-            return frame.bound_parts([box], tiles, None, linear, pixels)[0]
-        return frame.bound(box, tiles, None, linear)
+        return self.search.frame.bound_parts([box], tiles, None, linear, pixels)[0]
 
     def _settled(self, known: BoundedPixels) -> bool:
         """Whether every pose of the cell explains the photo: it is finished then."""

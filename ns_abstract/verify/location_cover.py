@@ -20,13 +20,7 @@ MOST, SPARE = 1500, 1.3
 
 @dataclass(frozen=True)
 class PoseCover:
-    """A set cut into cells that tile it: those that hold what is left, and those that hold none of it.
-
-    Attributes:
-        grid: The set.
-        left: Cells that hold all poses that are left.
-        excluded: The others.
-    """
+    """A set cut into cells that tile it: those that hold what is left, and those that hold none of it."""
 
     grid: CellGrid
     left: tuple[Cell, ...]
@@ -51,8 +45,6 @@ class ShearedBoxes:
     """Boxes of sheared parameters, and where they are in the set's own.
 
     Args:
-        lower, upper: [n, d] ends of the boxes.
-        names: [d] of the parameters.
         shear: As of `PoseBox`: name to other to factor.
     """
 
@@ -91,8 +83,8 @@ class ShearedBoxes:
         return chosen[some], lower[some], upper[some]
 
 
-def cover(box: ParameterBox, boxes: ShearedBoxes, most: int = MOST) -> PoseCover:
-    """Tile a set by cells of its own parameters, about ``most`` of which hold what is in ``boxes``."""
+def cover(box: ParameterBox, boxes: ShearedBoxes, most_cells: int = MOST) -> PoseCover:
+    """Tile a set by cells of its own parameters, about ``most_cells`` of which hold what is in ``boxes``."""
     d = box.dimensions
     grid = CellGrid(box, (1 << UNITS,) * d, (1,) * d)
     excluded: list[Cell] = []
@@ -106,8 +98,7 @@ def cover(box: ParameterBox, boxes: ShearedBoxes, most: int = MOST) -> PoseCover
         if not chosen.size:
             excluded.append(cell)
             return
-        hull = _replaced(box, lower.min(axis=0), upper.max(axis=0))
-        inner = inner_cell(grid, cell, hull)
+        inner = inner_cell(grid, cell, box.with_ends(lower.min(axis=0), upper.max(axis=0)))
         excluded.extend(slabs(cell, inner))
         count += 1
         filled = float(np.prod(upper - lower, axis=1).sum())
@@ -118,7 +109,7 @@ def cover(box: ParameterBox, boxes: ShearedBoxes, most: int = MOST) -> PoseCover
             heapq.heappush(queue, (-inner.volume, count, inner, chosen))
 
     add(Cell((0,) * d, grid.units), np.arange(len(boxes.lower)))
-    while queue and len(queue) + len(finished) < most:
+    while queue and len(queue) + len(finished) < most_cells:
         _, _, cell, chosen = heapq.heappop(queue)
         halves = min(
             (grid.cut(cell, [2 if k == axis else 1 for k in range(d)]) for axis in range(d)),
@@ -142,7 +133,3 @@ def _hull_volume(grid: CellGrid, boxes: ShearedBoxes, parts: list[Cell], chosen:
         if some.size:
             total += float(np.prod(upper.max(axis=0) - lower.min(axis=0)))
     return total
-
-
-def _replaced(box: ParameterBox, lower: Float64Array, upper: Float64Array) -> ParameterBox:
-    return ParameterBox(box.names, box.units, tuple(lower.tolist()), tuple(upper.tolist()))

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping
-from typing import Any
 
 import numpy as np
 
@@ -37,11 +36,8 @@ class LocationStore(Store):
         # what is excluded is known by what is left
         if leaf.verdict != "certified":
             ends = json.dumps(leaf.cell.first), json.dumps(leaf.cell.past)
-            self._keep((_CELL, 0.0, int(frame), *ends, leaf.verdict, leaf.reason, "[]"))
-
-    def _keep(self, row: tuple[Any, ...]) -> None:
-        self._base.execute(f"INSERT INTO search_settled VALUES ({', '.join('?' * len(row))})", row)
-        self._seals.settled.add(row)
+            row = _CELL, 0.0, int(frame), *ends, leaf.verdict, leaf.reason, "[]"
+            self._insert("search_settled", row, self._seals.settled)
 
     def close_block(self, block: CellBlock, findings: BlockResult, grid: CellGrid) -> bool:
         best: FoundPose | None = getattr(findings, "best", None)
@@ -53,7 +49,8 @@ class LocationStore(Store):
             if better or (best.outliers <= self.allowed and len(stored) < _POSES and best not in stored):
                 with self._transaction():
                     ends = json.dumps(best.values), "[]"
-                    self._keep((_POSE, float(best.outliers), int(block.frame), *ends, "", "", "[]"))
+                    row = _POSE, float(best.outliers), int(block.frame), *ends, "", "", "[]"
+                    self._insert("search_settled", row, self._seals.settled)
         return True
 
     def poses(self, frame: int) -> list[FoundPose]:
@@ -93,7 +90,6 @@ class LocationStore(Store):
                             0.0,
                             None if pose is None else self._list(frame, box, pose.values),
                         )
-                        rows.append(self._base.execute(f"INSERT INTO cells VALUES ({', '.join('?' * 7)})", row))
-                        rows[-1] = rows[-1].lastrowid
+                        rows.append(self._insert("cells", row, None))
             self._put("open_rows", rows)
             self._put("seconds", self.seconds)

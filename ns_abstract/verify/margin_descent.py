@@ -27,9 +27,7 @@ def descend(
 
     Args:
         box: Limits of the parameters.
-        start: Where the descent begins.
         value: Of parameter values [d]; differentiable.
-        steps: Most steps.
         enough: Whether the least value so far ends the descent.
     """
     low, high = (torch.tensor(v, dtype=torch.float64) for v in (box.lower, box.upper))

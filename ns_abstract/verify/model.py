@@ -58,7 +58,7 @@ class NetworkModel:
         return self.network(self.preprocess.apply(images))
 
     def input_sets(self, linear: tuple[np.ndarray, ...], lower: np.ndarray, upper: np.ndarray) -> ImageSets:
-        return self.preprocess.sets((linear[0], linear[1], linear[2], linear[3]), lower, upper)
+        return self.preprocess.input_sets((linear[0], linear[1], linear[2], linear[3]), lower, upper)
 
     @property
     def reusable_anywhere(self) -> bool:
@@ -81,20 +81,20 @@ class NetworkModel:
         )
         return output_bounds if d else dataclasses.replace(output_bounds, a=output_bounds.a[..., :0])
 
-    def branch(self, images: ImageSets, query: Query, groups: Sequence[Sequence[int]], most: int) -> float:
+    def branch(self, images: ImageSets, query: Query, groups: Sequence[Sequence[int]], most_branches: int) -> float:
         """A lower bound of the margin ``min over groups of max over its rows`` in the one cell of ``images``.
 
-        It is positive if ``most`` branches on the signs of units prove it (N16).
+        It is positive if ``most_branches`` branches on the signs of units prove it (N16).
         """
-        rows, offset = query.rows, query.offset
+        sets, rows, offset = parametric(images), query.rows, query.offset
         return branch(
-            self.network, parametric(images), rows, offset, groups, most, memory=self.memory, arithmetic=self.arithmetic
+            self.network, sets, rows, offset, groups, most_branches, memory=self.memory, arithmetic=self.arithmetic
         ).least
 
 
 @dataclasses.dataclass(frozen=True)
 class ModelSharedBounds:
-    """Bounds of a cell, and of others with its coefficients; see `ns_abstract.verify.protocol.SharedBounds`."""
+    """Bounds of a cell, and of others with its coefficients; `fresh` ones bound the last activation anew."""
 
     shared_bounds: SharedCoefficients
 

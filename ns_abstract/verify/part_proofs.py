@@ -40,7 +40,6 @@ class CellPart:
     """A part of a cell, in whole units.
 
     Attributes:
-        cell: The part.
         verdict: "certified": the property holds at every pose; "falsified": at none; None: it is to be examined.
         margin: Proven lower bound of the margin of a certified part, proven upper bound of a falsified one's.
     """
@@ -97,7 +96,7 @@ class PartQuestion:
         check_cancelled()
         box = grid.box_of(cell)
         try:
-            linear, lower, upper, slopes = scene.sets(box)
+            linear, lower, upper, slopes = scene.linear_sets(box)
         except InputError:
             raise
         except FAILURES:

@@ -134,7 +134,6 @@ class TiledPhoto:
         low, high: [T, side, side, 3] values of a picture that explains a pixel.
         counted: [T, side, side] which pixels count; false beyond the photo's edges.
         allowed: Pixels of the whole photo that may show anything.
-        brightness: What the camera may do to all values alike.
         shown: `Photo.shown` in tiles, where that is anything.
     """
 

@@ -41,11 +41,7 @@ class Region:
     name: str = "region"
 
     def pixels(self, height: int, width: int) -> np.ndarray:
-        """[H, W] bool.
-
-        Raises:
-            InputError: It reaches beyond the picture, the mask has another size or nothing white.
-        """
+        """[H, W] bool."""
         chosen = np.ones((height, width), bool)
         if self.mask is not None:
             chosen = read_grey_mask(self.mask)
@@ -85,9 +81,8 @@ class Measure:
     Attributes:
         plane: What it is read off.
         channels: [c] how much each channel of the plane counts, not negative.
-        rank: The so many-th largest of the region's pixels; None: their mean.
+        rank: The so many-th largest of the region's pixels, or smallest where ``least``; None: their mean.
         pixels: [n] places of the region's pixels, row by row.
-        least: Whether ``rank`` counts from the smallest pixel on.
         minus: [k] places of a second region, the same statistic of which is subtracted; None: nothing is.
         cap: Pixels above it count as it.
     """
@@ -171,10 +166,10 @@ def ranked(values: np.ndarray, place: int) -> np.ndarray:
     return np.partition(some, place - first, axis=1)[:, place - first]
 
 
-def shared_counts(effects: np.ndarray, most: int) -> np.ndarray:
-    """Return [d] numbers of parts, powers of two, ``most`` together or fewer, more where ``effects`` [d] are larger."""
+def shared_counts(effects: np.ndarray, most_parts: int) -> np.ndarray:
+    """Return [d] numbers of parts, powers of two, ``most_parts`` together or fewer; larger ``effects`` get more."""
     counts = np.ones(len(effects), np.int64)
-    while effects.size and np.max(effects / counts) > 0.0 and 2 * counts.prod() <= most:
+    while effects.size and np.max(effects / counts) > 0.0 and 2 * counts.prod() <= most_parts:
         counts[int(np.argmax(effects / counts))] *= 2
     return counts
 

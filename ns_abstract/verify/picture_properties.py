@@ -19,8 +19,8 @@ from ns_abstract.arithmetic.network_charges import OWN_MARGIN
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.fields import known
-from ns_abstract.io.jsonio import MODERATE, file_beside, is_number, show
+from ns_abstract.io.fields import fail, known
+from ns_abstract.io.jsonio import MODERATE, file_beside, is_number, show, unusable
 from ns_abstract.perturbation.variations import parse_selection
 from ns_abstract.refine.protocol import COLORS, WeightPlane
 from ns_abstract.verify.network import ImageSets, OutputBounds
@@ -60,8 +60,6 @@ class Leaf:
         plane, statistic, region, minus: What is measured; see `Measure`.
         channels: How much each channel of the plane counts.
         pixels: The so many-th largest pixel, for the statistic "rank": a number, or a part of the region.
-        low, high: Limits; infinite where there is none.
-        cap: See `Measure`.
     """
 
     sentence: str
@@ -204,11 +202,7 @@ class PictureProperty(Property):
         return PictureClaim(self.statement, tuple((leaf.low, leaf.high) for leaf in leaves(self.statement)))
 
     def model(self, height: int, width: int) -> MeasureModel:
-        """The measures in the place of a network, of pictures of this size whose colours come first.
-
-        Raises:
-            InputError: A region does not lie in them.
-        """
+        """The measures in the place of a network, of pictures of this size whose colours come first."""
         others = [plane for plane in self.planes if plane != "colors"]
         measures = self.measures(height, width)
         places = [0 if m.plane == "colors" else COLORS + others.index(m.plane) for m in measures]
@@ -270,10 +264,10 @@ class MeasureModel:
         lower = np.stack([np.resize(row, (most, *row.shape[1:])).ravel() for row in rows])
         return OutputBounds(lower, np.zeros((*lower.shape, 1)), lower)
 
-    def part_counts(self, images: ImageSets, most: int) -> np.ndarray:
-        """[d] numbers of parts of one cell, at most ``most`` together, more where its pictures change more."""
+    def part_counts(self, images: ImageSets, most_parts: int) -> np.ndarray:
+        """[d] numbers of parts of one cell, at most ``most_parts`` together, more where its pictures change more."""
         (planes,) = planes_of(images, self.channels)
-        return self._counts(planes, most)
+        return self._counts(planes, most_parts)
 
     def bound_parts(self, images: ImageSets, counts: np.ndarray, overlap: float) -> OutputBounds:
         """`bound` of equal parts of one cell, ``counts`` [d] along its parameters, each as if it were a cell (Q8).
@@ -285,11 +279,11 @@ class MeasureModel:
         lower = rows.reshape(len(rows), -1)
         return OutputBounds(lower, np.zeros((*lower.shape, 1)), lower)
 
-    def _counts(self, planes: PlaneSets, most: int) -> np.ndarray:
-        """[d] numbers of parts of a cell, ``most`` together or fewer where there are many pixels."""
+    def _counts(self, planes: PlaneSets, most_parts: int) -> np.ndarray:
+        """[d] numbers of parts of a cell, ``most_parts`` together or fewer where there are many pixels."""
         read = np.unique(np.concatenate([m.pixels for m in self.measures]))
         effects = np.abs(planes.linear[0][read].astype(np.float64)).sum(axis=(0, 1))
-        return shared_counts(effects, max(1, min(most, _NUMBERS // read.size)))
+        return shared_counts(effects, max(1, min(most_parts, _NUMBERS // read.size)))
 
     def _over(self, planes: PlaneSets, parts: CellParts) -> np.ndarray:
         """[parts, 2, leaves] lower bounds of values and of their negatives."""
@@ -297,7 +291,7 @@ class MeasureModel:
         low, high = (np.stack(side, axis=1) for side in zip(*ends, strict=True))
         return np.stack([low, -high], axis=1)
 
-    def branch(self, images: ImageSets, query: Query, groups: Sequence[Sequence[int]], most: int) -> float:
+    def branch(self, images: ImageSets, query: Query, groups: Sequence[Sequence[int]], most_branches: int) -> float:
         """Nothing: there are no activations."""
         return -math.inf
 
@@ -308,14 +302,6 @@ class MeasureModel:
 COMMON = ("preprocess", "partitions")
 #: Keys of every leaf.
 _PLACE = ("region", "mask")
-
-
-def _fail(name: str, found: Any, fix: str) -> InputError:
-    return InputError(f"found {show(found)}", field=name, fix=fix)
-
-
-def _raised(name: str, problem: str, fix: str) -> InputError:
-    return InputError(problem, field=name, fix=fix)
 
 
 class _PropertyObject(NamedTuple):
@@ -330,16 +316,16 @@ class _PropertyObject(NamedTuple):
         """A number between two others, the ends included."""
         value = self.root.get(key, otherwise)
         if value is None:
-            raise _raised(f"{self.prefix}{key}", "missing", f"write a number from {low:g} to {high:g}")
+            raise fail(f"{self.prefix}{key}", "missing", f"write a number from {low:g} to {high:g}")
         if not (is_number(value) and low <= value <= high):
-            raise _fail(f"{self.prefix}{key}", value, f"write a number from {low:g} to {high:g}")
+            raise unusable(value, field=f"{self.prefix}{key}", fix=f"write a number from {low:g} to {high:g}")
         return float(value)
 
     def choice(self, key: str, values: Sequence[str]) -> str:
         """One of some names, the first if there is none."""
         value = self.root.get(key, values[0])
         if value not in values or not isinstance(value, str):
-            raise _fail(f"{self.prefix}{key}", value, f"write one of {', '.join(values)}")
+            raise unusable(value, field=f"{self.prefix}{key}", fix=f"write one of {', '.join(values)}")
         return value
 
     def region(self, key: str = "region") -> Region:
@@ -347,21 +333,19 @@ class _PropertyObject(NamedTuple):
         name = f"{self.prefix}{key}"
         box, mask = self.root.get(key), self.root.get("mask") if key == "region" else None
         if box is not None and mask is not None:
-            raise _raised(f"{self.prefix}mask", "given together with region", "write one of them")
+            raise fail(f"{self.prefix}mask", "given together with region", "write one of them")
         if mask is not None:
             if not isinstance(mask, str) or not mask:
-                raise _fail(f"{self.prefix}mask", mask, "write the name of a .png, relative to this file")
-            try:
-                return Region(mask=file_beside(self.folder, mask), name=f"{self.prefix}mask")
-            except InputError as error:
-                raise InputError(error.problem, field=f"{self.prefix}mask", fix=error.fix) from None
+                raise unusable(mask, field=f"{self.prefix}mask", fix="write the name of a .png, relative to this file")
+            name = f"{self.prefix}mask"
+            return Region(mask=file_beside(self.folder, mask, name), name=name)
         if box is None or box == "all":
             return Region(name=name)
         if not (isinstance(box, list) and len(box) == 4 and all(type(v) is int and 0 <= v < 1 << 20 for v in box)):
-            raise _fail(name, box, 'write pixels [x0, y0, x1, y1], whole numbers of at least 0, or "all"')
+            raise unusable(box, field=name, fix='write pixels [x0, y0, x1, y1], whole numbers of at least 0, or "all"')
         x0, y0, x1, y1 = box
         if not (x0 < x1 and y0 < y1):
-            raise _fail(name, box, "write [x0, y0, x1, y1] with x0 < x1 and y0 < y1")
+            raise unusable(box, field=name, fix="write [x0, y0, x1, y1] with x0 < x1 and y0 < y1")
         return Region(box=(x0, y0, x1, y1), name=name)
 
 
@@ -373,21 +357,21 @@ def _below(number: float) -> float:
 def _visible(source: _PropertyObject) -> Leaf:
     root, prefix = source.root, source.prefix
     if "select" not in root:
-        raise _raised(f"{prefix}select", "missing", 'write {"box": [[x0, y0, z0], [x1, y1, z1]]}')
-    select = parse_selection(root["select"], f"{prefix}select", _raised, source.folder)
+        raise fail(f"{prefix}select", "missing", 'write {"box": [[x0, y0, z0], [x1, y1, z1]]}')
+    select = parse_selection(root["select"], f"{prefix}select", fail, source.folder)
     weight, region = source.number("weight", MODERATE[0], 1.0, 0.5), source.region()
     if "pixels" in root and "fraction" in root:
-        raise _raised(f"{prefix}fraction", "given together with pixels", "write one of them")
+        raise fail(f"{prefix}fraction", "given together with pixels", "write one of them")
     pixels: int | float = 1
     if "fraction" in root:
         pixels = source.number("fraction", 0.0, 1.0)
         if pixels == 0.0:
-            raise _fail(f"{prefix}fraction", root["fraction"], "write a number above 0")
+            raise unusable(root["fraction"], field=f"{prefix}fraction", fix="write a number above 0")
         count = f"{pixels:.4g} of the pixels"
     else:
         pixels = root.get("pixels", 1)
         if type(pixels) is not int or not 1 <= pixels < 1 << 40:
-            raise _fail(f"{prefix}pixels", pixels, "write a whole number of at least 1")
+            raise unusable(pixels, field=f"{prefix}pixels", fix="write a whole number of at least 1")
         count = f"{pixels} {'pixel' if pixels == 1 else 'pixels'}"
     sentence = f"at least {count} of {region} get a weight of at least {weight:g} from what is selected"
     return Leaf(sentence, WeightPlane(select), "rank", region, pixels=pixels, low=_below(weight))
@@ -401,7 +385,7 @@ def _clear(source: _PropertyObject) -> Leaf:
     distance, region = distance_given * scale, source.region()
     if source.choice("measure", ("weight", "expected")) == "expected":
         if "weight" in root:
-            raise _raised(f"{prefix}weight", "given with the expected depth", "remove it, or measure")
+            raise fail(f"{prefix}weight", "given with the expected depth", "remove it, or measure")
         sentence = f"the expected depth is above {distance_given:g} {unit} everywhere in {region}"
         # twice as far is as good as any
         return Leaf(sentence, "depth", "least", region, low=distance, cap=2.0 * distance)
@@ -415,11 +399,11 @@ def _picture(source: _PropertyObject) -> Leaf:
     statistic, channel = source.choice("statistic", STATISTICS), source.choice("channel", tuple(CHANNELS))
     region, minus = source.region(), source.region("minus") if "minus" in root else None
     if "min" not in root and "max" not in root:
-        raise _raised(f"{prefix}min", "missing", "write min, max or both")
+        raise fail(f"{prefix}min", "missing", "write min, max or both")
     low = source.number("min", -1.0, 1.0) if "min" in root else -math.inf
     high = source.number("max", -1.0, 1.0) if "max" in root else math.inf
     if low > high:
-        raise _raised(f"{prefix}min", f"{low:g} is above max {high:g}", "write the smaller limit under min")
+        raise fail(f"{prefix}min", f"{low:g} is above max {high:g}", "write the smaller limit under min")
     what = f"the {statistic} {channel} of {region}"
     if minus is not None:
         what += f" less that of {minus}"
@@ -453,45 +437,38 @@ def parse_picture_property(root: dict[str, Any], folder: Path, dataset_scale: fl
     """Return the property of the picture that a parsed PROP.json states; files that it names lie in ``folder``.
 
     ``dataset_scale``: normalised units per unit of the data set.
-
-    Raises:
-        InputError: A field cannot be used.
     """
     value = root.get("preprocess", {})
     if isinstance(value, dict):
-        known(value, ("resize",), "preprocess.", _raised)
+        known(value, ("resize",), "preprocess.", fail)
     common: dict[str, Any] = {"preprocess": parse_preprocess(value), "partitions": parse_partitions(root)}
     statement = parse_statement(root, folder, dataset_scale, COMMON)
     if sum(1 for _ in leaves(statement)) > _MOST_LEAVES:
-        raise _raised("type", f"more than {_MOST_LEAVES} statements", "split the file")
+        raise fail("type", f"more than {_MOST_LEAVES} statements", "split the file")
     return PictureProperty(statement, **common)
 
 
 def parse_statement(
     root: Any, folder: Path, dataset_scale: float, common: tuple[str, ...] = (), prefix: str = "", depth: int = 0
 ) -> Statement:
-    """Return the statement of an object; ``prefix`` is its place, ``common`` are keys that may stand beside it.
-
-    Raises:
-        InputError: A field cannot be used.
-    """
+    """Return the statement of an object; ``prefix`` is its place, ``common`` are keys that may stand beside it."""
     if not isinstance(root, dict):
-        raise _fail(prefix.rstrip(".") or "type", root, 'write an object {"type": ...}')
+        raise unusable(root, field=prefix.rstrip(".") or "type", fix='write an object {"type": ...}')
     kinds = [name for name in ("all", "any") if name in root]
     if kinds:
-        known(root, (*kinds[:1], *common), prefix, _raised)
+        known(root, (*kinds[:1], *common), prefix, fail)
         parts, name = root[kinds[0]], f"{prefix}{kinds[0]}"
         if not isinstance(parts, list) or not parts or depth >= _DEEPEST:
-            raise _fail(name, parts, f"write a list of properties, nested at most {_DEEPEST} times")
+            raise unusable(parts, field=name, fix=f"write a list of properties, nested at most {_DEEPEST} times")
         inner = [
             parse_statement(part, folder, dataset_scale, (), f"{name}[{k}].", depth + 1) for k, part in enumerate(parts)
         ]
         return Combined(kinds[0] == "all", tuple(inner))
     kind = root.get("type")
     if not isinstance(kind, str) or kind not in PICTURE_TYPES:
-        raise _raised(
+        raise fail(
             f"{prefix}type", "missing" if kind is None else f"found {show(kind)}",
             f"write one of {', '.join(PICTURE_TYPES)}",
         )  # fmt: skip
-    known(root, (*PICTURE_TYPES[kind].keys, *common), prefix, _raised)
+    known(root, (*PICTURE_TYPES[kind].keys, *common), prefix, fail)
     return PICTURE_TYPES[kind].parse(_PropertyObject(root, prefix, folder, dataset_scale))

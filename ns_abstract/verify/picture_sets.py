@@ -42,7 +42,7 @@ def flatter_where_better(
 
 @dataclass(frozen=True)
 class PictureSets:
-    """Linear sets of pictures over a box, from `ns_abstract.verify.protocol.FrameImages.sets`."""
+    """Linear sets of pictures over a box, from `ns_abstract.verify.protocol.FrameImages.linear_sets`."""
 
     box: ParameterBox
     linear: tuple[np.ndarray, ...]
@@ -66,10 +66,7 @@ def hull_of_sets(parts: Sequence[PictureSets]) -> PictureSets:
     """Return linear sets over the hull of the boxes of ``parts`` that contain every picture of each (V15)."""
     boxes = [sets.box for sets in parts]
     lower, upper = (np.array([getattr(box, name) for box in boxes]) for name in ("lower", "upper"))
-    first = boxes[0]
-    around = ParameterBox(
-        first.names, first.units, tuple(lower.min(axis=0).tolist()), tuple(upper.max(axis=0).tolist())
-    )
+    around = boxes[0].with_ends(lower.min(axis=0), upper.max(axis=0))
     middle, half = 0.5 * (lower + upper), 0.5 * (upper - lower)
     center, reach = around.middle, 0.5 * (np.array(around.upper) - np.array(around.lower))
     # p of the wider box is ``place + share q`` for q of a part
@@ -78,7 +75,7 @@ def hull_of_sets(parts: Sequence[PictureSets]) -> PictureSets:
     # any slopes will do: these are the least squares' of the parts' middles, each taken by its volume
     weight = np.maximum(share, _TUNING.least_share).prod(axis=1)
     weight /= weight.sum()
-    d, ones = first.dimensions, (1,) * (b_low.ndim - 1)
+    d, ones = around.dimensions, (1,) * (b_low.ndim - 1)
     slope, value = 0.5 * (a_low + a_high), 0.5 * (b_low + b_high)
     # float32's place is enough for what is arbitrary
     at, by = place.reshape(-1, *ones, d), share.reshape(-1, *ones, d)

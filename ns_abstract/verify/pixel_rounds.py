@@ -43,17 +43,13 @@ class PixelRounds:
     """Counts for each sub-box of a cell the pixels that exclude it, while these are bounded a part at a time (U8).
 
     Args:
-        photo: The photo.
         order: [n] numbers of the pixels to bound, in the order of `TiledPhoto.counted` flattened, the first one first.
-        sub_boxes: Number of sub-boxes; 1: the cell itself.
         inherited: [T, side, side] counted pixels that exclude the whole cell by bounds over a larger one (U9); they are
             not bounded again. None: there are none.
-        tuning: Preferences.
 
     Attributes:
         bounded: [T, side, side] pixels whose bounds were counted, and those inherited.
         numbers: [k] pixels so far that exclude each sub-box.
-        taken: Number of pixels of the order that were taken.
     """
 
     def __init__(
@@ -143,14 +139,8 @@ class PixelRounds:
 class BoundedPixels:
     """Linear bounds of a cell's pixels, as far as they were bounded; other pixels are NaN and exclude nothing (U8).
 
-    Args:
-        photo: The photo.
-        dimensions: Parameters of the cell.
-
     Attributes:
         outliers: [T, side, side] counted pixels that nothing in the cell explains, as far as is known.
-        lower, upper: [T, side, side, 3].
-        linear: Linear bounds, likewise.
     """
 
     def __init__(self, photo: TiledPhoto, dimensions: int) -> None:
@@ -188,19 +178,18 @@ class BoundedPixels:
 
 
 def telling_order(
-    gaps: Float64Array, likely: Float64Array, loose: Float64Array, counted: np.ndarray, most: int
+    gaps: Float64Array, likely: Float64Array, loose: Float64Array, counted: np.ndarray, most_pixels: int
 ) -> tuple[np.ndarray, int]:
-    """Numbers of the pixels to bound, at most ``most``, and how many of them are likely to exclude the cell.
+    """Numbers of the pixels to bound, at most ``most_pixels``, and how many of them are likely to exclude the cell.
 
     Args:
         gaps: [T, side, side] by how much the picture in the cell's middle misses the photo there.
         likely: [T, side, side] by how much all bounds over the cell are expected to.
         loose: [T, side, side] expected looseness of bounds: where they are loose they also take longer.
-        counted: [T, side, side] which pixels count.
     """
     sure = counted & (likely > 0.0)
     some = counted & (gaps > 0.0) & ~sure
     first, rest = np.flatnonzero(sure), np.flatnonzero(some)
     order = [first[np.argsort((loose - likely).reshape(-1)[first], kind="stable")]]
     order.append(rest[np.argsort(-gaps.reshape(-1)[rest], kind="stable")])
-    return np.concatenate(order)[:most], first.size
+    return np.concatenate(order)[:most_pixels], first.size

@@ -15,8 +15,8 @@ import torch
 
 from ns_abstract.arithmetic.rounding import PREPROCESS_ROUNDING, PREPROCESSED_ROUNDING
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.fields import known
-from ns_abstract.io.jsonio import FIX_MODERATE, is_moderate, show
+from ns_abstract.io.fields import fail, known
+from ns_abstract.io.jsonio import FIX_MODERATE, is_moderate, unusable
 
 if TYPE_CHECKING:
     from ns_abstract.verify.network import ImageSets
@@ -31,8 +31,6 @@ class Preprocess:
     Attributes:
         resize: Height and width of the network's input, or None where the camera path has them already.
         mean, std: Three numbers each, for the channels as the network sees them.
-        layout: "NCHW" or "NHWC".
-        channels: "RGB" or "BGR".
         range: What the picture's 0 and 1 become before mean and std.
     """
 
@@ -103,7 +101,7 @@ class Preprocess:
         values = (images * constants[1] + constants[0] - constants[2]) / constants[3]
         return values.permute(0, 3, 1, 2) if self.layout == "NCHW" else values
 
-    def sets(
+    def input_sets(
         self,
         linear: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
         lower: np.ndarray,
@@ -155,42 +153,38 @@ class Preprocess:
 
 
 def parse_preprocess(value: Any) -> Preprocess:
-    """Parse and check the object under the key ``preprocess`` of a property file.
+    """Parse and check the object under the key ``preprocess`` of a property file."""
 
-    Raises:
-        InputError: A key is unknown, or a value cannot be used.
-    """
-
-    def fail(name: str, found: Any, fix: str) -> InputError:
-        return InputError(f"found {show(found)}", field=f"preprocess{name}", fix=fix)
+    def refused(name: str, found: Any, fix: str) -> InputError:
+        return unusable(found, field=f"preprocess{name}", fix=fix)
 
     if not isinstance(value, dict):
-        raise fail("", value, "write an object")
-    known(value, KEYS, "preprocess.", lambda name, problem, fix: InputError(problem, field=name, fix=fix))
+        raise refused("", value, "write an object")
+    known(value, KEYS, "preprocess.", fail)
 
     def numbers(name: str, count: int, default: tuple[float, ...]) -> tuple[float, ...]:
         numbers = value.get(name, list(default))
         if not (isinstance(numbers, list) and len(numbers) == count and all(is_moderate(v) for v in numbers)):
-            raise fail(f".{name}", numbers, f"write {count} numbers, each {FIX_MODERATE}")
+            raise refused(f".{name}", numbers, f"write {count} numbers, each {FIX_MODERATE}")
         return tuple(float(v) for v in numbers)
 
     def choice(name: str, choices: tuple[str, str]) -> str:
         chosen = value.get(name, choices[0])
         if chosen not in choices or not isinstance(chosen, str):
-            raise fail(f".{name}", chosen, f"write {' or '.join(choices)}")
+            raise refused(f".{name}", chosen, f"write {' or '.join(choices)}")
         return chosen
 
     resize = value.get("resize")
     if resize is not None and not (
         isinstance(resize, list) and len(resize) == 2 and all(type(v) is int and 1 <= v <= 16384 for v in resize)
     ):
-        raise fail(".resize", resize, "write [height, width] in pixels")
+        raise refused(".resize", resize, "write [height, width] in pixels")
     std = numbers("std", 3, (1.0, 1.0, 1.0))
     if not min(std) > 0.0:
-        raise fail(".std", value["std"], "write three numbers above 0")
+        raise refused(".std", value["std"], "write three numbers above 0")
     ends = numbers("range", 2, (0.0, 1.0))
     if not ends[0] < ends[1]:
-        raise fail(".range", value["range"], "write the smaller end first")
+        raise refused(".range", value["range"], "write the smaller end first")
     return Preprocess(
         resize=None if resize is None else (resize[0], resize[1]),
         mean=numbers("mean", 3, (0.0, 0.0, 0.0)),

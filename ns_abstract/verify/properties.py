@@ -80,11 +80,7 @@ class Property(ABC):
 
     @abstractmethod
     def bind(self, pose_set: PoseBox, nominal: Callable[[], np.ndarray]) -> Claim:
-        """The claim about a frame; ``nominal`` gives outputs [n] at the middle of the set.
-
-        Raises:
-            InputError: The property makes no sense for this frame.
-        """
+        """The claim about a frame; ``nominal`` gives outputs [n] at the middle of the set."""
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.fields import known
-from ns_abstract.io.jsonio import FIX_MODERATE, MODERATE, file_beside, is_moderate, is_number, show
+from ns_abstract.io.fields import fail, known
+from ns_abstract.io.jsonio import FIX_MODERATE, MODERATE, file_beside, is_moderate, is_number, show, unusable
 from ns_abstract.verify.preprocess import parse_preprocess
 from ns_abstract.verify.properties import (
     CLASSES,
@@ -46,30 +46,18 @@ class _Type(NamedTuple):
     parse: Callable[[dict[str, Any], _KeySetting, dict[str, Any]], Property]
 
 
-def _fail(name: str, found: Any, fix: str) -> InputError:
-    return InputError(f"found {show(found)}", field=name, fix=fix)
-
-
 def loading(root: Any) -> dict[str, Any]:
-    """Return the keywords of `load_network` in a parsed PROP.json: the output, and the size of the pictures.
-
-    Raises:
-        InputError: A field cannot be used.
-    """
+    """Return the keywords of `load_network` in a parsed PROP.json: the output, and the size of the pictures."""
     if not isinstance(root, dict):
         return {}
     output = root.get("output")
     if "output" in root and not (isinstance(output, str) and output):
-        raise _fail("output", output, "write the name of one of the network's outputs")
+        raise unusable(output, field="output", fix="write the name of one of the network's outputs")
     return parse_preprocess(root.get("preprocess", {})).loading(output)
 
 
 def parse_property(root: Any, folder: Path, input_shape: tuple[int, ...], output_shape: tuple[int, ...]) -> Property:
-    """Return the property that a parsed PROP.json describes; files that it names lie in ``folder``.
-
-    Raises:
-        InputError: A field cannot be used.
-    """
+    """Return the property that a parsed PROP.json describes; files that it names lie in ``folder``."""
     if not isinstance(root, dict):
         raise InputError(f"the top level is {show(root)}, not an object", fix='write {"type": ...}')
     kind = root.get("type")
@@ -77,7 +65,7 @@ def parse_property(root: Any, folder: Path, input_shape: tuple[int, ...], output
         raise InputError(
             "missing" if kind is None else f"found {show(kind)}", field="type", fix=f"write one of {', '.join(_TYPES)}"
         )
-    known(root, (*_COMMON, *_TYPES[kind].keys), "", lambda name, problem, fix: InputError(problem, field=name, fix=fix))
+    known(root, (*_COMMON, *_TYPES[kind].keys), "", fail)
     preprocess = parse_preprocess(root.get("preprocess", {}))
     height, width = preprocess.size(input_shape)
     common: dict[str, Any] = {"preprocess": preprocess, "partitions": parse_partitions(root)}
@@ -92,17 +80,13 @@ def property_keys() -> dict[str, tuple[str, ...]]:
 
 
 def parse_partitions(root: dict[str, Any]) -> tuple[int, ...] | None:
-    """Return the fixed partition that a parsed PROP.json asks for, or None.
-
-    Raises:
-        InputError: It is no number and no list of numbers.
-    """
+    """Return the fixed partition that a parsed PROP.json asks for, or None."""
     value = root.get("partitions")
     if value is None:
         return None
     counts = value if isinstance(value, list) else [value]
     if not counts or not all(type(v) is int and 1 <= v <= 10**9 for v in counts):
-        raise _fail("partitions", value, "write a number of parts, or a list with one by parameter")
+        raise unusable(value, field="partitions", fix="write a number of parts, or a list with one by parameter")
     return tuple(counts)
 
 
@@ -111,7 +95,7 @@ def _classification(root: dict[str, Any], setting: _KeySetting, common: dict[str
     if outputs < 2:
         raise InputError(f"the network has {outputs} output", field="type", fix="use a classifier")
     if type(label) is not int or not 0 <= label < outputs:
-        raise _fail("label", label, f"write an integer from 0 to {outputs - 1}, the number of an output")
+        raise unusable(label, field="label", fix=f"write an integer from 0 to {outputs - 1}, the number of an output")
     return Classification(label=label, classes=outputs, **common)
 
 
@@ -123,20 +107,20 @@ def _regression(root: dict[str, Any], setting: _KeySetting, common: dict[str, An
         target = [target]
     if not isinstance(target, list) or not all(is_moderate(v) or v in COMPONENTS for v in target):
         names = f"numbers ({FIX_MODERATE}) or {', '.join(COMPONENTS)}"
-        raise _fail("target", root.get("target"), f"write camera, object, distance, or a list of {names}")
+        raise unusable(root.get("target"), field="target", fix=f"write camera, object, distance, or a list of {names}")
     if len(target) != outputs:
         raise InputError(
             f"{len(target)} values, the network has {outputs} outputs", field="target", fix="write one value by output"
         )
     origin = root.get("origin", [0.0, 0.0, 0.0])
     if not (isinstance(origin, list) and len(origin) == 3 and all(is_moderate(v) for v in origin)):
-        raise _fail("origin", origin, f"write a point of the normalised frame, each number {FIX_MODERATE}")
+        raise unusable(origin, field="origin", fix=f"write a point of the normalised frame, each number {FIX_MODERATE}")
     scale = root.get("scale", 1.0)
     if not is_moderate(scale) or scale == 0:
-        raise _fail("scale", scale, f"write a number other than 0: {FIX_MODERATE}")
+        raise unusable(scale, field="scale", fix=f"write a number other than 0: {FIX_MODERATE}")
     tolerance = root.get("tolerance")
     if not isinstance(tolerance, dict) or len(tolerance) != 1 or not set(tolerance) <= {"absolute", "relative"}:
-        raise _fail("tolerance", tolerance, 'write {"relative": 0.2} or {"absolute": 0.1}')
+        raise unusable(tolerance, field="tolerance", fix='write {"relative": 0.2} or {"absolute": 0.1}')
     absolute: tuple[float, ...] | None = None
     relative: float | None = None
     name, value = next(iter(tolerance.items()))
@@ -144,7 +128,7 @@ def _regression(root: dict[str, Any], setting: _KeySetting, common: dict[str, An
     if not all(is_moderate(v) and v > 0 for v in values) or len(values) not in (1, outputs):
         more = f" or {outputs} of them" if name == "absolute" else ""
         low, high = MODERATE
-        raise _fail(f"tolerance.{name}", value, f"write a number from {low:g} to {high:g}{more}")
+        raise unusable(value, field=f"tolerance.{name}", fix=f"write a number from {low:g} to {high:g}{more}")
     if name == "absolute":
         absolute = tuple(float(v) for v in values)
     else:
@@ -168,14 +152,16 @@ def _detection(root: dict[str, Any], setting: _KeySetting, common: dict[str, Any
             raise InputError("missing", field=name, fix="write a number, or null")
     label, iou, confidence, box = root["class"], root["iou"], root.get("confidence"), root.get("box")
     if label is not None and (type(label) is not int or not 0 <= label < CLASSES):
-        raise _fail("class", label, f"write an integer from 0 to {CLASSES - 1}, or null for objectness alone")
+        raise unusable(
+            label, field="class", fix=f"write an integer from 0 to {CLASSES - 1}, or null for objectness alone"
+        )
     for name, value in (("iou", iou), ("confidence", confidence)):
         if not (name == "iou" and value is None) and not (is_number(value) and MODERATE[0] <= value < 1):
-            raise _fail(name, value, f"write a number from {MODERATE[0]:g} to 1")
+            raise unusable(value, field=name, fix=f"write a number from {MODERATE[0]:g} to 1")
     if box is not None:
         good = isinstance(box, list) and len(box) == 4 and all(is_moderate(v) for v in box)
         if not good or not (box[0] < box[2] and box[1] < box[3]):
-            raise _fail("box", box, "write [x0, y0, x1, y1] in pixels of the network's input")
+            raise unusable(box, field="box", fix="write [x0, y0, x1, y1] in pixels of the network's input")
         if iou is None:
             raise InputError("given without iou", field="box", fix="write an iou, or remove the box")
         box = (float(box[0]), float(box[1]), float(box[2]), float(box[3]))
@@ -193,11 +179,8 @@ def _detection(root: dict[str, Any], setting: _KeySetting, common: dict[str, Any
 def _vnnlib(root: dict[str, Any], setting: _KeySetting, common: dict[str, Any]) -> Property:
     name = root.get("file")
     if not isinstance(name, str) or not name:
-        raise _fail("file", name, "write the name of a VNN-LIB file, relative to this one")
-    try:
-        file = file_beside(setting.folder, name)
-    except InputError as error:
-        raise InputError(error.problem, field="file", fix=error.fix) from None
+        raise unusable(name, field="file", fix="write the name of a VNN-LIB file, relative to this one")
+    file = file_beside(setting.folder, name, "file")
     return VnnLibProperty(file=file, unsafe=load_vnnlib(file, setting.output_shape, setting.input_shape), **common)
 
 

@@ -27,7 +27,7 @@ class FrameImages(Protocol):
         """Other scenes of the set, without end; none where only poses vary."""
         ...
 
-    def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
+    def linear_sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
         """(A_lower, b_lower, A_upper, b_upper) [H, W, 3, d] and [H, W, 3], lower, upper, and slopes [d]."""
         ...
 
@@ -69,14 +69,14 @@ class Model(Protocol):
         ...
 
     def input_sets(self, linear: tuple[np.ndarray, ...], lower: np.ndarray, upper: np.ndarray) -> ImageSets:
-        """Sets of the network's input; see `ns_abstract.verify.preprocess.Preprocess.sets`."""
+        """Sets of the network's input; see `ns_abstract.verify.preprocess.Preprocess.input_sets`."""
         ...
 
     def bound(self, images: ImageSets, query: Query) -> OutputBounds:
         """Bounds of the query's rows over the sets."""
         ...
 
-    def branch(self, images: ImageSets, query: Query, groups: Sequence[Sequence[int]], most: int) -> float:
+    def branch(self, images: ImageSets, query: Query, groups: Sequence[Sequence[int]], most_branches: int) -> float:
         """A lower bound of the margin of a linear claim over one set, by at most so many branches."""
         ...
 
@@ -85,35 +85,10 @@ class Model(Protocol):
 class PartsModel(Model, Protocol):
     """An optional interface of `Model`: bounds of parts of a cell cost next to nothing beside its sets."""
 
-    def part_counts(self, images: ImageSets, most: int) -> np.ndarray:
+    def part_counts(self, images: ImageSets, most_parts: int) -> np.ndarray:
         """[d] into how many parts one cell is best divided along its parameters, powers of two."""
         ...
 
     def bound_parts(self, images: ImageSets, counts: np.ndarray, overlap: float) -> OutputBounds:
         """Bounds of the query's rows over equal parts of one cell, a row for each, the last parameter's first."""
-        ...
-
-
-class SharedBounds(Protocol):
-    """Bounds of a cell, and of others with its coefficients (`SharedCoefficients`)."""
-
-    def first(self, query: Query) -> OutputBounds:
-        """Bounds of the query's rows over the cell."""
-        ...
-
-    def others(self, images: ImageSets, query: Query, *, fresh: bool = False) -> OutputBounds:
-        """The same over other cells."""
-        ...
-
-
-class SharedBoundsModel(Protocol):
-    """A network whose backward coefficients can be reused across cells."""
-
-    @property
-    def reusable_anywhere(self) -> bool:
-        """Whether rows of a cell serve for others that are no parts of it."""
-        ...
-
-    def shared_bounds(self, images: ImageSets) -> SharedBounds:
-        """Bounds of one cell, whose rows are to serve for others."""
         ...

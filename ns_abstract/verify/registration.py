@@ -51,9 +51,9 @@ class RegisteredImages:
         lower, upper = (*box.lower, *whole.lower[-PLACE:]), (*box.upper, *whole.upper[-PLACE:])
         return ParameterBox(whole.names, whole.units, lower, upper)
 
-    def sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
+    def linear_sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
         """As a scene's, but the linear sets have `PLACE` parameters more."""
-        linear, lower, upper, slopes = self.scene.sets(self.widened(box))
+        linear, lower, upper, slopes = self.scene.linear_sets(self.widened(box))
         return linear, lower, upper, slopes[:-PLACE]
 
     def differentiable(self, values: torch.Tensor) -> torch.Tensor:

@@ -33,11 +33,11 @@ class MarginTuning:
     close: float = 1.1
     stride: float = 4.0
     #: A radius below this part of the first one is called 0.
-    least: float = 2.0**-20
+    least_share: float = 2.0**-20
     #: Cuts of a cell one inside the other, parts by cut, and most parts that a cell is examined in.
     depth: int = 2
     parts: int = 4
-    most: int = 24
+    most_parts: int = 24
     #: Doublings of the radius in search of a scene that breaks what is certified.
     doublings: int = 6
     #: Trials that a report lists.
@@ -60,7 +60,7 @@ class VariationKind:
     text: str
     unit: str
     first: float
-    most: float
+    largest: float
     response: ResponseName | None = None
     place: tuple[str, ...] = ()
 
@@ -155,7 +155,6 @@ class SceneMargin:
         radius: All that was certified holds for all scenes this far from the stored one; 0: nothing more is known.
         reached, part: Radius at which the part of the certified volume holds that was looked at.
         state: "done", or "ended": by the time, or by a request to stop.
-        trials: Runs, in order.
         cells: How many are certified.
         example: Arrays that tell the scene of the smallest falsified radius, or None.
     """
@@ -189,7 +188,7 @@ class SceneMargin:
         """All of it for people."""
         kind, failing = self.kind, self.failing
         if self.radius > 0.0:
-            more = " (no larger one was tried)" if self.radius >= kind.most else ""
+            more = " (no larger one was tried)" if self.radius >= kind.largest else ""
             text = f"{kind.text} may be off by {self.radius:.4g} {kind.unit}{more}"
         elif self.state == "ended":
             text = (
@@ -275,12 +274,12 @@ class _Bisection:
 
     def largest(self, number: int, cell: CertifiedBox, ceiling: float | None) -> float:
         """The largest radius for one cell, of which more than ``ceiling`` is of no use; None: it is the first."""
-        most = self.kind.most if ceiling is None else ceiling
+        most = self.kind.largest if ceiling is None else ceiling
         radius = min(self.kind.first, most) if ceiling is None else ceiling
         low, high = 0.0, math.inf
         while low < most and not (low > 0.0 and high <= _TUNING.close * low):
             radius = min(most, three_digits(radius))
-            if radius < _TUNING.least * self.kind.first:
+            if radius < _TUNING.least_share * self.kind.first:
                 return 0.0
             if self._try(number, cell, radius):
                 low = radius
@@ -296,9 +295,9 @@ class _Bisection:
         """Larger radii, until a scene breaks what is certified."""
         radius = failing.radius
         for _ in range(_TUNING.doublings):
-            if radius >= self.kind.most:
+            if radius >= self.kind.largest:
                 return
-            radius = min(three_digits(2.0 * radius), self.kind.most)
+            radius = min(three_digits(2.0 * radius), self.kind.largest)
             self._try(failing.cell, cell, radius, cuts=False)
             if self.margin.trials[-1].outcome != "unknown":
                 return
@@ -335,7 +334,7 @@ class _Bisection:
                 if cuts and depth < _TUNING.depth
                 else []
             )
-            if not parts or count + len(waiting) + len(parts) > _TUNING.most:
+            if not parts or count + len(waiting) + len(parts) > _TUNING.most_parts:
                 return "unknown", outcome.reason, count, None
             waiting += [(entry, depth + 1) for entry in parts]
         return "holds", "", count, None

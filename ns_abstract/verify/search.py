@@ -29,7 +29,7 @@ from ns_abstract.verify.picture_sets import PictureSets
 from ns_abstract.verify.properties import Claim, LinearClaim, Query
 from ns_abstract.verify.protocol import ComparedCuts, FrameImages, Model, NearImages, PartsModel
 from ns_abstract.verify.search_results import FAILURES, BlockResult, FinishedCell, failure_text
-from ns_abstract.verify.subboxes import PixelWeights, SubBoxProof, margin_weights
+from ns_abstract.verify.sub_box_proof import PixelWeights, SubBoxProof, margin_weights
 
 #: Most cells examined together.
 BLOCK = 8
@@ -270,7 +270,7 @@ class Search:
         for cell in cells:
             check_cancelled()
             try:
-                linear, lower, upper, cell.slopes = cell.scene.sets(cell.box)
+                linear, lower, upper, cell.slopes = cell.scene.linear_sets(cell.box)
             except InputError:
                 raise
             except FAILURES as error:

@@ -18,12 +18,10 @@ class FinishedCell:
     """A finished cell with its verdict.
 
     Attributes:
-        verdict: "certified", "falsified" or "unknown".
         margin: Proven lower bound of the margin; that of the counterexample; or the best bound, or None.
         counterexample: Parameter values, or None.
         image: [H, W, 3] float32 picture of the counterexample, or None.
         outputs: [n] what the network says about it, or None.
-        reason: Why nothing is known, or "".
         undecided: Whether some picture of the cell says neither that the property holds nor that it fails.
         scene: What tells the counterexample's scene from others of the set, by name; None: only poses vary.
     """
@@ -45,8 +43,6 @@ class BlockResult:
     """The result of a block of cells.
 
     Attributes:
-        leaves: Cells that are done with.
-        blocks: Cells to examine next.
         ranks: How far off a proof of each block is, about (see `Search._rank`); the nearest are best examined first.
         samples: Whether the property was seen to hold at the middle of each cell.
         bounded: Cells whose network bounds were computed.

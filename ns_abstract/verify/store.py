@@ -74,9 +74,6 @@ class Store(StoreFile):
         parameters: Names and units of the parameters of all frames together.
         fixed: By frame, the values of parameters that do not vary in it.
         resume: Whether to go on with what is there; otherwise it is replaced.
-
-    Raises:
-        InputError: The folder cannot be written, or the stored search is another one or damaged.
     """
 
     def __init__(
@@ -114,9 +111,7 @@ class Store(StoreFile):
                 *(json.dumps(v) for v in (grid.units, grid.coarse, box.lower, box.upper)),
                 str(grid.volume),
             )
-            row = (*row, "0", "0", "0", "0", 0, 0)
-            self._base.execute(f"INSERT INTO search_frames VALUES ({', '.join('?' * len(row))})", row)
-            self._seals.frames.add(row)
+            self._insert("search_frames", (*row, "0", "0", "0", "0", 0, 0), self._seals.frames)
             self._open(frame, 0, grid, ((cells, RANK_FIRST) for cells in blocks))
 
     def _open(self, frame: int, depth: int, grid: CellGrid, blocks: Iterable[tuple[Sequence[Cell], float]]) -> None:
@@ -211,8 +206,7 @@ class Store(StoreFile):
             float(leaf.seconds),
             None if leaf.counterexample is None else self._list(frame, box, leaf.counterexample),
         )
-        self._base.execute("INSERT INTO cells VALUES (?, ?, ?, ?, ?, ?, ?)", row)
-        self._seals.cells.add(row)
+        self._insert("cells", row, self._seals.cells)
 
     def settled(self, kind: str, radius: float, frame: int, box: ParameterBox) -> CellOutcome | None:
         """What `keep_settled` was told of a cell, or None."""
@@ -229,8 +223,7 @@ class Store(StoreFile):
         with self._transaction():
             slopes = np.nan_to_num(np.asarray(outcome.slopes, np.float64)).tolist()
             row = (*_settled_key(kind, radius, frame, box), outcome.outcome, outcome.reason, json.dumps(slopes))
-            self._base.execute(f"INSERT INTO search_settled VALUES ({', '.join('?' * len(row))})", row)
-            self._seals.settled.add(row)
+            self._insert("search_settled", row, self._seals.settled)
 
     def finish(self, grids: Mapping[int, CellGrid]) -> None:
         """List what is still open as unknown, so that the cells cover the set; `Store` takes it back on resuming."""
@@ -240,11 +233,8 @@ class Store(StoreFile):
                 grid = grids[block.frame]
                 for cell in block.cells:
                     box = grid.box_of(cell)
-                    cursor = self._base.execute(
-                        "INSERT INTO cells VALUES (?, ?, ?, 'unknown', NULL, 0.0, NULL)",
-                        (block.frame, *(self._list(block.frame, box, ends) for ends in (box.lower, box.upper))),
-                    )
-                    rows.append(cursor.lastrowid)
+                    ends = (self._list(block.frame, box, end) for end in (box.lower, box.upper))
+                    rows.append(self._insert("cells", (block.frame, *ends, "unknown", None, 0.0, None), None))
             self._put("open_rows", rows)
             self._put("seconds", self.seconds)
 
@@ -254,7 +244,7 @@ class Store(StoreFile):
         """Note how far the search is."""
         shares = [fractions(tally) for tally in self.tallies()]
         mean = [sum(s[key] for s in shares) / max(1, len(shares)) for key in ("certified", "falsified", "unknown")]
-        self._base.execute("INSERT INTO search_trace VALUES (?, ?, ?, ?, ?)", (self.seconds, self.count, *mean))
+        self._insert("search_trace", (self.seconds, self.count, *mean), None)
 
     @property
     def points(self) -> list[dict[str, float]]:

@@ -95,11 +95,6 @@ class _Checksums:
 class StoreFile:
     """An open ``cells.sqlite`` whose rows are those that were written.
 
-    Args:
-        fingerprint: What a stored search must agree with to be continued.
-        parameters: Names and units of the parameters of all frames together.
-        resume: Whether to go on with what is there; otherwise it is replaced.
-
     Raises:
         InputError: The folder cannot be written, or the stored search is another one or damaged.
     """
@@ -277,11 +272,7 @@ class StoreFile:
         self.keep(f"{name}.npz", data)
 
     def keep(self, name: str, data: bytes) -> Path:
-        """Write a file and return it; one of that name that is not ours stays, and ours gets another name.
-
-        Raises:
-            InputError: It cannot be written.
-        """
+        """Write a file and return it; one of that name that is not ours stays, and ours gets another name."""
         file, number = self._place(name), 1
         wanted = file
 
@@ -349,6 +340,13 @@ class StoreFile:
             if self._base.in_transaction:
                 self._base.execute("ROLLBACK")
             raise
+
+    def _insert(self, table: str, row: tuple[Any, ...], seal: TableChecksum | None) -> int:
+        """Add a row of ``table``, sealed unless it stands for an open block; returns its number."""
+        number = self._base.execute(f"INSERT INTO {table} VALUES ({', '.join('?' * len(row))})", row).lastrowid
+        if seal is not None:
+            seal.add(row)
+        return number
 
     def _put(self, key: str, value: Any) -> None:
         self._base.execute("INSERT OR REPLACE INTO search_state VALUES (?, ?)", (key, json.dumps(value)))

@@ -104,9 +104,6 @@ def load_vnnlib(path: Path, output_shape: Shape, input_shape: Shape | None = Non
     """Read a VNN-LIB file, packed (.gz) or not, for a network of these shapes.
 
     As many outputs must be declared, and as many inputs or none; ``input_shape`` None: inputs are not compared.
-
-    Raises:
-        InputError: The file cannot be read or says something that is not understood.
     """
     text = _text(path)
     try:
@@ -160,9 +157,6 @@ def load_query(
 
     Returns the regions, and the query that a file of version 2 is; None for version 1. ``path`` is only named in errors
     if ``text`` is given.
-
-    Raises:
-        InputError: As `load_vnnlib`, or an input has no bounds.
     """
     text = _text(path) if text is None else text
     try:

@@ -87,9 +87,6 @@ def parse_query(
     """Return the query that the nested tokens of a file's `joined` text are.
 
     Shapes are of the network, without the batch; a number: of the elements alone; None: not compared.
-
-    Raises:
-        InputError: The query says something that is not understood, or is about another network.
     """
     if len(expressions) < 2 or not isinstance(expressions[0], list) or len(expressions[0]) != 2:
         raise InputError("no (vnnlib-version <2.0>) and network", fix="write (vnnlib-version <2.0>) first")

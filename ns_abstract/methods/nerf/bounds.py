@@ -138,11 +138,11 @@ class NerfBounds(RayField):
         )
         return low.reshape(-1, low.shape[2]), high.reshape(-1, high.shape[2])
 
-    def division(self, moves: np.ndarray, most: int = _PARTS, deeper: int | None = None) -> Division | None:
+    def division(self, moves: np.ndarray, most_parts: int = _PARTS, deeper: int | None = None) -> Division | None:
         """`division_for` for samples that move by ``moves`` [n, samples, d], as wide as the network's bounds bear."""
         d = moves.shape[2]
         if self.paths is None:
             usual, finer = _DEEPER.get(d, _DEEPER_MORE), _FINER.get(d, 0)
         else:
             usual, finer = _FOLLOWED_DEEPER * d, _FOLLOWED_FINER.get(d, _FOLLOWED_FINER_MORE)
-        return division_for(moves, self.displacement, most, usual if deeper is None else deeper, finer)
+        return division_for(moves, self.displacement, most_parts, usual if deeper is None else deeper, finer)

@@ -31,8 +31,8 @@ def check_device(device: str | None) -> str:
 
 
 @cache
-def processes_that_fit(needed: int, most: int) -> int:
-    """Return how many processes, at most ``most``, fit into a GPU's memory at ``needed`` bytes each.
+def processes_that_fit(needed: int, most_processes: int) -> int:
+    """Return how many processes, at most ``most_processes``, fit into a GPU's memory at ``needed`` bytes each.
 
     Found once: what they hold afterwards is no longer free. Raises InputError where not one fits.
     """
@@ -45,4 +45,4 @@ def processes_that_fit(needed: int, most: int) -> int:
             field="--device",
             fix="free some, or use cpu",
         )
-    return min(most, free // needed)
+    return min(most_processes, free // needed)

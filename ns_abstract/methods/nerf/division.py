@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -98,12 +100,12 @@ class Division:
 
 
 def division_for(
-    moves: np.ndarray, displacement: float, most: int, deeper: int, finer: int, swept: bool = False
+    moves: np.ndarray, displacement: float, most_parts: int, deeper: int, finer: int, swept: bool = False
 ) -> Division | None:
     """Return the subdivision whose cells keep samples within ``displacement``; ``moves`` [n, samples, d] over the box.
 
     ``finer``: see `Division`. ``swept``: whether the last axis is a sample's own interval, which is as wide in any box.
-    Returns None where there would be more than ``most`` parts and narrower boxes would need fewer.
+    Returns None where there would be more than ``most_parts`` parts and narrower boxes would need fewer.
     """
     d = moves.shape[2]
     if d == 0:
@@ -111,7 +113,7 @@ def division_for(
     widest = moves.reshape(-1, d).max(axis=0)
     if not np.isfinite(widest).all():
         return None
-    levels = (most // 3 if d == 1 else most).bit_length() - 1 - deeper - d * finer
+    levels = (most_parts // 3 if d == 1 else most_parts).bit_length() - 1 - deeper - d * finer
     axes: list[int] = []
     while widest.sum() > displacement:
         if len(axes) >= levels:
@@ -126,6 +128,34 @@ def division_for(
         axes.append(axis)
         widest[axis] *= 0.5
     return Division(tuple(axes), d, finer)
+
+
+@dataclass(frozen=True)
+class RayCells:
+    """Cells of one level, each of a ray and perhaps of one of its samples: [k] numbers."""
+
+    ray: np.ndarray
+    cell: np.ndarray
+    sample: Any = None
+
+    def __len__(self) -> int:
+        return self.ray.size
+
+    def take(self, which: np.ndarray | slice) -> RayCells:
+        """Some of them."""
+        parts: list[Any] = [None if part is None else part[which] for part in vars(self).values()]
+        return RayCells(*parts)
+
+    def chunks(self, size: int) -> Iterator[RayCells]:
+        """At most ``size`` at a time."""
+        return (self.take(slice(start, start + size)) for start in range(0, len(self), size))
+
+
+def join_cells(parts: Sequence[RayCells]) -> RayCells:
+    """All cells of ``parts``, one at least, of samples or of whole rays."""
+    columns = zip(*(vars(part).values() for part in parts), strict=True)
+    whole: list[Any] = [None if column[0] is None else np.concatenate(column) for column in columns]
+    return RayCells(*whole)
 
 
 #: What lower and upper bounds of several parts become.

@@ -10,7 +10,8 @@ from numba import njit
 
 from ns_abstract.arithmetic.simd.lanes import LINE
 from ns_abstract.methods.nerf import relu_kernel
-from ns_abstract.methods.nerf.layer_kernel import LayerInput, LayerOutput, LayerWeights, linear
+from ns_abstract.methods.nerf.layer_kernel import LayerOutput, LayerWeights, linear
+from ns_abstract.methods.nerf.layer_polynomials import PostActivation
 from ns_abstract.methods.nerf.relu_kernel import relu
 
 #: Pieces that go through all layers together.
@@ -139,7 +140,7 @@ def _step(z, encoded, remainder, weights, grid, limit, room):
         piece, neuron, error,
     )  # fmt: skip
     new = relu(relu_kernel.ReluInput(layer.poly, layer.sums, layer.box, z.failed, z.count), grid, limit, activation)
-    return LayerInput(
+    return PostActivation(
         layer.poly, activation.size, activation.spread, layer.box, activation.slope, activation.failed,
         activation.count, layer.columns[:total], owner[:total], piece[:new], neuron[:new], error[:new],
     )  # fmt: skip
@@ -166,7 +167,7 @@ def _piecewise(z, first, new, begin, past):
     while latest < z.new_owner.shape[0] and z.new_owner[latest] < past:
         latest += 1
     return (
-        LayerInput(
+        PostActivation(
             z.poly[begin:past], z.size[begin:past], z.spread[begin:past], z.box[begin:past], z.slope[begin:past],
             z.failed[begin:past], z.count[begin:past], z.columns[first:last], z.owner[first:last] - begin,
             z.new_owner[new:latest] - begin, z.new_neuron[new:latest], z.new_size[new:latest],
@@ -205,11 +206,11 @@ def through_layers(z, encoded, remainder, layers, last, grid, limit, out, output
     """Layers with their activations and a last one without, the pieces in the order in which they are given.
 
     Args:
-        z: `layer_kernel.LayerInput` of B pieces.
+        z: `PostActivation` of B pieces.
         encoded, remainder: [B, m, k] and [B, k] of the vector that layers see (`layer_kernel.linear`).
         layers, last: `StackedLayers`; at most one is last, which sees no encoded vector.
         grid, limit: See `relu_kernel.relu`.
-        out: `layer_kernel.LayerInput` behind ``layers``; room for [B limit, n] columns and [B n] new error terms.
+        out: `PostActivation` behind ``layers``; room for [B limit, n] columns and [B n] new error terms.
         outputs: `FieldOutputs` of the last layer, filled.
 
     Returns:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import secrets
 import time
 from collections.abc import Callable, Sequence
@@ -19,13 +18,14 @@ from ns_abstract.execution.cancellation import WorkCancelledError, check_cancell
 from ns_abstract.execution.engines import Processes
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseBox
+from ns_abstract.geometry.tiles import tile_grid
 from ns_abstract.methods.nerf.bounds import NerfBounds
+from ns_abstract.methods.nerf.hsv import color_shift, shift_ends, shift_parts
 from ns_abstract.methods.nerf.ray_field import BoundedRays, RayBounds, Shifts, typical_displacement
-from ns_abstract.methods.nerf.ray_pictures import PixelRenderer, RayPictures
-from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
+from ns_abstract.methods.nerf.render import NerfRenderer, RayRenderer, Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.nerf.strips import PoseStrips
-from ns_abstract.refine.protocol import LinearSets
+from ns_abstract.refine.protocol import Bounds, Frame
 
 
 @dataclass(frozen=True)
@@ -44,6 +44,10 @@ class FieldTuning:
     #: Rays and poses rendered to estimate that variation.
     look_rays: int = 256
     look_poses: int = 7
+    #: Step of the difference quotient that tells how far the picture moves, as a part of the parameter's range.
+    motion_step: float = 2.0**-10
+    #: Pixels that a turn of the whole circle of hues counts for.
+    motion_of_turn: float = 6.0
 
 
 _TUNING = FieldTuning()
@@ -89,18 +93,6 @@ class RayContext:
         return None
 
 
-@dataclass(frozen=True)
-class RayCellBounds:
-    """Bounds of some rays over one cell; see `ns_abstract.refine.protocol.Bounds`."""
-
-    lower: np.ndarray
-    upper: np.ndarray
-    slopes: np.ndarray
-    context: RayContext | None
-    linear: LinearSets | None
-    forms: None = None
-
-
 @lru_cache(maxsize=1)
 def _processes(count: int) -> Processes:
     """Kept until this process ends: what they import and compile is worth seconds."""
@@ -120,10 +112,11 @@ def _bound_share(frame: bytes, bounds: tuple[Any, ...], displacement: float, arg
     return _here[frame].rays(*arguments)
 
 
-class FieldFrame(RayPictures):
+class FieldFrame(Frame):
     """Bounds and renders one frame's set of poses of a field.
 
-    The set as a whole is bounded by [0, 1] without work, so that refinement can take ray after ray.
+    Every ray is a tile of its own. The set as a whole is bounded by [0, 1] without work, so that refinement can take
+    ray after ray.
 
     Args:
         share: Rays that are bounded together.
@@ -131,42 +124,81 @@ class FieldFrame(RayPictures):
         workers: Shares that are bounded side by side.
     """
 
+    tilewise = True
+    channels = 3
+    side = 1
+    tiles_at_once: int
+    #: Poses rendered in every part of a cell that is split.
+    witnesses = 8
+
     def __init__(
-        self, pose_set: PoseBox, renderer: PixelRenderer, bounds: BoundedRays, share: int, at_once: int, workers: int
+        self, pose_set: PoseBox, renderer: RayRenderer, bounds: BoundedRays, share: int, at_once: int, workers: int
     ) -> None:
-        super().__init__(pose_set, renderer)
+        self.pose_set, self.camera, self.box = pose_set, pose_set.camera, pose_set.box
+        self.across, self.down = tile_grid(self.camera, self.side)
         self._geometry = pose_set.geometry
-        self.bounds, self.workers = bounds, workers
-        self.typical_distance = float(bounds.distances[bounds.distances.size // 2])
+        self.renderer, self.bounds, self.workers = renderer, bounds, workers
         self._share, self.tiles_at_once = share, at_once
         self._inner: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
         #: whether boxes need not wait for what others tell of the width of cells
         self._steady = False
-        #: Numbers of the rays that `sets` bounds; of others it says 0.
+        #: Numbers of the rays that `cell_bounds` bounds; of others it says 0.
         self.rays = np.arange(self.tile_count)
 
+    def _pixels(self, tiles: np.ndarray) -> np.ndarray:
+        return np.stack([tiles // self.across, tiles % self.across], axis=1)
+
+    def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
+        """Rays [t, 1, 1, 3] float32 of the concrete image at parameter values [d]."""
+        return self.precise(values, tiles).astype(np.float32)
+
+    def precise(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
+        """What `render` rounds: float64."""
+        which = np.arange(self.tile_count) if tiles is None else tiles
+        shift = color_shift(self.pose_set, values)
+        colors = self.renderer.pixels(self.pose_set.camera, self.pose_set.pose(values), self._pixels(which), shift)
+        return colors[:, None, None, :]
+
+    def feasible(self, box: ParameterBox) -> ParameterBox | None:
+        """All of ``box``: every parameter in it belongs to a pose of the set."""
+        return box
+
+    def motion(self, box: ParameterBox) -> np.ndarray:
+        """[d] pixels that points at a typical distance move by over each parameter's range (an estimate)."""
+        d = box.dimensions
+        low, high = np.array(box.lower), np.array(box.upper)
+        distance = float(self.bounds.distances[self.bounds.distances.size // 2])
+        largest = np.zeros(d)
+        here = self._point(box.middle, distance)
+        for k in range(d):
+            step = np.zeros(d)
+            step[k] = _TUNING.motion_step * (high[k] - low[k])
+            moved = np.linalg.norm(self._point(box.middle + step, distance) - here) / _TUNING.motion_step
+            largest[k] = moved / distance * self.camera.fx
+            if box.names[k] in COLOR_SHIFTS:
+                largest[k] = _TUNING.motion_of_turn * (high[k] - low[k])
+        return largest
+
+    def _point(self, values: np.ndarray, distance: float) -> np.ndarray:
+        pose = self.pose_set.pose(values)
+        return pose[:, 3] - distance * pose[:, 2]
+
     def warm_up(self, stage: str | None = None) -> None:
-        """Compile the kernels that this frame needs."""
+        """Compile the kernels that this frame needs, which are few."""
         box = self.box
         for axis in range(box.dimensions):
             box = box.split(axis, 1024)[0]
         self.bounds.rays(self._geometry, box.without(COLOR_SHIFTS), self._pixels(np.arange(1)), 1.0)
         self.render(box.middle, np.arange(1))
 
-    def bound(
-        self, box: ParameterBox, tiles: np.ndarray, within: RayContext | None = None, keep_linear: bool = False
-    ) -> RayCellBounds:
-        """Bounds of the rays ``tiles`` over ``box``; ``within`` is the context of these rays and a box around it.
-
-        Rays that there is no time for any more (`ns_abstract.execution.cancellation`) are bounded by [0, 1].
-        """
-        return self.bound_parts([box], tiles, within, keep_linear)[0]
-
     def bound_parts(
         self, boxes: Sequence[ParameterBox], tiles: np.ndarray, within: RayContext | None = None,
         keep_linear: bool = False, pixels: np.ndarray | None = None,
-    ) -> list[RayCellBounds]:  # fmt: skip
-        """`bound` over each of ``boxes``, side by side; see `ns_abstract.refine.protocol.PartsFrame`."""
+    ) -> list[Bounds]:  # fmt: skip
+        """Bounds of the rays ``tiles`` over each of ``boxes``; ``within``: of these rays and a box around them.
+
+        Rays that there is no time for any more (`ns_abstract.execution.cancellation`) are bounded by [0, 1].
+        """
         tiles = np.asarray(tiles)
         if self.box.dimensions > 0 and self.box in boxes:
             nothing = self._unknown(tiles.size)
@@ -180,9 +212,7 @@ class FieldFrame(RayPictures):
             part_bounds.append(self._box(lower, upper, RayContext(tiles[order], alpha[order]), keep_linear))
         return part_bounds
 
-    def _box(
-        self, lower: np.ndarray, upper: np.ndarray, context: RayContext | None, keep_linear: bool
-    ) -> RayCellBounds:
+    def _box(self, lower: np.ndarray, upper: np.ndarray, context: RayContext | None, keep_linear: bool) -> Bounds:
         """What is told of bounds [t, 3]."""
         d = self.box.dimensions
         low, high = (side.reshape(-1, 1, 1, 3) for side in outward(lower, upper))
@@ -190,7 +220,7 @@ class FieldFrame(RayPictures):
         if keep_linear:
             flat = np.zeros((*low.shape, d), np.float32)
             linear = flat, low, flat, high
-        return RayCellBounds(low, high, np.zeros(d), context, linear)
+        return Bounds(low, high, np.zeros(d), context, linear)
 
     def _unknown(self, count: int) -> RayBounds:
         """What holds of any ``count`` rays."""
@@ -249,11 +279,7 @@ class FieldFrame(RayPictures):
         return [parts[i : i + each] for i in range(0, len(parts), each)]
 
     def _run(self, calls: Sequence[Sequence[Any]]) -> list[RayBounds]:
-        """`BoundedRays.rays` with the arguments of each call, side by side where there are several.
-
-        Raises:
-            WorkCancelledError: There is no time for all of them.
-        """
+        """`BoundedRays.rays` with the arguments of each call, side by side where there are several."""
         parts = [part for part in self._tried(calls) if part is not None]
         if len(parts) < len(calls):
             raise WorkCancelledError
@@ -271,18 +297,15 @@ class FieldFrame(RayPictures):
     def _strips(self) -> PoseStrips:
         return PoseStrips(self.bounds, self.pose_set, self._pixels(self.rays), self._run)
 
-    def sets(
-        self, box: ParameterBox, weigh: Callable[[], np.ndarray | None] | None = None, most: int | None = None
-    ) -> RayCellBounds:
+    def cell_bounds(
+        self, box: ParameterBox, weigh: Callable[[], np.ndarray | None] | None = None, most_rays: int | None = None
+    ) -> Bounds:
         """All rays over a cell ``box`` with linear bounds, from strips of the set that are kept.
 
         Args:
-            most: Rays that are bounded, about, the first of `rays`; the others are left at [0, 1]. All if None.
+            most_rays: Rays that are bounded, about, the first of `rays`; the others are left at [0, 1]. All if None.
             weigh: Gives [H, W, 3] what part of the margin a unit of each pixel's width may cost, or None; asked only
                 where rays could be refined.
-
-        Raises:
-            WorkCancelledError: There is no time for it.
         """
 
         def weights() -> np.ndarray | None:
@@ -291,7 +314,7 @@ class FieldFrame(RayPictures):
                 return None
             return np.asarray(pixel_weights, np.float64).reshape(self.tile_count, 3)[self.rays]
 
-        linear, lower, upper = self._strips.sets(box, weights, most)
+        linear, lower, upper = self._strips.cell_bounds(box, weights, most_rays)
         if len(lower) < self.rays.size:
             missing = [(0, self.rays.size - len(lower)), *[(0, 0)] * 2]
             linear = [np.pad(part, missing[: part.ndim], constant_values=k == 3) for k, part in enumerate(linear)]
@@ -301,7 +324,7 @@ class FieldFrame(RayPictures):
         d = box.dimensions
         slopes = 0.5 * (np.abs(a_lower) + np.abs(a_upper)).astype(np.float64).sum(axis=(0, 1))
         sets = a_lower.reshape(*shape, d), b_lower.reshape(shape), a_upper.reshape(*shape, d), b_upper.reshape(shape)
-        return RayCellBounds(lower.reshape(shape), upper.reshape(shape), slopes, None, sets)
+        return Bounds(lower.reshape(shape), upper.reshape(shape), slopes, None, sets)
 
     def _every(self, part: np.ndarray) -> np.ndarray:
         """Bounds of all rays, of those of `rays`."""
@@ -324,10 +347,6 @@ class FieldFrame(RayPictures):
         places = np.full(self.tile_count, -1)
         places[tiles] = np.arange(tiles.size)
         self._inner = places, lower, upper
-
-    def set_tolerance(self, excess: float) -> float:
-        """Nothing is left out of first cells, which cost nothing."""
-        return 0.0
 
     def plan(self, visible: int | None, lower: np.ndarray, upper: np.ndarray) -> list[str]:
         """What was left out for this frame, given what refinement found."""
@@ -358,18 +377,7 @@ class FieldFrame(RayPictures):
 
     def _shifts(self, box: ParameterBox) -> list[Shifts]:
         """Equal parts of the box's shifts of colours, which cost nothing to tell apart; empty: there are none."""
-        ranges = []
-        for name in COLOR_SHIFTS:
-            if name in box.names:
-                low, high = (side[box.names.index(name)] for side in (box.lower, box.upper))
-            else:
-                low = high = self.pose_set.fixed.get(name, 0.0)
-            ends = np.linspace(low, high, _SHIFT_PARTS + 1 if low < high else 2).tolist()
-            ends[0], ends[-1] = low, high
-            ranges.append(list(itertools.pairwise(ends)))
-        if not any(low or high for cuts in ranges for low, high in cuts):
-            return []
-        return list(itertools.product(*ranges))
+        return shift_parts(shift_ends(box, self.pose_set.fixed, _SHIFT_PARTS))
 
     def _tolerance(self, box: ParameterBox) -> float:
         """Narrower boxes are asked for when the bounds of wider ones are not good enough."""

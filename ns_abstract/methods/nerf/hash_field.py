@@ -6,17 +6,17 @@ The semantics are those of Nerfstudio's torch implementation (nerfstudio/field_c
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ns_abstract.geometry.transform import DataparserTransform
-from ns_abstract.io.assumptions import Assumption
+from ns_abstract.methods.nerf.scene import FieldScene
 
 FloatArray = NDArray[np.float64]
+#: nerfstudio/field_components/encodings.py:407, ``hash_fn``.
+PRIME_Y, PRIME_Z = 2654435761, 805459861
 #: Most layers of a network of densities.
 LAYERS_LIMIT = 8
 
@@ -129,18 +129,7 @@ class NerfactoField:
 
 
 @dataclass(frozen=True)
-class NerfactoScene:
-    """A nerfacto.
-
-    Attributes:
-        dataparser: Units of the training data against the normalised frame.
-        notes: What was assumed where the source says nothing, one sentence each.
-        assumptions: What was decided of the picture, and where each choice came from.
-    """
+class NerfactoScene(FieldScene):
+    """A nerfacto."""
 
     field: NerfactoField
-    dataparser: DataparserTransform = dataclasses.field(default_factory=DataparserTransform)
-    name: str = "scene"
-    source: str = ""
-    notes: tuple[str, ...] = ()
-    assumptions: tuple[Assumption, ...] = ()

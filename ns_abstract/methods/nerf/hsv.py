@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,6 +12,7 @@ from numba import njit
 from torch import Tensor
 
 from ns_abstract.arithmetic.rounding import HUE_ROOM, HUE_ROUNDING
+from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseBox
 
 Range = tuple[float, float]
@@ -22,6 +25,26 @@ def color_shift(pose_set: PoseBox, values: Any) -> tuple[Any, Any] | None:
         return None
     hue, saturation = (named.get(name, 0.0) for name in COLOR_SHIFTS)
     return hue, saturation
+
+
+def shift_ends(box: ParameterBox, fixed: Mapping[str, float], count: int) -> list[np.ndarray]:
+    """Edges of ``count`` equal parts of the ranges of hue and saturation in ``box``; two where one is ``fixed``."""
+    ends_by_shift = []
+    for name in COLOR_SHIFTS:
+        low = high = fixed.get(name, 0.0)
+        if name in box.names:
+            low, high = box.lower[box.names.index(name)], box.upper[box.names.index(name)]
+        ends = np.linspace(low, high, count + 1 if low < high else 2)
+        ends[0], ends[-1] = low, high
+        ends_by_shift.append(ends)
+    return ends_by_shift
+
+
+def shift_parts(ends: Sequence[np.ndarray]) -> list[tuple[Range, Range]]:
+    """Intervals of hue and saturation between `shift_ends`, the latter running faster; empty: nothing is shifted."""
+    ranges = [list(itertools.pairwise(edges.tolist())) for edges in ends]
+    shifted = any(low or high for cuts in ranges for low, high in cuts)
+    return [(hue, saturation) for hue, saturation in itertools.product(*ranges)] if shifted else []
 
 
 def shifted(rgb: Tensor, hue: Tensor | float, saturation: Tensor | float) -> Tensor:

@@ -69,31 +69,6 @@ class LayerWeights(NamedTuple):
     underflow: float
 
 
-class LayerInput(NamedTuple):
-    """B pieces before a layer; see `zonotope.PostActivation`. What stands where ``size`` is 0 is not looked at.
-
-    Attributes:
-        poly: [B, m, inputs].
-        size, spread, box, slope: [B, inputs].
-        failed, count: [B].
-        columns, owner: [C, inputs] of the type that they are multiplied in, and [C] their pieces, ascending.
-        new_owner, new_neuron, new_size: [N] error terms that move one neuron only, likewise.
-    """
-
-    poly: np.ndarray
-    size: np.ndarray
-    spread: np.ndarray
-    box: np.ndarray
-    slope: np.ndarray
-    failed: np.ndarray
-    count: np.ndarray
-    columns: np.ndarray
-    owner: np.ndarray
-    new_owner: np.ndarray
-    new_neuron: np.ndarray
-    new_size: np.ndarray
-
-
 class LayerOutput(NamedTuple):
     """B pieces behind a layer.
 
@@ -190,6 +165,7 @@ def linear(z, encoded, remainder, weights, out):
     """A linear layer, piece by piece (design.md, F4); returns the number of columns behind it.
 
     Args:
+        z: `PostActivation` in arrays, columns of the type that they are multiplied in.
         encoded, remainder: [B, m, k] and [B, k] polynomials and remainders of an encoded vector, if the layer sees it.
         out: `LayerOutput`, filled; its columns and owners may have room for more.
     """

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
 
-from ns_abstract.arithmetic.rounding import (
-    FIELD_UP,
-)
+from ns_abstract.arithmetic.rounding import FIELD_UP
 
 
 def column_sums(columns: Tensor, owner: Tensor, pieces: int) -> Tensor:
@@ -18,55 +17,46 @@ def column_sums(columns: Tensor, owner: Tensor, pieces: int) -> Tensor:
     return out.index_add_(0, owner, columns.abs())
 
 
-@dataclass
-class PostActivation:
-    """A batch of Chebyshev zonotopes behind an activation.
+class PostActivation(NamedTuple):
+    """A batch of B Chebyshev zonotopes behind an activation, the pieces: tensors, or arrays for kernels.
 
     Attributes:
         poly: [B, m, n] Chebyshev coefficients.
-        columns, owner: [C, n] error terms, not yet multiplied by ``slope``, and the piece [C] that each belongs to.
-        slope: [B, n] what the columns of a piece are multiplied by.
-        new_owner, new_neuron, new_size: [N] error terms that move one neuron only, not yet in ``columns``.
+        size: [B, n] sum of the absolute coefficients and error terms. 0: the neuron is off, and only ``box`` and
+            ``spread``, which are 0, say something about it; nothing else of it is looked at.
         spread: [B, n] sum of the absolute error terms.
         box: [B, n] radius of the rest.
-        size: [B, n] sum of the absolute coefficients and error terms. 0: the neuron is off, and only ``box`` and
-            ``spread``, which are 0, say something about it.
+        slope: [B, n] what the columns of a piece are multiplied by.
         failed: [B] whether the piece was given up: its other values mean nothing.
         count: [B] error terms.
+        columns, owner: [C, n] error terms, not yet multiplied by ``slope``, and the piece [C] that each belongs to,
+            ascending.
+        new_owner, new_neuron, new_size: [N] error terms that move one neuron only, not yet in ``columns``, likewise.
     """
 
-    poly: Tensor
-    columns: Tensor
-    owner: Tensor
-    slope: Tensor
-    new_owner: Tensor
-    new_neuron: Tensor
-    new_size: Tensor
-    spread: Tensor
-    box: Tensor
-    size: Tensor
-    failed: Tensor
-    count: Tensor
+    poly: Any
+    size: Any
+    spread: Any
+    box: Any
+    slope: Any
+    failed: Any
+    count: Any
+    columns: Any
+    owner: Any
+    new_owner: Any
+    new_neuron: Any
+    new_size: Any
 
     def select(self, which: Tensor) -> PostActivation:
         """The pieces ``which`` [k] (indices, ascending)."""
         place = torch.full_like(self.failed, -1, dtype=torch.int64)
         place[which] = torch.arange(which.numel(), device=which.device)
         owned, new = place[self.owner] >= 0, place[self.new_owner] >= 0
-        return PostActivation(
-            self.poly[which],
-            self.columns[owned],
-            place[self.owner[owned]],
-            self.slope[which],
-            place[self.new_owner[new]],
-            self.new_neuron[new],
-            self.new_size[new],
-            self.spread[which],
-            self.box[which],
-            self.size[which],
-            self.failed[which],
-            self.count[which],
-        )
+        pieces = (part[which] for part in self[:7])
+        return PostActivation._make((
+            *pieces, self.columns[owned], place[self.owner[owned]],
+            place[self.new_owner[new]], self.new_neuron[new], self.new_size[new],
+        ))  # fmt: skip
 
 
 @dataclass

@@ -7,10 +7,6 @@ config.yml says.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,7 +19,7 @@ from ns_abstract.methods.nerf.model_state import ModelState
 from ns_abstract.methods.nerf.scene import Encoding, FieldWeights, Layer, NerfScene
 from ns_abstract.methods.overrides import Overrides
 
-_FIX = "give a run of vanilla-nerf or abstract-nerf"
+FIX = "give a run of vanilla-nerf or abstract-nerf"
 _LAYERS_LIMIT = 64
 _SAMPLES_LIMIT = 4096
 #: nerfstudio/models/vanilla_nerf.py: exponents of the encodings of positions and directions, which its config
@@ -44,32 +40,21 @@ def holds_nerf(run: runs.RunConfig) -> bool:
 
 
 def load_nerf(run: runs.RunConfig, overrides: Overrides | None = None) -> NerfScene:
-    """Read the fields and what evaluation needs besides.
-
-    Raises:
-        InputError: For any content of the files, or an override, that cannot be used.
-    """
+    """Read the fields and what evaluation needs besides."""
     overrides = overrides or Overrides()
-    model_state.check_model(run, overrides, (_STOCK, _OURS), "vanilla-nerf", _FIX)
+    model_state.check_model(run, overrides, (_STOCK, _OURS), "vanilla-nerf", FIX)
     unused = config_keys.check_keys(run, config_keys.VANILLA_NERF)
     color = _color(run, overrides)
     coarse_samples = run.integer("num_coarse_samples", 64, 1, _SAMPLES_LIMIT)
     importance_samples = run.integer("num_importance_samples", 128, 1, _SAMPLES_LIMIT)
     transform, notes = runs.read_dataparser_transform(run)
     checkpoint = runs.find_checkpoint(run, overrides.load_step)
-    state = ModelState(runs.read_model_state(checkpoint))
+    state = ModelState(runs.read_model_state(checkpoint), checkpoint, FIX)
     if not any(key.startswith("field_fine.") for key in state):
-        raise InputError(
-            f"no NeRF fields in this checkpoint (method {show(run.method_name)})",
-            file=checkpoint,
-            field="pipeline._model.field_fine",
-            fix=_FIX,
-        )
+        raise state.refused(f"no NeRF fields in this checkpoint (method {show(run.method_name)})", "field_fine")
     exponents, counts = _encodings(run)
-    coarse, fine = (
-        field_weights(state, name, checkpoint, exponents, counts) for name in ("field_coarse", "field_fine")
-    )
-    state.refuse_unread(checkpoint, "vanilla-nerf", _FIX)
+    coarse, fine = (field_weights(state, name, exponents, counts) for name in ("field_coarse", "field_fine"))
+    state.refuse_unread("vanilla-nerf")
     return NerfScene(
         coarse=coarse,
         fine=fine,
@@ -83,10 +68,7 @@ def load_nerf(run: runs.RunConfig, overrides: Overrides | None = None) -> NerfSc
         name=run.experiment_name,
         source=str(checkpoint),
         notes=(*notes, *unused),
-        assumptions=(
-            color[0],
-            *model_state.records(run, state, checkpoint, overrides, _STOCK, transform, bool(notes)),
-        ),
+        assumptions=(color[0], *model_state.records(run, state, overrides, _STOCK, transform, bool(notes))),
     )
 
 
@@ -113,12 +95,7 @@ def _encodings(run: runs.RunConfig) -> tuple[tuple[float, float], tuple[int | No
         return _EXPONENTS, (None, None)
     highest = run.model.get("max_frequency_exponent", _MAX_EXPONENT)
     if not is_number(highest) or not 0.0 <= highest <= _MAX_EXPONENT_LIMIT:
-        raise InputError(
-            f"found {show(highest)}",
-            file=run.file,
-            field="pipeline.model.max_frequency_exponent",
-            fix=f"write a number from 0 to {_MAX_EXPONENT_LIMIT:g}",
-        )
+        raise run.refused("max_frequency_exponent", highest, f"a number from 0 to {_MAX_EXPONENT_LIMIT:g}")
     return (float(highest), direction - 1.0), (position, direction)
 
 
@@ -126,35 +103,25 @@ def _far_plane(run: runs.RunConfig) -> float:
     params = runs.as_mapping(run.model.get("collider_params", _PLANES))
     value = None if params is None else params.get("far_plane", _PLANES["far_plane"])
     if not is_number(value) or not 0.0 < value < 1e6:  # pyright: ignore[reportOperatorIssue]
-        raise InputError(
-            f"found {show(value)}",
-            file=run.file,
-            field="pipeline.model.collider_params.far_plane",
-            fix="write a distance above 0",
-        )
+        raise run.refused("collider_params.far_plane", value, "a distance above 0")
     return float(value)  # pyright: ignore[reportArgumentType]
 
 
 def field_weights(
-    state: Mapping[str, Any],
+    state: ModelState,
     name: str,
-    file: Path,
     exponents: tuple[float, float] = _EXPONENTS,
     counts: tuple[int | None, int | None] = (None, None),
 ) -> FieldWeights:
     """One field of a model's state.
 
     Args:
-        name: "field_coarse" or "field_fine".
         exponents: Highest exponents of the frequencies of positions and directions; the lowest are 0.
         counts: Numbers of these frequencies; None: what the layers' widths say.
-
-    Raises:
-        InputError: The layers do not fit each other or the encodings.
     """
 
     def layer(key: str, skip: bool = False) -> Layer:
-        return Layer(*model_state.read_linear(state, f"{name}.{key}", file, _FIX), skip)
+        return Layer(*state.linear(f"{name}.{key}"), skip)
 
     def layers(key: str) -> list[Layer]:
         layer_list = []
@@ -165,15 +132,10 @@ def field_weights(
     def fits(key: str, outputs: int, expected: tuple[int, ...]) -> None:
         if outputs not in expected:
             wanted = " or ".join(map(str, dict.fromkeys(expected)))
-            raise InputError(
-                f"takes {outputs} inputs, expected {wanted}",
-                file=file,
-                field=f"pipeline._model.{name}.{key}.weight",
-                fix=_FIX,
-            )
+            raise state.refused(f"takes {outputs} inputs, expected {wanted}", f"{name}.{key}.weight")
 
     base = layers("mlp_base")
-    position = _encoding(base[0].weight.shape[1], exponents[0], counts[0], file, f"pipeline._model.{name}.mlp_base")
+    position = _encoding(state, f"{name}.mlp_base", base[0].weight.shape[1], exponents[0], counts[0])
     for i in range(1, len(base)):
         width, inputs = base[i - 1].weight.shape[0], base[i].weight.shape[1]
         fits(f"mlp_base.layers.{i}", inputs, (width, width + position.size))
@@ -181,33 +143,22 @@ def field_weights(
     width = base[-1].weight.shape[0]
     density, head, color = layer("field_output_density.net"), layers("mlp_head"), layer("field_heads.0.net")
     fits("field_output_density.net", density.weight.shape[1], (width,))
-    direction = _encoding(
-        head[0].weight.shape[1] - width, exponents[1], counts[1], file, f"pipeline._model.{name}.mlp_head"
-    )
+    direction = _encoding(state, f"{name}.mlp_head", head[0].weight.shape[1] - width, exponents[1], counts[1])
     for i in range(1, len(head)):
         fits(f"mlp_head.layers.{i}", head[i].weight.shape[1], (head[i - 1].weight.shape[0],))
     fits("field_heads.0.net", color.weight.shape[1], (head[-1].weight.shape[0],))
     for key, outputs, expected in (("field_output_density", density, 1), ("field_heads.0", color, 3)):
         if outputs.weight.shape[0] != expected:
-            problem = f"{outputs.weight.shape[0]} outputs, expected {expected}"
-            raise InputError(problem, file=file, field=f"pipeline._model.{name}.{key}.net", fix=_FIX)
+            raise state.refused(f"{outputs.weight.shape[0]} outputs, expected {expected}", f"{name}.{key}.net")
     return FieldWeights(tuple(base), density, tuple(head), color, position, direction)
 
 
-def _encoding(size: int, highest: float, count: int | None, file: Path, field: str) -> Encoding:
+def _encoding(state: ModelState, key: str, size: int, highest: float, count: int | None) -> Encoding:
+    key = f"{key}.layers.0.weight"
     if size < 9 or (size - 3) % 6:
-        raise InputError(
-            f"{size} encoded values are not 3 coordinates with sines and cosines",
-            file=file,
-            field=f"{field}.layers.0.weight",
-            fix=_FIX,
-        )
+        raise state.refused(f"{size} encoded values are not 3 coordinates with sines and cosines", key)
     frequencies = (size - 3) // 6
     if count not in (None, frequencies):
-        raise InputError(
-            f"takes {frequencies} frequencies, config.yml says {count}",
-            file=file,
-            field=f"{field}.layers.0.weight",
-            fix="give the checkpoint that belongs to config.yml",
-        )
+        fix = "give the checkpoint that belongs to config.yml"
+        raise state.refused(f"takes {frequencies} frequencies, config.yml says {count}", key, fix)
     return Encoding(frequencies, 0.0, highest)

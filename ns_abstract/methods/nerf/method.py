@@ -15,20 +15,20 @@ from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.bounds import NerfBounds
 from ns_abstract.methods.nerf.device import check_device, processes_that_fit
-from ns_abstract.methods.nerf.frame import NerfFrame, RayCellBounds
-from ns_abstract.methods.nerf.occupancy import VOXEL_BYTES, OccupancyGrid
-from ns_abstract.methods.nerf.ray_field import basis_of, device_bytes
-from ns_abstract.methods.nerf.ray_pictures import (
+from ns_abstract.methods.nerf.field_method import (
     FieldMethod,
     arrays_digest,
     check_arithmetic,
     picture_of_parameters,
     refuse_layers,
 )
+from ns_abstract.methods.nerf.frame import NerfFrame
+from ns_abstract.methods.nerf.occupancy import VOXEL_BYTES, OccupancyGrid
+from ns_abstract.methods.nerf.ray_field import basis_of, device_bytes
 from ns_abstract.methods.nerf.render import NerfRenderer, Sampling
 from ns_abstract.methods.nerf.scene import NerfScene
 from ns_abstract.methods.nerf.white import WhiteSamples
-from ns_abstract.refine.protocol import MOST_PLANES, SceneSample, WeightPlane
+from ns_abstract.refine.protocol import MOST_PLANES, Bounds, SceneSample, WeightPlane
 
 #: Samples by ray where nothing is said: those of Nerfstudio's coarse pass.
 _SAMPLES = 64
@@ -47,9 +47,6 @@ class NerfMethod(FieldMethod):
         workers: Processes that bound rays; on a GPU, as many of them as have room there.
         occupancy: Declared as part of the scene: density is 0 outside of its occupied voxels.
         device: Where the field is bounded and drawn: "cpu" (None: the same) or "cuda".
-
-    Raises:
-        InputError: An option does not go with a NeRF, or the device is not there.
     """
 
     def __init__(
@@ -98,7 +95,6 @@ class NerfMethod(FieldMethod):
 
     @property
     def program(self) -> dict[str, Any]:
-        """Name and version of the bounded program."""
         s = self.sampling
         version = "algorithm-2" if self.paper else "nerfstudio-1.1.5-field"
         return {
@@ -113,24 +109,15 @@ class NerfMethod(FieldMethod):
 
     @property
     def content(self) -> str:
-        """The scene in a few words."""
         return f"vanilla NeRF, {self.scene.fine.text}"
 
     def frame(self, poses: PoseBox, sheared: bool = False, layers: bool = False) -> NerfFrame:
-        """One frame, ready for refinement; its cells are never ``sheared``.
-
-        Raises:
-            InputError: Layers are asked for: a NeRF's depth is a median.
-        """
+        """One frame, ready for refinement; its cells are never ``sheared``."""
         refuse_layers(layers)
         return NerfFrame(self.scene, self.sampling, poses, self.device, self._processes(poses.geometry.box.dimensions))
 
     def weight_frame(self, poses: PoseBox, planes: Sequence[WeightPlane], pixels: np.ndarray) -> NerfWeightFrame:
-        """See `ns_abstract.refine.protocol.WeightMethod`: weights of samples in boxes, distances along the rays.
-
-        Raises:
-            InputError: A selection is one of Gaussians, or the sampling is hierarchical.
-        """
+        """See `ns_abstract.refine.protocol.WeightMethod`: weights of samples in boxes, distances along the rays."""
         workers = self._processes(poses.geometry.box.dimensions)
         return NerfWeightFrame(self.scene, self.sampling, poses, planes, pixels, self.device, workers)
 
@@ -149,7 +136,6 @@ class NerfMethod(FieldMethod):
 
     @property
     def plan(self) -> tuple[str, ...]:
-        """What is left out for this scene, whatever the frame."""
         s, scene = self.sampling, self.scene
         grid = scene.occupancy
         declared = () if grid is None else (f"density declared 0 outside of a grid: {grid.describe()}",)
@@ -171,7 +157,6 @@ class NerfMethod(FieldMethod):
 
     @property
     def fingerprint(self) -> dict[str, Any]:
-        """Scene and program, for results that are continued."""
         fields = [self.scene.fine] + [self.scene.coarse] * (self.sampling.kind == "hierarchical")
         digest = arrays_digest(array for field in fields for array in field.arrays())
         if self.scene.occupancy is not None:
@@ -180,7 +165,6 @@ class NerfMethod(FieldMethod):
         return {"scene": digest.hexdigest(), "renderer": self.program["name"], "arithmetic": "real"}
 
     def describe(self) -> dict[str, Any]:
-        """The scene for reports."""
         scene, s = self.scene, self.sampling
         return {
             "name": scene.name,
@@ -262,11 +246,11 @@ class NerfWeightFrame(NerfFrame):
         """See `ns_abstract.refine.protocol.WeightFrame`."""
         return self.renderer.picture(self.camera, differentiable_pose(self.pose_set)(values[: self.box.dimensions]))
 
-    def sets(
-        self, box: ParameterBox, weigh: Callable[[], np.ndarray | None] | None = None, most: int | None = None
-    ) -> RayCellBounds:
-        """See `NerfFrame.sets`; rays that are not read have zeros."""
-        plain = super().sets(box.without(COLOR_SHIFTS), weigh, most)
+    def cell_bounds(
+        self, box: ParameterBox, weigh: Callable[[], np.ndarray | None] | None = None, most_rays: int | None = None
+    ) -> Bounds:
+        """See `NerfFrame.cell_bounds`; rays that are not read have zeros."""
+        plain = super().cell_bounds(box.without(COLOR_SHIFTS), weigh, most_rays)
         assert plain.linear is not None
         d, more = self.box.dimensions, self._dimensions - self.box.dimensions
         linear = list(plain.linear)

@@ -34,54 +34,55 @@ _SPLATS = ("rasterize_mode", "assume_splatfacto", "drop_nan_gaussians")
 
 
 class ModelState(dict[str, Any]):
-    """A model's state that remembers which tensors were read."""
+    """A model's state in a checkpoint, which remembers which tensors were read; ``fix``: what to give in its place."""
 
-    def __init__(self, state: Mapping[str, Any]) -> None:
+    def __init__(self, state: Mapping[str, Any], checkpoint: Path, fix: str) -> None:
         super().__init__(state)
+        self.checkpoint, self.fix = checkpoint, fix
         self.read: set[str] = set()
 
     def __getitem__(self, key: str) -> Any:
         self.read.add(key)
         return super().__getitem__(key)
 
-    def refuse_unread(self, checkpoint: Path, method: str, fix: str) -> None:
+    def refused(self, problem: str, key: str, fix: str | None = None) -> InputError:
+        """The error of what the state holds as ``key``."""
+        return InputError(problem, file=self.checkpoint, field=_name(key), fix=fix or self.fix)
+
+    def refuse_unread(self, method: str) -> None:
         """Raise InputError that names the tensors that were not read and may draw something."""
         unknown = sorted(key for key in self if key not in self.read and not key.startswith(tuple(_IDLE)))
         if unknown:
             more = f" and {len(unknown) - _SHOWN} more" if len(unknown) > _SHOWN else ""
             raise InputError(
                 f"holds tensors that {method} does not have: {visible(', '.join(unknown[:_SHOWN]))}{more}",
-                file=checkpoint,
+                file=self.checkpoint,
                 field="pipeline",
-                fix=fix,
+                fix=self.fix,
             )
 
+    def float32(self, key: str) -> NDArray[np.float32]:
+        """A tensor that has to be there."""
+        if key not in self:
+            raise self.refused("missing", key)
+        return to_float32(self[key], self.checkpoint, _name(key))
 
-def read_linear(
-    state: Mapping[str, Any], key: str, file: Path, fix: str
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Weight [out, in] and bias [out] of a linear layer.
+    def linear(self, key: str) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Weight [out, in] and bias [out] of a linear layer."""
+        weight, bias = self.float32(f"{key}.weight"), self.float32(f"{key}.bias")
+        if weight.ndim != 2 or 0 in weight.shape or bias.shape != weight.shape[:1]:
+            raise self.refused(
+                f"shapes {list(weight.shape)} and {list(bias.shape)} are not those of a linear layer", key
+            )
+        return weight, bias
 
-    Raises:
-        InputError: One is missing, or their shapes are not those of a linear layer.
-    """
-    where = f"pipeline._model.{key}"
-    for part in ("weight", "bias"):
-        if f"{key}.{part}" not in state:
-            raise InputError("missing", file=file, field=f"{where}.{part}", fix=fix)
-    weight, bias = (to_float32(state[f"{key}.{part}"], file, f"{where}.{part}") for part in ("weight", "bias"))
-    if weight.ndim != 2 or 0 in weight.shape or bias.shape != weight.shape[:1]:
-        problem = f"shapes {list(weight.shape)} and {list(bias.shape)} are not those of a linear layer"
-        raise InputError(problem, file=file, field=where, fix=fix)
-    return weight, bias
+
+def _name(key: str) -> str:
+    return f"pipeline._model.{key}"
 
 
 def check_model(run: runs.RunConfig, overrides: Overrides, classes: Sequence[str], method: str, fix: str) -> None:
-    """Refuse options of splats, and model classes whose picture may not be that of ``method``.
-
-    Raises:
-        InputError: Names the class, which is none of ``classes``, or the option.
-    """
+    """Refuse options of splats, and model classes whose picture may not be that of ``method``."""
     overrides.refuse(_SPLATS, "is for splats, this run is a NeRF")
     target = runs.target_class(run)
     if target and target not in classes:
@@ -116,7 +117,6 @@ def background(run: runs.RunConfig, overrides: Overrides, default: str) -> tuple
 def records(
     run: runs.RunConfig,
     state: ModelState,
-    checkpoint: Path,
     overrides: Overrides,
     stock: str,
     transform: DataparserTransform,
@@ -131,7 +131,7 @@ def records(
     target = runs.target_class(run)
     whose = "config.yml: pipeline.model._target" if target else "default: config.yml names no class"
     return (
-        runs.step_assumption(run, checkpoint, overrides.load_step),
+        runs.step_assumption(run, state.checkpoint, overrides.load_step),
         Assumption("model", target or stock.rpartition(".")[2], whose),
         *runs.idle_assumptions(state, _IDLE),
         runs.units_assumption(transform, assumed_units),

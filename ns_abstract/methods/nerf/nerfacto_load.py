@@ -10,7 +10,6 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from fractions import Fraction
-from pathlib import Path
 from typing import Any, Literal, cast
 
 import numpy as np
@@ -21,7 +20,7 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import is_number, show
 from ns_abstract.io.memory import check_memory
 from ns_abstract.methods import config_keys, runs
-from ns_abstract.methods.checkpoint import StoredTensor, to_float32
+from ns_abstract.methods.checkpoint import StoredTensor
 from ns_abstract.methods.nerf import model_state
 from ns_abstract.methods.nerf.hash_field import (
     LAYERS_LIMIT,
@@ -68,8 +67,8 @@ class _Grid:
     """What config.yml says of a hash grid."""
 
     levels: int
-    least: int
-    most: int
+    coarsest: int
+    finest: int
     log2_size: int
     features: int
 
@@ -84,11 +83,7 @@ def holds_nerfacto(run: runs.RunConfig) -> bool:
 
 
 def load_nerfacto(run: runs.RunConfig, overrides: Overrides | None = None) -> NerfactoScene:
-    """Read the fields and what evaluation needs besides.
-
-    Raises:
-        InputError: For any content of the files, or an override, that cannot be used.
-    """
+    """Read the fields and what evaluation needs besides."""
     overrides = overrides or Overrides()
     model_state.check_model(run, overrides, (_STOCK,), "nerfacto", _FIX)
     unused = config_keys.check_keys(run, config_keys.NERFACTO)
@@ -100,20 +95,20 @@ def load_nerfacto(run: runs.RunConfig, overrides: Overrides | None = None) -> Ne
     grid, proposals, samples = _grid(run), _proposal_arguments(run), _samples(run)
     transform, notes = runs.read_dataparser_transform(run)
     checkpoint = runs.find_checkpoint(run, overrides.load_step)
-    state = ModelState(runs.read_model_state(checkpoint))
-    _refuse_other_implementation(run, state, checkpoint)
+    state = ModelState(runs.read_model_state(checkpoint), checkpoint, _FIX)
+    _refuse_other_implementation(run, state)
     grids = [grid, *(_proposal_grid(one) for one in proposals)]
     check_memory(sum(_BYTES * one.rows * one.features for one in grids), checkpoint, "the hash tables")
     factor = _positive(run, "average_init_density", 1.0, math.inf)
-    encoding = _encoding(state, "field", "mlp_base.model.0.hash_table", grid, checkpoint)
+    encoding = _encoding(state, "field", "mlp_base.model.0.hash_table", grid)
     width = encoding.size
-    density = _net(state, "field.mlp_base.model.1", checkpoint, (width, run.integer("hidden_dim", 64, 1), 1 + FEATURES))
+    density = _net(state, "field.mlp_base.model.1", (width, run.integer("hidden_dim", 64, 1), 1 + FEATURES))
     field = NerfactoField(
         encoding=encoding,
         density_net=density,
-        color_net=_color_net(run, state, checkpoint),
+        color_net=_color_net(run, state),
         average_init_density=factor,
-        proposals=_proposals(run, state, checkpoint, proposals, factor),
+        proposals=_proposals(run, state, proposals, factor),
         samples=samples,
         # nerfstudio/model_components/scene_colliders.py: reset_near_plane, outside training
         near=0.0,
@@ -130,8 +125,8 @@ def load_nerfacto(run: runs.RunConfig, overrides: Overrides | None = None) -> Ne
         # the box that a field without contraction ends at
         if key.rpartition(".")[2] == "aabb":
             state.read.add(key)
-    state.refuse_unread(checkpoint, "nerfacto", _FIX)
-    others = model_state.records(run, state, checkpoint, overrides, _STOCK, transform, bool(notes))
+    state.refuse_unread("nerfacto")
+    others = model_state.records(run, state, overrides, _STOCK, transform, bool(notes))
     return NerfactoScene(
         field=field,
         dataparser=transform,
@@ -142,19 +137,19 @@ def load_nerfacto(run: runs.RunConfig, overrides: Overrides | None = None) -> Ne
     )
 
 
-def resolutions(levels: int, least: int, most: int) -> NDArray[np.int64]:
-    """[levels] resolutions of a hash grid from ``least`` to ``most``, as torch rounds them in float32.
+def resolutions(levels: int, coarsest: int, finest: int) -> NDArray[np.int64]:
+    """[levels] resolutions of a hash grid from ``coarsest`` to ``finest``, as torch rounds them in float32.
 
     A checkpoint does not hold them (nerfstudio/field_components/encodings.py, ``HashEncoding.__init__``).
     """
     import torch
 
-    powers = torch.pow(torch.tensor(_growth(levels, least, most)).float(), torch.arange(levels).float())
-    return torch.floor(least * powers).to(torch.int64).numpy()
+    powers = torch.pow(torch.tensor(_growth(levels, coarsest, finest)).float(), torch.arange(levels).float())
+    return torch.floor(coarsest * powers).to(torch.int64).numpy()
 
 
-def _growth(levels: int, least: int, most: int) -> float:
-    return float(np.exp((np.log(most) - np.log(least)) / (levels - 1))) if levels > 1 else 1.0
+def _growth(levels: int, coarsest: int, finest: int) -> float:
+    return float(np.exp((np.log(finest) - np.log(coarsest)) / (levels - 1))) if levels > 1 else 1.0
 
 
 def _resolution_record(field: NerfactoField) -> Assumption:
@@ -167,7 +162,7 @@ def _resolution_record(field: NerfactoField) -> Assumption:
 def _close_resolutions(grids: list[_Grid]) -> tuple[str, ...]:
     """A note on the resolutions that another machine's float32 power might round to another integer."""
     close = []
-    for one in dict.fromkeys((grid.levels, grid.least, grid.most) for grid in grids):
+    for one in dict.fromkeys((grid.levels, grid.coarsest, grid.finest) for grid in grids):
         for level, size in enumerate(resolutions(*one)):
             exact = one[1] * _growth(*one) ** level
             near = abs(exact - round(exact)) <= _CLOSE_ULPS * float(np.spacing(np.float32(exact)))
@@ -181,7 +176,7 @@ def _close_resolutions(grids: list[_Grid]) -> tuple[str, ...]:
     )
 
 
-def _refuse_other_implementation(run: runs.RunConfig, state: ModelState, checkpoint: Path) -> None:
+def _refuse_other_implementation(run: runs.RunConfig, state: ModelState) -> None:
     """Refuse checkpoints of tiny-cuda-nn, and those that hold no nerfacto at all.
 
     What config.yml says does not decide: without tiny-cuda-nn installed, "tcnn" trains torch's implementation.
@@ -189,24 +184,18 @@ def _refuse_other_implementation(run: runs.RunConfig, state: ModelState, checkpo
     if any(key.endswith(".params") for key in state):
         raise InputError(
             "holds grids and networks of tiny-cuda-nn, which computes in half precision and by other rules than torch",
-            file=checkpoint,
+            file=state.checkpoint,
             field="pipeline.model.implementation",
             fix="train with --pipeline.model.implementation torch",
         )
     if not any(key.startswith("field.mlp_base.") for key in state):
-        raise InputError(
-            f"no nerfacto in this checkpoint (method {show(run.method_name)})",
-            file=checkpoint,
-            field="pipeline._model.field.mlp_base",
-            fix=_FIX,
-        )
+        raise state.refused(f"no nerfacto in this checkpoint (method {show(run.method_name)})", "field.mlp_base")
 
 
 def _positive(run: runs.RunConfig, name: str, default: float, most: float) -> float:
     value: Any = run.model.get(name, default)
     if not is_number(value) or not 0.0 < value < most:
-        fix = "write a number above 0" + (f" and below {most:g}" if math.isfinite(most) else "")
-        raise InputError(f"found {show(value)}", file=run.file, field=_MODEL + name, fix=fix)
+        raise run.refused(name, value, "a number above 0" + (f" and below {most:g}" if math.isfinite(most) else ""))
     return float(value)
 
 
@@ -229,15 +218,10 @@ def _samples(run: runs.RunConfig) -> tuple[int, ...]:
     """Samples of every round, and of the picture."""
     rounds = run.integer("num_proposal_iterations", 2, 1, _ROUNDS_LIMIT)
     value: Any = run.model.get("num_proposal_samples_per_ray", (256, 96))
-    wanted = range(1, _SAMPLES_LIMIT + 1)
-    fits = isinstance(value, (list, tuple)) and all(type(one) is int and one in wanted for one in value)
+    fits = isinstance(value, (list, tuple)) and all(type(one) is int and 1 <= one <= _SAMPLES_LIMIT for one in value)
     if not fits or len(value) < rounds:
-        raise InputError(
-            f"found {show(value)}",
-            file=run.file,
-            field=_MODEL + "num_proposal_samples_per_ray",
-            fix=f"write {rounds} numbers from 1 to {_SAMPLES_LIMIT}, one for every proposal iteration",
-        )
+        wanted = f"{rounds} numbers from 1 to {_SAMPLES_LIMIT}, one for every proposal iteration"
+        raise run.refused("num_proposal_samples_per_ray", value, wanted)
     return (*value[:rounds], run.integer("num_nerf_samples_per_ray", 48, 1, _SAMPLES_LIMIT))
 
 
@@ -246,14 +230,9 @@ def _proposal_arguments(run: runs.RunConfig) -> list[dict[str, int]]:
     name = _MODEL + "proposal_net_args_list"
     value: Any = run.model.get("proposal_net_args_list", _PROPOSALS)
     entries = [runs.as_mapping(one) for one in value] if isinstance(value, (list, tuple)) else []
-    same = run.model.get("use_same_proposal_network", False)
-    if not isinstance(same, bool):
-        raise InputError(
-            f"found {show(same)}", file=run.file, field=_MODEL + "use_same_proposal_network", fix="write true or false"
-        )
+    same = run.flag("use_same_proposal_network", False)
     if not entries or None in entries or (same and len(entries) != 1):
-        fix = "write one mapping" if same else "write a list of mappings"
-        raise InputError(f"found {show(value)}", file=run.file, field=name, fix=fix)
+        raise run.refused("proposal_net_args_list", value, "one mapping" if same else "a list of mappings")
     arguments = []
     for entry in entries:
         assert entry is not None
@@ -285,39 +264,36 @@ def _argument(section: runs.RunConfig, name: str, key: str) -> int:
 
 
 def _proposals(
-    run: runs.RunConfig, state: ModelState, file: Path, arguments: list[dict[str, int]], factor: float
+    run: runs.RunConfig, state: ModelState, arguments: list[dict[str, int]], factor: float
 ) -> tuple[ProposalField, ...]:
     """The field of every round."""
     fields = []
     for i, one in enumerate(arguments):
         name, grid = f"proposal_networks.{i}", _proposal_grid(one)
-        encoding = _encoding(state, name, "mlp_base.0.hash_table", grid, file)
-        _refuse_second_table(state, f"{name}.encoding.hash_table", encoding, file)
+        encoding = _encoding(state, name, "mlp_base.0.hash_table", grid)
+        _refuse_second_table(state, f"{name}.encoding.hash_table", encoding)
         widths = (encoding.size, *(one["hidden_dim"],) * (one["num_layers"] - 1), 1)
-        fields.append(ProposalField(encoding, _net(state, f"{name}.mlp_base.1", file, widths), factor))
+        fields.append(ProposalField(encoding, _net(state, f"{name}.mlp_base.1", widths), factor))
     if len(fields) == 1:
         fields *= run.integer("num_proposal_iterations", 2, 1, _ROUNDS_LIMIT)
     return tuple(fields)
 
 
-def _encoding(state: ModelState, owner: str, key: str, grid: _Grid, file: Path) -> HashEncoding:
+def _encoding(state: ModelState, owner: str, key: str, grid: _Grid) -> HashEncoding:
     """The hash grid ``owner.key``, whose sizes are those of config.yml."""
-    for buffer, said in (("num_levels", grid.levels), ("max_res", grid.most), ("log2_hashmap_size", grid.log2_size)):
-        if f"{owner}.{buffer}" in state and (stored := _whole(state[f"{owner}.{buffer}"])) != said:
-            field = f"pipeline._model.{owner}.{buffer}"
-            raise InputError(f"found {stored}, config.yml says {said}", file=file, field=field, fix=_PAIR)
-    where = f"pipeline._model.{owner}.{key}"
-    if f"{owner}.{key}" not in state:
-        raise InputError("missing", file=file, field=where, fix=_FIX)
-    table = state[f"{owner}.{key}"]
-    shape, wanted = getattr(table, "shape", None), (grid.rows, grid.features)
+    for buffer, said in (("num_levels", grid.levels), ("max_res", grid.finest), ("log2_hashmap_size", grid.log2_size)):
+        name = f"{owner}.{buffer}"
+        if name in state and (stored := _whole(state[name])) != said:
+            raise state.refused(f"found {stored}, config.yml says {said}", name, _PAIR)
+    key = f"{owner}.{key}"
+    # before the table is read, which may be large
+    shape, wanted = getattr(state.get(key), "shape", None), (grid.rows, grid.features)
     if shape is not None and tuple(shape) != wanted:
-        problem = f"a table of {list(shape)}, config.yml says {list(wanted)}"
-        raise InputError(problem, file=file, field=where, fix=_PAIR)
-    values = to_float32(table, file, where).astype(np.float64)
-    sizes = resolutions(grid.levels, grid.least, grid.most)
+        raise state.refused(f"a table of {list(shape)}, config.yml says {list(wanted)}", key, _PAIR)
+    values = state.float32(key).astype(np.float64)
+    sizes = resolutions(grid.levels, grid.coarsest, grid.finest)
     if sizes.min() < 1:
-        raise InputError(f"resolution {sizes.min()}", file=file, field=where, fix="give a run with a larger base_res")
+        raise state.refused(f"resolution {sizes.min()}", key, "give a run with a larger base_res")
     return HashEncoding(values.reshape(grid.levels, -1, grid.features), sizes)
 
 
@@ -328,53 +304,40 @@ def _whole(value: Any) -> Any:
     return show(value) if not isinstance(value, np.ndarray) else value.item()
 
 
-def _refuse_second_table(state: ModelState, key: str, encoding: HashEncoding, file: Path) -> None:
+def _refuse_second_table(state: ModelState, key: str, encoding: HashEncoding) -> None:
     """Refuse a table under its second name (nerfstudio/fields/density_fields.py:84) if it has other values."""
     if key not in state:
         return
-    field = f"pipeline._model.{key}"
-    second = to_float32(state[key], file, field)
-    if not np.array_equal(second.ravel(), encoding.table.ravel()):
-        raise InputError(
-            "differs from mlp_base.0.hash_table, which is the same table", file=file, field=field, fix=_PAIR
-        )
+    if not np.array_equal(state.float32(key).ravel(), encoding.table.ravel()):
+        raise state.refused("differs from mlp_base.0.hash_table, which is the same table", key, _PAIR)
 
 
-def _net(state: ModelState, key: str, file: Path, widths: tuple[int, ...]) -> DenseNet:
+def _net(state: ModelState, key: str, widths: tuple[int, ...]) -> DenseNet:
     """The network ``key`` with layers of the widths that config.yml says."""
     weights, biases = [], []
     for i, shape in enumerate(zip(widths[1:], widths[:-1], strict=True)):
-        weight, bias = model_state.read_linear(state, f"{key}.layers.{i}", file, _FIX)
+        weight, bias = state.linear(f"{key}.layers.{i}")
         if weight.shape != shape:
-            where = f"pipeline._model.{key}.layers.{i}.weight"
             problem = f"found {list(weight.shape)}, config.yml says {list(shape)}"
-            raise InputError(problem, file=file, field=where, fix=_PAIR)
+            raise state.refused(problem, f"{key}.layers.{i}.weight", _PAIR)
         weights.append(weight.astype(np.float64))
         biases.append(bias.astype(np.float64))
     return DenseNet(tuple(weights), tuple(biases))
 
 
-def _color_net(run: runs.RunConfig, state: ModelState, file: Path) -> DenseNet:
+def _color_net(run: runs.RunConfig, state: ModelState) -> DenseNet:
     """The network of colours, the appearance embedding as a part of its first bias."""
-    use = run.model.get("use_appearance_embedding", True)
-    average = run.model.get("use_average_appearance_embedding", True)
-    for name, value in (("use_appearance_embedding", use), ("use_average_appearance_embedding", average)):
-        if not isinstance(value, bool):
-            raise InputError(f"found {show(value)}", file=run.file, field=_MODEL + name, fix="write true or false")
+    use, average = (run.flag(f"use_{kind}appearance_embedding", True) for kind in ("", "average_"))
     length = run.integer("appearance_embed_dim", 32, 0, _WIDTH_LIMIT) if use else 0
     width = run.integer("hidden_dim_color", 64, 1, _WIDTH_LIMIT)
     inputs = HARMONICS + FEATURES
-    net = _net(state, "field.mlp_head", file, (inputs + length, width, width, 3))
+    net = _net(state, "field.mlp_head", (inputs + length, width, width, 3))
     if not length:
         return net
     key = "field.embedding_appearance.embedding.weight"
-    where = f"pipeline._model.{key}"
-    if key not in state:
-        raise InputError("missing", file=file, field=where, fix=_FIX)
-    embeddings = to_float32(state[key], file, where)
+    embeddings = state.float32(key)
     if embeddings.ndim != 2 or embeddings.shape[1] != length or not embeddings.shape[0]:
-        problem = f"found {list(embeddings.shape)}, config.yml says rows of {length}"
-        raise InputError(problem, file=file, field=where, fix=_PAIR)
+        raise state.refused(f"found {list(embeddings.shape)}, config.yml says rows of {length}", key, _PAIR)
     first, bias = net.weights[0], net.biases[0]
     if average:
         bias = with_mean(bias, first[:, inputs:], embeddings)

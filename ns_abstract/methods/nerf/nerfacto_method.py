@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.device import check_device
-from ns_abstract.methods.nerf.hash_bounds.bounds import NerfactoFrame
-from ns_abstract.methods.nerf.hash_field import NerfactoScene
-from ns_abstract.methods.nerf.ray_pictures import (
+from ns_abstract.methods.nerf.field_method import (
     FieldMethod,
     arrays_digest,
     check_arithmetic,
     picture_of_parameters,
     refuse_layers,
 )
+from ns_abstract.methods.nerf.hash_bounds.bounds import NerfactoFrame
+from ns_abstract.methods.nerf.hash_field import NerfactoScene
+from ns_abstract.methods.nerf.nerfacto_render import NerfactoRenderer
 from ns_abstract.methods.program_options import ProgramOptions
 
 if TYPE_CHECKING:
@@ -64,7 +64,6 @@ class NerfactoMethod(FieldMethod):
 
     @property
     def program(self) -> dict[str, Any]:
-        """Name and version of the bounded program."""
         f = self.scene.field
         return {
             "name": "nerfacto",
@@ -77,7 +76,6 @@ class NerfactoMethod(FieldMethod):
 
     @property
     def content(self) -> str:
-        """The scene in a few words."""
         return f"nerfacto, {self.scene.field.text}"
 
     def frame(self, poses: PoseBox, sheared: bool = False, layers: bool = False) -> NerfactoFrame:
@@ -92,7 +90,6 @@ class NerfactoMethod(FieldMethod):
 
     @property
     def plan(self) -> tuple[str, ...]:
-        """What is left out for this scene, whatever the frame."""
         f = self.scene.field
         rounds = " and ".join(map(str, f.samples[:-1]))
         return (
@@ -102,7 +99,6 @@ class NerfactoMethod(FieldMethod):
 
     @property
     def fingerprint(self) -> dict[str, Any]:
-        """Scene and program, for results that are continued."""
         f = self.scene.field
         digest = arrays_digest(f.arrays())
         behind = f.background if isinstance(f.background, str) else f.background.tolist()
@@ -111,7 +107,6 @@ class NerfactoMethod(FieldMethod):
         return {"scene": digest.hexdigest(), "renderer": self.program["name"], "arithmetic": "real"}
 
     def describe(self) -> dict[str, Any]:
-        """The scene for reports."""
         scene, f = self.scene, self.scene.field
         return {
             "name": scene.name,
@@ -127,8 +122,4 @@ class NerfactoMethod(FieldMethod):
         }
 
     def differentiable(self, poses: PoseBox) -> Callable[[torch.Tensor], torch.Tensor]:
-        """Parameter values [d] to the picture [H, W, 3], in torch."""
-        from ns_abstract.methods.nerf.nerfacto_torch import DifferentiableNerfacto
-        from ns_abstract.methods.nerf.render import differentiable_picture
-
-        return picture_of_parameters(poses, partial(differentiable_picture, DifferentiableNerfacto(self.scene.field)))
+        return picture_of_parameters(poses, NerfactoRenderer(self.scene.field).picture)

@@ -116,11 +116,7 @@ class OccupancyGrid:
 
 
 def load_grid(path: Path) -> OccupancyGrid:
-    """Read a grid from an npz with ``occupied`` [X, Y, Z] bool and ``aabb`` [2, 3] (normalised units).
-
-    Raises:
-        InputError: The file cannot be read or does not hold a grid.
-    """
+    """Read a grid from an npz with ``occupied`` [X, Y, Z] bool and ``aabb`` [2, 3] (normalised units)."""
     with open_archive(path, "occupancy grid", "give an .npz with occupied and aabb") as file:
         for name in ("occupied", "aabb"):
             if name not in file.declared:
@@ -147,10 +143,10 @@ def sample_grid(
     lower: Sequence[float],
     upper: Sequence[float],
     resolution: int,
-    least: float,
+    least_density: float,
     progress: Callable[[float], None] = lambda share: None,
 ) -> OccupancyGrid:
-    """A grid of the voxels near which ``density`` (points [n, 3] float64 to [n]) exceeds ``least``.
+    """A grid of the voxels near which ``density`` (points [n, 3] float64 to [n]) exceeds ``least_density``.
 
     Eight points of every voxel are sampled and the voxels found grow by one on every side: a proposal, not a proof.
     """
@@ -165,7 +161,7 @@ def sample_grid(
         points = low + (places[:, None] + corners) * size
         with torch.inference_mode():
             values = density(torch.from_numpy(points.reshape(-1, 3)))
-        flat[numbers] = (values.reshape(-1, 8) > least).any(dim=1).cpu().numpy()
+        flat[numbers] = (values.reshape(-1, 8) > least_density).any(dim=1).cpu().numpy()
         progress((numbers[-1] + 1) / flat.size)
     for axis in range(3):
         grown = occupied.copy()

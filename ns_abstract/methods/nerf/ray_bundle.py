@@ -18,8 +18,6 @@ class RayBundle:
     """The rays of some pixels over one box of poses, as polynomials of the pose (design.md, F10).
 
     Args:
-        pixels: [n, 2] rows and columns.
-        degree: Of the Taylor models.
         swept: Whether samples lie anywhere in their bins; the last parameter is the place there.
     """
 

@@ -129,7 +129,6 @@ class BoundedRays(ABC):
     Attributes:
         displacement: Half the way of a sample over a first cell, as learned from earlier rays.
         distances, lengths: [samples] distances, and lengths of bins around them.
-        taylor: Degree of the Taylor models of poses.
     """
 
     displacement: float
@@ -143,7 +142,7 @@ class BoundedRays(ABC):
         """Whether kernels for a processor bound rays, a few at a time."""
 
     @abstractmethod
-    def division(self, moves: np.ndarray, most: int = ..., deeper: int | None = None) -> Division | None:
+    def division(self, moves: np.ndarray, most_parts: int = ..., deeper: int | None = None) -> Division | None:
         """The cells of a box, as wide as bounds of the field bear; None: the box is too wide.
 
         Args:

@@ -44,7 +44,7 @@ class FitGrid(NamedTuple):
 
 
 class ReluInput(NamedTuple):
-    """B pieces before an activation; see `zonotope.PreActivation`.
+    """B pieces before an activation; see `PreActivation`.
 
     Attributes:
         poly: [B, m, n] coefficients; replaced where the sign is open, and where a piece fails. What is off keeps its
@@ -62,7 +62,7 @@ class ReluInput(NamedTuple):
 
 
 class ReluOutput(NamedTuple):
-    """B pieces behind an activation; see `zonotope.PostActivation`.
+    """B pieces behind an activation; see `PostActivation`.
 
     Attributes:
         slope: [B, n] what columns are multiplied by.

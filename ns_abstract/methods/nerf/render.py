@@ -7,8 +7,9 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 import torch
@@ -36,8 +37,6 @@ class Sampling:
     """Where a ray is sampled.
 
     Attributes:
-        kind: "uniform" or "hierarchical".
-        near, far: Ends of the rays, normalised units.
         samples: Bins of equal length; of the coarse pass where the sampling is hierarchical.
         importance: Samples that the coarse weights place (hierarchical only).
     """
@@ -70,7 +69,66 @@ def camera_rays(camera: PinholeCamera, pixels: np.ndarray) -> np.ndarray:
     return np.stack([x, y, -np.ones_like(x)], axis=1)
 
 
-class NerfRenderer:
+class RayRenderer(ABC):
+    """Renders pictures of a field ray by ray; ``rays`` and ``points`` are those of one kind of field."""
+
+    dtype: torch.dtype = torch.float64
+    device: torch.device = torch.device("cpu")
+
+    @property
+    @abstractmethod
+    def points(self) -> int:
+        """Points that are evaluated for a ray."""
+
+    @abstractmethod
+    def rays(self, pose: Tensor, directions: Tensor, shift: Shift | None = None) -> Tensor:
+        """Colours [n, 3] in [0, 1] along camera-axes ``directions`` [n, 3] from ``pose`` [3, 4]; differentiable.
+
+        ``shift``: hue and saturation added to every point's colour (`hsv.shifted`).
+        """
+
+    def _directions(self, camera: PinholeCamera, pixels: np.ndarray) -> tuple[Tensor, ...]:
+        """Directions of ``pixels`` [n, 2], as many at a time as memory bears."""
+        directions = torch.from_numpy(camera_rays(camera, pixels)).to(self.device, self.dtype)
+        return directions.split(max(1, _CHUNK // self.points))
+
+    def pixels(
+        self, camera: PinholeCamera, pose: np.ndarray, pixels: np.ndarray, shift: Shift | None = None
+    ) -> np.ndarray:
+        """Colours [n, 3] float64 of ``pixels`` [n, 2] (row, column) from camera-to-world ``pose`` [3, 4]."""
+        matrix = torch.tensor(np.asarray(pose)).to(self.device, self.dtype)
+        with torch.inference_mode():
+            parts = []
+            for part in self._directions(camera, pixels):
+                check_cancelled()
+                parts.append(self.rays(matrix, part, shift))
+        return torch.cat(parts).double().cpu().numpy()
+
+    def image(self, camera: PinholeCamera, pose: np.ndarray, shift: Shift | None = None) -> np.ndarray:
+        """The image [H, W, 3] float64."""
+        return self.pixels(camera, pose, _every_pixel(camera), shift).reshape(camera.height, camera.width, 3)
+
+    def picture(self, camera: PinholeCamera, pose: Tensor, shift: Shift | None = None) -> Tensor:
+        """The image [H, W, 3] from camera-to-world ``pose`` [3, 4]; differentiable.
+
+        Rays are worked on once more where slopes are asked for, so that memory stays small.
+        """
+
+        def part(pose: Tensor, directions: Tensor) -> Tensor:
+            check_cancelled()
+            return self.rays(pose, directions, shift)
+
+        directions = self._directions(camera, _every_pixel(camera))
+        parts = [recompute(part, pose, some, use_reentrant=False) for some in directions]
+        return torch.cat(parts).reshape(camera.height, camera.width, 3)
+
+
+def _every_pixel(camera: PinholeCamera) -> np.ndarray:
+    """[H W, 2] rows and columns."""
+    return np.indices((camera.height, camera.width)).reshape(2, -1).T
+
+
+class NerfRenderer(RayRenderer):
     """Renders rays of a scene.
 
     Args:
@@ -93,10 +151,6 @@ class NerfRenderer:
         self._background = torch.tensor(sampling.background, dtype=dtype, device=device)
 
     def rays(self, pose: Tensor, directions: Tensor, shift: Shift | None = None) -> Tensor:
-        """Colours [n, 3] in [0, 1] along camera-axes ``directions`` [n, 3] from ``pose`` [3, 4]; differentiable.
-
-        ``shift``: hue and saturation added to every point's colour (`hsv.shifted`).
-        """
         world = directions @ pose[:, :3].T
         world = world / torch.linalg.vector_norm(world, dim=-1, keepdim=True)
         origin = pose[:, 3]
@@ -124,34 +178,11 @@ class NerfRenderer:
         total = total + self._background * (1.0 - weights.sum(dim=1))[:, None]
         return total.clamp(0.0, 1.0)
 
-    def pixels(
-        self, camera: PinholeCamera, pose: np.ndarray, pixels: np.ndarray, shift: Shift | None = None
-    ) -> np.ndarray:
-        """Colours [n, 3] float64 of ``pixels`` [n, 2] (row, column) from camera-to-world ``pose`` [3, 4]."""
-        directions = torch.from_numpy(camera_rays(camera, pixels)).to(self.device, self.dtype)
-        matrix = torch.tensor(np.asarray(pose)).to(self.device, self.dtype)
-        step = max(1, _CHUNK // self.points)
-        with torch.inference_mode():
-            parts = []
-            for part in directions.split(step):
-                check_cancelled()
-                parts.append(self.rays(matrix, part, shift))
-        return torch.cat(parts).double().cpu().numpy() if parts else np.zeros((0, 3))
-
-    def image(self, camera: PinholeCamera, pose: np.ndarray, shift: Shift | None = None) -> np.ndarray:
-        """The image [H, W, 3] float64."""
-        grid = np.indices((camera.height, camera.width)).reshape(2, -1).T
-        return self.pixels(camera, pose, grid, shift).reshape(camera.height, camera.width, 3)
-
     @property
     def points(self) -> int:
         """Points that are evaluated for a ray."""
         s = self.sampling
         return s.samples + (s.importance if s.kind == "hierarchical" else 0)
-
-    def picture(self, camera: PinholeCamera, pose: Tensor, shift: Shift | None = None) -> Tensor:
-        """The image [H, W, 3] from camera-to-world ``pose`` [3, 4]; differentiable."""
-        return differentiable_picture(self, camera, pose, shift, self.device, self.dtype)
 
     def _distances(self, bins: Tensor) -> Tensor:
         s = self.sampling
@@ -197,43 +228,6 @@ class NerfRenderer:
         return torch.sort(torch.cat([bins, new], dim=-1), dim=-1).values.detach()
 
 
-class DifferentiableRays(Protocol):
-    """Draws rays by differentiable operations."""
-
-    @property
-    def points(self) -> int:
-        """Points that are evaluated for a ray."""
-        ...
-
-    def rays(self, pose: Tensor, directions: Tensor, shift: Shift | None = None) -> Tensor:
-        """Colours [n, 3] along camera-axes ``directions`` [n, 3] from ``pose`` [3, 4]."""
-        ...
-
-
-def differentiable_picture(
-    field: DifferentiableRays,
-    camera: PinholeCamera,
-    pose: Tensor,
-    shift: Shift | None = None,
-    device: torch.device | str = "cpu",
-    dtype: torch.dtype = torch.float64,
-) -> Tensor:
-    """The image [H, W, 3] of a field from camera-to-world ``pose`` [3, 4]; differentiable.
-
-    Rays are worked on some at a time, and once more where slopes are asked for, so that memory stays small.
-    """
-    grid = np.indices((camera.height, camera.width)).reshape(2, -1).T
-    directions = torch.from_numpy(camera_rays(camera, grid)).to(device, dtype)
-
-    def part(pose: Tensor, directions: Tensor) -> Tensor:
-        check_cancelled()
-        return field.rays(pose, directions, shift)
-
-    step = max(1, _CHUNK // field.points)
-    parts = [recompute(part, pose, some, use_reentrant=False) for some in directions.split(step)]
-    return torch.cat(parts).reshape(camera.height, camera.width, 3)
-
-
 def _filled(values: Tensor, inside: Any) -> Tensor:
     """``values`` [p, ...] in the places ``inside`` [n, k], zeros elsewhere; all of them where it selects all."""
     if inside is ...:
@@ -244,5 +238,5 @@ def _filled(values: Tensor, inside: Any) -> Tensor:
 def interval_weights(density: Tensor, lengths: Tensor) -> Tensor:
     """Weights [n, k] of densities [n, k] on bins of ``lengths`` [n, k] (``RaySamples.get_weights``)."""
     depth = lengths * density
-    before = torch.cumsum(depth, dim=1) - depth
+    before = torch.cat([torch.zeros_like(depth[:, :1]), torch.cumsum(depth[:, :-1], dim=1)], dim=1)
     return torch.nan_to_num((1.0 - torch.exp(-depth)) * torch.exp(-before))

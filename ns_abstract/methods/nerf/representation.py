@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
 
 from ns_abstract.methods.nerf.hash_field import NerfactoScene
 from ns_abstract.methods.nerf.load import holds_nerf, load_nerf
@@ -18,11 +18,6 @@ if TYPE_CHECKING:
     from ns_abstract.methods.nerf.nerfacto_method import NerfactoMethod
 
 
-def _load(source: RunConfig | Path, overrides: Overrides) -> NerfScene:
-    assert isinstance(source, RunConfig)
-    return load_nerf(source, overrides)
-
-
 def _method(scene: NerfScene, options: ProgramOptions, arithmetic: str | None, workers: int) -> NerfMethod:
     from ns_abstract.methods.nerf.method import NerfMethod
     from ns_abstract.methods.nerf.occupancy import load_grid
@@ -35,11 +30,6 @@ def _method(scene: NerfScene, options: ProgramOptions, arithmetic: str | None, w
     )  # fmt: skip
 
 
-def _load_nerfacto(source: RunConfig | Path, overrides: Overrides) -> NerfactoScene:
-    assert isinstance(source, RunConfig)
-    return load_nerfacto(source, overrides)
-
-
 def _nerfacto_method(
     scene: NerfactoScene, options: ProgramOptions, arithmetic: str | None, workers: int
 ) -> NerfactoMethod:
@@ -48,10 +38,12 @@ def _nerfacto_method(
     return NerfactoMethod(scene, options, arithmetic, workers)
 
 
-NERF = Representation(lambda source: isinstance(source, RunConfig) and holds_nerf(source), _load, _method, rays=True)
-NERFACTO = Representation(
-    lambda source: isinstance(source, RunConfig) and holds_nerfacto(source),
-    _load_nerfacto,
-    _nerfacto_method,
-    rays=True,
-)
+def _of_runs(
+    holds: Callable[[RunConfig], bool], load: Callable[[Any, Overrides], Any], method: Callable[..., Any]
+) -> Representation:
+    """The representation of runs that ``holds`` tells from others."""
+    return Representation(lambda source: isinstance(source, RunConfig) and holds(source), load, method, rays=True)
+
+
+NERF = _of_runs(holds_nerf, load_nerf, _method)
+NERFACTO = _of_runs(holds_nerfacto, load_nerfacto, _nerfacto_method)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -18,7 +17,7 @@ from torch import Tensor
 from ns_abstract.arithmetic.outward import outward
 from ns_abstract.arithmetic.rounding import DENSITY_ROUNDING, DIRECTION_ROUNDING, KEPT_LIGHT_UP, SAMPLE_ROUNDING
 from ns_abstract.execution.cancellation import check_cancelled
-from ns_abstract.methods.nerf.division import Division
+from ns_abstract.methods.nerf.division import Division, RayCells, join_cells
 from ns_abstract.methods.nerf.hsv import shifted_bounds
 from ns_abstract.methods.nerf.layer_polynomials import PostActivation, PreActivation
 from ns_abstract.methods.nerf.outputs import bounds_by_part, brightness, greatest, opacity
@@ -42,26 +41,6 @@ _SHARE = 0.125
 _ROUNDS = 32
 #: Bins are bounded with a tolerance so many times as large: their bounds are loose anyhow.
 _SWEPT = 8.0
-
-
-@dataclass
-class _SampleCells:
-    """Cells of samples: ray, sample, cell, [k] each, all of one level."""
-
-    ray: np.ndarray
-    sample: np.ndarray
-    cell: np.ndarray
-
-    def __len__(self) -> int:
-        return self.ray.size
-
-    def take(self, which: np.ndarray | slice) -> _SampleCells:
-        return _SampleCells(self.ray[which], self.sample[which], self.cell[which])
-
-
-def join_sample_cells(parts: list[_SampleCells]) -> _SampleCells:
-    """All items of ``parts``."""
-    return _SampleCells(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("ray", "sample", "cell")))
 
 
 class SampleCellBounds:
@@ -158,13 +137,13 @@ class SampleCellBounds:
             )
         return self._levels[level]
 
-    def _rows(self, level: int, items: _SampleCells) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _rows(self, level: int, items: RayCells) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Where the parts [k, parts of a cell] of ``items`` stand in the arrays by sample, ray and part."""
         return items.sample[:, None], items.ray[:, None], self._level(level)[2][items.cell]
 
     def _bound_block(self, block: np.ndarray) -> None:
         """Bound the samples ``block`` of all rays."""
-        waiting: dict[int, list[_SampleCells]] = {}
+        waiting: dict[int, list[RayCells]] = {}
         for level in range(self.division.levels + 1):
             ray, place = np.nonzero((self.start[:, block] == level) & ~self.quiet[:, block])
             if not ray.size:
@@ -174,12 +153,12 @@ class SampleCellBounds:
             item, cell = np.nonzero(bright[ray])
             if not item.size:
                 continue
-            waiting[level] = [_SampleCells(ray[item], block[place[item]], cell)]
+            waiting[level] = [RayCells(ray[item], cell, block[place[item]])]
         self.wide |= any(level > 0 for level in waiting)
         for level in range(self.division.levels + 1):
             if level not in waiting:
                 continue
-            items = join_sample_cells(waiting.pop(level))
+            items = join_cells(waiting.pop(level))
             again = []
             for start in range(0, len(items), self.owner.batch):
                 batch = items.take(slice(start, start + self.owner.batch))
@@ -188,12 +167,12 @@ class SampleCellBounds:
                 first = self.start[batch.ray, batch.sample] == level
                 self.lost += int((lost & first).sum())
                 self.tried += int((visible & first).sum())
-            coarse = join_sample_cells(again)
+            coarse = join_cells(again)
             below = self.division.below[level]
             if below < 0 or not len(coarse):
                 continue
             children = self.division.children(level, coarse.cell)
-            finer = _SampleCells(np.tile(coarse.ray, 2), np.tile(coarse.sample, 2), children)
+            finer = RayCells(np.tile(coarse.ray, 2), children, np.tile(coarse.sample, 2))
             waiting.setdefault(below, []).append(finer)
 
     def _learn(self) -> None:
@@ -232,7 +211,8 @@ class SampleCellBounds:
                 cell = self._cell_of(deeper)[part[which]]
                 unique_cells = np.unique(np.stack([ray[which], sample[which], cell]), axis=1)
                 for start in range(0, unique_cells.shape[1], self.owner.batch):
-                    items = _SampleCells(*unique_cells[:, start : start + self.owner.batch])
+                    rays_here, samples, cells = unique_cells[:, start : start + self.owner.batch]
+                    items = RayCells(rays_here, cells, samples)
                     self._bound_batch(int(deeper), items, math.inf)
             rays = np.unique(ray)
 
@@ -288,7 +268,7 @@ class SampleCellBounds:
         """[count, parts, 3] the colour behind the last sample."""
         return np.tile(np.array(self.owner.sampling.background, np.float64), (count, self.light.shape[1], 1))
 
-    def _bound_batch(self, level: int, items: _SampleCells, coarse: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _bound_batch(self, level: int, items: RayCells, coarse: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Bound some cells of one level.
 
         Returns [k] which leave more light open than ``coarse``, which leave all of it, and which needed the network.
@@ -306,7 +286,7 @@ class SampleCellBounds:
         return halve, lost, tried
 
     def _occupied(
-        self, level: int, items: _SampleCells, lines: np.ndarray, radius: np.ndarray
+        self, level: int, items: RayCells, lines: np.ndarray, radius: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Which items may see occupied voxels, and [k] whether an item surely does; the others are made empty (F11)."""
         everything = np.arange(len(items))
@@ -326,7 +306,7 @@ class SampleCellBounds:
     def _bound_field(
         self,
         level: int,
-        items: _SampleCells,
+        items: RayCells,
         lines: np.ndarray,
         radius: np.ndarray,
         sure: np.ndarray,
@@ -378,7 +358,7 @@ class SampleCellBounds:
             self._color(level, items.take(coloured), pieces.select(which), there[which])
         return halve, lost
 
-    def _leave_alike(self, level: int, items: _SampleCells, density: PreActivation) -> np.ndarray:
+    def _leave_alike(self, level: int, items: RayCells, density: PreActivation) -> np.ndarray:
         """[k] whether next to nothing is seen of an item: that is all that is found out about it then."""
         length = torch.from_numpy(self.owner.lengths[items.sample]).to(density.poly.device)
         most = opacity(greatest(density)[:, 0], length, up=True)
@@ -390,7 +370,7 @@ class SampleCellBounds:
         self.level[rows] = level
         return alike
 
-    def _color(self, level: int, items: _SampleCells, pieces: PostActivation, there: Tensor) -> None:
+    def _color(self, level: int, items: RayCells, pieces: PostActivation, there: Tensor) -> None:
         """Bound the colours of ``pieces``, those of ``items``; ``there``: monomials at their nodes."""
         if self.owner.white is not None:
             self._whiten(self.owner.white, level, items)
@@ -408,7 +388,7 @@ class SampleCellBounds:
         slack = torch.where(color.failed, 1.0, slack).cpu().numpy()
         self.vague[where] = np.minimum(self.vague[where], slack[:, None])
 
-    def _whiten(self, white: WhiteSamples, level: int, items: _SampleCells) -> None:
+    def _whiten(self, white: WhiteSamples, level: int, items: RayCells) -> None:
         """Bound the colours of samples ``items`` that are white where they are chosen (Q3)."""
         distance = self.owner.distances[items.sample]
         lines, radius = self.pencil.points(items.ray, distance, 0.5 * self.owner.lengths[items.sample])

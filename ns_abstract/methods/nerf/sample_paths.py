@@ -7,7 +7,6 @@ field is bounded there and nowhere else, with the place in the rest as one more 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -18,7 +17,7 @@ from numpy.typing import NDArray
 
 from ns_abstract.arithmetic.rounding import DIRECTION_ROUNDING, FOLLOWED_UP, LINE_ROUNDING, NONZERO, SAMPLE_ROUNDING
 from ns_abstract.execution.cancellation import check_cancelled
-from ns_abstract.methods.nerf.division import Division
+from ns_abstract.methods.nerf.division import Division, RayCells, join_cells
 from ns_abstract.methods.nerf.hsv import Range, shifted_bounds
 from ns_abstract.methods.nerf.layer_polynomials import PostActivation, PreActivation
 from ns_abstract.methods.nerf.occupancy import OccupancyGrid
@@ -55,26 +54,6 @@ class FollowTuning:
 
 
 _TUNING = FollowTuning()
-
-
-@dataclass(frozen=True)
-class RayCells:
-    """Cells of rays: ray, cell, [k] each, all of one level."""
-
-    ray: np.ndarray
-    cell: np.ndarray
-
-    def __len__(self) -> int:
-        return self.ray.size
-
-    def take(self, which: np.ndarray | slice) -> RayCells:
-        """Some of them."""
-        return RayCells(self.ray[which], self.cell[which])
-
-    def chunks(self, size: int) -> Iterator[RayCells]:
-        """At most ``size`` at a time."""
-        for start in range(0, len(self), size):
-            yield self.take(slice(start, start + size))
 
 
 @dataclass(frozen=True)
@@ -244,8 +223,7 @@ class BundleBounds:
         for level in range(self.division.levels + 1):
             if level not in waiting:
                 continue
-            parts = waiting.pop(level)
-            cells = RayCells(*(np.concatenate([getattr(p, name) for p in parts]) for name in ("ray", "cell")))
+            cells = join_cells(waiting.pop(level))
             below, again = self.division.below[level], []
             for chunk in cells.chunks(_TUNING.cells):
                 again.append(chunk.take(self._bound(level, chunk)))

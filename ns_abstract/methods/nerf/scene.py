@@ -135,17 +135,31 @@ class FieldWeights:
         return f"{len(self.base)} x {width}{skip}; head {len(self.head)} x {self.head[0].weight.shape[0]}"
 
 
+@dataclass(frozen=True, kw_only=True)
+class FieldScene:
+    """What is told of any field.
+
+    Attributes:
+        dataparser: Units of the training data against the normalised frame.
+        notes: What was assumed where the source says nothing, one sentence each.
+        assumptions: What was decided of the picture, and where each choice came from.
+    """
+
+    dataparser: DataparserTransform = field(default_factory=DataparserTransform)
+    name: str = "scene"
+    source: str = ""
+    notes: tuple[str, ...] = ()
+    assumptions: tuple[Assumption, ...] = ()
+
+
 @dataclass(frozen=True)
-class NerfScene:
+class NerfScene(FieldScene):
     """A vanilla NeRF.
 
     Attributes:
         near, far: Distances of the rays' ends in evaluation, units of the normalised frame.
         background: [3] float32 RGB behind the last sample.
-        dataparser: Units of the training data against the normalised frame.
         occupancy: Declared by the user: density is 0 outside of its occupied voxels.
-        notes: What was assumed where the source says nothing, one sentence each.
-        assumptions: What was decided of the picture, and where each choice came from.
     """
 
     coarse: FieldWeights
@@ -155,9 +169,4 @@ class NerfScene:
     coarse_samples: int = 64
     importance_samples: int = 128
     background: Float32Array = field(default_factory=lambda: np.ones(3, np.float32))
-    dataparser: DataparserTransform = field(default_factory=DataparserTransform)
-    name: str = "scene"
-    source: str = ""
     occupancy: OccupancyGrid | None = None
-    notes: tuple[str, ...] = ()
-    assumptions: tuple[Assumption, ...] = ()

@@ -20,9 +20,10 @@ from ns_abstract.arithmetic.rounding import PART_END_ROUNDING
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseBox
 from ns_abstract.methods.nerf.division import Division
+from ns_abstract.methods.nerf.hsv import shift_ends, shift_parts
 from ns_abstract.methods.nerf.planes import fit_planes
 from ns_abstract.methods.nerf.ray_bundle import RayBundle
-from ns_abstract.methods.nerf.ray_field import BoundedRays, RayBounds, Shifts
+from ns_abstract.methods.nerf.ray_field import BoundedRays, RayBounds
 
 #: Rays that are bounded together by compiled kernels, and by torch alone, which wants many cells at a time.
 _GROUP, _GROUP_ON_DEVICE = 8, 64
@@ -83,7 +84,6 @@ class PoseStrips:
     Args:
         pose_set: The frame's set; parameters that shift colours come last in its box.
         pixels: [t, 2] rows and columns of the rays.
-        run: Bounds groups of rays, here or in other processes.
     """
 
     def __init__(self, bounds: BoundedRays, pose_set: PoseBox, pixels: np.ndarray, run: BoundBatches) -> None:
@@ -165,31 +165,14 @@ class PoseStrips:
 
     def _shift_ends(self, level: int) -> list[np.ndarray]:
         """Edges of the parts of hue and saturation of a level; two where it is fixed."""
-        ends_by_shift = []
-        for name in COLOR_SHIFTS:
-            if name in self.shifting:
-                axis = self.pose_set.box.names.index(name)
-                low, high = self.pose_set.box.lower[axis], self.pose_set.box.upper[axis]
-                ends = np.linspace(low, high, _SHIFT_PARTS * _SHIFT_FINER**level + 1)
-                ends[0], ends[-1] = low, high
-            else:
-                ends = np.full(2, self.pose_set.fixed.get(name, 0.0))
-            ends_by_shift.append(ends)
-        return ends_by_shift
-
-    def _shifts(self, level: int) -> list[Shifts]:
-        """Parts of hue and saturation, the latter running faster; empty: nothing is shifted."""
-        ranges = [list(itertools.pairwise(ends.tolist())) for ends in self._shift_ends(level)]
-        if not any(low or high for cuts in ranges for low, high in cuts):
-            return []
-        return [(hue, saturation) for hue, saturation in itertools.product(*ranges)]
+        return shift_ends(self.pose_set.box, self.pose_set.fixed, _SHIFT_PARTS * _SHIFT_FINER**level)
 
     # ---------------------------------------------------------------- strips
 
     def _call(
         self, strip: ParameterBox, pixels: np.ndarray, layout: StripLayout, level: int, known: np.ndarray | None
     ) -> tuple:
-        shifts = self._shifts(level)
+        shifts = shift_parts(self._shift_ends(level))
         return self.geometry, strip, pixels, TOLERANCES[level], known, None, shifts, layout.division
 
     def _ensure(self, level: int, place: tuple[int, ...], groups: Sequence[int]) -> list[_StripBounds]:
@@ -247,19 +230,19 @@ class PoseStrips:
                     return level
         return len(TOLERANCES)
 
-    def sets(
-        self, box: ParameterBox, weigh: PixelWeightSource | None, most: int | None = None
+    def cell_bounds(
+        self, box: ParameterBox, weigh: PixelWeightSource | None, most_rays: int | None = None
     ) -> tuple[list[np.ndarray], np.ndarray, np.ndarray]:
         """Linear bounds (A_lower, b_lower, A_upper, b_upper) [t, 3, d] and [t, 3], and lower and upper [t, 3].
 
-        Of the first rays alone where not all are asked for: ``t`` is then ``most``, or a few more.
+        Of the first rays alone where not all are asked for: ``t`` is then ``most_rays``, or a few more.
 
         Args:
-            most: How many rays are asked for; all if None.
+            most_rays: How many rays are asked for; all if None.
             weigh: Gives [t, 3] which part of the margin a unit of each pixel's width may cost, about; None there, or
                 in its place: nothing is worth refining.
         """
-        groups = [group for group in self.groups if most is None or group.start < most]
+        groups = [group for group in self.groups if most_rays is None or group.start < most_rays]
         linear, lower, upper = self._level_sets(box, 0, np.arange(len(groups)))
         weights, levels = None, self.levels(box)
         for level in range(1, levels):

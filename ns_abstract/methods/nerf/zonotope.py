@@ -66,13 +66,9 @@ def _rounding(inputs: int) -> float:
     return 2.0 * gamma(inputs + 4)
 
 
-def _before(pieces: PostActivation, kind: torch.dtype) -> layer_kernel.LayerInput:
+def _before(pieces: PostActivation, kind: torch.dtype) -> PostActivation:
     """``pieces`` for compiled layers, with columns of the type ``kind``."""
-    arrays = (
-        pieces.poly, pieces.size, pieces.spread, pieces.box, pieces.slope, pieces.failed, pieces.count,
-        pieces.columns.to(kind), pieces.owner, pieces.new_owner, pieces.new_neuron, pieces.new_size,
-    )  # fmt: skip
-    return layer_kernel.LayerInput(*(array.numpy() for array in arrays))
+    return PostActivation(*(tensor.numpy() for tensor in pieces._replace(columns=pieces.columns.to(kind))))
 
 
 @dataclass(frozen=True)
@@ -171,7 +167,6 @@ class FieldBounds:
             nodes: [B, nodes, 3] the vector's polynomial at the basis' nodes. Its degree by variable is at most
                 the basis' and `VECTOR_DEGREE`.
             radius: [B, 3] distance of the vector from the polynomial.
-            seen: ``position`` or ``direction``.
 
         Returns:
             [B, m, k] coefficients, [B, k] remainders, of the columns seen.
@@ -270,10 +265,11 @@ class FieldBounds:
         rooms = batch * self.limit, batch * n
         size, spread, box, slope = torch.empty(4, batch, n, dtype=torch.float64)
         out = PostActivation(
-            torch.empty(batch, m, n, dtype=torch.float64), torch.empty(rooms[0], n, dtype=kind),
-            torch.empty(rooms[0], dtype=torch.int64), slope, torch.empty(rooms[1], dtype=torch.int64),
-            torch.empty(rooms[1], dtype=torch.int64), torch.empty(rooms[1], dtype=torch.float64), spread, box, size,
+            torch.empty(batch, m, n, dtype=torch.float64), size, spread, box, slope,
             torch.empty(batch, dtype=torch.bool), torch.empty(batch, dtype=torch.int64),
+            torch.empty(rooms[0], n, dtype=kind), torch.empty(rooms[0], dtype=torch.int64),
+            torch.empty(rooms[1], dtype=torch.int64), torch.empty(rooms[1], dtype=torch.int64),
+            torch.empty(rooms[1], dtype=torch.float64),
         )  # fmt: skip
         count = int(last.shapes[:, 2].sum())
         poly = torch.empty(batch, m, count, dtype=torch.float64)
@@ -282,8 +278,8 @@ class FieldBounds:
             _before(pieces, kind), encoded.numpy(), remainder.numpy(), layers, last, grid, self.limit,
             _before(out, kind), FieldOutputs(poly.numpy(), sums.numpy(), radius.numpy()),
         )  # fmt: skip
-        out = replace(
-            out, columns=out.columns[:columns], owner=out.owner[:columns], new_owner=out.new_owner[:terms],
+        out = out._replace(
+            columns=out.columns[:columns], owner=out.owner[:columns], new_owner=out.new_owner[:terms],
             new_neuron=out.new_neuron[:terms], new_size=out.new_size[:terms],
         )  # fmt: skip
         return out, PreActivation(poly, out.columns[:0, :0], out.owner[:0], sums, radius, out.failed, out.count)
@@ -348,7 +344,7 @@ class FieldBounds:
             stays = ~failed[which]
             which, neuron, error = which[stays], neuron[stays], error[stays]
             poly[failed], box[failed], size[failed], spread[failed] = 0.0, 0.0, 0.0, 0.0
-        return PostActivation(poly, columns, owner, slope, which, neuron, error, spread, box, size, failed, count)
+        return PostActivation(poly, size, spread, box, slope, failed, count, columns, owner, which, neuron, error)
 
     def _fitted(self, p: Tensor, values: Tensor) -> tuple[Tensor, Tensor]:
         """Polynomials q [k, m] and errors [k]: ``|max(0, p) - q| <= error`` over the cell (design.md, F5)."""
@@ -414,8 +410,8 @@ class FieldBounds:
         index = torch.zeros(0, dtype=torch.int64, device=self.device)
         failed = torch.zeros(len(poly), dtype=torch.bool, device=self.device)
         return PostActivation(
-            poly[..., :0].contiguous(), none[:0], index, none, index, index, poly.new_zeros(0), none, none, none,
-            failed, failed.to(torch.int64),
+            poly[..., :0].contiguous(), none, none, none, none, failed, failed.to(torch.int64), none[:0], index, index,
+            index, poly.new_zeros(0),
         )  # fmt: skip
 
     def color(self, pieces: PostActivation, poly: Tensor, remainder: Tensor) -> PreActivation:

@@ -26,7 +26,7 @@ from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.stage_data import shared_out
 from ns_abstract.methods.splat.variations import VariedSplats
 from ns_abstract.perturbation.specification import ROTATIONS
-from ns_abstract.refine.protocol import COLORS, Frame, LinearSets, Score, SharedOrder
+from ns_abstract.refine.protocol import COLORS, Bounds, Frame, LinearSets, Score, SharedOrder
 
 if TYPE_CHECKING:
     from ns_abstract.methods.splat.reference import Reference
@@ -82,25 +82,11 @@ class VisibleContext:
 
 
 @dataclass(frozen=True)
-class TileBounds:
-    """Bounds of some tiles over one cell.
+class TileBounds(Bounds):
+    """Bounds of some tiles; ``trivial``: blocks of pixels where too many depth orders were open: nothing is known."""
 
-    Attributes:
-        lower, upper: [t, side, side, channels] float32, rounded outward.
-        slopes: [d] mean absolute linear coefficient by parameter: what a split along it may gain.
-        context: For the cells inside this one.
-        linear: (A_lower, b_lower, A_upper, b_upper) as in `ns_abstract.refine.result.Leaves`, or None.
-        trivial: Blocks of pixels where too many depth orders were open, so that nothing is known.
-        forms: Polynomials before the clamp, with linear bounds.
-    """
-
-    lower: np.ndarray
-    upper: np.ndarray
-    slopes: np.ndarray
     context: VisibleContext
-    linear: LinearSets | None
-    trivial: int
-    forms: np.ndarray | None = None
+    trivial: int = 0
 
 
 @dataclass(frozen=True)
@@ -145,7 +131,7 @@ class SplatSample:
         return {name: array for name, array in arrays.items() if counts[name]}
 
 
-class SplatFrame:
+class SplatFrame(Frame):
     """Bounds and renders one frame's set of poses.
 
     Args:
@@ -198,11 +184,6 @@ class SplatFrame:
             self.pose_set = pose_set.sheared(shear)
             self.box = self.pose_set.box
 
-    @property
-    def tile_count(self) -> int:
-        """Number of tiles, row by row."""
-        return self.across * self.down
-
     def warm_up(self, stage: str | None = None) -> None:
         """Compile the kernels that this frame needs, or those of one of `stages`."""
         box = self.box
@@ -249,9 +230,6 @@ class SplatFrame:
         self._floor = floor if floor > _TUNING.worth_it * self._stop > 0.0 else -1.0
         return max(self._floor, 0.0)
 
-    def observe(self, tiles: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> None:
-        """Bounds do not depend on what was rendered."""
-
     def plan(self, visible: int | None, lower: np.ndarray, upper: np.ndarray) -> list[str]:
         """What was left out for this frame, given what refinement found."""
         varied = self.varied
@@ -271,13 +249,11 @@ class SplatFrame:
         return plan
 
     def shared_order(self, other: Frame) -> SharedOrder | None:
-        """See `ns_abstract.refine.protocol.OrderedFrame`."""
         from ns_abstract.methods.splat.shared_order import shared_order
 
         return shared_order(self, other) if isinstance(other, SplatFrame) else None
 
     def feasible(self, box: ParameterBox) -> ParameterBox | None:
-        """See `PoseBox.feasible`."""
         return self.pose_set.feasible(box)
 
     def bound(
@@ -291,7 +267,6 @@ class SplatFrame:
         self, boxes: Sequence[ParameterBox], tiles: np.ndarray, within: VisibleContext | None, keep_linear: bool,
         pixels: np.ndarray | None,
     ) -> list[TileBounds]:  # fmt: skip
-        """See `ns_abstract.refine.protocol.PartsFrame`."""
         candidates = self.candidates(tiles, within, pixels)
         return each(lambda box: self._bound(box, tiles, within, candidates, keep_linear, pixels), boxes)
 
@@ -338,7 +313,7 @@ class SplatFrame:
             assert cell.linear is not None
             linear = linear_sets(cell.linear, cell.lower, cell.upper, box.dimensions)
         slopes = cell.slopes if parts is None else self._all_slopes(box, cell.slopes, parts)
-        return TileBounds(lower, upper, slopes, context, linear, int(cell.statistics[3]), cell.linear)
+        return TileBounds(lower, upper, slopes, context, linear, cell.linear, int(cell.statistics[3]))
 
     @cached_property
     def _pace(self) -> np.ndarray:

@@ -29,7 +29,7 @@ from ns_abstract.methods.splat.variations import VariedSplats, vary
 from ns_abstract.methods.splat.weights import SplatWeightFrame, WhiteGaussians, plane_mask
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.perturbation.variations import SceneVariation
-from ns_abstract.refine.protocol import MOST_PARTS, Frame, SceneElements, WeightPlane
+from ns_abstract.refine.protocol import MOST_PARTS, Frame, Method, SceneElements, WeightPlane
 
 if TYPE_CHECKING:
     import torch
@@ -47,7 +47,7 @@ _KEPT = 8
 _WITH_TILES = "the alpha threshold and tiles"
 
 
-class SplatMethod:
+class SplatMethod(Method):
     """A splat scene and the program that is bounded.
 
     Args:
@@ -62,6 +62,7 @@ class SplatMethod:
         self.scene = scene
         self.rasteriser: Rasteriser = rasteriser_named(renderer, version)
         self.arithmetic: Arithmetic = arithmetic_named(arithmetic or "float32")
+        self.guarantee = f"{self.arithmetic.name}-sound"
         self.splats: Splats = activate(scene, self.rasteriser)
         self._varied: dict[tuple[SceneVariation, ...], VariedSplats] = {}
         self._sums: dict[tuple[SceneVariation, ...], SceneSums] = {}
@@ -69,32 +70,22 @@ class SplatMethod:
 
     @property
     def name(self) -> str:
-        """The scene's name."""
         return self.scene.name
 
     @property
     def notes(self) -> tuple[str, ...]:
-        """What was assumed on reading the scene."""
         return tuple(self.scene.notes)
 
     @property
     def dataset_scale(self) -> float:
-        """Normalised units per unit of the data set."""
         return self.scene.dataparser.scale
 
     @property
     def program(self) -> dict[str, Any]:
-        """Name and version of the bounded program."""
         return {"name": self.rasteriser.name, "version": self.rasteriser.version}
 
     @property
-    def guarantee(self) -> str:
-        """What bounds of this program are called."""
-        return f"{self.arithmetic.name}-sound"
-
-    @property
     def content(self) -> str:
-        """The scene in a few words."""
         alone = " alone, of a model that may draw more" if self.scene.gaussians_alone else ""
         return f"{self.scene.count:,} Gaussians{alone}"
 
@@ -122,11 +113,9 @@ class SplatMethod:
         return SplatWeightFrame(white, self.splats, self.rasteriser, self.arithmetic, poses, varied, sums, self._slow)
 
     def ablations(self, poses: PoseBox) -> Iterator[tuple[str, SplatFrame]]:
-        """See `Method.ablations`."""
         return ablations(self.scene, self.rasteriser, self.arithmetic, poses, self.varied(poses.perturbation.scene))
 
     def attribution(self, frame: Frame, box: ParameterBox, tile: int, count: int) -> list[tuple[int, float]]:
-        """See `Method.attribution`."""
         assert isinstance(frame, SplatFrame)
         return attribution(frame, box, tile, count)
 
@@ -156,7 +145,6 @@ class SplatMethod:
         return self._varied[variations]
 
     def memory(self, pixels: int, threads: int) -> int:
-        """See `Method.memory`."""
         arrays = (self.splats.means, self.splats.axes, self.splats.opacity, self.splats.sh)
         ranges = sum(v.varies for v in self._varied.values()) * _BYTES_BY_VARIED
         # cells that are bounded side by side have buffers of their own
@@ -165,7 +153,6 @@ class SplatMethod:
 
     @property
     def plan(self) -> tuple[str, ...]:
-        """What is left out for this scene, whatever the frame."""
         scene, splats, plan = self.scene, self.splats, []
         for reason, count in scene.dropped.items():
             plan.append(f"{count:,} stored Gaussians left out: {reason}")
@@ -182,7 +169,6 @@ class SplatMethod:
 
     @property
     def fingerprint(self) -> dict[str, Any]:
-        """Scene and program, for results that are continued."""
         scene, digest = self.scene, hashlib.sha256()
         for array in (scene.means, scene.log_scales, scene.quats, scene.opacity_logits, scene.sh, scene.background):
             digest.update(np.ascontiguousarray(array).tobytes())
@@ -198,7 +184,6 @@ class SplatMethod:
         }
 
     def describe(self) -> dict[str, Any]:
-        """The scene for reports."""
         scene = self.scene
         return {
             "name": scene.name,

@@ -322,9 +322,6 @@ def falsify(
         seed: Of what is random.
         starts: [n, d] poses to try first, clipped into the box.
         strategies: Which of `STRATEGIES` to use. Poses that one does not need go to the next.
-
-    Raises:
-        ValueError: The bounds or images have the wrong shape, or a strategy is unknown.
     """
     unknown = set(strategies) - set(STRATEGIES)
     if unknown:

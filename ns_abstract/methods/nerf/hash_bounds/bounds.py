@@ -31,7 +31,7 @@ from ns_abstract.methods.nerf.hash_bounds.network import (
 )
 from ns_abstract.methods.nerf.hash_bounds.pieces import DensityArrays, FieldArrays, PieceRoom
 from ns_abstract.methods.nerf.hash_field import LAYERS_LIMIT, DenseNet, HashEncoding, NerfactoField, NerfactoScene
-from ns_abstract.methods.nerf.nerfacto_render import NerfactoRenderer
+from ns_abstract.methods.nerf.nerfacto_render import NerfactoRenderer, spacing
 from ns_abstract.methods.nerf.ray_bundle import TAYLOR, RayBundle
 from ns_abstract.methods.nerf.ray_field import BoundedRays, RayBounds, RayRequest
 
@@ -55,7 +55,7 @@ class HashTuning:
     most_first: int = 4096
     #: Halvings of first pieces by axis, and pieces of a ray beside 16 for each first one.
     deeper: int = 7
-    most: int = 512
+    most_pieces: int = 512
     #: Parts of the tolerance: a form's rest that is good, light behind which samples are left open (where samples are
     #: placed, and of a picture), and a weight whose colour is left open.
     rest: float = 0.25
@@ -89,10 +89,12 @@ class HashBounds(BoundedRays):
         """Rays are bounded one after another by compiled kernels."""
         return True
 
-    def division(self, moves: np.ndarray, most: int = _TUNING.most_first, deeper: int | None = None) -> Division | None:
+    def division(
+        self, moves: np.ndarray, most_parts: int = _TUNING.most_first, deeper: int | None = None
+    ) -> Division | None:
         """The parts for which bounds over a box are kept; None: the box is too wide. ``moves`` [n, samples, d]."""
         finer = _TUNING.finer if moves.shape[2] == 1 else 0
-        return division_for(moves, self.displacement, most, 0, finer)
+        return division_for(moves, self.displacement, most_parts, 0, finer)
 
     def bounded(self, request: RayRequest, division: Division | None) -> RayBounds:
         # opacities are not told, so those that are known are not looked at
@@ -144,7 +146,7 @@ class HashBounds(BoundedRays):
             rays = pieces.RayPolynomials(
                 bundle.origin, origin_radius, bundle.direction[some], direction_radius[some], bundle.exponents
             )
-            most = _TUNING.most + 16 * int(cells[some].prod(axis=1).max())
+            most = _TUNING.most_pieces + 16 * int(cells[some].prod(axis=1).max())
             pieces.bound_rays(
                 self.arrays, rays, cells[some], _TUNING.deeper * d, most, goal[some], limits, shifts, room,
                 counts, bounds_by_part[some], bounded[some],
@@ -170,24 +172,17 @@ def _density(encoding: HashEncoding, net: DenseNet, scale: float) -> DensityArra
     return DensityArrays(table, resolutions, ranges, net_weights(net), float(scale))
 
 
-def spacing_of(field: NerfactoField) -> tuple[bool, float, float]:
-    """Whether distances are piecewise, and the ends of rays in the units in which edges are equally spaced."""
-    if field.spacing == "uniform":
-        return False, float(field.near), float(field.far)
-    first, last = (x / 2.0 if x < 1.0 else 1.0 - 1.0 / (2.0 * x) for x in (field.near, field.far))
-    return True, first, last
-
-
 def field_arrays(field: NerfactoField) -> FieldArrays:
     """The arrays of ``field`` for kernels."""
-    last = isinstance(field.background, str)
+    last, piecewise = isinstance(field.background, str), field.spacing == "piecewise"
+    place = spacing if piecewise else float
     return FieldArrays(
         tuple(_density(one.encoding, one.net, one.average_init_density) for one in field.proposals),
         _density(field.encoding, field.density_net, field.average_init_density),
         head_weights(field.color_net, HARMONICS),
         np.zeros(3) if last else np.ascontiguousarray(field.background, np.float64),
         last,
-        spacing_of(field),
+        (piecewise, place(field.near), place(field.far)),
     )
 
 
@@ -226,11 +221,7 @@ def piece_room(field: NerfactoField, arrays: FieldArrays, dimensions: int) -> Pi
 
 
 class NerfactoFrame(FieldFrame):
-    """Bounds and renders one frame's set of poses of a nerfacto.
-
-    Args:
-        workers: Threads that bound rays side by side; results do not depend on their number.
-    """
+    """Bounds and renders one frame's set of poses of a nerfacto."""
 
     def __init__(self, scene: NerfactoScene, pose_set: PoseBox, workers: int = 1) -> None:
         bounds = HashBounds(scene.field, pose_set.geometry.box.dimensions)

@@ -10,7 +10,7 @@ from numba import njit
 
 from ns_abstract.arithmetic.rounding import CELL_ROUNDING, HASH_UP, TRILINEAR_ROUNDING
 from ns_abstract.methods.nerf.hash_bounds.forms import UNCOUNTED, spread_of
-from ns_abstract.methods.nerf.nerfacto_kernel import hash_row
+from ns_abstract.methods.nerf.hash_field import PRIME_Y, PRIME_Z
 
 #: Most nodes by axis of a level whose slopes are looked at, and in all of those of which the hull of values is taken.
 FORM_NODES, HULL_NODES = 6, 4096
@@ -43,6 +43,12 @@ def feature_room(features: int) -> FeatureRoom:
         np.zeros((2, 3), np.int64), np.zeros((4, 3)), np.zeros((*box, features)), np.zeros((2, *box)), np.zeros((2, 3)),
         np.zeros((2, features)),
     )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", **UNCOUNTED)
+def hash_row(x, y, z, rows):
+    """The row of a level's table, of ``rows`` (a power of two), that the corner (x, y, z) has."""
+    return (x ^ (y * PRIME_Y) ^ (z * PRIME_Z)) & (rows - 1)
 
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)

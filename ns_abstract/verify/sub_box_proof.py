@@ -18,10 +18,11 @@ import torch
 from ns_abstract.arithmetic.rounding import NONZERO
 from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.verify.model import ModelSharedBounds, NetworkModel
 from ns_abstract.verify.network import ImageSets, OutputBounds
 from ns_abstract.verify.picture_sets import PictureSets, hull_of_sets
 from ns_abstract.verify.properties import Claim, Query
-from ns_abstract.verify.protocol import FrameImages, Model, SharedBounds, SharedBoundsModel
+from ns_abstract.verify.protocol import FrameImages, Model
 from ns_abstract.verify.search_results import FAILURES
 
 #: The power of the width that sets cost.
@@ -36,7 +37,7 @@ class CoverTuning:
     #: open by it. Networks that bear more are told by boxes about the set's middle, of which the least is so small a
     #: part of it.
     opening: float = 42.0
-    least: float = 2.0**-9
+    least_share: float = 2.0**-9
 
 
 _TUNING = CoverTuning()
@@ -99,6 +100,12 @@ def margin_weights(model: Model, claim: Claim, image: np.ndarray, values: np.nda
     return PixelWeights(gradient.numpy() / here, here) if here > 0.0 else None
 
 
+def pixel_costs(scene: FrameImages, model: Model, claim: Claim, box: ParameterBox) -> np.ndarray | None:
+    """What part of the margin in the middle of a cell a unit of each pixel may cost (an estimate); None: unknown."""
+    weights = margin_weights(model, claim, scene.image(box.middle), box.middle)
+    return None if weights is None or not np.isfinite(weights.slopes).all() else np.abs(weights.slopes)
+
+
 @dataclass(frozen=True)
 class SubBoxOutcome:
     """The result of a cell.
@@ -106,7 +113,6 @@ class SubBoxOutcome:
     Attributes:
         margin: Proven lower bound of the margin on all of it; None: there is none.
         cuts: [d] into how many parts it should be cut along each parameter if there is none.
-        parts: Parts that were bounded.
     """
 
     margin: float | None
@@ -132,11 +138,7 @@ class _CellWork:
     """The state of the proof of one cell.
 
     Attributes:
-        feasible: See `Parametrisation`.
-        weights: Of the cell's middle.
-        query: What the network is asked.
         aim: What parts may cost, by what was found so far.
-        parts: Parts that were bounded.
         asked: Those of which the network was asked.
         done: What part of the box is proved, or holds no pose.
         margins: Lower bounds of the margin over what is proved.
@@ -151,7 +153,7 @@ class _CellWork:
     asked: int = 0
     done: float = 0.0
     margins: list[float] = field(default_factory=list)
-    rows: SharedBounds | None = None
+    rows: ModelSharedBounds | None = None
 
     def learn(self, cost: float, margin: float) -> None:
         """Take notice of the margin that own rows prove for a part that costs so much."""
@@ -184,12 +186,9 @@ class SubBoxProof:
     """Proves cells of several parameters sub-box by sub-box.
 
     Args:
-        scene: Pictures, in the parameters of ``frame``.
-        model: The network.
         sharing: The network, as it bounds neighbours together.
-        claim: What is to hold, in these parameters.
         frame: From cells to boxes of these parameters.
-        most: Most parts of a cell, about; one that would take more is cut first.
+        most_parts: About, of a cell; one that would take more is cut first.
         block: Most cells that are examined together.
         aim: What the sets of parts may cost of the margin (`PixelWeights.loss`), at first.
         other: Another way to cover the same cells, taken where it needs fewer parts.
@@ -197,10 +196,10 @@ class SubBoxProof:
 
     scene: FrameImages
     model: Model
-    sharing: SharedBoundsModel
+    sharing: NetworkModel
     claim: Claim
     frame: Parametrisation = own_parameters
-    most: int = 64
+    most_parts: int = 64
     block: int = 2
     aim: float = 0.26
     other: SubBoxProof | None = None
@@ -209,9 +208,7 @@ class SubBoxProof:
         """Try to prove a cell, if it takes few enough parts.
 
         Args:
-            cell: The cell.
             outputs: [n] outputs seen in it.
-            weights: Of its middle.
         """
         return self._chosen._prove(cell, outputs, weights)
 
@@ -226,7 +223,7 @@ class SubBoxProof:
         if probe_sets is None:
             return SubBoxOutcome(None, self._cuts(cell, root, None, 1.0), 0)
         cost, effects = weights.loss(probe_sets, self.opening) * _PROBE**_POWER, weights.effects(probe_sets) * _PROBE
-        if math.prod(divisions(effects, cost, self.aim, self.most)) > self.most:
+        if math.prod(divisions(effects, cost, self.aim, self.most_parts)) > self.most_parts:
             return SubBoxOutcome(None, self._cuts(cell, root, effects, cost), 0)
         work = _CellWork(feasible, weights, self.claim.query(outputs[None]), self.aim)
         try:
@@ -247,14 +244,14 @@ class SubBoxProof:
         """
         whole, most = self.scene.box, _TUNING.opening
         outputs = self.model.outputs(self.scene.image(np.array(whole.middle))[None])
-        query, first, share = self.claim.query(outputs), math.nan, _TUNING.least
+        query, first, share = self.claim.query(outputs), math.nan, _TUNING.least_share
         while share <= 1.0:
             sets = self._sets(_about_middle(whole, share))
             if sets is None:
                 break
             rows = self.sharing.shared_bounds(self._images([sets]))
             margin = float(self._proved(query, rows.first(query), [sets])[0])
-            first = margin if share == _TUNING.least else first
+            first = margin if share == _TUNING.least_share else first
             if not (first > 0.0 and margin > _SPARE * first):
                 break
             most = min(most, self.aim / max(float(sets.widths.mean()), NONZERO))
@@ -278,17 +275,13 @@ class SubBoxProof:
 
     def _sets(self, box: ParameterBox) -> PictureSets | None:
         check_cancelled()
-        linear, lower, upper, _ = self.scene.sets(box)
+        linear, lower, upper, _ = self.scene.linear_sets(box)
         picture_sets = PictureSets(box, linear, lower, upper)
         return picture_sets if picture_sets.sane else None
 
     def _all(self, work: _CellWork, node: _PendingBox) -> None:
-        """Prove a box, in groups of parts.
-
-        Raises:
-            _StoppedError: It takes too many, or one cannot be proved.
-        """
-        counts = divisions(node.effects, node.cost, work.aim, self.most)
+        """Prove a box, in groups of parts."""
+        counts = divisions(node.effects, node.cost, work.aim, self.most_parts)
         if math.prod(counts) > (_GROUP if self.sharing.reusable_anywhere else _JOINED):
             for half in node.parts(int(np.argmax(counts)), 2):
                 self._all(work, half)
@@ -310,11 +303,7 @@ class SubBoxProof:
         return feasible_boxes
 
     def _group(self, work: _CellWork, nodes: Sequence[_PendingBox]) -> None:
-        """Prove neighbouring parts.
-
-        Raises:
-            _StoppedError: It takes too many parts, or one cannot be proved.
-        """
+        """Prove neighbouring parts."""
         nodes = self._feasible(work, nodes)
         if not nodes:
             return
@@ -356,7 +345,9 @@ class SubBoxProof:
             self._lent(work, rows, parts, margins)
         return margins
 
-    def _lent(self, work: _CellWork, rows: SharedBounds, parts: Sequence[PictureSets], margins: np.ndarray) -> None:
+    def _lent(
+        self, work: _CellWork, rows: ModelSharedBounds, parts: Sequence[PictureSets], margins: np.ndarray
+    ) -> None:
         """Prove those of ``parts`` without a margin by rows of another, in place."""
         for fresh in (False, True):
             # before, nothing is known of some
@@ -384,8 +375,8 @@ class SubBoxProof:
             _StoppedError: There are too many, or one has none.
         """
         work.parts += len(nodes)
-        late = work.asked > self.most // 2 and work.asked > _MORE * self.most * work.done
-        if late or work.parts > 2.0 * _MORE * self.most:
+        late = work.asked > self.most_parts // 2 and work.asked > _MORE * self.most_parts * work.done
+        if late or work.parts > 2.0 * _MORE * self.most_parts:
             raise _StoppedError
         parts: list[PictureSets] = []
         for node in nodes:
@@ -398,11 +389,7 @@ class SubBoxProof:
     def _left(
         self, work: _CellWork, nodes: Sequence[_PendingBox], margins: np.ndarray
     ) -> list[tuple[int, _PendingBox]]:
-        """Those of ``nodes`` that have no proof, by number; the others are done with.
-
-        Raises:
-            _StoppedError: One cannot be cut any further.
-        """
+        """Those of ``nodes`` that have no proof, by number; the others are done with."""
         work.margins += [float(margin) for margin in margins if margin > 0.0]
         work.done += sum(node.share for node, margin in zip(nodes, margins, strict=True) if margin > 0.0)
         left = [(k, node) for k, node in enumerate(nodes) if not margins[k] > 0.0]
@@ -434,7 +421,7 @@ class SubBoxProof:
         goal = (self.aim / max(cost, self.aim)) ** (1.0 / _POWER) * float(effects.sum()) / d
         cuts = [1] * d
         for _ in range(_CUTS):
-            if not always and self._parts(cell, width, effects, goal) <= math.log2(self.most) and max(cuts) > 1:
+            if not always and self._parts(cell, width, effects, goal) <= math.log2(self.most_parts) and max(cuts) > 1:
                 break
             candidates = []
             for axis in range(d):
@@ -462,15 +449,15 @@ def _about_middle(box: ParameterBox, share: float | np.ndarray) -> ParameterBox:
     return inner
 
 
-def divisions(effects: np.ndarray, cost: float, aim: float, most: int) -> list[int]:
+def divisions(effects: np.ndarray, cost: float, aim: float, most_parts: int) -> list[int]:
     """Return into how many equal parts to divide each parameter so that their sets cost ``aim`` of the margin.
 
-    There is no use in many more parts than ``most``.
+    There is no use in many more parts than ``most_parts``.
     """
     gains = np.where(np.isfinite(effects), effects, 0.0) + NONZERO
     goal = (aim / cost) ** (1.0 / _POWER) * float(gains.sum()) if cost > aim else math.inf
     counts = np.ones(len(gains), np.int64)
-    while (gains / counts).sum() > goal and counts.prod() <= most:
+    while (gains / counts).sum() > goal and counts.prod() <= most_parts:
         # what a further part gains, by what it costs
         counts[np.argmax(gains / (counts * (counts + 1) * np.log1p(1.0 / counts)))] += 1
     return counts.tolist()

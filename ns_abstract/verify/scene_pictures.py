@@ -1,0 +1,45 @@
+"""Pictures of a set of poses, rendered and bounded as they are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from ns_abstract.execution.cancellation import check_cancelled
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.poses import PoseBox
+from ns_abstract.geometry.tiles import assemble
+from ns_abstract.refine.protocol import Bounds, Frame, LinearSets, SceneSample
+from ns_abstract.verify.camera_response import CameraResponse, response_sets
+
+
+class ScenePictures:
+    """Pictures of a frame as any camera of ``response`` shows them; see `ns_abstract.verify.protocol.FrameImages`."""
+
+    def __init__(self, frame: Frame, response: CameraResponse | None = None) -> None:
+        self.frame, self._response, self.box = frame, response, frame.box
+        self._tiles = np.arange(frame.tile_count)
+
+    @property
+    def pose_set(self) -> PoseBox:
+        """The poses that may be looked at."""
+        return self.frame.pose_set
+
+    def image(self, values: np.ndarray, member: SceneSample | None = None) -> np.ndarray:
+        check_cancelled()
+        render = self.frame.render if member is None else member
+        return assemble(render(np.asarray(values, np.float64)), self.frame.camera)
+
+    def scene_samples(self, seed: int) -> Iterator[SceneSample]:
+        return (
+            self.frame.scene_samples(seed) if self._response is None else self._response.scene_samples(self.frame, seed)
+        )
+
+    def _bounds(self, box: ParameterBox) -> Bounds:
+        """Linear bounds of all tiles."""
+        return self.frame.bound(box, self._tiles, keep_linear=True)
+
+    def linear_sets(self, box: ParameterBox) -> tuple[LinearSets, np.ndarray, np.ndarray, np.ndarray]:
+        tile_bounds = self._bounds(box)
+        return *response_sets(tile_bounds, self.frame.camera, self._response), tile_bounds.slopes
