@@ -166,7 +166,6 @@ class Certification:
 
     @property
     def fingerprint(self) -> dict[str, Any]:
-        """What a stored search must agree with to be continued."""
         return self._fingerprint
 
     @cached_property

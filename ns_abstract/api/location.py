@@ -142,7 +142,6 @@ class Location:
 
     @property
     def fingerprint(self) -> dict[str, Any]:
-        """What a stored search must agree with to be continued."""
         return self._fingerprint
 
     @cached_property

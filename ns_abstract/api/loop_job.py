@@ -167,7 +167,6 @@ class LoopJob:
 
     @property
     def fingerprint(self) -> dict[str, Any]:
-        """What a stored search must agree with to be continued."""
         return self._fingerprint
 
     @cached_property
