@@ -132,7 +132,6 @@ class Certification:
 
     @property
     def recipe(self) -> Recipe[Certification]:
-        """How another process opens it; files are looked for under the same paths."""
         question = self.question
         again = partial(
             _open,
@@ -156,7 +155,6 @@ class Certification:
 
     @property
     def assumptions(self) -> tuple[Assumption, ...]:
-        """What the verdicts rest on, and where each choice came from."""
         resize = self.property.preprocess.resize
         drawn = {} if resize is None else {"picture size": f"{self.question.source.name}: preprocess.resize"}
         return (
@@ -245,7 +243,6 @@ class Certification:
         return self._searches[key]
 
     def examine(self, number: int, grid: CellGrid, cells: tuple[Cell, ...]) -> BlockResult:
-        """What becomes of cells of a frame; see `ns_abstract.api.cell_search.Examiner`."""
         return self.search(number, grid).examine(cells)
 
     def _cover(self, pictures: FramePictures, response: CameraResponse | None = None) -> SubBoxProof | None:

@@ -89,7 +89,6 @@ class CertifyProgress(SearchProgress):
 
     @property
     def sentence(self) -> str:
-        """The four parts of the volume."""
         return shares_text(self.certified, self.falsified, self.unknown, self.open)
 
 
@@ -223,7 +222,6 @@ class Certificate(SearchResult):
         return {"certified": self.certified, "falsified": self.falsified, "unknown": self.unknown}
 
     def _lines(self) -> list[str]:
-        """The certificate in words."""
         return [
             f"{self.verdict}: on every image {self.sentence}",
             ", ".join(f"{kind} {percent(share)}" for kind, share in self._shares().items()),

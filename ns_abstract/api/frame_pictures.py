@@ -108,7 +108,6 @@ class FramePictures:
 
     @property
     def pose_set(self) -> PoseBox:
-        """The frame's poses."""
         return self.frame.pose_set
 
     def image(self, values: np.ndarray, member: SceneSample | None = None) -> np.ndarray:

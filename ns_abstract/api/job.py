@@ -100,7 +100,6 @@ class Job:
 
     @property
     def frame_count(self) -> int:
-        """Number of sets."""
         return len(self.pose_sets)
 
     @property

@@ -91,11 +91,9 @@ class LoopJob:
 
     @cached_property
     def search(self) -> LoopSearch:
-        """The search."""
         return LoopSearch(self.reacher())
 
     def examine(self, number: int, grid: CellGrid, cells: tuple[Cell, ...]) -> LoopBlockResult:
-        """What becomes of cells of a question; see `ns_abstract.api.cell_search.Examiner`."""
         return self.search.examine(number, grid, cells)
 
     @property
@@ -146,7 +144,6 @@ class LoopJob:
 
     @property
     def recipe(self) -> Recipe[LoopJob]:
-        """How another process opens it; files are looked for under the same paths."""
         loop = self.loop
         # laws of motion do not travel
         again = partial(
@@ -156,7 +153,6 @@ class LoopJob:
 
     @property
     def assumptions(self) -> tuple[Assumption, ...]:
-        """What the verdicts rest on, and where each choice came from."""
         output = self.loop.value.get("output")
         arithmetic = None if self.model.arithmetic == "float32" else self.model.arithmetic
         return (

@@ -68,7 +68,6 @@ class SearchOptions:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What the report says of them."""
         return {name: getattr(self, name) for name in ("time_budget", "arithmetic", "workers", "engine")}
 
     def search(

@@ -114,7 +114,6 @@ class InstanceFolder:
         return origin
 
     def write_lists(self) -> None:
-        """Write instances.csv, boxes.json and origins.json."""
         stream = io.StringIO()
         csv.writer(stream, lineterminator="\n").writerows(self.lines)
         content = stream.getvalue().encode()

@@ -41,7 +41,6 @@ class Check:
 
 
 def check(options: Check) -> int:
-    """Run the command; returns the exit code."""
     from ns_abstract.api.checking import check as audited
 
     audit = audited(
@@ -83,7 +82,6 @@ def check(options: Check) -> int:
 
 
 def main() -> None:
-    """Entry point of the console script."""
     run(check, command("ns-abstract-check", Check), "close other programs")
 
 

@@ -150,12 +150,10 @@ class Snapshot:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Height and width."""
         return self.lower.shape[0], self.lower.shape[1]
 
     @property
     def bytes(self) -> int:
-        """Memory of the pictures."""
         return 4 * self.lower.nbytes
 
 
@@ -200,9 +198,7 @@ class Source(Protocol):
         """
         ...
 
-    def warm_up(self) -> None:
-        """Compile what frames will need."""
-        ...
+    def warm_up(self) -> None: ...
 
 
 @dataclass(frozen=True, eq=False)
@@ -231,7 +227,6 @@ class SplatSource:
 
     @property
     def guarantee(self) -> str:
-        """What the bounds are worth on a platform that passes its self-check."""
         return f"{self.arithmetic}-sound"
 
     def frame(self, camera: PinholeCamera, perturbation: Perturbation) -> SplatFrame:
@@ -259,7 +254,6 @@ class SplatSource:
         return self._kept[perturbation.scene]
 
     def warm_up(self) -> None:
-        """Compile the kernels for one and for several parameters."""
         means = self.splats.means
         middle = np.median(means, axis=0)
         distance = 4.0 * float(np.median(np.linalg.norm(means - middle, axis=1))) + 0.1
@@ -298,17 +292,14 @@ class NerfSource:
 
     @property
     def about(self) -> str:
-        """What is bounded, as that is not the picture on screen."""
         s = self._method.sampling
         return f"of the fine field at {s.samples} uniform samples by ray, not of the picture with importance samples"
 
     def frame(self, camera: PinholeCamera, perturbation: Perturbation) -> NerfFrame:
-        """The frame of ``camera`` and a set of poses around it. Raises InputError: Gaussians are to vary."""
         self._method.prepare([perturbation])
         return self._method.frame(PoseBox.around(camera, perturbation))
 
     def warm_up(self) -> None:
-        """Compile the kernels for one and for several parameters."""
         camera = PinholeCamera(np.eye(3, 4), 2.0, 2.0, 1.0, 1.0, 2, 2)
         for radii in _WARM_UP:
             self.frame(camera, perturbation_of(radii)).warm_up()
