@@ -9,7 +9,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -128,7 +128,8 @@ class Certification:
         self.arithmetic: NetworkArithmetic = network_arithmetic
         self.model: NetworkModel | MeasureModel = question.searched(memory, network_arithmetic, picture)
         self.property: Property = question.property
-        self._searches: dict[tuple[int, CellGrid], Search] = {}
+        #: the search of a frame, by its number and cells; some are kept at hand
+        self.search = lru_cache(question.frames)(self._search)
 
     @property
     def recipe(self) -> Recipe[Certification]:
@@ -222,25 +223,16 @@ class Certification:
         ends += range(ends[-1] + self.block, len(roots) + self.block, self.block)
         return [roots[a:b] for a, b in itertools.pairwise(ends) if a < len(roots)]
 
-    def search(self, index: int, grid: CellGrid) -> Search:
-        """The search of a frame; kept at hand."""
-        key = (index, grid)
-        if key in self._searches:
-            # the last that was asked for is dropped last
-            self._searches[key] = self._searches.pop(key)
-        else:
-            while len(self._searches) >= self.question.frames:
-                self._searches.pop(next(iter(self._searches)))
-            pictures = self.pictures(index)
-            every_unit = self.property.partitions is not None
-            claim = self.claim(pictures)
-            pictures.weigh = partial(pixel_weights, pictures, self.model, claim)
-            cover = self._cover(pictures)
-            costly = isinstance(self.model, NetworkModel)
-            self._searches[key] = Search(
-                pictures, self.model, claim, grid, every_unit=every_unit, block=self.block, cover=cover, costly=costly
-            )
-        return self._searches[key]
+    def _search(self, index: int, grid: CellGrid) -> Search:
+        pictures = self.pictures(index)
+        every_unit = self.property.partitions is not None
+        claim = self.claim(pictures)
+        pictures.weigh = partial(pixel_weights, pictures, self.model, claim)
+        cover = self._cover(pictures)
+        costly = isinstance(self.model, NetworkModel)
+        return Search(
+            pictures, self.model, claim, grid, every_unit=every_unit, block=self.block, cover=cover, costly=costly
+        )
 
     def examine(self, number: int, grid: CellGrid, cells: tuple[Cell, ...]) -> BlockResult:
         return self.search(number, grid).examine(cells)
