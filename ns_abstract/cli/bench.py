@@ -14,9 +14,7 @@ from ns_abstract.cli.bench_options import (
     Certificates,
     Compile,
     Loops,
-    PlanBenchmark,
     Rays,
-    RulesBenchmark,
     ScaleBenchmark,
     Soundness,
     Tightness,
@@ -37,8 +35,6 @@ _TITLES = {
     "compile": "Seconds of compiling",
     "tightness": "Error against run time",
     "soundness": "Soundness",
-    "plan": "What is left out, taken back",
-    "rules": "Our bounds and the paper's rules",
     "rays": "Rays of a NeRF",
     "certificates": "Certified fraction against time",
     "loops": "A network in the loop: certified fraction against time",
@@ -170,9 +166,7 @@ def loops(options: Loops) -> int:
     return 1 if tables.search[0]["violations"] else DONE
 
 
-def rows_of(
-    options: CellBenchmark | Compile | Soundness | PlanBenchmark | RulesBenchmark | Rays, job: PathJob, name: str
-) -> list[dict[str, Any]]:
+def rows_of(options: CellBenchmark | Compile | Soundness | Rays, job: PathJob, name: str) -> list[dict[str, Any]]:
     """What a benchmark without curves finds for one scene and set of poses."""
     if isinstance(options, CellBenchmark):
         from ns_abstract.bench.scale import cell_cost
@@ -191,26 +185,14 @@ def rows_of(
                 options.scale, options.target_ratio,
             )
         ]  # fmt: skip
-    if isinstance(options, PlanBenchmark):
-        from ns_abstract.bench.plan import without
-
-        return without(job, name, options.frame, options.cells, options.scale)
-    if isinstance(options, Rays):
-        from ns_abstract.bench.rays import measure
-
-        return [
-            measure(
-                job, name, options.frame, options.scale, rays=options.rays, ratio=options.target_ratio,
-                seconds=options.seconds, poses=options.poses, seed=options.seed,
-            )
-        ]  # fmt: skip
-    from ns_abstract.bench.rules import compare
+    from ns_abstract.bench.rays import measure
 
     return [
-        row
-        for parts in options.parts
-        for row in compare(job, name, options.frame, parts, options.pixels, options.gaussians, options.seed)
-    ]
+        measure(
+            job, name, options.frame, options.scale, rays=options.rays, ratio=options.target_ratio,
+            seconds=options.seconds, poses=options.poses, seed=options.seed,
+        )
+    ]  # fmt: skip
 
 
 #: The benchmarks by the name that the command line gives them, with their options where none is given.
@@ -219,8 +201,6 @@ _DEFAULTS: dict[str, Any] = {
     "compile": Compile(),
     "tightness": Tightness(),
     "soundness": Soundness(),
-    "plan": PlanBenchmark(),
-    "rules": RulesBenchmark(),
     "rays": Rays(),
     "scale": ScaleBenchmark(),
     "certificates": Certificates(),
