@@ -288,18 +288,16 @@ class Certification:
 
     def prover(self, kind: VariationKind) -> ProveCell:
         """Bounds and attacks cells for all scenes around the stored one (V13)."""
-        searches: dict[
-            tuple[float, int], tuple[FramePictures, SearchedScene, SearchedModel, SubBoxProof | None, Claim]
-        ] = {}
+
+        # radii come one after the other; what is claimed does not depend on the scenes
+        @lru_cache(1)
+        def varied(
+            radius: float, frame: int
+        ) -> tuple[FramePictures, SearchedScene, SearchedModel, SubBoxProof | None, Claim]:
+            return *self._varied(kind, radius, frame), self.claim(self.pictures(frame))
 
         def prove(radius: float, frame: int, box: ParameterBox) -> CellOutcome:
-            key = radius, frame
-            if key not in searches:
-                # radii come one after the other
-                searches.clear()
-                # what is claimed does not depend on the scenes
-                searches[key] = *self._varied(kind, radius, frame), self.claim(self.pictures(frame))
-            pictures, scene, model, cover, claim = searches[key]
+            pictures, scene, model, cover, claim = varied(radius, frame)
             search = Search(scene, model, claim, CellGrid.adaptive(box, [1] * box.dimensions), cuts=False, cover=cover)
             (leaf,) = search.examine(search.grid.roots()).leaves
             if leaf.verdict == "certified":

@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -122,14 +122,14 @@ class LoopJob:
 
     def prover(self, kind: VariationKind) -> ProveCell:
         """Bounds and attacks cells for all scenes around the stored one (V13)."""
-        searches: dict[float, LoopSearch] = {}
+
+        # radii come one after the other
+        @lru_cache(1)
+        def search(radius: float) -> LoopSearch:
+            return LoopSearch(self._varied(kind, radius))
 
         def prove(radius: float, number: int, box: ParameterBox) -> CellOutcome:
-            if radius not in searches:
-                # radii come one after the other
-                searches.clear()
-                searches[radius] = LoopSearch(self._varied(kind, radius))
-            outcome = searches[radius].prove_cell(QUESTIONS[number], box)
+            outcome = search(radius).prove_cell(QUESTIONS[number], box)
             if outcome.example is None:
                 return outcome
             return replace(outcome, example={**outcome.example, "radius": np.array(radius)})
