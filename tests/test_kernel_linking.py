@@ -7,15 +7,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from benchmark_scripts import script
 from numba import njit
 from numba.core.errors import TypingError
 
 from ns_abstract.arithmetic import kernel_linking
 from ns_abstract.arithmetic.kernel_cache import store
 from ns_abstract.arithmetic.kernel_linking import LinkedOnly
-
-recording = script("compile_times").recording
+from ns_abstract.bench.compiling import recording
 
 
 def kernel(function: Any, module: str = "ns_abstract.of_a_test") -> Any:

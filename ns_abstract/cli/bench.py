@@ -12,6 +12,7 @@ import tyro
 from ns_abstract.cli.bench_options import (
     CellBenchmark,
     Certificates,
+    Compile,
     Loops,
     Rays,
     ScaleBenchmark,
@@ -31,6 +32,7 @@ _ABOUT = "Measure cost, tightness and soundness; without options on the demo sce
 #: Headings of the tables by benchmark.
 _TITLES = {
     "cell": "Cost of a cell",
+    "compile": "Seconds of compiling",
     "tightness": "Error against run time",
     "soundness": "Soundness",
     "rays": "Rays of a NeRF",
@@ -164,12 +166,16 @@ def loops(options: Loops) -> int:
     return 1 if tables.search[0]["violations"] else DONE
 
 
-def rows_of(options: CellBenchmark | Soundness | Rays, job: PathJob, name: str) -> list[dict[str, Any]]:
+def rows_of(options: CellBenchmark | Compile | Soundness | Rays, job: PathJob, name: str) -> list[dict[str, Any]]:
     """What a benchmark without curves finds for one scene and set of poses."""
     if isinstance(options, CellBenchmark):
         from ns_abstract.bench.scale import cell_cost
 
         return [cell_cost(job, name, options.frame, options.repeats)]
+    if isinstance(options, Compile):
+        from ns_abstract.bench.compiling import compile_times
+
+        return compile_times(job, name, options.frame)
     if isinstance(options, Soundness):
         from ns_abstract.bench.tightness import attack
 
@@ -192,6 +198,7 @@ def rows_of(options: CellBenchmark | Soundness | Rays, job: PathJob, name: str) 
 #: The benchmarks by the name that the command line gives them, with their options where none is given.
 _DEFAULTS: dict[str, Any] = {
     "cell": CellBenchmark(),
+    "compile": Compile(),
     "tightness": Tightness(),
     "soundness": Soundness(),
     "rays": Rays(),

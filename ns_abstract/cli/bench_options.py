@@ -68,6 +68,13 @@ class CellBenchmark(_Sets):
 
 
 @dataclass
+class Compile(_Sets):
+    """What compiling costs at first use, by kernel: seconds by the clock, of the processor, and inside LLVM."""
+
+    sets: tuple[str, ...] = ("x",)
+
+
+@dataclass
 class Tightness(_Scaled):
     """Error against run time: ratio of outer to inner gap, with curves."""
 

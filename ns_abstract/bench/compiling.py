@@ -1,12 +1,8 @@
-"""What compiling costs at first use, by kernel: seconds by the clock, of the processor, and inside LLVM.
-
-python benchmarks/compile_times.py --load-config RUN/config.yml
-"""
+"""What compiling costs at first use, by kernel."""
 
 from __future__ import annotations
 
 import os
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
@@ -17,26 +13,13 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-import tyro
-
 from ns_abstract.api.files import PathJob
-from ns_abstract.bench.sets import open_jobs, pose_set
-from ns_abstract.bench.tables import Table
-from ns_abstract.cli.bench_options import SceneBenchmark
+from ns_abstract.bench.sets import pose_set
 from ns_abstract.execution.worker_cache import Recipe, load
 from ns_abstract.geometry.poses import PoseBox
-from ns_abstract.methods.program_options import ProgramOptions
 
 #: Functions that a row names: those that took most by themselves.
 _NAMED = 3
-
-
-@dataclass
-class CompileBenchmark(SceneBenchmark):
-    """What compiling costs at first use."""
-
-    sets: tuple[str, ...] = ("x",)
-    """Sets of poses: x, yaw, roll, six, segments, orbit, point."""
 
 
 @dataclass
@@ -154,19 +137,3 @@ def compile_times(job: PathJob, name: str, frame: int) -> list[dict[str, Any]]:
     counted = ("functions", "wall s", "processor s", "LLVM s")
     total = {key: sum(row[key] for row in rows) for key in counted}
     return [{"set": name, **row} for row in [*rows, {"stage": "all", "kernel": "", **total, "of it": ""}]]
-
-
-def main(options: CompileBenchmark) -> int:
-    program = ProgramOptions(gsplat_version=options.gsplat_version)
-    jobs = open_jobs(
-        options.load_config, options.camera_path_filename, options.downscale_factor, None, program, options.overrides
-    )
-    table = Table(options.output_dir, "compile", "Seconds of compiling")
-    for job in jobs:
-        for name in options.sets:
-            table.add(*compile_times(job, name, options.frame))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(tyro.cli(CompileBenchmark)))
