@@ -11,8 +11,8 @@ import torch
 from conftest import blob_scene
 from gsplat_kernels import Kernels, Unavailable, library
 from scene_attacks import bound_cells
-from stiff_cases import all_cases
 
+from ns_abstract.bench.stiff_cases import all_cases
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.keyframe_cameras import look_at
 from ns_abstract.geometry.poses import PoseBox

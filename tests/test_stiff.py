@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import importlib
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -13,10 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from stiff import ARITHMETICS, WatchedFrame, run_case
-from stiff_cases import Case, all_cases
 
 from ns_abstract.arithmetic.rounding import Arithmetic
+from ns_abstract.bench import stiff
+from ns_abstract.bench.stiff import ARITHMETICS, WatchedFrame, run_case
+from ns_abstract.bench.stiff_cases import Case, all_cases
+from ns_abstract.cli.bench import bench
+from ns_abstract.cli.bench_options import Stiff
+from ns_abstract.cli.common import DONE
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.activate import Splats
@@ -148,18 +151,12 @@ def test_hidden_bounds_fail() -> None:
     assert outcome.failed and (outcome.row["NaN/inf"], outcome.row["violations"]) == (0, 3)
 
 
-@pytest.fixture
-def command() -> Any:
-    # skips where the benchmarks are not beside the tests
-    return importlib.import_module("benchmark_scripts").script("stiff_table")
+def options(folder: Path, *cases: str, **changes: Any) -> Stiff:
+    return Stiff(output_dir=folder, cases=cases, **(SMALL | changes))
 
 
-def options(command: Any, folder: Path, *cases: str, **changes: Any) -> Any:
-    return command.StiffTable(output_dir=folder, cases=cases, **(SMALL | changes))
-
-
-def test_command(command: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert command.measure(options(command, tmp_path, "one pose", "opacity 0", compare=True)) == 0
+def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert bench(options(tmp_path, "one pose", "opacity 0", compare=True)) == DONE
     shown = capsys.readouterr().out
     assert "0 violations" in shown and "one pose, moved" in shown
     with open(tmp_path / "stiff.csv", newline="") as stream:
@@ -176,15 +173,14 @@ def test_command(command: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str
 
 @pytest.mark.parametrize("frame", [Low, Undefined])
 def test_command_fails(
-    command: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
-    frame: type[WatchedFrame],
-) -> None:  # fmt: skip
-    monkeypatch.setattr(command, "run_case", partial(run_case, frame=frame))
-    assert command.measure(options(command, tmp_path, "one pose", arithmetics=("real",))) == 1
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], frame: type[WatchedFrame]
+) -> None:
+    monkeypatch.setattr(stiff, "run_case", partial(run_case, frame=frame))
+    assert bench(options(tmp_path, "one pose", arithmetics=("real",))) == 1
     assert " failed" in capsys.readouterr().out and "one pose" in (tmp_path / "stiff.csv").read_text()
 
 
-def test_unknown_case(command: Any, tmp_path: Path) -> None:
+def test_unknown_case(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no case"):
-        command.measure(options(command, tmp_path, "no such thing"))
+        bench(options(tmp_path, "no such thing"))
     assert not list(tmp_path.iterdir())

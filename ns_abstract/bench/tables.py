@@ -52,6 +52,7 @@ class Table:
     rows: list[dict[str, Any]] = field(default_factory=list)
 
     def add(self, *rows: dict[str, Any]) -> None:
+        """Print and write more rows."""
         lines = markdown(rows).splitlines()
         print("\n".join(lines[2 if self.rows else 0 :]), flush=True)
         self.rows += rows
@@ -89,6 +90,7 @@ def plot_scaling(path: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _two_panels() -> Any:
+    """A figure and its two axes."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 

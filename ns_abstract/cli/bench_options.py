@@ -180,6 +180,28 @@ class Loops(_Seeded):
 
 
 @dataclass
+class Stiff(_Seeded):
+    """Bound and attack tiny scenes at the ends of what can be loaded and asked."""
+
+    output_dir: Path = Path("bench")
+    """Folder for the tables."""
+    cases: tuple[str, ...] = ()
+    """Parts of the names of the cases to run. Default: all cases."""
+    arithmetics: tuple[Literal["float32", "real"], ...] = ("float32", "real")
+    """What is bounded: float32, real."""
+    cells: int = 16
+    """Most cells bounded for every case."""
+    seconds: float = 20.0
+    """Limit of the refinement and of every attack."""
+    poses: int = 60
+    """Images by the compiled renderer for every case."""
+    reference_poses: int = 16
+    """Images by each reference."""
+    compare: bool = False
+    """Also write what float32 costs against real arithmetic."""
+
+
+@dataclass
 class Vnnlib(_Library):
     """Decide instances of a verification competition: networks and VNN-LIB properties with boxes of inputs."""
 

@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 import torch
-from stiff_cases import Case
 
 from ns_abstract.arithmetic.rounding import Arithmetic
 from ns_abstract.arithmetic.rounding import arithmetic as arithmetic_of
+from ns_abstract.bench.stiff_cases import Case
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.splat.activate import Splats, activate
@@ -60,6 +60,7 @@ class WatchedFrame(SplatFrame):
         self.not_finite = self.crossed = 0
 
     def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
+        """See `SplatFrame.render`."""
         picture = super().render(values, tiles)
         self.not_finite += _not_finite(picture)
         return picture
@@ -68,6 +69,7 @@ class WatchedFrame(SplatFrame):
         self, box: ParameterBox, tiles: np.ndarray, within: VisibleContext | None = None, keep_linear: bool = False,
         pixels: np.ndarray | None = None,
     ) -> TileBounds:  # fmt: skip
+        """See `SplatFrame.bound`."""
         tile_bounds = super().bound(box, tiles, within, keep_linear, pixels)
         self.not_finite += _not_finite(
             tile_bounds.lower, tile_bounds.upper, tile_bounds.slopes, *(tile_bounds.linear or ())
@@ -170,3 +172,6 @@ def compare(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
         for single, exact in pairs
         if single is not exact
     ]
+
+
+# --- what the cases are made of ------------------------------------------------------------------
