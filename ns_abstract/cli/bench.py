@@ -15,7 +15,9 @@ from ns_abstract.cli.bench_options import (
     Certificates,
     Compile,
     Loops,
+    PlanBenchmark,
     Rays,
+    RulesBenchmark,
     ScaleBenchmark,
     Soundness,
     Stiff,
@@ -39,6 +41,8 @@ _TITLES = {
     "compile": "Seconds of compiling",
     "tightness": "Error against run time",
     "soundness": "Soundness",
+    "plan": "What is left out, taken back",
+    "rules": "Our bounds and the paper's rules",
     "rays": "Rays of a NeRF",
     "certificates": "Certified fraction against time",
     "loops": "A network in the loop: certified fraction against time",
@@ -213,7 +217,9 @@ def loops(options: Loops) -> int:
     return 1 if tables.search[0]["violations"] else DONE
 
 
-def rows_of(options: CellBenchmark | Compile | Soundness | Rays, job: PathJob, name: str) -> list[dict[str, Any]]:
+def rows_of(
+    options: CellBenchmark | Compile | Soundness | PlanBenchmark | RulesBenchmark | Rays, job: PathJob, name: str
+) -> list[dict[str, Any]]:
     """What a benchmark without curves finds for one scene and set of poses."""
     if isinstance(options, CellBenchmark):
         from ns_abstract.bench.scale import cell_cost
@@ -232,14 +238,26 @@ def rows_of(options: CellBenchmark | Compile | Soundness | Rays, job: PathJob, n
                 options.scale, options.target_ratio,
             )
         ]  # fmt: skip
-    from ns_abstract.bench.rays import measure
+    if isinstance(options, PlanBenchmark):
+        from ns_abstract.bench.plan import without
+
+        return without(job, name, options.frame, options.cells, options.scale)
+    if isinstance(options, Rays):
+        from ns_abstract.bench.rays import measure
+
+        return [
+            measure(
+                job, name, options.frame, options.scale, rays=options.rays, ratio=options.target_ratio,
+                seconds=options.seconds, poses=options.poses, seed=options.seed,
+            )
+        ]  # fmt: skip
+    from ns_abstract.bench.rules import compare
 
     return [
-        measure(
-            job, name, options.frame, options.scale, rays=options.rays, ratio=options.target_ratio,
-            seconds=options.seconds, poses=options.poses, seed=options.seed,
-        )
-    ]  # fmt: skip
+        row
+        for parts in options.parts
+        for row in compare(job, name, options.frame, parts, options.pixels, options.gaussians, options.seed)
+    ]
 
 
 #: The benchmarks by the name that the command line gives them, with their options where none is given.
@@ -248,6 +266,8 @@ _DEFAULTS: dict[str, Any] = {
     "compile": Compile(),
     "tightness": Tightness(),
     "soundness": Soundness(),
+    "plan": PlanBenchmark(),
+    "rules": RulesBenchmark(),
     "rays": Rays(),
     "scale": ScaleBenchmark(),
     "certificates": Certificates(),

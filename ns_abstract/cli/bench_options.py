@@ -104,6 +104,26 @@ class Soundness(_Seeded, _Scaled):
 
 
 @dataclass
+class PlanBenchmark(_Scaled):
+    """Take back, one by one, what a scene's plan leaves out: what it costs, and how bounds differ."""
+
+    cells: int = 24
+    """Cells that every scene and set is bounded with."""
+
+
+@dataclass
+class RulesBenchmark(_Seeded, _Sets):
+    """Our bounds against the paper's rules, on the same Gaussians, pixels and cells."""
+
+    parts: tuple[int, ...] = (8, 64)
+    """Cells by axis that a set is cut into; the middle one is bounded."""
+    pixels: int = 8
+    """Pixels for every scene, set and cell."""
+    gaussians: int = 30
+    """Most Gaussians by pixel."""
+
+
+@dataclass
 class Rays(_Seeded, _Scaled):
     """Random rays of a NeRF: CPU seconds by ray to a ratio, then attacks on the bounds."""
 

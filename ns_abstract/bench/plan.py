@@ -1,25 +1,16 @@
-"""Measure what the omissions of a plan save: each is reverted, and the bounds are compared.
-
-python benchmarks/plan_omissions.py --load-config RUN/config.yml
-"""
+"""Measure what the omissions of a plan save: each is reverted, and the bounds are compared."""
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import tyro
 
 from ns_abstract.api.files import PathJob
-from ns_abstract.bench.sets import open_jobs, pose_set, splat_of
-from ns_abstract.bench.tables import Table
-from ns_abstract.cli.bench_options import SceneBenchmark
+from ns_abstract.bench.sets import pose_set, splat_of
 from ns_abstract.geometry.poses import PoseBox
-from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.frame import SplatFrame, VisibleContext
 from ns_abstract.refine.engine import Refinement, RefinementGoal
@@ -27,18 +18,6 @@ from ns_abstract.refine.result import FrameResult
 
 #: More than any run of a given number of cells takes.
 _LONG = 1e6
-
-
-@dataclass
-class PlanBenchmark(SceneBenchmark):
-    """Take back, one by one, what a scene's plan leaves out: what it costs, and how bounds differ."""
-
-    sets: tuple[str, ...] = ("x", "yaw")
-    """Sets of poses: x, yaw, roll, six, segments, orbit, point."""
-    scale: float = 1.0
-    """Multiplies the ranges of translations and rotations."""
-    cells: int = 24
-    """Cells that every scene and set is bounded with."""
 
 
 class _EveryGaussian(SplatFrame):
@@ -99,19 +78,3 @@ def without(job: PathJob, name: str, frame: int, cells: int, scale: float = 1.0)
             }
         )
     return rows
-
-
-def main(options: PlanBenchmark) -> int:
-    program = ProgramOptions(gsplat_version=options.gsplat_version)
-    jobs = open_jobs(
-        options.load_config, options.camera_path_filename, options.downscale_factor, None, program, options.overrides
-    )
-    table = Table(options.output_dir, "plan", "What is left out, taken back")
-    for job in jobs:
-        for name in options.sets:
-            table.add(*without(job, name, options.frame, options.cells, options.scale))
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(tyro.cli(PlanBenchmark)))

@@ -1,31 +1,24 @@
 """Our bounds against those of the paper's rules, on the same Gaussians, pixels and cells.
 
 The cost of the paper's depth-order rule grows with the square of the number of Gaussians, so each pixel gets
-a scene of its own: the Gaussians that give it most of its light. The exit code is 1 if a bound was violated.
-
-    python benchmarks/paper_rules.py --load-config RUN/config.yml
+a scene of its own: the Gaussians that give it most of its light.
 """
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
-import tyro
 
 from ns_abstract.api.files import PathJob
 from ns_abstract.arithmetic.forms import Float64Array
 from ns_abstract.arithmetic.rounding import REAL
-from ns_abstract.bench.sets import open_jobs, pose_set, splat_of
-from ns_abstract.bench.tables import Table
-from ns_abstract.cli.bench_options import SceneBenchmark
+from ns_abstract.bench.sets import pose_set, splat_of
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.poses import PoseBox
-from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.methods.splat.activate import Splats, activate
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import PAPER
@@ -47,22 +40,6 @@ PAPER_RULES: dict[str, dict[str, object]] = {
     "MATRIXINV, sorting": {"blend": "sort"},
     "MATRIXINV, VR-IND, interval alpha": {"linear": False},
 }
-
-
-@dataclass
-class RulesBenchmark(SceneBenchmark):
-    """Our bounds against the paper's rules, on the same Gaussians, pixels and cells."""
-
-    sets: tuple[str, ...] = ("x", "yaw")
-    """Sets of poses: x, yaw, roll, six, segments, orbit, point."""
-    parts: tuple[int, ...] = (8, 64)
-    """Cells by axis that a set is cut into; the middle one is bounded."""
-    pixels: int = 8
-    """Pixels for every scene, set and cell."""
-    gaussians: int = 30
-    """Most Gaussians by pixel."""
-    seed: int = 0
-    """Decides every random choice."""
 
 
 def weights_at(splats: Splats, camera: PinholeCamera, rotation: Float64Array, position: Float64Array, u: Float64Array):
@@ -190,20 +167,3 @@ def compare(
         }
         for rule in rules
     ]
-
-
-def main(options: RulesBenchmark) -> int:
-    program = ProgramOptions(gsplat_version=options.gsplat_version)
-    jobs = open_jobs(
-        options.load_config, options.camera_path_filename, options.downscale_factor, None, program, options.overrides
-    )
-    table = Table(options.output_dir, "rules", "Our bounds and the paper's rules")
-    for job in jobs:
-        for name in options.sets:
-            for parts in options.parts:
-                table.add(*compare(job, name, options.frame, parts, options.pixels, options.gaussians, options.seed))
-    return 1 if any(row["violations"] for row in table.rows) else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main(tyro.cli(RulesBenchmark)))
