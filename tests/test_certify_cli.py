@@ -31,7 +31,7 @@ from waiting import LONG, until
 
 from ns_abstract.api import certificate_report
 from ns_abstract.api.cell_search import examine_block
-from ns_abstract.api.certificate_report import look_closer
+from ns_abstract.api.certificate_report import PoseRenderer, look_closer
 from ns_abstract.api.certification import Certification, CertifySettings, FramePictures, open_certification
 from ns_abstract.api.files import Settings
 from ns_abstract.cli import certify as certify_command
@@ -732,7 +732,7 @@ def test_where_it_fails_is_looked_at_closely(planted: Case, finished: Path, monk
     ]
     job = planted.job
     monkeypatch.setattr(certificate_report, "SECONDS", np.inf)
-    found = look_closer(job, entries, {0: rows}, lambda *_: None, lambda: False)
+    found = look_closer(PoseRenderer(job, lambda *_: None), entries, {0: rows}, lambda: False)
     broken = sum(r["upper"][0] - r["lower"][0] for r in rows if r["verdict"] == "falsified") / 0.3
     assert sum(region.share for region in found.regions) == pytest.approx(broken) and found.why == ""
     pictures = job.pictures(0)
@@ -756,13 +756,13 @@ def test_where_it_fails_is_looked_at_closely(planted: Case, finished: Path, monk
     assert len(found.stops) == 24 and {stop.verdict for stop, _ in found.stops} >= {"certified", "falsified"}
     for stop, shown in found.stops:
         assert stop.proven is None or (shown.margin is not None and shown.margin >= stop.proven)
-    assert look_closer(job, entries, {0: rows}, lambda *_: None, lambda: False) == found
+    assert look_closer(PoseRenderer(job, lambda *_: None), entries, {0: rows}, lambda: False) == found
     # no time: what is known without pictures stays
-    late = look_closer(job, entries, {0: rows}, lambda *_: None, lambda: True)
+    late = look_closer(PoseRenderer(job, lambda *_: None), entries, {0: rows}, lambda: True)
     assert late.regions == found.regions and not late.pictures and not late.stops and "time" in late.why
     # nothing certified: a right pose of a cell without a verdict
     unsure = [r | {"verdict": "unknown"} if r["verdict"] == "certified" else r for r in rows]
-    found = look_closer(job, entries, {0: unsure}, lambda *_: None, lambda: False)
+    found = look_closer(PoseRenderer(job, lambda *_: None), entries, {0: unsure}, lambda: False)
     assert any(good and "not certified" in good.title and good.margin > 0.0 for _, good in found.pictures)  # type: ignore[operator]
 
 

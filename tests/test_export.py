@@ -47,7 +47,7 @@ def bounded(blobs: Inputs, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Results of ns-abstract-render for the three frames of a small path."""
     folder = tmp_path_factory.mktemp("bounded") / "out"
     with pytest.MonkeyPatch.context() as patch, pytest.raises(SystemExit) as leave:
-        options = blobs.options(folder, time_budget=6, target_ratio=1.5)
+        options = blobs.options(folder, time_budget=600, target_ratio=1.5)
         patch.setattr("sys.argv", ["command", *options])
         render_command.main()
     assert leave.value.code == 0

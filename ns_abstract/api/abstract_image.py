@@ -171,7 +171,6 @@ class BoundResult:
         save_frame(path, self.frame, status=self.status, about=self.about)
 
     def _lines(self) -> list[str]:
-        """The result in words."""
         box = self.parameters
         units = ShownUnits.of(self.about.get("scene", {}))
         sides = [units.interval(*side) for side in zip(box.names, box.units, box.lower, box.upper, strict=True)]

@@ -86,7 +86,6 @@ class Examiner(Protocol):
 
 
 def examine_here(examiner: Examiner, number: int, grid: CellGrid, cells: tuple[Cell, ...]) -> BlockResult:
-    """Examine cells in this process."""
     import torch
 
     # as many workers as cores; more threads would only wait for each other

@@ -26,7 +26,7 @@ from ns_abstract.report.outside import SceneDrawing
 from ns_abstract.report.picture import preview
 from ns_abstract.report.regions import FailureRegion, PoseImage, coarse_first
 from ns_abstract.report.regions import stops as poses_along
-from ns_abstract.report.run import CommandRun
+from ns_abstract.report.run import CommandRun, sides
 from ns_abstract.report.verdict_picture import write_pictures
 from ns_abstract.verify.properties import Claim
 from ns_abstract.verify.store import Store, Tally, fractions
@@ -49,6 +49,7 @@ class CertificateReport:
 
     def __init__(self, job: Certification, about: CommandRun, search: CellSearch[Any]) -> None:
         self.job, self.about, self.search = job, about, search
+        self.renderer = PoseRenderer(job, self._kept_image)
         self.shown: list[dict[str, Any]] = []
         self.seen: dict[tuple[int, int], dict[str, Any]] = {}
         self.cameras: CameraDrawings | None = None
@@ -86,7 +87,7 @@ class CertificateReport:
             self.seen = {}
         ended = state in ("done", "budget")
         frames = document["frames"]
-        closer = look_closer(self.job, frames, rows, self._kept_image, search.deadline) if ended else None
+        closer = look_closer(self.renderer, frames, rows, search.deadline) if ended else None
         search.last.write(
             document,
             lambda: certificate_page(document, rows, self.shown, self.seen, self.cameras, closer),
@@ -113,9 +114,7 @@ class CertificateReport:
     def _entry(self, tally: Tally, rows: list[dict[str, Any]]) -> dict[str, Any]:
         shares = fractions(tally)
         names = [name for name, _ in self.job.job.parameters]
-        box = self.job.job.pose_sets[tally.frame].box
-        fixed = self.job.job.fixed[tally.frame]
-        sides = {n: (low, high) for n, low, high in zip(box.names, box.lower, box.upper, strict=True)}
+        poses = self.job.job.pose_sets[tally.frame]
         counts = {kind: sum(row["verdict"] == kind for row in rows) for kind in ("certified", "falsified", "unknown")}
         # cells that an ended command has left open stand as unknown without a margin or a time
         left = sum(row["verdict"] == "unknown" and row["seconds"] == 0.0 for row in rows)
@@ -124,16 +123,8 @@ class CertificateReport:
         total = self.job.partitions(self.search.grids[tally.frame])
         return {
             "index": tally.frame,
-            "intrinsics": self.job.job.pose_sets[tally.frame].camera.intrinsics._asdict(),
-            "parameters": [
-                {
-                    "name": name,
-                    "unit": unit,
-                    "lower": sides.get(name, (fixed.get(name, 0.0),) * 2)[0],
-                    "upper": sides.get(name, (fixed.get(name, 0.0),) * 2)[1],
-                }
-                for name, unit in self.job.job.parameters
-            ],
+            "intrinsics": poses.camera.intrinsics._asdict(),
+            "parameters": sides(poses.box, self.job.job.parameters, poses.fixed),
             "coverage": {
                 "certified": shares["certified"],
                 "falsified": shares["falsified"],
@@ -193,14 +184,8 @@ class CertificateReport:
         Raises:
             WorkCancelledError: There is no time for more pictures.
         """
-        by_name = dict(zip((name for name, _ in self.job.job.parameters), values, strict=True))
-        pictures = self.job.pictures(frame)
-        pose = np.array([by_name[name] for name in pictures.box.names])
-        # of another scene of the set, maybe
-        image = self._kept_image(frame, pose) if pictures.pose_set.perturbation.scene else None
-        if image is None:
-            with self.search.deadline.enforced():
-                image = pictures.image(pose)
+        with self.search.deadline.enforced():
+            pictures, pose, image = self.renderer.image(frame, values)
         return preview(pictures.shown(image, pose), side)
 
     def _cell_pictures(self, rows: Mapping[int, list[dict[str, Any]]]) -> dict[tuple[int, int], dict[str, Any]]:
@@ -244,13 +229,24 @@ def _worst(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return list({tuple(row["counterexample"]): row for row in reversed(broken)}.values())[::-1]
 
 
-class _PoseRenderer:
+class PoseRenderer:
     """Renders poses and shows them to the network."""
 
     def __init__(self, job: Certification, cached: Callable[[int, np.ndarray], np.ndarray | None]) -> None:
-        self._job, self._kept = job, cached
+        self.job, self._kept = job, cached
         self._names = [name for name, _ in job.job.parameters]
-        self._frames: dict[int, tuple[FramePictures, Claim]] = {}
+        self._frames: dict[int, FramePictures] = {}
+        self._claims: dict[int, Claim] = {}
+
+    def image(self, frame: int, values: Sequence[float]) -> tuple[FramePictures, np.ndarray, np.ndarray]:
+        """The frame's pictures, its own parameters of ``values`` of all parameters, and the picture there."""
+        if frame not in self._frames:
+            self._frames[frame] = self.job.pictures(frame)
+        pictures = self._frames[frame]
+        pose = np.array([values[self._names.index(name)] for name in pictures.box.names], np.float64)
+        # of another scene of the set, maybe
+        image = self._kept(frame, pose) if pictures.pose_set.perturbation.scene else None
+        return pictures, pose, pictures.image(pose) if image is None else image
 
     def look(self, title: str, frame: int, values: Sequence[float]) -> PoseImage:
         """The picture at values of all parameters, the network's outputs and the margin.
@@ -259,18 +255,12 @@ class _PoseRenderer:
             WorkCancelledError: There is no time for it.
         """
         check_cancelled()
-        if frame not in self._frames:
-            pictures = self._job.pictures(frame)
-            self._frames[frame] = pictures, self._job.claim(pictures)
-        pictures, claim = self._frames[frame]
-        pose = np.array([values[self._names.index(name)] for name in pictures.box.names], np.float64)
-        # of another scene of the set, maybe
-        image = self._kept(frame, pose) if pictures.pose_set.perturbation.scene else None
-        if image is None:
-            image = pictures.image(pose)
-        outputs = np.asarray(self._job.model.outputs(image[None]), np.float64)
+        pictures, pose, image = self.image(frame, values)
+        if frame not in self._claims:
+            self._claims[frame] = self.job.claim(pictures)
+        outputs = np.asarray(self.job.model.outputs(image[None]), np.float64)
         with torch.no_grad():
-            margin = float(claim.margin(torch.from_numpy(outputs), torch.from_numpy(pose[None]))[0])
+            margin = float(self._claims[frame].margin(torch.from_numpy(outputs), torch.from_numpy(pose[None]))[0])
         png = preview(pictures.shown(image, pose), _CLOSE_PIXELS)
         return PoseImage(title, values, png, outputs[0].tolist(), margin if np.isfinite(margin) else None)
 
@@ -288,24 +278,17 @@ class _PoseRenderer:
 
 
 def look_closer(
-    job: Certification,
-    entries: Sequence[Mapping[str, Any]],
-    rows: CellRows,
-    cached: Callable[[int, np.ndarray], np.ndarray | None],
-    over: Callable[[], bool],
+    looks: PoseRenderer, entries: Sequence[Mapping[str, Any]], rows: CellRows, over: Callable[[], bool]
 ) -> CertificateDetails:
     """Regions where the property fails, and poses along the sets, with pictures.
 
-    Args:
-        cached: The stored image of a counterexample, by frame and pose.
-        over: Whether no more pictures are to be rendered; `SECONDS` from now none are, either.
+    ``over``: whether no more pictures are to be rendered; `SECONDS` from now none are, either.
     """
     end = time.perf_counter() + SECONDS
-    looks = _PoseRenderer(job, cached)
     regions = broken.falsified_regions(entries, rows)
     sides = {entry["index"]: entry["parameters"] for entry in entries}
     pictures: list[tuple[PoseImage, PoseImage | None]] = []
-    stops = poses_along(entries, rows, ShownUnits.of(job.job.describe()))
+    stops = poses_along(entries, rows, ShownUnits.of(looks.job.job.describe()))
     pictures_by_frame: dict[int, PoseImage] = {}
     why = _OVER
     # a property that makes no sense for a frame is told by who searches

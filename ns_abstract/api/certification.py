@@ -9,7 +9,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
@@ -127,11 +127,11 @@ class Certification:
         self.arithmetic: NetworkArithmetic = network_arithmetic
         self.model: NetworkModel | MeasureModel = question.searched(memory, network_arithmetic, picture)
         self.property: Property = question.property
-        self._searches: dict[tuple[int, CellGrid], Search] = {}
+        #: the search of a frame, by its number and cells; some are kept at hand
+        self.search = lru_cache(question.frames)(self._search)
 
     @property
     def recipe(self) -> Recipe[Certification]:
-        """How another process opens it; files are looked for under the same paths."""
         question = self.question
         again = partial(
             _open,
@@ -155,7 +155,6 @@ class Certification:
 
     @property
     def assumptions(self) -> tuple[Assumption, ...]:
-        """What the verdicts rest on, and where each choice came from."""
         resize = self.property.preprocess.resize
         drawn = {} if resize is None else {"picture size": f"{self.question.source.name}: preprocess.resize"}
         return (
@@ -165,7 +164,6 @@ class Certification:
 
     @property
     def fingerprint(self) -> dict[str, Any]:
-        """What a stored search must agree with to be continued."""
         return self._fingerprint
 
     @cached_property
@@ -224,28 +222,18 @@ class Certification:
         ends += range(ends[-1] + self.block, len(roots) + self.block, self.block)
         return [roots[a:b] for a, b in itertools.pairwise(ends) if a < len(roots)]
 
-    def search(self, index: int, grid: CellGrid) -> Search:
-        """The search of a frame; kept at hand."""
-        key = (index, grid)
-        if key in self._searches:
-            # the last that was asked for is dropped last
-            self._searches[key] = self._searches.pop(key)
-        else:
-            while len(self._searches) >= self.question.frames:
-                self._searches.pop(next(iter(self._searches)))
-            pictures = self.pictures(index)
-            every_unit = self.property.partitions is not None
-            claim = self.claim(pictures)
-            pictures.weigh = partial(pixel_costs, pictures, self.model, claim)
-            cover = self._cover(pictures)
-            costly = isinstance(self.model, NetworkModel)
-            self._searches[key] = Search(
-                pictures, self.model, claim, grid, every_unit=every_unit, block=self.block, cover=cover, costly=costly
-            )
-        return self._searches[key]
+    def _search(self, index: int, grid: CellGrid) -> Search:
+        pictures = self.pictures(index)
+        every_unit = self.property.partitions is not None
+        claim = self.claim(pictures)
+        pictures.weigh = partial(pixel_costs, pictures, self.model, claim)
+        cover = self._cover(pictures)
+        costly = isinstance(self.model, NetworkModel)
+        return Search(
+            pictures, self.model, claim, grid, every_unit=every_unit, block=self.block, cover=cover, costly=costly
+        )
 
     def examine(self, number: int, grid: CellGrid, cells: tuple[Cell, ...]) -> BlockResult:
-        """What becomes of cells of a frame; see `ns_abstract.api.cell_search.Examiner`."""
         return self.search(number, grid).examine(cells)
 
     def _cover(self, pictures: FramePictures, response: CameraResponse | None = None) -> SubBoxProof | None:
@@ -299,18 +287,16 @@ class Certification:
 
     def prover(self, kind: VariationKind) -> ProveCell:
         """Bounds and attacks cells for all scenes around the stored one (V13)."""
-        searches: dict[
-            tuple[float, int], tuple[FramePictures, SearchedScene, SearchedModel, SubBoxProof | None, Claim]
-        ] = {}
+
+        # radii come one after the other; what is claimed does not depend on the scenes
+        @lru_cache(1)
+        def varied(
+            radius: float, frame: int
+        ) -> tuple[FramePictures, SearchedScene, SearchedModel, SubBoxProof | None, Claim]:
+            return *self._varied(kind, radius, frame), self.claim(self.pictures(frame))
 
         def prove(radius: float, frame: int, box: ParameterBox) -> CellOutcome:
-            key = radius, frame
-            if key not in searches:
-                # radii come one after the other
-                searches.clear()
-                # what is claimed does not depend on the scenes
-                searches[key] = *self._varied(kind, radius, frame), self.claim(self.pictures(frame))
-            pictures, scene, model, cover, claim = searches[key]
+            pictures, scene, model, cover, claim = varied(radius, frame)
             search = Search(scene, model, claim, CellGrid.adaptive(box, [1] * box.dimensions), cuts=False, cover=cover)
             (leaf,) = search.examine(search.grid.roots()).leaves
             if leaf.verdict == "certified":

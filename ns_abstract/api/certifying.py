@@ -25,12 +25,11 @@ from ns_abstract.api.certification import MEMORY, Certification, PropertySource,
 from ns_abstract.api.job import Job
 from ns_abstract.api.poses import PoseSet, pose_sets
 from ns_abstract.api.scenes import Scene, checked_scene
-from ns_abstract.api.search_options import SearchKeywords, SearchOptions
+from ns_abstract.api.search_options import SearchKeywords, SearchOptions, SearchResult
 from ns_abstract.execution.cancellation import Deadline
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.io.arguments import file_path
-from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.memory import allowed_memory
 from ns_abstract.report.certificate import coverage, verdict
@@ -90,7 +89,6 @@ class CertifyProgress(SearchProgress):
 
     @property
     def sentence(self) -> str:
-        """The four parts of the volume."""
         return shares_text(self.certified, self.falsified, self.unknown, self.open)
 
 
@@ -198,21 +196,17 @@ class CertifiedCell:
 
 
 @dataclass(frozen=True)
-class Certificate:
+class Certificate(SearchResult):
     """A certificate: what was proved and falsified of a network over a set of poses.
 
     Attributes:
         certified, falsified, unknown: Fractions of the parameter volume, mean over the sets; they add up to 1.
         cells: What the fractions are made of.
         verdict: "falsified" if any pose breaks the property, "certified" if all is proved, else "unknown".
-        parameters: Names and units of the cells' axes.
         sentence: The property in words, as the end of "on every image ...".
         guarantee: Of the pictures: "float32-sound" or "real-sound", and what of the scene it holds if not all (as in
             `ns_abstract.BoundResult`).
         network_guarantee: What holds of the network, one sentence each.
-        state: "done", "budget" (the time ended first) or "interrupted".
-        seconds: Time spent.
-        report: Content of report.json.
     """
 
     certified: float
@@ -220,29 +214,14 @@ class Certificate:
     unknown: float
     cells: tuple[CertifiedCell, ...] = field(repr=False)
     verdict: str
-    parameters: tuple[tuple[str, str], ...]
     sentence: str
     guarantee: str
     network_guarantee: tuple[str, ...] = field(repr=False)
-    state: str
-    seconds: float
-    report: dict[str, Any] = field(repr=False)
-
-    @property
-    def assumptions(self) -> tuple[Assumption, ...]:
-        """What the verdict rests on, and where each choice came from."""
-        return tuple(Assumption(**entry) for entry in self.report["assumptions"])
-
-    @property
-    def interrupted(self) -> bool:
-        """Whether the work was ended by Ctrl-C or by ``on_progress``."""
-        return self.state == "interrupted"
 
     def _shares(self) -> dict[str, float]:
         return {"certified": self.certified, "falsified": self.falsified, "unknown": self.unknown}
 
     def _lines(self) -> list[str]:
-        """The certificate in words."""
         return [
             f"{self.verdict}: on every image {self.sentence}",
             ", ".join(f"{kind} {percent(share)}" for kind, share in self._shares().items()),
@@ -314,17 +293,15 @@ def certify(
 def certificate(job: Certification, rows: Mapping[int, list[Row]], document: Mapping[str, Any]) -> Certificate:
     """The result of a search that has ended with these rows of cells by frame."""
     covered = coverage(document["frames"])
-    return Certificate(
+    return Certificate.of(
+        job.job.parameters,
+        document,
         certified=covered["certified"],
         falsified=covered["falsified"],
         unknown=covered["unknown"],
         cells=result_cells(rows, CertifiedCell, "margin"),
         verdict=verdict(document["frames"]),
-        parameters=tuple(job.job.parameters),
         sentence=job.property.sentence(),
         guarantee=short_guarantee(job.job.method.guarantee, document["scene"].get("bounded")),
         network_guarantee=tuple(document["network_guarantee"]),
-        state=document["state"],
-        seconds=document["seconds"],
-        report=dict(document),
     )

@@ -8,7 +8,6 @@ import statistics
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any
 
 from ns_abstract.check.audit import ClaimOutcome, opened, outcomes
@@ -115,21 +114,10 @@ def check(
         "loop": loop,
     }
     files = {name: None if file is None else file_path(file, name) for name, file in moved.items()}
-    return _audited(file_path(output_dir, "output_dir"), claims, seconds, seed, files, on_progress)
-
-
-def _audited(
-    folder: Path,
-    claims: int,
-    seconds: float,
-    seed: int,
-    moved: dict[str, Path | None],
-    on_progress: Callable[[Audit], object] | None,
-) -> Audit:
-    begin = time.monotonic()
+    folder, begin = file_path(output_dir, "output_dir"), time.monotonic()
     finished, spent = [], []
     try:
-        wrong, subjects, silent = opened(folder, moved)
+        wrong, subjects, silent = opened(folder, files)
         audit = Audit(structure=wrong, unclaimed=silent)
         start = time.monotonic()
         for outcome in outcomes(subjects, 0 if wrong else claims, begin + seconds - start, seed):

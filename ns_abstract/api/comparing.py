@@ -231,11 +231,8 @@ def open_comparison(settings: Settings, other: SceneSource, tolerance: float | N
     run_frame = second.run_frame if scene.run_frame is None else scene.run_frame
     path = load_camera_path(settings.camera_path_filename, settings.downscale_factor, run_frame)
     pose_sets = path_sets(settings, scene, path)
-    return ComparisonJob(
-        scene, second, pose_sets, tolerance=tolerance, path=path, arithmetic=settings.arithmetic, seed=settings.seed,
-        memory_limit=settings.memory_limit, workers=settings.workers, notes=path.notes,
-        set_choices=settings.set_choices(pose_sets, path),
-    )  # fmt: skip
+    options = settings.job_options(pose_sets, path)
+    return ComparisonJob(scene, second, pose_sets, tolerance=tolerance, path=path, **options)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

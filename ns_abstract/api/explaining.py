@@ -54,7 +54,6 @@ class Explanation:
         return max(0.0, 1.0 - sum(self.causes.values()))
 
     def lines(self) -> Iterator[str]:
-        """It in words."""
         gap = f"mean gap of a channel {self.gap:.4f}"
         yield f"frame {self.index}: {gap}; {self.excess:.4f} of it was reached by no render"
         if not self.leaves:

@@ -49,7 +49,18 @@ class Settings:
         """The scene and the program that draws it."""
         return SceneSource(self.load_config, self.program, self.overrides)
 
-    def set_choices(self, pose_sets: Sequence[PoseBox], path: CameraPath) -> tuple[Assumption, ...]:
+    def job_options(self, pose_sets: Sequence[PoseBox], path: CameraPath) -> dict[str, Any]:
+        """Options of `Job` for the sets of a path."""
+        return {
+            "arithmetic": self.arithmetic,
+            "seed": self.seed,
+            "memory_limit": self.memory_limit,
+            "workers": self.workers,
+            "notes": path.notes,
+            "set_choices": self._set_choices(pose_sets, path),
+        }
+
+    def _set_choices(self, pose_sets: Sequence[PoseBox], path: CameraPath) -> tuple[Assumption, ...]:
         """Where the size of the pictures and their sets come from."""
         file, factor, name = self.perturbation_filename, self.downscale_factor, Path(path.source).name
         if self.given_set is not None:
@@ -72,17 +83,8 @@ class PathJob(Job):
     def __init__(self, settings: Settings, scene: Scene, path: CameraPath, pose_sets: tuple[PoseBox, ...]) -> None:
         self.settings, self.scene, self.path = settings, scene, path
         try:
-            super().__init__(
-                scene,
-                pose_sets,
-                arithmetic=settings.arithmetic,
-                seed=settings.seed,
-                memory_limit=settings.memory_limit,
-                workers=settings.workers,
-                layers=[name for name in settings.outputs if name != "rgb"],
-                notes=path.notes,
-                set_choices=settings.set_choices(pose_sets, path),
-            )
+            layers = [name for name in settings.outputs if name != "rgb"]
+            super().__init__(scene, pose_sets, layers=layers, **settings.job_options(pose_sets, path))
         except InputError as error:
             # options have no file
             named = error.field is not None and not error.field.startswith("--")

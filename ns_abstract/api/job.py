@@ -10,7 +10,6 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, replace
 from functools import cached_property, partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -101,15 +100,16 @@ class Job:
 
     @property
     def frame_count(self) -> int:
-        """Number of sets."""
         return len(self.pose_sets)
 
     @property
     def recipe(self) -> Recipe[Job]:
         """How another process opens this job; files are looked for under the same paths."""
-        source = self.source.absolute
-        again = partial(_open, source, self.pose_sets, self.arithmetic, self.seed, self.memory_limit, self.layers)
-        return Recipe(again, self.fingerprint, Path(self.source.file))
+        again = partial(
+            _open, self.source.absolute, self.pose_sets, arithmetic=self.arithmetic, seed=self.seed,
+            memory_limit=self.memory_limit, layers=self.layers,
+        )  # fmt: skip
+        return Recipe(again, self.fingerprint, self.source.file)
 
     @property
     def continues(self) -> bool:
@@ -334,15 +334,8 @@ def require_sound_platform() -> None:
         )
 
 
-def _open(
-    source: SceneSource,
-    pose_sets: tuple[PoseBox, ...],
-    arithmetic: str | None,
-    seed: int,
-    memory_limit: float | None,
-    layers: tuple[str, ...],
-) -> Job:
-    return Job(source.open(), pose_sets, arithmetic=arithmetic, seed=seed, memory_limit=memory_limit, layers=layers)
+def _open(source: SceneSource, pose_sets: tuple[PoseBox, ...], **options: Any) -> Job:
+    return Job(source.open(), pose_sets, **options)
 
 
 def warm_up(frame: Frame) -> None:

@@ -22,7 +22,7 @@ from ns_abstract.api.job import Job
 from ns_abstract.api.location import Location, PhotoOptions, calibrated
 from ns_abstract.api.poses import PoseSet, pose_sets
 from ns_abstract.api.scenes import Scene, checked_scene
-from ns_abstract.api.search_options import SearchKeywords, SearchOptions
+from ns_abstract.api.search_options import SearchKeywords, SearchOptions, SearchResult
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.io.errors import InputError
 from ns_abstract.report.certificate import search_figures
@@ -157,7 +157,7 @@ class LocatedCell:
 
 
 @dataclass(frozen=True)
-class Located:
+class Located(SearchResult):
     """The poses of some sets that can have made a photo.
 
     Attributes:
@@ -166,11 +166,7 @@ class Located:
         best: Parameters ``pose`` of the rendered pose that explains most, and the number of ``outliers``; or None.
         answer: "none" (no pose of the sets made the photo), "possible" (a rendered pose explains it) or "unknown".
         cells: What the sets are made of.
-        parameters: Names and units of the cells' axes.
         guarantee: Of the pictures, as in `ns_abstract.BoundResult`.
-        state: "done", "budget" (the time ended first) or "interrupted".
-        seconds: Time spent.
-        report: Content of report.json.
     """
 
     possible_volume: float
@@ -178,11 +174,7 @@ class Located:
     best: Mapping[str, Any] | None
     answer: str
     cells: tuple[LocatedCell, ...] = field(repr=False)
-    parameters: tuple[tuple[str, str], ...]
     guarantee: str
-    state: str
-    seconds: float
-    report: dict[str, Any] = field(repr=False)
 
     def _repr_html_(self) -> str:
         shares = {"certified": 1.0 - self.possible_volume, "falsified": 0.0, "unknown": self.possible_volume}
@@ -294,15 +286,13 @@ def _checked_mask(mask: ArrayLike, job: Job) -> np.ndarray:
 def located(job: Location, rows: Mapping[int, list[Row]], document: Mapping[str, Any]) -> Located:
     """The result of a search that has ended with these rows of cells by frame."""
     hull = document["hull"]
-    return Located(
+    return Located.of(
+        job.job.parameters,
+        document,
         possible_volume=document["possible_volume"],
         hull=None if hull is None else (np.array(hull["lower"]), np.array(hull["upper"])),
         best=document["best"],
         answer=document["answer"],
         cells=result_cells(rows, LocatedCell),
-        parameters=tuple(job.job.parameters),
         guarantee=short_guarantee(job.job.method.guarantee, document["scene"].get("bounded")),
-        state=document["state"],
-        seconds=document["seconds"],
-        report=dict(document),
     )

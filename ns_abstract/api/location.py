@@ -120,7 +120,6 @@ class Location:
         return self._searches[number]
 
     def examine(self, number: int, grid: CellGrid, cells: tuple[Cell, ...]) -> LocationResult:
-        """What becomes of cells of a frame; see `ns_abstract.api.cell_search.Examiner`."""
         return self.search(number).examine(cells)
 
     def picture(self, number: int, values: np.ndarray) -> np.ndarray:
@@ -142,7 +141,6 @@ class Location:
 
     @property
     def fingerprint(self) -> dict[str, Any]:
-        """What a stored search must agree with to be continued."""
         return self._fingerprint
 
     @cached_property
@@ -156,7 +154,6 @@ class Location:
 
     @property
     def recipe(self) -> Recipe[Location]:
-        """How another process opens it."""
         photo = self.photo
         again = partial(_open, self.job.recipe.open, photo.levels, photo.counted, self.options)
         return Recipe(again, self.fingerprint, self.job.source.file)
@@ -240,7 +237,6 @@ class Calibration:
     noise_by_outliers: dict[str, float]
 
     def describe(self) -> dict[str, Any]:
-        """For report.json."""
         return asdict(self)
 
 

@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cached_property, lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -92,11 +92,9 @@ class LoopJob:
 
     @cached_property
     def search(self) -> LoopSearch:
-        """The search."""
         return LoopSearch(self.reacher())
 
     def examine(self, number: int, grid: CellGrid, cells: tuple[Cell, ...]) -> LoopBlockResult:
-        """What becomes of cells of a question; see `ns_abstract.api.cell_search.Examiner`."""
         return self.search.examine(number, grid, cells)
 
     @property
@@ -125,14 +123,14 @@ class LoopJob:
 
     def prover(self, kind: VariationKind) -> ProveCell:
         """Bounds and attacks cells for all scenes around the stored one (V13)."""
-        searches: dict[float, LoopSearch] = {}
+
+        # radii come one after the other
+        @lru_cache(1)
+        def search(radius: float) -> LoopSearch:
+            return LoopSearch(self._varied(kind, radius))
 
         def prove(radius: float, number: int, box: ParameterBox) -> CellOutcome:
-            if radius not in searches:
-                # radii come one after the other
-                searches.clear()
-                searches[radius] = LoopSearch(self._varied(kind, radius))
-            outcome = searches[radius].prove_cell(QUESTIONS[number], box)
+            outcome = search(radius).prove_cell(QUESTIONS[number], box)
             if outcome.example is None:
                 return outcome
             return replace(outcome, example={**outcome.example, "radius": np.array(radius)})
@@ -147,7 +145,6 @@ class LoopJob:
 
     @property
     def recipe(self) -> Recipe[LoopJob]:
-        """How another process opens it; files are looked for under the same paths."""
         loop = self.loop
         # laws of motion do not travel
         again = partial(
@@ -157,7 +154,6 @@ class LoopJob:
 
     @property
     def assumptions(self) -> tuple[Assumption, ...]:
-        """What the verdicts rest on, and where each choice came from."""
         output = self.loop.value.get("output")
         arithmetic = None if self.model.arithmetic == "float32" else self.model.arithmetic
         return (
@@ -168,7 +164,6 @@ class LoopJob:
 
     @property
     def fingerprint(self) -> dict[str, Any]:
-        """What a stored search must agree with to be continued."""
         return self._fingerprint
 
     @cached_property

@@ -19,7 +19,7 @@ from ns_abstract.reach.search import QUESTIONS, Question, SimulatedRun, sampled_
 from ns_abstract.reach.tubes import Dependence, Tube
 from ns_abstract.report.certificate import SCENE_MARGIN, search_figures
 from ns_abstract.report.outside import SceneDrawing
-from ns_abstract.report.run import CommandRun, plain
+from ns_abstract.report.run import CommandRun, plain, sides
 from ns_abstract.verify.search_results import Verdict
 from ns_abstract.verify.store import Store, Tally, fractions
 
@@ -153,10 +153,7 @@ class LoopReport:
                 "loop": loop.value,
                 "dynamics": loop.dynamics.about,
                 **learned,
-                "parameters": [
-                    {"name": n, "unit": u, "lower": a, "upper": b}
-                    for n, u, a, b in zip(loop.box.names, loop.box.units, loop.box.lower, loop.box.upper, strict=True)
-                ],
+                "parameters": sides(loop.box),
                 "simulated_states": [run.states for run in self.simulated[:40]],
                 "tubes": self.tubes,
                 "film": self.film,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ns_abstract.api.assumptions import choice
 from ns_abstract.api.files import resized
@@ -22,9 +22,6 @@ from ns_abstract.verify.network import NetworkArithmetic, load_network
 from ns_abstract.verify.network.explain import check_cell
 from ns_abstract.verify.properties import Property
 from ns_abstract.verify.property_reading import loading, parse_property
-
-if TYPE_CHECKING:
-    pass
 
 
 class Question:

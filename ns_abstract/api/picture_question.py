@@ -226,7 +226,6 @@ class PlanePictures(FramePictures):
 
     @cached_property
     def _limited(self) -> tuple[LimitedMeasure, ...]:
-        """What is read."""
         return self._property.limited(*self.wanted.shape)
 
     @cached_property
@@ -347,14 +346,12 @@ class PictureQuestion:
     frames = 8
 
     def guarantee(self, arithmetic: NetworkArithmetic) -> tuple[str, ...]:
-        """What holds of the measures."""
         return ("no network: sums and order statistics of pixels, bounded with the rounding of their float64 sums",)
 
     def check_memory(self, dimensions: int, memory: float) -> None:
         """Nothing is refused: measures take no memory to speak of."""
 
     def describe(self) -> dict[str, Any]:
-        """What takes the network's place in reports."""
         return {"name": self.name}
 
     def fingerprint(self, arithmetic: NetworkArithmetic) -> dict[str, Any]:
@@ -362,9 +359,7 @@ class PictureQuestion:
         return {"model": None, "dataset_scale": self._dataset_scale}
 
     def choices(self, arithmetic: NetworkArithmetic, picture: Picture) -> tuple[Assumption, ...]:
-        """What verdicts rest on."""
         return (choice("network", "none: the property is one of the picture", None, "--model"),)
 
     def absolute(self) -> partial[PictureQuestion]:
-        """How a process with another working directory asks it."""
         return partial(PictureQuestion, self.source.absolute())

@@ -22,10 +22,9 @@ from ns_abstract.api.cell_search import (
 from ns_abstract.api.loop_job import LoopJob, open_loop
 from ns_abstract.api.loop_report import LoopReport
 from ns_abstract.api.scenes import Scene, checked_scene
-from ns_abstract.api.search_options import SearchKeywords, SearchOptions
+from ns_abstract.api.search_options import SearchKeywords, SearchOptions, SearchResult
 from ns_abstract.execution.cancellation import Deadline
 from ns_abstract.io.arguments import file_path
-from ns_abstract.io.assumptions import Assumption
 from ns_abstract.reach.search import QUESTIONS
 from ns_abstract.report.figures import percent
 from ns_abstract.verify.cells import CellGrid
@@ -160,7 +159,7 @@ class ReachCell:
 
 
 @dataclass(frozen=True)
-class ReachResult:
+class ReachResult(SearchResult):
     """The result of a loop: what was proved and falsified of its runs.
 
     Attributes:
@@ -168,10 +167,6 @@ class ReachResult:
         falsified: Fraction in cells with a run that goes wrong, for the strongest question asked.
         verdict: Of the whole box: "falsified", "reaches", "safe" or "unknown".
         cells: What the fractions are made of.
-        parameters: Names and units of the cells' axes.
-        state: "done", "budget" (the time ended first) or "interrupted".
-        seconds: Time spent.
-        report: Content of report.json.
     """
 
     safe: float | None
@@ -179,15 +174,6 @@ class ReachResult:
     falsified: float
     verdict: str
     cells: tuple[ReachCell, ...] = field(repr=False)
-    parameters: tuple[tuple[str, str], ...]
-    state: str
-    seconds: float
-    report: dict[str, Any] = field(repr=False)
-
-    @property
-    def assumptions(self) -> tuple[Assumption, ...]:
-        """What the verdict rests on, and where each choice came from."""
-        return tuple(Assumption(**entry) for entry in self.report["assumptions"])
 
 
 def reach(
@@ -232,14 +218,12 @@ def result(job: LoopJob, rows: Mapping[int, list[Row]], document: Mapping[str, A
     """The result of a search that has ended with these rows of cells by question."""
     questions = document["questions"]
     fractions = {name: questions[name]["certified"] if name in questions else None for name in QUESTIONS}
-    return ReachResult(
+    return ReachResult.of(
+        list(zip(job.loop.box.names, job.loop.box.units, strict=True)),
+        document,
         safe=fractions["safe"],
         reaches=fractions["reaches"],
         falsified=list(questions.values())[-1]["falsified"],
         verdict=document["verdict"],
         cells=result_cells(rows, lambda number, *more: ReachCell(QUESTIONS[number], *more), "margin"),
-        parameters=tuple(zip(job.loop.box.names, job.loop.box.units, strict=True)),
-        state=document["state"],
-        seconds=document["seconds"],
-        report=dict(document),
     )

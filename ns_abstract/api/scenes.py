@@ -84,7 +84,6 @@ class Scene:
 
     @property
     def name(self) -> str:
-        """The scene's name."""
         return self.method().name
 
     @property

@@ -69,7 +69,6 @@ def _select() -> Schema:
 
 
 def perturbation_schema() -> Schema:
-    """The JSON Schema of a perturbation file."""
     varied = _object(
         _fields(KEYS, {"select": _select(), **dict.fromkeys(VARIATIONS, _RANGE)}),
         ["select"],
@@ -228,7 +227,6 @@ def _motion() -> Schema:
 
 
 def loop_schema() -> Schema:
-    """The JSON Schema of a closed loop's file."""
     per_state = {"type": "object", "additionalProperties": {"anyOf": [_NULL, _RANGE]}}
     initial = {"type": "object", "additionalProperties": {"anyOf": [_NUMBER, _INTERVAL]}}
     end = {"type": ["number", "null"]}
@@ -279,6 +277,5 @@ def _whole(name: str, title: str, root: Schema) -> Schema:
 
 
 def schema_files() -> dict[str, bytes]:
-    """The schemas by the names of their files."""
     schemas = {"perturbation": perturbation_schema(), "property": property_schema(), "loop": loop_schema()}
     return {f"{name}.schema.json": (json.dumps(schema, indent=1) + "\n").encode() for name, schema in schemas.items()}

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypedDict, TypeVar
 
@@ -15,9 +15,11 @@ from ns_abstract.api.cell_search import CellQuestion, CellSearch, Request, Row
 from ns_abstract.execution.starting import EngineName, started
 from ns_abstract.execution.stopping import interruptible
 from ns_abstract.io.arguments import positive, whole
+from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 
 P = TypeVar("P")
+R = TypeVar("R", bound="SearchResult")
 
 
 class SearchKeywords(TypedDict, total=False):
@@ -66,7 +68,6 @@ class SearchOptions:
 
     @property
     def settings(self) -> dict[str, Any]:
-        """What the report says of them."""
         return {name: getattr(self, name) for name in ("time_budget", "arithmetic", "workers", "engine")}
 
     def search(
@@ -99,3 +100,36 @@ class SearchOptions:
                 replace(request, on_progress=listener(stop, on_progress)),
             )
             return search.rows, document
+
+
+@dataclass(frozen=True, kw_only=True)
+class SearchResult:
+    """How a search has ended.
+
+    Attributes:
+        parameters: Names and units of the cells' axes.
+        state: "done", "budget" (the time ended first) or "interrupted".
+        seconds: Time spent.
+        report: Content of report.json.
+    """
+
+    parameters: tuple[tuple[str, str], ...]
+    state: str
+    seconds: float
+    report: dict[str, Any] = field(repr=False)
+
+    @classmethod
+    def of(cls: type[R], parameters: Sequence[tuple[str, str]], document: Mapping[str, Any], **more: Any) -> R:
+        """The result that a report's ``document`` tells of; ``more`` are the attributes of its kind."""
+        state, seconds = document["state"], document["seconds"]
+        return cls(parameters=tuple(parameters), state=state, seconds=seconds, report=dict(document), **more)
+
+    @property
+    def assumptions(self) -> tuple[Assumption, ...]:
+        """What the verdict rests on, and where each choice came from."""
+        return tuple(Assumption(**entry) for entry in self.report["assumptions"])
+
+    @property
+    def interrupted(self) -> bool:
+        """Whether the work was ended by Ctrl-C or by ``on_progress``."""
+        return self.state == "interrupted"

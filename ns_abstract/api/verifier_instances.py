@@ -16,6 +16,7 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.atomic import write_atomic, write_json
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import load_json, read_text
+from ns_abstract.report.run import sides
 from ns_abstract.verify.cells import CellGrid
 from ns_abstract.verify.interop import Form, LibraryVersion
 
@@ -83,8 +84,7 @@ class InstanceFolder:
                 raise InputError(f"holds {full} already", file=self.folder, field="--prefix", fix="give another one")
             written = job.write_vnnlib(frame, one, self.folder / full, self.form, self.version)
             self.lines.append([*(file.name for file in written), str(self.seconds)])
-            sides = zip(one.names, one.units, one.lower, one.upper, strict=True)
-            self.boxes[full] = [dict(zip(("name", "unit", "lower", "upper"), side, strict=True)) for side in sides]
+            self.boxes[full] = sides(one)
             self.origins[full] = self._provenance(job, frame, one, full)
 
     def _provenance(self, job: Certification, frame: int, box: ParameterBox, name: str) -> dict[str, Any]:
@@ -114,7 +114,6 @@ class InstanceFolder:
         return origin
 
     def write_lists(self) -> None:
-        """Write instances.csv, boxes.json and origins.json."""
         stream = io.StringIO()
         csv.writer(stream, lineterminator="\n").writerows(self.lines)
         content = stream.getvalue().encode()

@@ -4,14 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import tyro
 
 from ns_abstract.cli.sets import Overrides, SceneOverrides
-
-if TYPE_CHECKING:
-    pass
 
 
 @dataclass

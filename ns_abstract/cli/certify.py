@@ -17,7 +17,6 @@ from ns_abstract.io.errors import InputError
 
 
 def certify(options: Certify) -> int:
-    """Run the command; returns the exit code."""
     if options.time_budget is not None:
         positive(options.time_budget, "--time-budget")
     options.where.check()
@@ -60,7 +59,6 @@ def explain(options: ExplainNetwork) -> int:
 
 
 def main() -> None:
-    """Entry point of the console script."""
     if "--explain" in sys.argv[1:]:
         run(explain, command("ns-abstract-certify", ExplainNetwork))
     run(certify, command("ns-abstract-certify", Certify), "give fewer --workers or free memory")

@@ -43,7 +43,6 @@ class Check:
 
 
 def check(options: Check) -> int:
-    """Run the command; returns the exit code."""
     from ns_abstract.api.checking import check as audited
 
     audit = audited(
@@ -86,7 +85,6 @@ def check(options: Check) -> int:
 
 
 def main() -> None:
-    """Entry point of the console script."""
     run(check, command("ns-abstract-check", Check), "close other programs")
 
 

@@ -9,7 +9,6 @@ from ns_abstract.io.errors import InputError
 
 
 def compare(options: Compare) -> int:
-    """Run the command; returns the exit code."""
     if options.seed < 0:
         raise InputError(f"found {options.seed}", field="--seed", fix="give a number of at least 0")
     options.where.check()
@@ -23,7 +22,6 @@ def compare(options: Compare) -> int:
 
 
 def main() -> None:
-    """Entry point of the console script."""
     run(compare, command("ns-abstract-compare", Compare))
 
 

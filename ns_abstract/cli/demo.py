@@ -28,7 +28,6 @@ class Demo:
 
 
 def demo(options: Demo) -> int:
-    """Run the command; returns the exit code."""
     from rich.console import Console
 
     from ns_abstract.demo.writing import write_demo, write_loop_demo, write_nerf_demo, write_nerfacto_demo
@@ -72,7 +71,6 @@ def demo(options: Demo) -> int:
 
 
 def main() -> None:
-    """Entry point of the console script."""
     run(demo, command("ns-abstract-demo", Demo))
 
 

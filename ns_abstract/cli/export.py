@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Union
@@ -23,37 +24,41 @@ Picture = Literal["lower", "upper", "gap", "witness", "image"]
 
 
 @dataclass
-class Npz:
-    """All frames of a path in one npz: lower, upper, witness_lower, witness_upper, image [K, H, W, 3]."""
-
+class _ResultsFile:
     input_dir: Path
     """Folder that ns-abstract-render wrote."""
     output_filename: Path
-    """The npz file; replaced if it exists."""
+    """The file; replaced if it exists."""
 
 
 @dataclass
-class Png:
-    """Plain pictures of every frame. Lower bounds are rounded down to 8 bits, upper bounds up."""
-
+class _ResultsFolder:
     input_dir: Path
     """Folder that ns-abstract-render wrote."""
     output_dir: Path
-    """Folder for the pictures; made if missing."""
+    """Folder for the files; made if missing."""
+
+
+@dataclass(kw_only=True)
+class _Pictures:
     pictures: tuple[Picture, ...] = ("lower", "upper", "gap", "image")
     """lower, upper, gap (heat map), witness (gap of real renders, same scale), image (one render)."""
 
 
 @dataclass
-class Mp4:
+class Npz(_ResultsFile):
+    """All frames of a path in one npz: lower, upper, witness_lower, witness_upper, image [K, H, W, 3]."""
+
+
+@dataclass
+class Png(_Pictures, _ResultsFolder):
+    """Plain pictures of every frame. Lower bounds are rounded down to 8 bits, upper bounds up."""
+
+
+@dataclass
+class Mp4(_Pictures, _ResultsFile):
     """A video of a path, pictures side by side."""
 
-    input_dir: Path
-    """Folder that ns-abstract-render wrote."""
-    output_filename: Path
-    """The mp4 file; replaced if it exists."""
-    pictures: tuple[Picture, ...] = ("lower", "upper", "gap", "image")
-    """lower, upper, gap (heat map), witness (gap of real renders, same scale), image (one render)."""
     fps: float = 24.0
     """Frames per second."""
     panels: Annotated[bool, tyro.conf.FlagCreatePairsOff] = False
@@ -142,65 +147,46 @@ class Occupancy:
 
 
 @dataclass
-class Exr:
+class Exr(_ResultsFolder):
     """OpenEXR pictures of every frame: parts lower, upper, witness_lower, witness_upper and image, float32."""
 
-    input_dir: Path
-    """Folder that ns-abstract-render wrote."""
-    output_dir: Path
-    """Folder for the pictures; made if missing."""
-
 
 @dataclass
-class Safetensors:
+class Safetensors(_ResultsFolder):
     """Bounds and linear sets of every frame as safetensors, of ns-abstract-render --save-cells."""
 
-    input_dir: Path
-    """Folder that ns-abstract-render --save-cells wrote."""
-    output_dir: Path
-    """Folder for the files; made if missing."""
-
 
 @dataclass
-class Statement:
+class Statement(_ResultsFile):
     """A certificate as an in-toto statement (JSON), which other tools sign."""
 
     input_dir: Path
     """Folder that ns-abstract-certify or ns-abstract-reach wrote."""
-    output_filename: Path
-    """The JSON file; replaced if it exists."""
+
+
+@dataclass(kw_only=True)
+class _Scene:
+    load_config: Path | None = None
+    """config.yml of a Splatfacto run or a scene file (.ply, .sog, .spz, .splat, .glb, .pt), for its Gaussians."""
+    overrides: SceneOverrides = field(default_factory=Overrides)
 
 
 @dataclass
-class Rrd:
+class Rrd(_Scene, _ResultsFile):
     """A Rerun recording (.rrd): bounds and figures frame by frame, and with a path its cameras in the scene."""
 
-    input_dir: Path
-    """Folder that ns-abstract-render wrote."""
-    output_filename: Path
-    """The .rrd file; replaced if it exists."""
     camera_path_filename: Path | None = None
     """The path that was rendered, for the cameras."""
-    load_config: Path | None = None
-    """config.yml of a Splatfacto run or a scene file (.ply, .sog, .spz, .splat, .glb, .pt), for its Gaussians."""
-    overrides: SceneOverrides = field(default_factory=Overrides)
 
 
 @dataclass
-class Viser:
+class Viser(_Scene, _ResultsFile):
     """A recording of viser (.viser): the gap of every frame at its camera, in the scene."""
 
-    input_dir: Path
-    """Folder that ns-abstract-render wrote."""
-    output_filename: Path
-    """The .viser file; replaced if it exists."""
     camera_path_filename: Path
     """The path that was rendered."""
-    load_config: Path | None = None
-    """config.yml of a Splatfacto run or a scene file (.ply, .sog, .spz, .splat, .glb, .pt), for its Gaussians."""
     seconds: float = 0.5
     """Of each frame."""
-    overrides: SceneOverrides = field(default_factory=Overrides)
 
 
 @dataclass
@@ -220,23 +206,11 @@ Command = Union[tuple(Annotated[kind, tyro.conf.subcommand(name)] for name, kind
 
 
 def export(options: Any) -> int:
-    """Run the command; returns the exit code."""
     target = getattr(options, "output_dir", None) or options.output_filename
     try:
         if hasattr(options, "output_filename"):
             target.parent.mkdir(parents=True, exist_ok=True)
-        if isinstance(options, ExportVnnLib):
-            notes = _vnnlib(options)
-        elif isinstance(options, Occupancy):
-            notes = _occupancy(options)
-        elif isinstance(options, Ply):
-            notes = _ply(options)
-        elif isinstance(options, Statement):
-            notes = _statement(options)
-        elif isinstance(options, Schemas):
-            notes = _schemas(options)
-        else:
-            notes = _path(options)
+        notes = _WRITERS.get(type(options), _path)(options)
     except OSError as error:
         raise InputError(f"cannot be written ({error.strerror})", file=target, fix="choose another place") from None
     for note in notes:
@@ -398,8 +372,13 @@ def _recording(options: Rrd | Viser, results: Results) -> None:
     write_viser(results, cameras, scene, options.output_filename, options.seconds)
 
 
+#: What writes that is not of a path's frames.
+_WRITERS: dict[type, Callable[[Any], list[str]]] = {
+    Ply: _ply, Statement: _statement, Schemas: _schemas, Occupancy: _occupancy, ExportVnnLib: _vnnlib,
+}  # fmt: skip
+
+
 def main() -> None:
-    """Entry point of the console script."""
     run(export, command("ns-abstract-export", Command, _PARTS, _ABOUT))
 
 

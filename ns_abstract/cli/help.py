@@ -162,7 +162,6 @@ def _command(text: str, width: int) -> str:
 
 
 def columns() -> int:
-    """Width of the text."""
     return min(_MOST_COLUMNS, shutil.get_terminal_size().columns)
 
 

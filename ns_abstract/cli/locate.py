@@ -9,7 +9,6 @@ from ns_abstract.io.errors import InputError
 
 
 def locate(options: Locate) -> int:
-    """Run the command; returns the exit code."""
     if options.time_budget is not None and not 0.0 < options.time_budget < float("inf"):
         raise InputError(f"found {options.time_budget}", field="--time-budget", fix="give a positive number")
     options.where.check()
@@ -23,7 +22,6 @@ def locate(options: Locate) -> int:
 
 
 def main() -> None:
-    """Entry point of the console script."""
     run(locate, command("ns-abstract-locate", Locate), "give fewer --workers or free memory")
 
 

@@ -51,7 +51,6 @@ class Reach:
 
 
 def reach(options: Reach) -> int:
-    """Run the command; returns the exit code."""
     positive(options.time_budget, "--time-budget")
     options.where.check()
     stop = SignalStop()
@@ -85,7 +84,6 @@ def reach(options: Reach) -> int:
 
 
 def main() -> None:
-    """Entry point of the console script."""
     run(reach, command("ns-abstract-reach", Reach), "give fewer --workers or free memory")
 
 

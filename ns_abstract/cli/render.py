@@ -54,7 +54,6 @@ def describe(options: Render) -> int:
 
 
 def render(options: Render) -> int:
-    """Run the command; returns the exit code."""
     if options.describe:
         return describe(options)
     if options.output_dir is None:
@@ -76,7 +75,6 @@ def render(options: Render) -> int:
 
 
 def main() -> None:
-    """Entry point of the console script."""
     run(render, command("ns-abstract-render", Render))
 
 

@@ -90,7 +90,6 @@ def view(options: ViewRun) -> int:
 
 
 def main() -> None:
-    """Entry point of the console script."""
     run(view, command("ns-abstract-viewer", tyro.conf.FlagConversionOff[ViewRun]))
 
 

@@ -64,7 +64,6 @@ class AbstractConfig:
 
     @property
     def radii(self) -> dict[str, float]:
-        """Radii by parameter."""
         poses = dict(zip((*TRANSLATIONS, *ROTATIONS), (*self.translation, *self.rotation), strict=True))
         return {**poses, **{name: getattr(self, name) for name in VARIATIONS}}
 
@@ -133,7 +132,6 @@ class AbstractOutputs(_Base):
     gaussians = False
 
     def populate_modules(self) -> None:
-        """Add the panel."""
         super().populate_modules()
         options: AbstractConfig = self.config.abstract  # pyright: ignore[reportAttributeAccessIssue]
         # the viewer follows attributes of modules: a plain reference from the panel would lead it in circles
@@ -182,7 +180,6 @@ class AbstractOutputs(_Base):
         return {**outputs, **{name: value.to(self.device) for name, value in abstract_outputs.items()}}
 
     def _concrete(self, camera: Any, obb_box: Any) -> dict[str, torch.Tensor]:
-        """The model's own outputs."""
         return super().get_outputs_for_camera(camera, obb_box)
 
     def _abstract(self, camera: Any) -> dict[str, torch.Tensor]:

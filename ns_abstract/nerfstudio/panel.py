@@ -72,7 +72,6 @@ class Figures(ViewerElement[str]):
         self._create_gui_handle(viser_server)
 
     def show(self, text: str) -> None:
-        """Replace the text."""
         self.text = text
         if self.gui_handle is not None and self.gui_handle.content != text:
             self.gui_handle.content = text
@@ -96,7 +95,6 @@ class Attached(ViewerControl):
 
     @property
     def present(self) -> bool:
-        """Whether there is a viewer."""
         return self._present.is_set()
 
     @property
@@ -106,7 +104,6 @@ class Attached(ViewerControl):
 
     @property
     def folder(self) -> Path:
-        """The run's folder."""
         return self.viewer.log_filename.parent
 
     def draw(self) -> None:
@@ -242,7 +239,6 @@ class AbstractPanel(torch.nn.Module):
 
     @property
     def seconds(self) -> float:
-        """Time for a view."""
         seconds = float(self._seconds.value)
         return min(max(seconds, 0.1), 86400.0) if math.isfinite(seconds) else 1.0
 

@@ -34,7 +34,6 @@ class AbstractSplatfactoModelConfig(SplatfactoModelConfig):
 
     @classmethod
     def of(cls, config: SplatfactoModelConfig) -> AbstractSplatfactoModelConfig:
-        """The same configuration with abstract images."""
         names = {entry.name for entry in dataclasses.fields(cls)} - {"_target"}
         return cls(**{name: value for name, value in vars(config).items() if name in names})
 
@@ -102,7 +101,6 @@ class AbstractSplatfactoModel(AbstractOutputs, SplatfactoModel):
         return self._shown[1:]
 
     def abstract_source(self) -> SplatSource:
-        """The Gaussians as they are shown."""
         return self._scene()[0]
 
     def get_outputs(self, camera: Cameras) -> dict[str, Any]:

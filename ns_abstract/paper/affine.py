@@ -98,7 +98,6 @@ class Enclosure:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of the array."""
         return self.form.shape
 
     def bounds(self) -> tuple[Float64Array, Float64Array]:
@@ -122,7 +121,6 @@ class Enclosure:
         return Enclosure(self.form.broadcast_to(shape), self.range.broadcast_to(shape))
 
     def transpose(self) -> Enclosure:
-        """Transpose of a matrix."""
         return Enclosure(self.form.transpose(), self.range.transpose())
 
     def _lift(self, value: Enclosure | Interval | ArrayLike) -> Enclosure:
@@ -153,7 +151,6 @@ class Enclosure:
     __rmul__ = __mul__
 
     def __matmul__(self, other: Enclosure | Interval | ArrayLike) -> Enclosure:
-        """Product of two matrices."""
         other = self._lift(other)
         (n, k), (_, m) = self.shape, other.shape
         return (self.reshape(n, k, 1).broadcast_to((n, k, m)) * other.reshape(1, k, m)).sum(1)
@@ -162,7 +159,6 @@ class Enclosure:
         return self._lift(other) @ self
 
     def sum(self, axis: int = -1) -> Enclosure:
-        """Sum along one axis."""
         axis %= len(self.shape)
         if self.shape[axis] == 0:
             return Enclosure.of(self.basis, self.range.sum(axis))
@@ -185,7 +181,6 @@ class Enclosure:
         return Enclosure(self.form.square(), self.range.square())
 
     def power(self, exponent: int) -> Enclosure:
-        """``x ** exponent`` for an integer ``exponent >= 0``."""
         whole = self.range.power(exponent)
         result = Enclosure.of(self.basis, np.ones(self.shape))
         base = self
@@ -220,7 +215,6 @@ class Enclosure:
         return self._curve(lines.EXP, finite, None if self.basis.order == 1 else self._exp_taylor())
 
     def _exp_taylor(self) -> FormArray:
-        """Second-order forms of ``exp``; not finite where the argument is large."""
         center, farthest = self.form.center, np.maximum(self.form.center, self.range.upper)
         moderate = (np.abs(center) < _MODERATE) & (farthest < _MODERATE)
         value = Interval(np.where(moderate, center, 0.0)).exp()

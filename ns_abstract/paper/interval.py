@@ -175,7 +175,6 @@ class Interval:
         return np.maximum(_sum_ends(self.upper, -middle)[1], _sum_ends(middle, -self.lower)[1])
 
     def bounds(self) -> tuple[Float64Array, Float64Array]:
-        """Lower and upper ends."""
         return self.lower, self.upper
 
     def contains(self, values: ArrayLike) -> bool:
@@ -198,7 +197,6 @@ class Interval:
         return self._map(lambda end: end.reshape(*shape))
 
     def broadcast_to(self, shape: tuple[int, ...]) -> Interval:
-        """The intervals repeated to ``shape``."""
         return self._map(lambda end: np.broadcast_to(end, shape))
 
     def transpose(self) -> Interval:
@@ -287,15 +285,12 @@ class Interval:
         return rest[0]
 
     def sum(self, axis: int = -1) -> Interval:
-        """Sum along one axis."""
         return self._reduce(axis, lambda a, b: a + b, 0.0)
 
     def prod(self, axis: int = -1) -> Interval:
-        """Product along one axis."""
         return self._reduce(axis, lambda a, b: a * b, 1.0)
 
     def absolute(self) -> Interval:
-        """``|x|``."""
         reaches = (self.lower <= 0.0) & (self.upper >= 0.0)
         least = np.minimum(np.abs(self.lower), np.abs(self.upper))
         return Interval(np.where(reaches, 0.0, least), self.magnitude)
@@ -320,7 +315,6 @@ class Interval:
         return Interval(_power_ends(base.lower, exponent)[0], _power_ends(base.upper, exponent)[1])
 
     def sqrt(self) -> Interval:
-        """``sqrt(x)`` for ``x >= 0``; ``[-inf, inf]`` where ``x`` may be negative."""
         with np.errstate(invalid="ignore"):
             low, high = np.sqrt(self.lower), np.sqrt(self.upper)
         down = np.where(self.lower == 0.0, 0.0, round_down(low))
@@ -329,11 +323,9 @@ class Interval:
         return Interval(np.where(outside, -np.inf, down), np.where(outside, np.inf, up))
 
     def exp(self) -> Interval:
-        """``exp(x)``."""
         return Interval(_exp_ends(self.lower)[0], _exp_ends(self.upper)[1])
 
     def norm(self) -> Interval:
-        """Frobenius norm over all elements, a scalar."""
         return self.square().reshape(-1).sum(0).sqrt()
 
     def indicator(self) -> Interval:

@@ -128,7 +128,6 @@ class ComparisonReport(Report):
         return entry
 
     def document(self) -> dict[str, Any]:
-        """The content of report.json."""
         document = super().document() | {"kind": "comparison", "metrics": METRICS, "tolerance": self.tolerance}
         frames = document["frames"]
         for name in ("largest_upper", "largest_lower"):

@@ -24,6 +24,7 @@ from ns_abstract.report.figures import metrics, number, short_guarantee
 from ns_abstract.report.files import IMAGES, frame_index, load_frame
 from ns_abstract.report.picture import heat, to_bytes
 from ns_abstract.report.record import frame_digests
+from ns_abstract.report.run import sides
 
 PICTURES = ("lower", "upper", "gap", "witness", "image")
 _LABELS = {
@@ -91,9 +92,7 @@ class Results:
             self.guarantees.add(short_guarantee(str(stored.about.get("guarantee", "unknown")), bounded))
             if not result.bounded:
                 self.unbounded.append(index)
-            box = result.box
-            sides = zip(box.names, box.units, box.lower, box.upper, strict=True)
-            self.parameters.append([dict(zip(("name", "unit", "lower", "upper"), s, strict=True)) for s in sides])
+            self.parameters.append(sides(result.box))
 
     def __iter__(self) -> Iterator[FrameResult]:
         """The frames in order, each read when it is its turn."""

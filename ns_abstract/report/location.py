@@ -18,7 +18,7 @@ from ns_abstract.report.figures import number, unit_of_axis
 from ns_abstract.report.html import whole_page
 from ns_abstract.report.outside import SceneDrawing
 from ns_abstract.report.picture import heat, preview, to_bytes
-from ns_abstract.report.run import CommandRun, plain
+from ns_abstract.report.run import CommandRun, plain, sides
 from ns_abstract.report.verdict_maps import LEFT, NONE, OPEN, pairs_svg
 
 Row = Mapping[str, Any]
@@ -108,14 +108,13 @@ def _frame(
     found: Sequence[Any],
 ) -> dict[str, Any]:
     box = poses.box
-    sides = {n: (low, high) for n, low, high in zip(box.names, box.lower, box.upper, strict=True)}
-    ranges = {name: sides.get(name, (poses.fixed.get(name, 0.0),) * 2) for name, _ in parameters}
+    entries = sides(box, parameters, poses.fixed)
     left = [row for row in rows if row["verdict"] != "excluded"]
     columns = [[name for name, _ in parameters].index(name) for name in box.names]
 
     def volume(row: Row) -> float:
-        sides = np.subtract(row["upper"], row["lower"])[columns] / np.subtract(box.upper, box.lower)
-        return float(np.prod(sides))
+        shares = np.subtract(row["upper"], row["lower"])[columns] / np.subtract(box.upper, box.lower)
+        return float(np.prod(shares))
 
     hull = None
     if left:
@@ -126,16 +125,13 @@ def _frame(
     best = None
     if found:
         values = dict(zip(box.names, found[0].values, strict=True))
-        pose = [values.get(name, ranges[name][0]) for name, _ in parameters]
+        pose = [values.get(entry["name"], entry["lower"]) for entry in entries]
         matrix = poses.pose(np.array(found[0].values))
         best = {"pose": pose, "outliers": found[0].outliers, "camera_to_world": matrix}
     return {
         "index": index,
         "intrinsics": poses.camera.intrinsics._asdict(),
-        "parameters": [
-            {"name": name, "unit": unit, "lower": ranges[name][0], "upper": ranges[name][1]}
-            for name, unit in parameters
-        ],
+        "parameters": entries,
         "possible_volume": min(1.0, sum(map(volume, left))),
         "hull": hull,
         "best": best,

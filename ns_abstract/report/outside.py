@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any, TypeVar
+from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from markupsafe import Markup
@@ -16,8 +15,6 @@ from ns_abstract.report.picture import png
 from ns_abstract.report.svg import PlotAxis, draw_plot
 
 Float64 = NDArray[np.float64]
-K = TypeVar("K")
-V = TypeVar("V")
 
 #: Elements drawn at most, the numbers that are tried until a picture is small enough, and bytes of one.
 _COUNTS, _MOST_BYTES = (4000, 2000, 1000, 400), 90_000
@@ -55,23 +52,14 @@ class PlotWindow:
     size: tuple[int, int]
 
 
-def _remembered(cached: dict[K, V], key: K, find: Callable[[], V]) -> V:
-    """Return the value of a key from a small cache, or compute it."""
-    if key not in cached:
-        while len(cached) >= _KEPT:
-            cached.pop(next(iter(cached)))
-        cached[key] = find()
-    return cached[key]
-
-
-@dataclass
 class SceneDrawing:
     """Draws a scene from outside."""
 
-    elements: SceneElements
-    # reports are written again and again, mostly of the same windows
-    _windows: dict[tuple[Any, ...], PlotWindow] = field(default_factory=dict)
-    _pictures: dict[tuple[PlotWindow, float], bytes] = field(default_factory=dict)
+    def __init__(self, elements: SceneElements) -> None:
+        self.elements = elements
+        # reports are written again and again, mostly of the same windows
+        self._window = lru_cache(_KEPT)(self._found_window)
+        self._picture = lru_cache(_KEPT)(self._drawn_picture)
 
     @staticmethod
     def sight(axes: tuple[int, int]) -> tuple[int, float]:
@@ -93,10 +81,12 @@ class SceneDrawing:
         ``axes`` are the world's axes to the right and up; ``nearest`` as `picture` has it; ``width`` of the picture in
         pixels.
         """
-        key = axes, *low.tolist(), *high.tolist(), nearest, width
-        return _remembered(self._windows, key, lambda: self._window(axes, low, high, nearest, width))
+        return self._window(axes, tuple(low.tolist()), tuple(high.tolist()), nearest, width)
 
-    def _window(self, axes: tuple[int, int], low: Float64, high: Float64, nearest: float, width: int) -> PlotWindow:
+    def _found_window(
+        self, axes: tuple[int, int], lower: tuple[float, ...], upper: tuple[float, ...], nearest: float, width: int
+    ) -> PlotWindow:
+        low, high = np.array(lower), np.array(upper)
         span = max(float((high - low).max()), 1e-6)
         places = self.elements.places[self._drawn(axes, nearest)][:, list(axes)]
         if len(places):
@@ -110,9 +100,9 @@ class SceneDrawing:
 
     def picture(self, window: PlotWindow, nearest: float = np.inf) -> bytes:
         """PNG of the elements in a window but for those in front, beyond ``nearest`` towards who looks."""
-        return _remembered(self._pictures, (window, nearest), lambda: self._picture(window, nearest))
+        return self._picture(window, nearest)
 
-    def _picture(self, window: PlotWindow, nearest: float) -> bytes:
+    def _drawn_picture(self, window: PlotWindow, nearest: float) -> bytes:
         low, high = np.array(window.low), np.array(window.high)
         axes = list(window.axes)
         numbers = self._drawn(window.axes, nearest)

@@ -94,7 +94,6 @@ class ProgressBar:
         self._first = self._bar = self._cell = None
 
     def __call__(self, point: WorkProgress) -> None:
-        """Show where the work stands."""
         if self._first is None:
             self._begin(point)
         assert self._first is not None

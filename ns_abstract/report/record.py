@@ -28,7 +28,7 @@ from ns_abstract.report.files import (
     save_frame,
 )
 from ns_abstract.report.picture import layer_figure, previews, save_figure, save_picture
-from ns_abstract.report.run import CommandRun, differences, guarantee_text, plain
+from ns_abstract.report.run import CommandRun, differences, guarantee_text, plain, sides
 
 Status = Literal["done", "partial", "missing"]
 Outcome = Literal["done", "budget", "interrupted"]
@@ -361,29 +361,16 @@ class Report:
 
     def _entry(self, result: FrameResult, status: str) -> dict[str, Any]:
         height, width = result.lower.shape[:2]
-        box = result.box
         return plain(
             {
                 "index": result.index,
                 **metrics(result),
                 "seconds": result.seconds,
                 "cells": result.cells,
-                "trace": [
-                    {
-                        "seconds": p.seconds,
-                        "cells": p.cells,
-                        "mpg": p.mpg,
-                        "mpg_witness": p.mpg_witness,
-                        "covered": p.covered,
-                    }
-                    for p in result.trace
-                ],
+                "trace": [vars(point) for point in result.trace],
                 "seconds_to_ratio": {f"{mark:g}": seconds for mark, seconds in seconds_to(result.trace).items()},
                 "status": status,
-                "parameters": [
-                    {"name": name, "unit": unit, "lower": low, "upper": high}
-                    for name, unit, low, high in zip(box.names, box.units, box.lower, box.upper, strict=True)
-                ],
+                "parameters": sides(result.box),
                 "height": height,
                 "width": width,
                 "plan": result.plan,

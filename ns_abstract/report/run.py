@@ -7,13 +7,14 @@ import math
 import os
 import platform
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
 import numpy as np
 
+from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.version import VERSION as PACKAGE
 
@@ -64,6 +65,20 @@ def plain(value: Any) -> Any:
     if isinstance(value, os.PathLike):
         return os.fspath(value)
     raise TypeError(f"{type(value).__name__} has no JSON form")
+
+
+def sides(
+    box: ParameterBox, parameters: Sequence[tuple[str, str]] | None = None, fixed: Mapping[str, float] | None = None
+) -> list[dict[str, Any]]:
+    """Name, unit, lower and upper end of every parameter of a box, as report.json has them.
+
+    ``parameters``: names and units of those that are told; None: the box's own. One that the box lacks has its value in
+    ``fixed``, or 0.
+    """
+    ends = dict(zip(box.names, zip(box.lower, box.upper, strict=True), strict=True))
+    named = zip(box.names, box.units, strict=True) if parameters is None else parameters
+    entries = ((name, unit, *ends.get(name, ((fixed or {}).get(name, 0.0),) * 2)) for name, unit in named)
+    return [dict(zip(("name", "unit", "lower", "upper"), entry, strict=True)) for entry in entries]
 
 
 @cache

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -150,63 +151,55 @@ class Snapshot:
 
     @property
     def size(self) -> tuple[int, int]:
-        """Height and width."""
         return self.lower.shape[0], self.lower.shape[1]
 
     @property
     def bytes(self) -> int:
-        """Memory of the pictures."""
         return 4 * self.lower.nbytes
 
 
-class SceneFrame(Frame, Protocol):
-    """A frame whose scene may vary."""
-
-    def scene_samples(self, seed: int) -> Iterator[Any]:
-        """Other scenes of the set, each as a function like ``render``."""
-        ...
-
-
-class Source(Protocol):
+class Source(ABC):
     """A scene that frames can be made of; crosses to the worker process.
 
-    ``ladder``: longest sides of previews and the seconds that each may take. ``most``: longest side that is worth
-    bounding, or None. ``patience``: seconds that a worker may go on with an outdated request before another takes over.
-    ``about``: what is bounded where that is not the picture on screen, for people; or "".
+    ``ladder``: longest sides of previews and the seconds that each may take. ``patience``: seconds that a worker may go
+    on with an outdated request before another takes over.
     """
 
-    @property
-    def ladder(self) -> Mapping[int, float]: ...
+    ladder: ClassVar[Mapping[int, float]]
+    patience: ClassVar[float]
 
     @property
-    def most(self) -> int | None: ...
+    def most(self) -> int | None:
+        """Longest side that is worth bounding, or None."""
+        return None
 
     @property
-    def patience(self) -> float: ...
+    @abstractmethod
+    def about(self) -> str:
+        """What is bounded where that is not the picture on screen, for people; or ""."""
 
     @property
-    def about(self) -> str: ...
-
-    @property
+    @abstractmethod
     def guarantee(self) -> str:
         """What the bounds are worth on a platform that passes its self-check."""
-        ...
 
-    def frame(self, camera: PinholeCamera, perturbation: Perturbation) -> SceneFrame:
-        """The frame of ``camera`` and a set of poses around it.
+    @abstractmethod
+    def frame(self, camera: PinholeCamera, perturbation: Perturbation) -> Frame:
+        """The frame of ``camera`` and a set of poses around it. Raises InputError: the scene does not vary so."""
 
-        Raises:
-            InputError: The scene does not vary as asked.
-        """
-        ...
+    @abstractmethod
+    def _camera(self) -> PinholeCamera:
+        """A small camera whose frames need the kernels of all views."""
 
     def warm_up(self) -> None:
-        """Compile what frames will need."""
-        ...
+        """Compile the kernels for one and for several parameters."""
+        camera = self._camera()
+        for radii in _WARM_UP:
+            self.frame(camera, perturbation_of(radii)).warm_up()
 
 
 @dataclass(frozen=True, eq=False)
-class SplatSource:
+class SplatSource(Source):
     """A splat scene as it is shown: activated ``splats`` with the background, and the stored ``scene`` for selections.
 
     ``renderer``: "gsplat" or "paper"; ``version``: gsplat's; None: 1.4.0; ``arithmetic``: "float32" or "real".
@@ -221,7 +214,6 @@ class SplatSource:
     _kept: dict[tuple[SceneVariation, ...], VariedSplats] = field(default_factory=dict, init=False, repr=False)
 
     ladder: ClassVar[Mapping[int, float]] = SPLAT_LADDER
-    most: ClassVar[int | None] = None
     patience: ClassVar[float] = 0.4
 
     @property
@@ -231,15 +223,9 @@ class SplatSource:
 
     @property
     def guarantee(self) -> str:
-        """What the bounds are worth on a platform that passes its self-check."""
         return f"{self.arithmetic}-sound"
 
     def frame(self, camera: PinholeCamera, perturbation: Perturbation) -> SplatFrame:
-        """The frame of ``camera`` and a set of poses and scenes around it.
-
-        Raises:
-            InputError: A selection is empty.
-        """
         return SplatFrame(
             self.splats,
             rasteriser_named(self.renderer, self.version),
@@ -258,21 +244,18 @@ class SplatSource:
             self._kept[perturbation.scene] = varied
         return self._kept[perturbation.scene]
 
-    def warm_up(self) -> None:
-        """Compile the kernels for one and for several parameters."""
+    def _camera(self) -> PinholeCamera:
         means = self.splats.means
         middle = np.median(means, axis=0)
         distance = 4.0 * float(np.median(np.linalg.norm(means - middle, axis=1))) + 0.1
         pose = np.eye(3, 4)
         pose[:, 3] = middle
         pose[2, 3] += distance
-        camera = PinholeCamera(pose, 32.0, 32.0, 16.0, 16.0, 32, 32)
-        for radii in _WARM_UP:
-            self.frame(camera, perturbation_of(radii)).warm_up()
+        return PinholeCamera(pose, 32.0, 32.0, 16.0, 16.0, 32, 32)
 
 
 @dataclass(frozen=True, eq=False)
-class NerfSource:
+class NerfSource(Source):
     """A vanilla NeRF as it is bounded: its fine field at uniform samples, in small pictures."""
 
     scene: NerfScene
@@ -298,17 +281,12 @@ class NerfSource:
 
     @property
     def about(self) -> str:
-        """What is bounded, as that is not the picture on screen."""
         s = self._method.sampling
         return f"of the fine field at {s.samples} uniform samples by ray, not of the picture with importance samples"
 
     def frame(self, camera: PinholeCamera, perturbation: Perturbation) -> NerfFrame:
-        """The frame of ``camera`` and a set of poses around it. Raises InputError: Gaussians are to vary."""
         self._method.prepare([perturbation])
         return self._method.frame(PoseBox.around(camera, perturbation))
 
-    def warm_up(self) -> None:
-        """Compile the kernels for one and for several parameters."""
-        camera = PinholeCamera(np.eye(3, 4), 2.0, 2.0, 1.0, 1.0, 2, 2)
-        for radii in _WARM_UP:
-            self.frame(camera, perturbation_of(radii)).warm_up()
+    def _camera(self) -> PinholeCamera:
+        return PinholeCamera(np.eye(3, 4), 2.0, 2.0, 1.0, 1.0, 2, 2)

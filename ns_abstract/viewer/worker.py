@@ -45,7 +45,6 @@ class BoundsWorker:
         self._waiting: list[tuple[Any, ...]] = []
 
     def run(self) -> None:
-        """Serve."""
         self.problems = tuple(check_functions())
         while True:
             kind, *content = self._next()
@@ -117,7 +116,6 @@ class BoundsWorker:
         return self.connection.poll()
 
     def tell(self, number: int, refinement: Refinement, *, final: bool) -> None:
-        """Send what ``refinement`` knows."""
         assert self.source is not None
         guarantee = "sampled" if self.problems else self.source.guarantee
         self.connection.send(("picture", number, Snapshot.of(refinement.snapshot(), final=final, guarantee=guarantee)))
