@@ -66,8 +66,8 @@ class KnownBox:
     @property
     def nbytes(self) -> int:
         """Memory that it holds, without what draws pictures."""
-        shown = sum(one.context.nbytes + one.pixels.nbytes for one in self.elements or ())
-        return self.lower.nbytes + self.upper.nbytes + self.open.nbytes + shown
+        drawn = sum(one.context.nbytes + one.pixels.nbytes for one in self.elements or ())
+        return self.lower.nbytes + self.upper.nbytes + self.open.nbytes + drawn
 
 
 #: Tiles [t, side, side, 3] of a picture at parameter values [d]; right at the pixels that are not settled alone.
@@ -117,9 +117,9 @@ class KnownBoxes:
     def _drawn(self, box: ParameterBox, box_bounds: KnownBox) -> tuple[Draw, ...]:
         """By frame of weights, what draws the pixels of a box that are not settled."""
         if box not in self._draws:
-            shown = list(zip(self._weights, box_bounds.elements or (), strict=False))
-            draws = tuple(frame.drawn_alone(one.context, one.tiles, one.pixels) for (frame, _), one in shown)
-            self._draws[box] = sum(len(one.context.shown) for _, one in shown), draws
+            pairs = list(zip(self._weights, box_bounds.elements or (), strict=False))
+            draws = tuple(frame.drawn_alone(one.context, one.tiles, one.pixels) for (frame, _), one in pairs)
+            self._draws[box] = sum(len(one.context.shown) for _, one in pairs), draws
             while sum(count for count, _ in self._draws.values()) > _TUNING.drawn and len(self._draws) > 1:
                 self._draws.popitem(last=False)
         self._draws.move_to_end(box)
@@ -192,9 +192,9 @@ class NearbyPictures:
         box_bounds = self._known
         image = 0.5 * (box_bounds.lower + box_bounds.upper)
         if box_bounds.elements is not None:
-            for (frame, channels), shown, draw in zip(self._weights, box_bounds.elements, self._draws, strict=True):
+            for (frame, channels), elements, draw in zip(self._weights, box_bounds.elements, self._draws, strict=True):
                 drawn = draw(np.asarray(values, np.float64))
-                place((image,), (drawn,), frame, shown.tiles, channels, box_bounds.open)
+                place((image,), (drawn,), frame, elements.tiles, channels, box_bounds.open)
         return image
 
     def scene_samples(self, seed: int) -> Iterator[SceneSample]:
@@ -213,9 +213,9 @@ class NearbyPictures:
         linear = (flat[0], lower.copy(), flat[1], upper.copy())
         if box_bounds.elements is None:
             return linear, lower, upper, slopes
-        for (frame, channels), shown in zip(self._weights, box_bounds.elements, strict=True):
-            bounds = frame.bound_parts([box], shown.tiles, shown.context, True, shown.pixels)[0]
-            place_sets((*linear, lower, upper), bounds, frame, shown.tiles, channels, box_bounds.open)
+        for (frame, channels), elements in zip(self._weights, box_bounds.elements, strict=True):
+            bounds = frame.bound_parts([box], elements.tiles, elements.context, True, elements.pixels)[0]
+            place_sets((*linear, lower, upper), bounds, frame, elements.tiles, channels, box_bounds.open)
             slopes = slopes + bounds.slopes
         return linear, lower, upper, slopes
 
@@ -245,11 +245,11 @@ class NearbyPictures:
         places = np.flatnonzero(box_bounds.open)
         compared = np.zeros(box_bounds.open.shape, bool)
         compared.flat[places[:: -(-places.size // _TUNING.compared)]] = True
-        for (frame, channels), shown in zip(self._weights, box_bounds.elements, strict=True):
-            pixels = in_tiles(compared, frame.side)[shown.tiles]
+        for (frame, channels), elements in zip(self._weights, box_bounds.elements, strict=True):
+            pixels = in_tiles(compared, frame.side)[elements.tiles]
             some = pixels.any(axis=(1, 2))
-            tiles, pixels = shown.tiles[some], pixels[some]
-            (bounds,) = frame.bound_parts([box], tiles, shown.context, True, pixels)
+            tiles, pixels = elements.tiles[some], pixels[some]
+            (bounds,) = frame.bound_parts([box], tiles, elements.context, True, pixels)
             assert bounds.linear is not None
             sets = PictureSets(box, bounds.linear, bounds.lower, bounds.upper)
             width += float(sets.widths[pixels][:, : len(channels)].mean())

@@ -54,7 +54,7 @@ def _together(report: dict[str, Any], parts: list[StoredCells], frames: Collecti
         if not abs(sum(e[kind] for e in entries.values()) / len(entries) - said) <= 1e-9:
             wrong.append(f"the report says {said:.9g} of all sets are {kind}, its frames do not")
     whole, verdict = [k for k in entries if kinds.get(k) == {"certified"}], "unknown"
-    if any("falsified" in found for found in kinds.values()):
+    if any("falsified" in verdicts for verdicts in kinds.values()):
         verdict = "falsified"
     elif report.get("kind") == "loop" and whole:
         verdict = ("safe", "reaches")[whole[-1]]

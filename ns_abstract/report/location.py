@@ -201,7 +201,7 @@ def pair_svg(entry: Mapping[str, Any], rows: Sequence[Row]) -> Markup | None:
     whole = np.array([[parameters[k][end] for k in free] for end in ("lower", "upper")], np.float64)
     hull = np.array([entry["hull"]["lower"], entry["hull"]["upper"]], np.float64)[:, free]
     best = None if entry["best"] is None else np.array(entry["best"]["pose"], np.float64)[free]
-    shown = [parameters[k] for k in free]
+    moving = [parameters[k] for k in free]
     pictures = {}
     for i, j in itertools.permutations(range(len(free)), 2):
         window = whole if i > j else hull
@@ -209,7 +209,7 @@ def pair_svg(entry: Mapping[str, Any], rows: Sequence[Row]) -> Markup | None:
         pictures[i, j] = image, "the set" if i > j else "the hull"
 
     def labels(k: int, x: float, y: float, panel: int, bottom: float) -> list[str]:
-        p = shown[k]
+        p = moving[k]
         label = escape(f"{p['name']} ({unit_of_axis(p['unit'])})")
         middle = f'x="{x + 0.5 * panel:.0f}" text-anchor="middle"'
         return [
@@ -221,7 +221,7 @@ def pair_svg(entry: Mapping[str, Any], rows: Sequence[Row]) -> Markup | None:
             f'<text {middle} y="{y + 0.5 * panel + 28:.0f}">{number(hull[1, k], 3)}</text>',
         ]
 
-    return pairs_svg("What is left over pairs of parameters", shown, pictures, labels)
+    return pairs_svg("What is left over pairs of parameters", moving, pictures, labels)
 
 
 def _touched(

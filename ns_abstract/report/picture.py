@@ -216,11 +216,11 @@ def panels_figure(
     )
     axes: Any = figure.subplots(1, len(panels))
     for k, (place, (label, image, colors, top)) in enumerate(zip(axes, panels, strict=True)):
-        shown = place.imshow(image, cmap=colors, vmin=0.0, vmax=top, interpolation="antialiased")
+        mapped = place.imshow(image, cmap=colors, vmin=0.0, vmax=top, interpolation="antialiased")
         bare_axes(place)
         place.set_title(label, fontsize=_LABEL_POINTS, color=_INK)
         if k in bars:
-            figure.colorbar(shown, ax=place, fraction=0.05, pad=0.02).ax.tick_params(labelsize=_TICK_POINTS)
+            figure.colorbar(mapped, ax=place, fraction=0.05, pad=0.02).ax.tick_params(labelsize=_TICK_POINTS)
     figure.suptitle(title, fontsize=_TITLE_POINTS, color=_INK)
     return figure
 
@@ -240,11 +240,11 @@ def bare_axes(axes: Axes) -> None:
         spine.set_color(_SOFT)
 
 
-def _color_bar(figure: Figure, shown: Any, side: Axes, inches: float) -> None:
+def _color_bar(figure: Figure, mapped: Any, side: Axes, inches: float) -> None:
     """A colour bar with as many ticks as fit into ``inches``."""
     from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
-    bar = figure.colorbar(shown, cax=side)
+    bar = figure.colorbar(mapped, cax=side)
     bar.outline.set_linewidth(0.4)  # pyright: ignore[reportCallIssue]
     bar.locator = MaxNLocator(nbins=max(1, min(6, int(inches / 0.4))))
     # a common factor of small gaps stands above the bar

@@ -55,11 +55,11 @@ def shared_box(box: ParameterBox, whole: ParameterBox, motion: np.ndarray) -> Pa
         for moved in motion.tolist()
     ]
     level = min((level + less for level, less in zip(_levels(box, whole), spared, strict=True)), default=0)
-    found = box
-    while found == box and level >= 0:
-        found = _aligned(box, whole, [max(0, level - less) for less in spared])
+    aligned = box
+    while aligned == box and level >= 0:
+        aligned = _aligned(box, whole, [max(0, level - less) for less in spared])
         level -= 1
-    return _useful(found, box, whole, motion)
+    return _useful(aligned, box, whole, motion)
 
 
 def _levels(cell: ParameterBox, whole: ParameterBox) -> list[int]:

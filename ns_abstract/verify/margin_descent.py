@@ -50,9 +50,9 @@ def descend(
         if not 0.0 < length < math.inf or enough(best):
             break
         trial = (scaled - step * free / length).clamp(-1.0, 1.0)
-        found, trial_slope = evaluate(trial)
-        if found < best:
-            scaled, best, slope, step, moved = trial, found, trial_slope, min(2.0 * step, 1.0), True
+        trial_value, trial_slope = evaluate(trial)
+        if trial_value < best:
+            scaled, best, slope, step, moved = trial, trial_value, trial_slope, min(2.0 * step, 1.0), True
         else:
             step *= 0.25
     return box.at(scaled.detach().numpy()) if moved else None
