@@ -677,7 +677,7 @@ SIGNALS = [
 LOOPS = [
     row("reach", "good", "safe: certified", code=0, memory=WORK),
     row("reach", "done on a full disk", "cannot be used", room=1 << 15, memory=WORK),
-    row("reach", "SIGINT", "", signals=(signal.SIGINT,), after="safe", options="--time-budget 600", code=3, memory=WORK, loop=edited(initial={"x": [0.0, 0.9]}, unsafe=[{"box": {"x": [0.45, None]}}])),
+    row("reach", "SIGINT", "", signals=(signal.SIGINT,), after="safe", options="--time-budget 600", code=3, memory=WORK, loop=edited(steps=8, initial={"x": [0.0, 0.9]}, unsafe=[{"box": {"x": [0.45, None]}}])),
     row("reach", "loop absent", "none.json", options="--loop {here}/none.json"),
     row("reach", "loop empty", "is empty", loop=b""),
     row("reach", "loop not text", "UTF-8", loop=b"\xff\x00\xfe"),
