@@ -72,8 +72,8 @@ def grown(poses: PoseBox, hull: Mapping[str, Range], motion: Mapping[str, Range]
 
 def _seal(entry: Mapping[str, Any]) -> str:
     """SHA-256 of what is known of a photo, without which a report that others have changed would be continued."""
-    known = {name: value for name, value in entry.items() if name != "sha256"}
-    return hashlib.sha256(json.dumps(plain(known), sort_keys=True).encode()).hexdigest()
+    sealed = {name: value for name, value in entry.items() if name != "sha256"}
+    return hashlib.sha256(json.dumps(plain(sealed), sort_keys=True).encode()).hexdigest()
 
 
 @dataclass

@@ -165,14 +165,14 @@ class Statement(_ResultsFile):
 
 
 @dataclass(kw_only=True)
-class _Scene:
+class _SceneFile:
     load_config: Path | None = None
     """config.yml of a Splatfacto run or a scene file (.ply, .sog, .spz, .splat, .glb, .pt), for its Gaussians."""
     overrides: SceneOverrides = field(default_factory=Overrides)
 
 
 @dataclass
-class Rrd(_Scene, _ResultsFile):
+class Rrd(_SceneFile, _ResultsFile):
     """A Rerun recording (.rrd): bounds and figures frame by frame, and with a path its cameras in the scene."""
 
     camera_path_filename: Path | None = None
@@ -180,7 +180,7 @@ class Rrd(_Scene, _ResultsFile):
 
 
 @dataclass
-class Viser(_Scene, _ResultsFile):
+class Viser(_SceneFile, _ResultsFile):
     """A recording of viser (.viser): the gap of every frame at its camera, in the scene."""
 
     camera_path_filename: Path
