@@ -25,9 +25,9 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "benchmarks")]
 
-from published import listed  # noqa: E402
+from published import listed, spread  # noqa: E402
 
-from ns_abstract.bench.vnnlib import instances  # noqa: E402
+from ns_abstract.bench.vnnlib import instances, stored_file  # noqa: E402
 from ns_abstract.io.packed import unpacked  # noqa: E402
 
 #: Runs the program in its own folder, by another clock where cores are named.
@@ -45,11 +45,11 @@ runpy.run_path("abcrown.py", run_name="__main__")
 
 def plain(folder: Path, name: str, scratch: Path) -> Path:
     """The file that a line of the list names, unpacked where it is stored packed."""
-    path, packed = folder / name, folder / f"{name}.gz"
-    if path.exists() or not packed.exists():
+    path = stored_file(folder, name)
+    if path.suffix != ".gz":
         return path
-    copy = scratch / path.name
-    copy.write_bytes(b"".join(unpacked(packed, 1 << 30)))
+    copy = scratch / path.stem
+    copy.write_bytes(b"".join(unpacked(path, 1 << 30)))
     return copy
 
 
@@ -91,8 +91,7 @@ def main() -> None:
     folder, words = listed(options.folder).resolve(), collections.Counter[str]()
     print("| network | property | verdict | s | s in all | processor s |\n" + "|---" * 6 + "|")
     lines = instances(folder)
-    count = min(options.count, len(lines))
-    for line in (lines[k * len(lines) // count] for k in range(count)):
+    for line in (lines[number] for number in spread(len(lines), options.count)):
         result, named, seconds, used = verdict(
             options, folder, (line.network, line.property), min(options.seconds, line.seconds)
         )

@@ -43,6 +43,12 @@ def listed(folder: Path) -> Path:
     return copy
 
 
+def spread(known: int, count: int) -> list[int]:
+    """``count`` numbers of a list of ``known`` lines, evenly spread; all of a shorter one."""
+    count = min(count, known)
+    return [k * known // count for k in range(count)]
+
+
 def decided(job: Job) -> dict[str, Any]:
     """The row of one instance, by its number in the list."""
     folder, number, seconds, memory, arithmetic, processor = job
@@ -70,11 +76,9 @@ def main() -> None:
     options = parser.parse_args()
     print("| category | network | property | verdict | s | s in all | over | boxes | |\n" + "|---" * 9 + "|")
     for folder in map(listed, options.folders):
-        known = len(instances(folder))
-        count = min(options.count, known)
         jobs = [
-            (folder, k * known // count, options.seconds, options.memory, options.arithmetic, options.processor)
-            for k in range(count)
+            (folder, number, options.seconds, options.memory, options.arithmetic, options.processor)
+            for number in spread(len(instances(folder)), options.count)
         ]
         words: collections.Counter[str] = collections.Counter()
         with multiprocessing.get_context("spawn").Pool(options.jobs, maxtasksperchild=1) as pool:

@@ -149,7 +149,7 @@ PICTURES = (
     ),
     Fault(
         "proved parts: refuted ones are not attacked", "verify/cell_samples.py", "CellSamples.check_refutation",
-        "0.0 < self.margins[k] < math.inf", "False",
+        "0.0 < margin < math.inf", "False",
         "test_part_proofs.py::test_parts_that_are_refuted_are_attacked",
     ),
     Fault(

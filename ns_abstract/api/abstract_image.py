@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.jsonio import is_number, show
+from ns_abstract.io.jsonio import is_number, show, unusable
 from ns_abstract.refine.linear_map import LinearImage, bounds_at, linear_image
 from ns_abstract.refine.result import ExtraOutput, FrameResult, Leaves, TracePoint
 from ns_abstract.report.figures import ShownUnits, metrics, number
@@ -203,11 +203,11 @@ def sub_box(whole: ParameterBox, given: Any) -> ParameterBox:
     if isinstance(given, ParameterBox):
         given = dict(zip(given.names, zip(given.lower, given.upper, strict=True), strict=True))
     if not isinstance(given, Mapping):
-        raise InputError(f"found {show(given)}", field="box", fix='give ranges by name, such as {"x": (0.0, 0.01)}')
+        raise unusable(given, field="box", fix='give ranges by name, such as {"x": (0.0, 0.01)}')
     box = whole
     for name, ends in given.items():
         if name not in whole.names:
-            raise InputError(f"found {show(name)}", field="box", fix=f"the parameters are {', '.join(whole.names)}")
+            raise unusable(name, field="box", fix=f"the parameters are {', '.join(whole.names)}")
         axis = whole.names.index(name)
         low, high = whole.lower[axis], whole.upper[axis]
         pair = [float(end) if isinstance(end, np.number) else end for end in ends] if isinstance(ends, Sequence) else []

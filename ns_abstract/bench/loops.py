@@ -98,8 +98,7 @@ def _at_marks(
 
 
 def _box(job: LoopJob, cell: ReachCell) -> ParameterBox:
-    box = job.loop.box
-    return ParameterBox(box.names, box.units, tuple(cell.lower.tolist()), tuple(cell.upper.tolist()))
+    return job.loop.box.with_ends(cell.lower, cell.upper)
 
 
 def _runs(

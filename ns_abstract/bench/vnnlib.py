@@ -109,7 +109,7 @@ def networks_of(text: str) -> dict[str, str]:
     return files
 
 
-def _stored(folder: Path, name: str) -> Path:
+def stored_file(folder: Path, name: str) -> Path:
     """The file that a line names, or the same packed."""
     path = file_beside(folder, name)
     if path.suffix != ".gz" and not path.exists():
@@ -194,8 +194,10 @@ def run_folder(
                     if len(files) > 1:
                         raise InputError("is about several networks", field=one.property, fix=_ONE_NETWORK)
                     ((name, file),) = files.items()
-                    network, run = networks.load(_stored(folder, file))
-                    regions, query = _question(network, run, _stored(folder, one.property), name, memory, arithmetic)
+                    network, run = networks.load(stored_file(folder, file))
+                    regions, query = _question(
+                        network, run, stored_file(folder, one.property), name, memory, arithmetic
+                    )
                 ready = time.perf_counter()
                 answer = decide(network, run, regions, deadline, memory=memory, arithmetic=arithmetic)
             except WorkCancelledError:

@@ -7,8 +7,7 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 
-from ns_abstract.io.errors import InputError
-from ns_abstract.io.jsonio import show
+from ns_abstract.io.jsonio import unusable
 
 
 def positive(value: Any, field: str) -> float:
@@ -18,26 +17,26 @@ def positive(value: Any, field: str) -> float:
         InputError: It is none.
     """
     if isinstance(value, bool) or not isinstance(value, Real) or not 0.0 < float(value) < float("inf"):
-        raise InputError(f"found {show(value)}", field=field, fix="give a positive number")
+        raise unusable(value, field=field, fix="give a positive number")
     return float(value)
 
 
 def at_least(value: Any, least: float, field: str) -> float:
     """``value`` as a finite number that is no smaller than ``least``. Raises InputError where it is none."""
     if isinstance(value, bool) or not isinstance(value, Real) or not least <= float(value) < float("inf"):
-        raise InputError(f"found {show(value)}", field=field, fix=f"give a number of at least {least:g}")
+        raise unusable(value, field=field, fix=f"give a number of at least {least:g}")
     return float(value)
 
 
 def whole(value: Any, least: int, field: str) -> int:
     """``value`` as an integer that is no smaller than ``least``. Raises InputError where it is none."""
     if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
-        raise InputError(f"found {show(value)}", field=field, fix=f"give a whole number of at least {least}")
+        raise unusable(value, field=field, fix=f"give a whole number of at least {least}")
     return int(value)
 
 
 def file_path(value: Any, field: str) -> Path:
     """``value`` as a path. Raises InputError where it names no file."""
     if not isinstance(value, str | os.PathLike):
-        raise InputError(f"found {show(value)}", field=field, fix="give the path of a file")
+        raise unusable(value, field=field, fix="give the path of a file")
     return Path(value)

@@ -108,12 +108,9 @@ class CellSamples:
         Raises:
             ContradictionError: The property fails at one of them: a proof and a counterexample cannot both be right.
         """
-        for (pose, _), margin in zip(self.samples, self.margins, strict=True):
-            if _fails(margin) and box.contains(pose):
-                raise ContradictionError(
-                    f"internal error: margin proved to be at least {bound} on {box.lower} to {box.upper}, "
-                    f"found {margin} at {pose.tolist()}"
-                )
+        for (pose, _), margin in self._within(box):
+            if _fails(margin):
+                raise _contradiction(box, f"at least {bound}", margin, pose)
 
     def check_refutation(self, box: ParameterBox, bound: float) -> Sample:
         """The first sample in ``box``, on which the margin is proved to be at most ``bound`` (Q8).
@@ -121,14 +118,22 @@ class CellSamples:
         Raises:
             ContradictionError: The property holds at one of them.
         """
-        inside = [k for k, (pose, _) in enumerate(self.samples) if box.contains(pose)]
-        for k in inside:
-            if 0.0 < self.margins[k] < math.inf:
-                raise ContradictionError(
-                    f"internal error: margin proved to be at most {bound} on {box.lower} to {box.upper}, "
-                    f"found {self.margins[k]} at {self.samples[k][0].tolist()}"
-                )
-        return self.samples[inside[0]]
+        inside = self._within(box)
+        for (pose, _), margin in inside:
+            if 0.0 < margin < math.inf:
+                raise _contradiction(box, f"at most {bound}", margin, pose)
+        return inside[0][0]
+
+    def _within(self, box: ParameterBox) -> list[tuple[Sample, float]]:
+        """The samples in ``box``, with their margins."""
+        pairs = zip(self.samples, self.margins, strict=True)
+        return [(sample, margin) for sample, margin in pairs if box.contains(sample[0])]
+
+
+def _contradiction(box: ParameterBox, proved: str, margin: float, pose: np.ndarray) -> ContradictionError:
+    return ContradictionError(
+        f"internal error: margin proved to be {proved} on {box.lower} to {box.upper}, found {margin} at {pose.tolist()}"
+    )
 
 
 def _fails(margin: float) -> bool:

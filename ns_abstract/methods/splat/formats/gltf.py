@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.jsonio import JSON_BYTES_LIMIT, file_size, parse_json, show
+from ns_abstract.io.jsonio import JSON_BYTES_LIMIT, file_size, parse_json, show, unusable
 from ns_abstract.io.memory import check_memory
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.splat.formats.decoded import DecodedSplats, float32_rows, reserve
@@ -133,7 +133,7 @@ def _chunks(path: Path) -> tuple[dict[str, Any], bytes]:
 
 def _list(value: Any, name: str) -> list[dict[str, Any]]:
     if not isinstance(value, list) or not all(isinstance(entry, dict) for entry in value):
-        raise InputError(f"found {show(value)}", field=name, fix=_AGAIN)
+        raise unusable(value, field=name, fix=_AGAIN)
     return value
 
 
@@ -177,13 +177,13 @@ def _checked(primitive: dict[str, Any]) -> dict[str, int]:
         raise InputError(f"is stored with {', '.join(others)[:120]}", field=_EXTENSION, fix=_PLY)
     for name, value in extension.items():
         if name not in ("extensions", "extras") and (name not in _VALUES or value != _VALUES[name][0]):
-            raise InputError(f"found {show(value)}", field=f"{_EXTENSION}.{name}", fix=_PLY)
+            raise unusable(value, field=f"{_EXTENSION}.{name}", fix=_PLY)
     for name, (_, default) in _VALUES.items():
         if name not in extension and default is None:
             raise InputError("missing", field=f"{_EXTENSION}.{name}", fix=_AGAIN)
     attributes = primitive.get("attributes")
     if not isinstance(attributes, dict) or not all(type(v) is int for v in attributes.values()):
-        raise InputError(f"found {show(attributes)}", field="attributes", fix=_AGAIN)
+        raise unusable(attributes, field="attributes", fix=_AGAIN)
     return attributes
 
 
@@ -227,7 +227,7 @@ class _Accessors:
         accessor = self._at(self.accessors, index, name)
         count = accessor.get("count")
         if not _whole(count, len(self.data)):
-            raise InputError(f"found {show(count)}", field=f"{name}: count", fix=_AGAIN)
+            raise unusable(count, field=f"{name}: count", fix=_AGAIN)
         return count
 
     def read(

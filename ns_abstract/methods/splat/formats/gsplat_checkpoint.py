@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.io.errors import InputError, visible
-from ns_abstract.io.jsonio import show
+from ns_abstract.io.jsonio import show, unusable
 from ns_abstract.methods.checkpoint import read_checkpoint, to_float32
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.runs import read_mapping
@@ -162,5 +162,5 @@ def _config(path: Path) -> tuple[str | None, str, tuple[str, ...]]:
             raise InputError(problem, file=file, field=key, fix=RENDER_ELSEWHERE)
     antialiased = config.get("antialiased", False)
     if not isinstance(antialiased, bool):
-        raise InputError(f"found {show(antialiased)}", file=file, field="antialiased", fix="write true or false")
+        raise unusable(antialiased, file=file, field="antialiased", fix="write true or false")
     return "antialiased" if antialiased else "classic", f"{CONFIG}: antialiased", ()

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.jsonio import read_text, show
+from ns_abstract.io.jsonio import read_text, unusable
 
 ARGUMENTS = "cfg_args"
 _LIMIT = 2**16
@@ -67,5 +67,5 @@ def background(arguments: dict[str, Any], file: Path) -> tuple[float, float, flo
     """
     white = arguments.get("white_background")
     if white is not None and not isinstance(white, bool):
-        raise InputError(f"found {show(white)}", file=file, field="white_background", fix="write True or False")
+        raise unusable(white, file=file, field="white_background", fix="write True or False")
     return None if white is None else _BACKGROUNDS[white]
