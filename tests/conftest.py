@@ -58,12 +58,14 @@ HANDLERS = {number: signal.getsignal(number) for number in (signal.SIGINT, signa
 
 @pytest.fixture(autouse=True)
 def signals_as_before() -> Iterator[None]:
-    """Commands that tests and fixtures call in this process handle signals, and leave it so."""
+    """Commands that tests and fixtures call in this process handle signals and lost errors, and leave it so."""
+    unraisable = sys.unraisablehook
     for number, handler in HANDLERS.items():
         signal.signal(number, handler)
     yield
     for number, handler in HANDLERS.items():
         signal.signal(number, handler)
+    sys.unraisablehook = unraisable
 
 
 def environment() -> dict[str, str]:

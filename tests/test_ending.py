@@ -485,12 +485,19 @@ with stop.installed(), stop.last_words(lambda: None), stop.last_words(fail):
         ),
         ("run(lambda options: os.kill(os.getpid(), signal.SIGTERM), lambda: None)", "interrupted\n"),
         ("run(lambda options: 0, lambda: os.kill(os.getpid(), signal.SIGINT))", "interrupted\n"),
+        ("run(lambda options: [Half(lambda: None), stopped(options)], lambda: None)", "interrupted\n"),
+        (
+            "run(lambda options: [[Half(lambda: os.kill(os.getpid(), 15))].clear(), time.sleep(9)], lambda: 0)",
+            "interrupted\n",
+        ),
     ],
 )
 def test_a_signal_before_and_after_the_work_is_no_traceback(code: str, said: str) -> None:
     """Who presses Ctrl-C twice meets the end of the command with the second one."""
-    begin = "import atexit, os, signal\nfrom ns_abstract.cli.common import run\n"
-    begin += "def stopped(options):\n    raise KeyboardInterrupt\n"
+    begin = "import atexit, os, signal, time\nfrom ns_abstract.cli.common import run\n"
+    begin += "def stopped(options):\n    kept = Half(lambda: 1 / 0)\n    raise KeyboardInterrupt\n"
+    begin += "class Half:\n    def __init__(self, end):\n        self.end = end\n"
+    begin += "    def __del__(self):\n        self.end()\n"
     done = subprocess.run(
         [sys.executable, "-c", begin + code], capture_output=True, text=True, env=environment(), check=False
     )

@@ -222,6 +222,7 @@ def run(
         # until `SignalStop` handles them, and after
         for number in _SIGNALS:
             signal.signal(number, leave)
+        sys.unraisablehook = _end_lost_interruptions
     try:
         try:
             parsed = parse(options)
@@ -236,6 +237,8 @@ def run(
         if not is_interruption(error):
             raise
         print("interrupted", file=sys.stderr)
+        # finalizers of what the interruption left half built have nothing to say
+        sys.unraisablehook = lambda _: None
         code = INTERRUPTED
     except BrokenPipeError:
         sys.stderr.close()
@@ -247,6 +250,15 @@ def run(
         print(f"error: not enough memory{': ' + detail if detail else ''}; {relief}", file=sys.stderr)
         code = BAD_INPUT
     sys.exit(code)
+
+
+def _end_lost_interruptions(lost: sys.UnraisableHookArgs) -> None:
+    """End the process where a signal came inside a finalizer, which swallows the exception; print other errors."""
+    if lost.exc_value is None or not is_interruption(lost.exc_value):
+        sys.__unraisablehook__(lost)
+        return
+    print("interrupted", file=sys.stderr, flush=True)
+    os._exit(INTERRUPTED)
 
 
 def _is_shortage(error: Exception) -> bool:
