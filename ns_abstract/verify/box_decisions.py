@@ -17,6 +17,7 @@ from ns_abstract.verify.network import ImageSets, Network, NetworkArithmetic, Ou
 from ns_abstract.verify.network.bounds import NetworkBounds
 from ns_abstract.verify.network.branching import branch
 from ns_abstract.verify.network.dependence import input_shares
+from ns_abstract.verify.network.neuron_bounds import farther_steps
 from ns_abstract.verify.network.phase_tree import PhaseTree
 from ns_abstract.verify.network.subnormals import subnormals_kept
 from ns_abstract.verify.network.weighted_means import centred
@@ -246,7 +247,11 @@ class _BoxSearch:
         """
         by_step = max(_TUNING.least_seconds, _TUNING.step_cost * self.by_bounds)
         allowed = _TUNING.lines_share * self.deadline.left / boxes
-        steps = min(_STEPS, int(min(1e6, allowed / by_step)) - _TUNING.steps_before)
+        steps = int(min(1e6, allowed / by_step)) - _TUNING.steps_before
+        if farther_steps(steps):
+            # with the evaluation that they begin with
+            steps -= farther_steps(steps) + 1
+        steps = min(_STEPS, steps)
         if left and steps > 0:
             try:
                 with self.deadline.within(allowed).enforced():

@@ -17,8 +17,15 @@ from ns_abstract.verify.network.row_ascent import RowAscent
 from ns_abstract.verify.network.stopping import BackwardBounds, BackwardTrace, NeuronTarget, StoppingCriterion
 from ns_abstract.verify.network.work_budget import WorkBudget
 
+#: Of an unstable neuron's ends the one farther from zero takes one in so many of the nearer one's steps.
+_FEWER_STEPS = 4
 #: Rows of a network that is not deep from which on several threads share them.
 _ROWS_OF_A_THREAD = 128
+
+
+def farther_steps(steps: int) -> int:
+    """Return how many steps the end of an unstable neuron that is farther from zero takes, for the nearer one's."""
+    return steps // _FEWER_STEPS
 
 
 class NeuronBounds:
@@ -38,6 +45,7 @@ class NeuronBounds:
         self.intermediate, self.network, self.backward = intermediate, intermediate.network, backward
         self.schedule, self.sharing = schedule, sharing
         self.ascent = ascent
+        self.farther = RowAscent(intermediate, backward, farther_steps(ascent.steps), ascent.first)
         # rows in float64 pay where the network's own rounding is none
         self._number = intermediate.relaxations[0 if schedule.deep else -1].number
         self.spared = 0.0
@@ -71,6 +79,8 @@ class NeuronBounds:
         bounds.meet(left, again, sign[left] < 0.0)
         if self.ascent.steps and not cut:
             self._climb(index, where, reference, bounds, decides)
+            if decides and self.farther.steps:
+                self._climb(index, where, reference, bounds, decides, farther=True)
         c, r = form.c.flatten(1).clone(), form.r.flatten(1).clone()
         a = form.a.flatten(2).movedim(1, -1).clone()
         center, radius = bounds.middle()
@@ -85,17 +95,25 @@ class NeuronBounds:
         tight = replace(form, c=c, a=a, r=r, lower=lower, upper=upper)
         return self.intermediate.within(tight, tight.lower, tight.upper)
 
-    def _climb(self, index: int, where: Int64, reference: Float64, bounds: BackwardBounds, decides: bool) -> None:
+    def _climb(
+        self,
+        index: int,
+        where: Int64,
+        reference: Float64,
+        bounds: BackwardBounds,
+        decides: bool,
+        farther: bool = False,
+    ) -> None:
         """Raise and lower ends of ``bounds`` with lines of their own; planes stay.
 
-        ``decides``: only of unstable neurons, and of these only the end that is nearer to zero. The gap of their
-        lines depends on it the most.
+        ``decides``: only of unstable neurons, and of these only the end that is nearer to zero, on which the gap of
+        their lines depends the most, or the ``farther`` one.
         """
-        shape = grid(self.network.shape(index))
+        shape, ascent = grid(self.network.shape(index)), self.farther if farther else self.ascent
         for side, ends in ((1.0, bounds.lower), (-1.0, bounds.upper)):
             low, high = bounds.lower + reference, bounds.upper + reference
-            near = side * (high + low) >= 0.0
-            at = np.flatnonzero((low < 0.0) & (high > 0.0) & near) if decides else np.arange(len(where))
+            asked = (side * (high + low) >= 0.0) ^ farther
+            at = np.flatnonzero((low < 0.0) & (high > 0.0) & asked) if decides else np.arange(len(where))
             if not len(at):
                 continue
             cell, channel, y, x = (np.ascontiguousarray(v) for v in where[at].T)
@@ -103,7 +121,7 @@ class NeuronBounds:
             value[np.arange(len(at)), channel, 0, 0] = side
             best = BackwardBounds.unknown(len(at), self.intermediate.d)
             best.lower[:] = side * ends[at]
-            self.ascent.climb(index, Coefficients(value, y, x), cell, best, None)
+            ascent.climb(index, Coefficients(value, y, x), cell, best, None)
             ends[at] = side * best.lower
 
     def _one_hot(
