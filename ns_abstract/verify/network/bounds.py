@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from ns_abstract.verify.network.coefficients import Float64
 from ns_abstract.verify.network.dependence import dependence
 from ns_abstract.verify.network.forward import ForwardPass
 from ns_abstract.verify.network.graph import Network, NetworkArithmetic
-from ns_abstract.verify.network.image_sets import ActivationPhases, ImageSets, OutputBounds, Substitution
+from ns_abstract.verify.network.image_sets import ImageSets, OutputBounds, Substitution
 from ns_abstract.verify.network.input_planes import finite, middle_of, planes_of
 from ns_abstract.verify.network.intermediate_bounds import IntermediateBounds
 from ns_abstract.verify.network.max_pool_propagation import MaxPoolPropagation
@@ -41,7 +40,6 @@ def bound_outputs(
     arithmetic: NetworkArithmetic = "float32",
     slope_steps: int = 0,
     intermediate_steps: int = 0,
-    assumed: Sequence[Mapping[int, ActivationPhases]] | None = None,
 ) -> OutputBounds:
     """Lower bounds of ``rows @ network(x) + offset`` over every image set.
 
@@ -57,8 +55,6 @@ def bound_outputs(
         slope_steps: Steps towards the best slopes and tangents, for every row of its own (N14); each takes as long as
             two passes of the rows.
         intermediate_steps: The same for intermediate bounds, but in deep networks.
-        assumed: By cell: signs of inputs of (leaky) ReLUs, by node, of the images that bounds are of (N16).
-            ``slope_steps`` must be positive then.
     """
     offset = np.asarray(offset, np.float64)
     if images.a_lower.shape[1] != network.input_size:
@@ -70,17 +66,13 @@ def bound_outputs(
     step = max(1, int(0.5 * memory) // by_cell)
     parts = []
     for first in range(0, images.count, step):
-        phases = None if assumed is None else assumed[first : first + step]
-        cells = NetworkBounds(
-            network, images[first : first + step], substitution, memory, arithmetic, slope_steps, phases, None,
-            intermediate_steps,
-        )  # fmt: skip
+        part = images[first : first + step]
+        cells = NetworkBounds(network, part, substitution, memory, arithmetic, slope_steps, None, intermediate_steps)
         parts.append(cells.outputs(rows, offset[first : first + step] if offset.ndim > 1 else offset))
     if not parts:
         k, d = offset.shape[-1], images.dimensions
         return OutputBounds(np.zeros((0, k)), np.zeros((0, k, d)), np.zeros((0, k)))
-    names = ("lower", "a", "b") if assumed is None else ("lower", "a", "b", "loosest")
-    return OutputBounds(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    return OutputBounds(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("lower", "a", "b")))
 
 
 class NetworkBounds:
@@ -102,7 +94,6 @@ class NetworkBounds:
         memory: int,
         arithmetic: NetworkArithmetic = "float32",
         slope_steps: int = 0,
-        assumed: Sequence[Mapping[int, ActivationPhases]] | None = None,
         sharing: CoefficientSource | None = None,
         intermediate_steps: int = 0,
         asked: Float64 | None = None,
@@ -113,7 +104,7 @@ class NetworkBounds:
         middle = sharing.about(middle_of(fields))
         image = planes_of(fields, middle, network.input_shape, substitution)
         self.intermediate = intermediate = sharing.intermediate = IntermediateBounds(
-            network, image, middle, usable, arithmetic, assumed, coarse
+            network, image, middle, usable, arithmetic, coarse
         )
         schedule = WorkBudget(network)
         backward = BackwardPass(intermediate, memory, schedule.deep)

@@ -1,13 +1,7 @@
-"""The forward pass: affine forms of all nodes, tighter bounds of unstable neurons (design.md, N1, N16, N18)."""
+"""The forward pass: affine forms of all nodes, tighter bounds of unstable neurons (design.md, N1, N18)."""
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-import numpy as np
-import torch
-
-from ns_abstract.arithmetic.network_charges import SPARE, UNIT
 from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.verify.network.bilinear import Product
 from ns_abstract.verify.network.forms import NodeForm
@@ -17,7 +11,6 @@ from ns_abstract.verify.network.max_pool_propagation import MaxPoolPropagation
 from ns_abstract.verify.network.max_pooling import MaxPool
 from ns_abstract.verify.network.neuron_selection import NeuronSelection
 from ns_abstract.verify.network.propagation import ForwardPropagation
-from ns_abstract.verify.network.slope_optimisation import SplitNeurons
 from ns_abstract.verify.network.work_budget import WorkBudget
 
 
@@ -61,13 +54,11 @@ class ForwardPass:
             if isinstance(node.layer, Activation):
                 # what is known better of the input is also known to its other readers
                 source = node.inputs[0]
-                inputs[0] = self._assume(source, inputs[0])
                 unstable, apart = (
                     node.layer.unstable(*inputs[0].interval),
                     node.layer.relaxation_gap(*inputs[0].interval),
                 )
-                better = self.selection.better(source, inputs[0], unstable, apart, node.layer)
-                forms[source] = inputs[0] = self._assume(source, better)
+                forms[source] = inputs[0] = self.selection.better(source, inputs[0], unstable, apart, node.layer)
                 if isinstance(node.layer, LeakyRelu):
                     self.selection.unsure = float(node.layer.unstable(*inputs[0].interval).double().mean())
                 forms.append(self.propagation.activation(k, source, node.layer, inputs[0]))
@@ -112,28 +103,3 @@ class ForwardPass:
         if index in self.schedule.rests and index not in self.intermediate.stops:
             assert form is not None
             self.intermediate.stops[index] = self.intermediate.stop(index, form)
-
-    def _assume(self, source: int, z: NodeForm) -> NodeForm:
-        """What is known of node ``source`` where its numbers have the signs that are assumed (N16)."""
-        if self.intermediate.assumed is None or not any(source in phases for phases in self.intermediate.assumed):
-            return z
-        lower, upper = (v.flatten(1).clone() for v in (z.lower, z.upper))
-        least, most = (v.flatten(1).numpy() for v in z.interval)
-        reference, width = z.reference.flatten(1), z.width.flatten(1).numpy()
-        for cell, phases in enumerate(self.intermediate.assumed):
-            if source not in phases or not self.intermediate.usable[cell]:
-                continue
-            flat, side = phases[source]
-            if bool(np.where(side > 0.0, most[cell, flat] < 0.0, least[cell, flat] > 0.0).any()):
-                self.intermediate.infeasible[cell] = True
-                continue
-            at, positive = torch.from_numpy(flat), torch.from_numpy(side > 0.0)
-            zero = -reference[cell, at]
-            low, high = lower[cell, at], upper[cell, at]
-            lower[cell, at] = torch.where(positive, torch.minimum(torch.maximum(low, zero), high), low)
-            upper[cell, at] = torch.where(positive, high, torch.maximum(torch.minimum(high, zero), low))
-            noise = UNIT * (SPARE + self.network.readers[source]) * width[cell, flat]
-            if self.intermediate.rounds(source):
-                noise = noise + self.intermediate.relaxations[0].noise[source].flatten(1).numpy()[cell, flat]
-            self.intermediate.split[cell][source] = SplitNeurons(flat, side, -zero.numpy(), noise)
-        return replace(z, lower=lower.reshape(z.lower.shape), upper=upper.reshape(z.upper.shape))

@@ -36,7 +36,7 @@ class SplitNeurons:
 
     Attributes:
         flat: [B] where they are.
-        side: [B] 1 where they are assumed not to be negative, -1 where not positive; or [R, B] by row, 0 for neither.
+        side: [R, B] 1 where a row assumes them not to be negative, -1 where not positive, 0 for neither.
         reference: [B] their reference.
         noise: [B] charged for every part of a coefficient: rounding of the node and of rows.
     """
@@ -48,7 +48,7 @@ class SplitNeurons:
 
     def __getitem__(self, rows: np.ndarray) -> SplitNeurons:
         """Those of some rows."""
-        return replace(self, side=self.side[rows]) if self.side.ndim > 1 else self
+        return replace(self, side=self.side[rows])
 
     def pay(self, multiplier: Float32) -> tuple[Float32, Float64]:
         """What rows gain for ``multiplier`` [R, B], not negative: coefficients [R, B], and [R] the least offset.
