@@ -33,7 +33,7 @@ def branch(
     intermediate_steps: int = 0,
 ) -> TreeResult:
     """All groups, up to the first that is not proved."""
-    cells = NetworkBounds(network, images, "everywhere", 1 << 30, arithmetic, 1, intermediate_steps=intermediate_steps)
+    cells = NetworkBounds(network, images, 1 << 30, arithmetic, 1, intermediate_steps=intermediate_steps)
     tree, results = PhaseTree(cells, rows, offset), []
     for group in groups:
         results.append(tree.prove(group, most))

@@ -274,7 +274,7 @@ class _BoxSearch:
         """A tree over bounds with so many steps for intermediate ones, and the groups that its root leaves open."""
         start = self.deadline.left
         cells = NetworkBounds(
-            self.bounded, images, "everywhere", self.memory, self.arithmetic, 1, intermediate_steps=steps,
+            self.bounded, images, self.memory, self.arithmetic, 1, intermediate_steps=steps,
             asked=shared.unsafe.rows, coarse=True,
         )  # fmt: skip
         self.by_bounds = start - self.deadline.left

@@ -89,7 +89,7 @@ class NetworkModel:
 
         It is positive if ``most_branches`` branches on the phases of neurons prove every group (N16).
         """
-        cells = NetworkBounds(self.network, parametric(images), "everywhere", self.memory, self.arithmetic, 1)
+        cells = NetworkBounds(self.network, parametric(images), self.memory, self.arithmetic, 1)
         tree, least = PhaseTree(cells, query.rows, query.offset), np.inf
         for group in groups:
             result = tree.prove(group, most_branches)

@@ -12,7 +12,7 @@ from ns_abstract.verify.network.coefficients import Float64
 from ns_abstract.verify.network.dependence import dependence
 from ns_abstract.verify.network.forward import ForwardPass
 from ns_abstract.verify.network.graph import Network, NetworkArithmetic
-from ns_abstract.verify.network.image_sets import ImageSets, OutputBounds, Substitution
+from ns_abstract.verify.network.image_sets import ImageSets, OutputBounds
 from ns_abstract.verify.network.input_planes import finite, middle_of, planes_of
 from ns_abstract.verify.network.intermediate_bounds import IntermediateBounds
 from ns_abstract.verify.network.max_pool_propagation import MaxPoolPropagation
@@ -35,7 +35,6 @@ def bound_outputs(
     rows: Any,
     offset: Float64,
     *,
-    substitution: Substitution = "everywhere",
     memory: int = 1 << 30,
     arithmetic: NetworkArithmetic = "float32",
     slope_steps: int = 0,
@@ -48,8 +47,6 @@ def bound_outputs(
         images: m cells in d parameters.
         rows: [k, output_size] array or scipy sparse matrix.
         offset: [k], or [m, k] by image set.
-        substitution: Where the parameters' correlation is used: in every intermediate bound ("everywhere"), only in the
-            result ("end"), or not at all ("box").
         memory: Bytes to stay within, roughly.
         arithmetic: Whether the bounds hold for every float32 evaluation and the exact network, or for that alone.
         slope_steps: Steps towards the best slopes and tangents, for every row of its own (N14); each takes as long as
@@ -67,7 +64,7 @@ def bound_outputs(
     parts = []
     for first in range(0, images.count, step):
         part = images[first : first + step]
-        cells = NetworkBounds(network, part, substitution, memory, arithmetic, slope_steps, None, intermediate_steps)
+        cells = NetworkBounds(network, part, memory, arithmetic, slope_steps, None, intermediate_steps)
         parts.append(cells.outputs(rows, offset[first : first + step] if offset.ndim > 1 else offset))
     if not parts:
         k, d = offset.shape[-1], images.dimensions
@@ -90,7 +87,6 @@ class NetworkBounds:
         self,
         network: Network,
         images: ImageSets,
-        substitution: Substitution,
         memory: int,
         arithmetic: NetworkArithmetic = "float32",
         slope_steps: int = 0,
@@ -102,7 +98,7 @@ class NetworkBounds:
         sharing = CoefficientSource() if sharing is None else sharing
         fields, usable = finite(images)
         middle = sharing.about(middle_of(fields))
-        image = planes_of(fields, middle, network.input_shape, substitution)
+        image = planes_of(fields, middle, network.input_shape)
         self.intermediate = intermediate = sharing.intermediate = IntermediateBounds(
             network, image, middle, usable, arithmetic, coarse
         )
@@ -115,8 +111,6 @@ class NetworkBounds:
         pooling = MaxPoolPropagation(intermediate, backward, schedule, sharing)
         propagation = ForwardPropagation(intermediate, sharing, bool(slope_steps or inner.steps))
         self.last = ForwardPass(intermediate, propagation, pooling, selection, schedule).run()
-        if substitution == "end":
-            intermediate.set_image(planes_of(fields, middle, network.input_shape, "everywhere"))
         self.output_rows = OutputRows(intermediate, backward, RowAscent(intermediate, backward, slope_steps))
 
     def outputs(self, rows: Any, offset: Float64) -> OutputBounds:

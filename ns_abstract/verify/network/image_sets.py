@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
 from ns_abstract.verify.network.coefficients import Float64
-
-Substitution = Literal["everywhere", "end", "box"]
 
 
 @dataclass(frozen=True)

@@ -52,7 +52,7 @@ class IntermediateBounds:
         self.count, self.d = len(middle), image.slopes.shape[-1]
         self.in_float32 = arithmetic == "float32"
         self.flush = np.zeros(self.count)
-        self.set_image(image)
+        self.image, self.columns = image, columns_of(*image)
         # every number is passed by a few times at most
         sums = 4.0 * DOUBLE_UNIT * (network.neuron_count + len(network.nodes))
         self.relaxations = [Relaxations(torch.float32, UNIT, sums)]
@@ -64,10 +64,6 @@ class IntermediateBounds:
         self.stops: dict[int, NodeColumns] = {}
         self.unstable: dict[int, UnstableNeurons] = {}
         self.reused_relaxations: dict[int, ReusedRelaxation] = {}
-
-    def set_image(self, image: ImagePlanes) -> None:
-        """Take this for what is known of the image."""
-        self.image, self.columns = image, columns_of(*image)
 
     def image_form(self) -> NodeForm:
         """The image as a form."""

@@ -128,7 +128,7 @@ class _ReferenceCell(CoefficientSource):
         #: what all is relative to, by node, and what is followed at maxima
         self.references: dict[int, Tensor] = {}
         self.winners: dict[int, Tensor] = {}
-        self.cells = NetworkBounds(network, images, "everywhere", memory, arithmetic, sharing=self)
+        self.cells = NetworkBounds(network, images, memory, arithmetic, sharing=self)
 
     def reference(self, k: int, passed_on: Callable[[], Tensor]) -> Tensor:
         self.references[k] = passed_on()
@@ -197,7 +197,7 @@ class _ReusingCells(CoefficientSource):
         self._last = max(first.stored, default=0) if fresh else None
         self._columns: dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
         self._count = images.count
-        self.cells = NetworkBounds(first.network, images, "everywhere", memory, arithmetic, sharing=self)
+        self.cells = NetworkBounds(first.network, images, memory, arithmetic, sharing=self)
 
     def about(self, middle: Float64) -> Float64:
         # what rows gathered at maxima and products is relative to the first cell's references
