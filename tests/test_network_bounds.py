@@ -25,7 +25,6 @@ from ns_abstract.verify.network import (
     backward,
     bound_outputs,
     cost_model,
-    forward,
     intermediate_bounds,
     layers,
     load_network,
@@ -37,7 +36,6 @@ from ns_abstract.verify.network import (
 )
 from ns_abstract.verify.network.bounds import NetworkBounds
 from ns_abstract.verify.network.coefficients import Coefficients, columns_of, concretize, full
-from ns_abstract.verify.network.forward import ForwardPass
 from ns_abstract.verify.network.intermediate_bounds import IntermediateBounds
 from ns_abstract.verify.network.layers import Convolution
 from ns_abstract.verify.network.neuron_bounds import NeuronBounds
@@ -343,13 +341,13 @@ def test_rows_that_rest_on_several_nodes(
     reach = np.abs(a).sum(-1) + slack
     images = ImageSets(a, b - slack, a, b + slack, b - reach, b + reach)
     forms: dict[int, Any] = {}
-    leave = ForwardPass._leave
+    leave = NetworkBounds._leave
 
-    def left(forward: ForwardPass, index: int) -> None:
-        forms[index] = forward.intermediate.forms[index]
-        leave(forward, index)
+    def left(cells: NetworkBounds, index: int) -> None:
+        forms[index] = cells.intermediate.forms[index]
+        leave(cells, index)
 
-    monkeypatch.setattr(ForwardPass, "_leave", left)
+    monkeypatch.setattr(NetworkBounds, "_leave", left)
     found = []
     threads = torch.get_num_threads()
     try:
@@ -821,7 +819,7 @@ def test_float32_rounding_is_needed(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     rows = np.concatenate([np.eye(4), -np.eye(4)])
     for charged in (True, False):
         if not charged:
-            for part in (forward, intermediate_bounds, network_charges):
+            for part in (intermediate_bounds, network_charges):
                 monkeypatch.setattr(part, "UNIT", 0.0)
         lower = bound_outputs(network, images, rows, np.zeros(8)).lower
         broken[charged] = int((lower > y @ rows.T).sum())

@@ -1,4 +1,4 @@
-"""Bounds of a network's outputs over sets of images (docs/dev/design.md, N, N0)."""
+"""Bounds of a network's outputs over sets of images (docs/dev/design.md, N, N0, N1, N18)."""
 
 from __future__ import annotations
 
@@ -7,15 +7,18 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.verify.network.backward import BackwardPass
+from ns_abstract.verify.network.bilinear import Product
 from ns_abstract.verify.network.coefficient_source import CoefficientSource
 from ns_abstract.verify.network.coefficients import Float64
 from ns_abstract.verify.network.dependence import dependence
-from ns_abstract.verify.network.forward import ForwardPass
+from ns_abstract.verify.network.forms import NodeForm
 from ns_abstract.verify.network.graph import Network, NetworkArithmetic
 from ns_abstract.verify.network.image_sets import ImageSets, OutputBounds
 from ns_abstract.verify.network.input_planes import finite, middle_of, planes_of
 from ns_abstract.verify.network.intermediate_bounds import IntermediateBounds
+from ns_abstract.verify.network.layers import Activation, LeakyRelu
 from ns_abstract.verify.network.max_pool_propagation import MaxPoolPropagation
+from ns_abstract.verify.network.max_pooling import MaxPool
 from ns_abstract.verify.network.neuron_bounds import NeuronBounds
 from ns_abstract.verify.network.neuron_selection import NeuronSelection
 from ns_abstract.verify.network.output_bounds import OutputRows
@@ -77,6 +80,8 @@ class NetworkBounds:
 
     ``asked``: [k, output_size] rows of which bounds will be asked, or None; ``coarse``: see `IntermediateBounds`.
 
+    Forms of the nodes are propagated in order; neurons that pay for it are refined before what reads them.
+
     Attributes:
         intermediate: What is known of the nodes.
         last: The form of the last one.
@@ -102,17 +107,71 @@ class NetworkBounds:
         self.intermediate = intermediate = sharing.intermediate = IntermediateBounds(
             network, image, middle, usable, arithmetic, coarse
         )
-        schedule = WorkBudget(network)
+        self._network, self._schedule = network, (schedule := WorkBudget(network))
         backward = BackwardPass(intermediate, memory, schedule.deep)
         inner = RowAscent(intermediate, backward, 0 if schedule.deep else intermediate_steps, _INNER_STEP)
         neuron_bounds = NeuronBounds(intermediate, backward, schedule, sharing, inner)
         used = None if asked is None else dependence(network, asked)
-        selection = NeuronSelection(intermediate, neuron_bounds, schedule, sharing, used)
-        pooling = MaxPoolPropagation(intermediate, backward, schedule, sharing)
-        propagation = ForwardPropagation(intermediate, sharing, bool(slope_steps or inner.steps))
-        self.last = ForwardPass(intermediate, propagation, pooling, selection, schedule).run()
+        self._selection = NeuronSelection(intermediate, neuron_bounds, schedule, sharing, used)
+        self._pooling = MaxPoolPropagation(intermediate, backward, schedule, sharing)
+        self._propagation = ForwardPropagation(intermediate, sharing, bool(slope_steps or inner.steps))
+        self.last = self._propagate()
         self.output_rows = OutputRows(intermediate, backward, RowAscent(intermediate, backward, slope_steps))
 
     def outputs(self, rows: Any, offset: Float64) -> OutputBounds:
         """Bounds of ``rows @ y + offset`` in every cell."""
         return self.output_rows.bound(self.last, rows, offset)
+
+    def _propagate(self) -> NodeForm:
+        """Pass forms through the nodes in order, with better bounds where they pay; returns that of the last one."""
+        forms: list[NodeForm | None] = [self.intermediate.image_form()]
+        self.intermediate.forms = forms
+        if self._schedule.planned:
+            self._learn(0, False)
+        for k, node, inputs in self._network.walk(forms, leave=self._leave):
+            if isinstance(node.layer, Activation):
+                # what is known better of the input is also known to its other readers
+                source = node.inputs[0]
+                interval = inputs[0].interval
+                unstable, apart = node.layer.unstable(*interval), node.layer.relaxation_gap(*interval)
+                forms[source] = inputs[0] = self._selection.better(source, inputs[0], unstable, apart, node.layer)
+                if isinstance(node.layer, LeakyRelu):
+                    self._selection.unsure = float(node.layer.unstable(*inputs[0].interval).double().mean())
+                forms.append(self._propagation.activation(k, source, node.layer, inputs[0]))
+                if self._network.depth[source] > 1:
+                    self.intermediate.stops[source] = self.intermediate.stop(source, inputs[0])
+            elif isinstance(node.layer, Product):
+                intervals = inputs[0].interval, inputs[1].interval
+                unstable, apart = node.layer.unstable(*intervals), node.layer.relaxation_gap(*intervals)
+                for position, source in enumerate(node.inputs):
+                    forms[source] = inputs[position] = self._selection.better(source, inputs[position], unstable, apart)
+                forms.append(self._propagation.product(k, node.inputs, node.layer, inputs[0], inputs[1]))
+            elif isinstance(node.layer, MaxPool):
+                forms.append(self._pooling.maximum(k, node.inputs[0], node.layer, inputs[0]))
+            else:
+                forms.append(self._propagation.linear(k, node.inputs, node.layer, inputs))
+            if self._schedule.planned:
+                for index in node.inputs:
+                    self._learn(index, isinstance(node.layer, LeakyRelu) and node.layer.alpha == 0.0)
+                self._learn(k, False)
+        end = forms[-1]
+        assert end is not None
+        self.intermediate.forms = []
+        return end
+
+    def _learn(self, index: int, cut: bool) -> None:
+        """Tell the schedule how wide bounds of node ``index`` are; ``cut``: those of numbers that are not cut off."""
+        form = self.intermediate.forms[index]
+        assert form is not None
+        r = form.r
+        if cut:
+            above = form.interval.upper > 0.0
+            r = r[above] if bool(above.any()) else r
+        self._schedule.learns(index, float(r.mean()), float(form.reference.abs().mean()))
+
+    def _leave(self, index: int) -> None:
+        """Node ``index`` has been read; rows of later ones may end there (N18)."""
+        form = self.intermediate.forms[index]
+        if index in self._schedule.rests and index not in self.intermediate.stops:
+            assert form is not None
+            self.intermediate.stops[index] = self.intermediate.stop(index, form)

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ns_abstract.arithmetic.network_charges import OWN_LINE, UP
-from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.verify.network.bilinear import Product
 from ns_abstract.verify.network.graph import Network
 from ns_abstract.verify.network.layers import Activation, LinearLayer
@@ -200,12 +199,9 @@ def slope_derivatives(
     """
     values: list[Tensor | None] = [image]
     held = ascent.split
-    left = list(network.readers)
     count, forces = image.shape[0], {}
     by_node = {k: [np.zeros(v.shape) for v in own] for k, own in ascent.parameters.items()}
-    for k, node in enumerate(network.nodes[:last], 1):
-        check_cancelled()
-        inputs = [v for v in (values[i] for i in node.inputs) if v is not None]
+    for k, node, inputs in network.walk(values, last):
         coefficients = trace.get(k)
         if isinstance(node.layer, LinearLayer):
             values.append(node.layer.apply(inputs))
@@ -231,8 +227,4 @@ def slope_derivatives(
                 coefficient = coefficients.reshape(count, -1)[:, at.flat].astype(np.float64)
                 value = u[:, at.flat] + at.reference
                 by_node[k][number] = choice.derivative(ascent.parameters[k][number], coefficient, value)
-        for i in node.inputs:
-            left[i] -= 1
-            if not left[i]:
-                values[i] = None
     return by_node, {k: forces.get(k, np.zeros((count, len(v.flat)))) for k, v in held.items()}
