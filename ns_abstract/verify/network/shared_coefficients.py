@@ -139,12 +139,7 @@ class _ReferenceCell(CoefficientSource):
         return winner
 
     def reuse_bounds(
-        self,
-        index: int,
-        form: NodeForm,
-        unstable: Tensor,
-        apart: Tensor | None,
-        layer: Activation | None,
+        self, index: int, form: NodeForm, unstable: Tensor, apart: Tensor | None, layer: Activation | None
     ) -> tuple[NodeForm, Tensor, Tensor | None]:
         if isinstance(layer, LeakyRelu):
             # they may be open elsewhere
@@ -315,12 +310,7 @@ class _ReusingCells(CoefficientSource):
         return _ReusedBounds(np.moveaxis(slopes, 0, -1) * stored.sign[:, None], middle * stored.sign, half, *ends)
 
     def reuse_bounds(
-        self,
-        index: int,
-        form: NodeForm,
-        unstable: Tensor,
-        apart: Tensor | None,
-        layer: Activation | None,
+        self, index: int, form: NodeForm, unstable: Tensor, apart: Tensor | None, layer: Activation | None
     ) -> tuple[NodeForm, Tensor, Tensor | None]:
         form = self._borrowed(index, form)
         if layer is not None:
