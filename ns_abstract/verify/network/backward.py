@@ -197,7 +197,7 @@ class BackwardPass:
         return charged or isinstance(layer, Activation)
 
     def _bound_rows(self, batch: CoefficientBatch, bounds: BackwardBounds, cut: bool = False) -> None:
-        """Bounds of a batch whose rows rest on one node of which a form is known, or, where they are cut, several (N18)."""
+        """Bounds of a batch whose rows rest on one node with a known form, or where they are cut on several (N18)."""
         count, total = len(batch.cell), batch.total
         plane, box = np.zeros((count, 2, self.intermediate.d + 1)), np.zeros((count, 2))
         lost = self.intermediate.flush[batch.cell]

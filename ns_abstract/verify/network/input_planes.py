@@ -1,4 +1,4 @@
-"""Planes and forms of the network's input, relative to a reference image (docs/dev/design.md, N, N0, N22)."""
+"""Planes and forms of the network's input, relative to a reference image (docs/dev/design.md, N, N0, N22, V9)."""
 
 from __future__ import annotations
 
