@@ -91,6 +91,12 @@ def image_sets(shape: tuple[int, ...], m: int, d: int, radius: float, slack: flo
     return ImageSets(a - apart, b - low, a + apart, b + high, lower, upper)
 
 
+def boxed(images: ImageSets) -> ImageSets:
+    """The sets' boxes alone: nothing is said of parameters."""
+    still = np.zeros_like(images.a_lower)
+    return ImageSets(still, images.lower, still, images.upper, images.lower, images.upper)
+
+
 def members(images: ImageSets, cell: int, p: np.ndarray, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Images at ``p`` [B, d], ``t`` [B, n] of the way between their bounds; and which are in the set."""
     low = np.maximum(p @ images.a_lower[cell].T + images.b_lower[cell], images.lower[cell])

@@ -217,7 +217,7 @@ def test_parts_have_the_references_and_winners_of_the_whole(tmp_path: Path) -> N
     images = image_sets(SHAPE, 1, 2, 2.0, 1e-3)
     family, parts = SharedCoefficients(net, images, arithmetic="real"), halved(images)
     part = _ReusingCells(family._first, parts, 1 << 30, "real", False)
-    alone = NetworkBounds(net, parts, "everywhere", 1 << 30, "real")
+    alone = NetworkBounds(net, parts, 1 << 30, "real")
     (at,) = family._first.intermediate.relaxations[0].maxima
     assert (
         part.intermediate.relaxations[0].maxima[at].winner

@@ -30,7 +30,7 @@ def bounds_of(network: Network, rows: np.ndarray, asked: np.ndarray | None, coar
     x = np.random.default_rng(1).uniform(size=network.input_size)
     none, lower, upper = np.zeros((1, len(x), 1)), x[None] - 0.2, x[None] + 0.2
     images = ImageSets(none, lower, none, upper, lower, upper)
-    cells = NetworkBounds(network, images, "everywhere", 1 << 30, "real", 1, asked=asked, coarse=coarse)
+    cells = NetworkBounds(network, images, 1 << 30, "real", 1, asked=asked, coarse=coarse)
     return cells.outputs(rows, np.zeros(len(rows))).lower[0]
 
 
@@ -64,6 +64,6 @@ def test_branches_hold_with_rows_in_float32(name: str, tmp_path: Path) -> None:
     x = rng.uniform(size=network.input_size)
     images, rows = trees.box(x - radius, x + radius), rng.normal(size=(2, network.output_size))
     rows = np.concatenate([rows, -rows])
-    cells = NetworkBounds(network, images, "everywhere", 1 << 30, "real", 1, coarse=True)
+    cells = NetworkBounds(network, images, 1 << 30, "real", 1, coarse=True)
     tree = PhaseTree(cells, rows, np.zeros(4))
     assert trees.least_excess(network, tree, images, rows, 40 if name == "small" else 4) >= 0.0

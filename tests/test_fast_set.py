@@ -21,7 +21,6 @@ LONG = {
     "arithmetic/kernel_cache.py",
     "methods/splat/threshold_crossings.py",
     "reach/film.py",
-    "verify/network/forward.py",
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 
@@ -10,17 +11,35 @@ import pytest
 from onnx_files import OnnxFile, attack, image_sets, session
 from test_network_bounds import exact_least, mlp, residual
 
-from ns_abstract.verify.network import (
-    ImageSets,
-    NetworkArithmetic,
-    OutputBounds,
-    bound_outputs,
-    branching,
-    load_network,
-)
-from ns_abstract.verify.network.branching import branch
+from ns_abstract.verify.model import NetworkModel
+from ns_abstract.verify.network import ImageSets, Network, NetworkArithmetic, bound_outputs, load_network
+from ns_abstract.verify.network.bounds import NetworkBounds
+from ns_abstract.verify.network.phase_tree import PhaseTree, TreeResult
+from ns_abstract.verify.preprocess import Preprocess
+from ns_abstract.verify.properties import Query
 
 MOST = 100
+
+
+def branch(
+    network: Network,
+    images: ImageSets,
+    rows: np.ndarray,
+    offset: np.ndarray,
+    groups: Sequence[Sequence[int]],
+    most: int,
+    *,
+    arithmetic: NetworkArithmetic = "float32",
+    intermediate_steps: int = 0,
+) -> TreeResult:
+    """All groups, up to the first that is not proved."""
+    cells = NetworkBounds(network, images, 1 << 30, arithmetic, 1, intermediate_steps=intermediate_steps)
+    tree, results = PhaseTree(cells, rows, offset), []
+    for group in groups:
+        results.append(tree.prove(group, most))
+        if not results[-1].proved:
+            break
+    return TreeResult(all(r.proved for r in results), sum(r.branches for r in results), min(r.least for r in results))
 
 
 def line(rng: np.random.Generator, n: int) -> ImageSets:
@@ -83,19 +102,14 @@ def test_behind_residuals(seed: int, tmp_path: Path) -> None:
         assert found.proved and found.branches > 1
 
 
-def test_an_end_comes_soon(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_end_comes_soon(tmp_path: Path) -> None:
     network, layers, _ = mlp(tmp_path, 1, 2.0)
     images, row = line(np.random.default_rng(1), 3), np.array([[1.0, 0.5]])
     least = float(exact_least(layers, images.b_lower[0], images.a_lower[0, :, 0], row[0]))
     found = branch(network, images, row, np.array([-least - 1e-6]), [[0]], 1)
     assert not found.proved and found.branches == 1
-    assert branch(network, images, row, np.array([-least - 1e-6]), [[0]], MOST, enough=lambda: True).branches <= 1
     assert not branch(network, images, row, np.array([np.nan]), [[0]], MOST).proved
     assert not branch(network, images, row, np.array([1e3 - least]), [[]], MOST).proved
-    # a bound that is no number proves nothing
-    nothing = OutputBounds(np.full((1, 1), np.nan), np.zeros((1, 1, 1)), np.zeros((1, 1)), np.full((1, 1, 2), -1))
-    monkeypatch.setattr(branching, "bound_outputs", lambda *_, **__: nothing)
-    assert not branch(network, images, row, np.array([1e3 - least]), [[0]], MOST).proved
 
 
 def test_a_network_without_units(tmp_path: Path) -> None:
@@ -106,3 +120,22 @@ def test_a_network_without_units(tmp_path: Path) -> None:
     least = bound_outputs(network, images, np.eye(2), np.zeros(2)).lower[0]
     assert branch(network, images, np.eye(2), 1e-3 - least, [[0], [1]], MOST).proved
     assert not branch(network, images, np.eye(2), -1e-3 - least, [[0], [1]], MOST).proved
+
+
+def test_margins_that_branches_prove(tmp_path: Path) -> None:
+    """A positive margin is not above the exact one of any group; a group that fails leaves none, whatever follows."""
+    network, layers, _ = mlp(tmp_path, 2, 2.0)
+    rng = np.random.default_rng(2)
+    images, rows = line(rng, 3), rng.normal(size=(3, 2))
+    least = np.array([float(exact_least(layers, images.b_lower[0], images.a_lower[0, :, 0], row)) for row in rows])
+    alone = bound_outputs(network, images, rows, np.zeros(3), slope_steps=12).lower[0]
+    assert (least - alone).min() > 0.1
+    model = NetworkModel(network, Preprocess(), 1 << 30)
+    # the last group has the greatest margin
+    held = -(alone + 0.5 * (least - alone)) + np.array([0.0, 1.0, 2.0])
+    for groups in ([[0], [1], [2]], [[0], [2, 1]]):
+        exact = min(max(least[k] + held[k] for k in group) for group in groups)
+        assert 0.0 < model.branch(images, Query(rows, held), groups, MOST) <= exact
+    broken = np.where(np.arange(3) == 1, -least - 1e-3, held)
+    for groups in ([[0], [1], [2]], [[1], [0]], [[0], []]):
+        assert not model.branch(images, Query(rows, broken), groups, MOST) > 0.0

@@ -305,7 +305,7 @@ def test_rounding_of_rows_over_sets(double: bool, tmp_path: Path) -> None:
         reach = np.abs(a).sum(-1)
         images = ImageSets(a, b, a, b, np.nextafter(-reach, -np.inf), np.nextafter(reach, np.inf))
         for sign in (1.0, -1.0):
-            cells = NetworkBounds(network, images, "everywhere", 1 << 30, "real")
+            cells = NetworkBounds(network, images, 1 << 30, "real")
             if not double:
                 cells.intermediate.relaxations.pop()
             found = cells.outputs(sign * np.eye(5), np.zeros(5))
@@ -343,7 +343,7 @@ def test_rows_of_outputs_in_float64_are_tighter(blocks: int, tmp_path: Path) -> 
     rows = np.concatenate([np.eye(3), -np.eye(3)])
     widths = []
     for double in (False, True):
-        cells = NetworkBounds(network, images, "everywhere", 1 << 30, "real")
+        cells = NetworkBounds(network, images, 1 << 30, "real")
         if not double:
             cells.intermediate.relaxations.pop()
         found = cells.outputs(rows, np.zeros(6))

@@ -36,7 +36,7 @@ MOST = 100
 def tree_of(
     network: Network, images: ImageSets, rows: np.ndarray, offset: np.ndarray, arithmetic: NetworkArithmetic = "real"
 ) -> PhaseTree:
-    return PhaseTree(NetworkBounds(network, images, "everywhere", 1 << 30, arithmetic, 1), rows, offset)
+    return PhaseTree(NetworkBounds(network, images, 1 << 30, arithmetic, 1), rows, offset)
 
 
 def box(lower: np.ndarray, upper: np.ndarray) -> ImageSets:
@@ -204,7 +204,7 @@ def test_several_threads_bound_the_same_rows(tmp_path: Path) -> None:
     try:
         for count in (1, 2):
             torch.set_num_threads(count)
-            cells = NetworkBounds(network, images, "everywhere", 1 << 30, "real", 1, intermediate_steps=3, coarse=True)
+            cells = NetworkBounds(network, images, 1 << 30, "real", 1, intermediate_steps=3, coarse=True)
             found.append(cells.intermediate.unstable[max(cells.intermediate.unstable)])
     finally:
         torch.set_num_threads(threads)
@@ -254,7 +254,7 @@ def test_ends_of_unstable_neurons_gain_by_lines_of_their_own(steps: int, tmp_pat
     x = rng.normal(size=6)
     images = box(x - 0.5, x + 0.5)
     plain, chosen = (
-        NetworkBounds(network, images, "everywhere", 1 << 30, "real", 1, intermediate_steps=number).intermediate
+        NetworkBounds(network, images, 1 << 30, "real", 1, intermediate_steps=number).intermediate
         for number in (0, steps)
     )
     node = max(plain.unstable)

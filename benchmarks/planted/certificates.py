@@ -26,7 +26,8 @@ _PLACES = "test_registration.py::test_bounds_hold_for_every_place_of_the_scene"
 _ROUNDED = "verify/eight_bit.py"
 _BOXES = "verify/box_decisions.py"
 _EITHER = "test_vnnlib_runner.py::test_proofs_alone_never_decide_unsafe_instances"
-_BRANCHING, _SLOPES = "verify/network/branching.py", "verify/network/slope_optimisation.py"
+_SLOPES = "verify/network/slope_optimisation.py"
+_MARGINS = "test_network_branching.py::test_margins_that_branches_prove"
 _BRANCHES = "test_network_branching.py::test_claims_next_to_the_exact_minimum"
 _TREE, _LINES = "verify/network/phase_tree.py", "verify/network/relu_lines.py"
 _HELD = "test_phase_tree.py::test_branches_hold_for_the_images_in_them[small-1.0]"
@@ -275,10 +276,6 @@ CERTIFICATES = (
         _BOXES, "_halves", "[(lower, left), (right, upper)]", "[(lower, left)]", _EITHER,
     ),
     Fault(
-        "branching: one sign of a unit is left out",
-        _BRANCHING, "_PhaseBranch.halves", "(1.0, -1.0)", "(1.0,)", _BRANCHES,
-    ),
-    Fault(
         "branching: multipliers of either sign",
         _SLOPES, "DualAscent.climb", "np.maximum(moved, 0.0).astype(np.float32)", "moved.astype(np.float32)", _BRANCHES,
     ),
@@ -287,16 +284,16 @@ CERTIFICATES = (
         _SLOPES, "SplitNeurons.pay", "gained.astype(np.float64) @ self.reference - room", "-room", _BRANCHES,
     ),
     Fault(
-        "branching: signs of the other side are assumed",
-        "verify/network/forward.py", "ForwardPass._assume", "torch.from_numpy(side > 0.0)",
-        "torch.from_numpy(side < 0.0)",
-        _BRANCHES,
+        "branching: the margin is that of the last group",
+        "verify/model.py", "NetworkModel.branch", "min(least, result.least)", "result.least", _MARGINS,
     ),
     Fault(
-        "branching: what is not a number is proved",
-        _BRANCHING, "_branch_of", "np.where(np.isnan(bounds.lower[number]), -np.inf, bounds.lower[number])",
-        "np.where(np.isnan(bounds.lower[number]), np.inf, bounds.lower[number])",
-        "test_network_branching.py::test_an_end_comes_soon",
+        "branching: a group that fails is passed over",
+        "verify/model.py", "NetworkModel.branch", "break", "least = 1.0", _MARGINS,
+    ),
+    Fault(
+        "phase tree: the margin is that of the best branch",
+        _TREE, "PhaseTree._climbed", "best[~open_].max(1).min()", "best[~open_].max(1).max() + 1.0", _MARGINS,
     ),
     Fault(
         "phase tree: one half is left out",

@@ -326,7 +326,7 @@ VERDICTS = (
     Fault(
         "network: rows that rest on several nodes count the last alone",
         _BACKWARD,
-        "BackwardPass._rest_rows",
+        "BackwardPass._bound_rows",
         "box += two",
         "box = two",
         "test_network_bounds.py::test_rows_that_rest_on_several_nodes[residual-0]",
@@ -334,7 +334,7 @@ VERDICTS = (
     Fault(
         "network: what rows gather on the way is lost where they end by plan",
         _BACKWARD,
-        "BackwardPass._rest_rows",
+        "BackwardPass._bound_rows",
         "batch.total",
         "0.0 * batch.total",
         "test_network_bounds.py::test_rows_that_end_by_plan_lie_below_the_exact_minimum[1]",

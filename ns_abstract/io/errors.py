@@ -31,12 +31,7 @@ class InputError(ValueError):
     """
 
     def __init__(
-        self,
-        problem: str,
-        *,
-        fix: str | None = None,
-        file: str | Path | None = None,
-        field: str | None = None,
+        self, problem: str, *, fix: str | None = None, file: str | Path | None = None, field: str | None = None
     ) -> None:
         self.problem = problem
         self.fix = fix

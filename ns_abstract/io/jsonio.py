@@ -99,9 +99,7 @@ def file_size(path: Path, what: str, fix: str | None = None) -> int:
         raise InputError(f"no such {what}", file=path, fix=fix or "check the path") from None
     except OSError as error:
         raise InputError(
-            f"{what} cannot be opened: {error.strerror or type(error).__name__}",
-            file=path,
-            fix=FIX_ACCESS,
+            f"{what} cannot be opened: {error.strerror or type(error).__name__}", file=path, fix=FIX_ACCESS
         ) from None
     except ValueError:
         raise InputError(f"not a valid path for a {what}", file=show(str(path)), fix="check the path") from None
@@ -153,9 +151,7 @@ def read_bytes(path: Path, what: str, limit: int) -> bytes:
             data = stream.read(size + 1)
     except OSError as error:
         raise InputError(
-            f"{what} cannot be read: {error.strerror or type(error).__name__}",
-            file=path,
-            fix="check the permissions",
+            f"{what} cannot be read: {error.strerror or type(error).__name__}", file=path, fix="check the permissions"
         ) from None
     if len(data) > size:
         raise InputError(f"{what} grew while it was read", file=path, fix="wait until it is written")

@@ -69,10 +69,7 @@ class KeyTable:
         return self._known[name]
 
     def unknown(
-        self,
-        section: Mapping[Any, Any],
-        prefix: str = "",
-        mapping: Callable[[Any], Mapping[Any, Any] | None] = _plain,
+        self, section: Mapping[Any, Any], prefix: str = "", mapping: Callable[[Any], Mapping[Any, Any] | None] = _plain
     ) -> list[str]:
         """The dotted names of keys of ``section`` that are not in the table.
 

@@ -13,15 +13,7 @@ from ns_abstract.refine.result import FrameResult
 from ns_abstract.report.figures import ShownUnits, number
 from ns_abstract.report.files import StoredFrame, frame_name
 from ns_abstract.report.html import counted, set_of, whole_page
-from ns_abstract.report.picture import (
-    GAP_COLORS,
-    color_stops,
-    heat,
-    panels_figure,
-    preview,
-    save_figure,
-    to_bytes,
-)
+from ns_abstract.report.picture import GAP_COLORS, color_stops, heat, panels_figure, preview, save_figure, to_bytes
 from ns_abstract.report.record import PAGE_FRAMES, PREVIEW_PIXELS, Report, RunRecord
 
 if TYPE_CHECKING:

@@ -101,11 +101,7 @@ def location_document(
 
 
 def _frame(
-    parameters: Sequence[tuple[str, str]],
-    index: int,
-    poses: PoseBox,
-    rows: Sequence[Row],
-    found: Sequence[Any],
+    parameters: Sequence[tuple[str, str]], index: int, poses: PoseBox, rows: Sequence[Row], found: Sequence[Any]
 ) -> dict[str, Any]:
     box = poses.box
     entries = sides(box, parameters, poses.fixed)

@@ -40,9 +40,7 @@ def shown_frames(frames: Sequence[Mapping[str, Any]], most: int) -> list[Mapping
 
 
 def render_page(
-    document: Mapping[str, Any],
-    pictures: Mapping[int, Mapping[str, bytes]],
-    plays: Mapping[int, str] | None = None,
+    document: Mapping[str, Any], pictures: Mapping[int, Mapping[str, bytes]], plays: Mapping[int, str] | None = None
 ) -> str:
     """The page of a report: HTML, self-contained; every text of the document is escaped.
 

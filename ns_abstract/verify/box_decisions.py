@@ -15,7 +15,6 @@ import torch
 from ns_abstract.execution.cancellation import Deadline, WorkCancelledError, check_cancelled
 from ns_abstract.verify.network import ImageSets, Network, NetworkArithmetic, OutputBounds, bound_outputs
 from ns_abstract.verify.network.bounds import NetworkBounds
-from ns_abstract.verify.network.branching import branch
 from ns_abstract.verify.network.dependence import input_shares
 from ns_abstract.verify.network.neuron_bounds import farther_steps
 from ns_abstract.verify.network.phase_tree import PhaseTree
@@ -262,7 +261,7 @@ class _BoxSearch:
         for group in left:
             result = tree.prove(group, _BRANCHES)
             self.boxes += result.branches
-            if not result.proved and not self._prove_with_fresh_bounds(shared, which, images, group):
+            if not result.proved:
                 return False
         return True
 
@@ -280,7 +279,7 @@ class _BoxSearch:
         """A tree over bounds with so many steps for intermediate ones, and the groups that its root leaves open."""
         start = self.deadline.left
         cells = NetworkBounds(
-            self.bounded, images, "everywhere", self.memory, self.arithmetic, 1, intermediate_steps=steps,
+            self.bounded, images, self.memory, self.arithmetic, 1, intermediate_steps=steps,
             asked=shared.unsafe.rows, coarse=True,
         )  # fmt: skip
         self.by_bounds = start - self.deadline.left
@@ -291,23 +290,6 @@ class _BoxSearch:
             if not result.proved:
                 left.append(group)
         return tree, left
-
-    def _prove_with_fresh_bounds(
-        self, shared: _SharedProperty, which: int, images: ImageSets, group: Sequence[int]
-    ) -> bool:
-        """Whether a group is proved by branches with intermediate bounds of their own."""
-        branching = branch(
-            self.bounded,
-            images,
-            shared.unsafe.rows,
-            shared.offset[which],
-            [group],
-            _BRANCHES,
-            memory=self.memory,
-            arithmetic=self.arithmetic,
-        )
-        self.boxes += branching.branches
-        return branching.proved
 
     def _images(self, lower: np.ndarray, upper: np.ndarray) -> ImageSets:
         """Boxes [m, n]: every input that varies is a parameter, if they are few; p numbers them in their order."""

@@ -1,4 +1,4 @@
-"""A network with its preprocessing, as the search for certificates uses it (docs/dev/design.md, V9)."""
+"""A network with its preprocessing, as the search for certificates uses it (docs/dev/design.md, V6)."""
 
 from __future__ import annotations
 
@@ -18,8 +18,10 @@ from ns_abstract.verify.network import (
     bound_outputs,
     reusable_anywhere,
 )
-from ns_abstract.verify.network.branching import branch
+from ns_abstract.verify.network.bounds import NetworkBounds
 from ns_abstract.verify.network.load import onnx_runner, require_unchanged
+from ns_abstract.verify.network.phase_tree import PhaseTree
+from ns_abstract.verify.network.subnormals import subnormals_kept
 from ns_abstract.verify.preprocess import Preprocess
 from ns_abstract.verify.properties import Query
 
@@ -81,15 +83,20 @@ class NetworkModel:
         )
         return output_bounds if d else dataclasses.replace(output_bounds, a=output_bounds.a[..., :0])
 
+    @subnormals_kept()
     def branch(self, images: ImageSets, query: Query, groups: Sequence[Sequence[int]], most_branches: int) -> float:
         """A lower bound of the margin ``min over groups of max over its rows`` in the one cell of ``images``.
 
-        It is positive if ``most_branches`` branches on the signs of units prove it (N16).
+        It is positive if ``most_branches`` branches on the phases of neurons prove every group (N16).
         """
-        sets, rows, offset = parametric(images), query.rows, query.offset
-        return branch(
-            self.network, sets, rows, offset, groups, most_branches, memory=self.memory, arithmetic=self.arithmetic
-        ).least
+        cells = NetworkBounds(self.network, parametric(images), self.memory, self.arithmetic, 1)
+        tree, least = PhaseTree(cells, query.rows, query.offset), np.inf
+        for group in groups:
+            result = tree.prove(group, most_branches)
+            least = min(least, result.least)
+            if not result.proved:
+                break
+        return least
 
 
 @dataclasses.dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from ns_abstract.verify.network.bounds import bound_outputs
 from ns_abstract.verify.network.graph import Network, NetworkArithmetic
-from ns_abstract.verify.network.image_sets import ImageSets, OutputBounds, Substitution
+from ns_abstract.verify.network.image_sets import ImageSets, OutputBounds
 from ns_abstract.verify.network.load import load_network
 from ns_abstract.verify.network.shared_coefficients import SharedCoefficients, reusable_anywhere
 
@@ -12,7 +12,6 @@ __all__ = [
     "NetworkArithmetic",
     "OutputBounds",
     "SharedCoefficients",
-    "Substitution",
     "bound_outputs",
     "load_network",
     "reusable_anywhere",

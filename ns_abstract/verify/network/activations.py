@@ -61,7 +61,6 @@ class Clip(ScalarFunction):
         return AFFINE * (self.factor * _size(lower, upper) + abs(self.offset)) + flushed
 
 
-@dataclass(frozen=True, eq=False)
 class Abs(ScalarFunction):
     """``|z|``."""
 
@@ -81,7 +80,6 @@ class Abs(ScalarFunction):
 # ---------------------------------------------------------------- algebraic
 
 
-@dataclass(frozen=True, eq=False)
 class HardSwish(ScalarFunction):
     """``z min(max(z / 6 + 1 / 2, 0), 1)``."""
 
@@ -216,7 +214,6 @@ class PositivePower(_Positive):
 # ---------------------------------------------------------------- with exponentials
 
 
-@dataclass(frozen=True, eq=False)
 class Exp(LibraryFunction):
     """The exponential."""
 
@@ -233,7 +230,6 @@ class Exp(LibraryFunction):
         return torch.where(representable, 2.0 * LIBRARY * upper.exp() + FLUSHED, torch.full_like(upper, math.nan))
 
 
-@dataclass(frozen=True, eq=False)
 class Log(_Positive, LibraryFunction):
     """The natural logarithm."""
 
@@ -250,7 +246,6 @@ class Log(_Positive, LibraryFunction):
         return LIBRARY * (1.0 + torch.maximum(lower.log().abs(), upper.log().abs()))
 
 
-@dataclass(frozen=True, eq=False)
 class Softplus(LibraryFunction):
     """``log(1 + exp(z))``."""
 
@@ -290,7 +285,6 @@ class Elu(LibraryFunction):
         return 2.0 * LIBRARY * self.scale * (self.alpha + size) + flushed
 
 
-@dataclass(frozen=True, eq=False)
 class Erf(LibraryFunction):
     """The error function."""
 
@@ -326,7 +320,6 @@ class _Sigmoidal(ScalarFunction):
         return lower < upper
 
 
-@dataclass(frozen=True, eq=False)
 class Sigmoid(_Sigmoidal):
     """``1 / (1 + exp(-z))``."""
 
@@ -337,7 +330,6 @@ class Sigmoid(_Sigmoidal):
         return torch.sigmoid(z) * torch.sigmoid(-z)
 
 
-@dataclass(frozen=True, eq=False)
 class Tanh(_Sigmoidal):
     """Hyperbolic tangent."""
 
@@ -358,7 +350,6 @@ class _Gated(LibraryFunction):
         return 4.0 * LIBRARY * _size(lower, upper) + FLUSHED
 
 
-@dataclass(frozen=True, eq=False)
 class Silu(_Gated):
     """``z / (1 + exp(-z))``."""
 
@@ -375,7 +366,6 @@ class Silu(_Gated):
         return gate + z * gate * torch.sigmoid(-z)
 
 
-@dataclass(frozen=True, eq=False)
 class Gelu(_Gated):
     """``z (1 + erf(z / sqrt(2))) / 2``."""
 
@@ -393,7 +383,6 @@ _CUBIC = 0.044715
 _RATE = math.sqrt(2.0 / math.pi)
 
 
-@dataclass(frozen=True, eq=False)
 class GeluTanh(_Gated):
     """``z (1 + tanh(sqrt(2 / pi) (z + 0.044715 z^3))) / 2``."""
 
@@ -409,7 +398,6 @@ class GeluTanh(_Gated):
         return gate + z * gate * torch.sigmoid(-inner) * 2.0 * _RATE * (1.0 + 3.0 * _CUBIC * z.square())
 
 
-@dataclass(frozen=True, eq=False)
 class Mish(_Gated):
     """``z tanh(log(1 + exp(z)))``."""
 

@@ -14,7 +14,6 @@ from ns_abstract.verify.network.coefficients import (
     Coefficients,
     Float64,
     Int64,
-    NodeColumns,
     charge,
     concretize,
     full,
@@ -129,7 +128,7 @@ class BackwardPass:
                 and at in self.intermediate.stops
                 and len(batch.waiting) == 1
             ):
-                self._bound_rows(at, batch, self.intermediate.stops[at], bounds)
+                self._bound_rows(batch, bounds)
                 going_on = ~enough.done(bounds, batch.number)
                 if going_on.mean() < 0.75:
                     bounds.ended[batch.number[~going_on]] = at
@@ -157,7 +156,7 @@ class BackwardPass:
                 shape = self.network.shape(source)
                 batch.waiting[source] = full(part, shape) if there is None else join(there, part, shape)
         if cut:
-            self._rest_rows(batch, bounds)
+            self._bound_rows(batch, bounds, cut=True)
             return
         if batch.chosen is not None and 0 in batch.waiting:
             whole = full(batch.waiting[0], self.network.input_shape, force=True)
@@ -166,7 +165,7 @@ class BackwardPass:
             batch.trace.reached[batch.number] = True
             if 0 in batch.waiting:
                 batch.trace.keep(0, batch.waiting[0], self.network.input_shape, batch.number)
-        self._bound_rows(0, batch, self.intermediate.columns, bounds)
+        self._bound_rows(batch, bounds)
 
     def _inputs_of(self, start: int, at: int, batch: CoefficientBatch, here: Coefficients) -> list[Coefficients]:
         """Coefficients of the inputs of node ``at`` in place of its own ``here``; constants go to ``batch.total``."""
@@ -197,34 +196,23 @@ class BackwardPass:
         charged = isinstance(layer, LinearLayer) and at != start and at not in self.intermediate.folded
         return charged or isinstance(layer, Activation)
 
-    def _bound_rows(self, at: int, batch: CoefficientBatch, columns: NodeColumns, bounds: BackwardBounds) -> None:
-        """Bounds of a batch whose rows are all on node ``at``."""
-        count = len(batch.cell)
-        plane, box = np.zeros((count, 2, self.intermediate.d + 1)), np.zeros((count, 2))
-        coefficients = batch.waiting.get(at)
-        if coefficients is None:
-            plane[:, :, -1] = box[:] = batch.total
-        else:
-            concretize(coefficients.value, coefficients.y, coefficients.x, batch.cell, columns, batch.total, plane, box)
-        lost = self.intermediate.flush[batch.cell][:, None] * np.array([-1.0, 1.0])
-        plane[:, :, -1] += lost
-        box += lost
-        bounds.improve(batch.number, plane, box)
-
-    def _rest_rows(self, batch: CoefficientBatch, bounds: BackwardBounds) -> None:
-        """Bounds of a batch whose rows rest on several nodes, of which forms are known (N18)."""
+    def _bound_rows(self, batch: CoefficientBatch, bounds: BackwardBounds, cut: bool = False) -> None:
+        """Bounds of a batch whose rows rest on one node with a known form, or where they are cut on several (N18)."""
         count, total = len(batch.cell), batch.total
         plane, box = np.zeros((count, 2, self.intermediate.d + 1)), np.zeros((count, 2))
-        sizes = np.zeros(count)
+        lost = self.intermediate.flush[batch.cell]
+        if not batch.waiting:
+            plane[:, :, -1] = box[:] = total
         for at, coefficients in batch.waiting.items():
             columns = self.intermediate.stops[at] if at else self.intermediate.columns
             one, two = np.zeros_like(plane), np.zeros_like(box)
             concretize(coefficients.value, coefficients.y, coefficients.x, batch.cell, columns, total, one, two)
             plane += one
             box += two
-            sizes += np.abs(one).sum((1, 2)) + np.abs(two).sum(1)
             total = np.zeros_like(total)
-        lost = self.intermediate.flush[batch.cell] + 2.0 * DOUBLE_UNIT * len(batch.waiting) * sizes
+            if cut:
+                sizes = np.abs(one).sum((1, 2)) + np.abs(two).sum(1)
+                lost = lost + 2.0 * DOUBLE_UNIT * len(batch.waiting) * sizes
         lost = lost[:, None] * np.array([-1.0, 1.0])
         plane[:, :, -1] += lost
         box += lost

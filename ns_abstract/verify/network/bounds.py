@@ -1,22 +1,24 @@
-"""Bounds of a network's outputs over sets of images (docs/dev/design.md, N, N0)."""
+"""Bounds of a network's outputs over sets of images (docs/dev/design.md, N, N0, N1, N18)."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from ns_abstract.verify.network.backward import BackwardPass
+from ns_abstract.verify.network.bilinear import Product
 from ns_abstract.verify.network.coefficient_source import CoefficientSource
 from ns_abstract.verify.network.coefficients import Float64
 from ns_abstract.verify.network.dependence import dependence
-from ns_abstract.verify.network.forward import ForwardPass
+from ns_abstract.verify.network.forms import NodeForm
 from ns_abstract.verify.network.graph import Network, NetworkArithmetic
-from ns_abstract.verify.network.image_sets import ActivationPhases, ImageSets, OutputBounds, Substitution
+from ns_abstract.verify.network.image_sets import ImageSets, OutputBounds
 from ns_abstract.verify.network.input_planes import finite, middle_of, planes_of
 from ns_abstract.verify.network.intermediate_bounds import IntermediateBounds
+from ns_abstract.verify.network.layers import Activation, LeakyRelu
 from ns_abstract.verify.network.max_pool_propagation import MaxPoolPropagation
+from ns_abstract.verify.network.max_pooling import MaxPool
 from ns_abstract.verify.network.neuron_bounds import NeuronBounds
 from ns_abstract.verify.network.neuron_selection import NeuronSelection
 from ns_abstract.verify.network.output_bounds import OutputRows
@@ -36,12 +38,10 @@ def bound_outputs(
     rows: Any,
     offset: Float64,
     *,
-    substitution: Substitution = "everywhere",
     memory: int = 1 << 30,
     arithmetic: NetworkArithmetic = "float32",
     slope_steps: int = 0,
     intermediate_steps: int = 0,
-    assumed: Sequence[Mapping[int, ActivationPhases]] | None = None,
 ) -> OutputBounds:
     """Lower bounds of ``rows @ network(x) + offset`` over every image set.
 
@@ -50,15 +50,11 @@ def bound_outputs(
         images: m cells in d parameters.
         rows: [k, output_size] array or scipy sparse matrix.
         offset: [k], or [m, k] by image set.
-        substitution: Where the parameters' correlation is used: in every intermediate bound ("everywhere"), only in the
-            result ("end"), or not at all ("box").
         memory: Bytes to stay within, roughly.
         arithmetic: Whether the bounds hold for every float32 evaluation and the exact network, or for that alone.
         slope_steps: Steps towards the best slopes and tangents, for every row of its own (N14); each takes as long as
             two passes of the rows.
         intermediate_steps: The same for intermediate bounds, but in deep networks.
-        assumed: By cell: signs of inputs of (leaky) ReLUs, by node, of the images that bounds are of (N16).
-            ``slope_steps`` must be positive then.
     """
     offset = np.asarray(offset, np.float64)
     if images.a_lower.shape[1] != network.input_size:
@@ -70,23 +66,21 @@ def bound_outputs(
     step = max(1, int(0.5 * memory) // by_cell)
     parts = []
     for first in range(0, images.count, step):
-        phases = None if assumed is None else assumed[first : first + step]
-        cells = NetworkBounds(
-            network, images[first : first + step], substitution, memory, arithmetic, slope_steps, phases, None,
-            intermediate_steps,
-        )  # fmt: skip
+        part = images[first : first + step]
+        cells = NetworkBounds(network, part, memory, arithmetic, slope_steps, None, intermediate_steps)
         parts.append(cells.outputs(rows, offset[first : first + step] if offset.ndim > 1 else offset))
     if not parts:
         k, d = offset.shape[-1], images.dimensions
         return OutputBounds(np.zeros((0, k)), np.zeros((0, k, d)), np.zeros((0, k)))
-    names = ("lower", "a", "b") if assumed is None else ("lower", "a", "b", "loosest")
-    return OutputBounds(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
+    return OutputBounds(*(np.concatenate([getattr(part, name) for part in parts]) for name in ("lower", "a", "b")))
 
 
 class NetworkBounds:
     """Bounds of one network over several cells: builds the passes and runs them over all nodes.
 
     ``asked``: [k, output_size] rows of which bounds will be asked, or None; ``coarse``: see `IntermediateBounds`.
+
+    Forms of the nodes are propagated in order; neurons that pay for it are refined before what reads them.
 
     Attributes:
         intermediate: What is known of the nodes.
@@ -98,11 +92,9 @@ class NetworkBounds:
         self,
         network: Network,
         images: ImageSets,
-        substitution: Substitution,
         memory: int,
         arithmetic: NetworkArithmetic = "float32",
         slope_steps: int = 0,
-        assumed: Sequence[Mapping[int, ActivationPhases]] | None = None,
         sharing: CoefficientSource | None = None,
         intermediate_steps: int = 0,
         asked: Float64 | None = None,
@@ -111,23 +103,75 @@ class NetworkBounds:
         sharing = CoefficientSource() if sharing is None else sharing
         fields, usable = finite(images)
         middle = sharing.about(middle_of(fields))
-        image = planes_of(fields, middle, network.input_shape, substitution)
+        image = planes_of(fields, middle, network.input_shape)
         self.intermediate = intermediate = sharing.intermediate = IntermediateBounds(
-            network, image, middle, usable, arithmetic, assumed, coarse
+            network, image, middle, usable, arithmetic, coarse
         )
-        schedule = WorkBudget(network)
+        self._network, self._schedule = network, (schedule := WorkBudget(network))
         backward = BackwardPass(intermediate, memory, schedule.deep)
         inner = RowAscent(intermediate, backward, 0 if schedule.deep else intermediate_steps, _INNER_STEP)
         neuron_bounds = NeuronBounds(intermediate, backward, schedule, sharing, inner)
         used = None if asked is None else dependence(network, asked)
-        selection = NeuronSelection(intermediate, neuron_bounds, schedule, sharing, used)
-        pooling = MaxPoolPropagation(intermediate, backward, schedule, sharing)
-        propagation = ForwardPropagation(intermediate, sharing, bool(slope_steps or inner.steps))
-        self.last = ForwardPass(intermediate, propagation, pooling, selection, schedule).run()
-        if substitution == "end":
-            intermediate.set_image(planes_of(fields, middle, network.input_shape, "everywhere"))
+        self._selection = NeuronSelection(intermediate, neuron_bounds, schedule, sharing, used)
+        self._pooling = MaxPoolPropagation(intermediate, backward, schedule, sharing)
+        self._propagation = ForwardPropagation(intermediate, sharing, bool(slope_steps or inner.steps))
+        self.last = self._propagate()
         self.output_rows = OutputRows(intermediate, backward, RowAscent(intermediate, backward, slope_steps))
 
     def outputs(self, rows: Any, offset: Float64) -> OutputBounds:
         """Bounds of ``rows @ y + offset`` in every cell."""
         return self.output_rows.bound(self.last, rows, offset)
+
+    def _propagate(self) -> NodeForm:
+        """Pass forms through the nodes in order, with better bounds where they pay; returns that of the last one."""
+        forms: list[NodeForm | None] = [self.intermediate.image_form()]
+        self.intermediate.forms = forms
+        if self._schedule.planned:
+            self._learn(0, False)
+        for k, node, inputs in self._network.walk(forms, leave=self._leave):
+            if isinstance(node.layer, Activation):
+                # what is known better of the input is also known to its other readers
+                source = node.inputs[0]
+                interval = inputs[0].interval
+                unstable, apart = node.layer.unstable(*interval), node.layer.relaxation_gap(*interval)
+                forms[source] = inputs[0] = self._selection.better(source, inputs[0], unstable, apart, node.layer)
+                if isinstance(node.layer, LeakyRelu):
+                    self._selection.unsure = float(node.layer.unstable(*inputs[0].interval).double().mean())
+                forms.append(self._propagation.activation(k, source, node.layer, inputs[0]))
+                if self._network.depth[source] > 1:
+                    self.intermediate.stops[source] = self.intermediate.stop(source, inputs[0])
+            elif isinstance(node.layer, Product):
+                intervals = inputs[0].interval, inputs[1].interval
+                unstable, apart = node.layer.unstable(*intervals), node.layer.relaxation_gap(*intervals)
+                for position, source in enumerate(node.inputs):
+                    forms[source] = inputs[position] = self._selection.better(source, inputs[position], unstable, apart)
+                forms.append(self._propagation.product(k, node.inputs, node.layer, inputs[0], inputs[1]))
+            elif isinstance(node.layer, MaxPool):
+                forms.append(self._pooling.maximum(k, node.inputs[0], node.layer, inputs[0]))
+            else:
+                forms.append(self._propagation.linear(k, node.inputs, node.layer, inputs))
+            if self._schedule.planned:
+                for index in node.inputs:
+                    self._learn(index, isinstance(node.layer, LeakyRelu) and node.layer.alpha == 0.0)
+                self._learn(k, False)
+        end = forms[-1]
+        assert end is not None
+        self.intermediate.forms = []
+        return end
+
+    def _learn(self, index: int, cut: bool) -> None:
+        """Tell the schedule how wide bounds of node ``index`` are; ``cut``: those of numbers that are not cut off."""
+        form = self.intermediate.forms[index]
+        assert form is not None
+        r = form.r
+        if cut:
+            above = form.interval.upper > 0.0
+            r = r[above] if bool(above.any()) else r
+        self._schedule.learns(index, float(r.mean()), float(form.reference.abs().mean()))
+
+    def _leave(self, index: int) -> None:
+        """Node ``index`` has been read; rows of later ones may end there (N18)."""
+        form = self.intermediate.forms[index]
+        if index in self._schedule.rests and index not in self.intermediate.stops:
+            assert form is not None
+            self.intermediate.stops[index] = self.intermediate.stop(index, form)

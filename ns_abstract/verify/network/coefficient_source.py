@@ -45,12 +45,7 @@ class CoefficientSource:
         return None
 
     def reuse_bounds(
-        self,
-        index: int,
-        form: NodeForm,
-        unstable: Tensor,
-        apart: Tensor | None,
-        layer: Activation | None,
+        self, index: int, form: NodeForm, unstable: Tensor, apart: Tensor | None, layer: Activation | None
     ) -> tuple[NodeForm, Tensor, Tensor | None]:
         """Return bounds of node ``index``, its unstable neurons, and their relaxation gaps (see `NeuronSelection`)."""
         return form, unstable, apart

@@ -14,14 +14,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from ns_abstract.arithmetic.network_charges import (
-    ATTENTION,
-    ATTENTION_BLOCKS,
-    LOST_SHARE,
-    OWN_QUOTIENTS,
-    STEPS,
-    SWITCH,
-)
+from ns_abstract.arithmetic.network_charges import ATTENTION, ATTENTION_BLOCKS, LOST_SHARE, OWN_QUOTIENTS, STEPS, SWITCH
 from ns_abstract.verify.network.activations import FLUSHED, Clip, Exp, Gelu, HardSwish, Reciprocal, Softplus
 from ns_abstract.verify.network.scalar_function import _size
 

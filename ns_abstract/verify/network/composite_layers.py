@@ -10,26 +10,13 @@ from typing import Any
 import numpy as np
 import torch
 
-from ns_abstract.arithmetic.network_charges import (
-    ATTENTION,
-    ATTENTION_BLOCKS,
-    FOLDING,
-    LEAST_DIVISOR,
-    gamma,
-)
+from ns_abstract.arithmetic.network_charges import ATTENTION, ATTENTION_BLOCKS, FOLDING, LEAST_DIVISOR, gamma
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network import activations, composite_activations
 from ns_abstract.verify.network.elementwise_layers import ElementwiseBuilder
 from ns_abstract.verify.network.graph import as_double, item
 from ns_abstract.verify.network.interpolation import ResizeAxis
-from ns_abstract.verify.network.layers import (
-    Convolution,
-    Gather,
-    LinearLayer,
-    ScaleLayer,
-    Shape,
-    Sum,
-)
+from ns_abstract.verify.network.layers import Convolution, Gather, LinearLayer, ScaleLayer, Shape, Sum
 from ns_abstract.verify.network.sparse_layers import (
     ChannelWindows,
     PairwiseDifferences,

@@ -6,7 +6,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.verify.network.coefficients import Coefficients, Float64, full, grid
 from ns_abstract.verify.network.graph import Network
 from ns_abstract.verify.network.layers import LinearLayer
@@ -60,15 +59,10 @@ def input_shares(network: Network, lower: Float64, upper: Float64) -> Float64:
 
 def _motions(network: Network, pair: Tensor) -> list[float]:
     """By nonlinear node: how far its inputs are apart, together, for a pair of images [2, n]."""
-    values, left, motions = [pair.reshape(2, *network.input_shape)], list(network.readers), []
-    for node in network.nodes:
-        check_cancelled()
-        inputs = [values[k] for k in node.inputs]
+    values: list[Tensor | None] = [pair.reshape(2, *network.input_shape)]
+    motions = []
+    for _, node, inputs in network.walk(values):
         if not isinstance(node.layer, LinearLayer):
             motions.append(float(sum((v[1] - v[0]).abs().sum() for v in inputs)))
         values.append(node.layer(inputs))
-        for k in node.inputs:
-            left[k] -= 1
-            if not left[k]:
-                values[k] = values[k][:0]
     return motions

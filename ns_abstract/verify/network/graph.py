@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 import torch
@@ -20,6 +20,7 @@ from ns_abstract.verify.network.max_pooling import MaxPool
 from ns_abstract.verify.network.scalar_function import LibraryFunction
 
 Layer = LinearLayer | Activation | Product | MaxPool
+Value = TypeVar("Value")
 
 #: Whether bounds hold for every float32 evaluation and the exact network, or for that alone.
 NetworkArithmetic = Literal["float32", "real"]
@@ -162,20 +163,28 @@ class Network:
         if tuple(images.shape[1:]) != self.input_shape:
             raise ValueError(f"images [B, {', '.join(map(str, self.input_shape))}] expected, got {tuple(images.shape)}")
         values: list[Tensor | None] = [images]
+        for _, node, inputs in self.walk(values):
+            values.append(node.layer(inputs))
+        assert values[-1] is not None
+        return values[-1].reshape(images.shape[0], -1)
+
+    def walk(
+        self, values: list[Value | None], last: int | None = None, leave: Callable[[int], None] | None = None
+    ) -> Iterator[tuple[int, Node, list[Value]]]:
+        """Yield the nodes up to ``last``, with their numbers and inputs; the caller appends each node's value.
+
+        ``values``: by node, those so far. One that no other node reads becomes None, or is left to ``leave``.
+        """
         left = list(self.readers)
-        for node in self.nodes:
+        for k, node in enumerate(self.nodes[:last], 1):
             check_cancelled()
-            values.append(node.layer([self._needed(values[index]) for index in node.inputs]))
+            yield k, node, [value for index in node.inputs if (value := values[index]) is not None]
             for index in node.inputs:
                 left[index] -= 1
                 if not left[index]:
+                    if leave is not None:
+                        leave(index)
                     values[index] = None
-        return self._needed(values[-1]).reshape(images.shape[0], -1)
-
-    @staticmethod
-    def _needed(value: Tensor | None) -> Tensor:
-        assert value is not None
-        return value
 
 
 def item(shape: Sequence[int]) -> str:

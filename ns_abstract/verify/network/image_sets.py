@@ -1,13 +1,10 @@
-"""Linear sets of images, assumed activation phases, and output bounds over them (docs/dev/design.md, N)."""
+"""Linear sets of images, and output bounds over them (docs/dev/design.md, N)."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
 
-from ns_abstract.verify.network.coefficients import Float64, Int64
-
-Substitution = Literal["everywhere", "end", "box"]
+from ns_abstract.verify.network.coefficients import Float64
 
 
 @dataclass(frozen=True)
@@ -51,23 +48,15 @@ class ImageSets:
         return ImageSets(*(getattr(self, name)[cells] for name in self.__dataclass_fields__))
 
 
-#: Signs that are assumed of a node's numbers: where they are in the node [B], and 1 or -1 [B] for "not negative" or
-#: "not positive".
-ActivationPhases = tuple[Int64, Float64]
-
-
 @dataclass(frozen=True)
 class OutputBounds:
     """Lower bounds of ``rows @ y + offset``; minus infinity where nothing is known, never NaN.
 
     Attributes:
-        lower: [m, k] for every p of the cell; infinite where no image has the signs that are assumed.
+        lower: [m, k] for every p of the cell.
         a, b: [m, k, d], [m, k]: ``a p + b`` is a lower bound at p.
-        loosest: [m, k, 2] where signs are assumed: the node and the place in it of the input of an open unit that costs
-            the row most, about; -1 where no unit is open.
     """
 
     lower: Float64
     a: Float64
     b: Float64
-    loosest: Int64 | None = None

@@ -1,4 +1,4 @@
-"""Planes and forms of the network's input, relative to a reference image (docs/dev/design.md, N, N0, N22)."""
+"""Planes and forms of the network's input, relative to a reference image (docs/dev/design.md, N, N0, N22, V9)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import torch
 from ns_abstract.arithmetic.network_charges import OVERFLOW, OWN_FEW, OWN_IMAGE
 from ns_abstract.verify.network.coefficients import Float64, grid
 from ns_abstract.verify.network.forms import NodeForm
-from ns_abstract.verify.network.image_sets import ImageSets, Substitution
+from ns_abstract.verify.network.image_sets import ImageSets
 
 
 class ImagePlanes(NamedTuple):
@@ -43,15 +43,11 @@ def middle_of(fields: list[Float64]) -> Float64:
     return 0.5 * (np.maximum(fields[1], fields[4]) + np.minimum(fields[3], fields[5]))
 
 
-def planes_of(
-    fields: list[Float64], middle: Float64, input_shape: tuple[int, ...], substitution: Substitution
-) -> ImagePlanes:
+def planes_of(fields: list[Float64], middle: Float64, input_shape: tuple[int, ...]) -> ImagePlanes:
     """Return the image sets as planes relative to the reference ``middle``."""
     m, _, d = fields[0].shape
     shape = grid(input_shape)
     a_lower, b_lower, a_upper, b_upper, lower, upper = fields
-    if substitution != "everywhere":
-        a_lower, b_lower, a_upper, b_upper = np.zeros_like(a_lower), lower, np.zeros_like(a_upper), upper
     b_lower, lower = (v - middle - OWN_IMAGE * (np.abs(v) + np.abs(middle)) for v in (b_lower, lower))
     b_upper, upper = (v - middle + OWN_IMAGE * (np.abs(v) + np.abs(middle)) for v in (b_upper, upper))
     # numpy keeps the order of axes in memory that the images came with

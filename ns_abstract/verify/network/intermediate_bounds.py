@@ -1,8 +1,6 @@
-"""Intermediate bounds and relaxations of all nodes over several cells (docs/dev/design.md, N1, N16, N18)."""
+"""Intermediate bounds and relaxations of all nodes over several cells (docs/dev/design.md, N1, N18)."""
 
 from __future__ import annotations
-
-from collections.abc import Mapping, Sequence
 
 import numpy as np
 import torch
@@ -13,11 +11,9 @@ from ns_abstract.verify.network.coefficients import Float64, NodeColumns, column
 from ns_abstract.verify.network.cost_model import BackwardRoute
 from ns_abstract.verify.network.forms import NodeForm
 from ns_abstract.verify.network.graph import Network, NetworkArithmetic
-from ns_abstract.verify.network.image_sets import ActivationPhases
 from ns_abstract.verify.network.input_planes import ImagePlanes, form_of
 from ns_abstract.verify.network.relaxations import Relaxations, ReusedRelaxation
 from ns_abstract.verify.network.slope_choices import UnstableNeurons
-from ns_abstract.verify.network.slope_optimisation import SplitNeurons
 
 
 class IntermediateBounds:
@@ -27,7 +23,7 @@ class IntermediateBounds:
         network, image: The network, and what is known of the image.
         middle: [m, n] the images' reference.
         usable: [m] cells that are not given up; changed in place.
-        arithmetic, assumed: As in `ns_abstract.verify.network.bound_outputs`.
+        arithmetic: As in `ns_abstract.verify.network.bound_outputs`.
         coarse: Whether rows are in float32, and charged for it, in real arithmetic, too: they take less than half the
             time.
 
@@ -35,13 +31,11 @@ class IntermediateBounds:
         count, d: Cells m and parameters d.
         in_float32: Whether the network's evaluation in float32 is bounded.
         image, columns: The image as planes, and as rows are bounded on it.
-        infeasible: [m] cells without an image that has the signs assumed.
         flush: [m] what flushes to zero may lose on the way of any row.
         relaxations: What rows take on their way; rows of outputs take the last, the others the first.
         folded: Nodes whose rounding is in that of their only reader.
         forms, stops: By node: what is known of it, while other nodes read it; what rows may stop at.
         unstable: By node: units whose lower lines may have other slopes.
-        split: By cell and node: what rows take of signs that are assumed.
         reused_relaxations: By node: lines with slopes of another cell's rows.
     """
 
@@ -52,14 +46,13 @@ class IntermediateBounds:
         middle: Float64,
         usable: np.ndarray,
         arithmetic: NetworkArithmetic,
-        assumed: Sequence[Mapping[int, ActivationPhases]] | None,
         coarse: bool = False,
     ) -> None:
-        self.network, self.middle, self.usable, self.assumed = network, middle, usable, assumed
+        self.network, self.middle, self.usable = network, middle, usable
         self.count, self.d = len(middle), image.slopes.shape[-1]
         self.in_float32 = arithmetic == "float32"
-        self.infeasible, self.flush = np.zeros(self.count, bool), np.zeros(self.count)
-        self.set_image(image)
+        self.flush = np.zeros(self.count)
+        self.image, self.columns = image, columns_of(*image)
         # every number is passed by a few times at most
         sums = 4.0 * DOUBLE_UNIT * (network.neuron_count + len(network.nodes))
         self.relaxations = [Relaxations(torch.float32, UNIT, sums)]
@@ -70,12 +63,7 @@ class IntermediateBounds:
         self.forms: list[NodeForm | None] = []
         self.stops: dict[int, NodeColumns] = {}
         self.unstable: dict[int, UnstableNeurons] = {}
-        self.split: list[dict[int, SplitNeurons]] = [{} for _ in range(self.count)]
         self.reused_relaxations: dict[int, ReusedRelaxation] = {}
-
-    def set_image(self, image: ImagePlanes) -> None:
-        """Take this for what is known of the image."""
-        self.image, self.columns = image, columns_of(*image)
 
     def image_form(self) -> NodeForm:
         """The image as a form."""
@@ -97,11 +85,6 @@ class IntermediateBounds:
                 finite = torch.isfinite(part)
                 fine = fine & (finite.all(1) if part.ndim > fine.ndim else finite)
         consistent = fine.reshape(self.count, -1).all(1)
-        if self.assumed is not None and not bool(consistent.all()):
-            # bounds that hold for all images with these signs contradict each other: there are none (N16)
-            crossed = torch.isfinite(low) & torch.isfinite(high) & (low > high)
-            has_phases = np.array([len(phases) > 0 for phases in self.assumed]) & self.usable
-            self.infeasible |= has_phases & crossed.reshape(self.count, -1).any(1).numpy()
         self.usable &= consistent.numpy()
         form_within = NodeForm(form.reference, form.c, form.a, form.r, low, high, form.active)
         if bool(consistent.all()):

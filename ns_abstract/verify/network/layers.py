@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import ClassVar
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 import torch
@@ -378,8 +378,7 @@ class Gather(LinearLayer):
         return [Coefficients.whole(value.reshape(count, *before))]
 
 
-@dataclass(frozen=True)
-class LinearRelaxation:
+class LinearRelaxation(NamedTuple):
     """The linear relaxation of an activation over an interval: lines ``slope * z + offset``, float64, shaped as z."""
 
     lower_slope: Tensor

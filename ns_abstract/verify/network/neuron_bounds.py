@@ -121,7 +121,7 @@ class NeuronBounds:
             value[np.arange(len(at)), channel, 0, 0] = side
             best = BackwardBounds.unknown(len(at), self.intermediate.d)
             best.lower[:] = side * ends[at]
-            ascent.climb(index, Coefficients(value, y, x), cell, best, None)
+            ascent.climb(index, Coefficients(value, y, x), cell, best)
             ends[at] = side * best.lower
 
     def _one_hot(

@@ -1,4 +1,4 @@
-"""Bounds of linear functions of the outputs, with optimised slopes and multipliers (docs/dev/design.md, N14, N16)."""
+"""Bounds of linear functions of the outputs, with optimised slopes and multipliers (docs/dev/design.md, N14)."""
 
 from __future__ import annotations
 
@@ -13,9 +13,6 @@ from ns_abstract.verify.network.forms import NodeForm
 from ns_abstract.verify.network.image_sets import OutputBounds
 from ns_abstract.verify.network.intermediate_bounds import IntermediateBounds
 from ns_abstract.verify.network.row_ascent import RowAscent
-
-#: Room for rounding above zero where nothing better is looked for.
-_SURE = 1e-9
 
 
 class ShiftedRows(NamedTuple):
@@ -57,11 +54,9 @@ class OutputRows:
         index = len(self.network.nodes)
         m, k = self.intermediate.count, offset.shape[-1]
         plane, lower = np.zeros((m, k, self.intermediate.d + 1)), np.zeros((m, k))
-        loosest = np.zeros((m, k, 2), np.int64)
         shape = grid(self.network.shape(index))
         shifted = self.shifted(last, rows, offset)
         stored, offset = shifted.stored, shifted.offset
-        need = -offset + _SURE * (1.0 + np.abs(offset))
         for top, left, height, width, number in windows(stored.reshape(k, *shape)):
             part = stored.reshape(k, *shape)[:, :, top : top + height, left : left + width]
             step = max(1, ROWS_AT_ONCE // (stored.itemsize * shape[0] * height * width))
@@ -73,16 +68,15 @@ class OutputRows:
                 )
                 bounds = self.backward.bound(index, rows.replaced(rows.value.copy()), cell)
                 if self.ascent.steps:
-                    wanted = None if self.intermediate.assumed is None else need[cell, row]
-                    loosest[cell, row] = self.ascent.climb(index, rows, cell, bounds, wanted)
+                    self.ascent.climb(index, rows, cell, bounds)
                 plane[cell, row], lower[cell, row] = bounds.plane[:, 0], bounds.lower
         room = shifted.room(plane)
         lower, b = lower + offset - room, plane[..., -1] + offset - room
         a = plane[..., :-1]
         finite = self.intermediate.usable[:, None] & np.isfinite(lower)
         usable = self.intermediate.usable[:, None] & np.isfinite(b) & np.isfinite(a).all(-1)
-        lower = np.where(self.intermediate.infeasible[:, None], np.inf, np.where(finite, lower, -np.inf))
-        return OutputBounds(lower, np.where(usable[..., None], a, 0.0), np.where(usable, b, -np.inf), loosest)
+        lower = np.where(finite, lower, -np.inf)
+        return OutputBounds(lower, np.where(usable[..., None], a, 0.0), np.where(usable, b, -np.inf))
 
 
 def windows(rows: np.ndarray) -> list[tuple[int, int, int, int, Int64]]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import heapq
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -53,12 +53,12 @@ class TreeTuning:
 
 
 _TUNING = TreeTuning()
-#: Bytes of a branch beside its arrays' contents, about.
-_OBJECTS = 4096
+#: Bytes of a branch beside its arrays' contents, about; and of a row's work, in those of the lines that it chooses.
+_OBJECTS, _BESIDE = 4096, 4.0
 
 
 class TreeResult(NamedTuple):
-    """Whether all branches were proved, how many were bounded, and the weakest bound that is left."""
+    """Whether all branches were proved, how many were bounded, and the weakest bound: of what is left, or of all."""
 
     proved: bool
     branches: int
@@ -155,27 +155,31 @@ class PhaseTree:
         self.shifted = cells.output_rows.shifted(cells.last, rows, offset)
         self.room = int(tuning.waiting * cells.output_rows.backward.memory)
         self.gains = SplitGains(tuning.bounded, tuning.often)
+        # lines of a row's own, and what is worked out beside them
+        lines = [self.intermediate.relaxations[-1].lines[k][:, 0].nbytes for k in self.choices]
+        self.together = min(tuning.together, int(cells.output_rows.backward.memory / (_BESIDE * sum(lines) + 1.0)))
+        self._least = np.inf
 
-    def prove(self, group: Sequence[int], most: int, over: Callable[[], bool] = lambda: False) -> TreeResult:
+    def prove(self, group: Sequence[int], most: int) -> TreeResult:
         """Try to prove that a row of ``group`` is positive for every image of the cell.
 
         Args:
             group: Numbers of rows.
             most: Branches after which it is given up.
-            over: Asked between batches: whether to give up.
         """
-        if not self.intermediate.usable[0]:
+        if not self.intermediate.usable[0] or not group:
             return TreeResult(False, 0, -np.inf)
+        self._least = np.inf
         rows = _GroupRows.of(self.shifted, list(group), grid(self.network.shape(self.index)))
         none = {k: np.zeros(len(own.units.flat), np.int8) for k, own in self.relus.items()}
         number, count = itertools.count(), 1
         opened = self._climbed(rows, [_Branch(none, np.full(len(group), -np.inf))], self.tuning.root_steps)
         waiting = [(float(branch.lower.max()), next(number), branch) for branch in opened]
-        size = max(1, self.tuning.together // (2 * len(group)))
+        size = max(1, self.together // (2 * len(group)))
         while waiting:
             check_cancelled()
             worst = waiting[0][0]
-            if count >= most or over():
+            if count >= most:
                 return TreeResult(False, count, worst)
             taken = self._taken(waiting, size)
             ended = [branch for branch in taken if not branch.splits]
@@ -188,7 +192,7 @@ class PhaseTree:
             count += len(halves)
             for branch in self._climbed(rows, halves, self.tuning.steps):
                 heapq.heappush(waiting, (float(branch.lower.max()), next(number), branch))
-        return TreeResult(True, count, 0.0)
+        return TreeResult(True, count, self._least)
 
     def _taken(self, waiting: list[tuple[float, int, _Branch]], size: int) -> list[_Branch]:
         """Take up to ``size`` branches off the heap: the weakest, or the strongest if there is no room for more."""
@@ -256,6 +260,7 @@ class PhaseTree:
                 self.ascent.move(self.index, 0, chosen, bounds, ascent)
             open_ = ~(best > 0.0).any(1)
             if not open_.all():
+                self._least = min(self._least, float(best[~open_].max(1).min()))
                 unsettled = np.repeat(open_, g)
                 left, best = left[open_], best[open_]
                 ascent.keep(unsettled)
@@ -297,7 +302,7 @@ class PhaseTree:
         hopeful = [self.gains.hopeful(branch.splits) for branch in branches]
         splits = [(number, split) for number, own in enumerate(hopeful) for split in own]
         bounds = []
-        step = max(1, self.tuning.together // (2 * g))
+        step = max(1, self.together // (2 * g))
         for first in range(0, len(splits), step):
             check_cancelled()
             part = splits[first : first + step]

@@ -147,10 +147,7 @@ class ForwardPropagation:
                 give = give + OWN_LINE * (low.abs() + high.abs() + slope.abs() * z.reference.abs())
                 if fold:
                     give = give + rounded.abs() * relaxations.noise[source]
-                ends = (
-                    relaxations.outward(low + base - give, -1.0),
-                    relaxations.outward(high + base + give, 1.0),
-                )
+                ends = (relaxations.outward(low + base - give, -1.0), relaxations.outward(high + base + give, 1.0))
                 lines_found += [rounded.to(relaxations.dtype), *(ends if side < 0.0 else reversed(ends))]
             return torch.stack(lines_found).reshape(6, self.intermediate.count, *grid(layer.shape)).numpy()
 

@@ -15,7 +15,7 @@ from ns_abstract.verify.network.coefficients import Coefficients, Float64, Int64
 from ns_abstract.verify.network.cost_model import on_threads
 from ns_abstract.verify.network.intermediate_bounds import IntermediateBounds
 from ns_abstract.verify.network.max_pooling import MaxPool
-from ns_abstract.verify.network.slope_choices import LineChoice, ReluSlopes, ascending
+from ns_abstract.verify.network.slope_choices import LineChoice, ascending
 from ns_abstract.verify.network.slope_optimisation import FIRST_STEP, DualAscent, OptimisedSlopes, slope_derivatives
 from ns_abstract.verify.network.stopping import BackwardBounds
 
@@ -37,22 +37,15 @@ class RowAscent:
         self.intermediate, self.network, self.backward = intermediate, intermediate.network, backward
         self.steps, self.first = steps, first
 
-    def climb(
-        self, index: int, coefficients: Coefficients, cell: Int64, best: BackwardBounds, need: Float64 | None
-    ) -> Int64:
-        """Raise ``best.lower`` of rows on node ``index``, and planes with it, where lines of their own give more.
-
-        A cell whose rows are all above ``need`` [R] is done. Returns `OutputBounds.loosest` of the rows.
-        """
-        loosest = np.full((len(cell), 2), -1, np.int64)
+    def climb(self, index: int, coefficients: Coefficients, cell: Int64, best: BackwardBounds) -> None:
+        """Raise ``best.lower`` of rows on node ``index``, and planes with it, where lines of their own give more."""
         for k in np.unique(cell):
             choices, own = ascending(self.intermediate.unstable, k), np.flatnonzero(cell == k)
-            if not (choices or self.intermediate.split[k]) or not self.intermediate.usable[k]:
+            if not choices or not self.intermediate.usable[k]:
                 continue
             parts, threads = self._shares(own, choices, coefficients.value.itemsize)
-            climbed = functools.partial(self._climb, index, coefficients, k, choices, best, need)
-            loosest[own] = np.concatenate(list(on_threads(climbed, parts, threads)))
-        return loosest
+            for _ in on_threads(functools.partial(self._climb, index, coefficients, k, choices, best), parts, threads):
+                pass
 
     def _shares(
         self, own: Int64, choices: Mapping[int, Sequence[LineChoice]], itemsize: int
@@ -72,22 +65,18 @@ class RowAscent:
         k: int,
         choices: Mapping[int, Sequence[LineChoice]],
         best: BackwardBounds,
-        need: Float64 | None,
         own: Int64,
-    ) -> Int64:
+    ) -> None:
         """`climb` for rows ``own`` of cell k."""
         start = coefficients[own]
         lines = {at: self.intermediate.relaxations[-1].lines[at][:, k] for at in choices}
-        ascent = DualAscent(choices, lines, len(own), self.intermediate.split[k], step=self.first)
+        ascent = DualAscent(choices, lines, len(own), step=self.first)
         for number in range(self.steps + 1):
-            if need is not None and bool((best.lower[own] > need[own]).all()):
-                return np.full((len(own), 2), -1, np.int64)
             chosen, bounds = self.evaluate(index, start, k, ascent)
             better = bounds.lower > best.lower[own]
             best.lower[own[better]], best.plane[own[better]] = bounds.lower[better], bounds.plane[better]
             if number < self.steps:
                 self.move(index, k, chosen, bounds, ascent)
-        return self._loosest(chosen, choices, len(own))
 
     def evaluate(
         self, index: int, start: Coefficients, k: int, ascent: DualAscent
@@ -116,21 +105,6 @@ class RowAscent:
             if source in node.inputs and k in chosen.trace
         ]
         return max(sizes, default=0.0)
-
-    def _loosest(self, chosen: OptimisedSlopes, choices: Mapping[int, Sequence[LineChoice]], count: int) -> Int64:
-        """[R, 2] the node and place of the input of the open ReLU that costs each row most."""
-        loosest, most = np.full((count, 2), -1, np.int64), np.full(count, -1.0)
-        for k, own in choices.items():
-            if k not in chosen.trace or not isinstance(own[0], ReluSlopes):
-                continue
-            flat = own[0].units.flat
-            losses = own[0].losses(chosen.trace[k].reshape(count, -1)[:, flat])
-            at = losses.argmax(1)
-            value = losses[np.arange(count), at]
-            here = value > most
-            most[here] = value[here]
-            loosest[here, 0], loosest[here, 1] = self.network.nodes[k - 1].inputs[0], flat[at[here]]
-        return loosest
 
     def _derivatives(
         self, index: int, cell: int, chosen: OptimisedSlopes, found: BackwardBounds, ascent: DualAscent

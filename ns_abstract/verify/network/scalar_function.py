@@ -147,7 +147,7 @@ class ScalarFunction(Activation):
         low, high = lower.reshape(-1), upper.reshape(-1)
         if any(self.bends):
             parts = [work(*ends) for ends in zip(low.split(_TOGETHER), high.split(_TOGETHER), strict=True)]
-            results = [torch.cat(v) for v in zip(*(_fields(part) for part in parts), strict=True)]
+            results = [torch.cat(v) for v in zip(*parts, strict=True)]
             return LinearRelaxation(*(v.reshape(lower.shape) for v in results))
         middle = 0.5 * (low + high)
         slope, value = self.straight(middle), self.function(middle)
@@ -165,7 +165,7 @@ class ScalarFunction(Activation):
             kinked |= (low < point) & (high > point)
         at = kinked.nonzero()[:, 0]
         for part in at.split(_TOGETHER):
-            for whole, own in zip(results, _fields(work(low[part], high[part])), strict=True):
+            for whole, own in zip(results, work(low[part], high[part]), strict=True):
                 whole[part] = own
         return LinearRelaxation(*(v.reshape(lower.shape) for v in results))
 
@@ -302,10 +302,6 @@ class Tangents:
         far = torch.maximum(self.lower.abs(), self.upper.abs())
         size = self.values.abs().amax(0) + value.abs() + (slope.abs() + self.curve.slope_scale) * width + OWN_FUNCTION
         return slope, self.side * (touch + OWN_FUNCTION * (size + slope.abs() * far))
-
-
-def _fields(lines: LinearRelaxation) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    return lines.lower_slope, lines.lower_offset, lines.upper_slope, lines.upper_offset
 
 
 def _size(lower: Tensor, upper: Tensor) -> Tensor:

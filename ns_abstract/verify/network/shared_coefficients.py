@@ -128,7 +128,7 @@ class _ReferenceCell(CoefficientSource):
         #: what all is relative to, by node, and what is followed at maxima
         self.references: dict[int, Tensor] = {}
         self.winners: dict[int, Tensor] = {}
-        self.cells = NetworkBounds(network, images, "everywhere", memory, arithmetic, sharing=self)
+        self.cells = NetworkBounds(network, images, memory, arithmetic, sharing=self)
 
     def reference(self, k: int, passed_on: Callable[[], Tensor]) -> Tensor:
         self.references[k] = passed_on()
@@ -139,12 +139,7 @@ class _ReferenceCell(CoefficientSource):
         return winner
 
     def reuse_bounds(
-        self,
-        index: int,
-        form: NodeForm,
-        unstable: Tensor,
-        apart: Tensor | None,
-        layer: Activation | None,
+        self, index: int, form: NodeForm, unstable: Tensor, apart: Tensor | None, layer: Activation | None
     ) -> tuple[NodeForm, Tensor, Tensor | None]:
         if isinstance(layer, LeakyRelu):
             # they may be open elsewhere
@@ -197,7 +192,7 @@ class _ReusingCells(CoefficientSource):
         self._last = max(first.stored, default=0) if fresh else None
         self._columns: dict[int, tuple[NDArray[np.float32], NDArray[np.float32]]] = {}
         self._count = images.count
-        self.cells = NetworkBounds(first.network, images, "everywhere", memory, arithmetic, sharing=self)
+        self.cells = NetworkBounds(first.network, images, memory, arithmetic, sharing=self)
 
     def about(self, middle: Float64) -> Float64:
         # what rows gathered at maxima and products is relative to the first cell's references
@@ -315,12 +310,7 @@ class _ReusingCells(CoefficientSource):
         return _ReusedBounds(np.moveaxis(slopes, 0, -1) * stored.sign[:, None], middle * stored.sign, half, *ends)
 
     def reuse_bounds(
-        self,
-        index: int,
-        form: NodeForm,
-        unstable: Tensor,
-        apart: Tensor | None,
-        layer: Activation | None,
+        self, index: int, form: NodeForm, unstable: Tensor, apart: Tensor | None, layer: Activation | None
     ) -> tuple[NodeForm, Tensor, Tensor | None]:
         form = self._borrowed(index, form)
         if layer is not None:

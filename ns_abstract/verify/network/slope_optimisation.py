@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ns_abstract.arithmetic.network_charges import OWN_LINE, UP
-from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.verify.network.bilinear import Product
 from ns_abstract.verify.network.graph import Network
 from ns_abstract.verify.network.layers import Activation, LinearLayer
@@ -36,7 +35,7 @@ class SplitNeurons:
 
     Attributes:
         flat: [B] where they are.
-        side: [B] 1 where they are assumed not to be negative, -1 where not positive; or [R, B] by row, 0 for neither.
+        side: [R, B] 1 where a row assumes them not to be negative, -1 where not positive, 0 for neither.
         reference: [B] their reference.
         noise: [B] charged for every part of a coefficient: rounding of the node and of rows.
     """
@@ -48,7 +47,7 @@ class SplitNeurons:
 
     def __getitem__(self, rows: np.ndarray) -> SplitNeurons:
         """Those of some rows."""
-        return replace(self, side=self.side[rows]) if self.side.ndim > 1 else self
+        return replace(self, side=self.side[rows])
 
     def pay(self, multiplier: Float32) -> tuple[Float32, Float64]:
         """What rows gain for ``multiplier`` [R, B], not negative: coefficients [R, B], and [R] the least offset.
@@ -200,12 +199,9 @@ def slope_derivatives(
     """
     values: list[Tensor | None] = [image]
     held = ascent.split
-    left = list(network.readers)
     count, forces = image.shape[0], {}
     by_node = {k: [np.zeros(v.shape) for v in own] for k, own in ascent.parameters.items()}
-    for k, node in enumerate(network.nodes[:last], 1):
-        check_cancelled()
-        inputs = [v for v in (values[i] for i in node.inputs) if v is not None]
+    for k, node, inputs in network.walk(values, last):
         coefficients = trace.get(k)
         if isinstance(node.layer, LinearLayer):
             values.append(node.layer.apply(inputs))
@@ -231,8 +227,4 @@ def slope_derivatives(
                 coefficient = coefficients.reshape(count, -1)[:, at.flat].astype(np.float64)
                 value = u[:, at.flat] + at.reference
                 by_node[k][number] = choice.derivative(ascent.parameters[k][number], coefficient, value)
-        for i in node.inputs:
-            left[i] -= 1
-            if not left[i]:
-                values[i] = None
     return by_node, {k: forces.get(k, np.zeros((count, len(v.flat)))) for k, v in held.items()}
