@@ -85,6 +85,11 @@ def test_a_command_takes_both(tmp_path: Path) -> None:
         job = open_job(Settings(config, save(tmp_path / name, value), spec))
         center = job.pose_sets[0].camera.camera_to_world[:, 3]
         np.testing.assert_allclose(center, POSE[:, 3] * (0.5 if name == "transforms.json" else 1.0), atol=1e-15)
+    # without it nothing says where the data set's cameras stand in the run's frame
+    file.unlink()
+    with pytest.raises(InputError, match=r"beside its dataparser_transforms\.json"):
+        open_job(Settings(config, tmp_path / "transforms.json", spec))
+    open_job(Settings(config, tmp_path / "cameras.json", spec))
 
 
 def test_intrinsics_of_a_camera_path(tmp_path: Path) -> None:

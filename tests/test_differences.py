@@ -629,6 +629,20 @@ def test_mistakes_are_one_line(
     assert not (tmp_path / "out").exists()
 
 
+def test_a_run_that_lost_its_frame_is_taken_to_be_in_the_others(tmp_path: Path) -> None:
+    """And the report says that nothing compared them."""
+    scene = blob_scene(count=10)
+    runs = [write(tmp_path, scene, name) for name in "ab"]
+    frame = PoseBox.around(ring()[0], parse_perturbation(SHIFT))
+    origins = []
+    for lost in (False, True):
+        if lost:
+            (runs[1].parent / "dataparser_transforms.json").unlink()
+        job = ComparisonJob(*map(nsa.load_scene, runs), [frame])
+        origins.append(job.frame_choice.origin)
+    assert origins == ["equal dataparser_transforms.json", "default: the file of B states none"]
+
+
 @pytest.mark.slow
 def test_two_nerfs(tmp_path: Path, in_process: InProcess) -> None:
     run = nerf_run(tmp_path)

@@ -33,6 +33,14 @@ INPUTS = (
         f"{_DATA_SET}::test_bad_cameras_end_in_one_line[a list of distortions]",
     ),
     Fault(
+        "cameras of a data set: a run without a transform has the data set's frame",
+        "api/scenes.py",
+        "Scene.run_frame",
+        "entry.origin == NO_TRANSFORMS",
+        "False",
+        f"{_DATA_SET}::test_a_command_takes_both",
+    ),
+    Fault(
         "cameras of a data set: lenses of all frames are not looked at",
         _CAMERAS,
         "transforms_cameras",

@@ -76,7 +76,8 @@ def transforms_cameras(
     """
     if frame is None:
         problem = "is a data set's transforms.json, and the scene is no run whose frame could be told from it"
-        raise InputError(problem, fix="give the config.yml of a run trained on it, or make a camera path")
+        fix = "give the config.yml of a run trained on it, beside its dataparser_transforms.json, or make a camera path"
+        raise InputError(problem, fix=fix)
     frames = root.get("frames")
     if not isinstance(frames, list) or not frames:
         raise unusable(frames, field="frames", fix="write a list of at least one camera")
