@@ -85,6 +85,11 @@ def test_a_command_takes_both(tmp_path: Path) -> None:
         job = open_job(Settings(config, save(tmp_path / name, value), spec))
         center = job.pose_sets[0].camera.camera_to_world[:, 3]
         np.testing.assert_allclose(center, POSE[:, 3] * (0.5 if name == "transforms.json" else 1.0), atol=1e-15)
+    # without it nothing says where the data set's cameras stand in the run's frame
+    file.unlink()
+    with pytest.raises(InputError, match=r"beside its dataparser_transforms\.json"):
+        open_job(Settings(config, tmp_path / "transforms.json", spec))
+    open_job(Settings(config, tmp_path / "cameras.json", spec))
 
 
 def test_intrinsics_of_a_camera_path(tmp_path: Path) -> None:
@@ -94,10 +99,46 @@ def test_intrinsics_of_a_camera_path(tmp_path: Path) -> None:
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (40, 40, 15.5, 11)
 
 
+def test_what_all_frames_have_comes_first(tmp_path: Path) -> None:
+    """Nerfstudio reads a frame's own intrinsics where the file states none for all frames."""
+    value = transforms()
+    value["frames"][0] |= {"fl_x": 60.0, "cx": 3.0, "cy": 4.0, "w": 64}
+    del value["cy"]
+    camera = load_camera_path(save(tmp_path / "t.json", value), 1, DataparserTransform(np.eye(3, 4), 1.0)).cameras[0]
+    assert (camera.fx, camera.fy, camera.cx, camera.cy, camera.width) == (30, 31, 15, 4, 32)
+
+
+def test_axes_of_colmap_are_applied_where_nothing_is_stated(tmp_path: Path) -> None:
+    """Data sets of former versions, which have COLMAP's model beside them (nerfstudio_dataparser.py)."""
+    (tmp_path / "colmap" / "sparse" / "0").mkdir(parents=True)
+    swapped = np.array([[0.0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]])
+    matrix = np.column_stack([np.asarray(look_at((0.0, 0.0, 0.0), (1.0, 2.0, 0.5)))[:3, :3], [0.3, -0.1, 0.2]])
+    both = DataparserTransform(matrix @ np.vstack([swapped, [0, 0, 0, 1]]), 1.0)
+    file = tmp_path / "transforms.json"
+    for value, inner in ((transforms(), matrix), (transforms(applied_transform=np.eye(3, 4).tolist()), both.matrix)):
+        camera = load_camera_path(save(file, value), 1, both).cameras[0]
+        np.testing.assert_allclose(camera.camera_to_world, inner @ np.vstack([POSE, [0, 0, 0, 1]]), atol=1e-14)
+
+
 BAD: dict[str, tuple[Any, str]] = {
     "distorted": (transforms(k1=0.01), "distorted"),
     "distorted frame": (
         transforms(frames=[{"transform_matrix": [*POSE.tolist(), [0, 0, 0, 1]], "p2": -1e-3}]), "frames[0].p2",
+    ),
+    "a frame cannot straighten": (
+        transforms(k1=0.01, frames=[{"transform_matrix": [*POSE.tolist(), [0, 0, 0, 1]], "k1": 0.0}]), "distorted",
+    ),
+    "a list of distortions": (transforms(distortion_params=[0.1, 0, 0, 0, 0, 0]), "distortion_params"),
+    "a frame's list of distortions": (
+        transforms(frames=[{"transform_matrix": [*POSE.tolist(), [0, 0, 0, 1]], "distortion_params": [0, 0.1]}]),
+        "frames[0].distortion_params",
+    ),
+    "a frame cannot hide a fisheye": (
+        transforms(
+            camera_model="OPENCV_FISHEYE",
+            frames=[{"transform_matrix": [*POSE.tolist(), [0, 0, 0, 1]], "camera_model": "OPENCV"}],
+        ),
+        "camera_model",
     ),
     "fisheye": (transforms(camera_model="OPENCV_FISHEYE"), "camera_model"),
     "no frames": (transforms(frames=[]), "frames"),

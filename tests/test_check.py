@@ -27,13 +27,14 @@ from ns_abstract.api.checking import check
 from ns_abstract.check.claims import _divided
 from ns_abstract.check.forms import Affine, parameters
 from ns_abstract.check.inputs import BadInput, read_poses
-from ns_abstract.check.pictures import ClaimedBounds
+from ns_abstract.check.pictures import ClaimedBounds, Picture
 from ns_abstract.check.poses import CheckedCamera, Poses
 from ns_abstract.check.results import partition, read_cells
 from ns_abstract.check.splats import FLOAT, ActivatedScene, activated, meeting, pixels, reaches
 from ns_abstract.cli import check as check_command
 from ns_abstract.geometry.camera_path import PinholeCamera as PathCamera
 from ns_abstract.geometry.poses import PoseBox
+from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.constants import VERSIONS
 from ns_abstract.methods.splat.reference import Reference
 from ns_abstract.methods.splat.scene import SplatScene
@@ -519,6 +520,32 @@ def test_frames_of_which_nothing_is_claimed_are_named(copy: Path, in_process: In
 def test_too_little_time_is_no_success(copy: Path, in_process: InProcess) -> None:
     code, out, _ = in_process(check_command.main, [str(copy), "--claims", "50", "--seconds", "0.001"])
     assert code == 3 and "50 not settled" in out
+    assert json.loads((copy / "check.json").read_text())["uniform"]["claims"] == 25
+
+
+@pytest.mark.slow
+def test_claims_past_the_time_are_not_drawn(copy: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """However many they are: drawing one takes time, too."""
+    drawn: list[Any] = []
+
+    draw = Picture.draw
+
+    def counted(*given: Any, **more: Any) -> Any:
+        drawn.append(given)
+        return draw(*given, **more)
+
+    monkeypatch.setattr(Picture, "draw", counted)
+    found = check(copy, claims=100_000, seconds=0.5)
+    assert len(drawn) < 10_000 and found.claims == 100_000 and found.unsettled >= 90_000 and found.exit_code == 3
+    with pytest.raises(InputError, match="claims"):
+        check(copy, claims=10**23)
+
+
+@pytest.mark.parametrize("name", ["x" * 5000, "a\0b"])
+def test_names_that_no_file_has_are_one_line(name: str) -> None:
+    for options in ({"output_dir": name}, {"output_dir": ".", "model": name}):
+        with pytest.raises(InputError, match="cannot be opened"):
+            check(**options)
 
 
 BAD: dict[str, tuple[Callable[[Path], object], str]] = {

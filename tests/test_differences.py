@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import Inputs, blob_scene, ring
+from nerfactos import tiny_nerfacto
 from scene_files import nerf_run, path_of
 
 import ns_abstract as nsa
@@ -25,6 +26,7 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.geometry.transform import DataparserTransform
+from ns_abstract.methods.nerf.write import write_nerfacto_run
 from ns_abstract.methods.splat.frame import linear_sets
 from ns_abstract.methods.splat.method import SplatMethod
 from ns_abstract.methods.splat.scene import SplatScene
@@ -586,6 +588,16 @@ def _scaled(folder: Path) -> dict[str, Any]:
     return {"other": write(folder, replace(blob_scene(), dataparser=DataparserTransform(scale=2.0)), "scaled")}
 
 
+def _turned(folder: Path) -> dict[str, Any]:
+    """Two runs of a data set far from its origin, which stand alike but for a turn of a degree."""
+    runs = []
+    for name, angle in (("far", 0.0), ("far-turned", np.radians(1.0))):
+        turn = np.array([[np.cos(angle), -np.sin(angle), 0.0], [np.sin(angle), np.cos(angle), 0.0], [0.0, 0.0, 1.0]])
+        frame = DataparserTransform(np.column_stack([turn, [4.5e6, 3e5, 100.0]]), 0.01)
+        runs.append(write(folder, replace(blob_scene(), dataparser=frame), name))
+    return {"load_config": runs[0], "other": runs[1]}
+
+
 def _varied(folder: Path) -> dict[str, Any]:
     spec = folder / "varied.json"
     spec.write_text(json.dumps({**SHIFT, "scene": [{"select": {"opacity": [0, 1]}, "opacity": 0.1}]}))
@@ -597,6 +609,7 @@ def _varied(folder: Path) -> dict[str, Any]:
     [
         (_moved, ["dataparser_transforms.json", "--other"]),
         (_scaled, ["dataparser_transforms.json", "--other"]),
+        (_turned, ["dataparser_transforms.json", "--other"]),
         (_varied, ["scene", "remove the key"]),
         (lambda folder: {"other": nerf_run(folder)}, ["NeRF", "--other"]),
         (lambda folder: {"other": folder / "absent.ply"}, ["absent.ply"]),
@@ -616,6 +629,20 @@ def test_mistakes_are_one_line(
     assert not (tmp_path / "out").exists()
 
 
+def test_a_run_that_lost_its_frame_is_taken_to_be_in_the_others(tmp_path: Path) -> None:
+    """And the report says that nothing compared them."""
+    scene = blob_scene(count=10)
+    runs = [write(tmp_path, scene, name) for name in "ab"]
+    frame = PoseBox.around(ring()[0], parse_perturbation(SHIFT))
+    origins = []
+    for lost in (False, True):
+        if lost:
+            (runs[1].parent / "dataparser_transforms.json").unlink()
+        job = ComparisonJob(*map(nsa.load_scene, runs), [frame])
+        origins.append(job.frame_choice.origin)
+    assert origins == ["equal dataparser_transforms.json", "default: the file of B states none"]
+
+
 @pytest.mark.slow
 def test_two_nerfs(tmp_path: Path, in_process: InProcess) -> None:
     run = nerf_run(tmp_path)
@@ -633,3 +660,19 @@ def test_two_nerfs(tmp_path: Path, in_process: InProcess) -> None:
     code, _, said = in_process(main, list(map(str, [*options, *more])))
     document = json.loads((tmp_path / "out" / "report.json").read_text())
     assert code == 0 and document["largest_lower"] == 0.0, said
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("behind", ["last_sample", "black"])
+def test_two_nerfactos(behind: str, tmp_path: Path, in_process: InProcess) -> None:
+    """Their runs always say what is behind them; A's background is not taken for B's."""
+    scene, runs = tiny_nerfacto(), []
+    for name in "ab":
+        field = replace(scene.field, background=behind if behind == "last_sample" else np.zeros(3))
+        runs.append(write_nerfacto_run(replace(scene, field=field), tmp_path, timestamp="t", experiment_name=name))
+    options = ["--load-config", runs[0], "--other", runs[1], "--camera-path-filename", path_of(tmp_path)]
+    more = ["--downscale-factor", "4", "--output-dir", tmp_path / "out", "--workers", "1", "--time-budget", "3"]
+    code, _, said = in_process(main, list(map(str, [*options, *more])))
+    assert code == 0, said
+    document = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert document["largest_lower"] == 0.0 and not any("A's" in entry["origin"] for entry in document["assumptions"])

@@ -16,6 +16,7 @@ from test_locate import taken
 import ns_abstract as nsa
 from ns_abstract.api.location import calibrate, training_data
 from ns_abstract.api.sequence import grown
+from ns_abstract.cli.certify import main as certify_main
 from ns_abstract.cli.locate import main
 from ns_abstract.geometry.camera_path import load_camera_path
 from ns_abstract.geometry.poses import PoseBox
@@ -133,6 +134,20 @@ def test_calibration_needs_the_photos(make_blobs: Callable[..., Inputs], tmp_pat
         )
         assert code == 2 and words in err and err.count("\n") == 1, err
         assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_that_cannot_be_used_is_one_line(blobs: Inputs, tmp_path: Path, in_process: InProcess) -> None:
+    """What is searched for is told once it is searched for."""
+    image, file = tmp_path / "photo.png", tmp_path / "file"
+    Image.new("RGB", (32, 32), 0).save(image)
+    file.touch()
+    options = blobs.options(file, image=image, frames=0, workers=1)
+    prop = {"type": "picture", "region": [0, 0, 4, 4], "statistic": "mean", "channel": "r", "max": 1.0}
+    (tmp_path / "prop.json").write_text(json.dumps(prop))
+    claimed = blobs.options(file, property=tmp_path / "prop.json", frames=0, workers=1)
+    for command, given in ((main, options), (certify_main, claimed)):
+        code, _, err = in_process(command, given)
+        assert code == 2 and "--output-dir" in err and err.count("\n") == 1, err
 
 
 # ---------------------------------------------------------------- sequences

@@ -111,6 +111,13 @@ REFUSED = [
     ({"orbit": ORBIT | {"axis": [0, "1", 0]}}, "orbit.axis"),
     ({"orbit": ORBIT | {"axis": [1e200, 1e200, 0]}}, "orbit.axis"),
     ({"orbit": ORBIT | {"azimuth": [1, 0]}}, "orbit.azimuth"),
+    ({"orbit": ORBIT | {"azimuth": [0, 1e308]}}, "orbit.azimuth"),
+    ({"orbit": ORBIT | {"target": [0, 1e300, 0]}}, "orbit.target"),
+    # the width of these overflows
+    ({"translation": {"x": 1e308}}, "translation.x"),
+    ({"translation": {"x": 1, "z": [-1e16, 0]}}, "translation.z"),
+    ({"rotation": {"roll": 1e308}}, "rotation.roll"),
+    ({"scene": [{"select": {}, "color": 0.1}, {"select": {}, "mean": 1e308}]}, "scene[1].mean"),
     ({"orbit": ORBIT | {"azimuth": None}}, "orbit.azimuth"),
 ]
 

@@ -11,7 +11,7 @@ from PIL import Image
 from splat_files import deep_png
 
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.photos import read_grey_mask, read_mask, read_photo
+from ns_abstract.io.photos import read_grey_mask, read_mask, read_photo, sequence_photos
 
 DEEP = np.random.default_rng(0).integers(0, 1 << 16, (5, 7, 3)).astype(np.uint16)
 
@@ -58,3 +58,10 @@ def test_grey_masks_of_16_bits_are_refused(tmp_path: Path) -> None:
     values = (DEEP[..., 0] >> 8).astype(np.uint8)
     Image.fromarray(values).save(file)
     np.testing.assert_array_equal(read_grey_mask(file), values >= 128)
+
+
+@pytest.mark.parametrize("name", ["x" * 5000, "a\0b"])
+def test_names_that_no_file_has(name: str) -> None:
+    for read in (read_photo, sequence_photos, lambda file: read_mask(file, (5, 7))):
+        with pytest.raises(InputError, match="no such"):
+            read(Path(name))

@@ -724,3 +724,13 @@ def test_linear_axis(high):
     axis = page.PlotAxis(0.0, high, 200.0, 20.0, log=False)
     ticks = axis.ticks()
     assert 3 <= len(ticks) <= 8 and ticks[0] == 0.0 and all(20.0 - 1e-6 <= axis(tick) <= 200.0 for tick in ticks)
+
+
+def test_names_that_are_no_utf8(tmp_path):
+    """Linux lets a file have any bytes as its name; Python has surrogates in it, which no page and no JSON has."""
+    name = os.fsdecode(b"caf\xe9.yml")
+    report = Report(tmp_path, run(command=("render", name), settings={"load_config": Path(name)}))
+    report.add(frame(0))
+    report.finish("done")
+    assert read(tmp_path)["command"] == ["render", name] and first_command(tmp_path) == ["render", name]
+    assert r"caf\udce9.yml" in (tmp_path / "report.html").read_text()

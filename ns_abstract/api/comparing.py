@@ -22,6 +22,7 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import CameraPath, PinholeCamera, load_camera_path
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
+from ns_abstract.geometry.transform import DataparserTransform
 from ns_abstract.io.arguments import at_least, positive
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
@@ -38,8 +39,8 @@ class ComparisonTuning:
     """What counts as the same.
 
     Attributes:
-        same_frame: Entries by which transforms of two runs to one frame may differ, relative to the largest: rounding
-            of their files.
+        same_frame: By which the maps of two runs to their frames may differ, in the entries of rotation and scale
+            together and, relative to its length, in the shift: rounding of their files.
     """
 
     same_frame: float = 1e-6
@@ -200,8 +201,7 @@ def _check_comparable(scene: Scene, other: Scene, pose_sets: Sequence[PoseBox]) 
     first, second = scene.run_frame, other.run_frame
     if first is None or second is None:
         return
-    matrices = [np.append(frame.matrix.ravel() * frame.scale, frame.scale) for frame in (first, second)]
-    if not np.abs(matrices[0] - matrices[1]).max() <= _TUNING.same_frame * np.abs(matrices[0]).max():
+    if not _same_frame(first, second):
         raise InputError(
             f"its dataparser_transforms.json is not that of {scene.source.file}, so one camera would not look at the "
             "same place",
@@ -209,6 +209,15 @@ def _check_comparable(scene: Scene, other: Scene, pose_sets: Sequence[PoseBox]) 
             field="--other",
             fix="train it with the same data and the dataparser's same options, or export it in A's frame",
         )
+
+
+def _same_frame(first: DataparserTransform, second: DataparserTransform) -> bool:
+    """Whether both runs put every point of the data set at the same place, but for rounding of their files."""
+    turns, shifts = zip(*((f.matrix[:, :3] * f.scale, f.matrix[:, 3] * f.scale) for f in (first, second)), strict=True)
+    # of a data set far from its origin the shift is long beside rotation and scale, which have a tolerance of their own
+    sizes = first.scale, float(np.abs(turns[0]).max()), max(first.scale, float(np.abs(shifts[0]).max()))
+    changes = abs(first.scale - second.scale), np.abs(turns[0] - turns[1]).max(), np.abs(shifts[0] - shifts[1]).max()
+    return all(change <= _TUNING.same_frame * size for change, size in zip(changes, sizes, strict=True))
 
 
 def _frame_choice(scene: Scene, other: Scene) -> Assumption:
@@ -226,7 +235,8 @@ def open_comparison(settings: Settings, other: SceneSource, tolerance: float | N
     used.
     """
     scene, second = settings.scene.open(), other.open()
-    if second.background is None and scene.background is not None:
+    # a run of a NeRF always says what is behind it
+    if not second.rays and second.background is None and scene.background is not None:
         second = second.on_background(scene.background, _BACKGROUND_OF_A)
     run_frame = second.run_frame if scene.run_frame is None else scene.run_frame
     path = load_camera_path(settings.camera_path_filename, settings.downscale_factor, run_frame)

@@ -306,7 +306,8 @@ def training_data(scene: Scene) -> Path:
     """
     file = scene.source.file
     if scene.run_frame is None:
-        raise InputError("the scene is no run with photos", file=file, field=_OPTION, fix="give --noise and --outliers")
+        problem = "the scene is no run with photos, or its dataparser_transforms.json is missing"
+        raise InputError(problem, file=file, field=_OPTION, fix="give --noise and --outliers")
     run = read_config(file)
     value = run.root.get("data")
     stated = value.value if isinstance(value, Tagged) else [value]

@@ -20,6 +20,7 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.methods.load import open_scene
 from ns_abstract.methods.overrides import UNSAID, OverrideKeywords, Overrides, assumption_of
 from ns_abstract.methods.program_options import ProgramOptions
+from ns_abstract.methods.runs import NO_TRANSFORMS
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.refine.protocol import Method, PreciseFrame
 
@@ -93,7 +94,9 @@ class Scene:
 
     @property
     def run_frame(self) -> DataparserTransform | None:
-        """From the frame of the run's data set to the run's; None where the scene is no run."""
+        """From the frame of the run's data set to the run's; None where the scene is no run, or its folder says none."""
+        if any(entry.origin == NO_TRANSFORMS for entry in self.assumptions):
+            return None
         if self.source.file.is_file() and self.source.file.suffix.lower() not in (".yml", ".yaml"):
             return None
         return self._content.dataparser

@@ -66,14 +66,14 @@ def _together(report: dict[str, Any], parts: list[StoredCells], frames: Collecti
 
 
 def outcomes(subjects: list[Claims], claims: int, seconds: float, seed: int) -> Iterator[ClaimOutcome]:
-    """Draws claims, every second one uniformly, and settles each; the others hunt for faults."""
+    """Draws claims while there is time, every second one uniformly, and settles each; the others hunt for faults."""
     end, rng = time.monotonic() + seconds, np.random.default_rng(seed)
     sizes = np.array([s.count for s in subjects], np.float64)
-    for number in range(claims):
+    for number in (number for number in range(claims) if time.monotonic() < end):
         subject, start = subjects[int(rng.choice(len(subjects), p=sizes / sizes.sum()))], time.monotonic()
         claim, share = subject.draw(rng, hunted=number % 2 == 1), 4.0 * (end - start) / (claims - number)
         with reading("report.json", "says what this program cannot follow", "make the result again"):
-            settled = subject.settle(claim, min(start + share, end)) if start < end else (None, False, {})
+            settled = subject.settle(claim, min(start + share, end))
         refutation = {"frame": subject.cells.index, **subject.place(claim), **settled[2]} if settled[0] is False else {}
         yield ClaimOutcome(*settled[:2], number % 2 == 0, refutation)
 

@@ -48,15 +48,18 @@ def searched(
     frame: int,
     request: Request,
     kept: Callable[[Store], str],
+    introduce: Callable[[], None] = lambda: None,
 ) -> dict[str, Any]:
     """Search for verdicts as ``request`` says, with a bar of progress; returns the content of report.json.
 
     Args:
         job: Of the pictures; the kernels of its ``frame`` are compiled first, once and not in every worker.
         kept: What is told of a search that goes on with an earlier one.
+        introduce: Prints what is searched for, once nothing of it is refused: an error is the only line then.
     """
 
     def opened(store: Store) -> None:
+        introduce()
         if store.resumed:
             console.print(f"  {kept(store)}")
         if where.engine == "local":
@@ -84,8 +87,7 @@ def locate_photos(options: Locate, stop: SignalStop) -> None:
         with stop.at_once():
             location = open_location(options.settings)
             frames = check_frames(options.frames, location.job.frame_count)
-        _tell(console, location)
-        _search(options, stop, console, location, frames, options.output_dir)
+        _search(options, stop, console, location, frames, options.output_dir, lambda: _tell(console, location))
         return
     with stop.at_once():
         settings = options.settings
@@ -93,11 +95,15 @@ def locate_photos(options: Locate, stop: SignalStop) -> None:
         photos = open_sequence(
             settings, options.image_sequence, options.motion, options.output_dir, options.frames, options.resume
         )
-    _tell(console, photos.first)
+    untold = [photos.first]
 
     def search(location: Location, frames: tuple[int, ...], folder: Path) -> dict[str, Any]:
-        console.print(f"{location.file}")
-        return _search(options, stop, console, location, frames, folder)
+        def introduce() -> None:
+            if untold:
+                _tell(console, untold.pop())
+            console.print(f"{location.file}")
+
+        return _search(options, stop, console, location, frames, folder, introduce)
 
     document = photos.follow(search)
     if document["not_examined"] and document["state"] == "done":
@@ -120,19 +126,29 @@ def _tell(console: Any, location: Location) -> None:
 
 
 def _search(
-    options: Locate, stop: SignalStop, console: Any, location: Location, frames: tuple[int, ...], folder: Path
+    options: Locate,
+    stop: SignalStop,
+    console: Any,
+    location: Location,
+    frames: tuple[int, ...],
+    folder: Path,
+    introduce: Callable[[], None],
 ) -> dict[str, Any]:
-    """Locate one photo; returns the content of its report.json."""
+    """Locate one photo; returns the content of its report.json. ``introduce``: as in `searched`."""
     # a photo of a sequence that was not begun has no folder yet
     resume = options.resume and (options.image_sequence is None or (folder / "cells.sqlite").exists())
     question = LocationQuestion(location, frames, stated(options), ("ns-abstract-locate", *sys.argv[1:]))
-    for note in question.about.plan:
-        console.print(f"  {note}")
+
+    def introduced() -> None:
+        introduce()
+        for note in question.about.plan:
+            console.print(f"  {note}")
 
     request = Request(options.time_budget or _LOCATE_SECONDS, resume)
     document = searched(
         question, folder, options.where, stop, console, location.job, frames[0], request,
         lambda store: f"{store.open_blocks} cells still to be examined from before",
+        introduced,
     )  # fmt: skip
     left = percent(document["possible_volume"])
     console.print(f"{_ANSWERS[document['answer']]}; {left} of the set left")
@@ -166,13 +182,12 @@ def certify_path(options: Certify, stop: SignalStop) -> bool:
         check_network_memory(job, options.memory_limit, workers)
         frames = check_frames(options.frames, job.job.frame_count)
         question = CertificateQuestion(job, frames, stated(options), ("ns-abstract-certify", *sys.argv[1:]))
-    _introduce(console, job, question.about.plan)
-
     budget = options.time_budget or _CERTIFY_SECONDS
     document = searched(
         question, options.output_dir, options.where, stop, console, job.job, frames[0],
         Request(budget, options.resume, scene_margin=options.scene_margin),
         lambda store: f"{store.count} cells kept from before, {store.open_blocks} blocks still to be examined",
+        lambda: _introduce(console, job, question.about.plan),
     )  # fmt: skip
     covered = coverage(document["frames"])
     parts = ", ".join(f"{kind} {percent(covered[kind])}" for kind in ("certified", "falsified", "unknown"))

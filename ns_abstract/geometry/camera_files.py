@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,8 @@ from ns_abstract.io.jsonio import InputTuning, is_number, show, unusable
 #: OpenCV axes (x right, y down, z forward) as OpenGL axes (x right, y up, z back).
 _OPENGL = np.diag([1.0, -1.0, -1.0])
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+#: What Nerfstudio takes for applied_transform where a data set states none and has this folder beside it.
+_COLMAP_FOLDER, _COLMAP_APPLIED = "colmap/sparse/0", [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
 _INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 
@@ -55,34 +58,48 @@ def inria_cameras(root: list[dict[str, Any]]) -> Iterator[FileCamera]:
         yield FileCamera(field, pose.tolist(), focal[0], focal[1], sides[0] / 2, sides[1] / 2, width, height)
 
 
-def transforms_cameras(root: Mapping[str, Any], frame: DataparserTransform | None) -> Iterator[FileCamera]:
+def transforms_cameras(
+    root: Mapping[str, Any], frame: DataparserTransform | None, folder: Path
+) -> Iterator[FileCamera]:
     """The cameras of a data set's ``transforms.json``, in the frame of a run that was trained on it.
 
-    ``frame``: the run's; None: the scene is no run. Raises InputError where there is no run, a camera is not a plain
-    perspective one, or a field is missing.
+    As Nerfstudio reads them (nerfstudio_dataparser.py): what the file states for all frames comes before what a frame
+    states.
+
+    Args:
+        root: The content of the file.
+        frame: The run's; None: the scene is no run.
+        folder: Where the file lies.
+
+    Raises:
+        InputError: There is no run, a camera is not a plain perspective one, or a field is missing.
     """
     if frame is None:
         problem = "is a data set's transforms.json, and the scene is no run whose frame could be told from it"
-        raise InputError(problem, fix="give the config.yml of a run trained on it, or make a camera path")
+        fix = "give the config.yml of a run trained on it, beside its dataparser_transforms.json, or make a camera path"
+        raise InputError(problem, fix=fix)
     frames = root.get("frames")
     if not isinstance(frames, list) or not frames:
         raise unusable(frames, field="frames", fix="write a list of at least one camera")
     # the run's frame is that of the poses here after what was applied to them is undone
-    applied = np.eye(4)
-    if "applied_transform" in root:
-        applied[:3] = _matrix(root["applied_transform"], 3, 4, "applied_transform")
+    applied, stated = np.eye(4), root.get("applied_transform")
+    if "applied_transform" not in root and (folder / _COLMAP_FOLDER).exists():
+        stated = _COLMAP_APPLIED
+    if "applied_transform" in root or stated is not None:
+        applied[:3] = _matrix(stated, 3, 4, "applied_transform")
     if not abs(np.linalg.det(applied)) > InputTuning.nothing:
         raise InputError("a matrix that cannot be inverted", field="applied_transform", fix="write a rotation")
     applied_scale = _number(root.get("applied_scale", 1.0), "applied_scale")
     if not applied_scale > 0:
         raise unusable(applied_scale, field="applied_scale", fix="write a number above 0")
     undone = DataparserTransform(frame.matrix @ np.linalg.inv(applied), frame.scale / applied_scale)
+    _refuse_distorted(root, "")
     for i, entry in enumerate(frames):
         field = f"frames[{i}]"
         if not isinstance(entry, dict):
             raise unusable(entry, field=field, fix="write an object")
-        values = {**root, **entry}
-        _refuse_distorted(values, field)
+        _refuse_distorted(entry, f"{field}.")
+        values = {**entry, **root}
         numbers = {key: _number(values.get(key), f"{field}.{key}") for key in _INTRINSICS if key not in ("fl_y",)}
         numbers["fl_y"] = _number(values.get("fl_y", numbers["fl_x"]), f"{field}.fl_y")
         pose = _matrix(entry.get("transform_matrix"), None, 4, f"{field}.transform_matrix")
@@ -93,17 +110,19 @@ def transforms_cameras(root: Mapping[str, Any], frame: DataparserTransform | Non
         )  # fmt: skip
 
 
-def _refuse_distorted(values: Mapping[str, Any], field: str) -> None:
-    model = values.get("camera_model", "PERSPECTIVE")
+def _refuse_distorted(section: Mapping[str, Any], prefix: str) -> None:
+    """Refuse what the whole file or one frame states of other lenses; one of them must not hide the other."""
+    model = section.get("camera_model", "PERSPECTIVE")
     if model not in _MODELS:
         problem = f"found {show(model)}: only perspective cameras are bounded"
-        raise InputError(problem, field=f"{field}.camera_model", fix="undistort the pictures and train on them")
-    for key in _DISTORTION:
-        if values.get(key, 0.0) != 0:
+        raise InputError(problem, field=f"{prefix}camera_model", fix="undistort the pictures and train on them")
+    listed: Any = section.get("distortion_params", 0.0)
+    for key, value in (*((key, section.get(key, 0.0)) for key in _DISTORTION), ("distortion_params", listed)):
+        if any(part != 0 for part in (value if isinstance(value, list) else [value])):
             problem = (
                 "the lens is distorted; Nerfstudio trains on an undistorted, cropped picture, whose camera differs"
             )
-            raise InputError(problem, field=f"{field}.{key}", fix="make a camera path in Nerfstudio's viewer")
+            raise InputError(problem, field=f"{prefix}{key}", fix="make a camera path in Nerfstudio's viewer")
 
 
 def _matrix(value: Any, rows: int | None, columns: int, field: str) -> NDArray[np.float64]:

@@ -162,7 +162,7 @@ def load_camera_path(
         if is_inria(root):
             return _photo_path(inria_cameras(root), str(path), downscale_factor)
         if isinstance(root, dict) and "camera_path" not in root and "frames" in root:
-            return _photo_path(transforms_cameras(root, run_frame), str(path), downscale_factor)
+            return _photo_path(transforms_cameras(root, run_frame, path.parent), str(path), downscale_factor)
         _refuse_others(root)
         return _parse(root, str(path), downscale_factor)
     except InputError as error:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 import os
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 
-from ns_abstract.io.jsonio import unusable
+from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import FIX_ACCESS, show, unusable
 
 
 def positive(value: Any, field: str) -> float:
@@ -36,7 +38,14 @@ def whole(value: Any, least: int, field: str) -> int:
 
 
 def file_path(value: Any, field: str) -> Path:
-    """``value`` as a path. Raises InputError where it names no file."""
+    """``value`` as a path. Raises InputError where it can name no file; what is absent is found when it is read."""
     if not isinstance(value, str | os.PathLike):
         raise unusable(value, field=field, fix="give the path of a file")
+    try:
+        os.stat(value)
+    except (OSError, ValueError) as error:
+        # pathlib's tests of files pass on all errors but these
+        if getattr(error, "errno", None) not in (errno.ENOENT, errno.ENOTDIR, errno.EBADF, errno.ELOOP):
+            problem, name = f"cannot be opened: {getattr(error, 'strerror', None) or error}", show(os.fspath(value))
+            raise InputError(problem, file=name, field=field, fix=FIX_ACCESS) from None
     return Path(value)

@@ -32,11 +32,19 @@ def write_atomic(
         raise
 
 
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write text as UTF-8; errors as for `write_atomic`.
+
+    A name of a file that is no UTF-8 has surrogates in Python, which stand as escapes that JSON reads back.
+    """
+    write_atomic(path, lambda stream: stream.write(text.encode(errors="backslashreplace")))
+
+
 def write_json(path: str | os.PathLike[str], value: Any) -> Path:
     """Write a value as JSON that people can read, and return the file.
 
     Raises OSError: as `write_atomic`. Raises TypeError: JSON has no such value.
     """
     text = json.dumps(value, indent=1) + "\n"
-    write_atomic(path, lambda stream: stream.write(text.encode()))
+    write_text(path, text)
     return Path(path)

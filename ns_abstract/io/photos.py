@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import os
 import re
 from pathlib import Path
 from typing import Any
@@ -46,7 +47,7 @@ def sequence_photos(folder: Path, field: str = "--image-sequence") -> list[Path]
     Raises:
         InputError: There is no such folder, or it holds none.
     """
-    if not folder.is_dir():
+    if not os.path.isdir(folder):
         raise InputError("no such folder", file=folder, field=field, fix="give a folder of photos")
     photos = sorted(file for file in folder.iterdir() if file.suffix.lower() in _ENDINGS and file.is_file())
     if not photos:
@@ -113,7 +114,7 @@ def _refuse_other_bits(image: Any, file: Path, field: str | None = None) -> None
 def _opened(file: Path, field: str) -> Any:
     from PIL import Image
 
-    if not file.is_file():
+    if not os.path.isfile(file):
         raise InputError("no such file", file=file, field=field, fix="give an existing picture")
     try:
         with Image.open(file, formats=_FORMATS) as image:

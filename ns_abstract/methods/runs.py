@@ -32,6 +32,8 @@ from ns_abstract.methods.overrides import assumption_of
 
 CONFIG_NAME = "config.yml"
 TRANSFORMS_NAME = "dataparser_transforms.json"
+#: Origin of the units of a run without that file.
+NO_TRANSFORMS = f"default: {TRANSFORMS_NAME} is missing"
 DEFAULT_MODEL_FOLDER = "nerfstudio_models"
 
 CONFIG_BYTES_LIMIT = 2**20
@@ -245,7 +247,7 @@ def idle_assumptions(state: Collection[str], idle: Mapping[str, str]) -> tuple[A
 
 def units_assumption(transform: DataparserTransform, assumed: bool) -> Assumption:
     """The units of the data set; ``assumed``: the run does not say them."""
-    origin = "default: dataparser_transforms.json is missing" if assumed else "dataparser_transforms.json"
+    origin = NO_TRANSFORMS if assumed else TRANSFORMS_NAME
     return Assumption("units", f"1 of the data set is {transform.scale:.9g}", origin)
 
 

@@ -27,7 +27,7 @@ from viser import ViserServer
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.keyframe_cameras import KeyframeCamera as PathView
 from ns_abstract.geometry.keyframe_cameras import path_json
-from ns_abstract.io.atomic import write_atomic
+from ns_abstract.io.atomic import write_text
 from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.specification import ROTATIONS, TRANSLATIONS, Perturbation, perturbation_object
 from ns_abstract.perturbation.variations import VARIATIONS
@@ -266,7 +266,7 @@ class AbstractPanel(torch.nn.Module):
         try:
             file.parent.mkdir(parents=True, exist_ok=True)
             text = json.dumps(certify_path(view), indent=1) + "\n"
-            write_atomic(file, lambda stream: stream.write(text.encode()))
+            write_text(file, text)
         except OSError as error:
             self._figures.show(f"{self._figures.text}\n\n**{file}** cannot be written ({error.strerror})")
             return

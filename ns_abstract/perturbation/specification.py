@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
@@ -138,16 +138,25 @@ def parse_perturbation(
     for name, (low, high) in shifts.items():
         if low < -1.0 or high > 1.0:
             raise fail(name, f"found {show(value[name])}", "stay within -1 and 1")
-    translation = _ranges(value, "translation", TRANSLATIONS, fail)
-    if units == "dataset":
-        translation = _scaled(translation, dataset_scale)
+    length = dataset_scale if units == "dataset" else 1.0
+    translation = _scaled(_ranges(value, "translation", TRANSLATIONS, fail), length)
+    rotation, orbit = _scaled(_ranges(value, "rotation", ROTATIONS, fail), turn), _orbit(value, fail, turn)
+    scene = _scene(value, fail, field_prefix, folder)
+    parts = {"translation": translation, "rotation": rotation}
+    if orbit is not None:
+        parts["orbit"] = {"target": orbit.target, "azimuth": orbit.azimuth}
+    parts |= {
+        f"scene[{k}]": {name: ends for name in VARIATIONS if (ends := getattr(entry, name)) is not None}
+        for k, entry in enumerate(scene)
+    }
+    _refuse_huge(parts, fail)
     return Perturbation(
         frame=frame,  # pyright: ignore[reportArgumentType]
         translation=translation,
-        rotation=_scaled(_ranges(value, "rotation", ROTATIONS, fail), turn),
+        rotation=rotation,
         sweep=sweep,  # pyright: ignore[reportArgumentType]
-        orbit=_orbit(value, fail, turn),
-        scene=_scene(value, fail, field_prefix, folder),
+        orbit=orbit,
+        scene=scene,
         hue=shifts.get("hue"),
         saturation=shifts.get("saturation"),
         units=units,
@@ -195,6 +204,15 @@ def _ranges(value: Mapping[str, Any], name: str, keys: tuple[str, ...], fail: Fa
         raise fail(name, f"found {show(inner)}", f"write {FILE_KEYS[name]}")
     known(inner, keys, f"{name}.", fail)
     return {key: interval(inner[key], f"{name}.{key}", fail) for key in keys if key in inner}
+
+
+def _refuse_huge(parts: Mapping[str, Mapping[str, Sequence[float]]], fail: Fail) -> None:
+    """Refuse numbers whose differences and products could overflow; they are normalised units and radians."""
+    for part, entries in parts.items():
+        for name, numbers in entries.items():
+            most = max(map(abs, numbers))
+            if not most <= InputTuning.largest:
+                raise fail(f"{part}.{name}", f"reaches {most:g}", f"stay within {InputTuning.largest:g} in size")
 
 
 def _scaled(limits: Mapping[str, Range], factor: float) -> dict[str, Range]:

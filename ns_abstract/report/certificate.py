@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from ns_abstract.io.atomic import write_atomic
+from ns_abstract.io.atomic import write_text
 from ns_abstract.io.folder import unwritable
 from ns_abstract.report.run import CommandRun, plain
 
@@ -155,7 +155,7 @@ def write_certificate(folder: Path, document: Mapping[str, Any], page: str) -> N
     """Write report.json and report.html. Raises InputError where the folder cannot be written."""
     text = json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False)
     try:
-        write_atomic(folder / "report.json", lambda stream: stream.write(f"{text}\n".encode()))
-        write_atomic(folder / "report.html", lambda stream: stream.write(page.encode()))
+        write_text(folder / "report.json", f"{text}\n")
+        write_text(folder / "report.html", page)
     except OSError as error:
         raise unwritable(folder, error) from None

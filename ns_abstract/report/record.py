@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from ns_abstract.io.atomic import write_atomic
+from ns_abstract.io.atomic import write_text
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.folder import first_command, remove_parts, unwritable
 from ns_abstract.io.jsonio import is_number, load_json
@@ -413,7 +413,7 @@ class Report:
         document = self.document()
         try:
             text = json.dumps(document, indent=1, allow_nan=False, ensure_ascii=False)
-            write_atomic(self.folder / "report.json", lambda stream: stream.write(f"{text}\n".encode()))
+            write_text(self.folder / "report.json", f"{text}\n")
             if page:
                 self._write_page(document)
         except OSError as error:
@@ -422,7 +422,7 @@ class Report:
     def _write_page(self, document: dict[str, Any]) -> None:
         begin = time.monotonic()
         text = self._page(document)
-        write_atomic(self.folder / "report.html", lambda stream: stream.write(text.encode()))
+        write_text(self.folder / "report.html", text)
         took = time.monotonic() - begin
         self._page_due = time.monotonic() + max(_PAGE_SECONDS, _PAGE_SHARE * took)
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from markupsafe import Markup, escape
 
-from ns_abstract.io.atomic import write_atomic
+from ns_abstract.io.atomic import write_text
 from ns_abstract.io.folder import unwritable
 from ns_abstract.report.cameras import CameraDrawings
 from ns_abstract.report.certificate_page import along_path, verdict_drawings
@@ -106,7 +106,7 @@ def write_pictures(
         if text is None:
             continue
         try:
-            write_atomic(folder / f"{name}.svg", lambda stream, text=text: stream.write(text.encode()))
+            write_text(folder / f"{name}.svg", text)
         except OSError as error:
             raise unwritable(folder, error) from None
         written.append(f"{name}.svg")

@@ -251,7 +251,7 @@ class StoreFile:
             return
         try:
             # closing() does not commit: nothing is to be written
-            with closing(sqlite3.connect(f"file:{quote(str(self.file.absolute()))}?mode=ro", uri=True)) as base:
+            with closing(sqlite3.connect(f"file:{quote(os.fsencode(self.file.absolute()))}?mode=ro", uri=True)) as base:
                 digests = dict(base.execute("SELECT name, sha256 FROM search_images"))
         except sqlite3.Error:
             return
