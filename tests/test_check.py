@@ -568,6 +568,8 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "no report": (lambda f: (f / "report.json").unlink(), "ns-abstract-render"),
     "damaged report": (lambda f: (f / "report.json").write_text("{"), "cannot be read"),
     "a report of something else": (lambda f: (f / "report.json").write_text('{"version": 1}'), "settings"),
+    "differences": (lambda f: report(f, lambda d: d.update(kind="comparison")), "ns-abstract-compare"),
+    "places of a photo": (lambda f: report(f, lambda d: d.update(answer="none")), "ns-abstract-locate"),
     "a report of other types": (lambda f: report(f, lambda d: d.update(frames=3)), "not the report of a result"),
 }
 

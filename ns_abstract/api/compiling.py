@@ -63,8 +63,9 @@ class _CompileProgress:
         """Say it, with an estimate by the measured times and by the functions that are done, whichever is later."""
         used = time.monotonic() - self.begin
         done = min(done, self.functions)
-        # the first ones say little about the others
-        by_count = used * (self.functions - done) / done if done > self.functions // 3 else 0.0
+        # the first ones say little about the others, but more than a time that is over
+        telling = done > self.functions // 3 or used > self.seconds
+        by_count = used * (self.functions - done) / done if done and telling else 0.0
         left = max(self.seconds - used, by_count, 1.0)
         _log.info(
             "compiling kernels (first use only): %d of %d functions, about %.0f s left", done, self.functions, left

@@ -9,7 +9,7 @@ import numpy as np
 
 from ns_abstract.api.files import PathJob
 from ns_abstract.geometry.poses import PoseBox
-from ns_abstract.report.figures import ShownUnits, listed, number
+from ns_abstract.report.figures import ShownUnits, frames_listed, number
 
 #: Parts of the visible scene elements that are nearer than the depths that are told.
 _QUANTILES = {"near": 0.05, "middle": 0.5, "far": 0.95}
@@ -28,7 +28,8 @@ def _scene(job: PathJob) -> Iterator[str]:
     program = method.program
     yield f"scene      {method.name}: {method.content}, {program['name']} {program['version']}"
     yield "frame      the run's normalised frame; cameras look along -z, x is right, y is up (OpenGL)"
-    yield f"scale      1 unit of the data set (transforms.json) = {number(scale)} normalised units"
+    unit = "normalised unit" if scale == 1.0 else "normalised units"
+    yield f"scale      1 unit of the data set (transforms.json) = {number(scale)} {unit}"
     yield f"           1 cm = {number(0.01 * scale)} normalised units, {_METRES}"
     yield f"           1 degree = {number(math.radians(1.0), 6)} rad"
 
@@ -66,8 +67,7 @@ def _sets(job: PathJob, frames: Sequence[int]) -> Iterator[str]:
     for index in frames:
         frames_by_text.setdefault(tuple(_ranges(job.pose_sets[index], units)), []).append(index)
     for lines, indices in frames_by_text.items():
-        some = f"frame{'s' if indices[1:] else ''} {listed(indices)}"
-        yield f"set        of {'every frame' if len(indices) == len(frames) else some}:"
+        yield f"set        of {'every frame' if len(indices) == len(frames) > 1 else frames_listed(indices)}:"
         if not lines:
             yield "  one camera pose"
         yield from (f"  {line}" for line in lines)

@@ -247,7 +247,7 @@ class KernelStore:
                 return
             # not after every kernel: it looks at all files of the session
             self.publish()
-            _log.info("compiling kernels (first use only): %d functions done", self.functions)
+            _log.info("compiling kernels (first use only): functions done: %d", self.functions)
 
     def close(self) -> None:
         """Publish, and remove the session's folder unless it is another process'."""

@@ -246,8 +246,7 @@ def read_poses(path: Path, given: dict[str, Any] | None, frame: int, settings: d
         turn = math.pi / 180.0 if spec.get("angle_units", "radians") == "degrees" else 1.0
         length = scale if spec.get("units", "normalised") == "dataset" else 1.0
         shifts, turns, orbit = (spec.get(key) or {} for key in ("translation", "rotation", "orbit"))
-        ends = {name: (shifts.get(name, 0.0), length) for name in SHIFTS}
-        ends |= {name: (turns.get(name, 0.0), turn) for name in TURNS}
+        ends = {n: (shifts.get(n, 0.0), length) for n in SHIFTS} | {n: (turns.get(n, 0.0), turn) for n in TURNS}
         ends |= {"segment": ((0.0, 1.0), 1.0)} if swept else {}
         ends |= {"azimuth": (orbit["azimuth"], turn)} if orbit else {}
         about = (np.array(orbit["target"], np.float64), np.array(orbit["axis"], np.float64)) if orbit else None

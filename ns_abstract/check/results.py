@@ -56,6 +56,8 @@ def read_report(folder: Path) -> dict[str, Any]:
     for name in ("settings", "fingerprint", "scene", "renderer"):
         if not isinstance(report.get(name), dict):
             raise BadInput("missing", file, name, _WHERE)
+    if report.get("kind") == "comparison" or "answer" in report:
+        raise BadInput("results of ns-abstract-compare and ns-abstract-locate are not checked", file, fix=_WHERE)
     return report
 
 
@@ -88,9 +90,8 @@ def read_cells(folder: Path, name: str, index: int, digest: object) -> StoredCel
 
 def read_verdicts(folder: Path, report: dict[str, Any]) -> list[StoredCells]:
     """The cells of a certificate or a loop: by frame, or by question (0 safe, 1 reaches)."""
-    file, rows, total, loop = folder / "cells.sqlite", 0, 0, report.get("kind") == "loop"
+    file, rows, total, loop, cells = folder / "cells.sqlite", 0, 0, report.get("kind") == "loop", []
     by_frame: dict[int, list[Any]] = {}
-    cells = []
     with reading(file, "cannot be read as the cells of this result", _AGAIN):
         frames = [{"index": k, "parameters": report["parameters"]} for k in (0, 1)] if loop else report["frames"]
         if loop and _initial(report["loop"]) != [[p.get(key) for key in _BOX] for p in report["parameters"]]:

@@ -78,6 +78,8 @@ def check(options: Check) -> int:
         f"at least {100.0 * share:.1f} % of all claims hold in real numbers, and "
         f"{100.0 * audit.uniform['float32_at_least']:.1f} % in float32 (95 % confidence, {count} drawn uniformly)"
     )
+    if audit.unsettled:
+        print("claims that are not settled need more --seconds, or are of bounds too tight for this program to prove")
     if audit.unclaimed:
         print(f"nothing is claimed, and checked, of frames {', '.join(map(str, audit.unclaimed))}")
     print(f"details: {options.output_dir / 'check.json'}")

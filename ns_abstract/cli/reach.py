@@ -59,7 +59,7 @@ def reach(options: Reach) -> int:
             from ns_abstract.api.cell_search import Request
             from ns_abstract.api.reaching import LoopQuestion, open_loop
             from ns_abstract.api.scenes import SceneSource
-            from ns_abstract.cli.searching import searched
+            from ns_abstract.cli.searching import kept_cells, say_if_late, searched
             from ns_abstract.reach.page import runs_text
             from ns_abstract.report.figures import percent
 
@@ -72,13 +72,14 @@ def reach(options: Reach) -> int:
         document = searched(
             question, options.output_dir, options.where, stop, console, job.job, 0,
             Request(options.time_budget, options.resume, scene_margin=options.scene_margin),
-            lambda store: f"{store.count} cells kept from before, {store.open_blocks} blocks still to be examined",
+            kept_cells,
         )  # fmt: skip
         for name, entry in document["questions"].items():
             console.print(
                 f"{name}: certified {percent(entry['certified'])}, falsified {percent(entry['falsified'])}, "
                 f"unknown {percent(entry['unknown'])}; {runs_text(name, entry['simulated'])}"
             )
+        say_if_late(console, document)
         console.print(f"{document['verdict']}; report: {options.output_dir / 'report.html'}")
     return INTERRUPTED if stop() else DONE
 

@@ -23,7 +23,7 @@ from ns_abstract.io.folder import claim
 from ns_abstract.refine.protocol import Method
 from ns_abstract.refine.result import FrameResult, Leaves
 from ns_abstract.report.comparison import ComparisonReport
-from ns_abstract.report.figures import listed, number
+from ns_abstract.report.figures import frames_listed, number
 from ns_abstract.report.progress import ProgressBar, ShownProgress
 from ns_abstract.report.record import Report, RunRecord, failed_self_check
 
@@ -156,8 +156,17 @@ def _bounded(
             # also after a failure: what is finished is written
             report.finish("interrupted" if stop() else "budget" if report.missing else "done")
     if report.missing:
-        console.print(f"no bounds yet for frames {listed(report.missing)}: raise --time-budget, --resume")
+        console.print(f"no bounds yet for {frames_listed(report.missing)}: raise --time-budget, --resume")
+    _say_what_next(console, report, pending)
     return report
+
+
+def _say_what_next(console: Console, report: Report, pending: Sequence[int]) -> None:
+    """Name the frames that could be tighter, or the way to go on where there was ``pending`` nothing."""
+    if partial := sorted(set(report.pending) - set(report.missing)):
+        console.print(f"{frames_listed(partial)} ended before the target: go on with --resume")
+    elif not pending:
+        console.print("every frame has reached the target: nothing is left to do but for a stricter one")
 
 
 def _run_record(job: Job, options: Render | Compare, frames: tuple[int, ...], problems: tuple[str, ...]) -> RunRecord:
@@ -203,7 +212,7 @@ def _introduce(
     for note in (*(note for note in job.notes if note not in job.warnings), *job.plan, *more):
         console.print(f"  {note}")
     if report.kept:
-        console.print(f"  kept from before: frames {listed(report.kept)}")
+        console.print(f"  kept from before: {frames_listed(report.kept)}")
 
 
 def _tell(console: Console, entry: dict[str, Any], lines: Callable[[dict[str, Any]], Sequence[str]]) -> None:

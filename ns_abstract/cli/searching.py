@@ -22,7 +22,7 @@ from ns_abstract.cli.common import SignalStop, plain_console
 from ns_abstract.cli.sets import stated
 from ns_abstract.execution.engine_options import EngineOptions
 from ns_abstract.report.certificate import coverage
-from ns_abstract.report.figures import listed, percent
+from ns_abstract.report.figures import frames_listed, percent
 from ns_abstract.report.progress import ProgressBar
 from ns_abstract.verify.store import Store
 
@@ -78,6 +78,17 @@ def searched(
                 on_margin=lambda margin: console.print(f"scene margin: {margin.sentence}"),
             ),
         )
+
+
+def kept_cells(store: Store) -> str:
+    """What a search that goes on has and lacks, in words."""
+    return f"{store.count} cells kept from before, {store.open_blocks} blocks of cells still to be examined"
+
+
+def say_if_late(console: Any, document: dict[str, Any]) -> None:
+    """Name the way to go on with a search that the time budget ended."""
+    if document["state"] == "budget":
+        console.print("the time budget ended first: go on with --resume")
 
 
 def locate_photos(options: Locate, stop: SignalStop) -> None:
@@ -154,11 +165,14 @@ def _search(
     console.print(f"{_ANSWERS[document['answer']]}; {left} of the set left")
     late = [entry["index"] for entry in document["frames"] if entry["best"] is None and entry["possible_volume"] > 0.0]
     if document["state"] != "done" and late:
-        console.print(f"  not examined before the time was over: frames {listed(late)}; give more --time-budget")
+        console.print(f"  not examined before the time was over: {frames_listed(late)}")
     elif document["answer"] != "possible" and document["best"] is not None and document["state"] == "done":
         missed = document["best"]["outliers"]
         text = f"  best pose misses {missed} pixels: --noise and --outliers must allow the scene's own error"
         console.print(text)
+    if options.image_sequence is None:
+        # a sequence goes on with the next photo
+        say_if_late(console, document)
     console.print(f"report: {folder / 'report.html'}")
     return document
 
@@ -186,7 +200,7 @@ def certify_path(options: Certify, stop: SignalStop) -> bool:
     document = searched(
         question, options.output_dir, options.where, stop, console, job.job, frames[0],
         Request(budget, options.resume, scene_margin=options.scene_margin),
-        lambda store: f"{store.count} cells kept from before, {store.open_blocks} blocks still to be examined",
+        kept_cells,
         lambda: _introduce(console, job, question.about.plan),
     )  # fmt: skip
     covered = coverage(document["frames"])
@@ -200,5 +214,6 @@ def certify_path(options: Certify, stop: SignalStop) -> bool:
         more = f", {percent(both['undecided'])} unknown (no finite margin)" if both["undecided"] else ""
         text = f"{percent(both['PCP-V'])} are proved (PCP-V), {percent(both['PCP-S'])} right at every sample (PCP-S)"
         console.print(f"of {both['partitions']:,} fixed parts, {text}{more}")
+    say_if_late(console, document)
     console.print(f"report: {options.output_dir / 'report.html'}")
     return all(entry["sampled"]["poses"] for entry in document["frames"])

@@ -202,7 +202,7 @@ def parse_json(text: str, file: str | Path | None = None, depth: int = JSON_DEPT
         raise InputError(
             f"not valid JSON: {error.msg} at line {error.lineno}, column {error.colno}",
             file=file,
-            fix="correct the syntax",
+            fix="correct the syntax" if text.lstrip().startswith(("{", "[")) else "give a JSON file",
         ) from None
     except RecursionError:
         raise InputError(f"JSON nested more than {depth} levels deep", file=file, fix="remove the nesting") from None

@@ -13,7 +13,7 @@ from ns_abstract.reach.loop import Loop
 from ns_abstract.reach.planes import LoopPlot, Marks, plane_marks, region, views
 from ns_abstract.reach.search import QUESTIONS
 from ns_abstract.report.figures import ShownUnits
-from ns_abstract.report.html import set_of, whole_page
+from ns_abstract.report.html import SEARCH_STATES, set_of, whole_page
 from ns_abstract.report.outside import PICTURE_WIDTH, SceneDrawing, behind, draw_plane, plane_axes
 from ns_abstract.report.svg import PlotAxis, draw_legend, draw_line, draw_plot
 
@@ -57,6 +57,7 @@ def loop_page(
         name=name,
         kind=kind,
         heading=heading,
+        state=SEARCH_STATES.get(document["state"]),
         initial=set_of(document, units) or "one state",
         course=loop,
         pictures=_pictures(document, rows, loop, outside),
@@ -82,8 +83,11 @@ def _pictures(
     rows: Mapping[int, Sequence[Mapping[str, Any]]],
     loop: Loop,
     outside: SceneDrawing | None,
-) -> list[tuple[str, str, Markup]]:
-    """Titles, texts and plots, from above and from the side; in the plane of two states where the camera only turns."""
+) -> list[tuple[str, str, str, Markup]]:
+    """Titles, legends, texts on the scene and plots: from above and from the side.
+
+    Where the camera only turns, the one plot is in the plane of two states.
+    """
     last = max(rows, default=None)
     cells = [] if last is None else rows[last]
     plot_arguments = (
@@ -107,7 +111,7 @@ def _pictures(
     one, two = (f"{name} {unit}".strip() for name, unit in list(zip(loop.names, loop.units, strict=True))[:2])
     title = "Seen by its first two states"
     plot = draw_plot(x, y, (one, two), _drawn(marks, x, y), size=_SIZE, title=title)
-    return [(title, f"{_MARKS_TEXT} tubes of a few certified cells.{plot_arguments}", plot)]
+    return [(title, f"{_MARKS_TEXT} tubes of a few certified cells.{plot_arguments}", "", plot)]
 
 
 _MARKS_TEXT = "Grey: simulated runs; red: stored runs that go wrong; blue outlines:"
@@ -124,7 +128,7 @@ def _drawn(marks: Marks, x: PlotAxis, y: PlotAxis) -> str:
 
 def _seen(
     view: LoopPlot, document: Mapping[str, Any], loop: Loop, outside: SceneDrawing | None, asked: str
-) -> tuple[str, str, Markup]:
+) -> tuple[str, str, str, Markup]:
     window, marks = view.window, ""
     x, y = plane_axes(window)
     sets = [("unsafe", faces, -1.0) for faces in loop.unsafe]
@@ -143,9 +147,9 @@ def _seen(
     scene = behind(outside, view.clip, "tubes alone")
     text = (
         f"Where the camera is, in the run's normalised frame. {_MARKS_TEXT} boxes of all positions at a step, for a "
-        f"few certified cells{extra}.{asked} {scene}"
+        f"few certified cells{extra}.{asked}"
     )
-    return title, text, plot
+    return title, text, scene, plot
 
 
 def _widths(document: Mapping[str, Any]) -> list[tuple[Mapping[str, Any], Markup]]:

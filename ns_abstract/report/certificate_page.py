@@ -12,18 +12,13 @@ from markupsafe import Markup, escape
 
 from ns_abstract.report.cameras import CameraDrawings
 from ns_abstract.report.figures import ShownUnits, is_ring, number, percent, unit_of_axis
-from ns_abstract.report.html import set_of, uri, whole_page
+from ns_abstract.report.html import SEARCH_STATES, set_of, uri, whole_page
 from ns_abstract.report.regions import FailureRegion, PoseImage, WalkPose, regions_html, walk_html
 from ns_abstract.report.run import plain
 from ns_abstract.report.svg import PlotAxis, draw_line, draw_plot, draw_svg
 from ns_abstract.report.verdict_maps import free_parameters, maps_of, matrix_svg, mixed, pixels
 
 _VERDICTS = ("certified", "falsified", "unknown")
-_STATES = {
-    "running": "The command was still running, or was killed, when this page was written.",
-    "interrupted": "The command was interrupted; go on with --resume.",
-    "budget": "The time budget ended first; go on with --resume.",
-}
 #: Most frames drawn one by one.
 _MOST_ROWS = 200
 _MOST_POINTS = 400
@@ -86,7 +81,7 @@ def certificate_page(
         model=str(document["model"].get("name", "the network")),
         kind=kind,
         heading=heading,
-        state=_STATES.get(document["state"]),
+        state=SEARCH_STATES.get(document["state"]),
         verdicts=_VERDICTS,
         numbered=bool(numbers),
         maps=maps,

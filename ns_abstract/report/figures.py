@@ -192,6 +192,11 @@ def listed(numbers: Sequence[int]) -> str:
     return ", ".join(texts) + (f" and others, {len(numbers):,} together" if len(runs) > _RUNS else "")
 
 
+def frames_listed(indices: Sequence[int]) -> str:
+    """Ascending ``indices`` of frames in words, as "frame 3" or "frames 0 to 4, 7"."""
+    return f"frame{'' if len(indices) == 1 else 's'} {listed(indices)}"
+
+
 def short_guarantee(guarantee: str, bounded: str | None) -> str:
     """The name of a guarantee with what of the scene it holds, as "float32-sound, of the Gaussians alone".
 

@@ -16,6 +16,12 @@ from markupsafe import Markup
 from ns_abstract.report.figures import ShownUnits, number, percent, short_guarantee
 
 _FOLDER = Path(__file__).parent
+#: Sentences on a search that left cells unexamined, by the state of its report.
+SEARCH_STATES = {
+    "running": "The command was still running, or was killed, when this page was written.",
+    "interrupted": "The command was interrupted; go on with --resume.",
+    "budget": "The time budget ended first; go on with --resume.",
+}
 
 
 def uri(data: bytes) -> str:

@@ -167,7 +167,7 @@
     const whole = !frame.cells || get("play-whole").checked, where = whole ? "any pose of the set" : "this pose";
     let sum = 0;
     for (let i = 0; i < frame.height * frame.width; i++) sum += length(frame, frame.now.lower, frame.now.upper, 3 * i);
-    const mean = "mean pixel gap " + shortNumber(whole ? frame.mpg : sum / (frame.height * frame.width));
+    const mean = "Mean pixel gap " + shortNumber(whole ? frame.mpg : sum / (frame.height * frame.width));
     if (shown === "lower") return "No picture of " + where + " is darker. " + mean;
     if (shown === "upper") return "No picture of " + where + " is brighter. " + mean;
     if (shown === "gap") return "Length over RGB of upper − lower, over " + where + "; the brightest colour is " + shortNumber(frame.scale) + ". " + mean;

@@ -121,7 +121,8 @@ class Classification(Property):
     classes: int
 
     def sentence(self) -> str:
-        return f"output {self.label} is larger than each of the other {self.classes - 1}"
+        others = "the other" if self.classes == 2 else f"each of the other {self.classes - 1}"
+        return f"output {self.label} is larger than {others}"
 
     def bind(self, pose_set: PoseBox, nominal: Callable[[], np.ndarray]) -> Claim:
         others = [k for k in range(self.classes) if k != self.label]

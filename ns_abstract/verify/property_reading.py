@@ -94,8 +94,11 @@ def _classification(root: dict[str, Any], setting: _KeySetting, common: dict[str
     label, outputs = root.get("label"), setting.outputs
     if outputs < 2:
         raise InputError(f"the network has {outputs} output", field="type", fix="use a classifier")
+    fix = f"write an integer from 0 to {outputs - 1}, the number of an output"
+    if "label" not in root:
+        raise InputError("missing", field="label", fix=fix)
     if type(label) is not int or not 0 <= label < outputs:
-        raise unusable(label, field="label", fix=f"write an integer from 0 to {outputs - 1}, the number of an output")
+        raise unusable(label, field="label", fix=fix)
     return Classification(label=label, classes=outputs, **common)
 
 

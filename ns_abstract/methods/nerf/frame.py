@@ -352,11 +352,7 @@ class FieldFrame(Frame):
         """What was left out for this frame, given what refinement found."""
         untreated = int(((lower == 0.0) & (upper == 1.0)).all(axis=-1).sum())
         total = lower.shape[0] * lower.shape[1]
-        return (
-            [f"{untreated:,} of {total:,} rays left at [0, 1]: the goal was reached, or the time over, before them"]
-            if untreated
-            else []
-        )
+        return [f"{untreated:,} of {total:,} rays left at [0, 1]: the work ended before them"] if untreated else []
 
     def _reached(self, box: ParameterBox, tiles: np.ndarray, shifted: bool) -> tuple[np.ndarray, np.ndarray]:
         """Ends [n, 3] of the colours reached over the box or, where a refinement reports them, the set.
