@@ -9,6 +9,14 @@ _CAMERAS, _DATA_SET = "geometry/camera_files.py", "test_camera_files.py"
 
 INPUTS = (
     Fault(
+        "sets may be as wide as no float64 is",
+        "perturbation/specification.py",
+        "_refuse_huge",
+        "not most <= InputTuning.largest",
+        "False",
+        "test_perturbation.py::test_refused[93]",
+    ),
+    Fault(
         "cameras of a data set: a frame's own intrinsics come first",
         _CAMERAS,
         "transforms_cameras",

@@ -94,7 +94,7 @@ class Scene:
 
     @property
     def run_frame(self) -> DataparserTransform | None:
-        """From the frame of the run's data set to the run's; None where the scene is no run, or none is stored."""
+        """From the frame of the run's data set to the run's; None where no run says so."""
         if any(entry.origin == NO_TRANSFORMS for entry in self.assumptions):
             return None
         if self.source.file.is_file() and self.source.file.suffix.lower() not in (".yml", ".yaml"):

@@ -142,7 +142,7 @@ def parse_perturbation(
     translation = _scaled(_ranges(value, "translation", TRANSLATIONS, fail), length)
     rotation, orbit = _scaled(_ranges(value, "rotation", ROTATIONS, fail), turn), _orbit(value, fail, turn)
     scene = _scene(value, fail, field_prefix, folder)
-    parts: dict[str, Mapping[str, Any]] = {"translation": translation, "rotation": rotation}
+    parts: dict[str, Mapping[str, Sequence[float]]] = {"translation": translation, "rotation": rotation}
     if orbit is not None:
         parts["orbit"] = {"target": orbit.target, "azimuth": orbit.azimuth}
     parts |= {
