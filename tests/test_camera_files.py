@@ -85,6 +85,14 @@ def test_a_command_takes_both(tmp_path: Path) -> None:
         job = open_job(Settings(config, save(tmp_path / name, value), spec))
         center = job.pose_sets[0].camera.camera_to_world[:, 3]
         np.testing.assert_allclose(center, POSE[:, 3] * (0.5 if name == "transforms.json" else 1.0), atol=1e-15)
+    # other data parsers do not undo what the file says was applied
+    text = config.read_text()
+    assert text.count("nerfstudio_dataparser.Nerfstudio") == 2
+    ngp = text.replace("nerfstudio_dataparser.Nerfstudio", "instant_ngp_dataparser.InstantNGP")
+    config.write_text(ngp)
+    with pytest.raises(InputError, match="a run whose data parser is Nerfstudio's or COLMAP's"):
+        open_job(Settings(config, tmp_path / "transforms.json", spec))
+    config.write_text(text)
     # without it nothing says where the data set's cameras stand in the run's frame
     file.unlink()
     with pytest.raises(InputError, match=r"beside its dataparser_transforms\.json"):

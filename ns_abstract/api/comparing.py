@@ -238,8 +238,8 @@ def open_comparison(settings: Settings, other: SceneSource, tolerance: float | N
     # a run of a NeRF always says what is behind it
     if not second.rays and second.background is None and scene.background is not None:
         second = second.on_background(scene.background, _BACKGROUND_OF_A)
-    run_frame = second.run_frame if scene.run_frame is None else scene.run_frame
-    path = load_camera_path(settings.camera_path_filename, settings.downscale_factor, run_frame)
+    data_frame = other.data_frame if scene.data_frame is None else scene.data_frame
+    path = load_camera_path(settings.camera_path_filename, settings.downscale_factor, data_frame)
     pose_sets = path_sets(settings, scene, path)
     options = settings.job_options(pose_sets, path)
     return ComparisonJob(scene, second, pose_sets, tolerance=tolerance, path=path, **options)

@@ -120,7 +120,7 @@ def open_job(
         InputError: A file, a field or an option cannot be used.
     """
     scene = settings.scene.open()
-    path = load_camera_path(settings.camera_path_filename, settings.downscale_factor, scene.run_frame)
+    path = load_camera_path(settings.camera_path_filename, settings.downscale_factor, scene.data_frame)
     # a set that cannot be made is found before hours of work
     sets = path_sets(settings, scene, path, perturbation, default)
     return PathJob(settings, scene, path, sets if drawn is None else tuple(map(drawn, sets)))

@@ -262,7 +262,7 @@ def calibrate(
     tuning = tuning or CalibrationTuning()
     file = training_data(scene)
     frames = load_json(file, "data set").get("frames", [])
-    path = load_camera_path(file, run_frame=scene.run_frame)
+    path = load_camera_path(file, run_frame=scene.data_frame)
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(len(frames), tuning.photos)).round().astype(int))
     method, residuals, errors, size = scene.method(arithmetic), [], [], (0, 0)
     for k in chosen:
@@ -305,7 +305,7 @@ def training_data(scene: Scene) -> Path:
     InputError where the scene is no run, or nothing is there.
     """
     file = scene.source.file
-    if scene.run_frame is None:
+    if scene.data_frame is None:
         problem = "the scene is no run with photos, or its dataparser_transforms.json is missing"
         raise InputError(problem, file=file, field=_OPTION, fix="give --noise and --outliers")
     run = read_config(file)

@@ -20,7 +20,7 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.methods.load import open_scene
 from ns_abstract.methods.overrides import UNSAID, OverrideKeywords, Overrides, assumption_of
 from ns_abstract.methods.program_options import ProgramOptions
-from ns_abstract.methods.runs import NO_TRANSFORMS
+from ns_abstract.methods.runs import NO_TRANSFORMS, places_transforms, read_config
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.refine.protocol import Method, PreciseFrame
 
@@ -100,6 +100,12 @@ class Scene:
         if self.source.file.is_file() and self.source.file.suffix.lower() not in (".yml", ".yaml"):
             return None
         return self._content.dataparser
+
+    @property
+    def data_frame(self) -> DataparserTransform | None:
+        """From the frame of a ``transforms.json`` to the run's; None where no run says so."""
+        frame = self.run_frame
+        return None if frame is None or not places_transforms(read_config(self.source.file)) else frame
 
     @property
     def background(self) -> tuple[float, ...] | None:

@@ -32,6 +32,9 @@ from ns_abstract.methods.overrides import assumption_of
 
 CONFIG_NAME = "config.yml"
 TRANSFORMS_NAME = "dataparser_transforms.json"
+#: Data parsers whose ``dataparser_transforms.json`` begins where a ``transforms.json`` ends once what it says was
+#: applied is undone.
+_PLACING_PARSERS = ("Nerfstudio", "NerfstudioDataParser", "ColmapDataParser")
 #: Origin of the units of a run without that file.
 NO_TRANSFORMS = f"default: {TRANSFORMS_NAME} is missing"
 DEFAULT_MODEL_FOLDER = "nerfstudio_models"
@@ -249,6 +252,19 @@ def units_assumption(transform: DataparserTransform, assumed: bool) -> Assumptio
     """The units of the data set; ``assumed``: the run does not say them."""
     origin = NO_TRANSFORMS if assumed else TRANSFORMS_NAME
     return Assumption("units", f"1 of the data set is {transform.scale:.9g}", origin)
+
+
+def places_transforms(run: RunConfig) -> bool:
+    """Return whether the run's frame is told from that of a ``transforms.json``: not by every data parser of Nerfstudio.
+
+    Instant-NGP's, for one, leaves alone what the file says was applied to its poses.
+    """
+    manager = (as_mapping(run.root.get("pipeline")) or {}).get("datamanager")
+    parser = (as_mapping(manager) or {}).get("dataparser")
+    target = (as_mapping(parser) or {}).get("_target", parser)
+    if target is None:
+        return True
+    return isinstance(target, Tagged) and target.tag.rpartition(".")[2].removesuffix("Config") in _PLACING_PARSERS
 
 
 def target_class(run: RunConfig) -> str:
