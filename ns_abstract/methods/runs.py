@@ -255,7 +255,7 @@ def units_assumption(transform: DataparserTransform, assumed: bool) -> Assumptio
 
 
 def places_transforms(run: RunConfig) -> bool:
-    """Return whether the run's frame is told from that of a ``transforms.json``: not by every data parser of Nerfstudio.
+    """Return whether the run's frame is told from that of a ``transforms.json``: not by every data parser.
 
     Instant-NGP's, for one, leaves alone what the file says was applied to its poses.
     """
