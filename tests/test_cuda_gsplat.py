@@ -32,6 +32,8 @@ SHIFT = 0.02
 
 @pytest.fixture(scope="module")
 def cuda() -> Any:
+    # it is asked for on the way, when the folder is no longer looked in
+    script("both_ways")
     return script("cuda_gsplat")
 
 

@@ -238,7 +238,7 @@ def open_comparison(settings: Settings, other: SceneSource, tolerance: float | N
     # a run of a NeRF always says what is behind it
     if not second.rays and second.background is None and scene.background is not None:
         second = second.on_background(scene.background, _BACKGROUND_OF_A)
-    data_frame = other.data_frame if scene.data_frame is None else scene.data_frame
+    data_frame = second.data_frame if scene.data_frame is None else scene.data_frame
     path = load_camera_path(settings.camera_path_filename, settings.downscale_factor, data_frame)
     pose_sets = path_sets(settings, scene, path)
     options = settings.job_options(pose_sets, path)
