@@ -230,10 +230,11 @@ def head_weights(net: DenseNet, harmonics: int) -> HeadWeights:
 
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
-def look_at_direction(forms, head, rows, radius):
-    """What the first layer of the ``head`` adds up of a direction's harmonics ``forms`` [16, n + 3].
+def weigh_direction(forms, head, rows, radius):
+    """Set ``rows`` and ``radius`` to the share of a direction in the first layer of the ``head``.
 
-    ``rows``: [n + 2, neurons]; overwritten. ``radius``: [neurons]; overwritten.
+    It is the weighted sum of the direction's spherical harmonics ``forms`` [16, n + 3]: ``rows`` [n + 2, neurons] are
+    its linear part, ``radius`` [neurons] bounds what is not linear, and the rounding.
     """
     count, width = forms.shape
     rows[:] = 0.0
@@ -250,7 +251,7 @@ def look_at_direction(forms, head, rows, radius):
 def colors(z, count, seen, head, rooms, live, rest):
     """Neurons of colours before the sigmoid in ``rooms[-1]`` from those of the density's network; returns the rows.
 
-    ``z`` is the `LayerZonotope` of the density's network, ``count`` rows; ``seen`` what `look_at_direction` made.
+    ``z`` is the `LayerZonotope` of the density's network, ``count`` rows; ``seen`` what `weigh_direction` made.
     Others: see `finish`.
     """
     sizes_of(z, count)

@@ -43,8 +43,8 @@ from ns_abstract.methods.nerf.hash_bounds.network import (
     colors,
     finish,
     from_features,
-    look_at_direction,
     output_form,
+    weigh_direction,
 )
 from ns_abstract.methods.nerf.hash_bounds.points import harmonics, line_form, point, quotients
 
@@ -246,7 +246,7 @@ def _start(rays, ray, middle, half, field, line, room):
     work = room.work[0]
     quotients(origin, direction, line, ratios, shifts, along, work)
     harmonics(direction, line, room.directions[0], work)
-    look_at_direction(room.directions[0], field.head, room.directions[1], room.directions[2])
+    weigh_direction(room.directions[0], field.head, room.directions[1], room.directions[2])
     edges = room.edges[0]
     count = edges.low.shape[0] - 1
     for j in range(count + 1):
