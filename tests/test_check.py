@@ -518,7 +518,7 @@ def test_frames_of_which_nothing_is_claimed_are_named(copy: Path, in_process: In
 
 
 def test_seconds_of_a_claim_are_those_of_settled_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def outcomes(*_: object) -> Iterator[ClaimOutcome]:
+    def outcomes(*arguments: object) -> Iterator[ClaimOutcome]:
         time.sleep(0.1)
         yield ClaimOutcome(True, True, True, {})
         for _ in range(5):
