@@ -75,7 +75,7 @@ def test_weights_are_algorithm_1(job: PathJob) -> None:
 
 
 def test_plan_changes_nothing(job: PathJob) -> None:
-    rows = plan.without(job, "x", 0, 6)
+    rows = plan.cost_of_omissions(job, "x", 0, 6)
     assert [row["taken back"] for row in rows] == [
         "as planned", "every Gaussian in every cell", "harmonics that are zero",
     ]  # fmt: skip

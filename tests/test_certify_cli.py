@@ -528,9 +528,12 @@ def test_ended_while_kernels_are_compiled(planted: Case, tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-def test_budget_ends_with_a_result_and_is_continued(planted: Case, finished: Path, tmp_path: Path) -> None:
+def test_budget_ends_with_a_result_and_is_continued(
+    planted: Case, finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     folder = tmp_path / "out"
     assert certify(command_options(Certify, **planted.values(folder, time_budget=1e-6))) == 0
+    assert "the time budget ended first: go on with --resume" in "".join(capsys.readouterr())
     first = report(folder)
     assert first["state"] == "budget" and first["verdict"] != "certified"
     assert first["coverage"]["not_examined"] > 0.0 and first["frames"][0]["cells"]["open"] > 0

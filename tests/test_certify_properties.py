@@ -56,7 +56,7 @@ BAD: dict[str, tuple[Any, str, Any]] = {
     "type": ({"type": "segmentation"}, "type", None),
     "type is a list": ({"type": ["classification"]}, "type", None),
     "unknown key": ({"type": "classification", "label": 1, "lable": 1}, "lable", None),
-    "no label": ({"type": "classification"}, "label", None),
+    "no label": ({"type": "classification"}, "label: missing", None),
     "label is text": ({"type": "classification", "label": "cat"}, "label", None),
     "label is true": ({"type": "classification", "label": True}, "label", None),
     "label too large": ({"type": "classification", "label": 10}, "label", None),
@@ -129,6 +129,12 @@ def test_mistake_names_file_field_and_fix(name: str, tmp_path: Path) -> None:
         parsed(tmp_path, value, shapes or (SHAPE, (10,)))
     assert fragment in str(caught.value)
     assert caught.value.file is not None and caught.value.fix
+
+
+def test_sentence_of_a_class(tmp_path: Path) -> None:
+    for outputs, words in ((2, "the other"), (10, "each of the other 9")):
+        found = parsed(tmp_path, {"type": "classification", "label": 1}, (SHAPE, (outputs,)))
+        assert found.sentence() == f"output 1 is larger than {words}"
 
 
 @pytest.mark.parametrize("text", ["", "{", '{"type": "classification", "label": NaN}', '{"label": 1, "label": 2}'])

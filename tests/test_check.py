@@ -10,7 +10,8 @@ import json
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from conftest import InProcess, Inputs, blob_scene, environment, ring
 import ns_abstract as nsa
 from ns_abstract.api import checking
 from ns_abstract.api.checking import check
+from ns_abstract.check.audit import ClaimOutcome
 from ns_abstract.check.claims import _divided
 from ns_abstract.check.forms import Affine, parameters
 from ns_abstract.check.inputs import BadInput, read_poses
@@ -514,6 +516,19 @@ def test_frames_of_which_nothing_is_claimed_are_named(copy: Path, in_process: In
     code, out, _ = in_process(check_command.main, [str(copy), "--claims", "2"])
     assert code == 0 and "nothing is claimed, and checked, of frames 1, 2" in out
     assert json.loads((copy / "check.json").read_text())["unclaimed"] == [1, 2]
+
+
+def test_seconds_of_a_claim_are_those_of_settled_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def outcomes(*arguments: object) -> Iterator[ClaimOutcome]:
+        time.sleep(0.1)
+        yield ClaimOutcome(True, True, True, {})
+        for _ in range(5):
+            yield ClaimOutcome(None, False, False, {})
+
+    monkeypatch.setattr(checking, "opened", lambda folder, moved: ([], [], []))
+    monkeypatch.setattr(checking, "outcomes", outcomes)
+    audit = check(tmp_path)
+    assert (audit.claims, audit.unsettled) == (6, 5) and audit.median_seconds >= 0.1
 
 
 @pytest.mark.slow

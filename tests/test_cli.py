@@ -563,7 +563,8 @@ def test_budget_reached_with_a_result_for_every_frame_is_success(
     make_blobs: Callable[..., Inputs], tmp_path: Path, call: Callable[..., tuple[int, str]]
 ) -> None:
     inputs = make_blobs(views=ring(1), spec=SIX)
-    assert call(inputs.options(tmp_path / "out", time_budget=0.5, target_ratio=1.0))[0] == 0
+    code, said = call(inputs.options(tmp_path / "out", time_budget=0.5, target_ratio=1.0))
+    assert code == 0 and "frame 0 ended before the target: go on with --resume" in said
     document = report(tmp_path / "out")
     assert document["frames"][0]["status"] == "partial"
     assert document["missing"] == []
@@ -584,7 +585,9 @@ def test_resuming_keeps_finished_frames_and_ends_the_same(
         assert (tmp_path / f"frame_0000{k}.npz").read_bytes() == data
     for k in range(3):
         same_pictures(frame(tmp_path, k), frame(finished, k))
-    assert report(tmp_path)["state"] == "done"
+    assert report(tmp_path)["state"] == "done" and "go on with" not in said
+    code, said = call(blobs.options(tmp_path, time_budget=120, resume=True))
+    assert code == 0 and "every frame has reached the target" in said
 
 
 @pytest.mark.slow

@@ -194,6 +194,18 @@ def test_what_is_compiled_is_told_where_there_is_no_terminal(
     assert any(line.startswith(wanted) for line in said)
 
 
+def test_what_is_left_of_compiling_is_estimated_by_what_is_done_where_it_takes_long(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    progress = compiling._CompileProgress([["pixel_stage"]])
+    total, begin = progress.functions, progress.begin
+    monkeypatch.setattr(compiling.time, "monotonic", lambda: begin + 2.0 * progress.seconds)
+    monkeypatch.setattr(logging.getLogger("ns_abstract"), "propagate", True)
+    with caplog.at_level(logging.INFO, "ns_abstract.kernels"):
+        progress.say(total // 10)
+    assert int(re.findall(r"about (\d+) s left", caplog.text)[-1]) > 10 * progress.seconds
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("stage", ["moving_colors", "no_stage"])
 def test_a_worker_runs_the_stages_of_its_command_line(blobs: Inputs, stage: str) -> None:

@@ -141,7 +141,7 @@ def test_frames_of_odd_size_and_without_bounds_are_filmed(bounded: Path, tmp_pat
         about=ABOUT,
     )
     code, said = run(call, "mp4", "--input-dir", tmp_path, "--output-filename", tmp_path / "a.mp4")
-    assert code == 0 and "no bounds but [0, 1] in frames 0" in said
+    assert code == 0 and "no bounds but [0, 1] in frame 0" in said
     with av.open(str(tmp_path / "a.mp4")) as film:
         stream = film.streams.video[0]
         # even, as the codec wants it, and no picture is cut

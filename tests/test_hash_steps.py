@@ -231,9 +231,9 @@ def test_networks_are_enclosed() -> None:
         rooms = tuple(network.zonotope(10 + 16, n) for n in (8, 8, 4, 1))
         color_rooms = tuple(network.zonotope(26 + 16, n) for n in (8, 8, 3))
         live = np.zeros(16, np.int64)
-        count = network.finish(rooms, network.from_features(inputs, weights, rooms[0]), weights, live, rest)
+        count = network.remaining_layers(rooms, network.from_features(inputs, weights, rooms[0]), weights, live, rest)
         rows, radius = np.zeros((4, 8)), np.zeros(8)
-        network.look_at_direction(seen, head_weights, rows, radius)
+        network.weigh_direction(seen, head_weights, rows, radius)
         total = network.colors(rooms[2], count, (rows, radius), head_weights, color_rooms, live, rest)
         x = np.array([float(member(rng, one, pose, place)) for one in inputs])
         h = x

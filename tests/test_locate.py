@@ -232,6 +232,15 @@ def test_a_cover_holds_every_pose_of_sheared_boxes(seed: int) -> None:
     assert found.volume < 0.5
 
 
+def test_a_cover_takes_little_that_is_excluded() -> None:
+    """A set of which a part is excluded is not reported as left as a whole."""
+    box = box_of([0.0, 0.0, 0.0, 0.0], [1.0, 1.0, 1.0, 1.0])
+    lower = np.array([[0.0, 0.0, 0.0, 0.0], [0.5, 0.0, 0.0, 0.0]])
+    upper = np.array([[0.5, 1.0, 1.0, 1.0], [1.0, 0.75, 1.0, 1.0]])
+    found = cover(box, ShearedBoxes(lower, upper, box.names, {}))
+    assert 0.875 <= found.volume <= 1.03 * 0.875
+
+
 def test_nearby_values() -> None:
     image = np.random.default_rng(0).random((5, 6, 3))
     least, most = nearby(image, 2)

@@ -294,6 +294,8 @@ def test_bad_files(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "fifo.json")
     refused(tmp_path / "fifo.json", "regular")
     refused(tmp_path / "a\0b.json", "path")
+    refused(write(tmp_path, "method_name: splatfacto"), "give a JSON file")
+    refused(write(tmp_path, '{"version": 1,}'), "correct the syntax")
     with pytest.raises(InputError, match="limit of 100"):
         load_json(write(tmp_path, content()), limit=100)
 

@@ -671,6 +671,8 @@ def test_page_of_many_frames(tmp_path, count):
     asked = tuple(range(max(count, 1)))
     reader = written(tmp_path, results, frames=asked)
     title = {0: "No bounds yet: 0 of 1 frame", 1: "Bounds for the frame"}.get(count, f"Bounds for all {count} frames")
+    whose = "the frame's set" if count == 1 else "a frame's set"
+    assert (whose in reader.text) == (count > 0)
     assert title in reader.text and "compared with exact results on one GPU" in reader.text
     assert reader.seen.count("img") == 5 * count and reader.seen.count("svg") == count + 2 * (count > 1)
     assert reader.seen.count("details") == count

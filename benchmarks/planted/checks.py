@@ -293,7 +293,7 @@ CHECKS = (
     Fault(
         "checker: Gaussians reach half as far",
         _SPLATS,
-        "_ends",
+        "_pixel_ends",
         "np.where(wild, longest, reach * np.sqrt(variance) * (1.0 + 1e-9))",
         "np.where(wild, longest, 0.5 * reach * np.sqrt(variance))",
         _PIXELS,

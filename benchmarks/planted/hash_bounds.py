@@ -46,7 +46,7 @@ HASH_BOUNDS = (
         _STEPS + "test_colours_of_rays_are_enclosed", True,
     ),
     Fault(
-        "hash fields: networks end at the second layer", _FOLDER + "network.py", "finish",
+        "hash fields: networks end at the second layer", _FOLDER + "network.py", "remaining_layers",
         "weights.sizes.shape[0] - 1", "min(weights.sizes.shape[0] - 1, 2)", _STEPS + "test_networks_are_enclosed",
     ),
 )  # fmt: skip

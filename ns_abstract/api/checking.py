@@ -33,7 +33,7 @@ class Audit:
         refutations: By refuted claim: frame, cell, pose, what is wrong.
         uniform: Claims and proofs of the uniform sample, and the least part of all claims that holds, at 95 %.
         structure: What is wrong with the cells; empty: they tile every set, every pixel is bounded, counts are right.
-        seconds, median_seconds: Of all claims, and of one.
+        seconds, median_seconds: Of all claims, and of one that was settled.
         picture: What all proved claims hold of: "real numbers", or "every float32 evaluation".
         unclaimed: Numbers of frames of which nothing is claimed: they are missing, or their cells do not cover the set.
     """
@@ -138,7 +138,9 @@ def check(
         audit._tally(finished)
     except BadInput as error:
         raise InputError(error.problem, fix=error.fix, file=error.file, field=error.field) from None
-    audit.seconds, audit.median_seconds = time.monotonic() - begin, statistics.median(spent) if spent else 0.0
+    # claims that the time did not reach took none
+    settled = [took for outcome, took in zip(finished, spent, strict=True) if outcome.verdict is not None]
+    audit.seconds, audit.median_seconds = time.monotonic() - begin, statistics.median(settled or spent or [0.0])
     write_json(folder / "check.json", {"version": 1, "seed": seed, **asdict(audit)})
     return audit
 

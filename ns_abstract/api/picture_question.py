@@ -209,7 +209,10 @@ class PlanePictures(FramePictures):
     def _bounded(
         self, frame: Frame, box: ParameterBox, channels: list[int], most_rays: int | None = None
     ) -> tuple[Bounds, np.ndarray]:
-        """Bounds of the tiles that hold pixels which are read (see `RayFrame.cell_bounds`), and their numbers."""
+        """Bounds of the tiles that hold `wanted` pixels, and these tiles' numbers.
+
+        ``most_rays``: As of `RayFrame.cell_bounds`, where the frame is bounded ray by ray.
+        """
         if frame.tilewise:
 
             def weigh() -> np.ndarray | None:

@@ -110,6 +110,7 @@ class PhotoSequence:
         self.entries: list[dict[str, Any]] = self._stored() if self.resume else []
 
     def _stored(self) -> list[dict[str, Any]]:
+        """Entries of the photos that an earlier command has finished, if its inputs were the same."""
         file = self.folder / _REPORT
         if not file.is_file():
             return []

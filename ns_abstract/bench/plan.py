@@ -37,8 +37,10 @@ def _refined(frame: SplatFrame, index: int, cells: int, seed: int) -> tuple[Fram
     return result, time.process_time() - started
 
 
-def without(job: PathJob, name: str, frame: int, cells: int, scale: float = 1.0) -> list[dict[str, Any]]:
-    """One row for the plan and for every omission that is taken back, with the same number of cells.
+def cost_of_omissions(job: PathJob, name: str, frame: int, cells: int, scale: float = 1.0) -> list[dict[str, Any]]:
+    """One row for the bounds as planned, and one for each omission of the plan that is taken back.
+
+    All are refined to the same number of ``cells``.
 
     Returns:
         Processor seconds, gaps, and by how much any bound of any pixel is tighter or looser than the plan's.

@@ -102,10 +102,10 @@ def reaches(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit:
     parts, count = np.array_split(np.arange(len(splats.means)), 1 + len(splats.means) // TOGETHER), len(view.origin)
     with np.errstate(all="ignore"):
         some = (projected(splats, cam, view, np.broadcast_to(at, (count, len(at))), unit, False) for at in parts)
-        return np.concatenate([_ends(p, unit) for p in some], axis=1)
+        return np.concatenate([_pixel_ends(p, unit) for p in some], axis=1)
 
 
-def _ends(p: ProjectedForms, unit: float) -> Array:
+def _pixel_ends(p: ProjectedForms, unit: float) -> Array:
     zl, zh = p.depth.range()
     wild = ~(p.kappa < 0.125)
     # alpha is the threshold where the exponent is the logarithm, and dx^2 is at most twice that times the variance

@@ -239,9 +239,9 @@ def rows_of(
             )
         ]  # fmt: skip
     if isinstance(options, PlanBenchmark):
-        from ns_abstract.bench.plan import without
+        from ns_abstract.bench.plan import cost_of_omissions
 
-        return without(job, name, options.frame, options.cells, options.scale)
+        return cost_of_omissions(job, name, options.frame, options.cells, options.scale)
     if isinstance(options, Rays):
         from ns_abstract.bench.rays import measure
 

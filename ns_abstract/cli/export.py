@@ -324,6 +324,7 @@ def _vnnlib(options: ExportVnnLib) -> list[str]:
 
 def _path(options: Npz | Png | Mp4 | Exr | Safetensors | Rrd | Viser) -> list[str]:
     from ns_abstract.report.export import Results, write_archive, write_pictures, write_video
+    from ns_abstract.report.figures import frames_listed
     from ns_abstract.report.recordings import write_exr, write_safetensors
 
     results = Results(options.input_dir)
@@ -343,7 +344,7 @@ def _path(options: Npz | Png | Mp4 | Exr | Safetensors | Rrd | Viser) -> list[st
         write_video(results, options.output_filename, options.pictures, options.fps, options.panels)
     notes = [] if results.checked else ["no report.json beside the frames: nothing says whether they were changed"]
     if results.unbounded:
-        notes.append(f"no bounds but [0, 1] in frames {', '.join(map(str, results.unbounded))}")
+        notes.append(f"no bounds but [0, 1] in {frames_listed(results.unbounded)}")
     return notes
 
 

@@ -305,7 +305,7 @@ class PoseBox:
 
     @cached_property
     def _rounding(self) -> tuple[float, float]:
-        """What the concrete pose's float64 evaluation may add to a rotation's and a position's entry."""
+        """Error bounds of a pose evaluated in float64: of an entry of its rotation, and of one of its position."""
         start, displacement = self._base[1], self._base[4]
         limits = dict(zip(self.box.names, zip(self.box.lower, self.box.upper, strict=True), strict=True))
         shifts = [*self.perturbation.translation.values(), *(limits[n] for n in SCENE_SHIFTS if n in limits)]

@@ -283,7 +283,7 @@ class LeafSets:
         self.bytes = 0
 
     def keep(self, cell: LeafCell, bounds: Bounds, places: np.ndarray, parent: LeafCell | None = None) -> None:
-        """Take those of ``cell`` in the tiles at ``places``, in place of those of its ``parent``."""
+        """Store the linear sets of ``cell`` in the tiles at ``places``, in place of those of its ``parent``."""
         if not self.tiles.keep_linear or bounds.linear is None:
             return
         linear = _usable_linear(bounds.linear)

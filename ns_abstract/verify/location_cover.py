@@ -15,7 +15,7 @@ from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.location import UNITS
 
 #: Most cells of a cover that are left, and by how much their volume may exceed that of what they hold.
-MOST, SPARE = 1500, 1.3
+MOST, SPARE = 1500, 1.03
 
 
 @dataclass(frozen=True)

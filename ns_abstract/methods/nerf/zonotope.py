@@ -415,7 +415,7 @@ class FieldBounds:
         )  # fmt: skip
 
     def color(self, pieces: PostActivation, poly: Tensor, remainder: Tensor) -> PreActivation:
-        """The colour before its sigmoid, three outputs, from an encoded direction; its columns are left out."""
+        """The three colour channels before their sigmoid, from an encoded direction; its columns are left out."""
         first = poly, remainder
         if self._grid is not None:
             return self._through(pieces, *self._head_stacks, first, self._grid)[1]

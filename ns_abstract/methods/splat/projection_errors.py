@@ -267,7 +267,10 @@ def _mean_errors(s, n, rules, camera, charges):
 
 @njit(cache=True, error_model="numpy")
 def _covariance_errors(s, n, camera, charges, rotation_magnitude):
-    """The covariance and its errors, from the rows of `_mean_errors` (design.md, G6): rows A .. EC, TAME."""
+    """Set rows A .. EC: bounds of the blurred covariance and its float32 errors, from the rows of `_mean_errors` (G6).
+
+    TAME is finite where all of them are.
+    """
     r0, r1 = _rotation_row(rotation_magnitude, 0), _rotation_row(rotation_magnitude, 1)
     r2 = _rotation_row(rotation_magnitude, 2)
     for q in range(n):
@@ -295,7 +298,7 @@ def _covariance_errors(s, n, camera, charges, rotation_magnitude):
         c = s[CHI + q] / z2_low
         b = max(abs(s[BLO + q]), abs(s[BHI + q])) / z2_low
         deep, root_a, root_c = np.sqrt(variance), np.sqrt(a), np.sqrt(c)
-        # of what an entry is made of, of the ratios in J, of its last sum
+        # errors of the factors, of the ratios in the Jacobian, and of the last sum
         error_a = _dot(g_x, h_x) + 2.0 * jump_x * deep * root_a + jump_x * jump_x * variance + charges.blur * a
         error_c = _dot(g_y, h_y) + 2.0 * jump_y * deep * root_c + jump_y * jump_y * variance + charges.blur * c
         error_b = _dot(g_x, h_y) + deep * (jump_x * root_c + jump_y * root_a) + jump_x * jump_y * variance
@@ -307,7 +310,6 @@ def _covariance_errors(s, n, camera, charges, rotation_magnitude):
         s[A + q], s[B + q], s[C + q] = a, b, c
         s[DET + q] = s[DLO + q] / (z2_high * z2_high)
         s[EA + q], s[EB + q], s[EC + q] = error_a, error_b, error_c
-        # what is not finite, or not a number, in any of them is not so in the sum
         s[TAME + q] = a + c + error_a + error_b + error_c
 
 

@@ -21,8 +21,8 @@ def _places(r: OnnxReader, value: TensorValue) -> np.ndarray:
     return r.builder.positions(value.index).reshape(value.whole)
 
 
-def _moved(r: OnnxReader, node: onnx.NodeProto, value: TensorValue, places: np.ndarray, output: int = 0) -> None:
-    """An output that holds the numbers at flat positions of a value."""
+def _gathered(r: OnnxReader, node: onnx.NodeProto, value: TensorValue, places: np.ndarray, output: int = 0) -> None:
+    """Set a node's output to the numbers of ``value`` at the flat positions ``places``, in their shape."""
     if places.size == 0:
         raise InputError(f"nothing is left of {item(value.whole)}", fix="check the constants")
     index = value.index
@@ -101,7 +101,7 @@ def _transpose(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     order = [int(v) for v in a.get("perm", range(rank - 1, -1, -1))]
     if sorted(order) != list(range(rank)):
         raise InputError(f"attribute perm = {order} of {rank} axes", fix="check the axes")
-    _moved(r, node, x, _places(r, x).transpose(order))
+    _gathered(r, node, x, _places(r, x).transpose(order))
 
 
 def _pad(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
@@ -172,13 +172,13 @@ def _slice(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     if x.batched and len(range(1)[chosen[0]]) == 1:
         _part(r, node, x, chosen)
     else:
-        _moved(r, node, x, _places(r, x)[tuple(chosen)])
+        _gathered(r, node, x, _places(r, x)[tuple(chosen)])
 
 
 def _part(r: OnnxReader, node: onnx.NodeProto, x: TensorValue, chosen: Sequence[slice], output: int = 0) -> None:
     """Part of an item."""
     if not x.batched:
-        _moved(r, node, x, _places(r, x)[tuple(chosen)], output)
+        _gathered(r, node, x, _places(r, x)[tuple(chosen)], output)
         return
     index = r.builder.part(x.index, chosen[1:])
     r.result(node, index, (1, *r.builder.shape(index)), output)
@@ -219,7 +219,7 @@ def _gather(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     if indices.dtype.kind not in "iu" or (indices.size and not (-size <= indices.min() and indices.max() < size)):
         raise InputError(f"indices do not lie in the {size} numbers of axis {axis}", fix="check the indices")
     r.builder.reserve(float(math.prod(x.whole)) / size * indices.size)
-    _moved(r, node, x, np.take(_places(r, x), indices, axis))
+    _gathered(r, node, x, np.take(_places(r, x), indices, axis))
 
 
 def _gather_nd(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
@@ -232,7 +232,7 @@ def _gather_nd(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     if not bool(((-sizes <= indices) & (indices < sizes)).all()):
         raise InputError(f"indices do not lie in {item(x.whole[:count])}", fix="check the indices")
     r.builder.reserve(float(indices.size // count) * math.prod(x.whole[count:]))
-    _moved(r, node, x, _places(r, x)[tuple(np.moveaxis(indices, -1, 0))])
+    _gathered(r, node, x, _places(r, x)[tuple(np.moveaxis(indices, -1, 0))])
 
 
 def _expand(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
@@ -244,7 +244,7 @@ def _expand(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
 def _tile(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x, repeats = r.value(node), [int(v) for v in np.atleast_1d(r.weight(node, 1))]
     r.builder.reserve(float(math.prod(x.whole)) * math.prod(float(max(0, v)) for v in repeats))
-    _moved(r, node, x, np.tile(_places(r, x), repeats))
+    _gathered(r, node, x, np.tile(_places(r, x), repeats))
 
 
 def _depth_to_space(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
@@ -257,7 +257,7 @@ def _depth_to_space(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
         if h % size or w % size:
             raise InputError(f"attribute blocksize = {size} of {item(x.whole)}", fix="it must divide the size")
         places = _places(r, x).reshape(n, c, h // size, size, w // size, size).transpose(0, 3, 5, 1, 2, 4)
-        _moved(r, node, x, places.reshape(n, c * size * size, h // size, w // size))
+        _gathered(r, node, x, places.reshape(n, c * size * size, h // size, w // size))
         return
     if c % (size * size) or mode not in ("DCR", "CRD"):
         raise InputError(f"attributes blocksize = {size}, mode = {mode} of {item(x.whole)}", fix="check the size")
@@ -266,7 +266,7 @@ def _depth_to_space(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
         places = _places(r, x).reshape(n, size, size, rest, h, w).transpose(0, 3, 4, 1, 5, 2)
     else:
         places = _places(r, x).reshape(n, rest, size, size, h, w).transpose(0, 1, 4, 2, 5, 3)
-    _moved(r, node, x, places.reshape(n, rest, h * size, w * size))
+    _gathered(r, node, x, places.reshape(n, rest, h * size, w * size))
 
 
 def _resize(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:

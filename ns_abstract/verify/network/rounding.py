@@ -160,7 +160,7 @@ class Rounding:
 
         ``size`` = |W| |x| + |bias|; ``end``: what its values are at most (N2, N20).
         """
-        count = self.terms[k] = self._count(sources, layer, inputs)
+        count = self.terms[k] = self._rounding_count(sources, layer, inputs)
         folding = FOLDING if k in self.network.scaled else 0
         few = gamma(folding + PRODUCTS + len(inputs)) * size
         few = few + (shifts := self.shifted(k, sources, layer))
@@ -192,8 +192,11 @@ class Rounding:
         together = partial_sums(count, peak, squares, end())
         return gamma(1) * (together + count * gamma(count + FOLDING + 1) * size) + few
 
-    def _count(self, sources: tuple[int, ...], layer: LinearLayer, inputs: list[NodeForm]) -> Tensor | int:
-        """Roundings that a layer's sums may suffer; what is added behind sums may be added within them (N2)."""
+    def _rounding_count(self, sources: tuple[int, ...], layer: LinearLayer, inputs: list[NodeForm]) -> Tensor | int:
+        """The largest number of roundings in one sum of the layer (N2).
+
+        A program may fold a scale or a sum of branches into the sums before it, so these count with it.
+        """
         if not isinstance(layer, (ScaleLayer, Sum)):
             return layer.roundings([f.active for f in inputs])
         before = [self.network.nodes[i - 1].layer for i in sources if i]

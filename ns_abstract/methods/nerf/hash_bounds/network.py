@@ -175,11 +175,11 @@ def linear(z, count, live, weight, absolute, bias, rounding, out, rest):
 
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
-def finish(rooms, count, weights, live, rest):
-    """The layers behind the first one, whose neurons before their ReLU are in ``rooms[0]``; returns the rows.
+def remaining_layers(rooms, count, weights, live, rest):
+    """Bound the layers after the first, whose neurons before their ReLU are in ``rooms[0]``.
 
-    ``rooms``: `LayerZonotope` of every layer, and more; ``count``: rows of the first. ``live`` [most neurons] and
-    ``rest`` [ROWS, two lines] are scratch.
+    Returns how many rows the last layer's `LayerZonotope` has. ``rooms``: `LayerZonotope` of every layer, and more;
+    ``count``: rows of the first. ``live`` [most neurons] and ``rest`` [ROWS, two lines] are scratch.
     """
     for layer in range(1, weights.sizes.shape[0] - 1):
         z = rooms[layer - 1]
@@ -230,10 +230,11 @@ def head_weights(net: DenseNet, harmonics: int) -> HeadWeights:
 
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)
-def look_at_direction(forms, head, rows, radius):
-    """What the first layer of the ``head`` adds up of a direction's harmonics ``forms`` [16, n + 3].
+def weigh_direction(forms, head, rows, radius):
+    """Set ``rows`` and ``radius`` to the share of a direction in the first layer of the ``head``.
 
-    ``rows``: [n + 2, neurons]; overwritten. ``radius``: [neurons]; overwritten.
+    It is the weighted sum of the direction's spherical harmonics ``forms`` [16, n + 3]: ``rows`` [n + 2, neurons] are
+    its linear part, ``radius`` [neurons] bounds what is not linear, and the rounding.
     """
     count, width = forms.shape
     rows[:] = 0.0
@@ -250,8 +251,8 @@ def look_at_direction(forms, head, rows, radius):
 def colors(z, count, seen, head, rooms, live, rest):
     """Neurons of colours before the sigmoid in ``rooms[-1]`` from those of the density's network; returns the rows.
 
-    ``z`` is the `LayerZonotope` of the density's network, ``count`` rows; ``seen`` what `look_at_direction` made.
-    Others: see `finish`.
+    ``z`` is the `LayerZonotope` of the density's network, ``count`` rows; ``seen`` what `weigh_direction` made.
+    Others: see `remaining_layers`.
     """
     sizes_of(z, count)
     n = z.rows.shape[1]
@@ -264,7 +265,7 @@ def colors(z, count, seen, head, rooms, live, rest):
             first.rows[s, j] += rows[s, j]
     for j in range(rows.shape[1]):
         first.radius[j] = (first.radius[j] + radius[j] + BIAS_ROUNDING * abs(first.rows[0, j])) * HASH_UP
-    return finish(rooms, count, head.net, live, rest)
+    return remaining_layers(rooms, count, head.net, live, rest)
 
 
 @njit(cache=True, error_model="numpy", **UNCOUNTED)

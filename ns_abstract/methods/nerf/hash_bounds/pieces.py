@@ -41,10 +41,10 @@ from ns_abstract.methods.nerf.hash_bounds.network import (
     LayerZonotope,
     NetWeights,
     colors,
-    finish,
     from_features,
-    look_at_direction,
     output_form,
+    remaining_layers,
+    weigh_direction,
 )
 from ns_abstract.methods.nerf.hash_bounds.points import harmonics, line_form, point, quotients
 
@@ -159,7 +159,7 @@ def density_of(field, place, line, rooms, room, out):
             room.features[level * features : (level + 1) * features], room.levels,
         )  # fmt: skip
     count = from_features(room.features[: levels * features], field.net, rooms[0])
-    count = finish(rooms, count, field.net, room.live, room.rest)
+    count = remaining_layers(rooms, count, field.net, room.live, room.rest)
     output_form(rooms[field.net.sizes.shape[0] - 2], count, 0, out.shape[0] - 1, out)
     return count
 
@@ -246,7 +246,7 @@ def _start(rays, ray, middle, half, field, line, room):
     work = room.work[0]
     quotients(origin, direction, line, ratios, shifts, along, work)
     harmonics(direction, line, room.directions[0], work)
-    look_at_direction(room.directions[0], field.head, room.directions[1], room.directions[2])
+    weigh_direction(room.directions[0], field.head, room.directions[1], room.directions[2])
     edges = room.edges[0]
     count = edges.low.shape[0] - 1
     for j in range(count + 1):
