@@ -385,17 +385,16 @@ def _form_bounds(begin, end, block, inputs, linear):
     # the radius' own rounding: three for every fragment
     up = UP + LAYER_ROUNDING * (end - begin)
     falls, rises = 0.0 * radius, 0.0 * radius
-    if blended.crossings > 0:
+    if blended.crossings > 0 or inputs.shape.sub_boxes > 0:
         store(scratch, 0, radius * up)
         set_blend(polynomials, scratch, crossings, d)
+    if blended.crossings > 0:
         store(scratch, 16, blended.since)
         gather_crossings(
             begin, end, blended.crossings, offset_by(scratch, 16), fragments, crossings, scratch, inputs.shape
         )
         falls, rises = load4(scratch, 0), load4(scratch, 4)
     if inputs.shape.sub_boxes > 0:
-        store(scratch, 0, radius * up)
-        set_blend(polynomials, scratch, crossings, d)
         store(scratch, 0, falls)
         store(scratch, 4, rises)
         bound_sub_boxes(blended.crossings, limit, scratch, crossings, inputs, block.part_ends)

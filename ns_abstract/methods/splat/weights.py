@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ns_abstract.arithmetic.outward import outward
 from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, Arithmetic
 from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import ParameterBox
@@ -198,7 +199,7 @@ class SplatWeightFrame(SplatFrame):
         """See `ns_abstract.refine.protocol.ElementFrame` (design.md, B13)."""
         candidates = self.candidates(tiles, within, pixels)
         bounds = self._bound(box, tiles, within, candidates, True, pixels, SubBoxes(counts, tuple(levels)))
-        return bounds, part_ends(bounds.parts, pixels)
+        return bounds, outward(*part_ends(bounds.parts, pixels))
 
     def differentiable(self, values: torch.Tensor) -> torch.Tensor:
         """See `ns_abstract.refine.protocol.WeightFrame`, by the reference renderer."""
