@@ -272,7 +272,7 @@ class SplatBounds:
                 or sub-boxes are not as above.
         """
         if parts is not None and (keep_linear or layers or sub_boxes is not None):
-            raise ValueError("intervals over parts of a cell have no linear sets and no layers, and no sub-boxes beside")
+            raise ValueError("intervals over parts of a cell have no linear sets and no layers, nor sub-boxes")
         shape, equal = _divided(forms.rotation.basis, parts, keep_parts, sub_boxes)
         with_ends = keep_parts or sub_boxes is not None
         across, down = tile_grid(camera, self.side)
