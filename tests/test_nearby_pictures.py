@@ -256,9 +256,8 @@ def _attack_sub_boxes(pictures: PlanePictures, cells: list[ParameterBox], poses:
                 low, high = ends.lower[number][:, channels], ends.upper[number][:, channels]
                 assert ((low <= values) & (values <= high)).all()
                 count += values.size
-        planes = PlaneSets(
-            tuple(a.reshape(-1, *a.shape[2:]) for a in sets[0]), *(a.reshape(-1, a.shape[-1]) for a in sets[1:3])
-        )
+        lower, upper = (a.reshape(-1, a.shape[-1]) for a in sets[1:3])
+        planes = PlaneSets(tuple(a.reshape(-1, *a.shape[2:]) for a in sets[0]), lower, upper)
         found = planes.over(CellParts.equal(counts, SUB_BOX_OVERLAP), ends.pixels, channels[0], np.ones(1))
         shares.append(float((ends.upper - ends.lower)[..., channels[0]].mean() / (found[1] - found[0]).mean()))
     return shares, count
