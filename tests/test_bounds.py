@@ -25,7 +25,7 @@ from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.intervals import sort_keys as sort_group
 from ns_abstract.methods.splat.projection_errors import FORMS, SPREAD, UNBOUNDED, columns
 from ns_abstract.methods.splat.render import Renderer
-from ns_abstract.methods.splat.stage_data import cell_parts, shared_out
+from ns_abstract.methods.splat.stage_data import SubBoxes, cell_parts, shared_out
 from ns_abstract.perturbation.specification import Perturbation
 
 both_orders = pytest.mark.parametrize("order", [1, 2])
@@ -87,6 +87,11 @@ class Case:
         generator = np.random.default_rng(0)
         return np.concatenate([box.corners()[:4], box.corners()[-4:], box.sample(count, generator)])
 
+    def ends(self, cell) -> np.ndarray:
+        """Lower and upper bounds [H, W, 2, 3, parts] over parts or sub-boxes of a cell."""
+        ends = assemble(cell.parts.reshape(*cell.parts.shape[:3], -1), self.camera)
+        return ends.reshape(*ends.shape[:2], 2, 3, -1).clip(0.0, 1.0)
+
     def check(
         self, order: int, parts: int = 2, count: int = 9, arithmetic=REAL, floor: float = -1.0
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -98,18 +103,18 @@ class Case:
         lowest, highest = np.ones((2, self.camera.height, self.camera.width, 3)) * [[[[1.0]]], [[[0.0]]]]
         least, most = lowest.copy(), highest.copy()
         for box in self.poses.box.split(0, parts):
-            cell = self.bounds(box, order, arithmetic, keep_linear=True, floor=floor)
+            sub_boxes = SubBoxes(shared_out(np.ones(box.dimensions), 16)) if box.dimensions else None
+            cell = self.bounds(box, order, arithmetic, keep_linear=True, floor=floor, sub_boxes=sub_boxes)
             assert cell.statistics[4] == 0
             lower, upper = assemble(cell.lower, self.camera), assemble(cell.upper, self.camera)
             linear = assemble(cell.linear, self.camera)
             found = [(lower, upper)]
+            over_parts = [] if sub_boxes is None else [(cell_parts(sub_boxes.counts), self.ends(cell))]
             if order == 1:
                 divided = shared_out(np.ones(box.dimensions), 16)
                 by_parts = self.bounds(box, 1, arithmetic, floor=floor, parts=divided, keep_parts=True)
                 assert by_parts.statistics[4] == 0
-                parts = cell_parts(divided)
-                ends = assemble(by_parts.parts.reshape(*by_parts.parts.shape[:3], -1), self.camera)
-                ends = ends.reshape(*ends.shape[:2], 2, 3, -1).clip(0.0, 1.0)
+                over_parts.append((cell_parts(divided), self.ends(by_parts)))
                 found.append((assemble(by_parts.lower, self.camera), assemble(by_parts.upper, self.camera)))
             pairs = self.poses.enclosure(box, order).rotation.basis.pairs
             for values in self.samples(box, count):
@@ -120,9 +125,9 @@ class Case:
                 radius = linear[..., -1] + 1e-12
                 assert (np.minimum(1.0, middle - radius) <= image).all(), (box, values)
                 assert (np.maximum(0.0, middle + radius) >= image).all(), (box, values)
-                if order == 1:
-                    # and each of the parts holds the pictures of its own poses
-                    within = (np.abs(p[:, None] - parts.middles) <= parts.half[:, None]).all(axis=0)
+                # and each of the parts holds the pictures of its own poses
+                for sub, ends in over_parts:
+                    within = (np.abs(p[:, None] - sub.middles) <= sub.half[:, None]).all(axis=0)
                     assert within.any()
                     assert (ends[:, :, 0, :, within] <= image).all() and (ends[:, :, 1, :, within] >= image).all()
                 for low, high in found:

@@ -26,7 +26,7 @@ from ns_abstract.methods.splat.pixel_block import (
     fragment_width,
     set_unknown,
 )
-from ns_abstract.methods.splat.stage_data import FormShape, Parts, PixelInputs, cell_parts, shared_out
+from ns_abstract.methods.splat.stage_data import FormShape, Parts, PixelInputs, SubBoxes, cell_parts, shared_out
 from ns_abstract.perturbation.specification import Perturbation
 
 BACKGROUND = np.array([0.25, 0.5, 0.75])
@@ -285,6 +285,8 @@ def test_parts_have_no_linear_sets_and_no_layers():
     for option in ("keep_linear", "layers"):
         with pytest.raises(ValueError, match="no linear sets and no layers"):
             case.bounds(case.poses.box, 1, parts=np.array([4, 2]), **{option: True})
+    with pytest.raises(ValueError, match="nor sub-boxes"):
+        case.bounds(case.poses.box, 1, parts=np.array([4, 2]), sub_boxes=SubBoxes(np.array([4, 2])))
     one = wide_case(False, 0, x=0.15)
     with pytest.raises(ValueError, match="one parameter have no parts"):
         one.bounds(one.poses.box, 2, parts=np.array([8]))

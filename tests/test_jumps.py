@@ -1,18 +1,21 @@
-"""Fragments that some poses skip, against exact arithmetic (design.md, B11)."""
+"""Fragments that some poses skip, against exact arithmetic (design.md, B11, B13)."""
 
 from __future__ import annotations
 
 import itertools
 from fractions import Fraction
+from typing import NamedTuple
 
 import numpy as np
 import pytest
 from blends import CAPACITY, blended
 from numba import njit
 
+from ns_abstract.arithmetic.rounding import SUB_BOX_OVERLAP
 from ns_abstract.arithmetic.simd.intrinsics import offset_by, pointer
 from ns_abstract.arithmetic.simd.lanes import load4, store
 from ns_abstract.methods.splat.blend import flattened
+from ns_abstract.methods.splat.form_sub_boxes import bound_sub_boxes
 from ns_abstract.methods.splat.pixel_block import (
     ALPHA_HIGH,
     ALPHA_LOW,
@@ -20,6 +23,7 @@ from ns_abstract.methods.splat.pixel_block import (
     BEND_SPREAD,
     FORM,
     LISTED,
+    PART_ENDS,
     ThresholdCrossings,
     bends_of,
     color_ends,
@@ -28,7 +32,7 @@ from ns_abstract.methods.splat.pixel_block import (
     crossing_rows,
     fragment_width,
 )
-from ns_abstract.methods.splat.stage_data import FormShape
+from ns_abstract.methods.splat.stage_data import FormShape, Parts, cell_parts
 from ns_abstract.methods.splat.threshold_crossings import bound_by_parts, gather_crossings, set_blend
 
 THRESHOLD = 2.0**-8
@@ -61,6 +65,29 @@ def _bounds(values, lists, colors, background, shape, count, limit, crossings_, 
     store(out, 4, rises)
     bound_by_parts(blend.crossings, limit, crossings, out, d)
     out[24] = blend.crossings
+
+
+class _SubBoxInputs(NamedTuple):
+    """What of `PixelInputs` sub-boxes need."""
+
+    parts: Parts
+    shape: FormShape
+
+
+@njit(error_model="numpy")
+def _by_sub_box(values, lists, colors, background, inputs, count, limit, crossings_, t_, out_, ends_):
+    """Three channels over sub-boxes into ``ends_``, as `PixelBlock.part_ends` has them."""
+    t, out, ends = pointer(t_), pointer(out_), pointer(ends_)
+    entries, distances, rows = crossings_
+    crossings = ThresholdCrossings(pointer(entries), pointer(distances), pointer(rows), rows.shape[1])
+    fragments, blend = blended(values, lists, colors, background, inputs.shape, 1, count, t, crossings, True)
+    store(out, 0, blend.radius * (1.0 + 2.0**-40))
+    set_blend(t, out, crossings, inputs.shape.dimensions)
+    store(out, 20, blend.since)
+    gather_crossings(0, count, blend.crossings, offset_by(out, 20), fragments, crossings, out, inputs.shape)
+    given = Parts(pointer(inputs.parts.middles), pointer(inputs.parts.half), inputs.parts.slope, inputs.parts.levels)
+    bound_sub_boxes(blend.crossings, limit, out, crossings, _SubBoxInputs(given, inputs.shape), ends)
+    return blend.crossings
 
 
 def _fragments(shape, alphas, radii, colors):
@@ -137,6 +164,71 @@ def _bounded(d, order, alphas, radii, colors, background):
     )  # fmt: skip
     low, high = out[0:3], out[4:7]
     return low, high, out[8:11], out[12:15], int(out[24])
+
+
+def _over_sub_boxes(counts, order, alphas, radii, colors, background, levels=()):
+    """Lower and upper bounds [3, parts] over sub-boxes, and the parts."""
+    d, number = len(counts), int(np.prod(counts))
+    parts = cell_parts(np.array(counts), SUB_BOX_OVERLAP, levels)
+    shape = FormShape(d, order, 3 if order == 2 else d + 1, 0, number)
+    values, palette, lists = _fragments(shape, alphas, radii, colors)
+    crossings = np.zeros(CAPACITY, np.int64), np.zeros(8 * CAPACITY), np.zeros((int(crossing_rows(shape)), 272))
+    t, out = np.zeros(4 * (3 * shape.monomials + 5 + d * (d + 1) // 2)), np.zeros(25)
+    ends = np.full(PART_ENDS + 6 * number, np.nan)
+    _by_sub_box(
+        values.ravel(), lists.ravel(), palette.ravel(), background, _SubBoxInputs(parts, shape), len(alphas),
+        THRESHOLD * (1.0 - 2.0**-52), crossings, t, out, ends,
+    )  # fmt: skip
+    low, high = ends[PART_ENDS:].reshape(2, 3, number)
+    return low, high, parts
+
+
+@pytest.mark.slow_cases(every=3)
+@pytest.mark.parametrize("radius", [0.0, 0.05])
+@pytest.mark.parametrize("counts, order", [((2, 8, 2), 1), ((8,), 2), ((8,), 1), ((4, 2), 1), ((2, 1, 2, 1, 2, 1), 1)])
+def test_sub_boxes_hold_their_own_pictures(counts, order, radius):
+    """No pose of a sub-box is outside of its bounds, which say more than those of the cell (B13)."""
+    d = len(counts)
+    generator = np.random.default_rng(10 * d + order)
+    shares = []
+    for count in (1, 3, 12, 40):
+        alphas, radii, colors = _case(d, count, generator, radius=radius)
+        background = np.array([*generator.random(3), 0.0])
+        low, high, parts = _over_sub_boxes(counts, order, alphas, radii, colors, background)
+        whole_low, whole_high, flat_low, flat_high, _ = _bounded(d, order, alphas, radii, colors, background)
+        exact = [[Fraction(float(x)) for x in side.ravel()] for side in (low, high)]
+        for number in range(parts.middles.shape[1]):
+            middle, half = parts.middles[:, number], parts.half
+            places = [*generator.choice([-1.0, 1.0], (4, d)), *generator.uniform(-1.0, 1.0, (6, d))]
+            for place in [np.clip(middle + half * p, -1.0, 1.0) for p in places]:
+                errors = radii * generator.choice([-1.0, 0.0, 1.0], count)
+                shown = _picture(alphas, errors, colors, background[:3], place, d)
+                for channel in range(3):
+                    at = channel * low.shape[1] + number
+                    assert exact[0][at] <= shown[channel] <= exact[1][at], (count, number, place)
+        whole = np.minimum(whole_high, flat_high) - np.maximum(whole_low, flat_low)
+        shares.append(float(((high - low) / whole[:, None]).mean()))
+    assert max(shares) < {1: 0.8, 2: 0.8, 3: 0.8, 6: 1.0}[d], shares
+
+
+@pytest.mark.parametrize("counts, order", [((2, 4, 2), 1), ((8,), 2)])
+def test_sub_boxes_are_refined_about_levels(counts, order):
+    """Where a level lies between the simple ends they are those that are asked for everywhere; else these hold, too."""
+    generator = np.random.default_rng(3)
+    refined, simple = 0, 0
+    for _ in range(6):
+        case = (*_case(len(counts), 12, generator), np.array([*generator.random(3), 0.0]))
+        low, high, _ = _over_sub_boxes(counts, order, *case)
+        loose_low, loose_high, _ = _over_sub_boxes(counts, order, *case, (2.0,))
+        levels = (float(np.sort(loose_low[0])[2]), float(np.sort(loose_high[2])[-3]))
+        some_low, some_high, _ = _over_sub_boxes(counts, order, *case, levels)
+        assert (loose_low <= some_low).all() and (some_low <= low).all()
+        assert (high <= some_high).all() and (some_high <= loose_high).all()
+        between = np.any([(loose_low <= level) & (level <= loose_high) for level in levels], axis=0).any(axis=0)
+        np.testing.assert_array_equal(some_low, np.where(between, low, loose_low))
+        np.testing.assert_array_equal(some_high, np.where(between, high, loose_high))
+        refined, simple = refined + int(between.sum()), simple + int((~between).sum())
+    assert refined > 0 < simple
 
 
 @pytest.mark.slow

@@ -15,13 +15,15 @@ from test_picture_properties import Case
 
 from ns_abstract.api.nearby_pictures import KnownBoxes, NearbyPictures, NearbyTuning
 from ns_abstract.api.picture_question import PlanePictures
+from ns_abstract.arithmetic.rounding import SUB_BOX_OVERLAP
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.tiles import assemble
+from ns_abstract.methods.splat.stage_data import cell_parts
 from ns_abstract.methods.splat.weights import SplatWeightFrame
 from ns_abstract.verify.enclosing_boxes import enclosing_box, shared_box
-from ns_abstract.verify.picture_measures import Measure
+from ns_abstract.verify.picture_measures import CellParts, Measure, PlaneSets
 from ns_abstract.verify.picture_sets import PictureSets
-from ns_abstract.verify.protocol import ComparedCuts, NearImages
+from ns_abstract.verify.protocol import ComparedCuts, DividedImages, NearImages
 from ns_abstract.verify.search_results import ContradictionError
 from ns_abstract.verify.settled_pixels import LimitedMeasure, unsettled
 
@@ -225,6 +227,70 @@ def test_many_pictures_near_cells_are_those_of_the_set(several: bool, blobs: Inp
     job, pictures = _pictures(tmp_path, blobs, _tight(tmp_path, blobs, [ONE, CLEAR, OTHER] if several else [ONE]))
     count = _attack(job, pictures, _cells(pictures.box, 40, np.random.default_rng(2)), 120)
     assert 0 < np.mean(count) < 400
+
+
+def _attack_sub_boxes(pictures: PlanePictures, cells: list[ParameterBox], poses: int) -> tuple[list[float], int]:
+    """Compare bounds over sub-boxes with whole pictures; their widths beside those of the cells' sets, and ends."""
+    rng, shares, count = np.random.default_rng(6), [], 0
+    channels = [channel for _, some in pictures.weights for channel in some]
+    for cell in cells:
+        near = pictures.near(cell)
+        assert isinstance(near, NearbyPictures) and isinstance(near, DividedImages)
+        counts = near.sub_box_counts(cell, 16)
+        if counts is None:
+            continue
+        assert counts.prod() == 16
+        sets, ends = near.divided_sets(cell, counts)
+        alone = near.linear_sets(cell)
+        for one, other in zip((*sets[0], *sets[1:]), (*alone[0], *alone[1:]), strict=True):
+            np.testing.assert_array_equal(one, other)
+        assert ends is not None and ends.counts is counts
+        np.testing.assert_array_equal(ends.pixels, np.flatnonzero(near._known.open))
+        parts, half = cell_parts(counts, SUB_BOX_OVERLAP), 0.5 * (np.array(cell.upper) - cell.lower)
+        middles = parts.middles.T
+        for number, middle in enumerate(middles):
+            signs = rng.choice([-1.0, 1.0], (poses, middle.size)), rng.uniform(-1.0, 1.0, (poses, middle.size))
+            for place in np.clip(middle + parts.half * np.concatenate(signs), -1.0, 1.0):
+                whole = pictures.image(cell.middle + half * place).reshape(-1, near._known.lower.shape[-1])
+                values = whole[ends.pixels][:, channels].astype(np.float64)
+                low, high = ends.lower[number][:, channels], ends.upper[number][:, channels]
+                assert ((low <= values) & (values <= high)).all()
+                count += values.size
+        lower, upper = (a.reshape(-1, a.shape[-1]) for a in sets[1:3])
+        planes = PlaneSets(tuple(a.reshape(-1, *a.shape[2:]) for a in sets[0]), lower, upper)
+        found = planes.over(CellParts.equal(counts, SUB_BOX_OVERLAP), ends.pixels, channels[0], np.ones(1))
+        shares.append(float((ends.upper - ends.lower)[..., channels[0]].mean() / (found[1] - found[0]).mean()))
+    return shares, count
+
+
+def test_bounds_over_sub_boxes_are_those_of_their_pictures(blobs: Inputs, tmp_path: Path) -> None:
+    _, pictures = _pictures(tmp_path, blobs, _tight(tmp_path, blobs, [SMALL]))
+    shares, count = _attack_sub_boxes(pictures, _cells(pictures.box, 3, np.random.default_rng(1)), 1)
+    assert count > 0 and np.mean(shares) < 1.0, shares
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("several", [False, True])
+def test_many_bounds_over_sub_boxes_are_those_of_their_pictures(several: bool, blobs: Inputs, tmp_path: Path) -> None:
+    _, pictures = _pictures(tmp_path, blobs, _tight(tmp_path, blobs, [ONE, CLEAR, OTHER] if several else [ONE]))
+    shares, count = _attack_sub_boxes(pictures, _cells(pictures.box, 12, np.random.default_rng(2)), 3)
+    assert count > 0 and np.mean(shares) < 1.0, shares
+
+
+def test_claims_that_need_whole_values_have_no_sub_boxes(blobs: Inputs, tmp_path: Path) -> None:
+    """Every end would have to be as narrow as it can be; and there are none where every pixel is settled."""
+    job, pictures = _pictures(tmp_path, blobs, _tight(tmp_path, blobs, [SMALL]))
+    (cell,) = _cells(pictures.box, 1, np.random.default_rng(1))
+    limited = job.property.limited(16, 16)
+    near = KnownBoxes(pictures, [_frame(pictures)], pictures.wanted, limited).near(cell)
+    assert near is not None and near.sub_box_counts(cell, 8) is not None
+    mean = [replace(one, measure=replace(one.measure, rank=None)) for one in limited]
+    near = KnownBoxes(pictures, [_frame(pictures)], pictures.wanted, mean).near(cell)
+    assert near is not None and near.sub_box_counts(cell, 8) is None
+    _, dark = _pictures(tmp_path / "dark", blobs, {**SMALL, "weight": 0.999})
+    near = dark.near(cell)
+    assert isinstance(near, NearbyPictures) and near.sub_box_counts(cell, 8) is None
+    assert near.divided_sets(cell, np.array([2, 2, 2]))[1] is None
 
 
 def test_wide_cells_and_other_planes_are_bounded_as_they_are(blobs: Inputs, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -16,7 +17,7 @@ from ns_abstract.arithmetic.rounding import SUB_BOX_OVERLAP
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.part_proofs import CellPart, PartQuestion
-from ns_abstract.verify.picture_measures import CellParts, Measure, shared_counts
+from ns_abstract.verify.picture_measures import CellParts, Measure, SubBoxEnds, planes_of, shared_counts
 from ns_abstract.verify.picture_properties import MeasureModel, parse_picture_property
 from ns_abstract.verify.properties import Claim
 from ns_abstract.verify.search import Search
@@ -162,6 +163,36 @@ def test_parts_overlap() -> None:
     sets = _sets(np.random.default_rng(2), 2)
     bright = (sets[0], sets[1] + 0.1, sets[2], sets[3] + 0.1, sets[4], sets[5] + 0.1)
     assert _parts(bright, cell, box) and not _parts(bright, cell, far)
+
+
+def test_ends_over_sub_boxes_are_those_of_their_pixels() -> None:
+    """Each pixel and sub-box takes its own ends where these say more, in whatever region a measure reads (Q8)."""
+    rng, d = np.random.default_rng(4), 2
+    sets = _sets(rng, d)
+    counts, some = np.array([4, 2]), np.array([1, 4, 7, 11])
+    low = rng.uniform(0.2, 0.6, (8, some.size, 1))
+    ends = SubBoxEnds(counts, some, low, low + rng.uniform(0.0, 0.4, low.shape))
+    (planes,) = planes_of(_model().input_sets(sets[:4], sets[4], sets[5]), 1)
+    parts = CellParts.equal(counts, SUB_BOX_OVERLAP)
+    gained = 0
+    for region in (np.arange(PIXELS), np.array([0, 4, 5, 11]), np.array([2, 3]), np.array([7]), np.array([0])):
+        plain = planes.over(parts, region, 0, np.ones(1))
+        found = replace(planes, ends=ends).over(parts, region, 0, np.ones(1))
+        for column, pixel in enumerate(region.tolist()):
+            (place,) = np.nonzero(some == pixel)
+            for side, own, better in ((0, ends.lower, np.maximum), (1, ends.upper, np.minimum)):
+                expected = plain[side][:, column]
+                if place.size:
+                    expected = better(expected, own[:, place[0], 0])
+                    gained += int((expected != plain[side][:, column]).sum())
+                np.testing.assert_allclose(found[side][:, column], expected, rtol=0.0, atol=1e-11)
+                # outward
+                np.testing.assert_array_equal(better(found[side][:, column], expected), expected)
+    assert gained > 20
+    # ends of other parts say nothing of these
+    images = _model().input_sets(sets[:4], sets[4], sets[5])
+    with pytest.raises(AssertionError):
+        _model().bound_parts(images, counts[::-1], ends)
 
 
 class Disc:

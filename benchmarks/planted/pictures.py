@@ -163,8 +163,23 @@ PICTURES = (
         "test_part_proofs.py::test_refuted_parts_are_falsified_at_once",
     ),
     Fault(
-        "near cells: settled pixels have their lower bounds", _NEARBY, "NearbyPictures.linear_sets",
+        "near cells: settled pixels have their lower bounds", _NEARBY, "NearbyPictures._sets",
         "box_bounds.upper.copy()", "box_bounds.lower.copy()", _NEAR,
+    ),
+    Fault(
+        "near cells: sub-boxes are those of the other end", _NEARBY, "NearbyPictures._sets",
+        "part[:, source].T", "part[:, source, ::-1].T",
+        "test_nearby_pictures.py::test_bounds_over_sub_boxes_are_those_of_their_pictures",
+    ),
+    Fault(
+        "near cells: pixels have their neighbours' bounds over sub-boxes", _NEARBY, "NearbyPictures._sets",
+        "places[elements.tiles][pixels]", "places[elements.tiles][pixels][::-1]",
+        "test_nearby_pictures.py::test_bounds_over_sub_boxes_are_those_of_their_pictures",
+    ),
+    Fault(
+        "proved parts: bounds over sub-boxes are those of the other end", _MEASURES, "PlaneSets.over",
+        "side[:, found, cut]", "side[::-1, found, cut]",
+        "test_part_proofs.py::test_ends_over_sub_boxes_are_those_of_their_pixels",
     ),
     Fault(
         "near cells: enclosing boxes are believed", _NEARBY, "KnownBoxes._attack",

@@ -16,6 +16,7 @@ _BOUNDS = "methods/splat/bounds.py"
 _ALPHAS = "methods/splat/alphas.py"
 _JUMPS = "methods/splat/threshold_crossings.py"
 _INTERVALS = "methods/splat/intervals.py"
+_SUB_BOXES = "methods/splat/form_sub_boxes.py"
 _REORDERING = "methods/splat/reordering.py"
 _STAGE_DATA = "methods/splat/stage_data.py"
 _BLOCK = "methods/splat/pixel_block.py"
@@ -358,7 +359,7 @@ SPLATS = (
     Fault(
         "parts forget what alpha is off its form",
         _JUMPS,
-        "_restrict",
+        "restrict",
         "low - radius, high + radius",
         "low, high",
         "test_jumps.py::test_skipped_fragments[1-2-0.05]",
@@ -366,7 +367,7 @@ SPLATS = (
     Fault(
         "parts forget slopes of products",
         _JUMPS,
-        "_restrict",
+        "restrict",
         "fma(2.0 * middle[j], bend, load8(rows, (part + 1 + j) * room + column))",
         "load8(rows, (part + 1 + j) * room + column)",
         "test_jumps.py::test_skipped_fragments[1-2-0.0]",
@@ -374,7 +375,7 @@ SPLATS = (
     Fault(
         "planes above what is taken begin at half of the threshold",
         _JUMPS,
-        "_set_planes",
+        "set_planes",
         "where(skipped | steep, 0.0, share * most)",
         "where(skipped | steep, 0.0, 0.5 * share * most)",
         "test_jumps.py::test_skipped_fragments[1-2-0.0]",
@@ -382,7 +383,7 @@ SPLATS = (
     Fault(
         "planes below what is taken fall to it at twice the threshold",
         _JUMPS,
-        "_set_planes",
+        "set_planes",
         "where(skipped, 0.0, share * limit)",
         "where(skipped, 0.0, 2.0 * share * limit)",
         "test_jumps.py::test_skipped_fragments[1-2-0.0]",
@@ -398,10 +399,34 @@ SPLATS = (
     Fault(
         "parts are passed over without what may be skipped there",
         _JUMPS,
-        "bound_by_parts",
-        "(reach + high + out[4 + channel]) * UP + center",
+        "foretell",
+        "(reach + high + moved[4 + channel]) * UP + center",
         "(reach + high) * UP + center",
         "test_jumps.py::test_skipped_fragments[1-2-0.0]",
+    ),
+    Fault(
+        "sub-boxes are half as wide as they are",
+        _SUB_BOXES,
+        "bound_sub_boxes",
+        "parts.middles[boxes * k + number], parts.half[k]",
+        "parts.middles[boxes * k + number], 0.5 * parts.half[k]",
+        "test_jumps.py::test_sub_boxes_hold_their_own_pictures[counts0-1-0.0]",
+    ),
+    Fault(
+        "sub-boxes: fragments that may be skipped raise what they lower",
+        _SUB_BOXES,
+        "bound_sub_boxes",
+        "1.0 if side == 1 else -1.0",
+        "1.0",
+        "test_jumps.py::test_sub_boxes_hold_their_own_pictures[counts0-1-0.0]",
+    ),
+    Fault(
+        "parts and sub-boxes: what changes of order and colours add to a form is forgotten",
+        _BLEND,
+        "_form_bounds",
+        "store(scratch, 0, radius * up)",
+        "store(scratch, 0, 0.0 * radius)",
+        "test_bounds.py::test_depth_swap[1]",
     ),
     Fault(
         "one parameter: what is behind a skipped fragment does not move",

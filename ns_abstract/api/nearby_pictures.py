@@ -19,8 +19,9 @@ from ns_abstract.geometry.tiles import assemble, in_tiles
 from ns_abstract.io.errors import InputError
 from ns_abstract.refine.protocol import Bounds, ElementFrame, Frame, SceneSample
 from ns_abstract.verify.enclosing_boxes import enclosing_box, shared_box
+from ns_abstract.verify.picture_measures import SubBoxEnds, shared_counts
 from ns_abstract.verify.picture_sets import PictureSets
-from ns_abstract.verify.protocol import FrameImages
+from ns_abstract.verify.protocol import FrameImages, PixelSets
 from ns_abstract.verify.search_results import FAILURES, ContradictionError
 from ns_abstract.verify.settled_pixels import LimitedMeasure, unsettled
 
@@ -100,7 +101,8 @@ class KnownBoxes:
         if box is None:
             return None
         box_bounds = self._about(box)
-        return NearbyPictures(self._pictures, self._weights, box_bounds, self._drawn(box, box_bounds), self._measures)
+        draws = self._drawn(box, box_bounds)
+        return NearbyPictures(self._pictures, self._weights, box_bounds, draws, self._measures, self._motion)
 
     def _about(self, box: ParameterBox) -> KnownBox:
         """What is known of a box, itself inside of one of which this is known."""
@@ -172,7 +174,8 @@ class NearbyPictures:
     """Pictures [H, W, C] of cells inside of a box; see `ns_abstract.verify.protocol.FrameImages`.
 
     Arguments as of `KnownBoxes`; ``box_bounds`` is what is known of the box, ``draws`` by frame what draws the pixels
-    that are not settled; empty where there are none.
+    that are not settled; empty where there are none. ``motion`` [d] are the pixels that the picture moves by over the
+    set.
     """
 
     def __init__(
@@ -182,9 +185,10 @@ class NearbyPictures:
         box_bounds: KnownBox,
         draws: Sequence[Draw],
         measures: Sequence[LimitedMeasure],
+        motion: np.ndarray,
     ) -> None:
         self._pictures, self._weights, self._known, self.box = pictures, weights, box_bounds, pictures.box
-        self._draws, self._measures = draws, measures
+        self._draws, self._measures, self._motion = draws, measures, motion
 
     def image(self, values: np.ndarray, member: SceneSample | None = None) -> np.ndarray:
         """Picture at a pose of the box: pixels that are settled are in the middle of their bounds."""
@@ -205,19 +209,54 @@ class NearbyPictures:
         """Picture at parameter values [d], every pixel as it is."""
         return self._pictures.differentiable(values)
 
-    def linear_sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
+    def linear_sets(self, box: ParameterBox) -> PixelSets:
         """Sets over a cell: of settled pixels what holds over the box around it."""
+        return self._sets(box, None)[0]
+
+    def sub_box_counts(self, box: ParameterBox, most: int) -> np.ndarray | None:
+        """See `ns_abstract.verify.protocol.DividedImages`; none where a claim needs more of pixels than their side."""
+        if self._known.elements is None or not all(one.counts for one in self._measures):
+            return None
+        whole = self.box
+        widths = [
+            (past - first) / (high - low) if high > low else 0.0
+            for first, past, low, high in zip(box.lower, box.upper, whole.lower, whole.upper, strict=True)
+        ]
+        return shared_counts(self._motion * np.array(widths), most)
+
+    def divided_sets(self, box: ParameterBox, counts: np.ndarray) -> tuple[PixelSets, SubBoxEnds | None]:
+        """See `ns_abstract.verify.protocol.DividedImages` (docs/dev/design.md, Q8)."""
+        return self._sets(box, counts)
+
+    def _sets(self, box: ParameterBox, counts: np.ndarray | None) -> tuple[PixelSets, SubBoxEnds | None]:
+        """Sets over a cell, and bounds of the pixels that are not settled over ``counts`` [d] sub-boxes of it."""
         box_bounds, d = self._known, box.dimensions
         flat = [np.zeros((*box_bounds.lower.shape, d), np.float32) for _ in range(2)]
         lower, upper, slopes = box_bounds.lower.copy(), box_bounds.upper.copy(), np.zeros(d)
         linear = (flat[0], lower.copy(), flat[1], upper.copy())
         if box_bounds.elements is None:
-            return linear, lower, upper, slopes
+            return (linear, lower, upper, slopes), None
+        ends = None if counts is None else self._no_ends(counts)
         for (frame, channels), elements in zip(self._weights, box_bounds.elements, strict=True):
-            bounds = frame.bound_parts([box], elements.tiles, elements.context, True, elements.pixels)[0]
+            context, pixels = elements.context, elements.pixels
+            if ends is None:
+                bounds = frame.bound_parts([box], elements.tiles, context, True, pixels)[0]
+            else:
+                levels = [limit for one in self._measures for limit in one.limits]
+                bounds, by_box = frame.bound_sub_boxes(box, elements.tiles, context, pixels, ends.counts, levels)
+                places = in_tiles(np.cumsum(box_bounds.open).reshape(box_bounds.open.shape) - 1, frame.side)
+                for whole, part in zip((ends.lower, ends.upper), by_box, strict=True):
+                    for source, target in enumerate(channels):
+                        whole[:, places[elements.tiles][pixels], target] = part[:, source].T
             place_sets((*linear, lower, upper), bounds, frame, elements.tiles, channels, box_bounds.open)
             slopes = slopes + bounds.slopes
-        return linear, lower, upper, slopes
+        return (linear, lower, upper, slopes), ends
+
+    def _no_ends(self, counts: np.ndarray) -> SubBoxEnds:
+        """Ends over ``counts`` [d] sub-boxes of the pixels that are not settled, all zeros."""
+        pixels = np.flatnonzero(self._known.open)
+        shape = int(counts.prod()), pixels.size, self._known.lower.shape[-1]
+        return SubBoxEnds(counts, pixels, np.zeros(shape), np.zeros(shape))
 
     def cut_gains(self, box: ParameterBox) -> np.ndarray:
         """[d] by how much sets of pixels narrow, about, where a cell is cut to nothing along each parameter (Q7).

@@ -318,6 +318,17 @@ class ElementFrame(WeightFrame, Protocol):
         """
         ...
 
+    def bound_sub_boxes(
+        self, box: ParameterBox, tiles: np.ndarray, within: Any, pixels: np.ndarray, counts: np.ndarray,
+        levels: Sequence[float],
+    ) -> tuple[Bounds, tuple[np.ndarray, np.ndarray]]:  # fmt: skip
+        """Bounds with linear bounds as `Frame.bound_parts` has them, and those over sub-boxes.
+
+        The latter are a pair as of `SubBoxFrame.sub_box_ends`. Only where one of ``levels`` lies between the ends of a
+        pixel over a sub-box are these made as narrow as they can be; none: everywhere.
+        """
+        ...
+
 
 @runtime_checkable
 class WeightMethod(Protocol):

@@ -84,10 +84,8 @@ def divided(cell: Cell, left: np.ndarray, filled: float) -> Iterator[tuple[Cell,
         yield cell, False
         return
     units = [(b - a) // n for a, b, n in zip(cell.first, cell.past, left.shape, strict=True)]
-    spans = []
-    for axis in range(left.ndim):
-        some = np.flatnonzero(left.any(axis=tuple(k for k in range(left.ndim) if k != axis)))
-        spans.append((int(some[0]), int(some[-1]) + 1))
+    places = np.argwhere(left)
+    spans = list(zip(places.min(axis=0).tolist(), (places.max(axis=0) + 1).tolist(), strict=True))
     inner = Cell(
         tuple(a + unit * start for a, unit, (start, _) in zip(cell.first, units, spans, strict=True)),
         tuple(a + unit * stop for a, unit, (_, stop) in zip(cell.first, units, spans, strict=True)),

@@ -13,6 +13,7 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.refine.protocol import SceneSample
 from ns_abstract.verify.cells import Cell
 from ns_abstract.verify.part_proofs import CellPart
+from ns_abstract.verify.picture_measures import SubBoxEnds
 from ns_abstract.verify.protocol import FrameImages
 from ns_abstract.verify.search_results import ContradictionError
 
@@ -30,6 +31,7 @@ class CellSamples:
         slopes: [d] what a cut along each parameter may gain.
         cost: The part of the margin that the width of the sets costs, about; NaN: nobody knows.
         cuts: Into how many parts to cut the cell along each parameter; empty: as slopes say.
+        ends: Bounds over the cell's sub-boxes; None: there are none.
         parts: That tile the cell, where some of them are decided.
     """
 
@@ -44,6 +46,7 @@ class CellSamples:
     slopes: np.ndarray = field(init=False)
     cost: float = math.nan
     cuts: tuple[int, ...] = ()
+    ends: SubBoxEnds | None = None
     parts: list[CellPart] = field(default_factory=list)
 
     def __post_init__(self) -> None:

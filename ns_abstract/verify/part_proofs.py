@@ -10,16 +10,16 @@ from typing import Literal
 
 import numpy as np
 
-from ns_abstract.arithmetic.rounding import SUB_BOX_OVERLAP
 from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.cell_boxes import divided, meeting, resolved, sub_box_counts
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.network import ImageSets
+from ns_abstract.verify.picture_measures import SubBoxEnds
 from ns_abstract.verify.picture_sets import sane
 from ns_abstract.verify.properties import Claim, Query
-from ns_abstract.verify.protocol import FrameImages, PartsModel
+from ns_abstract.verify.protocol import DividedImages, FrameImages, PartsModel, PixelSets
 from ns_abstract.verify.search_results import FAILURES
 
 
@@ -65,15 +65,18 @@ class PartQuestion:
     query: Query
     refute: bool = True
 
-    def parts(self, images: ImageSets, cell: Cell, box: ParameterBox, halves: bool = True) -> list[CellPart]:
+    def parts(
+        self, images: ImageSets, cell: Cell, box: ParameterBox, halves: bool = True, ends: SubBoxEnds | None = None
+    ) -> list[CellPart]:
         """Parts that tile a cell, by what its linear sets ``images`` decide of them (Q8); empty if they decide none.
 
         ``box``: the cell's parameters. ``halves``: whether halves of it are refuted, too, and not all of it alone.
+        ``ends``: what `divided_sets` returns of the cell.
         """
-        counts = sub_box_counts(cell, self.model.part_counts(images, _TUNING.parts))
+        counts = sub_box_counts(cell, self.model.part_counts(images, _TUNING.parts)) if ends is None else ends.counts
         if not resolved(box, counts):
             return []
-        bounds, boxes = self.model.bound_parts(images, counts, SUB_BOX_OVERLAP), [box] * int(counts.prod())
+        bounds, boxes = self.model.bound_parts(images, counts, ends), [box] * int(counts.prod())
         low, high = (
             np.asarray(margins, np.float64).reshape(counts)
             for margins in (
@@ -96,7 +99,7 @@ class PartQuestion:
         check_cancelled()
         box = grid.box_of(cell)
         try:
-            linear, lower, upper, slopes = scene.linear_sets(box)
+            (linear, lower, upper, slopes), ends = divided_sets(scene, cell, box)
         except InputError:
             raise
         except FAILURES:
@@ -105,9 +108,18 @@ class PartQuestion:
         if not sane(linear, lower, upper):
             return []
         images = self.model.input_sets(tuple(side[None] for side in linear), lower[None], upper[None])
-        return self.parts(images, cell, box, halves=False) or [
+        return self.parts(images, cell, box, halves=False, ends=ends) or [
             CellPart(half, None) for half in grid.divide(cell, slopes, 0.5, 2)
         ]
+
+
+def divided_sets(scene: FrameImages, cell: Cell, box: ParameterBox) -> tuple[PixelSets, SubBoxEnds | None]:
+    """Sets of a cell with the parameters ``box``, and bounds over sub-boxes of whole units where it has some (Q8)."""
+    if isinstance(scene, DividedImages):
+        most = scene.sub_box_counts(box, _TUNING.parts)
+        if most is not None and resolved(box, counts := sub_box_counts(cell, most)):
+            return scene.divided_sets(box, counts)
+    return scene.linear_sets(box), None
 
 
 def _tiled(

@@ -199,17 +199,41 @@ class CellParts:
 
 
 @dataclass(frozen=True)
+class SubBoxEnds:
+    """Bounds of some pixels over each of equal sub-boxes of one cell, beside its linear sets (Q8).
+
+    Attributes:
+        counts: [d] numbers of sub-boxes along the parameters, powers of two. Each reaches by `SUB_BOX_OVERLAP` of the
+            cell's half-widths beyond its ends.
+        pixels: [n] places in the picture, row by row, each once.
+        lower, upper: [s, n, C] of planes, sub-boxes numbered like entries of an array of shape ``counts``.
+    """
+
+    counts: np.ndarray
+    pixels: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+
+
+@dataclass(frozen=True)
 class PlaneSets:
-    """Linear sets of all planes of one cell's pictures, A_lower [n, C, d], b_lower [n, C], A_upper, b_upper."""
+    """Linear sets of all planes of one cell's pictures, A_lower [n, C, d], b_lower [n, C], A_upper, b_upper.
+
+    ``ends``: bounds of some pixels over the parts that `over` is asked for; None: the sets are all that is known.
+    """
 
     linear: tuple[np.ndarray, ...]
     lower: np.ndarray
     upper: np.ndarray
+    ends: SubBoxEnds | None = None
 
     def over(
         self, parts: CellParts, pixels: np.ndarray, first: int, channels: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """[s, k] lower and upper bounds of weighted channels, ``first`` on, of ``pixels`` [k] over each part."""
+        """[s, k] lower and upper bounds of weighted channels, ``first`` on, of ``pixels`` [k] over each part.
+
+        The pixels are places in the picture, in order.
+        """
         cut = slice(first, first + len(channels))
         ends = []
         for sign, side, interval in ((-1.0, 0, self.lower), (1.0, 2, self.upper)):
@@ -220,6 +244,14 @@ class PlaneSets:
             line = parts.middles @ a.T + b + sign * (parts.halves @ np.abs(a).T)
             nearest = np.maximum(line, flat) if sign < 0.0 else np.minimum(line, flat)
             ends.append(nearest + sign * OWN_MARGIN * size)
+        if self.ends is not None:
+            place = np.minimum(np.searchsorted(pixels, self.ends.pixels), len(pixels) - 1)
+            found = pixels[place] == self.ends.pixels
+            for nearer, side, sign in ((np.maximum, self.ends.lower, -1.0), (np.minimum, self.ends.upper, 1.0)):
+                own = side[:, found, cut] @ channels
+                own += sign * OWN_MARGIN * np.abs(own)
+                of_side = ends[0] if sign < 0.0 else ends[1]
+                of_side[:, place[found]] = nearer(of_side[:, place[found]], own)
         return ends[0], ends[1]
 
 

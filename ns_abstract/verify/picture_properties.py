@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +16,7 @@ import numpy as np
 import torch
 
 from ns_abstract.arithmetic.network_charges import OWN_MARGIN
+from ns_abstract.arithmetic.rounding import SUB_BOX_OVERLAP
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
@@ -31,6 +32,7 @@ from ns_abstract.verify.picture_measures import (
     Plane,
     PlaneSets,
     Region,
+    SubBoxEnds,
     planes_of,
     shared_counts,
 )
@@ -269,13 +271,14 @@ class MeasureModel:
         (planes,) = planes_of(images, self.channels)
         return self._counts(planes, most_parts)
 
-    def bound_parts(self, images: ImageSets, counts: np.ndarray, overlap: float) -> OutputBounds:
+    def bound_parts(self, images: ImageSets, counts: np.ndarray, ends: SubBoxEnds | None = None) -> OutputBounds:
         """`bound` of equal parts of one cell, ``counts`` [d] along its parameters, each as if it were a cell (Q8).
 
-        They reach by ``overlap`` of the cell's half-widths beyond their ends.
+        They reach by `SUB_BOX_OVERLAP` of the cell's half-widths beyond their ends. ``ends`` are over the same parts.
         """
+        assert ends is None or np.array_equal(ends.counts, counts)
         (planes,) = planes_of(images, self.channels)
-        rows = self._over(planes, CellParts.equal(counts, overlap))
+        rows = self._over(replace(planes, ends=ends), CellParts.equal(counts, SUB_BOX_OVERLAP))
         lower = rows.reshape(len(rows), -1)
         return OutputBounds(lower, np.zeros((*lower.shape, 1)), lower)
 

@@ -11,6 +11,7 @@ import torch
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.refine.protocol import SceneSample
 from ns_abstract.verify.network import ImageSets, OutputBounds
+from ns_abstract.verify.picture_measures import SubBoxEnds
 from ns_abstract.verify.properties import Query
 
 
@@ -27,7 +28,7 @@ class FrameImages(Protocol):
         """Other scenes of the set, without end; none where only poses vary."""
         ...
 
-    def linear_sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:
+    def linear_sets(self, box: ParameterBox) -> PixelSets:
         """(A_lower, b_lower, A_upper, b_upper) [H, W, 3, d] and [H, W, 3], lower, upper, and slopes [d]."""
         ...
 
@@ -44,6 +45,26 @@ class NearImages(Protocol):
         """Pictures and sets for poses of ``cell`` and boxes inside it.
 
         Every margin has the sign of that of the picture as it is, though pixels may have other values.
+        """
+        ...
+
+
+#: (A_lower, b_lower, A_upper, b_upper), lower, upper, and slopes; see `FrameImages.linear_sets`.
+PixelSets = tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]
+
+
+@runtime_checkable
+class DividedImages(Protocol):
+    """An optional interface of `FrameImages`: bounds over equal sub-boxes of a cell cost little beside its sets."""
+
+    def sub_box_counts(self, box: ParameterBox, most: int) -> np.ndarray | None:
+        """[d] into how many sub-boxes a cell is best divided, powers of two, ``most`` together; None: into none."""
+        ...
+
+    def divided_sets(self, box: ParameterBox, counts: np.ndarray) -> tuple[PixelSets, SubBoxEnds | None]:
+        """`FrameImages.linear_sets`, and bounds over sub-boxes of pixels that decide; None: there are no such pixels.
+
+        There are ``counts`` [d] sub-boxes, at least 8.
         """
         ...
 
@@ -89,6 +110,10 @@ class PartsModel(Model, Protocol):
         """[d] into how many parts one cell is best divided along its parameters, powers of two."""
         ...
 
-    def bound_parts(self, images: ImageSets, counts: np.ndarray, overlap: float) -> OutputBounds:
-        """Bounds of the query's rows over equal parts of one cell, a row for each, the last parameter's first."""
+    def bound_parts(self, images: ImageSets, counts: np.ndarray, ends: SubBoxEnds | None = None) -> OutputBounds:
+        """Bounds of the query's rows over equal parts of one cell, a row for each, the last parameter's first.
+
+        Parts reach by `SUB_BOX_OVERLAP` of the cell's half-widths beyond their ends; ``ends`` bound pixels over the
+        same parts.
+        """
         ...

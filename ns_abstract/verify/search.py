@@ -24,10 +24,11 @@ from ns_abstract.verify.cell_samples import CellSamples, Sample, drawn, sample_k
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.margin_descent import descend
 from ns_abstract.verify.network import ImageSets
-from ns_abstract.verify.part_proofs import CellPart, PartQuestion
+from ns_abstract.verify.part_proofs import CellPart, PartQuestion, divided_sets
+from ns_abstract.verify.picture_measures import SubBoxEnds
 from ns_abstract.verify.picture_sets import PictureSets
 from ns_abstract.verify.properties import Claim, LinearClaim, Query
-from ns_abstract.verify.protocol import ComparedCuts, FrameImages, Model, NearImages, PartsModel
+from ns_abstract.verify.protocol import ComparedCuts, FrameImages, Model, NearImages, PartsModel, PixelSets
 from ns_abstract.verify.search_results import FAILURES, BlockResult, FinishedCell, failure_text
 from ns_abstract.verify.sub_box_proof import PixelWeights, SubBoxProof, margin_weights
 
@@ -270,7 +271,7 @@ class Search:
         for cell in cells:
             check_cancelled()
             try:
-                linear, lower, upper, cell.slopes = cell.scene.linear_sets(cell.box)
+                (linear, lower, upper, cell.slopes), cell.ends = self._sets(cell)
             except InputError:
                 raise
             except FAILURES as error:
@@ -300,7 +301,7 @@ class Search:
             margins = np.array(self.claim.proved(query, self.model.bound(inputs, query), boxes), np.float64)
             for place, cell in enumerate(usable):
                 groups = self._branching(cell, float(margins[place]))
-                if isinstance(self.model, PartsModel) and not margins[place] > 0.0 and self._splittable(cell.cell):
+                if self._divisible(cell.cell) and not margins[place] > 0.0:
                     cell.parts = self._decided(cell, query, inputs[place : place + 1])
                 if groups:
                     better = self.model.branch(inputs[place : place + 1], query, groups, _BRANCHES)
@@ -318,12 +319,21 @@ class Search:
             else:
                 cell.reason = reason
 
+    def _divisible(self, cell: Cell) -> bool:
+        return isinstance(self.model, PartsModel) and self._splittable(cell)
+
+    def _sets(self, cell: CellSamples) -> tuple[PixelSets, SubBoxEnds | None]:
+        """Sets of a cell, and bounds over its sub-boxes where these are looked at."""
+        if self._divisible(cell.cell):
+            return divided_sets(cell.scene, cell.cell, cell.box)
+        return cell.scene.linear_sets(cell.box), None
+
     def _decided(self, cell: CellSamples, query: Query, images: ImageSets) -> list[CellPart]:
         """Parts that tile a cell, where some of them are decided (Q8); what is left is bounded once more by itself."""
         assert isinstance(self.model, PartsModel)
         question = PartQuestion(self.claim, self.model, query, refute=not self.every_unit)
         parts: list[CellPart] = []
-        for part in question.parts(images, cell.cell, cell.box):
+        for part in question.parts(images, cell.cell, cell.box, ends=cell.ends):
             finer = [] if part.verdict else question.bounded(cell.scene, self.grid, part.cell)
             parts += finer or [part]
         return parts

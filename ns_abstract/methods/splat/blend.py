@@ -21,6 +21,7 @@ from ns_abstract.arithmetic.rounding import (
 )
 from ns_abstract.arithmetic.simd.intrinsics import lowest_bit, offset_by, prefetch, signed
 from ns_abstract.arithmetic.simd.lanes import LINE, bits, load4, maximum, minimum, store, where
+from ns_abstract.methods.splat.form_sub_boxes import bound_sub_boxes
 from ns_abstract.methods.splat.intervals import AHEAD, BlendBounds, blend_interval, blend_parts, write_parts
 from ns_abstract.methods.splat.lists import BLOCK
 from ns_abstract.methods.splat.pixel_block import (
@@ -384,14 +385,19 @@ def _form_bounds(begin, end, block, inputs, linear):
     # the radius' own rounding: three for every fragment
     up = UP + LAYER_ROUNDING * (end - begin)
     falls, rises = 0.0 * radius, 0.0 * radius
-    if blended.crossings > 0:
+    if blended.crossings > 0 or inputs.shape.sub_boxes > 0:
         store(scratch, 0, radius * up)
         set_blend(polynomials, scratch, crossings, d)
+    if blended.crossings > 0:
         store(scratch, 16, blended.since)
         gather_crossings(
             begin, end, blended.crossings, offset_by(scratch, 16), fragments, crossings, scratch, inputs.shape
         )
         falls, rises = load4(scratch, 0), load4(scratch, 4)
+    if inputs.shape.sub_boxes > 0:
+        store(scratch, 0, falls)
+        store(scratch, 4, rises)
+        bound_sub_boxes(blended.crossings, limit, scratch, crossings, inputs, block.part_ends)
     if order == 1:
         radius = flattened(polynomials, radius, scratch, m)
     radius = radius * up

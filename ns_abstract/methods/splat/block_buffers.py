@@ -86,7 +86,8 @@ def _aligned(size):
 @njit(cache=True, error_model="numpy")
 def _part_ends(shape, capacity):
     """Memory for `PixelBlock.part_ends` with lists of ``capacity`` fragments."""
-    return np.empty(PART_ENDS + (6 * shape.parts + 2 * PART_LANES * capacity if shape.parts > 0 else 0))
+    by_interval = 6 * shape.parts + 2 * PART_LANES * capacity if shape.parts > 0 else 0
+    return np.empty(PART_ENDS + max(by_interval, 6 * shape.sub_boxes))
 
 
 @njit(cache=True, error_model="numpy")

@@ -10,6 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ns_abstract.arithmetic.forms import Basis
 from ns_abstract.arithmetic.rounding import (
     FRAGMENT_ROUNDING,
     GRAM_ROOM,
@@ -41,11 +42,13 @@ from ns_abstract.methods.splat.stage_data import (
     Colors,
     Cutoffs,
     FormShape,
+    Parts,
     PixelBounds,
     PixelInputs,
     ProjectedGaussians,
     SceneColors,
     SceneGaussians,
+    SubBoxes,
     ViewingAxes,
     cell_parts,
     check_parts,
@@ -148,10 +151,28 @@ class SceneSums:
         return _shifted_colors(self._varied, self._charges)
 
     @cached_property
+    def largest_mean(self) -> float:
+        """Greatest absolute coordinate of a mean, world units."""
+        return float(np.abs(self._splats.means).max(initial=0.0))
+
+    @cached_property
     def least_step(self) -> float:
         """Least difference other than 0 between two coordinates of means along one axis, world units."""
         steps = [np.diff(np.unique(column)) for column in self._splats.means.T]
         return min(float(step.min(initial=np.inf)) for step in steps)
+
+
+def _divided(
+    basis: Basis, parts: np.ndarray | None, keep_parts: bool, sub_boxes: SubBoxes | None
+) -> tuple[FormShape, Parts]:
+    """The forms of a cell, and its equal parts or sub-boxes, if it is to be divided; see `SplatBounds.cell`."""
+    counts = parts if sub_boxes is None else sub_boxes.counts
+    if counts is None:
+        return form_shape(basis), cell_parts(np.ones(basis.dimensions, np.int64))
+    check_parts(counts, basis.dimensions)
+    if sub_boxes is None:
+        return form_shape(basis, int(counts.prod())), cell_parts(counts, SUB_BOX_OVERLAP * keep_parts)
+    return form_shape(basis, 0, int(counts.prod())), cell_parts(counts, SUB_BOX_OVERLAP, sub_boxes.levels)
 
 
 def _cell_poses(forms: PoseForms) -> CellPoses:
@@ -201,7 +222,7 @@ class SplatBounds:
 
     def _tied(self, origin: np.ndarray) -> bool:
         """Whether means are equal where their differences to ``origin`` [3] are, and none varies (design.md, O1)."""
-        largest = float(np.abs(self.splats.means).max(initial=0.0)) + float(np.abs(origin).max())
+        largest = self._sums.largest_mean + float(np.abs(origin).max())
         # two roundings of the differences
         return self.varied.mean_radius.shape[0] == 0 and self._sums.least_step > TIE_ROUNDING * largest
 
@@ -227,6 +248,7 @@ class SplatBounds:
         pixels: np.ndarray | None = None,
         parts: np.ndarray | None = None,
         keep_parts: bool = False,
+        sub_boxes: SubBoxes | None = None,
     ) -> CellBounds:
         """Bounds of the tiles ``wanted`` over the poses enclosed by ``forms`` (design.md, G10).
 
@@ -242,17 +264,17 @@ class SplatBounds:
             pixels: [t, side, side] which of the tiles' pixels are wanted, nothing is said of the others; all if None.
             parts: [d] numbers of parts along the cell's axes, powers of two and at least `PART_LANES` together: bound
                 pixels by intervals over each of them, not by forms (B12).
-
             keep_parts: Whether to return bounds over each of these parts.
+            sub_boxes: Bound pixels by forms over each of these, too, and return these bounds as ``parts`` (B13).
 
         Raises:
-            ValueError: Linear sets or layers are asked for together with ``parts``, or these are not as above.
+            ValueError: Linear sets, layers or ``sub_boxes`` are asked for together with ``parts``, or numbers of parts
+                or sub-boxes are not as above.
         """
-        if parts is not None:
-            check_parts(parts, forms.rotation.basis.dimensions)
-            if keep_linear or layers:
-                raise ValueError("intervals over parts of a cell have no linear sets and no layers")
-        shape = form_shape(forms.rotation.basis, 0 if parts is None else int(parts.prod()))
+        if parts is not None and (keep_linear or layers or sub_boxes is not None):
+            raise ValueError("intervals over parts of a cell have no linear sets and no layers, nor sub-boxes")
+        shape, equal = _divided(forms.rotation.basis, parts, keep_parts, sub_boxes)
+        with_ends = keep_parts or sub_boxes is not None
         across, down = tile_grid(camera, self.side)
         wanted = np.asarray(np.arange(across * down) if wanted is None else wanted, np.int64)
         if candidates is None:
@@ -268,7 +290,7 @@ class SplatBounds:
         if layers:
             colors = _four_channels(colors, self._depths(poses, candidates, alive, gaussians.delta, m), alive, m)
             common = np.ascontiguousarray(poses.offset[: m + 1, 2])
-        bounds = self._allocate_bounds(wanted.size, candidates.size, shape, keep_linear, layers, keep_parts)
+        bounds = self._allocate_bounds(wanted.size, candidates.size, shape, keep_linear, layers, with_ends)
         inputs = PixelInputs(
             gaussians,
             self._viewing_axes(forms, poses.rotation_magnitude, gaussians),
@@ -278,7 +300,7 @@ class SplatBounds:
             self.charges,
             self._cutoffs(floor, PART_PAIR_LIMIT if keep_parts else PAIR_LIMIT),
             shape,
-            cell_parts(np.ones(shape.dimensions, np.int64) if parts is None else parts, SUB_BOX_OVERLAP * keep_parts),
+            equal,
         )
         sets = pixel_sets(pixels, wanted.size, self.side)
         self.stages.pixel_stage(TileLists(wanted, offsets, entries), sets, inputs, bounds)
@@ -287,7 +309,7 @@ class SplatBounds:
             *visible_again(bounds.marks, candidates, gaussians.box, gaussians.tiles, self.side),
             bounds.linear if keep_linear else None, bounds.layers if layers else None,
             bounds.slopes.sum(axis=0) / (max(wanted.size, 1) * self.side**2 * 3), bounds.statistics.sum(axis=0),
-            bounds.parts if keep_parts else None,
+            bounds.parts if with_ends else None,
         )  # fmt: skip
 
     def _projected(
@@ -303,7 +325,7 @@ class SplatBounds:
         return gaussians, np.flatnonzero(state)
 
     def _allocate_bounds(
-        self, tiles: int, gaussians: int, shape: FormShape, keep_linear: bool, layers: bool, keep_parts: bool
+        self, tiles: int, gaussians: int, shape: FormShape, keep_linear: bool, layers: bool, with_ends: bool
     ) -> PixelBounds:
         """The output of the pixel stage for so many tiles and candidates, not filled in."""
         shaped = (tiles, self.side, self.side, 3)
@@ -315,7 +337,7 @@ class SplatBounds:
             slopes=np.zeros((tiles, shape.dimensions)),
             statistics=np.zeros((threads(), 5), np.int64),
             # memory is taken where it is written: for the pixels that are wanted
-            parts=np.empty((tiles if keep_parts else 0, self.side, self.side, 6, shape.parts)),
+            parts=np.empty((tiles if with_ends else 0, self.side, self.side, 6, max(shape.parts, shape.sub_boxes))),
             marks=np.zeros(gaussians, np.uint8),
         )
 

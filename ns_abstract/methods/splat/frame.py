@@ -23,7 +23,7 @@ from ns_abstract.methods.splat.constants import Rasteriser
 from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW, DEPTH_HIGH, DEPTH_LOW
 from ns_abstract.methods.splat.lists import summed_area, touching
 from ns_abstract.methods.splat.render import Renderer
-from ns_abstract.methods.splat.stage_data import shared_out
+from ns_abstract.methods.splat.stage_data import SubBoxes, shared_out
 from ns_abstract.methods.splat.variations import VariedSplats
 from ns_abstract.perturbation.specification import ROTATIONS
 from ns_abstract.refine.protocol import COLORS, Bounds, Frame, LinearSets, Score, SharedOrder
@@ -83,10 +83,16 @@ class VisibleContext:
 
 @dataclass(frozen=True)
 class TileBounds(Bounds):
-    """Bounds of some tiles; ``trivial``: blocks of pixels where too many depth orders were open: nothing is known."""
+    """Bounds of some tiles.
+
+    Attributes:
+        trivial: Blocks of pixels where too many depth orders were open: nothing is known.
+        parts: [t, side, side, 6, k] see `PixelBounds.parts`; None: the cell has no sub-boxes.
+    """
 
     context: VisibleContext
     trivial: int = 0
+    parts: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -281,23 +287,20 @@ class SplatFrame(Frame):
         cell = self.bounds.cell(
             self.camera, forms, tiles, floor=self._floor, pixels=pixels, parts=counts, keep_parts=True
         )
-        assert cell.parts is not None
-        ends = cell.parts[pixels]
-        lower, upper = ends[:, :COLORS], ends[:, COLORS:]
-        # crossed or not a number: nothing is known
-        sane = lower <= upper
-        return np.where(sane, lower, 0.0).clip(0.0, 1.0), np.where(sane, upper, 1.0).clip(0.0, 1.0)
+        return part_ends(cell.parts, pixels)
 
     def _bound(
         self, box: ParameterBox, tiles: np.ndarray, within: VisibleContext | None, candidates: np.ndarray | None,
-        keep_linear: bool, pixels: np.ndarray | None,
+        keep_linear: bool, pixels: np.ndarray | None, sub_boxes: SubBoxes | None = None,
     ) -> TileBounds:  # fmt: skip
-        """`bound`, given what may be seen there."""
+        """`bound`, given what may be seen there; over ``sub_boxes`` of the box, too, if some are named."""
         check_cancelled()
         forms = self.pose_set.enclosure(box, self.order)
         layers = self.channels > COLORS
         parts = None if keep_linear or layers else self._parts(box)
-        cell = self.bounds.cell(self.camera, forms, tiles, candidates, keep_linear, self._floor, layers, pixels, parts)
+        cell = self.bounds.cell(
+            self.camera, forms, tiles, candidates, keep_linear, self._floor, layers, pixels, parts, sub_boxes=sub_boxes
+        )
         lower, upper = cell.lower, cell.upper
         if cell.layers is not None:
             low, high = (
@@ -313,7 +316,7 @@ class SplatFrame(Frame):
             assert cell.linear is not None
             linear = linear_sets(cell.linear, cell.lower, cell.upper, box.dimensions)
         slopes = cell.slopes if parts is None else self._all_slopes(box, cell.slopes, parts)
-        return TileBounds(lower, upper, slopes, context, linear, cell.linear, int(cell.statistics[3]))
+        return TileBounds(lower, upper, slopes, context, linear, cell.linear, int(cell.statistics[3]), cell.parts)
 
     @cached_property
     def _pace(self) -> np.ndarray:
@@ -431,6 +434,16 @@ class SplatFrame(Frame):
                 [self.camera.fx * x / z + self.camera.cx, self.camera.fy * y / z + self.camera.cy], axis=1
             )
         return np.where(np.isfinite(pixels), pixels, 0.0), z
+
+
+def part_ends(parts: np.ndarray | None, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper bounds [n, 3, k] of the ``n`` chosen ``pixels`` [t, side, side] from `PixelBounds.parts`."""
+    assert parts is not None
+    ends = parts[pixels]
+    lower, upper = ends[:, :COLORS], ends[:, COLORS:]
+    # crossed or not a number: nothing is known
+    sane = lower <= upper
+    return np.where(sane, lower, 0.0).clip(0.0, 1.0), np.where(sane, upper, 1.0).clip(0.0, 1.0)
 
 
 def linear_sets(forms: np.ndarray, lower: np.ndarray, upper: np.ndarray, d: int) -> LinearSets:

@@ -275,7 +275,7 @@ def blend_parts(begin, end, reordered, block, inputs, slopes):
 
 @njit(cache=True, error_model="numpy")
 def write_parts(fall, rise, part_ends, out, u):
-    """Write the ends of `blend_parts` in each part, widened by ``fall`` and ``rise``, to ``out`` [6, parts].
+    """Write the ends of `blend_parts` or `bound_sub_boxes`, widened by ``fall`` and ``rise``, to ``out`` [6, parts].
 
     Ends that cross or are no numbers are written as they are: they bound nothing. ``u`` is scratch for 8 numbers.
     """

@@ -193,7 +193,7 @@ class PixelBlock(NamedTuple):
     Attributes:
         shifted: Depths of one pixel's list against its own reference (see `depths`).
         part_ends: Over parts of the cell: least of the channels and most, [2, 4], scratch, and from `PART_ENDS` on the
-            least of three channels and the most in each part, [6, parts]; then scratch for a list's alphas.
+            least of three channels and the most in each part or sub-box, [6, parts]; then scratch for a list's alphas.
         sums: [3 m + bends + 5, 4] scratch by channel: polynomials, then what `blend` and `depths` need beside them.
         ray: [3] the block's central ray at the cell's middle, world axes, of unit depth.
     """

@@ -52,7 +52,7 @@ def _set_trivial(pixels, left, above, bounds, m):
 
 @njit(cache=True, error_model="numpy")
 def _set_trivial_parts(pixels, left, above, bounds):
-    """`_set_trivial` of the parts of the cell, where these are asked for."""
+    """`_set_trivial` of the parts or sub-boxes of the cell, where these are asked for."""
     while pixels != 0 and bounds.parts.shape[0] > 0:
         q = lowest_bit(pixels)
         pixels = signed(pixels & (pixels - 1))
@@ -114,7 +114,7 @@ def _borrowed_inputs(inputs):
     colors = Colors(
         borrowed(colors.values), borrowed(colors.background), colors.error, colors.channels, borrowed(colors.common)
     )
-    parts = Parts(pointer(parts.middles), pointer(parts.half), pointer(parts.slope))
+    parts = Parts(pointer(parts.middles), pointer(parts.half), pointer(parts.slope), borrowed(parts.levels))
     return PixelInputs(
         gaussians, axes, inputs.intrinsics, colors, inputs.rules, inputs.charges, inputs.cutoffs, inputs.shape, parts
     )

@@ -7,6 +7,7 @@ Throughout, n counts the candidates of a cell, m the coefficients of its forms, 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -23,16 +24,18 @@ PART_LANES = 8
 class FormShape(NamedTuple):
     """The forms of a cell, as `Basis` tells: ``order`` 2 for one parameter, else 1.
 
-    Pixels have no forms where the cell has ``parts``, over which intervals bound them (B12).
+    Pixels have no forms where the cell has ``parts``, over which intervals bound them (B12). Their forms are bounded
+    over each of its ``sub_boxes``, too, where it has some (B13).
     """
 
     dimensions: int
     order: int
     monomials: int
     parts: int = 0
+    sub_boxes: int = 0
 
 
-def form_shape(basis: Basis, parts: int = 0) -> FormShape:
+def form_shape(basis: Basis, parts: int = 0, sub_boxes: int = 0) -> FormShape:
     """``basis`` as kernels take it.
 
     Raises:
@@ -42,7 +45,7 @@ def form_shape(basis: Basis, parts: int = 0) -> FormShape:
         raise ValueError(f"forms of order 2 have one parameter, not {basis.dimensions}")
     if basis.order == 2 and parts:
         raise ValueError("cells of one parameter have no parts")
-    return FormShape(basis.dimensions, basis.order, basis.monomials, parts)
+    return FormShape(basis.dimensions, basis.order, basis.monomials, parts, sub_boxes)
 
 
 class SceneGaussians(NamedTuple):
@@ -186,19 +189,34 @@ class Cutoffs(NamedTuple):
     pairs: int
 
 
+class SubBoxes(NamedTuple):
+    """Equal sub-boxes of a cell over which pixels' forms are bounded (design.md, B13).
+
+    Attributes:
+        counts: [d] numbers of them along the axes, powers of two, at least `PART_LANES` together.
+        levels: Values of a channel. Only where one of them lies between the ends over a sub-box are these made as
+            narrow as they can be; none: everywhere.
+    """
+
+    counts: np.ndarray
+    levels: tuple[float, ...] = ()
+
+
 class Parts(NamedTuple):
-    """Equal parts of a cell, at places and of widths in [-1, 1] (design.md, B12).
+    """Equal parts of a cell, at places and of widths in [-1, 1] (design.md, B12, B13).
 
     Attributes:
         middles: [d, parts].
         half: [d] half-widths.
         slope: [d] turns the sum of ``middles`` times the ends of a quantity over the parts into its slope; 0 where an
             axis is not divided.
+        levels: See `SubBoxes`.
     """
 
     middles: np.ndarray
     half: np.ndarray
     slope: np.ndarray
+    levels: np.ndarray
 
 
 def check_parts(counts: np.ndarray, dimensions: int) -> None:
@@ -220,7 +238,7 @@ def shared_out(weights: np.ndarray, parts: int) -> np.ndarray:
     return counts
 
 
-def cell_parts(counts: np.ndarray, overlap: float = 0.0) -> Parts:
+def cell_parts(counts: np.ndarray, overlap: float = 0.0, levels: Sequence[float] = ()) -> Parts:
     """The parts of a cell, ``counts`` [d] of them along its axes: powers of two, so that all is exact (B12).
 
     They reach beyond their ends by ``overlap`` of the cell's half-width.
@@ -229,7 +247,8 @@ def cell_parts(counts: np.ndarray, overlap: float = 0.0) -> Parts:
     grid = np.array(np.meshgrid(*along, indexing="ij"), np.float64)
     middles = np.ascontiguousarray(grid.reshape(counts.size, counts.prod()))
     squares = np.square(middles).sum(axis=1)
-    return Parts(middles, 1.0 / counts + overlap, np.where(counts > 1, 0.5 / np.where(counts > 1, squares, 1.0), 0.0))
+    slope = np.where(counts > 1, 0.5 / np.where(counts > 1, squares, 1.0), 0.0)
+    return Parts(middles, 1.0 / counts + overlap, slope, np.array(levels, np.float64))
 
 
 class PixelBounds(NamedTuple):
@@ -243,8 +262,8 @@ class PixelBounds(NamedTuple):
             were uncertain, pixels with results that were not numbers.
         layers: [t, side, side, 4] bounds of the accumulation, and of the expected depth where anything is drawn (see
             `depths`; infinity before its negative: nothing can be), or empty.
-        parts: [t, side, side, 6, parts] least of the three channels and most in each part of the cell, where pixels are
-            wanted, or empty.
+        parts: [t, side, side, 6, parts] least of the three channels and most in each part or sub-box of the cell, where
+            pixels are wanted, or empty.
         marks: [n] uint8; set to 1 for every Gaussian that some wanted pixel of these tiles may draw or stop at. Those
             that stay 0 are hidden or too faint for every pose: leaving them out changes nothing.
     """
@@ -271,7 +290,7 @@ class PixelInputs(NamedTuple):
         charges: For the program's rounding.
         cutoffs: What is left out.
         shape: Of the Gaussians' forms.
-        parts: Of the cell, where ``shape`` has some.
+        parts: Of the cell, or its sub-boxes, where ``shape`` has some.
     """
 
     gaussians: ProjectedGaussians

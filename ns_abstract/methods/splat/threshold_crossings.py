@@ -73,7 +73,7 @@ def _restricted_rows(d):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _columns(count):
+def crossing_columns(count):
     """Columns of `ThresholdCrossings.rows` in use: whole lanes."""
     return CROSSING_LANES + -(-count // CROSSING_LANES) * CROSSING_LANES
 
@@ -91,7 +91,7 @@ def gather_crossings(begin, end, count, since, fragments, crossings, out, shape)
     first = load4(since, 0)
     falls = 0.0 * first
     rises = falls
-    for column in range(CROSSING_LANES + count, _columns(count)):
+    for column in range(CROSSING_LANES + count, crossing_columns(count)):
         for row in range(_restricted_rows(d)):
             rows[row * room + column] = 0.0
         rows[_THRESHOLD * room + column] = 1.0
@@ -167,7 +167,7 @@ def clear_slopes(crossings, d, order):
 
 
 @njit(cache=True, error_model="numpy")
-def _restrict(columns, middle, half, crossings, d):
+def restrict(columns, middle, half, crossings, d):
     """The first ``columns`` forms over the part of the box about ``middle`` [d] of the half-widths ``half`` [d]."""
     rows, room = crossings.rows, crossings.room
     part = _restricted_rows(d)
@@ -212,8 +212,8 @@ def _restrict(columns, middle, half, crossings, d):
 
 
 @njit(cache=True, error_model="numpy")
-def _set_planes(columns, limit, crossings, d):
-    """Planes above and below what skipping takes of each fragment over a part, from what `_restrict` left (B11).
+def set_planes(columns, limit, crossings, d):
+    """Planes above and below what skipping takes of each fragment over a part, from what `restrict` left (B11).
 
     A fragment surely is skipped below alpha ``limit``.
     """
@@ -319,7 +319,7 @@ def _by_planes(columns, side, place, bounds, crossings, d):
 
 
 @njit(cache=True, error_model="numpy")
-def _part_bounds(columns, side, place, bounds, crossings, d):
+def bound_part(columns, side, place, bounds, crossings, d):
     """`_by_planes` at the corner that the blends point to, or between where the planes point back; the better."""
     rows, room = crossings.rows, crossings.room
     part = _restricted_rows(d)
@@ -388,6 +388,30 @@ def _foremost(foretold, left):
     return best
 
 
+@njit(cache=True, error_model="numpy", forceinline=True)
+def crossing_scratch(crossings, d):
+    """Scratch behind what `restrict` shares."""
+    return offset_by(crossings.rows, (_restricted_rows(d) + d + _SCRATCH) * crossings.room + CROSSING_LANES * d)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def foretell(foretold, moved, crossings, d):
+    """Bound three channels over a part from what `restrict` left of them, wherever fragments are skipped.
+
+    ``foretold`` [8] receives upper bounds of their negatives, then of themselves; ``moved`` [8] is by how much skipping
+    lowers them at most, then by how much it raises them.
+    """
+    rows, room, part = crossings.rows, crossings.room, _restricted_rows(d)
+    for channel in range(3):
+        reach = 0.0
+        for k in range(d):
+            reach += abs(rows[(part + 1 + k) * room + channel])
+        center = rows[part * room + channel]
+        low, high = rows[(part + d + _LOW) * room + channel], rows[(part + d + _HIGH) * room + channel]
+        foretold[channel] = (reach - low + moved[channel]) * UP - center
+        foretold[4 + channel] = (reach + high + moved[4 + channel]) * UP + center
+
+
 @njit(cache=True, error_model="numpy")
 def bound_by_parts(count, limit, crossings, out, d):
     """Bounds of three channels, whose blends `set_blend` wrote, with ``count`` fragments that may be skipped (B11).
@@ -395,10 +419,8 @@ def bound_by_parts(count, limit, crossings, out, d):
     ``out`` [8] holds by how much skipping lowers the channels at most, then by how much it raises them; it receives
     lower bounds, then upper ones, each of three channels and one of none. ``d`` is positive.
     """
-    rows, room = crossings.rows, crossings.room
-    columns, part = _columns(count), _restricted_rows(d)
-    # behind what `_restrict` shares
-    pieces = offset_by(rows, (part + d + _SCRATCH) * room + CROSSING_LANES * d)
+    columns = crossing_columns(count)
+    pieces = crossing_scratch(crossings, d)
     middle = offset_by(pieces, 2 * d)
     half = offset_by(middle, d)
     place = offset_by(half, d)
@@ -408,15 +430,8 @@ def bound_by_parts(count, limit, crossings, out, d):
     # what a part may reach at most, wherever fragments are skipped
     for number in range(_PARTS):
         _place_part(number, pieces, middle, half, d)
-        _restrict(CROSSING_LANES, middle, half, crossings, d)
-        for channel in range(3):
-            reach = 0.0
-            for k in range(d):
-                reach += abs(rows[(part + 1 + k) * room + channel])
-            center = rows[part * room + channel]
-            low, high = rows[(part + d + _LOW) * room + channel], rows[(part + d + _HIGH) * room + channel]
-            foretold[8 * number + channel] = (reach - low + out[channel]) * UP - center
-            foretold[8 * number + 4 + channel] = (reach + high + out[4 + channel]) * UP + center
+        restrict(CROSSING_LANES, middle, half, crossings, d)
+        foretell(offset_by(foretold, 8 * number), out, crossings, d)
     for k in range(8):
         # nothing is known of the channel of nothing
         out[k] = -float("inf") if k % 4 < 3 else float("inf")
@@ -431,12 +446,12 @@ def bound_by_parts(count, limit, crossings, out, d):
         if wanted == 0:
             continue
         _place_part(number, pieces, middle, half, d)
-        _restrict(columns, middle, half, crossings, d)
-        _set_planes(columns, limit, crossings, d)
+        restrict(columns, middle, half, crossings, d)
+        set_planes(columns, limit, crossings, d)
         for side in range(2):
             if (wanted >> 4 * side) & 15 == 0:
                 continue
-            _part_bounds(columns, 1.0 if side == 1 else -1.0, place, bounds, crossings, d)
+            bound_part(columns, 1.0 if side == 1 else -1.0, place, bounds, crossings, d)
             for channel in range(3):
                 k = 4 * side + channel
                 bound = min(foretold[8 * number + k], bounds[channel])

@@ -12,17 +12,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ns_abstract.arithmetic.outward import outward
 from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, Arithmetic
 from ns_abstract.execution.cancellation import check_cancelled
+from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseBox, PoseForms
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.bounds import SceneSums, SplatBounds
 from ns_abstract.methods.splat.constants import Rasteriser
-from ns_abstract.methods.splat.frame import SplatFrame, SplatSample, VisibleContext
+from ns_abstract.methods.splat.frame import SplatFrame, SplatSample, TileBounds, VisibleContext, part_ends
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.scene import Float64Array, SplatScene
-from ns_abstract.methods.splat.stage_data import CellPoses
+from ns_abstract.methods.splat.stage_data import CellPoses, SubBoxes
 from ns_abstract.methods.splat.variations import VariedSplats, selected
 from ns_abstract.refine.protocol import MOST_PLANES, SceneSample, WeightPlane
 
@@ -66,6 +68,8 @@ class WhiteGaussians:
 
     def at(self, depth: Float64Array) -> Float64Array:
         """[N, 3] colours of Gaussians at ``depth`` [N]."""
+        if np.isinf(self.nearer).all():
+            return self.selected.astype(np.float64)
         return (self.selected & ((depth[:, None] < self.nearer) | np.isinf(self.nearer))).astype(np.float64)
 
     def between(self, numbers: np.ndarray, low: Float64Array, high: Float64Array) -> tuple[Float64Array, Float64Array]:
@@ -187,6 +191,15 @@ class SplatWeightFrame(SplatFrame):
             return renderer.tiles(self.camera, rotation, position, tiles, member, pixels).astype(np.float32)
 
         return draw
+
+    def bound_sub_boxes(
+        self, box: ParameterBox, tiles: np.ndarray, within: VisibleContext, pixels: np.ndarray, counts: np.ndarray,
+        levels: Sequence[float],
+    ) -> tuple[TileBounds, tuple[np.ndarray, np.ndarray]]:  # fmt: skip
+        """See `ns_abstract.refine.protocol.ElementFrame` (design.md, B13)."""
+        candidates = self.candidates(tiles, within, pixels)
+        bounds = self._bound(box, tiles, within, candidates, True, pixels, SubBoxes(counts, tuple(levels)))
+        return bounds, outward(*part_ends(bounds.parts, pixels))
 
     def differentiable(self, values: torch.Tensor) -> torch.Tensor:
         """See `ns_abstract.refine.protocol.WeightFrame`, by the reference renderer."""
