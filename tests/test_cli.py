@@ -753,6 +753,13 @@ def test_demo_into_a_file_is_refused(tmp_path: Path, call: Callable[..., tuple[i
     one_line(*call(["--output-dir", str(tmp_path / "file")], demo_command.main), "file", "--output-dir")
 
 
+def test_demo_replaces_no_files_of_others(tmp_path: Path, call: Callable[..., tuple[int, str]]) -> None:
+    mine = tmp_path / "camera_path.json"
+    mine.write_text("mine")
+    one_line(*call(["--output-dir", str(tmp_path)], demo_command.main), "camera_path.json", "--output-dir")
+    assert mine.read_text() == "mine" and list(tmp_path.iterdir()) == [mine]
+
+
 def test_demo_options_are_checked(call: Callable[..., tuple[int, str]]) -> None:
     one_line(*call([], demo_command.main), "--output-dir", "missing")
 
@@ -769,6 +776,8 @@ def test_demo_writes_what_the_next_command_needs(
     assert job.frame_count == 5
     assert job.pose_sets[0].box.names == ("x",)
     assert len(list((tmp_path / "data" / "images").glob("*.png"))) == 10
+    # an earlier demo is written anew
+    assert call(["--output-dir", str(tmp_path), "--splats-only"], demo_command.main)[0] == 0
 
 
 def test_many_frames_are_told_in_few_words() -> None:

@@ -30,19 +30,20 @@ class Demo:
 def demo(options: Demo) -> int:
     from rich.console import Console
 
-    from ns_abstract.demo.writing import write_demo, write_loop_demo, write_nerf_demo, write_nerfacto_demo
+    from ns_abstract.demo import writing
 
     folder = options.output_dir
+    writing.refuse_others(folder)
     console = Console(stderr=True, highlight=False)
     try:
         with console.status("modelling the airfield, rendering its data set"):
-            config, files = write_demo(folder)
+            config, files = writing.write_demo(folder)
         with console.status("modelling the gate, fitting the network of its loop"):
-            course, loop = write_loop_demo(folder / "gate")
+            course, loop = writing.write_loop_demo(folder / "gate")
         fields = {}
         if not options.splats_only:
             with console.status("writing the NeRFs"):
-                fields = {"NeRF": write_nerf_demo(folder), "nerfacto": write_nerfacto_demo(folder)}
+                fields = {"NeRF": writing.write_nerf_demo(folder), "nerfacto": writing.write_nerfacto_demo(folder)}
     except OSError as error:
         raise InputError(
             f"cannot be written ({error.strerror})", file=folder, field="--output-dir", fix="choose another folder"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -23,6 +24,7 @@ from ns_abstract.demo.scenes import (
 from ns_abstract.geometry.camera_path import PinholeCamera, focal_length
 from ns_abstract.geometry.keyframe_cameras import KeyframeCamera
 from ns_abstract.io.atomic import write_json
+from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.write import write_nerf_run, write_nerfacto_run
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
@@ -31,6 +33,21 @@ from ns_abstract.methods.splat.write import write_splatfacto_run
 
 #: Name of the run's folder: a fixed time, so that the demo is the same every time.
 TIMESTAMP = "2026-01-01_120000"
+#: What the demo writes into its folder beside the airfield's run.
+_WRITTEN = (
+    "SPEC.json", "camera_path.json", "camera_path_orbit.json", "camera_path_buoy.json", "camera_path_nerfacto.json",
+    "data", "data-buoy", "data-buoy-nerfacto", "buoy", "buoy-nerfacto", "gate",
+)  # fmt: skip
+
+
+def refuse_others(folder: Path) -> None:
+    """Raise InputError where the demo would replace what is not an earlier demo's."""
+    if (folder / "airfield" / "splatfacto" / TIMESTAMP).is_dir():
+        return
+    there = next((name for name in _WRITTEN if os.path.lexists(folder / name)), None)
+    if there is not None:
+        problem = f"holds {there}, which is no earlier demo's"
+        raise InputError(problem, file=folder, field="--output-dir", fix="choose another folder")
 
 
 def write_nerf_demo(folder: Path) -> tuple[Path, Path]:
