@@ -138,8 +138,8 @@ def check(
         audit._tally(finished)
     except BadInput as error:
         raise InputError(error.problem, fix=error.fix, file=error.file, field=error.field) from None
-    # claims that the time did not reach took none
-    settled = [took for outcome, took in zip(finished, spent, strict=True) if outcome.verdict is not None]
+    # claims that the time did not reach come last and took none
+    settled = [took for outcome, took in zip(finished, spent, strict=False) if outcome.verdict is not None]
     audit.seconds, audit.median_seconds = time.monotonic() - begin, statistics.median(settled or spent or [0.0])
     write_json(folder / "check.json", {"version": 1, "seed": seed, **asdict(audit)})
     return audit
