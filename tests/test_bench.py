@@ -95,7 +95,7 @@ def test_a_plan_that_loses_something_is_noticed(job: PathJob, monkeypatch: pytes
 
     monkeypatch.setattr(SplatFrame, "_bound", wider)
     # parts inherit their parents' bounds: wide enough that those do not hide it
-    rows = plan.without(job, "x", 0, 6, 2.0)
+    rows = plan.cost_of_omissions(job, "x", 0, 6, 2.0)
     assert rows[0]["looser by"] == 0.0 and rows[1]["looser by"] > 0.005
 
 

@@ -90,7 +90,7 @@ def test_a_command_takes_both(tmp_path: Path) -> None:
     assert text.count("nerfstudio_dataparser.Nerfstudio") == 2
     ngp = text.replace("nerfstudio_dataparser.Nerfstudio", "instant_ngp_dataparser.InstantNGP")
     config.write_text(ngp)
-    with pytest.raises(InputError, match="a run whose data parser is Nerfstudio's or COLMAP's"):
+    with pytest.raises(InputError, match="with Nerfstudio's or COLMAP's data parser"):
         open_job(Settings(config, tmp_path / "transforms.json", spec))
     config.write_text(text)
     # without it nothing says where the data set's cameras stand in the run's frame

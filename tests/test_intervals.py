@@ -45,7 +45,7 @@ def _blended(values, palette, shape, parts, rules, charges_, unknown, out, slope
         if unknown[e]:
             set_unknown(block.fragments, e * width, values[e, ALPHA_HIGH], shape.monomials)
     buffers.palette[: palette.size] = palette
-    of_parts = Parts(pointer(parts.middles), pointer(parts.half), pointer(parts.slope))
+    of_parts = Parts(pointer(parts.middles), pointer(parts.half), pointer(parts.slope), parts.levels)
     inputs = PixelInputs(None, None, None, None, rules, charges_, None, shape, of_parts)
     ends = blend_parts(0, count, False, block, inputs, pointer(slopes))
     for k in range(4):

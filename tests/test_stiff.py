@@ -90,8 +90,8 @@ class Low(WatchedFrame):
         super().__init__(splats, rasteriser, arithmetic, pose_set)
         honest = self.bounds.cell
 
-        def cell(*arguments: Any) -> CellBounds:
-            found = honest(*arguments)
+        def cell(*arguments: Any, **named: Any) -> CellBounds:
+            found = honest(*arguments, **named)
             self.alter(found)
             return found
 

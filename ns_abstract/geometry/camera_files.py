@@ -77,8 +77,8 @@ def transforms_cameras(
     if frame is None:
         problem = "is a data set's transforms.json, and the scene is no run whose frame could be told from it"
         fix = (
-            "give the config.yml, beside its dataparser_transforms.json, of a run whose data parser is Nerfstudio's or "
-            "COLMAP's, or make a camera path"
+            "give the config.yml of a run trained on it, beside its dataparser_transforms.json and with Nerfstudio's "
+            "or COLMAP's data parser, or make a camera path"
         )
         raise InputError(problem, fix=fix)
     frames = root.get("frames")
