@@ -15,6 +15,7 @@ from ns_abstract.check.inputs import BadInput
 from ns_abstract.io.arguments import file_path, positive, whole
 from ns_abstract.io.atomic import write_json
 from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import unusable
 
 #: Part of the claims that must be settled.
 _ENOUGH = 0.8
@@ -104,10 +105,10 @@ def check(
         InputError: A file or a field in it cannot be used.
     """
     if whole(claims, 1, "claims") > _MOST_CLAIMS:
-        raise InputError(f"found {claims}", field="claims", fix=f"give a number of at most {_MOST_CLAIMS:,}")
+        raise unusable(claims, field="claims", fix=f"give a number of at most {_MOST_CLAIMS:,}")
     positive(seconds, "seconds")
     if whole(seed, 0, "seed") >= 2**63:
-        raise InputError(f"found {seed}", field="seed", fix="give a number below 2**63")
+        raise unusable(seed, field="seed", fix="give a number below 2**63")
     moved = {
         "load_config": load_config,
         "camera_path_filename": camera_path,

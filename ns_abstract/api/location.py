@@ -306,7 +306,7 @@ def training_data(scene: Scene) -> Path:
     """
     file = scene.source.file
     if scene.data_frame is None:
-        problem = "the scene is no run with photos, or its dataparser_transforms.json is missing"
+        problem = "the scene is no run with photos whose frame could be told from that of their transforms.json"
         raise InputError(problem, file=file, field=_OPTION, fix="give --noise and --outliers")
     run = read_config(file)
     value = run.root.get("data")
