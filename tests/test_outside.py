@@ -22,7 +22,7 @@ from ns_abstract.perturbation.specification import parse_perturbation
 from ns_abstract.reach.loop import Loop, parse_loop
 from ns_abstract.reach.planes import plane_marks, region, views
 from ns_abstract.refine.protocol import SceneElements
-from ns_abstract.report.cameras import MOST, CameraDrawings, cameras_entry, cell_cameras, standing, upward
+from ns_abstract.report.cameras import MOST, CameraDrawings, cameras_entry, cell_cameras, looked_at, standing, upward
 from ns_abstract.report.export import encode_gif, encode_mp4
 from ns_abstract.report.outside import PlotWindow, SceneDrawing
 from ns_abstract.verify.store import Store
@@ -327,6 +327,24 @@ def test_cameras_that_stand_still_are_drawn() -> None:
         page = CameraDrawings(cells, left_out, standing({0: still}), None).html({})
         assert page.count(f'<path class="{row["verdict"]}"') == 2 and "nan" not in page
     assert CameraDrawings([], 0, standing({0: poses()}), None).html({}) == ""
+
+
+def test_what_cameras_look_at_is_shown() -> None:
+    """A camera that hardly moves is drawn with what it sees, and not with what is beside or behind it."""
+    sets = {0: shifts()}
+    pose = sets[0].pose(np.asarray(sets[0].box.middle))
+    ahead, across = -pose[:, 2], pose[:, 0]
+    places = [pose[:, 3] + 4.0 * ahead, pose[:, 3] + 5.0 * ahead + across, pose[:, 3] + 6.0 * ahead]
+    beside = [pose[:, 3] - 3.0 * ahead, pose[:, 3] + 1.0 * ahead + 2.0 * across]
+    outside = SceneDrawing(elements(*[(place, np.ones(3), 0.03, 0.9) for place in [*places, *beside]]))
+    (point,) = looked_at(sets, outside)
+    np.testing.assert_allclose(point, pose[:, 3] + 5.0 * ahead)
+    drawings = CameraDrawings([], 0, standing(sets), outside, sights=looked_at(sets, outside))
+    for view in drawings.views(300):
+        chosen = list(view.window.axes)
+        assert (np.array(view.window.low) < point[chosen]).all() and (point[chosen] < view.window.high).all()
+    blind = SceneDrawing(elements(*[(place, np.ones(3), 0.03, 0.9) for place in beside]))
+    assert looked_at(sets, blind).shape == looked_at(sets, None).shape == (0, 3)
 
 
 @pytest.mark.slow

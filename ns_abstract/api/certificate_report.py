@@ -16,9 +16,10 @@ import torch
 from ns_abstract.api.cell_search import CellSearch
 from ns_abstract.api.certification import Certification, FramePictures
 from ns_abstract.execution.cancellation import WorkCancelledError, cancel_when, check_cancelled
+from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.report import regions as broken
-from ns_abstract.report.cameras import CameraDrawings, cameras_entry, cell_cameras, standing, upward
+from ns_abstract.report.cameras import CameraDrawings, cameras_entry, cell_cameras, looked_at, standing, upward
 from ns_abstract.report.certificate import certificate_document, search_figures
 from ns_abstract.report.certificate_page import CertificateDetails, certificate_page
 from ns_abstract.report.figures import ShownUnits
@@ -60,7 +61,7 @@ class CertificateReport:
         entries = [self._entry(tally, rows[tally.frame]) for tally in store.tallies()]
         sets = {frame: self.job.job.pose_sets[frame] for frame in rows}
         cells, left_out = cell_cameras(sets, rows, [name for name, _ in self.job.job.parameters])
-        self.cameras = CameraDrawings(cells, left_out, self._standing, self._outside, upward(sets))
+        self.cameras = CameraDrawings(cells, left_out, self._standing, self._outside, upward(sets), self._sights)
         claim = {
             "property": self.job.question.source.value,
             "property_text": self.job.property.sentence(),
@@ -99,7 +100,15 @@ class CertificateReport:
     @cached_property
     def _standing(self) -> tuple[np.ndarray, np.ndarray]:
         """Where cameras may stand; the same for every report, so that the scene is drawn once."""
-        return standing({frame: self.job.job.pose_sets[frame] for frame in self.search.grids})
+        return standing(self._sets)
+
+    @cached_property
+    def _sights(self) -> np.ndarray:
+        return looked_at(self._sets, self._outside)
+
+    @property
+    def _sets(self) -> dict[int, PoseBox]:
+        return {frame: self.job.job.pose_sets[frame] for frame in self.search.grids}
 
     @cached_property
     def _outside(self) -> SceneDrawing | None:

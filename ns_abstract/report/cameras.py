@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -119,6 +119,25 @@ def standing(pose_sets: Mapping[int, PoseBox]) -> tuple[Float64, Float64]:
     return np.min(places, axis=0), np.max(places, axis=0)
 
 
+def looked_at(pose_sets: Mapping[int, PoseBox], outside: SceneDrawing | None) -> Float64:
+    """[n, 3] points in front of the cameras in the middles of the sets, behind which half of what they see lies.
+
+    Cameras that see none of the opaque elements have none.
+    """
+    points: list[Float64] = []
+    opaque = np.zeros((0, 3)) if outside is None else outside.opaque_places
+    for poses in pose_sets.values():
+        pose = poses.pose(np.asarray(poses.box.middle, np.float64))
+        rays, ahead = corner_rays(poses.camera, pose), -pose[:, 2]
+        away = opaque - pose[:, 3]
+        # inside of the pyramid of the corners' rays, whose sides are seen from one side all the way around
+        sides = away @ np.cross(rays, np.roll(rays, -1, axis=0)).T
+        depths = (away @ ahead)[(sides > 0.0).all(axis=1) | (sides < 0.0).all(axis=1)]
+        depths = depths[depths > 0.0]
+        points += [pose[:, 3] + float(np.median(depths)) * ahead] if len(depths) else []
+    return np.array(points, np.float64).reshape(-1, 3)
+
+
 def upward(pose_sets: Mapping[int, PoseBox]) -> int:
     """The axis that sets turn about most nearly, so that an orbit is seen in its plane; 2 where none turns."""
     for poses in pose_sets.values():
@@ -164,7 +183,7 @@ class CameraDrawings:
 
     ``ends`` [3], [3] bound a box about where cameras stand, normalised units. ``outside`` draws the scene behind them;
     None: it has no elements with a place of their own. ``up`` is the axis from whose tip the plan is drawn; see
-    `upward`.
+    `upward`. ``sights`` [n, 3] are points that are shown as well; see `looked_at`.
     """
 
     cells: Sequence[CellCamera]
@@ -172,6 +191,7 @@ class CameraDrawings:
     ends: tuple[Float64, Float64]
     outside: SceneDrawing | None
     up: int = 2
+    sights: Float64 = field(default_factory=lambda: np.zeros((0, 3)))
 
     def views(self, width: int) -> list[CameraPlot]:
         """What there is to see from above and from the side, in pictures so many pixels wide."""
@@ -186,7 +206,8 @@ class CameraDrawings:
             (sideways(low, high, self.up), "from the side", np.inf),
         ):
             chosen = list(axes)
-            window = about(self.outside, axes, low[chosen] - around, high[chosen] + around, nearest, width)
+            shown = np.array([low - around, high + around, *self.sights])[:, chosen]
+            window = about(self.outside, axes, shown.min(axis=0), shown.max(axis=0), nearest, width)
             length = min(room, _OF_WINDOW * (window.high[0] - window.low[0]))
             shapes = []
             for camera in sorted(self.cells, key=lambda cell: _ORDER.index(cell.verdict)):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.refine.protocol import SceneElements
-from ns_abstract.report.cameras import CameraDrawings, cell_cameras, standing
+from ns_abstract.report.cameras import CameraDrawings, cell_cameras, looked_at, standing
 from ns_abstract.report.figures import number, unit_of_axis
 from ns_abstract.report.html import whole_page
 from ns_abstract.report.outside import SceneDrawing
@@ -161,7 +161,7 @@ def location_page(
     names = [p["name"] for p in document["frames"][0]["parameters"]] if document["frames"] else []
     cells, left_out = cell_cameras(sets, left, names)
     outside = None if elements is None else SceneDrawing(elements)
-    drawings = CameraDrawings(cells, left_out, standing(sets), outside).plots({}) if cells else []
+    cameras = CameraDrawings(cells, left_out, standing(sets), outside, sights=looked_at(sets, outside))
     maps = [(entry, svg) for entry in document["frames"] if (svg := pair_svg(entry, rows[entry["index"]])) is not None]
     return whole_page(
         "location.html",
@@ -171,7 +171,7 @@ def location_page(
         kind=kind,
         heading=heading,
         maps=maps,
-        drawings=drawings,
+        drawings=cameras.plots({}) if cells else [],
         pictures=pictures,
         largest=_LARGEST,
     )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 
 import numpy as np
 from markupsafe import Markup
@@ -67,12 +67,20 @@ class SceneDrawing:
         third = 3 - sum(axes)
         return third, float(np.cross(np.eye(3)[axes[0]], np.eye(3)[axes[1]])[third])
 
+    @cached_property
+    def _opaque(self) -> NDArray[np.bool_]:
+        return np.isfinite(self.elements.places).all(axis=1) & (self.elements.opacities >= _OPAQUE)
+
+    @property
+    def opaque_places(self) -> Float64:
+        """[n, 3] middles of the opaque elements, normalised units."""
+        return self.elements.places[self._opaque]
+
     def _drawn(self, axes: tuple[int, int], nearest: float) -> NDArray[np.intp]:
         """Numbers of the opaque elements that are not nearer to who looks than ``nearest``, the farthest first."""
         third, sign = self.sight(axes)
         depth = sign * self.elements.places[:, third]
-        good = np.isfinite(self.elements.places).all(axis=1) & (self.elements.opacities >= _OPAQUE)
-        visible = np.flatnonzero(good & (depth <= nearest))
+        visible = np.flatnonzero(self._opaque & (depth <= nearest))
         return visible[np.argsort(depth[visible], kind="stable")]
 
     def window(self, axes: tuple[int, int], low: Float64, high: Float64, nearest: float, width: int) -> PlotWindow:
