@@ -8,6 +8,12 @@ _FILES = "test_scene_files.py::"
 
 SCENES = (
     Fault(
+        "scenes: a checkpoint sets the attributes of its tensors",
+        "methods/checkpoint_pickle.py", "_Stack.state",
+        "isinstance(target, (dict, Placeholder))", "vars(target).update(_) is None",
+        "test_load.py::test_hostile_index[attributes of a tensor]",
+    ),
+    Fault(
         "scenes: the configuration's step is not read",
         _RUNS, "find_checkpoint", "load_step(run) if step is None else step", "step",
         _FILES + "test_a_nerf_is_of_the_step_of_the_configuration",
