@@ -795,17 +795,17 @@ _LIST = b"](" + b"N" * 1000 + b"e"
 HOSTILE_INDICES: dict[str, tuple[bytes, str]] = {
     "attributes of a tensor": (
         b"\x80\x02" + _tensor() + b"}X\x07\x00\x00\x00stridesJ\x00\x00\x00\x40\x85sb.",
-        "attributes",
+        "attributes of a value",
     ),
     "attributes of a storage": (
         b"\x80\x02" + _tensor().replace(b"Q", b"Q}X\x04\x00\x00\x00kindNsb") + b".",
-        "attributes",
+        "attributes of a value",
     ),
     "a key of tuples in tuples": (b"\x80\x02}N" + _TUPLES + b"Ns.", "as a key"),
     "a key nested without end": (b"\x80\x02}N" + b"\x85" * 500_000 + b"Ns.", "as a key"),
     "keys of one hash": (b"\x80\x02}\x8a\x08\xff\xff\xff\xff\xff\xff\xff\x1fNs.", "as a key"),
     "members of tuples in tuples": (b"\x80\x04\x8f(N" + _TUPLES + b"\x90.", "as a key"),
-    "too many instructions": (b"\x80\x02](" + b"]" * 2**20 + b"e.", "instructions"),
+    "too many instructions": (b"\x80\x02](" + b"]" * 2**20 + b"e.", "more than 1048576"),
     "mappings copied many times": (
         b"\x80\x02"
         + _GLOBALS
