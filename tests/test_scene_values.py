@@ -187,6 +187,22 @@ def test_other_kinds_are_refused_by_name(tmp_path: Path, name: str) -> None:
     assert "UTF-8" not in message and "header" not in message
 
 
+@pytest.mark.parametrize("name", ["a.splat", "a.spz", "a.sog", "a.glb", "a.bin", "ckpt_6_rank0.pt"])
+def test_a_file_that_may_not_be_read_is_no_other_kind(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / name).write_bytes(b"abc")
+    opened = Path.open
+
+    def refuse(path: Path, *arguments: Any, **more: Any) -> Any:
+        if path.name == name:
+            raise PermissionError(13, "Permission denied")
+        return opened(path, *arguments, **more)
+
+    monkeypatch.setattr(Path, "open", refuse)
+    refused(tmp_path / name, "cannot be read: Permission denied; check the permissions")
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(("content", "name"), [(LFS, "Git LFS pointer"), (PAGE, "web page")])
 def test_a_checkpoint_that_was_not_fetched(tmp_path: Path, content: bytes, name: str) -> None:
