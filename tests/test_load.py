@@ -443,6 +443,7 @@ def test_fields_left_out_take_defaults_and_are_noted(run: Run) -> None:
     assert np.array_equal(scene.dataparser.matrix, np.eye(3, 4)) and scene.dataparser.scale == 1
     assert len(scene.notes) == 2
     assert "dataparser_transforms.json is missing" in scene.notes[0]
+    assert scene.dataparser.stated_scale is None
     assert "sh_degree, rasterize_mode, background_color" in scene.notes[1]
 
 

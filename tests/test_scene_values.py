@@ -20,6 +20,7 @@ from scene_files import (
     checkpoint_of,
     differ,
     picture,
+    path_of,
     ply,
     refused,
     shows,
@@ -185,6 +186,24 @@ def test_other_kinds_are_refused_by_name(tmp_path: Path, name: str) -> None:
     write(tmp_path / name)
     message = refused(tmp_path / name, *mentions)
     assert "UTF-8" not in message and "header" not in message
+
+
+@pytest.mark.parametrize("kind", ["run", "ply"])
+def test_units_of_a_data_set_need_the_run_to_state_them(tmp_path: Path, kind: str) -> None:
+    """Nerfstudio writes dataparser_transforms.json with every run; an export has none."""
+    file = two_steps(tmp_path) if kind == "run" else ply(tmp_path / "a.ply", thin_scene(), MIP)
+    camera = nsa.load_camera_path(path_of(tmp_path)).cameras[0]
+    poses = nsa.PoseSet(camera, translation={"x": 0.01}, units="dataset")
+    clear = {"type": "clear", "distance": 0.5, "units": "dataset"}
+    if kind == "run":
+        poses.of(nsa.load_scene(file))
+        (file.parent / "dataparser_transforms.json").unlink()
+    scene = nsa.load_scene(file)
+    with pytest.raises(nsa.InputError, match=r"units: found dataset.*dataparser_transforms\.json"):
+        poses.of(scene)
+    with pytest.raises(nsa.InputError, match=r"units: found dataset.*dataparser_transforms\.json"):
+        nsa.certify(scene, nsa.PoseSet(camera), None, clear, time_budget=1.0)
+    assert nsa.PoseSet(camera, translation={"x": 0.01}).of(scene).box.upper == (0.01,)
 
 
 @pytest.mark.parametrize("name", ["a.splat", "a.spz", "a.sog", "a.glb", "a.bin", "ckpt_6_rank0.pt"])

@@ -293,7 +293,7 @@ class Job:
     def describe(self) -> dict[str, Any]:
         """The scene for reports, and the units that its sets were stated in."""
         about, first = self.method.describe(), self.pose_sets[0].perturbation
-        units = ShownUnits(first.units, first.angle_units, self.method.dataset_scale)
+        units = ShownUnits(first.units, first.angle_units, self.method.dataset_scale or 1.0)
         notes = [*about.get("notes", ()), *self.notes]
         return {**about, "units": asdict(units), **({"notes": notes} if self.notes else {})}
 

@@ -360,8 +360,8 @@ class Method(Protocol):
         ...
 
     @property
-    def dataset_scale(self) -> float:
-        """Normalised units per unit of the data set."""
+    def dataset_scale(self) -> float | None:
+        """Normalised units per unit of the data set; None: the scene does not say."""
         ...
 
     @property
