@@ -485,6 +485,8 @@ with stop.installed(), stop.last_words(lambda: None), stop.last_words(fail):
         ),
         ("run(lambda options: os.kill(os.getpid(), signal.SIGTERM), lambda: None)", "interrupted\n"),
         ("run(lambda options: 0, lambda: os.kill(os.getpid(), signal.SIGINT))", "interrupted\n"),
+        # Python notes that such text was interrupted, and ends by the signal
+        ("run(lambda options: exec('raise KeyboardInterrupt'), lambda: None)", "interrupted\n"),
         ("run(lambda options: [Half(lambda: None), stopped(options)], lambda: None)", "interrupted\n"),
         (
             "run(lambda options: [[Half(lambda: os.kill(os.getpid(), 15))].clear(), time.sleep(9)], lambda: 0)",
@@ -502,6 +504,19 @@ def test_a_signal_before_and_after_the_work_is_no_traceback(code: str, said: str
         [sys.executable, "-c", begin + code], capture_output=True, text=True, env=environment(), check=False
     )
     assert (done.returncode, done.stderr) == (3, said)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("script", [True, False])
+def test_a_signal_while_a_command_is_imported_is_one_line(number: int, script: bool) -> None:
+    """Other programs that import the package keep their signals."""
+    name = "/usr/bin/ns-abstract-compare" if script else "other"
+    code = f"import os, sys\nsys.argv = [{name!r}]\nimport ns_abstract.cli\nos.kill(os.getpid(), {int(number)})\n"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment(), check=False)
+    if script:
+        assert (done.returncode, done.stderr) == (3, "interrupted\n")
+    else:
+        assert done.returncode == -number and done.stderr != "interrupted\n"
 
 
 # ---------------------------------------------------------------- memory and options

@@ -237,6 +237,8 @@ def run(
         if not is_interruption(error):
             raise
         print("interrupted", file=sys.stderr)
+        # Python would end by the signal where the interruption left executed text, as a dataclass has; this forgets it
+        exec("")
         # finalizers of what the interruption left half built have nothing to say
         sys.unraisablehook = lambda _: None
         code = INTERRUPTED

@@ -155,7 +155,7 @@ def _search(
         for note in question.about.plan:
             console.print(f"  {note}")
 
-    request = Request(options.time_budget or _LOCATE_SECONDS, resume)
+    request = Request(options.time_budget or _LOCATE_SECONDS, resume, rows=False)
     document = searched(
         question, folder, options.where, stop, console, location.job, frames[0], request,
         lambda store: f"{store.open_blocks} cells still to be examined from before",
@@ -202,7 +202,7 @@ def certify_path(options: Certify, stop: SignalStop) -> bool:
     budget = options.time_budget or _CERTIFY_SECONDS
     document = searched(
         question, options.output_dir, options.where, stop, console, job.job, frames[0],
-        Request(budget, options.resume, scene_margin=options.scene_margin),
+        Request(budget, options.resume, rows=False, scene_margin=options.scene_margin),
         kept_cells,
         lambda: _introduce(console, job, question.about.plan),
     )  # fmt: skip
