@@ -31,6 +31,7 @@ from ns_abstract.api.files import Settings, open_job
 from ns_abstract.api.job import Job
 from ns_abstract.api.poses import PoseSet
 from ns_abstract.api.scenes import load_scene
+from ns_abstract.arithmetic.kernel_cache import store
 from ns_abstract.cli import certify as certify_command
 from ns_abstract.cli import render as render_command
 from ns_abstract.cli.common import SignalStop, run
@@ -210,6 +211,24 @@ def test_a_ray_that_takes_long_is_given_up_when_kernels_are_compiled(
     monkeypatch.setattr(NerfBounds, "rays", endless)
     job.warm_up(0)
     assert looks
+
+
+def test_a_ray_is_not_given_up_while_kernels_are_compiled(nerf: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The others would be compiled in the time that the budget counts."""
+    job = open_job(nerf)
+    done: list[int] = []
+
+    def compiling(self: NerfBounds, *rest: Any) -> Any:
+        for k in range(3):
+            time.sleep(0.3)
+            store().function_done()
+            check_cancelled()
+            done.append(k)
+
+    monkeypatch.setattr(job_module, "_WARM_RAY", 0.2)
+    monkeypatch.setattr(NerfBounds, "rays", compiling)
+    job.warm_up(0)
+    assert done == [0, 1, 2]
 
 
 @pytest.mark.slow
