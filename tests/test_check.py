@@ -353,6 +353,18 @@ def test_a_file_with_another_digest_is_refused(tmp_path: Path) -> None:
         read_cells(tmp_path, "frame_00000.npz", 0, "0" * 64)
 
 
+def test_a_frame_that_unpacks_to_more_than_is_free_is_not_unpacked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "frame_00000.npz"
+    np.savez_compressed(file, box_lower=np.zeros((1000, 3)))
+    monkeypatch.setattr(sys.modules[read_cells.__module__], "free_memory", lambda: 20_000)
+    monkeypatch.setattr(np, "load", lambda *_, **__: pytest.fail("was unpacked"))
+    assert file.stat().st_size < 1000
+    with pytest.raises(BadInput, match=r"unpacks to 24,\d+ bytes, 20,000 are free"):
+        read_cells(tmp_path, file.name, 0, hashlib.sha256(file.read_bytes()).hexdigest())
+
+
 @pytest.mark.parametrize("motion", [[1.0, 0.0], [0.0, 1.0], [np.nan, np.inf], [0.0, 0.0]])
 def test_parts_of_a_box_are_the_box(motion: list[float]) -> None:
     low, high = np.array([0.1, -0.3]), np.array([0.2, 0.7])

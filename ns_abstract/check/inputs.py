@@ -8,7 +8,7 @@ import math
 import re
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +55,15 @@ def reading(file: Any, problem: str, fix: str | None = None) -> Iterator[None]:
         raise
     except Exception:
         raise BadInput(problem, file, fix=fix) from None
+
+
+def free_memory() -> int:
+    """Bytes that may still be allocated; 8 GiB where the system does not say."""
+    with suppress(OSError, ValueError, IndexError):
+        for line in Path("/proc/meminfo").read_text().splitlines():
+            if line.startswith("MemAvailable:"):
+                return 1024 * int(line.split()[1])
+    return 8 << 30
 
 
 def read_json(file: Path, what: str, fix: str | None = None) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ns_abstract.check.inputs import BadInput, read_json, reading, sha256
+from ns_abstract.check.inputs import BadInput, free_memory, read_json, reading, sha256
 
 Array = Any
 
@@ -68,8 +68,11 @@ def read_cells(folder: Path, name: str, index: int, digest: object) -> StoredCel
         if sha256(file) != digest:
             raise BadInput("is not the file that the report names (sha256)", file, fix=_AGAIN)
         with zipfile.ZipFile(file) as archive:
-            if sum(entry.file_size for entry in archive.infolist()) > _MOST:
-                raise BadInput("is too large", file)
+            size, free = sum(entry.file_size for entry in archive.infolist()), free_memory()
+            if size > min(_MOST, free):
+                raise BadInput(
+                    f"unpacks to {size:,} bytes, {free:,} are free", file, fix="use a machine with more memory"
+                )
         with np.load(file, allow_pickle=False) as archive:
             if "box_lower" not in archive:
                 raise BadInput("keeps no cells", file, fix="run ns-abstract-render with --save-cells")
