@@ -215,17 +215,15 @@ def test_what_is_compiled_without_stages_is_told_of_all(
 ) -> None:
     """Kernels of a NeRF are compiled in one piece: from the first one on it is told how many there are, about."""
 
-    class Rays(Frame):
-        tilewise, compiled = False, (84, 40.0)
+    def warm_up() -> None:
+        for _ in range(3):
+            store().function_done()
 
-        def warm_up(self, stage: str | None = None) -> None:
-            for _ in range(3):
-                store().function_done()
-
+    rays: Any = SimpleNamespace(tilewise=False, compiled=(84, 40.0), warm_up=warm_up)
     monkeypatch.setattr(kernel_cache, "_PACE", -1.0)
     monkeypatch.setattr(logging.getLogger("ns_abstract"), "propagate", True)
     with caplog.at_level(logging.INFO, "ns_abstract.kernels"):
-        job_module.warm_up(Rays())
+        job_module.warm_up(rays)
         store().function_done()
     counts = re.findall(r"(\d+) of (\d+) functions, about \d+ s left", caplog.text)
     assert list(dict.fromkeys(counts)) == [("1", "84"), ("2", "84"), ("3", "84")] and "functions done: " in caplog.text

@@ -9,7 +9,8 @@ _FILES = "test_scene_files.py::"
 SCENES = (
     Fault(
         "scenes: units of a data set that the scene does not state are normalised ones",
-        "perturbation/specification.py", "unit_length", "dataset_scale is None", "(dataset_scale := dataset_scale or 1.0) is None",
+        "perturbation/specification.py", "unit_length",
+        "dataset_scale is None", "(dataset_scale := dataset_scale or 1.0) is None",
         "test_perturbation.py::test_dataset_units_that_no_scene_states_are_refused",
     ),
     Fault(

@@ -8,7 +8,7 @@ import math
 import re
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -57,15 +57,6 @@ def reading(file: Any, problem: str, fix: str | None = None) -> Iterator[None]:
         raise BadInput(problem, file, fix=fix) from None
 
 
-def free_memory() -> int:
-    """Bytes that may still be allocated; 8 GiB where the system does not say."""
-    with suppress(OSError, ValueError, IndexError):
-        for line in Path("/proc/meminfo").read_text().splitlines():
-            if line.startswith("MemAvailable:"):
-                return 1024 * int(line.split()[1])
-    return 8 << 30
-
-
 def read_json(file: Path, what: str, fix: str | None = None) -> dict[str, Any]:
     """A JSON object."""
     with reading(file, f"this {what} cannot be read", fix):
@@ -73,8 +64,7 @@ def read_json(file: Path, what: str, fix: str | None = None) -> dict[str, Any]:
             raise BadInput(f"no such {what}", file, fix=fix)
         if file.stat().st_size > _TEXT:
             raise BadInput(f"this {what} is too large", file, fix=fix)
-        content = json.loads(file.read_bytes())
-        if not isinstance(content, dict):
+        if not isinstance(content := json.loads(file.read_bytes()), dict):
             raise BadInput("the top level is not an object", file, fix=fix)
     return content
 
