@@ -7,6 +7,7 @@ import dataclasses
 import hashlib
 import itertools
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -25,6 +26,7 @@ from conftest import InProcess, Inputs, blob_scene, environment, ring
 import ns_abstract as nsa
 from ns_abstract.api import checking
 from ns_abstract.api.checking import check
+from ns_abstract.check import results
 from ns_abstract.check.audit import ClaimOutcome
 from ns_abstract.check.claims import _divided
 from ns_abstract.check.forms import Affine, parameters
@@ -351,6 +353,39 @@ def test_a_file_with_another_digest_is_refused(tmp_path: Path) -> None:
     np.savez(tmp_path / "frame_00000.npz", lower=np.zeros(3))
     with pytest.raises(BadInput, match="sha256"):
         read_cells(tmp_path, "frame_00000.npz", 0, "0" * 64)
+
+
+@pytest.mark.parametrize(("writable", "log", "fixed"), [(True, False, 0), (False, False, 1), (False, True, 0)])
+def test_cells_in_a_folder_that_cannot_be_written_are_read(
+    writable: bool, log: bool, fixed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """SQLite would make a file beside the table; what is not in the table yet would be missed without."""
+    opened: list[str] = []
+
+    def connect(place: str, uri: bool) -> Any:
+        opened.append(place)
+        raise OSError
+
+    monkeypatch.setattr(results.os, "access", lambda folder, mode: writable)
+    monkeypatch.setattr(results.sqlite3, "connect", connect)
+    if log:
+        (tmp_path / "cells.sqlite-wal").touch()
+    with pytest.raises(BadInput):
+        results.read_verdicts(tmp_path, {"frames": []})
+    assert opened[0].endswith("cells.sqlite?mode=ro" + fixed * "&immutable=1")
+
+
+def test_a_frame_that_unpacks_to_half_of_the_memory_is_not_unpacked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "frame_00000.npz"
+    np.savez_compressed(file, box_lower=np.zeros((1000, 3)))
+    assert os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") >= 2 * results._MOST
+    monkeypatch.setattr(results, "_MOST", 20_000)
+    monkeypatch.setattr(np, "load", lambda *_, **__: pytest.fail("was unpacked"))
+    assert file.stat().st_size < 1000
+    with pytest.raises(BadInput, match="too large"):
+        read_cells(tmp_path, file.name, 0, hashlib.sha256(file.read_bytes()).hexdigest())
 
 
 @pytest.mark.parametrize("motion", [[1.0, 0.0], [0.0, 1.0], [np.nan, np.inf], [0.0, 0.0]])

@@ -8,6 +8,7 @@ import os
 import re
 import subprocess
 import sys
+import time
 from multiprocessing import Pipe
 from pathlib import Path
 from types import SimpleNamespace
@@ -18,10 +19,15 @@ import pytest
 from conftest import Inputs
 
 from ns_abstract.api import compiling
+from ns_abstract.api import job as job_module
 from ns_abstract.api.files import Settings, open_job
+from ns_abstract.arithmetic import kernel_cache
 from ns_abstract.arithmetic.kernel_cache import SESSION, KernelMissingError, store
 from ns_abstract.cli.common import show_log
+from ns_abstract.methods.nerf.frame import NerfFrame
+from ns_abstract.methods.nerf.hash_bounds.bounds import NerfactoFrame
 from ns_abstract.methods.splat.bounds import Stages
+from ns_abstract.refine.protocol import Frame
 
 
 def test_stages_are_shared_out() -> None:
@@ -195,15 +201,37 @@ def test_what_is_compiled_is_told_where_there_is_no_terminal(
 
 
 def test_what_is_left_of_compiling_is_estimated_by_what_is_done_where_it_takes_long(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    begin = time.monotonic()
+    progress = compiling._progress([["pixel_stage"]])
+    monkeypatch.setattr(time, "monotonic", lambda: begin + 2.0 * progress.seconds)
+    (left,) = re.findall(r"about (\d+) s left", progress.line(progress.functions // 10))
+    assert int(left) > 10 * progress.seconds
+
+
+def test_what_is_compiled_without_stages_is_told_of_all(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    progress = compiling._CompileProgress([["pixel_stage"]])
-    total, begin = progress.functions, progress.begin
-    monkeypatch.setattr(compiling.time, "monotonic", lambda: begin + 2.0 * progress.seconds)
+    """Kernels of a NeRF are compiled in one piece: from the first one on it is told how many there are, about."""
+
+    def warm_up() -> None:
+        for _ in range(3):
+            store().function_done()
+
+    rays: Any = SimpleNamespace(tilewise=False, compiled=(84, 40.0), warm_up=warm_up)
+    monkeypatch.setattr(kernel_cache, "_PACE", -1.0)
     monkeypatch.setattr(logging.getLogger("ns_abstract"), "propagate", True)
     with caplog.at_level(logging.INFO, "ns_abstract.kernels"):
-        progress.say(total // 10)
-    assert int(re.findall(r"about (\d+) s left", caplog.text)[-1]) > 10 * progress.seconds
+        job_module.warm_up(rays)
+        store().function_done()
+    counts = re.findall(r"(\d+) of (\d+) functions, about \d+ s left", caplog.text)
+    assert list(dict.fromkeys(counts)) == [("1", "84"), ("2", "84"), ("3", "84")] and "functions done: " in caplog.text
+
+
+@pytest.mark.parametrize("frame", [NerfFrame, NerfactoFrame])
+def test_frames_without_stages_say_how_much_they_compile(frame: type[Frame]) -> None:
+    assert not frame.stages and frame.compiled[0] > 50 and frame.compiled[1] > 10.0
 
 
 @pytest.mark.slow

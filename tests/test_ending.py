@@ -31,6 +31,7 @@ from ns_abstract.api.files import Settings, open_job
 from ns_abstract.api.job import Job
 from ns_abstract.api.poses import PoseSet
 from ns_abstract.api.scenes import load_scene
+from ns_abstract.arithmetic.kernel_cache import store
 from ns_abstract.cli import certify as certify_command
 from ns_abstract.cli import render as render_command
 from ns_abstract.cli.common import SignalStop, run
@@ -210,6 +211,24 @@ def test_a_ray_that_takes_long_is_given_up_when_kernels_are_compiled(
     monkeypatch.setattr(NerfBounds, "rays", endless)
     job.warm_up(0)
     assert looks
+
+
+def test_a_ray_is_not_given_up_while_kernels_are_compiled(nerf: Settings, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The others would be compiled in the time that the budget counts."""
+    job = open_job(nerf)
+    done: list[int] = []
+
+    def compiling(self: NerfBounds, *rest: Any) -> Any:
+        for k in range(3):
+            time.sleep(0.3)
+            store().function_done()
+            check_cancelled()
+            done.append(k)
+
+    monkeypatch.setattr(job_module, "_WARM_RAY", 0.2)
+    monkeypatch.setattr(NerfBounds, "rays", compiling)
+    job.warm_up(0)
+    assert done == [0, 1, 2]
 
 
 @pytest.mark.slow
@@ -485,6 +504,8 @@ with stop.installed(), stop.last_words(lambda: None), stop.last_words(fail):
         ),
         ("run(lambda options: os.kill(os.getpid(), signal.SIGTERM), lambda: None)", "interrupted\n"),
         ("run(lambda options: 0, lambda: os.kill(os.getpid(), signal.SIGINT))", "interrupted\n"),
+        # Python notes that such text was interrupted, and ends by the signal
+        ("run(lambda options: exec('raise KeyboardInterrupt'), lambda: None)", "interrupted\n"),
         ("run(lambda options: [Half(lambda: None), stopped(options)], lambda: None)", "interrupted\n"),
         (
             "run(lambda options: [[Half(lambda: os.kill(os.getpid(), 15))].clear(), time.sleep(9)], lambda: 0)",
@@ -502,6 +523,19 @@ def test_a_signal_before_and_after_the_work_is_no_traceback(code: str, said: str
         [sys.executable, "-c", begin + code], capture_output=True, text=True, env=environment(), check=False
     )
     assert (done.returncode, done.stderr) == (3, said)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("script", [True, False])
+def test_a_signal_while_a_command_is_imported_is_one_line(number: int, script: bool) -> None:
+    """Other programs that import the package keep their signals."""
+    name = "/usr/bin/ns-abstract-compare" if script else "other"
+    code = f"import os, sys\nsys.argv = [{name!r}]\nimport ns_abstract.cli\nos.kill(os.getpid(), {int(number)})\n"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=environment(), check=False)
+    if script:
+        assert (done.returncode, done.stderr) == (3, "interrupted\n")
+    else:
+        assert done.returncode == -number and done.stderr != "interrupted\n"
 
 
 # ---------------------------------------------------------------- memory and options

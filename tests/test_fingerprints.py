@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 from pathlib import Path
 from typing import Any
@@ -12,6 +13,7 @@ import pytest
 from certifying import classifier
 from conftest import Inputs, blob_scene
 from onnx.external_data_helper import convert_model_to_external_data
+from PIL import Image
 
 import ns_abstract as nsa
 from ns_abstract.api.certification import CertifySettings, open_certification
@@ -25,6 +27,7 @@ from ns_abstract.io.stamps import file_stamp
 from ns_abstract.methods.splat.drawable import StoredGaussians, drawable
 from ns_abstract.methods.splat.method import SplatMethod
 from ns_abstract.verify.network import load
+from ns_abstract.verify.picture_properties import PictureProperty
 
 CLASSES = {"type": "classification", "label": 0, "preprocess": {"resize": [16, 16]}}
 #: Of the picture, at a distance in units of the data set.
@@ -96,6 +99,62 @@ def test_a_network_that_is_replaced_while_it_is_read_is_refused(
     with pytest.raises(nsa.InputError, match="was replaced"):
         load.load_network(net)
     assert net.read_bytes() != numbers
+
+
+def library(outputs: int, value: float) -> str:
+    """A VNN-LIB file that forbids first outputs of at most ``value``."""
+    names = [f"(declare-const X_{i} Real)" for i in range(16 * 16 * 3)]
+    names += [f"(declare-const Y_{i} Real)" for i in range(outputs)]
+    return "\n".join([*names, f"(assert (<= Y_0 {value}))"])
+
+
+@pytest.mark.parametrize("kind", ["mask.png", "index.txt", "index.npy", "net.vnnlib", "net.vnnlib.gz"])
+def test_reports_name_the_files_of_a_property_that_were_read(blobs: Inputs, tmp_path: Path, kind: str) -> None:
+    """A mask, a list of Gaussians or a VNN-LIB file that is replaced after it was read gives no name to verdicts."""
+    file, net = tmp_path / kind, None
+
+    def write(version: int) -> None:
+        if kind == "mask.png":
+            Image.fromarray(np.where(np.arange(1024).reshape(32, 32) < 99 + version, 255, 0).astype(np.uint8)).save(
+                file
+            )
+        elif kind == "index.txt":
+            file.write_text(f"0 1 {2 + version}")
+        elif kind == "index.npy":
+            np.save(file, np.array([0, 1, 2 + version]))
+        else:
+            text = library(3, float(version)).encode()
+            file.write_bytes(gzip.compress(text, mtime=0) if kind.endswith(".gz") else text)
+
+    value: dict[str, Any] = {"type": "visible", "select": {"indices": kind}}
+    if kind == "mask.png":
+        value = {"type": "clear", "distance": 0.5, "mask": kind}
+    elif "vnnlib" in kind:
+        value, net = (
+            {"type": "vnnlib", "file": kind, "preprocess": {"resize": [16, 16]}},
+            classifier(tmp_path / "net.onnx"),
+        )
+    prop = write_json(tmp_path / "prop.json", value)
+    prints = []
+    for version in (0, 1):
+        write(version)
+        prints.append(certified(blobs, net, prop)["property"])
+    write(0)
+    job = open_certification(CertifySettings(Settings(blobs.config, blobs.path, blobs.spec), net, prop))
+    write(1)
+    assert job.fingerprint["property"] == prints[0] != prints[1]
+
+
+def test_a_mask_is_read_once(blobs: Inputs, tmp_path: Path) -> None:
+    mask = np.zeros((32, 32), np.uint8)
+    mask[3:5, 7:20] = 255
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    prop = write_json(tmp_path / "prop.json", {"type": "clear", "distance": 0.5, "mask": "mask.png"})
+    job = open_certification(CertifySettings(Settings(blobs.config, blobs.path, blobs.spec), None, prop))
+    Image.fromarray(255 - mask).save(tmp_path / "mask.png")
+    assert isinstance(job.property, PictureProperty)
+    (measure,) = job.property.measures(32, 32)
+    assert np.array_equal(measure.pixels, np.flatnonzero(mask))
 
 
 @pytest.mark.slow

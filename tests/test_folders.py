@@ -22,6 +22,7 @@ from test_certify_search import fill, open_store, search_of
 from test_report import frame, read, run
 
 import ns_abstract
+from ns_abstract.api import certificate_report
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.folder import MARK, claim, remove_parts, unwritable
 from ns_abstract.io.version import computed_by
@@ -68,6 +69,25 @@ def test_a_search_leaves_the_files_of_others_alone(tmp_path: Path) -> None:
     names = {file.name for file in (tmp_path / IMAGES).iterdir()}
     assert names == {"holiday.jpg", "frame_00000_0-1.npz", "frame_00000_0-1_2.npz"}
     assert (tmp_path / IMAGES / "frame_00000_0-1_2.npz").read_bytes() == b"second"
+
+
+def test_a_stored_image_that_claims_too_much_is_not_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who has a copy of a result may have changed it: an image is read if it is of the pose and has a usual size."""
+    pose, image, file = np.array([0.25]), np.ones((8, 8, 3), np.float32), tmp_path / "image.npz"
+
+    def stored(**arrays: Any) -> Any:
+        np.savez_compressed(file, **{"values": pose, "image": image, **arrays})
+        return certificate_report._image_at(file, pose)
+
+    assert np.array_equal(stored(), image)
+    assert stored(values=pose + 1.0) is None and stored(image=image.astype(np.float64)) is None
+    assert stored(image=image[0]) is None and stored(values=np.zeros(3)) is None
+    monkeypatch.setattr(certificate_report, "_MOST_NUMBERS", 191)
+    assert stored() is None
+    file.write_bytes(b"none")
+    assert certificate_report._image_at(file, pose) is None
+    np.savez(file, values=pose)
+    assert certificate_report._image_at(file, pose) is None
 
 
 def test_a_new_search_removes_the_images_of_the_last_one(tmp_path: Path) -> None:

@@ -443,6 +443,7 @@ def test_fields_left_out_take_defaults_and_are_noted(run: Run) -> None:
     assert np.array_equal(scene.dataparser.matrix, np.eye(3, 4)) and scene.dataparser.scale == 1
     assert len(scene.notes) == 2
     assert "dataparser_transforms.json is missing" in scene.notes[0]
+    assert scene.dataparser.stated_scale is None
     assert "sh_degree, rasterize_mode, background_color" in scene.notes[1]
 
 
@@ -782,7 +783,50 @@ def test_bad_checkpoint(run: Run, case: str) -> None:
 
 
 _GLOBALS = b"ccollections\nOrderedDict\n"
+_TUPLES = b"".join(b"q" + bytes([k]) + b"h" + bytes([k]) + b"\x86" for k in range(60))
+
+
+def _tensor(shape: bytes = b"K\x03\x85", strides: bytes = b"K\x01\x85") -> bytes:
+    """The instructions of a tensor of three values in storage 1, after those of the protocol."""
+    storage = b"(X\x07\x00\x00\x00storagectorch\nFloatStorage\nX\x01\x00\x00\x001X\x03\x00\x00\x00cpuK\x03tQ"
+    return b"ctorch._utils\n_rebuild_tensor_v2\n(" + storage + b"K\x00" + shape + strides + b"\x89" + _GLOBALS + b")RtR"
+
+
+_LIST = b"](" + b"N" * 1000 + b"e"
 HOSTILE_INDICES: dict[str, tuple[bytes, str]] = {
+    "attributes of a tensor": (
+        b"\x80\x02" + _tensor() + b"}X\x07\x00\x00\x00stridesJ\x00\x00\x00\x40\x85sb.",
+        "attributes of a value",
+    ),
+    "attributes of a storage": (
+        b"\x80\x02" + _tensor().replace(b"Q", b"Q}X\x04\x00\x00\x00kindNsb") + b".",
+        "attributes of a value",
+    ),
+    "a key of tuples in tuples": (b"\x80\x02}N" + _TUPLES + b"Ns.", "as a key"),
+    "a key nested without end": (b"\x80\x02}N" + b"\x85" * 500_000 + b"Ns.", "as a key"),
+    "keys of one hash": (b"\x80\x02}\x8a\x08\xff\xff\xff\xff\xff\xff\xff\x1fNs.", "as a key"),
+    "members of tuples in tuples": (b"\x80\x04\x8f(N" + _TUPLES + b"\x90.", "as a key"),
+    "too many instructions": (b"\x80\x02](" + b"]" * 2**20 + b"e.", "more than 1048576"),
+    "mappings copied many times": (
+        b"\x80\x02"
+        + _GLOBALS
+        + b"q\x01}("
+        + b"".join(b"K" + bytes([k]) + b"N" for k in range(256))
+        + b"uq\x02"
+        + b"h\x01h\x02\x85R" * 1000
+        + b".",
+        "copy more values",
+    ),
+    "shapes copied many times": (b"\x80\x02ctorch\nSize\n" + _LIST + b"\x85R.", "dimensions"),
+    "a shape of no values": (
+        b"\x80\x02" + _tensor(b"K\x00\x8a\x08" + bytes(7) + b"\x20\x86", b"K\x01K\x01\x86") + b".",
+        "too many values",
+    ),
+    "a shape of many sizes": (
+        b"\x80\x02" + _tensor(b"(" + b"K\x01" * 65 + b"t", b"(" + b"K\x01" * 65 + b"t") + b".",
+        "dimensions",
+    ),
+    "a shape of truths": (b"\x80\x02" + _tensor(b"\x88\x85") + b".", "size"),
     "a memo of many gigabytes": (b"\x80\x02}r\xff\xff\xff\x7f.", "LONG_BINPUT"),
     "text of many gigabytes": (b"\x80\x02X\xff\xff\xff\x7fabc.", "damaged"),
     "bytes of many gigabytes": (b"\x80\x05\x96\xff\xff\xff\xff\xff\x00\x00\x00abc.", "damaged"),

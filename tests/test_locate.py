@@ -33,6 +33,9 @@ HALF = Fraction(1, 510)
 SET: dict[str, Any] = {"translation": {"x": 0.03, "y": 0.02}, "rotation": {"yaw": 0.03, "roll": 0.05}}
 
 
+COVER = Location.cover
+
+
 def box_of(lower: Any, upper: Any) -> ParameterBox:
     names = ("x", "y", "z", "yaw", "pitch", "roll")[: len(lower)]
     return ParameterBox(names, ("",) * len(names), tuple(map(float, lower)), tuple(map(float, upper)))
@@ -241,6 +244,65 @@ def test_a_cover_takes_little_that_is_excluded() -> None:
     assert 0.875 <= found.volume <= 1.03 * 0.875
 
 
+def test_a_cover_ends_with_its_time() -> None:
+    """It holds all that is left however early it ends."""
+    generator = np.random.default_rng(0)
+    lower = generator.uniform(-1.0, 0.9, (300, 6))
+    upper = lower + 0.1 * generator.uniform(size=(300, 6))
+    names, shear = tuple("abcdef"), {"a": {"d": 0.3, "e": -0.1}}
+    box = ParameterBox(names, ("",) * 6, (-1.0,) * 6, (1.0,) * 6)
+    asked = itertools.count()
+    early = cover(box, ShearedBoxes(lower, upper, names, shear), late=lambda: next(asked) >= 5)
+    assert len(early.left) <= 6 and early.volume > 0.1
+    holders = [early.grid.box_of(cell) for cell in early.left]
+    inside = generator.uniform(lower, upper)
+    inside[:, 0] += 0.3 * inside[:, 3] - 0.1 * inside[:, 4]
+    kept = inside[(np.abs(inside) <= 1.0).all(axis=1)]
+    assert len(kept) > 200 and all(any(holder.contains(values) for holder in holders) for values in kept)
+
+
+def test_what_is_left_is_told_apart_from_the_boxes_around_it(blobs: Inputs, tmp_path: Path) -> None:
+    """Six parameters, of which two cells far apart are left: the boxes around them hold far more."""
+    camera = nsa.load_camera_path(blobs.path).cameras[0]
+    scene = nsa.load_scene(blobs.config)
+    poses = nsa.PoseSet(
+        camera, translation={"x": 0.03, "y": 0.03, "z": 0.03}, rotation={"yaw": 0.03, "pitch": 0.03, "roll": 0.03}
+    )
+    job = Job(scene, [poses.of(scene)])
+    location = Location(job, np.zeros((32, 32, 3), np.uint8), None, PhotoOptions())
+    grid = location.search(0).grid
+    middle = [units // 2 for units in grid.units]
+    half = 1 << 15
+    left = [
+        Cell(tuple(middle), tuple(m + half for m in middle)),
+        Cell(tuple(m - 2 * half for m in middle), tuple(m - half for m in middle)),
+    ]
+    part = location.left_volume(0, left)
+    assert 0.0 < part < 1e-7
+    whole, own = (np.subtract(b.upper, b.lower) for b in (grid.box, location.search(0).plain.box))
+    assert part == pytest.approx(2 * (half / grid.units[0]) ** 6 * np.prod(whole / own))
+    assert location.cover(0, left, lambda: True).volume > 100.0 * part
+    assert location.left_volume(0, grid.roots()) == 1.0
+
+
+def test_a_locate_command_ends_with_its_time(
+    blobs: Inputs, tmp_path: Path, in_process: InProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The boxes around what is left are cut until the time is over, and no longer."""
+    image = tmp_path / "photo.png"
+    Image.fromarray(np.random.default_rng(0).integers(0, 256, (32, 32, 3), np.uint8)).save(image)
+    ends: list[float] = []
+    monkeypatch.setattr(
+        Location,
+        "cover",
+        lambda self, number, cells, late: (ends.append(late.left), COVER(self, number, cells, late))[1],
+    )
+    code, _, _ = in_process(main, options(blobs, tmp_path / "out", image, time_budget=3))
+    assert code == 0 and len(ends) == 1 and ends[0] <= 3.0
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["possible_volume"] <= report["covered_volume"] <= 1.0
+
+
 def test_nearby_values() -> None:
     image = np.random.default_rng(0).random((5, 6, 3))
     least, most = nearby(image, 2)
@@ -334,7 +396,8 @@ def test_locate_finds_the_pose(blobs: Inputs, tmp_path: Path) -> None:
         kind: sum(np.prod((c.upper - c.lower) / sizes) for c in place.cells if (c.verdict == "excluded") == kind)
         for kind in (True, False)
     }
-    assert volumes[False] == pytest.approx(place.possible_volume)
+    assert volumes[False] == pytest.approx(place.covered_volume)
+    assert place.possible_volume <= place.covered_volume
     assert sum(volumes.values()) == pytest.approx(1.0)
     for cell in place.cells:
         if cell.verdict == "possible":

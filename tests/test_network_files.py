@@ -162,6 +162,11 @@ def test_external_data(tmp_path: Path) -> None:
     refused(_external(inside, "link.bin"), "outside the model's folder")
     refused(_external(inside, "missing.bin"), "missing.bin")
     refused(_external(inside, "weights.bin", offset="1000000"), "initializer c0")
+    twice = _external(inside, "weights.bin")
+    model = onnx.load(str(twice), load_external_data=False)
+    model.graph.initializer[0].external_data.add(key="location", value="weights.bin")
+    twice.write_bytes(model.SerializeToString())
+    refused(twice, "twice")
 
 
 def test_a_claim_of_a_huge_tensor_is_refused(tmp_path: Path) -> None:

@@ -170,6 +170,15 @@ def test_degrees():
             parse_perturbation(value | {"angle_units": wrong})
 
 
+def test_dataset_units_that_no_scene_states_are_refused():
+    value = {"units": "dataset", "translation": {"x": 2.0}}
+    with pytest.raises(InputError, match=r"perturbation\.units: found dataset.*dataparser_transforms\.json"):
+        parse_perturbation(value, dataset_scale=None)
+    assert parse_perturbation(value | {"units": "normalised"}, dataset_scale=None).translation["x"] == (-2.0, 2.0)
+    # no length is stated
+    assert not parse_perturbation({"units": "dataset", "rotation": {"yaw": 0.1}}, dataset_scale=None).translation
+
+
 def test_dataset_units():
     """Lengths in the units of transforms.json are scaled; angles are not."""
     value = {"units": "dataset", "translation": {"x": 2.0, "z": [1, 3]}, "rotation": {"yaw": 0.5}}

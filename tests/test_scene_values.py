@@ -19,6 +19,7 @@ from scene_files import (
     NAN,
     checkpoint_of,
     differ,
+    path_of,
     picture,
     ply,
     refused,
@@ -185,6 +186,40 @@ def test_other_kinds_are_refused_by_name(tmp_path: Path, name: str) -> None:
     write(tmp_path / name)
     message = refused(tmp_path / name, *mentions)
     assert "UTF-8" not in message and "header" not in message
+
+
+@pytest.mark.parametrize("kind", ["run", "ply"])
+def test_units_of_a_data_set_need_the_run_to_state_them(tmp_path: Path, kind: str) -> None:
+    """Nerfstudio writes dataparser_transforms.json with every run; an export has none."""
+    file = two_steps(tmp_path) if kind == "run" else ply(tmp_path / "a.ply", thin_scene(), MIP)
+    camera = nsa.load_camera_path(path_of(tmp_path)).cameras[0]
+    poses = nsa.PoseSet(camera, translation={"x": 0.01}, units="dataset")
+    clear = {"type": "clear", "distance": 0.5, "units": "dataset"}
+    if kind == "run":
+        poses.of(nsa.load_scene(file))
+        (file.parent / "dataparser_transforms.json").unlink()
+    scene = nsa.load_scene(file)
+    with pytest.raises(nsa.InputError, match=r"units: found dataset.*dataparser_transforms\.json"):
+        poses.of(scene)
+    with pytest.raises(nsa.InputError, match=r"units: found dataset.*dataparser_transforms\.json"):
+        nsa.certify(scene, nsa.PoseSet(camera), None, clear, time_budget=1.0)
+    assert nsa.PoseSet(camera, translation={"x": 0.01}).of(scene).box.upper == (0.01,)
+
+
+@pytest.mark.parametrize("name", ["a.splat", "a.spz", "a.sog", "a.glb", "a.bin", "ckpt_6_rank0.pt"])
+def test_a_file_that_may_not_be_read_is_no_other_kind(
+    tmp_path: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / name).write_bytes(b"abc")
+    opened = Path.open
+
+    def refuse(path: Path, *arguments: Any, **more: Any) -> Any:
+        if path.name == name:
+            raise PermissionError(13, "Permission denied")
+        return opened(path, *arguments, **more)
+
+    monkeypatch.setattr(Path, "open", refuse)
+    refused(tmp_path / name, "cannot be read: Permission denied; check the permissions")
 
 
 @pytest.mark.slow

@@ -8,6 +8,28 @@ _FILES = "test_scene_files.py::"
 
 SCENES = (
     Fault(
+        "scenes: units of a data set that the scene does not state are normalised ones",
+        "perturbation/specification.py", "unit_length",
+        "dataset_scale is None", "(dataset_scale := dataset_scale or 1.0) is None",
+        "test_perturbation.py::test_dataset_units_that_no_scene_states_are_refused",
+    ),
+    Fault(
+        "scenes: a run without its transform states units",
+        "methods/runs.py", "read_dataparser_transform", "DataparserTransform(stated=False)", "DataparserTransform()",
+        _FILES.replace("files", "values") + "test_units_of_a_data_set_need_the_run_to_state_them[run]",
+    ),
+    Fault(
+        "scenes: reports name files of a property as they are later",
+        "api/frame_pictures.py", "PropertySource._digest", "self.digests.get(digests.key(file))", "None",
+        "test_fingerprints.py::test_reports_name_the_files_of_a_property_that_were_read[index.txt]",
+    ),
+    Fault(
+        "scenes: a checkpoint sets the attributes of its tensors",
+        "methods/checkpoint_pickle.py", "_Stack.state",
+        "isinstance(target, (dict, Placeholder))", "vars(target).update(_) is None",
+        "test_load.py::test_hostile_index[attributes of a tensor]",
+    ),
+    Fault(
         "scenes: the configuration's step is not read",
         _RUNS, "find_checkpoint", "load_step(run) if step is None else step", "step",
         _FILES + "test_a_nerf_is_of_the_step_of_the_configuration",

@@ -185,12 +185,14 @@ class Request:
     """How much is to be done, in ``budget`` seconds.
 
     ``scene_margin``: whether to look, in half of the time, for the largest variation of the scene for which what is
-    certified holds. ``on_open`` is called with the store before the search, when there is a report.
+    certified holds. ``rows``: whether the cells are read back at the end. ``on_open`` is called with the store before
+    the search, when there is a report.
     """
 
     budget: float
     resume: bool = False
     report: bool = True
+    rows: bool = True
     scene_margin: bool = False
     on_open: Callable[[Store], object] = lambda store: None
     on_progress: Callable[[Any], object] = lambda progress: None
@@ -292,7 +294,8 @@ class CellSearch(Generic[P]):
                 question.finish(self)
                 store.finish(self.grids)
                 document = self.report("interrupted" if stop() else "budget" if store.open_blocks else "done")
-            self.rows = {tally.frame: store.leaves(tally.frame) for tally in store.tallies()}
+            if request.rows:
+                self.rows = {tally.frame: store.leaves(tally.frame) for tally in store.tallies()}
         return document
 
     def tell_progress(self) -> None:

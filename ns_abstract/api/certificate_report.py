@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import math
 import time
-import zipfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import cached_property
@@ -17,6 +17,7 @@ from ns_abstract.api.cell_search import CellSearch
 from ns_abstract.api.certification import Certification, FramePictures
 from ns_abstract.execution.cancellation import WorkCancelledError, cancel_when, check_cancelled
 from ns_abstract.geometry.poses import PoseBox
+from ns_abstract.io.arrays import open_archive
 from ns_abstract.io.errors import InputError
 from ns_abstract.report import regions as broken
 from ns_abstract.report.cameras import CameraDrawings, cameras_entry, cell_cameras, looked_at, standing, upward
@@ -36,6 +37,8 @@ from ns_abstract.verify.store_file import IMAGES
 #: Counterexamples in report.json by frame, and images of each kind on the page.
 _EXAMPLES, _IMAGES = 5, 6
 _PIXELS = 256
+#: Numbers of a stored image that is read at most.
+_MOST_NUMBERS = 1 << 28
 #: Cells whose picture the page shows when they are chosen, and its longest side.
 _SEEN, _SEEN_PIXELS = 64, 96
 #: Seconds that a closer look may take; the longest side of its pictures; cells without a verdict that are tried for a
@@ -220,10 +223,13 @@ class CertificateReport:
 def _image_at(file: Path, pose: np.ndarray) -> np.ndarray | None:
     """The image of a stored counterexample, if it is that of ``pose``; None also where others have changed the file."""
     try:
-        with np.load(file, allow_pickle=False) as stored:
-            image = stored["image"] if np.array_equal(stored["values"], pose) else None
-            return None if image is None or image.ndim != 3 or image.dtype != np.float32 else image
-    except (OSError, ValueError, LookupError, zipfile.BadZipFile):
+        with open_archive(file, "counterexample", "") as stored:
+            shape, kind = stored.declared["image"]
+            fits = len(shape) == 3 and kind == np.float32 and math.prod(shape) <= _MOST_NUMBERS
+            if not fits or stored.declared["values"][0] != pose.shape:
+                return None
+            return stored.read("image") if np.array_equal(stored.read("values"), pose) else None
+    except InputError:
         return None
 
 

@@ -14,6 +14,7 @@ from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 
 from ns_abstract.api.job import Job
+from ns_abstract.arithmetic.compile_progress import CompileProgress
 from ns_abstract.arithmetic.kernel_cache import SESSION, KernelMissingError, store
 from ns_abstract.execution.worker_cache import load
 from ns_abstract.refine.protocol import Frame
@@ -48,35 +49,11 @@ def missing(frame: Frame) -> list[str]:
     return stages
 
 
-class _CompileProgress:
-    """Reports the progress of compiling."""
-
-    def __init__(self, parts: Sequence[Sequence[str]]) -> None:
-        measured = [[_MEASURED.get(stage, _UNMEASURED) for stage in part] for part in parts]
-        self.functions = sum(count for part in measured for count, _ in part)
-        self.seconds = max(sum(seconds for _, seconds in part) for part in measured)
-        self.begin = time.monotonic()
-        self.said = self.begin
-        self.say(0)
-
-    def say(self, done: int) -> None:
-        """Say it, with an estimate by the measured times and by the functions that are done, whichever is later."""
-        used = time.monotonic() - self.begin
-        done = min(done, self.functions)
-        # the first ones say little about the others, but more than a time that is over
-        telling = done > self.functions // 3 or used > self.seconds
-        by_count = used * (self.functions - done) / done if done and telling else 0.0
-        left = max(self.seconds - used, by_count, 1.0)
-        _log.info(
-            "compiling kernels (first use only): %d of %d functions, about %.0f s left", done, self.functions, left
-        )
-
-    def due(self) -> bool:
-        """Whether it is time for the next line."""
-        due = time.monotonic() - self.said > _PACE
-        if due:
-            self.said = time.monotonic()
-        return due
+def _progress(parts: Sequence[Sequence[str]]) -> CompileProgress:
+    """The progress of stages that are compiled side by side."""
+    measured = [[_MEASURED.get(stage, _UNMEASURED) for stage in part] for part in parts]
+    functions = sum(count for part in measured for count, _ in part)
+    return CompileProgress(functions, max(sum(seconds for _, seconds in part) for part in measured), _PACE)
 
 
 def compile_beside(job: Job, index: int, processes: int | None = None) -> None:
@@ -88,7 +65,8 @@ def compile_beside(job: Job, index: int, processes: int | None = None) -> None:
     if not frame.stages or not (stages := missing(frame)):
         return
     parts = shares(stages, len(os.sched_getaffinity(0)) if processes is None else processes)
-    progress = _CompileProgress(parts)
+    progress = _progress(parts)
+    _log.info(progress.line(0))
     if len(parts) < 2:
         return
     compiled = [0] * len(parts)
@@ -114,7 +92,7 @@ def compile_beside(job: Job, index: int, processes: int | None = None) -> None:
             time.sleep(0.1)
             compiled = [_latest(line, before) for line, before in zip(lines, compiled, strict=True)]
             if progress.due():
-                progress.say(sum(compiled))
+                _log.info(progress.line(sum(compiled)))
                 store().publish()
     store().publish()
 

@@ -28,9 +28,12 @@ def _scene(job: PathJob) -> Iterator[str]:
     program = method.program
     yield f"scene      {method.name}: {method.content}, {program['name']} {program['version']}"
     yield "frame      the run's normalised frame; cameras look along -z, x is right, y is up (OpenGL)"
-    unit = "normalised unit" if scale == 1.0 else "normalised units"
-    yield f"scale      1 unit of the data set (transforms.json) = {number(scale)} {unit}"
-    yield f"           1 cm = {number(0.01 * scale)} normalised units, {_METRES}"
+    if scale is None:
+        yield "scale      the scene does not say the units of a data set"
+    else:
+        unit = "normalised unit" if scale == 1.0 else "normalised units"
+        yield f"scale      1 unit of the data set (transforms.json) = {number(scale)} {unit}"
+        yield f"           1 cm = {number(0.01 * scale)} normalised units, {_METRES}"
     yield f"           1 degree = {number(math.radians(1.0), 6)} rad"
 
 
@@ -50,8 +53,11 @@ def _cameras(job: PathJob, frames: Sequence[int]) -> Iterator[str]:
             continue
         depth_quantiles = {name: float(np.quantile(depths, part)) for name, part in _QUANTILES.items()}
         scale = job.method.dataset_scale
-        text = ", ".join(f"{name} {number(z)} ({number(z / scale)})" for name, z in depth_quantiles.items())
-        yield f"    depth in normalised units (of the data set): {text}"
+        text = ", ".join(
+            f"{name} {number(z)}" + ("" if scale is None else f" ({number(z / scale)})")
+            for name, z in depth_quantiles.items()
+        )
+        yield f"    depth in normalised units{'' if scale is None else ' (of the data set)'}: {text}"
         yield (
             f"    at the middle depth, a shift by 0.01 normalised units moves the picture by "
             f"{number(0.01 * poses.camera.fx / depth_quantiles['middle'], 3)} pixels; 1 degree of yaw by "

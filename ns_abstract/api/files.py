@@ -141,7 +141,7 @@ def path_sets(
 
 
 def _perturbations(
-    settings: Settings, scale: float, path: CameraPath, default: Perturbation | None
+    settings: Settings, scale: float | None, path: CameraPath, default: Perturbation | None
 ) -> tuple[Perturbation, ...]:
     file = settings.perturbation_filename
     if settings.given_set is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any, cast
@@ -13,6 +13,7 @@ import torch
 
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseBox
+from ns_abstract.io import digests
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import load_json
 from ns_abstract.io.stamps import file_stamp
@@ -28,10 +29,14 @@ _IMAGES = 64
 
 @dataclass(frozen=True)
 class PropertySource:
-    """A property and the file that states it; ``file``: the file, or None."""
+    """A property and the file that states it.
+
+    ``file``: the file, or None. ``digests``: SHA-256 of the files that it names, as they were read inside `recorded`.
+    """
 
     value: Any
     file: Path | None = None
+    digests: dict[str, str] = field(default_factory=dict, compare=False, repr=False)
 
     @classmethod
     def of(cls, given: Mapping[str, Any] | str | Path) -> PropertySource:
@@ -47,7 +52,7 @@ class PropertySource:
 
     @property
     def stamped(self) -> Any:
-        """The content, with the sum of every file in place of its name."""
+        """The content, with the SHA-256 of every file, as it was read, in place of its name."""
         return self._stamped(self.value)
 
     def _stamped(self, value: Any) -> Any:
@@ -57,11 +62,13 @@ class PropertySource:
             return value
         files = ("file", "mask", "indices")
         return {
-            key: file_stamp(self.folder / part)["sha256"]
-            if key in files and isinstance(part, str)
-            else self._stamped(part)
+            key: self._digest(self.folder / part) if key in files and isinstance(part, str) else self._stamped(part)
             for key, part in value.items()
         }
+
+    def _digest(self, file: Path) -> str:
+        # what was not read has no part in the property
+        return self.digests.get(digests.key(file)) or file_stamp(file)["sha256"]
 
     @property
     def folder(self) -> Path:

@@ -17,6 +17,7 @@ import numpy as np
 from ns_abstract.api.assumptions import scene_choices
 from ns_abstract.api.assumptions import set_choices as object_choices
 from ns_abstract.api.scenes import Scene, SceneSource
+from ns_abstract.arithmetic.kernel_cache import store as kernels
 from ns_abstract.arithmetic.selfcheck import platform_problems
 from ns_abstract.execution.cancellation import WorkCancelledError, cancel_when
 from ns_abstract.execution.threads import most_threads
@@ -38,7 +39,7 @@ from ns_abstract.report.figures import ShownUnits, number
 _WIDE_TURN = 0.5
 #: Bytes for leaves below which nothing can be done.
 _LEAST_LEAF_BYTES = 64 << 20
-#: Seconds that the ray with which kernels are compiled may take.
+#: Seconds that the ray with which kernels are compiled may take from one kernel to the next.
 _WARM_RAY = 2.0
 #: Rays that are rendered to see what a picture takes.
 _LOOK_RAYS = 128
@@ -293,7 +294,7 @@ class Job:
     def describe(self) -> dict[str, Any]:
         """The scene for reports, and the units that its sets were stated in."""
         about, first = self.method.describe(), self.pose_sets[0].perturbation
-        units = ShownUnits(first.units, first.angle_units, self.method.dataset_scale)
+        units = ShownUnits(first.units, first.angle_units, self.method.dataset_scale or 1.0)
         notes = [*about.get("notes", ()), *self.notes]
         return {**about, "units": asdict(units), **({"notes": notes} if self.notes else {})}
 
@@ -341,7 +342,11 @@ def _open(source: SceneSource, pose_sets: tuple[PoseBox, ...], **options: Any) -
 def warm_up(frame: Frame) -> None:
     """Compile the kernels that a frame needs; where one ray takes long, it is given up once they are compiled."""
     begin = time.perf_counter()
-    with suppress(WorkCancelledError), cancel_when(lambda: frame.tilewise and time.perf_counter() - begin > _WARM_RAY):
+    with (
+        kernels().expecting(*frame.compiled),
+        suppress(WorkCancelledError),
+        cancel_when(lambda: frame.tilewise and time.perf_counter() - max(begin, kernels().latest) > _WARM_RAY),
+    ):
         frame.warm_up()
 
 

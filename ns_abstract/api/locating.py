@@ -23,6 +23,7 @@ from ns_abstract.api.location import Location, PhotoOptions, calibrated
 from ns_abstract.api.poses import PoseSet, pose_sets
 from ns_abstract.api.scenes import Scene, checked_scene
 from ns_abstract.api.search_options import SearchKeywords, SearchOptions, SearchResult
+from ns_abstract.execution.cancellation import Deadline
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.io.errors import InputError
 from ns_abstract.report.certificate import search_figures
@@ -31,6 +32,7 @@ from ns_abstract.report.location import location_document, location_page, locati
 from ns_abstract.report.notebook import verdicts_html
 from ns_abstract.report.run import CommandRun
 from ns_abstract.verify.cells import CellGrid
+from ns_abstract.verify.location_cover import PoseCover
 from ns_abstract.verify.location_store import LocationStore
 from ns_abstract.verify.store import Store
 
@@ -39,6 +41,9 @@ if TYPE_CHECKING:
 
 #: How far 255 times a float may be from a whole number: float32 rounds numbers up to 1 by 2^-25, here at most 2^-17.
 _LEVEL_ERROR = 1e-3
+#: Seconds that boxes around what is left are looked for once the time is over; the part of the time, and the seconds,
+#: that are kept for them at most.
+_GRACE, _SHARE_FOR_COVER, _MOST_FOR_COVER = 2.0, 0.05, 20.0
 
 
 @dataclass(frozen=True)
@@ -89,9 +94,23 @@ class LocationQuestion(CellQuestion[LocateProgress]):
     def prepare(self, search: CellSearch[LocateProgress], request: Request) -> None:
         store = cast(LocationStore, search.store)
         store.allowed = self.job.photo.allowed
-        store.cover = lambda frame: self.job.cover(frame, store.left(frame))
+        uncovered = dict.fromkeys(tally.frame for tally in store.tallies())
+
+        def cover(frame: int) -> PoseCover:
+            if search.stop():
+                end = Deadline(_GRACE / len(self.sets))
+            else:
+                seconds = max(_GRACE, search.whole.left) / max(1, len(uncovered))
+                end = Deadline(seconds, search.stop)
+            uncovered.pop(frame, None)
+            return self.job.cover(frame, store.left(frame), end)
+
+        store.cover = cover
         request.on_open(store)
         self.job.job.warm_up(next(iter(self.sets)))
+
+    def reserved(self, seconds: float) -> float:
+        return min(_MOST_FOR_COVER, _SHARE_FOR_COVER * seconds)
 
     def progress(self, store: Store) -> LocateProgress:
         assert isinstance(store, LocationStore)
@@ -105,6 +124,7 @@ class LocationQuestion(CellQuestion[LocateProgress]):
         if state == "running":
             return {}
         rows = {tally.frame: store.leaves(tally.frame) for tally in store.tallies()}
+        left = {frame: self.job.left_volume(frame, store.left(frame)) for frame in rows}
         sets = {frame: self.job.job.pose_sets[frame] for frame in rows}
         poses = {frame: store.poses(frame) for frame in rows}
         photo = self.job.photo
@@ -117,7 +137,7 @@ class LocationQuestion(CellQuestion[LocateProgress]):
             **_more(self.job),
         }
         document = location_document(
-            self.about, about, self.parameters, sets, rows, poses, search_figures(store), state=state
+            self.about, about, self.parameters, sets, rows, left, poses, search_figures(store), state=state
         )
         if search.request.report:
             picture, missed = None, None
@@ -162,6 +182,7 @@ class Located(SearchResult):
 
     Attributes:
         possible_volume: Part of the parameter volume that is not excluded, mean over the sets.
+        covered_volume: Part of it in the cells that are not excluded: boxes around what is left.
         hull: Ends [d], [d] of the smallest box around all that is not excluded; None: no pose made the photo.
         best: Parameters ``pose`` of the rendered pose that explains most, and the number of ``outliers``; or None.
         answer: "none" (no pose of the sets made the photo), "possible" (a rendered pose explains it) or "unknown".
@@ -170,6 +191,7 @@ class Located(SearchResult):
     """
 
     possible_volume: float
+    covered_volume: float
     hull: tuple[np.ndarray, np.ndarray] | None
     best: Mapping[str, Any] | None
     answer: str
@@ -290,6 +312,7 @@ def located(job: Location, rows: Mapping[int, list[Row]], document: Mapping[str,
         job.job.parameters,
         document,
         possible_volume=document["possible_volume"],
+        covered_volume=document["covered_volume"],
         hull=None if hull is None else (np.array(hull["lower"]), np.array(hull["upper"])),
         best=document["best"],
         answer=document["answer"],

@@ -127,17 +127,30 @@ class Location:
         plain = self.search(number).plain
         return assemble(plain.render(np.asarray(values, np.float64)), plain.camera)[..., :3]
 
-    def cover(self, number: int, cells: list[Cell]) -> PoseCover:
-        """Cells of a set's own parameters that hold all poses in ``cells`` of its search."""
+    def left_volume(self, number: int, cells: list[Cell]) -> float:
+        """The part of a set that ``cells`` of its search hold at most; some of them reach beyond the set."""
         search = self.search(number)
-        boxes = [box for cell in cells if (box := search.frame.feasible(search.grid.box_of(cell))) is not None]
+        # a shear keeps volumes
+        whole, own = (np.subtract(box.upper, box.lower) for box in (search.grid.box, search.plain.box))
+        shares = sum(cell.volume for cell in cells) / search.grid.volume
+        return min(1.0, shares * float(np.prod(whole / own)))
+
+    def cover(self, number: int, cells: list[Cell], late: Callable[[], bool] = lambda: False) -> PoseCover:
+        """Cells of a set's own parameters that hold all poses in ``cells`` of its search; ``late``: see `cover`."""
+        search = self.search(number)
+        boxes = []
+        for box in map(search.grid.box_of, cells):
+            # poses outside of the set cost nothing but tightness
+            feasible = box if late() else search.frame.feasible(box)
+            if feasible is not None:
+                boxes.append(feasible)
         d = search.frame.box.dimensions
         lower, upper = (
             np.array([getattr(box, end) for box in boxes], np.float64).reshape(len(boxes), d)
             for end in ("lower", "upper")
         )
         sheared = ShearedBoxes(lower, upper, search.frame.box.names, search.frame.pose_set.shear)
-        return cover(search.plain.box, sheared)
+        return cover(search.plain.box, sheared, late=late)
 
     @property
     def fingerprint(self) -> dict[str, Any]:

@@ -25,6 +25,7 @@ from ns_abstract.execution.worker_cache import Recipe
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.assumptions import Assumption
+from ns_abstract.io.digests import recorded
 from ns_abstract.io.errors import InputError
 from ns_abstract.perturbation.specification import TRANSLATIONS
 from ns_abstract.reach.learned import LearnedDynamics
@@ -54,8 +55,11 @@ class LoopJob:
 
     def __init__(self, job: Job, loop: Loop, network_arithmetic: NetworkArithmetic = "float32") -> None:
         require_sound_platform()
+        #: Of masks and lists of Gaussians, as they were read.
+        self._digests: dict[str, str] = {}
         if loop.views:
-            loop = parse_loop(dict(loop.value), loop.network.absolute().parent, job.method.dataset_scale)
+            with recorded(self._digests):
+                loop = parse_loop(dict(loop.value), loop.network.absolute().parent, job.method.dataset_scale)
         self.job, self.loop = job, loop
         # selections and regions are checked before anything is computed
         self._seen = self._views(job.pose_sets[0])
@@ -174,7 +178,7 @@ class LoopJob:
         if self.loop.views:
             # masks and lists of Gaussians are files of their own
             stated = [self.loop.value.get(key) for key in ("unsafe", "goal")]
-            learned["views"] = PropertySource(stated, self.loop.network.absolute()).stamped
+            learned["views"] = PropertySource(stated, self.loop.network.absolute(), self._digests).stamped
             # distances may be stated in units of the data set
             learned["dataset_scale"] = self.job.method.dataset_scale
         return {

@@ -14,6 +14,7 @@ from ns_abstract.api.job import Job
 from ns_abstract.api.network_stamp import network_prints
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.assumptions import Assumption
+from ns_abstract.io.digests import recorded
 from ns_abstract.io.errors import InputError
 from ns_abstract.refine.protocol import Method
 from ns_abstract.verify.eight_bit import Picture
@@ -41,7 +42,8 @@ class Question:
         self.network = load_network(model, **load_options)
         shapes = self.network.input_shape, self.network.output_shape
         try:
-            self.property: Property = parse_property(source.value, source.folder, *shapes)
+            with recorded(source.digests):
+                self.property: Property = parse_property(source.value, source.folder, *shapes)
         except InputError as error:
             raise source.within(error) from None
         #: height and width of the network's pictures

@@ -23,6 +23,7 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble, in_tiles
 from ns_abstract.io.assumptions import Assumption
+from ns_abstract.io.digests import recorded
 from ns_abstract.io.errors import InputError
 from ns_abstract.refine.protocol import (
     COLORS,
@@ -291,12 +292,13 @@ class PictureQuestion:
 
     def __init__(self, source: PropertySource) -> None:
         self.source = source
-        self._dataset_scale = 1.0
+        self._dataset_scale: float | None = 1.0
         self.property = self._parsed(1.0)
 
-    def _parsed(self, dataset_scale: float) -> PictureProperty:
+    def _parsed(self, dataset_scale: float | None) -> PictureProperty:
         try:
-            return parse_picture_property(self.source.value, self.source.folder, dataset_scale)
+            with recorded(self.source.digests):
+                return parse_picture_property(self.source.value, self.source.folder, dataset_scale)
         except InputError as error:
             raise self.source.within(error) from None
 

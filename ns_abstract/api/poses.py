@@ -192,8 +192,8 @@ class PoseSet:
         # what is wrong is told where it is written
         self.perturbation()
 
-    def perturbation(self, dataset_scale: float = 1.0) -> Perturbation:
-        """What varies, in normalised units; ``dataset_scale``: normalised units per unit of the data set."""
+    def perturbation(self, dataset_scale: float | None = 1.0) -> Perturbation:
+        """What varies, in normalised units; ``dataset_scale``: normalised units per unit of the data set, or None."""
         return parse_perturbation(self.specification, dataset_scale=dataset_scale, field_prefix="", folder=self.folder)
 
     def of(self, scene: Scene) -> poses.PoseBox:

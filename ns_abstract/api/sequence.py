@@ -29,7 +29,7 @@ Range = tuple[float, float]
 _REPORT = "report.json"
 
 
-def load_motion(file: Path, sets: Mapping[int, PoseBox], dataset_scale: float) -> dict[str, Range]:
+def load_motion(file: Path, sets: Mapping[int, PoseBox], dataset_scale: float | None) -> dict[str, Range]:
     """By how much parameters may change from one photo to the next, by name.
 
     Raises:

@@ -7,6 +7,7 @@ from typing import Any
 
 from ns_abstract.check.inputs import BadInput, read_scene
 from ns_abstract.check.results import read_report, read_verdicts
+from ns_abstract.io import digests
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import load_json
 from ns_abstract.io.stamps import file_stamp
@@ -69,8 +70,10 @@ def _run_files(report: dict[str, Any], notes: list[str]) -> list[dict[str, Any]]
     if not isinstance(source, str) or not isinstance(config, str):
         return []
     try:
-        read_scene(Path(config), report)
         stamp = file_stamp(Path(source))
+        read_scene(Path(config), report)
+        if file_stamp(Path(source)) != stamp:
+            raise InputError("was replaced while it was read", file=source)
     except (BadInput, InputError, OSError) as error:
         why = getattr(error, "problem", None) or str(error)
         notes.append(f"the scene is named by its arrays alone: {source}: {why}")
@@ -82,9 +85,10 @@ def _given_file(report: dict[str, Any], name: str) -> list[dict[str, Any]]:
     """The file of the property or the loop, where it still says what was certified."""
     file = report["settings"].get(name)
     try:
-        if not isinstance(file, str) or load_json(Path(file)) != report.get(name):
-            return []
-        stamp = file_stamp(Path(file))
+        read: dict[str, str] = {}
+        with digests.recorded(read):
+            if not isinstance(file, str) or load_json(Path(file)) != report.get(name):
+                return []
     except (InputError, OSError):
         return []
-    return [_subject(stamp["name"], stamp["sha256"], of=f"the file of the {name}")]
+    return [_subject(Path(file).name, read[digests.key(file)], of=f"the file of the {name}")]

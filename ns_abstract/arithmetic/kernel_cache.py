@@ -36,6 +36,7 @@ import platformdirs
 from numba.core.caching import FunctionCache
 
 from ns_abstract.arithmetic import kernel_linking
+from ns_abstract.arithmetic.compile_progress import CompileProgress
 from ns_abstract.arithmetic.shipped_kernels import adopt, shipped_folder
 from ns_abstract.io.atomic import write_atomic
 from ns_abstract.io.errors import InputError
@@ -54,7 +55,7 @@ _KEPT = 4
 #: Bytes that have to be free where kernels are written.
 _FREE = 32 << 20
 #: Seconds between two words on progress, and between two times that kernels are published.
-_PACE = 10.0
+_PACE = 5.0
 
 #: What numba asks by default.
 _LOCATORS = "UserProvidedCacheLocator,InTreeCacheLocator,UserWideCacheLocator,IPythonCacheLocator,ZipCacheLocator"
@@ -102,7 +103,11 @@ class KernelStore:
         self._published: dict[Path, tuple[int, int]] = {}
         self._entries = _read_manifest(self._folder)
         self.compiled, self.functions = 0, 0
+        #: When the last function was compiled, by `time.perf_counter`.
+        self.latest = 0.0
         self._said = time.monotonic()
+        self._progress: CompileProgress | None = None
+        self._before = 0
         with suppress(OSError):
             os.utime(self._folder)
         self._clear(root)
@@ -237,17 +242,32 @@ class KernelStore:
             )
         self.compiled += 1
 
+    @contextmanager
+    def expecting(self, functions: int, seconds: float) -> Iterator[None]:
+        """Inside, progress is told of so many functions, about, that take so many seconds; of 0 nothing is known."""
+        self._progress = CompileProgress(functions, seconds, _PACE) if functions else None
+        self._before, self._said = self.functions, time.monotonic()
+        try:
+            yield
+        finally:
+            self._progress = None
+
     def function_done(self) -> None:
         """A kernel, or a function that one calls, was compiled."""
         self.functions += 1
+        self.latest = time.perf_counter()
         now = time.monotonic()
-        if now - self._said > _PACE:
+        first = self._progress is not None and self.functions == self._before + 1
+        if first or now - self._said > _PACE:
             self._said = now
             if self.shared:
                 return
             # not after every kernel: it looks at all files of the session
             self.publish()
-            _log.info("compiling kernels (first use only): functions done: %d", self.functions)
+            if self._progress is None:
+                _log.info("compiling kernels (first use only): functions done: %d", self.functions)
+            else:
+                _log.info(self._progress.line(self.functions - self._before))
 
     def close(self) -> None:
         """Publish, and remove the session's folder unless it is another process'."""

@@ -64,8 +64,7 @@ def read_json(file: Path, what: str, fix: str | None = None) -> dict[str, Any]:
             raise BadInput(f"no such {what}", file, fix=fix)
         if file.stat().st_size > _TEXT:
             raise BadInput(f"this {what} is too large", file, fix=fix)
-        content = json.loads(file.read_bytes())
-        if not isinstance(content, dict):
+        if not isinstance(content := json.loads(file.read_bytes()), dict):
             raise BadInput("the top level is not an object", file, fix=fix)
     return content
 

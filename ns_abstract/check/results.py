@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import os
 import sqlite3
 import zipfile
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from ns_abstract.check.inputs import BadInput, read_json, reading, sha256
 Array = Any
 
 #: Bytes of arrays of one frame, and rows of a table, that are read at most.
-_MOST, _ROWS = 32 << 30, 10_000_000
+_MOST, _ROWS = min(32 << 30, os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE") // 2), 10_000_000
 #: Arrays of a frame file, and their types.
 _KINDS = {"tile": "<i4", "box_lower": "<f8", "box_upper": "<f8"}
 _KINDS |= {f"{of}{side}": "<f4" for of in ("", "witness_", "b_", "A_") for side in ("lower", "upper")}
@@ -63,8 +64,7 @@ def read_report(folder: Path) -> dict[str, Any]:
 
 def read_cells(folder: Path, name: str, index: int, digest: object) -> StoredCells:
     """A frame file, checked before anything in it is unpacked."""
-    file = folder / name
-    with reading(file, "cannot be read as a frame file", _AGAIN):
+    with reading(file := folder / name, "cannot be read as a frame file", _AGAIN):
         if sha256(file) != digest:
             raise BadInput("is not the file that the report names (sha256)", file, fix=_AGAIN)
         with zipfile.ZipFile(file) as archive:
@@ -96,7 +96,9 @@ def read_verdicts(folder: Path, report: dict[str, Any]) -> list[StoredCells]:
         frames = [{"index": k, "parameters": report["parameters"]} for k in (0, 1)] if loop else report["frames"]
         if loop and _initial(report["loop"]) != [[p.get(key) for key in _BOX] for p in report["parameters"]]:
             raise BadInput("is of other initial states than the loop's", folder / "report.json", "parameters", _AGAIN)
-        base = sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro", uri=True)
+        # in a folder that cannot be written, SQLite could not make its file beside a finished table
+        fixed = "" if os.access(folder, os.W_OK) or Path(f"{file}-wal").exists() else "&immutable=1"
+        base = sqlite3.connect(f"{file.resolve().as_uri()}?mode=ro{fixed}", uri=True)
         # rows that stand for what is still to be examined
         query = "SELECT value FROM search_state WHERE key = 'open_rows'"
         left = set(json.loads((base.execute(query).fetchone() or ["[]"])[0]))

@@ -13,6 +13,7 @@ import signal
 import socket
 import sys
 import threading
+from collections import namedtuple
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, redirect_stderr, suppress
 from types import FrameType
@@ -237,6 +238,8 @@ def run(
         if not is_interruption(error):
             raise
         print("interrupted", file=sys.stderr)
+        # Python would end by the signal where the interruption left executed text, as a dataclass has; this forgets it
+        namedtuple("Executed", ())
         # finalizers of what the interruption left half built have nothing to say
         sys.unraisablehook = lambda _: None
         code = INTERRUPTED

@@ -71,7 +71,7 @@ def reach(options: Reach) -> int:
         console = plain_console()
         document = searched(
             question, options.output_dir, options.where, stop, console, job.job, 0,
-            Request(options.time_budget, options.resume, scene_margin=options.scene_margin),
+            Request(options.time_budget, options.resume, rows=False, scene_margin=options.scene_margin),
             kept_cells,
         )  # fmt: skip
         for name, entry in document["questions"].items():

@@ -155,7 +155,7 @@ def _search(
         for note in question.about.plan:
             console.print(f"  {note}")
 
-    request = Request(options.time_budget or _LOCATE_SECONDS, resume)
+    request = Request(options.time_budget or _LOCATE_SECONDS, resume, rows=False)
     document = searched(
         question, folder, options.where, stop, console, location.job, frames[0], request,
         lambda store: f"{store.open_blocks} cells still to be examined from before",
@@ -163,6 +163,9 @@ def _search(
     )  # fmt: skip
     left = percent(document["possible_volume"])
     console.print(f"{_ANSWERS[document['answer']]}; {left} of the set left")
+    covered = percent(document["covered_volume"])
+    if covered != left:
+        console.print(f"  cells.sqlite has boxes around it, which take {covered} of the set")
     late = [entry["index"] for entry in document["frames"] if entry["best"] is None and entry["possible_volume"] > 0.0]
     if document["state"] != "done" and late:
         console.print(f"  not examined before the time was over: {frames_listed(late)}")
@@ -199,7 +202,7 @@ def certify_path(options: Certify, stop: SignalStop) -> bool:
     budget = options.time_budget or _CERTIFY_SECONDS
     document = searched(
         question, options.output_dir, options.where, stop, console, job.job, frames[0],
-        Request(budget, options.resume, scene_margin=options.scene_margin),
+        Request(budget, options.resume, rows=False, scene_margin=options.scene_margin),
         kept_cells,
         lambda: _introduce(console, job, question.about.plan),
     )  # fmt: skip

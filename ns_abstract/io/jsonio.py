@@ -5,6 +5,7 @@ Every failure is an :class:`ns_abstract.io.errors.InputError` that names the fil
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import re
@@ -13,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeGuard
 
+from ns_abstract.io.digests import record
 from ns_abstract.io.errors import InputError
 
 JSON_BYTES_LIMIT = 32 * 2**20
@@ -155,6 +157,7 @@ def read_bytes(path: Path, what: str, limit: int) -> bytes:
         ) from None
     if len(data) > size:
         raise InputError(f"{what} grew while it was read", file=path, fix="wait until it is written")
+    record(path, lambda: hashlib.sha256(data))
     return data
 
 

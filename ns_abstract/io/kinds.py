@@ -50,27 +50,34 @@ _ENDINGS = {
 
 def is_ply(path: Path) -> bool:
     """Whether a file begins as a .ply does."""
-    return _head(path).startswith((b"ply\n", b"ply\r"))
+    try:
+        return _head(path).startswith((b"ply\n", b"ply\r"))
+    except OSError:
+        return False
 
 
 def refuse_other_kind(path: Path) -> None:
     """Refuse a file whose first bytes (or, where its kind has no mark, whose name) tell that it is of another kind.
 
     Raises:
-        InputError: Names the kind, and the command that converts or fetches it.
+        InputError: Names the kind, and the command that converts or fetches it; or the file may not be read.
     """
-    kind = _other_kind(path, _head(path))
+    try:
+        head = _head(path)
+    except PermissionError as error:
+        # its name alone would make a file of another kind of it
+        raise InputError(f"cannot be read: {error.strerror}", file=path, fix="check the permissions") from None
+    except OSError:
+        # what reads the file says why
+        head = b""
+    kind = _other_kind(path, head)
     if kind is not None:
         raise InputError(f"is {kind[0]}", file=path, fix=kind[1].replace("{name}", path.name))
 
 
 def _head(path: Path) -> bytes:
-    try:
-        with path.open("rb") as stream:
-            return stream.read(_HEAD)
-    except OSError:
-        # what reads the file says why
-        return b""
+    with path.open("rb") as stream:
+        return stream.read(_HEAD)
 
 
 def _other_kind(path: Path, head: bytes) -> tuple[str, str] | None:

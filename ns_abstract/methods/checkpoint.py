@@ -7,15 +7,11 @@ names in it only those of `_NAMES`, each of which stands for a function of this 
 
 from __future__ import annotations
 
-import io
 import math
 import mmap
-import pickle
-import pickletools
 import struct
 import zipfile
 from collections import Counter
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -28,18 +24,13 @@ from ns_abstract.io.errors import InputError, first_line
 from ns_abstract.io.jsonio import file_size, show
 from ns_abstract.io.kinds import refuse_other_kind
 from ns_abstract.io.memory import check_memory
+from ns_abstract.methods.checkpoint_pickle import RECOPY, Placeholder, read_structure
 
 PICKLE_BYTES_LIMIT = 16 * 2**20
 ARCHIVE_MEMBERS_LIMIT = 100_000
+#: Dimensions of arrays of every version of numpy, and values that no file holds.
+_MOST_DIMENSIONS, _LARGEST_TENSOR = 32, 2**58
 
-RECOPY = "copy the checkpoint again from the run"
-_PICKLE_MODULES = {"torch", "collections", "numpy", "_codecs"}
-_INSTRUCTIONS = frozenset(
-    """PROTO FRAME STOP MARK POP POP_MARK NONE NEWTRUE NEWFALSE BININT BININT1 BININT2 LONG1 BINFLOAT BINUNICODE
-    SHORT_BINUNICODE BINSTRING SHORT_BINSTRING BINBYTES SHORT_BINBYTES EMPTY_DICT EMPTY_LIST EMPTY_TUPLE EMPTY_SET
-    TUPLE TUPLE1 TUPLE2 TUPLE3 SETITEM SETITEMS APPEND APPENDS ADDITEMS BINPUT LONG_BINPUT BINGET LONG_BINGET MEMOIZE
-    GLOBAL REDUCE BUILD BINPERSID""".split()  # noqa: SIM905
-)
 #: By torch's name of a storage: numpy's type of its bytes, and torch's name of its values' type.
 _STORAGES = {
     "FloatStorage": ("<f4", "float32"),
@@ -142,8 +133,8 @@ def read_checkpoint(path: Path) -> Any:
         with zipfile.ZipFile(path) as archive:
             index = _validated_pickle_member(archive, path, size)
             data = archive.read(index)
-            _check_instructions(data, path)
-            return _CheckedUnpickler(data, _Storages(path, archive, index.filename.removesuffix("data.pkl"))).load()
+            storages = _Storages(path, archive, index.filename.removesuffix("data.pkl"))
+            return read_structure(data, path, _NAMES, storages.storage)
     except (InputError, MemoryError):
         raise
     except OSError as error:
@@ -182,28 +173,6 @@ def _validated_pickle_member(archive: zipfile.ZipFile, path: Path, size: int) ->
     return pickles[0]
 
 
-def _check_instructions(data: bytes, path: Path) -> None:
-    """Refuse pickles with other names or instructions; pickletools builds nothing, it only lists them."""
-    wanted, unusual = set(), None
-    for opcode, argument, _ in pickletools.genops(data):
-        if opcode.name in ("GLOBAL", "INST", "STACK_GLOBAL"):
-            wanted.add(str(argument or "unnamed").replace(" ", "."))
-        if opcode.name not in _INSTRUCTIONS or (opcode.name.endswith("PUT") and int(argument or 0) > len(data)):
-            # a memo of a large number takes memory up to it
-            unusual = unusual or opcode.name
-    # names outside of torch and numpy first: they are what an attack needs
-    for name in sorted(wanted, key=lambda n: (n.partition(".")[0] in _PICKLE_MODULES, n)):
-        if name not in _NAMES:
-            raise InputError(
-                f"asks for the Python object {show(name)}; nothing was run",
-                file=path,
-                field="data.pkl",
-                fix="use only checkpoints that ns-train wrote",
-            )
-    if unusual:
-        raise InputError(f"damaged checkpoint: unusual contents ({unusual})", file=path, fix=RECOPY)
-
-
 class _Storages:
     """The members of an archive that hold values."""
 
@@ -212,7 +181,14 @@ class _Storages:
         self._bytes: Any = None
         self._found: dict[tuple[str, str], NDArray[Any]] = {}
 
-    def values(self, kind: str, key: str, count: int) -> NDArray[Any]:
+    def storage(self, pid: Any) -> _Storage:
+        """torch.serialization.persistent_id: ("storage", type, key, device, number of values)."""
+        kind, storage, key, _device, count = pid
+        if kind != "storage" or storage not in _STORAGES or not isinstance(count, int):
+            raise ValueError("a storage of an unknown type")
+        return _Storage(storage, self._values(storage, str(key), count))
+
+    def _values(self, kind: str, key: str, count: int) -> NDArray[Any]:
         """``count`` values of a storage, a read-only view of the mapped file."""
         if (kind, key) not in self._found:
             member = self._archive.getinfo(f"{self._folder}data/{key}")
@@ -242,52 +218,48 @@ class _Storages:
         return at + 30 + name + extra
 
 
-class _Mapping(dict[Any, Any]):
-    """An ordered or counting mapping of a checkpoint, without attributes that the file could set."""
-
-    __slots__ = ()
-
-    def __setstate__(self, _state: Any) -> None:
-        pass
-
-
-class _Nothing:
-    """A placeholder for an object of a checkpoint that is never used."""
-
-    __slots__ = ()
-
-    def __setstate__(self, _state: Any) -> None:
-        pass
-
-
 @dataclass(frozen=True)
 class _Storage:
     kind: str
     values: NDArray[Any]
 
 
-def _mapping(*arguments: Any) -> _Mapping:
-    return _Mapping(*arguments)
+def _mapping(*items: Any) -> dict[Any, Any]:
+    """A mapping with an order, or of counts."""
+    if len(items) > 1 or not all(isinstance(part, dict) for part in items):
+        raise ValueError("a mapping of other objects")
+    return dict(*items)
 
 
-def _nothing(*_arguments: Any) -> _Nothing:
-    return _Nothing()
+def _nothing(*_arguments: Any) -> Placeholder:
+    return Placeholder()
+
+
+def _sizes(numbers: Any) -> tuple[int, ...]:
+    """A tensor's sizes or strides. ValueError: other objects, or more than numpy's arrays have."""
+    if not isinstance(numbers, (list, tuple)) or len(numbers) > _MOST_DIMENSIONS:
+        raise ValueError("a tensor of other or too many dimensions")
+    if not all(type(n) is int and 0 <= n < 2**62 for n in numbers):
+        raise ValueError("a tensor of negative size")
+    return tuple(numbers)
 
 
 def _tensor(
     storage: Any, offset: Any, shape: Any, strides: Any, _grad: Any = None, _hooks: Any = None, metadata: Any = None
 ) -> StoredTensor:
     """torch._utils._rebuild_tensor_v2."""
-    counts = [offset, *shape, *strides]
+    shape, strides = _sizes(shape), _sizes(strides)
+    (offset,) = _sizes((offset,))
     if not isinstance(storage, _Storage) or len(shape) != len(strides):
         raise ValueError("a tensor without its storage")
-    if not all(isinstance(n, int) and 0 <= n < 2**62 for n in counts):
-        raise ValueError("a tensor of negative size")
+    # numpy refuses some shapes of no values
+    if math.prod(max(n, 1) for n in shape) > _LARGEST_TENSOR:
+        raise ValueError("a tensor of too many values")
     last = offset + sum((n - 1) * step for n, step in zip(shape, strides, strict=True))
     if 0 not in shape and last >= storage.values.size:
         raise ValueError("a tensor larger than its storage")
     kind = "negated" if metadata else _STORAGES[storage.kind][1]
-    return StoredTensor(kind, tuple(shape), tuple(strides), offset, storage.values)
+    return StoredTensor(kind, shape, strides, offset, storage.values)
 
 
 def _parameter(data: Any, *_rest: Any) -> Any:
@@ -298,35 +270,20 @@ def _parameter(data: Any, *_rest: Any) -> Any:
 def _other(kind: str, place: int, *arguments: Any) -> StoredTensor:
     """A tensor that is not dense; its shape is argument ``place``."""
     shape: Any = arguments[1][2] if kind == "sparse" else arguments[place]
-    return StoredTensor(kind, tuple(int(n) for n in shape))
-
-
-class _Function:
-    """A function that a checkpoint may call; has no attributes that the file could set."""
-
-    __slots__ = ("__call",)
-
-    def __init__(self, call: Callable[..., Any]) -> None:
-        object.__setattr__(self, "_Function__call", call)
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        raise AttributeError(name)
-
-    def __call__(self, *arguments: Any) -> Any:
-        return self.__call(*arguments)
+    return StoredTensor(kind, _sizes(shape))
 
 
 _NUMBERS = ("Bool", "Float16", "Float32", "Float64", *(f"{sign}Int{n}" for sign in ("", "U") for n in (8, 16, 32, 64)))
 _NAMES: dict[str, Any] = {
-    "collections.OrderedDict": _Function(_mapping),
-    "collections.Counter": _Function(_mapping),
-    "torch.Size": _Function(tuple),
-    "torch._utils._rebuild_tensor_v2": _Function(_tensor),
-    "torch._utils._rebuild_parameter": _Function(_parameter),
-    "torch._utils._rebuild_parameter_with_state": _Function(_parameter),
-    "torch._utils._rebuild_sparse_tensor": _Function(partial(_other, "sparse", 0)),
-    "torch._utils._rebuild_qtensor": _Function(partial(_other, "quantized", 2)),
-    "torch._utils._rebuild_meta_tensor_no_storage": _Function(partial(_other, "empty (meta)", 1)),
+    "collections.OrderedDict": _mapping,
+    "collections.Counter": _mapping,
+    "torch.Size": _sizes,
+    "torch._utils._rebuild_tensor_v2": _tensor,
+    "torch._utils._rebuild_parameter": _parameter,
+    "torch._utils._rebuild_parameter_with_state": _parameter,
+    "torch._utils._rebuild_sparse_tensor": partial(_other, "sparse", 0),
+    "torch._utils._rebuild_qtensor": partial(_other, "quantized", 2),
+    "torch._utils._rebuild_meta_tensor_no_storage": partial(_other, "empty (meta)", 1),
     **{f"torch.{name}": name for name in _STORAGES},
     # Schedulers and optimizers hold numpy scalars and torch's types; none of their values is used.
     **dict.fromkeys(
@@ -342,24 +299,6 @@ _NAMES: dict[str, Any] = {
             "numpy.dtype",
             *(f"numpy.dtypes.{kind}DType" for kind in _NUMBERS),
         ),
-        _Function(_nothing),
+        _nothing,
     ),
 }
-
-
-class _CheckedUnpickler(pickle.Unpickler):
-    """Builds what a checked pickle describes."""
-
-    def __init__(self, data: bytes, storages: _Storages) -> None:
-        super().__init__(io.BytesIO(data), fix_imports=False)
-        self._storages = storages
-
-    def find_class(self, module: str, name: str, /) -> Any:
-        return _NAMES[f"{module}.{name}"]
-
-    def persistent_load(self, pid: Any, /) -> Any:
-        """torch.serialization.persistent_id: ("storage", type, key, device, number of values)."""
-        kind, storage, key, _device, count = pid
-        if kind != "storage" or storage not in _STORAGES or not isinstance(count, int):
-            raise ValueError("a storage of an unknown type")
-        return _Storage(storage, self._storages.values(storage, str(key), count))

@@ -285,8 +285,8 @@ def read_dataparser_transform(run: RunConfig) -> tuple[DataparserTransform, tupl
     """
     path = run.folder / TRANSFORMS_NAME
     if not os.path.lexists(path):
-        note = f"{path} is missing: dataset units are taken to be those of the normalised frame"
-        return DataparserTransform(), (note,)
+        note = f"{path} is missing: units of the data set are not known"
+        return DataparserTransform(stated=False), (note,)
     data = load_json(path, "dataparser transform", TRANSFORMS_BYTES_LIMIT)
     if not isinstance(data, dict):
         raise unusable(data, field="top level", fix="write an object", file=path)

@@ -72,11 +72,11 @@ class Perturbation:
     angle_units: str = field(default="radians", repr=False, compare=False)
 
 
-def load_perturbation(path: str | Path, *, dataset_scale: float = 1.0) -> Perturbation:
+def load_perturbation(path: str | Path, *, dataset_scale: float | None = 1.0) -> Perturbation:
     """Read a perturbation file; a camera path that holds a ``perturbation`` object also serves.
 
     Args:
-        dataset_scale: Normalised units per unit of transforms.json (dataparser_transforms.json).
+        dataset_scale: Normalised units per unit of transforms.json (dataparser_transforms.json); None: not known.
 
     Raises:
         InputError: The file or a field in it cannot be used.
@@ -103,10 +103,24 @@ def _refuse_overrides(entries: object) -> None:
             )
 
 
+def unit_length(units: str, dataset_scale: float | None, fail: Fail) -> float:
+    """Normalised units per unit of ``units``, "normalised" or "dataset".
+
+    Raises:
+        InputError: Units of the data set are meant, and ``dataset_scale`` is None: the scene does not say them.
+    """
+    if units != "dataset":
+        return 1.0
+    if dataset_scale is None:
+        fix = "put the run's dataparser_transforms.json beside its config.yml, or use normalised units"
+        raise fail("units", "found dataset, and the scene does not say the units of its data set", fix)
+    return dataset_scale
+
+
 def parse_perturbation(
     value: object,
     *,
-    dataset_scale: float = 1.0,
+    dataset_scale: float | None = 1.0,
     field_prefix: str = "perturbation.",
     folder: Path | None = None,
 ) -> Perturbation:
@@ -138,8 +152,8 @@ def parse_perturbation(
     for name, (low, high) in shifts.items():
         if low < -1.0 or high > 1.0:
             raise fail(name, f"found {show(value[name])}", "stay within -1 and 1")
-    length = dataset_scale if units == "dataset" else 1.0
-    translation = _scaled(_ranges(value, "translation", TRANSLATIONS, fail), length)
+    ranges = _ranges(value, "translation", TRANSLATIONS, fail)
+    translation = _scaled(ranges, unit_length(units, dataset_scale, fail) if ranges else 1.0)
     rotation, orbit = _scaled(_ranges(value, "rotation", ROTATIONS, fail), turn), _orbit(value, fail, turn)
     scene = _scene(value, fail, field_prefix, folder)
     parts: dict[str, Mapping[str, Sequence[float]]] = {"translation": translation, "rotation": rotation}

@@ -233,11 +233,11 @@ def load_loop(path: str | Path) -> Loop:
         raise error.within(path) from None
 
 
-def parse_loop(value: Any, folder: Path, dataset_scale: float = 1.0) -> Loop:
+def parse_loop(value: Any, folder: Path, dataset_scale: float | None = 1.0) -> Loop:
     """Check the content of LOOP.json.
 
     Args:
-        dataset_scale: Normalised units per unit of the data set, for distances in pictures.
+        dataset_scale: Normalised units per unit of the data set, for distances in pictures; None: not known.
     """
     if not isinstance(value, dict):
         raise fail("", f"found {show(value)}", "write an object")
@@ -413,7 +413,7 @@ def _unsafe(value: Any, field: str, names: tuple[str, ...]) -> tuple[HalfSpace, 
     return (HalfSpace(tuple((-normal).tolist()), -end),)
 
 
-def _view(value: Mapping[str, Any], field: str, folder: Path, dataset_scale: float) -> PictureProperty:
+def _view(value: Mapping[str, Any], field: str, folder: Path, dataset_scale: float | None) -> PictureProperty:
     """The property of the picture under a key."""
     try:
         if "partitions" in value:

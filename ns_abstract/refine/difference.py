@@ -69,6 +69,7 @@ class DifferenceFrame(Frame):
         self.side, self.across, self.down = first.side, first.across, first.down
         self.tilewise, self.tiles_at_once, self.witnesses = first.tilewise, first.tiles_at_once, first.witnesses
         self.stages = tuple(dict.fromkeys((*first.stages, *second.stages)))
+        self.compiled = max(first.compiled, second.compiled)
         self.largest: RenderedMaximum | None = None
         self._inside = pixels_inside(first)
         self.greatest = np.zeros((first.tile_count, first.side, first.side, COLORS), np.float32)

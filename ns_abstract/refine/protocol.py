@@ -130,6 +130,8 @@ class Frame(Protocol):
             that a cell concerns.
         witnesses: Poses rendered in every part of a cell of one parameter that is split.
         stages: Parts of the kernels that can be compiled apart, the slowest first; none: they cannot.
+        compiled: Functions of the kernels, about, where there are no stages, and the seconds that one core compiles; 0:
+            not known.
     """
 
     pose_set: PoseBox
@@ -143,6 +145,7 @@ class Frame(Protocol):
     tiles_at_once: int | None
     witnesses: int
     stages: tuple[str, ...] = ()
+    compiled: tuple[int, float] = (0, 0.0)
 
     @property
     def tile_count(self) -> int:
@@ -360,8 +363,8 @@ class Method(Protocol):
         ...
 
     @property
-    def dataset_scale(self) -> float:
-        """Normalised units per unit of the data set."""
+    def dataset_scale(self) -> float | None:
+        """Normalised units per unit of the data set; None: the scene does not say."""
         ...
 
     @property

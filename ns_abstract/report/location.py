@@ -31,6 +31,7 @@ _POSSIBLE, _BEST = (29, 116, 64), (179, 38, 30)
 
 METRICS = {
     "possible_volume": "part of the parameter volume that is not excluded, mean over the frames' sets",
+    "covered_volume": "part of it in cells that are not excluded: boxes around what is left",
     "hull": "the smallest box around all that is not excluded; null: no pose of the sets made the photo",
     "best": "of all rendered poses the one that explains most, and how many counted pixels it does not explain",
     "answer": "none (proved: no pose of the sets made the photo), possible (a rendered pose explains it), unknown",
@@ -52,6 +53,7 @@ def location_document(
     parameters: Sequence[tuple[str, str]],
     sets: Mapping[int, PoseBox],
     rows: Mapping[int, Sequence[Row]],
+    left: Mapping[int, float],
     poses: Mapping[int, Sequence[Any]],
     figures: Mapping[str, Any],
     *,
@@ -65,11 +67,12 @@ def location_document(
         parameters: Names and units of the table ``parameters``.
         sets: By frame, the poses.
         rows: By frame, the cells.
+        left: By frame, the part of the set that the search left.
         poses: Rendered poses by frame, the best first, with ``values`` and ``outliers``.
         figures: See `ns_abstract.report.certificate.search_figures`.
         state: "done", "budget" or "interrupted".
     """
-    frames = [_frame(parameters, frame, sets[frame], rows[frame], poses[frame]) for frame in sorted(rows)]
+    frames = [_frame(parameters, frame, sets[frame], rows[frame], left[frame], poses[frame]) for frame in sorted(rows)]
     hulls = [entry["hull"] for entry in frames if entry["hull"] is not None]
     bests = [dict(entry["best"], frame=entry["index"]) for entry in frames if entry["best"] is not None]
     best = min(bests, key=lambda entry: entry["outliers"], default=None)
@@ -87,7 +90,10 @@ def location_document(
         run.head()
         | {
             "answer": answer,
-            "possible_volume": sum(entry["possible_volume"] for entry in frames) / max(1, len(frames)),
+            **{
+                name: sum(entry[name] for entry in frames) / max(1, len(frames))
+                for name in ("possible_volume", "covered_volume")
+            },
             "hull": hull,
             "best": best,
             "photo": photo,
@@ -101,7 +107,12 @@ def location_document(
 
 
 def _frame(
-    parameters: Sequence[tuple[str, str]], index: int, poses: PoseBox, rows: Sequence[Row], found: Sequence[Any]
+    parameters: Sequence[tuple[str, str]],
+    index: int,
+    poses: PoseBox,
+    rows: Sequence[Row],
+    searched: float,
+    found: Sequence[Any],
 ) -> dict[str, Any]:
     box = poses.box
     entries = sides(box, parameters, poses.fixed)
@@ -112,6 +123,7 @@ def _frame(
         shares = np.subtract(row["upper"], row["lower"])[columns] / np.subtract(box.upper, box.lower)
         return float(np.prod(shares))
 
+    covered = min(1.0, sum(map(volume, left)))
     hull = None
     if left:
         hull = {
@@ -128,7 +140,8 @@ def _frame(
         "index": index,
         "intrinsics": poses.camera.intrinsics._asdict(),
         "parameters": entries,
-        "possible_volume": min(1.0, sum(map(volume, left))),
+        "possible_volume": min(covered, searched),
+        "covered_volume": covered,
         "hull": hull,
         "best": best,
         "cells": {kind: sum(row["verdict"] == kind for row in rows) for kind in ("excluded", "possible", "unknown")},

@@ -239,11 +239,13 @@ def stops(
     each, units = most // max(1, len(entries)), units or ShownUnits()
     poses = []
     for position, entry in enumerate(entries):
+        cells = rows.get(entry["index"], ())
+        ends = cell_ends(cells)
         parameters = entry["parameters"]
         axis = direction(parameters)
         middle = [0.5 * (p["lower"] + p["upper"]) for p in parameters]
         if axis is None or each < 2:
-            poses.append(_stop(entry, rows, units, middle, None))
+            poses.append(_stop(entry, cells, ends, units, middle, None))
             continue
         low, high = parameters[axis]["lower"], parameters[axis]["upper"]
         name = parameters[axis]["name"]
@@ -251,18 +253,19 @@ def stops(
         follows = position + 1 < len(entries) and name == "segment"
         closed = name == "azimuth" and high - low >= _FULL_TURN * (1.0 - 1e-9)
         for value in np.linspace(low, high, each, endpoint=not (follows or closed)).tolist():
-            poses.append(_stop(entry, rows, units, [*middle[:axis], value, *middle[axis + 1 :]], axis))
+            poses.append(_stop(entry, cells, ends, units, [*middle[:axis], value, *middle[axis + 1 :]], axis))
     return poses
 
 
 def _stop(
     entry: Mapping[str, Any],
-    rows: Mapping[int, Sequence[Mapping[str, Any]]],
+    cells: Sequence[Mapping[str, Any]],
+    ends: tuple[NDArray[np.float64], NDArray[np.float64]],
     units: ShownUnits,
     values: list[float],
     axis: int | None,
 ) -> WalkPose:
-    row = cell_at(rows.get(entry["index"], ()), values)
+    row = cell_at(cells, values, ends)
     at = f"frame {entry['index']}"
     if axis is not None:
         p = entry["parameters"][axis]
@@ -274,11 +277,24 @@ def _stop(
     )
 
 
-def cell_at(rows: Sequence[Mapping[str, Any]], values: Sequence[float]) -> Mapping[str, Any] | None:
-    """The cell that holds a pose; where several meet a certified one, which holds for its ends, too."""
+def cell_ends(rows: Sequence[Mapping[str, Any]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lower and upper ends [n, d] of cells."""
+    lower, upper = (np.array([row[key] for row in rows], np.float64) for key in ("lower", "upper"))
+    return lower, upper
+
+
+def cell_at(
+    rows: Sequence[Mapping[str, Any]],
+    values: Sequence[float],
+    ends: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
+) -> Mapping[str, Any] | None:
+    """The cell that holds a pose; where several meet a certified one, which holds for its ends, too.
+
+    ``ends``: those of the rows (`cell_ends`), where there are several poses to look for.
+    """
     if not rows:
         return None
-    lower, upper = (np.array([row[key] for row in rows], np.float64) for key in ("lower", "upper"))
+    lower, upper = cell_ends(rows) if ends is None else ends
     inside = np.flatnonzero(((lower <= values) & (upper >= values)).all(axis=1)).tolist()
     order = ("certified", "falsified", "unknown")
     return min((rows[k] for k in inside), key=lambda row: order.index(row["verdict"]), default=None)

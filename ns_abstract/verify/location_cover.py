@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import heapq
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -83,8 +83,13 @@ class ShearedBoxes:
         return chosen[some], lower[some], upper[some]
 
 
-def cover(box: ParameterBox, boxes: ShearedBoxes, most_cells: int = MOST) -> PoseCover:
-    """Tile a set by cells of its own parameters, about ``most_cells`` of which hold what is in ``boxes``."""
+def cover(
+    box: ParameterBox, boxes: ShearedBoxes, most_cells: int = MOST, late: Callable[[], bool] = lambda: False
+) -> PoseCover:
+    """Tile a set by cells of its own parameters, about ``most_cells`` of which hold what is in ``boxes``.
+
+    ``late``: whether there is no more time; cells are not cut from then on.
+    """
     d = box.dimensions
     grid = CellGrid(box, (1 << UNITS,) * d, (1,) * d)
     excluded: list[Cell] = []
@@ -109,7 +114,7 @@ def cover(box: ParameterBox, boxes: ShearedBoxes, most_cells: int = MOST) -> Pos
             heapq.heappush(queue, (-inner.volume, count, inner, chosen))
 
     add(Cell((0,) * d, grid.units), np.arange(len(boxes.lower)))
-    while queue and len(queue) + len(finished) < most_cells:
+    while queue and len(queue) + len(finished) < most_cells and not late():
         _, _, cell, chosen = heapq.heappop(queue)
         halves = min(
             (grid.cut(cell, [2 if k == axis else 1 for k in range(d)]) for axis in range(d)),

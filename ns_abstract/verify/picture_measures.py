@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
@@ -17,7 +17,6 @@ import torch
 
 from ns_abstract.arithmetic.network_charges import OWN_MARGIN
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.photos import read_grey_mask
 from ns_abstract.refine.protocol import WeightPlane
 from ns_abstract.verify.network import ImageSets
 
@@ -39,12 +38,14 @@ class Region:
     box: tuple[int, int, int, int] | None = None
     mask: Path | None = None
     name: str = "region"
+    #: [H, W] bool of the mask, read once: its file may change during a search.
+    white: np.ndarray | None = field(default=None, compare=False, repr=False)
 
     def pixels(self, height: int, width: int) -> np.ndarray:
         """[H, W] bool."""
         chosen = np.ones((height, width), bool)
-        if self.mask is not None:
-            chosen = read_grey_mask(self.mask)
+        if self.white is not None:
+            chosen = self.white.copy()
             if chosen.shape != (height, width):
                 raise InputError(
                     f"the mask has {chosen.shape[1]} x {chosen.shape[0]} pixels, the picture {width} x {height}",

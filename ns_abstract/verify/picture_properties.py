@@ -22,6 +22,8 @@ from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.fields import fail, known
 from ns_abstract.io.jsonio import MODERATE, file_beside, is_number, show, unusable
+from ns_abstract.io.photos import read_grey_mask
+from ns_abstract.perturbation.specification import unit_length
 from ns_abstract.perturbation.variations import parse_selection
 from ns_abstract.refine.protocol import COLORS, WeightPlane
 from ns_abstract.verify.network import ImageSets, OutputBounds
@@ -313,7 +315,7 @@ class _PropertyObject(NamedTuple):
     root: dict[str, Any]
     prefix: str
     folder: Path
-    dataset_scale: float
+    dataset_scale: float | None
 
     def number(self, key: str, low: float, high: float, otherwise: float | None = None) -> float:
         """A number between two others, the ends included."""
@@ -341,7 +343,8 @@ class _PropertyObject(NamedTuple):
             if not isinstance(mask, str) or not mask:
                 raise unusable(mask, field=f"{self.prefix}mask", fix="write the name of a .png, relative to this file")
             name = f"{self.prefix}mask"
-            return Region(mask=file_beside(self.folder, mask, name), name=name)
+            file = file_beside(self.folder, mask, name)
+            return Region(mask=file, name=name, white=read_grey_mask(file))
         if box is None or box == "all":
             return Region(name=name)
         if not (isinstance(box, list) and len(box) == 4 and all(type(v) is int and 0 <= v < 1 << 20 for v in box)):
@@ -383,7 +386,8 @@ def _visible(source: _PropertyObject) -> Leaf:
 def _clear(source: _PropertyObject) -> Leaf:
     root, prefix = source.root, source.prefix
     distance_given = source.number("distance", *MODERATE)
-    scale = source.dataset_scale if source.choice("units", ("normalised", "dataset")) == "dataset" else 1.0
+    units = source.choice("units", ("normalised", "dataset"))
+    scale = unit_length(units, source.dataset_scale, lambda name, problem, fix: fail(f"{prefix}{name}", problem, fix))
     unit = "units of the data set" if scale != 1.0 else "normalised units"
     distance, region = distance_given * scale, source.region()
     if source.choice("measure", ("weight", "expected")) == "expected":
@@ -436,10 +440,10 @@ def is_of_picture(root: Any) -> bool:
     return isinstance(root, dict) and ("all" in root or "any" in root or root.get("type") in tuple(PICTURE_TYPES))
 
 
-def parse_picture_property(root: dict[str, Any], folder: Path, dataset_scale: float = 1.0) -> PictureProperty:
+def parse_picture_property(root: dict[str, Any], folder: Path, dataset_scale: float | None = 1.0) -> PictureProperty:
     """Return the property of the picture that a parsed PROP.json states; files that it names lie in ``folder``.
 
-    ``dataset_scale``: normalised units per unit of the data set.
+    ``dataset_scale``: normalised units per unit of the data set; None: not known.
     """
     value = root.get("preprocess", {})
     if isinstance(value, dict):
@@ -452,7 +456,7 @@ def parse_picture_property(root: dict[str, Any], folder: Path, dataset_scale: fl
 
 
 def parse_statement(
-    root: Any, folder: Path, dataset_scale: float, common: tuple[str, ...] = (), prefix: str = "", depth: int = 0
+    root: Any, folder: Path, dataset_scale: float | None, common: tuple[str, ...] = (), prefix: str = "", depth: int = 0
 ) -> Statement:
     """Return the statement of an object; ``prefix`` is its place, ``common`` are keys that may stand beside it."""
     if not isinstance(root, dict):

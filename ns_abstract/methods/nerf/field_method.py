@@ -37,8 +37,8 @@ class FieldMethod(Method):
         return self._named.notes
 
     @property
-    def dataset_scale(self) -> float:
-        return self._named.dataparser.scale
+    def dataset_scale(self) -> float | None:
+        return self._named.dataparser.stated_scale
 
     def prepare(self, perturbations: Sequence[Perturbation]) -> None:
         """Refuse what needs Gaussians. Raises InputError where a set varies the scene."""

@@ -77,8 +77,8 @@ class SplatMethod(Method):
         return tuple(self.scene.notes)
 
     @property
-    def dataset_scale(self) -> float:
-        return self.scene.dataparser.scale
+    def dataset_scale(self) -> float | None:
+        return self.scene.dataparser.stated_scale
 
     @property
     def program(self) -> dict[str, Any]:

@@ -183,6 +183,9 @@ class StoredTensors:
         def fail(problem: str, fix: str = "put the data beside the model") -> InputError:
             return InputError(problem, file=self.path, field=field, fix=fix)
 
+        if len(where) < len(tensor.external_data):
+            # programs take one or the other
+            raise fail("states where its data lie twice", _FIX)
         try:
             target = (folder / location).resolve()
             start, length = int(where.get("offset", 0)), int(where.get("length", kind.itemsize * count))

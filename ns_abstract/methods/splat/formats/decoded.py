@@ -92,7 +92,7 @@ def scene_of(decoded: DecodedSplats, overrides: Overrides) -> SplatScene:
         sh_degree=math.isqrt(rows.sh.shape[1]) - 1,
         rasterize_mode=cast(Literal["classic", "antialiased"], assumptions[0].value),
         background=np.array(overrides.background or background, np.float32),
-        dataparser=DataparserTransform(),
+        dataparser=DataparserTransform(stated=False),
         name=visible(file.stem),
         source=str(file),
         **dropped,
