@@ -300,7 +300,7 @@ def test_a_locate_command_ends_with_its_time(
     code, _, _ = in_process(main, options(blobs, tmp_path / "out", image, time_budget=3))
     assert code == 0 and len(ends) == 1 and ends[0] <= 3.0
     report = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert report["possible_volume"] <= report["covered_volume"] <= 1.0
+    assert report["left_volume"] <= report["possible_volume"] <= 1.0
 
 
 def test_nearby_values() -> None:
@@ -396,8 +396,8 @@ def test_locate_finds_the_pose(blobs: Inputs, tmp_path: Path) -> None:
         kind: sum(np.prod((c.upper - c.lower) / sizes) for c in place.cells if (c.verdict == "excluded") == kind)
         for kind in (True, False)
     }
-    assert volumes[False] == pytest.approx(place.covered_volume)
-    assert place.possible_volume <= place.covered_volume
+    assert volumes[False] == pytest.approx(place.possible_volume)
+    assert place.left_volume <= place.possible_volume
     assert sum(volumes.values()) == pytest.approx(1.0)
     for cell in place.cells:
         if cell.verdict == "possible":

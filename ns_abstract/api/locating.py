@@ -182,7 +182,7 @@ class Located(SearchResult):
 
     Attributes:
         possible_volume: Part of the parameter volume that is not excluded, mean over the sets.
-        covered_volume: Part of it in the cells that are not excluded: boxes around what is left.
+        left_volume: Part of it that the search left; the cells are boxes around that.
         hull: Ends [d], [d] of the smallest box around all that is not excluded; None: no pose made the photo.
         best: Parameters ``pose`` of the rendered pose that explains most, and the number of ``outliers``; or None.
         answer: "none" (no pose of the sets made the photo), "possible" (a rendered pose explains it) or "unknown".
@@ -191,7 +191,7 @@ class Located(SearchResult):
     """
 
     possible_volume: float
-    covered_volume: float
+    left_volume: float
     hull: tuple[np.ndarray, np.ndarray] | None
     best: Mapping[str, Any] | None
     answer: str
@@ -312,7 +312,7 @@ def located(job: Location, rows: Mapping[int, list[Row]], document: Mapping[str,
         job.job.parameters,
         document,
         possible_volume=document["possible_volume"],
-        covered_volume=document["covered_volume"],
+        left_volume=document["left_volume"],
         hull=None if hull is None else (np.array(hull["lower"]), np.array(hull["upper"])),
         best=document["best"],
         answer=document["answer"],

@@ -161,11 +161,11 @@ def _search(
         lambda store: f"{store.open_blocks} cells still to be examined from before",
         introduced,
     )  # fmt: skip
-    left = percent(document["possible_volume"])
+    left = percent(document["left_volume"])
     console.print(f"{_ANSWERS[document['answer']]}; {left} of the set left")
-    covered = percent(document["covered_volume"])
-    if covered != left:
-        console.print(f"  cells.sqlite has boxes around it, which take {covered} of the set")
+    possible = percent(document["possible_volume"])
+    if possible != left:
+        console.print(f"  cells.sqlite has boxes around it, which take {possible} of the set")
     late = [entry["index"] for entry in document["frames"] if entry["best"] is None and entry["possible_volume"] > 0.0]
     if document["state"] != "done" and late:
         console.print(f"  not examined before the time was over: {frames_listed(late)}")

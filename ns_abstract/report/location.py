@@ -31,7 +31,7 @@ _POSSIBLE, _BEST = (29, 116, 64), (179, 38, 30)
 
 METRICS = {
     "possible_volume": "part of the parameter volume that is not excluded, mean over the frames' sets",
-    "covered_volume": "part of it in cells that are not excluded: boxes around what is left",
+    "left_volume": "part of it that the search left; the cells are boxes around that",
     "hull": "the smallest box around all that is not excluded; null: no pose of the sets made the photo",
     "best": "of all rendered poses the one that explains most, and how many counted pixels it does not explain",
     "answer": "none (proved: no pose of the sets made the photo), possible (a rendered pose explains it), unknown",
@@ -92,7 +92,7 @@ def location_document(
             "answer": answer,
             **{
                 name: sum(entry[name] for entry in frames) / max(1, len(frames))
-                for name in ("possible_volume", "covered_volume")
+                for name in ("possible_volume", "left_volume")
             },
             "hull": hull,
             "best": best,
@@ -123,7 +123,7 @@ def _frame(
         shares = np.subtract(row["upper"], row["lower"])[columns] / np.subtract(box.upper, box.lower)
         return float(np.prod(shares))
 
-    covered = min(1.0, sum(map(volume, left)))
+    possible = min(1.0, sum(map(volume, left)))
     hull = None
     if left:
         hull = {
@@ -140,8 +140,8 @@ def _frame(
         "index": index,
         "intrinsics": poses.camera.intrinsics._asdict(),
         "parameters": entries,
-        "possible_volume": min(covered, searched),
-        "covered_volume": covered,
+        "possible_volume": possible,
+        "left_volume": min(possible, searched),
         "hull": hull,
         "best": best,
         "cells": {kind: sum(row["verdict"] == kind for row in rows) for kind in ("excluded", "possible", "unknown")},
