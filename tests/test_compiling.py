@@ -27,7 +27,6 @@ from ns_abstract.cli.common import show_log
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.hash_bounds.bounds import NerfactoFrame
 from ns_abstract.methods.splat.bounds import Stages
-from ns_abstract.refine.protocol import Frame
 
 
 def test_stages_are_shared_out() -> None:
@@ -230,7 +229,7 @@ def test_what_is_compiled_without_stages_is_told_of_all(
 
 
 @pytest.mark.parametrize("frame", [NerfFrame, NerfactoFrame])
-def test_frames_without_stages_say_how_much_they_compile(frame: type[Frame]) -> None:
+def test_frames_without_stages_say_how_much_they_compile(frame: type[NerfFrame] | type[NerfactoFrame]) -> None:
     assert not frame.stages and frame.compiled[0] > 50 and frame.compiled[1] > 10.0
 
 

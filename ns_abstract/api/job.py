@@ -31,7 +31,7 @@ from ns_abstract.io.version import computed_by
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.perturbation.variations import SceneVariation
 from ns_abstract.refine.engine import Refinement, RefinementGoal
-from ns_abstract.refine.protocol import Frame, Method
+from ns_abstract.refine.protocol import CountedFrame, Frame, Method
 from ns_abstract.refine.result import EXTRA_OUTPUTS, FrameResult, PartResult, TracePoint, joined
 from ns_abstract.report.figures import ShownUnits, number
 
@@ -341,9 +341,9 @@ def _open(source: SceneSource, pose_sets: tuple[PoseBox, ...], **options: Any) -
 
 def warm_up(frame: Frame) -> None:
     """Compile the kernels that a frame needs; where one ray takes long, it is given up once they are compiled."""
-    begin = time.perf_counter()
+    begin, compiled = time.perf_counter(), frame.compiled if isinstance(frame, CountedFrame) else (0, 0.0)
     with (
-        kernels().expecting(*frame.compiled),
+        kernels().expecting(*compiled),
         suppress(WorkCancelledError),
         cancel_when(lambda: frame.tilewise and time.perf_counter() - max(begin, kernels().latest) > _WARM_RAY),
     ):

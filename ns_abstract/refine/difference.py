@@ -17,6 +17,7 @@ from ns_abstract.refine.protocol import (
     COLORS,
     Bounds,
     CellContext,
+    CountedFrame,
     Frame,
     LinearSets,
     OrderedFrame,
@@ -69,7 +70,9 @@ class DifferenceFrame(Frame):
         self.side, self.across, self.down = first.side, first.across, first.down
         self.tilewise, self.tiles_at_once, self.witnesses = first.tilewise, first.tiles_at_once, first.witnesses
         self.stages = tuple(dict.fromkeys((*first.stages, *second.stages)))
-        self.compiled = max(first.compiled, second.compiled)
+        self.compiled = max(
+            frame.compiled if isinstance(frame, CountedFrame) else (0, 0.0) for frame in (first, second)
+        )
         self.largest: RenderedMaximum | None = None
         self._inside = pixels_inside(first)
         self.greatest = np.zeros((first.tile_count, first.side, first.side, COLORS), np.float32)

@@ -130,8 +130,6 @@ class Frame(Protocol):
             that a cell concerns.
         witnesses: Poses rendered in every part of a cell of one parameter that is split.
         stages: Parts of the kernels that can be compiled apart, the slowest first; none: they cannot.
-        compiled: Functions of the kernels, about, where there are no stages, and the seconds that one core compiles; 0:
-            not known.
     """
 
     pose_set: PoseBox
@@ -145,7 +143,6 @@ class Frame(Protocol):
     tiles_at_once: int | None
     witnesses: int
     stages: tuple[str, ...] = ()
-    compiled: tuple[int, float] = (0, 0.0)
 
     @property
     def tile_count(self) -> int:
@@ -208,6 +205,16 @@ class Frame(Protocol):
         found.
         """
         return []
+
+
+@runtime_checkable
+class CountedFrame(Protocol):
+    """An optional interface of a `Frame` without stages: what compiling its kernels takes.
+
+    ``compiled``: functions of the kernels, about, and the seconds that one core compiles.
+    """
+
+    compiled: tuple[int, float]
 
 
 @runtime_checkable
