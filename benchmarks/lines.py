@@ -28,14 +28,18 @@ def rows_of(name: str, table: dict[str, Any]) -> list[tuple[str, str]]:
 
 
 def function_lines(path: Path, names: set[str]) -> int:
-    """Return the lines of a file's functions and classes, with decorators. Raises KeyError: a name is missing."""
-    found = {
-        node.name: node
-        for node in ast.parse(path.read_text()).body
-        if isinstance(node, (ast.FunctionDef, ast.ClassDef))
-    }
-    starts = {name: min([node.lineno, *(item.lineno for item in node.decorator_list)]) for name, node in found.items()}
-    return sum((found[name].end_lineno or 0) - starts[name] + 1 for name in names)
+    """Return the lines of a file's functions, classes and methods ("Class.method"). KeyError: there is none."""
+    found: dict[str, int] = {}
+
+    def visit(nodes: list[ast.stmt], within: str) -> None:
+        for node in nodes:
+            if isinstance(node, ast.FunctionDef | ast.ClassDef):
+                start = min([node.lineno, *(item.lineno for item in node.decorator_list)])
+                found[within + node.name] = (node.end_lineno or 0) - start + 1
+                visit(node.body if isinstance(node, ast.ClassDef) else [], f"{node.name}.")
+
+    visit(ast.parse(path.read_text(encoding="utf-8")).body, "")
+    return sum(found[name] for name in names)
 
 
 def moved(table: dict[str, Any]) -> Iterator[tuple[str, str, int]]:
@@ -54,7 +58,7 @@ def sums(table: dict[str, Any]) -> Counter[str]:
     found: Counter[str] = Counter()
     for path in PACKAGE.rglob("*.py"):
         ((feature, _row),) = rows_of(path.relative_to(PACKAGE).as_posix(), table)
-        found[feature] += path.read_text().count("\n")
+        found[feature] += path.read_text(encoding="utf-8").count("\n")
     for name, feature, lines in moved(table):
         found[rows_of(name, table)[0][0]] -= lines
         found[feature] += lines
@@ -62,7 +66,7 @@ def sums(table: dict[str, Any]) -> Counter[str]:
 
 
 if __name__ == "__main__":
-    result = sums(tomllib.loads(TABLE.read_text()))
+    result = sums(tomllib.loads(TABLE.read_text(encoding="utf-8")))
     for feature, lines in result.most_common():
         print(f"{lines:7,} {feature}")
     print(f"{result.total():7,} all")
