@@ -10,14 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ns_abstract.api.cell_search import (
-    CellQuestion,
-    CellSearch,
-    Request,
-    Row,
-    SearchProgress,
-    result_cells,
-)
+from ns_abstract.api.cell_search import CellQuestion, CellSearch, Request, Row, SearchProgress, result_cells
 from ns_abstract.api.job import Job
 from ns_abstract.api.location import Location, PhotoOptions, calibrated
 from ns_abstract.api.poses import PoseSet, pose_sets

@@ -197,11 +197,7 @@ def calibrated(scene: Scene, job: Job, options: PhotoOptions) -> tuple[PhotoOpti
         InputError: There are no photos.
     """
     calibration = calibrate(
-        scene,
-        job.pose_sets[0].camera.height,
-        noise=options.noise,
-        outliers=options.outliers,
-        arithmetic=job.arithmetic,
+        scene, job.pose_sets[0].camera.height, noise=options.noise, outliers=options.outliers, arithmetic=job.arithmetic
     )
     return replace(options, noise=calibration.noise, outliers=calibration.outliers), calibration
 

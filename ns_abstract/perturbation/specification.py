@@ -104,11 +104,7 @@ def _refuse_overrides(entries: object) -> None:
 
 
 def parse_perturbation(
-    value: object,
-    *,
-    dataset_scale: float = 1.0,
-    field_prefix: str = "perturbation.",
-    folder: Path | None = None,
+    value: object, *, dataset_scale: float = 1.0, field_prefix: str = "perturbation.", folder: Path | None = None
 ) -> Perturbation:
     """Check a parsed ``perturbation`` object and convert the camera's translations to the normalised frame.
 

@@ -13,15 +13,7 @@ from ns_abstract.arithmetic.rounding import DIFFERENCE_ROUNDING, UNIT32
 from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.refine.frame_tiles import pixels_inside
-from ns_abstract.refine.protocol import (
-    COLORS,
-    Bounds,
-    CellContext,
-    Frame,
-    LinearSets,
-    OrderedFrame,
-    PreciseFrame,
-)
+from ns_abstract.refine.protocol import COLORS, Bounds, CellContext, Frame, LinearSets, OrderedFrame, PreciseFrame
 from ns_abstract.refine.result import RenderedMaximum, greater
 
 #: A preference: pixels above the floor up to which a cell's orders are looked at.
