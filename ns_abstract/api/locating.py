@@ -241,7 +241,7 @@ def locate(
 
 
 def photo_levels(photo: ArrayLike) -> np.ndarray:
-    """[H, W, 3] uint8 levels of a photo. Raises InputError where it has none, or others than multiples of 1/255."""
+    """[H, W, 3] uint8 levels of a photo. Raises InputError where it is none, or holds other numbers than k/255."""
     values = np.asarray(photo)
     if values.ndim != 3 or values.shape[2] != 3 or values.dtype.kind not in "fu":
         raise InputError(
