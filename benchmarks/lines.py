@@ -66,7 +66,10 @@ def sums(table: dict[str, Any]) -> Counter[str]:
 
 
 if __name__ == "__main__":
-    result = sums(tomllib.loads(TABLE.read_text(encoding="utf-8")))
-    for feature, lines in result.most_common():
-        print(f"{lines:7,} {feature}")
-    print(f"{result.total():7,} all")
+    table = tomllib.loads(TABLE.read_text(encoding="utf-8"))
+    result = sums(table)
+    for existed, title in ((True, "what existed"), (False, "later features")):
+        group = {feature: lines for feature, lines in result.items() if table[feature].get("existed", False) == existed}
+        print(f"{sum(group.values()):7,} {title}")
+        for feature, lines in sorted(group.items(), key=lambda entry: -entry[1]):
+            print(f"{lines:11,} {feature}")
