@@ -16,11 +16,11 @@ from certifying import linear
 
 from ns_abstract.api.certifying import CertifyProgress
 from ns_abstract.api.files import PathJob
+from ns_abstract.bench import loops, rules, scale
 from ns_abstract.bench import paper as paper_tables
-from ns_abstract.bench import scale
 from ns_abstract.bench.sets import open_jobs, pose_set, splat_of
 from ns_abstract.cli.bench import bench
-from ns_abstract.cli.bench_options import ScaleBenchmark, Tightness
+from ns_abstract.cli.bench_options import Certificates, RulesBenchmark, ScaleBenchmark, Tightness
 from ns_abstract.cli.common import DONE
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.program_options import ProgramOptions
@@ -29,7 +29,7 @@ from ns_abstract.methods.splat.constants import PAPER
 from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.paper import splat as paper
 
-loops, plan, rules = (script(name) for name in ("loops", "plan", "rules"))
+plan = script("plan")
 
 
 def test_version_of_gsplat(blobs) -> None:
@@ -104,10 +104,13 @@ def test_a_plan_that_loses_something_is_noticed(job: PathJob, monkeypatch: pytes
 
 @pytest.mark.slow
 def test_commands(blobs, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    files = {"load_config": (blobs.config,), "camera_path_filename": blobs.path}
     path = ["--camera-path-filename", str(blobs.path), "--output-dir", str(tmp_path)]
     assert plan.main([str(blobs.config), *path, "--sets", "x", "--cells", "4"]) == 0
-    size = ["--parts", "8", "--pixels", "1", "--gaussians", "5"]
-    assert rules.main([str(blobs.config), *path, "--sets", "x", "roll", *size]) == 0
+    assert (
+        bench(RulesBenchmark(**files, output_dir=tmp_path, sets=("x", "roll"), parts=(8,), pixels=1, gaussians=5))
+        == DONE
+    )
     printed = capsys.readouterr().out
     assert printed.count("every Gaussian in every cell") == 1 and printed.count("MATRIXINV, sorting") == 2
     for name, count in (("plan", 3), ("rules", 10)):
@@ -173,10 +176,11 @@ def test_certified_fraction_of_a_network_that_always_says_the_same(
     net = linear(tmp_path / "net.onnx", np.zeros((2, 3 * 16 * 16)), np.array([1.0, -1.0]), 16)
     prop = tmp_path / "property.json"
     prop.write_text(json.dumps({"type": "classification", "label": label, "preprocess": {"resize": [16, 16]}}))
-    files = {"camera-path-filename": blobs.path, "output-dir": tmp_path, "model": net, "property": prop}
-    words = [word for name, file in files.items() for word in (f"--{name}", str(file))]
-    words += ["--sets", "x", "--seconds", "600", "--workers", "1", "--marks", "600", "900"]
-    assert loops.main([str(blobs.config), *words]) == 0
+    options = Certificates(
+        (blobs.config,), blobs.path, tmp_path, model=net, property=prop, sets=("x",), seconds=600.0, workers=1,
+        marks=(600.0, 900.0),
+    )  # fmt: skip
+    assert bench(options) == DONE
     with open(tmp_path / "certificates.csv", newline="") as stream:
         (row,) = csv.DictReader(stream)
     assert float(row[verdict]) == 1.0 and row["at 600 s"] == row["certified"] and "at 900 s" not in row

@@ -11,7 +11,11 @@ import tyro
 
 from ns_abstract.cli.bench_options import (
     CellBenchmark,
+    Certificates,
     Compile,
+    Loops,
+    Rays,
+    RulesBenchmark,
     ScaleBenchmark,
     Soundness,
     Tightness,
@@ -32,7 +36,15 @@ _TITLES = {
     "compile": "Seconds of compiling",
     "tightness": "Error against run time",
     "soundness": "Soundness",
+    "rules": "Our bounds and the paper's rules",
+    "rays": "Rays of a NeRF",
+    "certificates": "Certified fraction against time",
+    "loops": "A network in the loop: certified fraction against time",
 }
+
+
+def _said(text: str) -> None:
+    print(text, file=sys.stderr, flush=True)
 
 
 def _check_positive(options: dict[str, float | None]) -> None:
@@ -104,7 +116,61 @@ def scale(options: ScaleBenchmark) -> int:
     return DONE
 
 
-def rows_of(options: CellBenchmark | Compile | Soundness, job: PathJob, name: str) -> list[dict[str, Any]]:
+def certificates(options: Certificates) -> int:
+    """Measure how fast sets are certified; the table is written after every row."""
+    from ns_abstract.api.scenes import SceneSource
+    from ns_abstract.bench.loops import SETS, curve
+    from ns_abstract.bench.tables import Table
+    from ns_abstract.geometry.camera_path import load_camera_path
+
+    if len(options.load_config) != 1 or options.model is None or options.property is None:
+        field = "--load-config, --model, --property"
+        raise InputError("missing, or several runs", field=field, fix="give one run, a network and a property")
+    file = options.camera_path_filename or options.load_config[0].resolve().parents[2] / "camera_path.json"
+    path, scene = (
+        load_camera_path(file, options.downscale_factor),
+        SceneSource(options.load_config[0], overrides=options.overrides).open(),
+    )
+    sets = SETS if path.perturbations[options.frame] is None else {**SETS, "path": path.perturbations[options.frame]}
+    for name in options.sets:
+        if name not in sets:
+            raise InputError(f"found {name}", field="--sets", fix=f"the sets are {', '.join(sets)}")
+    table = Table(options.output_dir, "certificates", _TITLES["certificates"])
+    for name in options.sets:
+        marks = [mark for mark in options.marks if mark <= options.seconds]
+        table.add(
+            curve(
+                scene, path.cameras[options.frame], name, sets[name], options.model, options.property, options.seconds,
+                options.workers, marks, _said, path.following(options.frame),
+            )
+        )  # fmt: skip
+    return DONE
+
+
+def loops(options: Loops) -> int:
+    """Measure a loop; the exit code is 1 if a run left a tube or a certified cell had a run that went wrong."""
+    from ns_abstract.api.scenes import SceneSource
+    from ns_abstract.bench.loops import measure
+    from ns_abstract.bench.tables import markdown, write
+
+    if options.runs < 1:
+        raise InputError(f"found {options.runs}", field="--runs", fix="give a number of at least 1")
+    marks = [mark for mark in options.marks if mark <= options.seconds]
+    tables = measure(
+        SceneSource(options.load_config, overrides=options.overrides).open(), options.loop, options.seconds,
+        options.workers, options.runs, marks,
+        options.seed, _said,
+    )  # fmt: skip
+    for name, rows in (("loops", tables.search), ("loops-steps", tables.steps)):
+        if rows:
+            write(rows, options.output_dir, name, _TITLES["loops"] if name == "loops" else "Widths by step")
+            print(markdown(rows))
+    return 1 if tables.search[0]["violations"] else DONE
+
+
+def rows_of(
+    options: CellBenchmark | Compile | Soundness | RulesBenchmark | Rays, job: PathJob, name: str
+) -> list[dict[str, Any]]:
     """What a benchmark without curves finds for one scene and set of poses."""
     if isinstance(options, CellBenchmark):
         from ns_abstract.bench.scale import cell_cost
@@ -114,14 +180,31 @@ def rows_of(options: CellBenchmark | Compile | Soundness, job: PathJob, name: st
         from ns_abstract.bench.compiling import compile_times
 
         return compile_times(job, name, options.frame)
-    from ns_abstract.bench.tightness import attack
+    if isinstance(options, Soundness):
+        from ns_abstract.bench.tightness import attack
+
+        return [
+            attack(
+                job, name, options.frame, options.seconds, options.poses, options.reference_poses, options.seed,
+                options.scale, options.target_ratio,
+            )
+        ]  # fmt: skip
+    if isinstance(options, Rays):
+        from ns_abstract.bench.rays import measure
+
+        return [
+            measure(
+                job, name, options.frame, options.scale, rays=options.rays, ratio=options.target_ratio,
+                seconds=options.seconds, poses=options.poses, seed=options.seed,
+            )
+        ]  # fmt: skip
+    from ns_abstract.bench.rules import compare
 
     return [
-        attack(
-            job, name, options.frame, options.seconds, options.poses, options.reference_poses, options.seed,
-            options.scale, options.target_ratio,
-        )
-    ]  # fmt: skip
+        row
+        for parts in options.parts
+        for row in compare(job, name, options.frame, parts, options.pixels, options.gaussians, options.seed)
+    ]
 
 
 #: The benchmarks by the name that the command line gives them, with their options where none is given.
@@ -130,7 +213,11 @@ _DEFAULTS: dict[str, Any] = {
     "compile": Compile(),
     "tightness": Tightness(),
     "soundness": Soundness(),
+    "rules": RulesBenchmark(),
+    "rays": Rays(),
     "scale": ScaleBenchmark(),
+    "certificates": Certificates(),
+    "loops": Loops(load_config=tyro.MISSING, loop=tyro.MISSING),
     "vnnlib": Vnnlib(folder=tyro.MISSING),
     "verify": Verify(query=tyro.MISSING),
 }
@@ -138,7 +225,7 @@ _DEFAULTS: dict[str, Any] = {
 
 #: Benchmarks that say themselves what they measure.
 _ALONE: dict[type, Callable[[Any], int]] = {
-    Vnnlib: vnnlib, Verify: verify, ScaleBenchmark: scale,
+    Vnnlib: vnnlib, Verify: verify, ScaleBenchmark: scale, Certificates: certificates, Loops: loops,
 }  # fmt: skip
 
 
@@ -152,7 +239,8 @@ def bench(options: Any) -> int:
 
     program = ProgramOptions(
         gsplat_version=options.gsplat_version,
-        occupancy_grid=options.occupancy_grid if isinstance(options, Tightness) else None,
+        occupancy_grid=options.occupancy_grid if isinstance(options, Rays | Tightness) else None,
+        device=options.device if isinstance(options, Rays) else None,
     )
     jobs = open_jobs(
         options.load_config, options.camera_path_filename, options.downscale_factor, None, program, options.overrides
@@ -185,7 +273,7 @@ def bench(options: Any) -> int:
             f"Beside the paper's Table {number}",
         )
     violations = sum(int(str(row.get("violations", 0))) for row in table.rows)
-    if isinstance(options, Soundness):
+    if isinstance(options, Soundness | Rays):
         total = sum(int(str(row["comparisons"])) for row in table.rows)
         print(f"{total:,} comparisons, {violations} violations")
     return 1 if violations else DONE

@@ -104,6 +104,37 @@ class Soundness(_Seeded, _Scaled):
 
 
 @dataclass
+class RulesBenchmark(_Seeded, _Sets):
+    """Our bounds against the paper's rules, on the same Gaussians, pixels and cells."""
+
+    parts: tuple[int, ...] = (8, 64)
+    """Cells by axis that a set is cut into; the middle one is bounded."""
+    pixels: int = 8
+    """Pixels for every scene, set and cell."""
+    gaussians: int = 30
+    """Most Gaussians by pixel."""
+
+
+@dataclass
+class Rays(_Seeded, _Scaled):
+    """Random rays of a NeRF: CPU seconds by ray to a ratio, then attacks on the bounds."""
+
+    sets: tuple[str, ...] = ("yaw",)
+    rays: int = 20
+    """Number of rays."""
+    target_ratio: float = 1.1
+    """Where the rays are tight enough."""
+    seconds: float = 600.0
+    """Time for every scene and set."""
+    poses: int = 200
+    """Poses of the attacks, beside gradient ascent."""
+    occupancy_grid: Path | None = None
+    """Declare the fields empty outside of this grid's occupied voxels."""
+    device: Literal["cpu", "cuda"] | None = None
+    """cuda: bound the field on a GPU. Default: cpu."""
+
+
+@dataclass
 class ScaleBenchmark(SceneBenchmark):
     """Cost and peak memory of a cell, by number of Gaussians (the scene is resampled) and size of the picture."""
 
@@ -119,6 +150,45 @@ class ScaleBenchmark(SceneBenchmark):
     """Refinement of the last, largest case."""
     memory_limit: float = 8.0
     """GiB that refinement plans with."""
+
+
+@dataclass
+class Certificates(SceneBenchmark):
+    """Certified fraction against time, by set of poses."""
+
+    model: Path | None = None
+    """Network, .onnx."""
+    property: Path | None = None
+    """What is to hold (JSON)."""
+    sets: tuple[str, ...] = ("xyz",)
+    """Sets of poses: x, xyz, xyz-small, six, six-wide; path: what the camera path says."""
+    seconds: float = 120.0
+    """Time for every set."""
+    workers: int = 2
+    """Processes."""
+    marks: tuple[float, ...] = (30.0, 60.0, 120.0, 300.0, 600.0)
+    """Seconds at which the certified fraction is told, up to the time that there is."""
+
+
+@dataclass
+class Loops(_Seeded):
+    """A network in the loop: certified fraction against time, tubes against runs, attacks on tubes."""
+
+    load_config: Path
+    """Run (config.yml) or scene file."""
+    loop: Path
+    """LOOP.json."""
+    output_dir: Path = Path("bench")
+    """Folder for the tables."""
+    seconds: float = 120.0
+    """Time for the search."""
+    workers: int = 2
+    """Processes."""
+    runs: int = 10_000
+    """Simulated runs from the whole initial box, and from one certified cell."""
+    marks: tuple[float, ...] = (30.0, 60.0, 120.0, 300.0, 600.0)
+    """Seconds at which the certified fraction is told, up to the time that there is."""
+    overrides: SceneOverrides = field(default_factory=Overrides)
 
 
 @dataclass

@@ -1,28 +1,20 @@
-"""Measure the cost and tightness of random rays of a NeRF, and attack the bounds.
-
-python benchmarks/rays.py RUN/config.yml [--sets yaw] [--device cuda]
-"""
+"""Measure the cost and tightness of random rays of a NeRF, and attack the bounds."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from measured import run_parser, runs
 
 from ns_abstract.api.files import PathJob
 from ns_abstract.bench.sets import pose_set
-from ns_abstract.bench.tables import Table
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.method import NerfMethod
-from ns_abstract.methods.program_options import ProgramOptions
 from ns_abstract.refine.engine import Refinement
 from ns_abstract.verify.attack.falsify import falsify
 from ns_abstract.verify.attack.soundness import nerf_renderer
@@ -96,29 +88,3 @@ def measure(job: PathJob, name: str, frame: int, scale: float, **options: Any) -
         "violations": attack.violations,
         "not finite": attack.not_finite,
     }
-
-
-def main(words: Sequence[str] | None = None) -> int:
-    """Measure runs; 1 if a bound was violated."""
-    parser = run_parser(__doc__, "yaw")
-    parser.add_argument("--scale", type=float, default=1.0, help="multiplies the ranges of translations and rotations")
-    parser.add_argument("--rays", type=int, default=20)
-    parser.add_argument("--target-ratio", type=float, default=1.1, help="where the rays are tight enough")
-    parser.add_argument("--seconds", type=float, default=600.0, help="for every scene and set")
-    parser.add_argument("--poses", type=int, default=200, help="of the attacks, beside gradient ascent")
-    parser.add_argument("--occupancy-grid", type=Path, help="declares the fields empty outside of its occupied voxels")
-    parser.add_argument("--device", choices=("cpu", "cuda"))
-    options = parser.parse_args(words)
-    table = Table(options.output_dir, "rays", "Rays of a NeRF")
-    for job in runs(options, ProgramOptions(occupancy_grid=options.occupancy_grid, device=options.device)):
-        for name in options.sets:
-            row = measure(
-                job, name, options.frame, options.scale, rays=options.rays, ratio=options.target_ratio,
-                seconds=options.seconds, poses=options.poses, seed=options.seed,
-            )  # fmt: skip
-            table.add(row)
-    return int(any(row["violations"] for row in table.rows))
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

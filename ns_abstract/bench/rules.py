@@ -2,24 +2,20 @@
 
 The cost of the paper's depth-order rule grows with the square of the number of Gaussians, so each pixel gets
 a scene of its own: the Gaussians that give it most of its light.
-
-    python benchmarks/rules.py [RUN/config.yml ...] [--sets x yaw] [--parts 8 64]
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
-from measured import run_parser, runs
 
 from ns_abstract.api.files import PathJob
 from ns_abstract.arithmetic.forms import Float64Array
 from ns_abstract.arithmetic.rounding import REAL
 from ns_abstract.bench.sets import pose_set, splat_of
-from ns_abstract.bench.tables import Table
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.poses import PoseBox
@@ -171,25 +167,3 @@ def compare(
         }
         for rule in rules
     ]
-
-
-def main(words: Sequence[str] | None = None) -> int:
-    """Compare on runs, or the demo scene; 1 if a render lies outside of bounds."""
-    parser = run_parser(__doc__, "x", "yaw")
-    parser.add_argument(
-        "--parts", type=int, nargs="+", default=[8, 64], help="cells by axis; the middle one is bounded"
-    )
-    parser.add_argument("--pixels", type=int, default=8, help="for every scene, set and cell")
-    parser.add_argument("--gaussians", type=int, default=30, help="most Gaussians by pixel")
-    options = parser.parse_args(words)
-    table = Table(options.output_dir, "rules", "Our bounds and the paper's rules")
-    for job in runs(options):
-        for name in options.sets:
-            for parts in options.parts:
-                size = options.pixels, options.gaussians
-                table.add(*compare(job, name, options.frame, parts, *size, options.seed))
-    return int(any(row["violations"] for row in table.rows))
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

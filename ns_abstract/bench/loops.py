@@ -1,29 +1,21 @@
-"""Certified fraction against time; of a network in the loop, tubes against the hull of many runs and attacks, too.
-
-python benchmarks/loops.py RUN/config.yml --loop LOOP.json [--runs 10000]
-python benchmarks/loops.py RUN/config.yml --model NET.onnx --property PROP.json [--sets xyz]
-"""
+"""A network in the loop: certified fraction against time, tubes against the hull of many runs, and attacks on tubes."""
 
 from __future__ import annotations
 
-import argparse
-import sys
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from measured import run_parser
 
 from ns_abstract.api.certifying import CertifyProgress, certify
 from ns_abstract.api.loop_job import LoopJob, open_loop
 from ns_abstract.api.loop_report import widths
 from ns_abstract.api.poses import PoseSet
 from ns_abstract.api.reaching import ReachCell, ReachProgress, ReachResult, reach
-from ns_abstract.api.scenes import Scene, SceneSource
-from ns_abstract.bench.tables import Table, markdown, write
+from ns_abstract.api.scenes import Scene
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.camera_path import PinholeCamera, load_camera_path
+from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.reach.search import QUESTIONS, SimulatedRun, first_outside, sampled_disturbances, simulate
 from ns_abstract.reach.tubes import Dependence, Tube
 
@@ -227,56 +219,3 @@ def curve(
         "bounded": bounded,
         "worker s / bounded": effort["worker_seconds"] / bounded if bounded else float("nan"),
     }
-
-
-def _said(text: str) -> None:
-    print(text, file=sys.stderr, flush=True)
-
-
-def _loop(options: argparse.Namespace, marks: Sequence[float]) -> int:
-    tables = measure(
-        SceneSource(options.load_config[0]).open(), options.loop, options.seconds, options.workers, options.runs, marks,
-        options.seed, _said,
-    )  # fmt: skip
-    titles = "A network in the loop: certified fraction against time", "Widths by step"
-    for name, title, rows in zip(("loops", "loops-steps"), titles, tables, strict=True):
-        if rows:
-            write(rows, options.output_dir, name, title)
-            print(markdown(rows))
-    return int(tables.search[0]["violations"] > 0)
-
-
-def _certificates(options: argparse.Namespace, marks: Sequence[float]) -> int:
-    config, frame = options.load_config[0], options.frame
-    file = options.camera_path_filename or config.resolve().parents[2] / "camera_path.json"
-    path, scene = load_camera_path(file, options.downscale_factor), SceneSource(config).open()
-    sets = SETS if path.perturbations[frame] is None else {**SETS, "path": path.perturbations[frame]}
-    table = Table(options.output_dir, "certificates", "Certified fraction against time")
-    for name in options.sets:
-        row = curve(
-            scene, path.cameras[frame], name, sets[name], options.model, options.property, options.seconds,
-            options.workers, marks, _said, path.following(frame),
-        )  # fmt: skip
-        table.add(row)
-    return 0
-
-
-def main(words: Sequence[str] | None = None) -> int:
-    """Measure one run; 1 if a run left a tube or a certified cell had a run that went wrong."""
-    parser = run_parser(__doc__, "xyz")
-    parser.add_argument("--loop", type=Path, help="LOOP.json; without it a network and a property are measured")
-    parser.add_argument("--model", type=Path, help="network, .onnx")
-    parser.add_argument("--property", type=Path, help="what is to hold (JSON)")
-    parser.add_argument("--seconds", type=float, default=120.0, help="of the search, of every set")
-    parser.add_argument("--workers", type=int, default=2)
-    parser.add_argument("--runs", type=int, default=10_000, help="from the whole initial box, and from one cell")
-    parser.add_argument("--marks", type=float, nargs="+", default=[30.0, 60.0, 120.0, 300.0, 600.0], help="seconds")
-    options = parser.parse_args(words)
-    if len(options.load_config) != 1 or not (options.loop or (options.model and options.property)):
-        parser.error("give one run, and a loop, or a network with a property")
-    marks = [mark for mark in options.marks if mark <= options.seconds]
-    return _loop(options, marks) if options.loop else _certificates(options, marks)
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
