@@ -158,10 +158,10 @@ def plain(name: str) -> str:
 def prepare(options: argparse.Namespace) -> int:
     """Write the files that `compare` takes."""
     from kernels_on_cpu import cell_about
-    from stiff_cases import all_cases
 
     from ns_abstract.arithmetic.rounding import FLOAT32
     from ns_abstract.bench.sets import open_jobs, pose_set, splat_of
+    from ns_abstract.bench.stiff_cases import all_cases
     from ns_abstract.methods.splat.activate import activate
     from ns_abstract.methods.splat.bounds import SplatBounds
     from ns_abstract.methods.splat.constants import VERSIONS

@@ -34,10 +34,10 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
 
 from both_ways import bounded_both_ways
 from gsplat_kernels import Kernels, Unavailable
-from stiff_cases import all_cases
 
 from ns_abstract.arithmetic.rounding import FLOAT32
 from ns_abstract.bench.sets import open_jobs, pose_set, splat_of
+from ns_abstract.bench.stiff_cases import all_cases
 from ns_abstract.bench.tables import markdown, write
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseBox

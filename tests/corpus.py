@@ -65,7 +65,7 @@ MODULES = {
 #: Imported by the server before it forks.
 _IMPORTS = (
     *sorted(set(MODULES.values())), "torch", "onnx", "onnxruntime", "plyfile", "ns_abstract.cli.rendering",
-    "ns_abstract.cli.searching", "ns_abstract.bench.sets", "ns_abstract.report.export",
+    "ns_abstract.cli.searching", "ns_abstract.bench.sets", "ns_abstract.bench.stiff", "ns_abstract.report.export",
     "ns_abstract.api.reaching", "ns_abstract.methods.splat.write", "ns_abstract.verify.interop",
     "ns_abstract.report.picture", "ns_abstract.report.recordings", "ns_abstract.api.statement",
 )  # fmt: skip

@@ -11,16 +11,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from benchmark_scripts import script
 from certifying import linear
 
 from ns_abstract.api.certifying import CertifyProgress
 from ns_abstract.api.files import PathJob
-from ns_abstract.bench import loops, rules, scale
+from ns_abstract.bench import loops, plan, rules, scale
 from ns_abstract.bench import paper as paper_tables
 from ns_abstract.bench.sets import open_jobs, pose_set, splat_of
 from ns_abstract.cli.bench import bench
-from ns_abstract.cli.bench_options import Certificates, RulesBenchmark, ScaleBenchmark, Tightness
+from ns_abstract.cli.bench_options import Certificates, PlanBenchmark, RulesBenchmark, ScaleBenchmark, Tightness
 from ns_abstract.cli.common import DONE
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.program_options import ProgramOptions
@@ -28,8 +27,6 @@ from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.constants import PAPER
 from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.paper import splat as paper
-
-plan = script("plan")
 
 
 def test_version_of_gsplat(blobs) -> None:
@@ -105,8 +102,7 @@ def test_a_plan_that_loses_something_is_noticed(job: PathJob, monkeypatch: pytes
 @pytest.mark.slow
 def test_commands(blobs, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     files = {"load_config": (blobs.config,), "camera_path_filename": blobs.path}
-    path = ["--camera-path-filename", str(blobs.path), "--output-dir", str(tmp_path)]
-    assert plan.main([str(blobs.config), *path, "--sets", "x", "--cells", "4"]) == 0
+    assert bench(PlanBenchmark(**files, output_dir=tmp_path, sets=("x",), cells=4)) == DONE
     assert (
         bench(RulesBenchmark(**files, output_dir=tmp_path, sets=("x", "roll"), parts=(8,), pixels=1, gaussians=5))
         == DONE

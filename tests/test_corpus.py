@@ -351,6 +351,7 @@ OPTIONS = [
     row("certify", "frames out of range", "--frames", options="--frames 5"),
     row("bench", "no such benchmark", "bogus", options="bogus"),
     row("bench", "scale without a run", "--load-config", options="scale --no-load-config"),
+    row("bench", "case that is not there", "--cases", options="stiff --cases nothing --no-load-config --no-camera-path-filename"),
     row("bench", "set that is not there", "sideways", options="cell --sets sideways"),
     row("demo", "no such option", "--bogus", options="--bogus 1"),
     row("demo", "output without a name", "--output-dir", options=("--output-dir",)),

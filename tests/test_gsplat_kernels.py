@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from benchmark_scripts import script
 from conftest import blob_scene
 from gsplat_kernels import Kernels, Unavailable, library
 from scene_attacks import bound_cells
 
+from ns_abstract.bench.stiff_cases import all_cases
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.keyframe_cameras import look_at
 from ns_abstract.geometry.poses import PoseBox
@@ -23,7 +23,6 @@ from ns_abstract.perturbation.specification import parse_perturbation
 from ns_abstract.verify.attack.soundness import compiled_renderer
 
 torch.set_num_threads(1)
-all_cases = script("stiff_cases").all_cases
 
 WIDTH, HEIGHT, FOCAL = 40, 24, 36.0
 MODES = ("classic", "antialiased")

@@ -12,9 +12,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from benchmark_scripts import script
 
 from ns_abstract.arithmetic.rounding import Arithmetic
+from ns_abstract.bench import stiff
+from ns_abstract.bench.stiff import ARITHMETICS, WatchedFrame, run_case
+from ns_abstract.bench.stiff_cases import Case, all_cases
+from ns_abstract.cli.bench import bench
+from ns_abstract.cli.bench_options import Stiff
+from ns_abstract.cli.common import DONE
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.activate import Splats
@@ -23,9 +28,6 @@ from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, Rasteriser
 from ns_abstract.verify.attack.soundness import compiled_renderer
 
 torch.set_num_threads(1)
-stiff, stiff_cases = script("stiff"), script("stiff_cases")
-ARITHMETICS, WatchedFrame, run_case, main = stiff.ARITHMETICS, stiff.WatchedFrame, stiff.run_case, stiff.main
-Case, all_cases = stiff_cases.Case, stiff_cases.all_cases
 CASES = all_cases()
 SMALL: dict[str, Any] = {"cells": 2, "seconds": 10.0, "poses": 5, "reference_poses": 2}
 
@@ -149,13 +151,12 @@ def test_hidden_bounds_fail() -> None:
     assert outcome.failed and (outcome.row["NaN/inf"], outcome.row["violations"]) == (0, 3)
 
 
-def words(folder: Path, *cases: str) -> list[str]:
-    small = [word for name, value in SMALL.items() for word in ("--" + name.replace("_", "-"), str(value))]
-    return ["--output-dir", str(folder), "--cases", *cases, *small]
+def options(folder: Path, *cases: str, **changes: Any) -> Stiff:
+    return Stiff(output_dir=folder, cases=cases, **(SMALL | changes))
 
 
 def test_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main([*words(tmp_path, "one pose", "opacity 0"), "--compare"]) == 0
+    assert bench(options(tmp_path, "one pose", "opacity 0", compare=True)) == DONE
     shown = capsys.readouterr().out
     assert "0 violations" in shown and "one pose, moved" in shown
     with open(tmp_path / "stiff.csv", newline="") as stream:
@@ -175,11 +176,11 @@ def test_command_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], frame: type[WatchedFrame]
 ) -> None:
     monkeypatch.setattr(stiff, "run_case", partial(run_case, frame=frame))
-    assert main([*words(tmp_path, "one pose"), "--arithmetics", "real"]) == 1
+    assert bench(options(tmp_path, "one pose", arithmetics=("real",))) == 1
     assert " failed" in capsys.readouterr().out and "one pose" in (tmp_path / "stiff.csv").read_text()
 
 
 def test_unknown_case(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no case"):
-        main(words(tmp_path, "no such thing"))
+        bench(options(tmp_path, "no such thing"))
     assert not list(tmp_path.iterdir())

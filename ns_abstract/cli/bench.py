@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import faulthandler
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -14,10 +15,12 @@ from ns_abstract.cli.bench_options import (
     Certificates,
     Compile,
     Loops,
+    PlanBenchmark,
     Rays,
     RulesBenchmark,
     ScaleBenchmark,
     Soundness,
+    Stiff,
     Tightness,
     Verify,
     Vnnlib,
@@ -29,6 +32,8 @@ from ns_abstract.io.errors import InputError
 if TYPE_CHECKING:
     from ns_abstract.api.files import PathJob
 
+#: Seconds after which a case that does not end ends the process, with a trace of where it stands.
+_STUCK = 900.0
 _ABOUT = "Measure cost, tightness and soundness; without options on the demo scene. Tables go to the folder bench."
 #: Headings of the tables by benchmark.
 _TITLES = {
@@ -36,6 +41,7 @@ _TITLES = {
     "compile": "Seconds of compiling",
     "tightness": "Error against run time",
     "soundness": "Soundness",
+    "plan": "What is left out, taken back",
     "rules": "Our bounds and the paper's rules",
     "rays": "Rays of a NeRF",
     "certificates": "Certified fraction against time",
@@ -95,6 +101,49 @@ def verify(options: Verify) -> int:
     )  # fmt: skip
     print(answer, end="")
     return DONE
+
+
+def stiff(options: Stiff) -> int:
+    """Run the stiff cases; the exit code is 1 if a bound was broken or a number was not finite."""
+    from ns_abstract.bench.stiff import compare, run_case
+    from ns_abstract.bench.stiff_cases import all_cases
+    from ns_abstract.bench.tables import Table, markdown, write
+
+    cases = [c for c in all_cases() if not options.cases or any(part in c.name for part in options.cases)]
+    if not cases:
+        raise InputError(
+            f"no case has {' or '.join(options.cases)} in its name",
+            field="--cases",
+            fix="give parts of names, such as needles, or leave the option out",
+        )
+    # a case that never ends must not take the others' rows with it
+    table, failed = Table(options.output_dir, "stiff", "Stiff and extreme cases"), 0
+    for case in cases:
+        for kind in options.arithmetics:
+            faulthandler.dump_traceback_later(_STUCK, exit=True, file=2)
+            try:
+                outcome = run_case(
+                    case,
+                    kind,
+                    cells=options.cells,
+                    seconds=options.seconds,
+                    poses=options.poses,
+                    reference_poses=options.reference_poses,
+                    seed=options.seed,
+                )
+            finally:
+                faulthandler.cancel_dump_traceback_later()
+            table.add(outcome.row)
+            failed += outcome.failed
+            for violation in outcome.worst[:1]:
+                print(f"  {violation}", flush=True)
+    if options.compare and (differences := compare(table.rows)):
+        write(differences, options.output_dir, "stiff-compare", "Float32 against real arithmetic")
+        print(markdown(differences))
+    total = sum(row["comparisons"] for row in table.rows)
+    violations = sum(row["violations"] for row in table.rows)
+    print(f"{len(table.rows)} runs, {failed} failed: {total:,} comparisons, {violations:,} violations")
+    return 1 if failed else DONE
 
 
 def scale(options: ScaleBenchmark) -> int:
@@ -169,7 +218,7 @@ def loops(options: Loops) -> int:
 
 
 def rows_of(
-    options: CellBenchmark | Compile | Soundness | RulesBenchmark | Rays, job: PathJob, name: str
+    options: CellBenchmark | Compile | Soundness | PlanBenchmark | RulesBenchmark | Rays, job: PathJob, name: str
 ) -> list[dict[str, Any]]:
     """What a benchmark without curves finds for one scene and set of poses."""
     if isinstance(options, CellBenchmark):
@@ -189,6 +238,10 @@ def rows_of(
                 options.scale, options.target_ratio,
             )
         ]  # fmt: skip
+    if isinstance(options, PlanBenchmark):
+        from ns_abstract.bench.plan import cost_of_omissions
+
+        return cost_of_omissions(job, name, options.frame, options.cells, options.scale)
     if isinstance(options, Rays):
         from ns_abstract.bench.rays import measure
 
@@ -213,11 +266,13 @@ _DEFAULTS: dict[str, Any] = {
     "compile": Compile(),
     "tightness": Tightness(),
     "soundness": Soundness(),
+    "plan": PlanBenchmark(),
     "rules": RulesBenchmark(),
     "rays": Rays(),
     "scale": ScaleBenchmark(),
     "certificates": Certificates(),
     "loops": Loops(load_config=tyro.MISSING, loop=tyro.MISSING),
+    "stiff": Stiff(),
     "vnnlib": Vnnlib(folder=tyro.MISSING),
     "verify": Verify(query=tyro.MISSING),
 }
@@ -225,7 +280,7 @@ _DEFAULTS: dict[str, Any] = {
 
 #: Benchmarks that say themselves what they measure.
 _ALONE: dict[type, Callable[[Any], int]] = {
-    Vnnlib: vnnlib, Verify: verify, ScaleBenchmark: scale, Certificates: certificates, Loops: loops,
+    Vnnlib: vnnlib, Verify: verify, Stiff: stiff, ScaleBenchmark: scale, Certificates: certificates, Loops: loops,
 }  # fmt: skip
 
 

@@ -104,6 +104,14 @@ class Soundness(_Seeded, _Scaled):
 
 
 @dataclass
+class PlanBenchmark(_Scaled):
+    """Take back, one by one, what a scene's plan leaves out: what it costs, and how bounds differ."""
+
+    cells: int = 24
+    """Cells that every scene and set is bounded with."""
+
+
+@dataclass
 class RulesBenchmark(_Seeded, _Sets):
     """Our bounds against the paper's rules, on the same Gaussians, pixels and cells."""
 
@@ -189,6 +197,28 @@ class Loops(_Seeded):
     marks: tuple[float, ...] = (30.0, 60.0, 120.0, 300.0, 600.0)
     """Seconds at which the certified fraction is told, up to the time that there is."""
     overrides: SceneOverrides = field(default_factory=Overrides)
+
+
+@dataclass
+class Stiff(_Seeded):
+    """Bound and attack tiny scenes at the ends of what can be loaded and asked."""
+
+    output_dir: Path = Path("bench")
+    """Folder for the tables."""
+    cases: tuple[str, ...] = ()
+    """Parts of the names of the cases to run. Default: all cases."""
+    arithmetics: tuple[Literal["float32", "real"], ...] = ("float32", "real")
+    """What is bounded: float32, real."""
+    cells: int = 16
+    """Most cells bounded for every case."""
+    seconds: float = 20.0
+    """Limit of the refinement and of every attack."""
+    poses: int = 60
+    """Images by the compiled renderer for every case."""
+    reference_poses: int = 16
+    """Images by each reference."""
+    compare: bool = False
+    """Also write what float32 costs against real arithmetic."""
 
 
 @dataclass

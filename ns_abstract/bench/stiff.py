@@ -1,7 +1,5 @@
 """Stiff cases: tiny scenes at the limits of what can be loaded, each bounded and then attacked.
 
-    python benchmarks/stiff.py [--cases needles ...] [--compare]
-
 Every scene is what a run could hold (finite parameters, scales and quaternion lengths that are normal
 float32), and every set what a perturbation file could say. A case passes if no image of three renderers
 leaves its abstract image and nothing that was computed is NaN or infinite.
@@ -9,24 +7,19 @@ leaves its abstract image and nothing that was computed is NaN or infinite.
 
 from __future__ import annotations
 
-import argparse
-import faulthandler
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
-from stiff_cases import Case, all_cases
 
 from ns_abstract.arithmetic.rounding import Arithmetic
 from ns_abstract.arithmetic.rounding import arithmetic as arithmetic_of
-from ns_abstract.bench.tables import Table, markdown, write
+from ns_abstract.bench.stiff_cases import Case
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseBox
-from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.activate import Splats, activate
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, Rasteriser
 from ns_abstract.methods.splat.frame import SplatFrame, TileBounds, VisibleContext
@@ -37,8 +30,6 @@ from ns_abstract.verify.attack.soundness import compiled_renderer, reference_ren
 from ns_abstract.verify.attack.violations import Violation, merge
 
 ARITHMETICS = ("float32", "real")
-#: Seconds after which a case that does not end ends the process, with a trace of where it stands.
-_STUCK = 900.0
 
 
 @dataclass(frozen=True)
@@ -183,47 +174,4 @@ def compare(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
     ]
 
 
-def main(words: Sequence[str] | None = None) -> int:
-    """Run the cases; 1 if a bound was broken or a number was not finite."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("--output-dir", type=Path, default=Path("bench"))
-    parser.add_argument("--cases", nargs="+", default=[], help="parts of the names of the cases to run")
-    parser.add_argument("--arithmetics", nargs="+", default=ARITHMETICS, choices=ARITHMETICS)
-    parser.add_argument("--cells", type=int, default=16, help="most cells bounded for every case")
-    parser.add_argument("--seconds", type=float, default=20.0, help="of the refinement and of every attack")
-    parser.add_argument("--poses", type=int, default=60, help="images by the compiled renderer for every case")
-    parser.add_argument("--reference-poses", type=int, default=16, help="images by each reference")
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--compare", action="store_true", help="write what float32 costs against real arithmetic, too")
-    options = parser.parse_args(words)
-    cases = [c for c in all_cases() if not options.cases or any(part in c.name for part in options.cases)]
-    if not cases:
-        problem = f"no case has {' or '.join(options.cases)} in its name"
-        raise InputError(problem, field="--cases", fix="give parts of names, such as needles, or leave the option out")
-    # a case that never ends must not take the others' rows with it
-    table, failed = Table(options.output_dir, "stiff", "Stiff and extreme cases"), 0
-    for case in cases:
-        for kind in options.arithmetics:
-            faulthandler.dump_traceback_later(_STUCK, exit=True, file=2)
-            try:
-                outcome = run_case(
-                    case, kind, cells=options.cells, seconds=options.seconds, poses=options.poses,
-                    reference_poses=options.reference_poses, seed=options.seed,
-                )  # fmt: skip
-            finally:
-                faulthandler.cancel_dump_traceback_later()
-            table.add(outcome.row)
-            failed += outcome.failed
-            for violation in outcome.worst[:1]:
-                print(f"  {violation}", flush=True)
-    if options.compare and (differences := compare(table.rows)):
-        write(differences, options.output_dir, "stiff-compare", "Float32 against real arithmetic")
-        print(markdown(differences))
-    total = sum(row["comparisons"] for row in table.rows)
-    violations = sum(row["violations"] for row in table.rows)
-    print(f"{len(table.rows)} runs, {failed} failed: {total:,} comparisons, {violations:,} violations")
-    return 1 if failed else 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
+# --- what the cases are made of ------------------------------------------------------------------

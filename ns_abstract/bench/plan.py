@@ -1,21 +1,15 @@
-"""Measure what the omissions of a plan save: each is reverted, and the bounds are compared.
-
-python benchmarks/plan.py [RUN/config.yml ...] [--sets x yaw]
-"""
+"""Measure what the omissions of a plan save: each is reverted, and the bounds are compared."""
 
 from __future__ import annotations
 
-import argparse
 import time
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 
 from ns_abstract.api.files import PathJob
-from ns_abstract.bench.sets import open_jobs, pose_set, splat_of
-from ns_abstract.bench.tables import Table
+from ns_abstract.bench.sets import pose_set, splat_of
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.splat.activate import activate
 from ns_abstract.methods.splat.frame import SplatFrame, VisibleContext
@@ -86,26 +80,3 @@ def cost_of_omissions(job: PathJob, name: str, frame: int, cells: int, scale: fl
             }
         )
     return rows
-
-
-def main(words: Sequence[str] | None = None) -> int:
-    """Measure runs, or the demo scene."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("load_config", type=Path, nargs="*")
-    parser.add_argument("--camera-path-filename", type=Path)
-    parser.add_argument("--output-dir", type=Path, default=Path("bench"))
-    parser.add_argument("--frame", type=int, default=0)
-    parser.add_argument("--downscale-factor", type=float, default=1.0)
-    parser.add_argument("--sets", nargs="+", default=["x", "yaw"])
-    parser.add_argument("--scale", type=float, default=1.0, help="multiplies the ranges of translations and rotations")
-    parser.add_argument("--cells", type=int, default=24, help="that every scene and set is bounded with")
-    options = parser.parse_args(words)
-    table = Table(options.output_dir, "plan", "What is left out, taken back")
-    for job in open_jobs(tuple(options.load_config), options.camera_path_filename, options.downscale_factor):
-        for name in options.sets:
-            table.add(*cost_of_omissions(job, name, options.frame, options.cells, options.scale))
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
