@@ -319,9 +319,7 @@ class CellSearch(Generic[P]):
             stop=stop,
             keep=self._keep_counterexamples,
             on_tick=periodic_report(
-                store,
-                self.tell_progress,
-                (lambda: self.report("running")) if request.report else lambda: None,
+                store, self.tell_progress, (lambda: self.report("running")) if request.report else lambda: None
             ),
             finish_one=question.finish_one,
         )

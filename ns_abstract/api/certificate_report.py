@@ -93,8 +93,7 @@ class CertificateReport:
         frames = document["frames"]
         closer = look_closer(self.renderer, frames, rows, search.deadline) if ended else None
         search.last.write(
-            document,
-            lambda: certificate_page(document, rows, self.shown, self.seen, self.cameras, closer),
+            document, lambda: certificate_page(document, rows, self.shown, self.seen, self.cameras, closer)
         )
         if ended:
             write_pictures(search.folder, document, rows, self.cameras)

@@ -133,14 +133,7 @@ class Certification:
     @property
     def recipe(self) -> Recipe[Certification]:
         question = self.question
-        again = partial(
-            _open,
-            self.job.recipe.open,
-            question.absolute(),
-            self.memory,
-            self.arithmetic,
-            self.picture,
-        )
+        again = partial(_open, self.job.recipe.open, question.absolute(), self.memory, self.arithmetic, self.picture)
         return Recipe(again, self.fingerprint, self.job.source.file)
 
     @property

@@ -57,11 +57,7 @@ def network_memory(limit: float | None, workers: int) -> int:
 
 
 def check_network_memory(certification: Certification, limit: float | None, workers: int) -> None:
-    """Refuse a network one cell of which takes more memory than a process may.
-
-    Raises:
-        InputError: It does, about.
-    """
+    """Refuse a network one cell of which takes, about, more memory than a process may. Raises InputError: how much."""
     job = certification.job
     certification.question.check_memory(len(job.parameters), allowed_memory(limit) / (1 if job.rays else workers))
 

@@ -71,11 +71,7 @@ class Explanation:
 
 
 def check_explained(job: Job) -> None:
-    """Raise InputError where explanations are not supported.
-
-    Raises:
-        InputError: The scene is a field.
-    """
+    """Raise InputError where explanations are not supported: the scene is a field."""
     if job.rays:
         raise InputError("is for splats, this run is a NeRF", field="--explain", fix="leave it out")
 

@@ -10,14 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ns_abstract.api.cell_search import (
-    CellQuestion,
-    CellSearch,
-    Request,
-    Row,
-    SearchProgress,
-    result_cells,
-)
+from ns_abstract.api.cell_search import CellQuestion, CellSearch, Request, Row, SearchProgress, result_cells
 from ns_abstract.api.job import Job
 from ns_abstract.api.location import Location, PhotoOptions, calibrated
 from ns_abstract.api.poses import PoseSet, pose_sets
@@ -270,11 +263,7 @@ def locate(
 
 
 def photo_levels(photo: ArrayLike) -> np.ndarray:
-    """[H, W, 3] uint8 levels of a photo.
-
-    Raises:
-        InputError: It is none, or its numbers are no multiples of 1/255.
-    """
+    """[H, W, 3] uint8 levels of a photo. Raises InputError where it is none, or holds other numbers than k/255."""
     values = np.asarray(photo)
     if values.ndim != 3 or values.shape[2] != 3 or values.dtype.kind not in "fu":
         raise InputError(

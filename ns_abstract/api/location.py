@@ -204,17 +204,9 @@ def open_location(settings: LocateSettings) -> Location:
 
 
 def calibrated(scene: Scene, job: Job, options: PhotoOptions) -> tuple[PhotoOptions, Calibration]:
-    """What explains the run's training photos, but no less than ``options``.
-
-    Raises:
-        InputError: There are no photos.
-    """
+    """What explains the run's training photos, but no less than ``options``. Raises InputError without photos."""
     calibration = calibrate(
-        scene,
-        job.pose_sets[0].camera.height,
-        noise=options.noise,
-        outliers=options.outliers,
-        arithmetic=job.arithmetic,
+        scene, job.pose_sets[0].camera.height, noise=options.noise, outliers=options.outliers, arithmetic=job.arithmetic
     )
     return replace(options, noise=calibration.noise, outliers=calibration.outliers), calibration
 

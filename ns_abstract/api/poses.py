@@ -13,13 +13,7 @@ from numpy.typing import ArrayLike
 
 from ns_abstract.api.scenes import Scene, not_a_camera
 from ns_abstract.geometry import poses
-from ns_abstract.geometry.camera_path import (
-    PinholeCamera,
-    checked_pose,
-    checked_side,
-    focal_length,
-    stated_intrinsics,
-)
+from ns_abstract.geometry.camera_path import PinholeCamera, checked_pose, checked_side, focal_length, stated_intrinsics
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import show
 from ns_abstract.perturbation.specification import Perturbation, parse_perturbation

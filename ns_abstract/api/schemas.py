@@ -155,12 +155,7 @@ def property_schema() -> Schema:
     joined, parts = _joined_statements()
     several = {"anyOf": [_object({**one, **beside}, list(one)) for one in joined]}
     cases.append({"if": {"not": {"required": ["type"]}}, "then": several})
-    root: Schema = {
-        "type": "object",
-        "properties": {"type": {"enum": list(kinds)}},
-        "allOf": cases,
-        "$defs": parts,
-    }
+    root: Schema = {"type": "object", "properties": {"type": {"enum": list(kinds)}}, "allOf": cases, "$defs": parts}
     return _whole("property", "What is to hold on every picture", root)
 
 

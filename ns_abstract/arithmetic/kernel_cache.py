@@ -386,11 +386,7 @@ def _open() -> KernelStore:
 
 @cache
 def store() -> KernelStore:
-    """The kernels of these sources.
-
-    Raises:
-        InputError: No folder can be written, not even a temporary one.
-    """
+    """The kernels of these sources. Raises InputError: no folder can be written, not even a temporary one."""
     opened_store = _open()
     if (shipped := shipped_folder(PACKAGE, source_key())) is not None:
         opened_store.also_from(shipped, shipped=True)

@@ -87,9 +87,7 @@ def table(name: str) -> tuple[Float64Array, Float64Array, Float64Array]:
     return x, lower, upper
 
 
-def check_functions(
-    functions: Mapping[str, Callable[[Float64Array, Float64Array], None]] | None = None,
-) -> list[str]:
+def check_functions(functions: Mapping[str, Callable[[Float64Array, Float64Array], None]] | None = None) -> list[str]:
     """One sentence for each of this machine's functions that is less accurate than the bounds assume.
 
     ``functions``: ``f(x, out)`` for arrays [n], by the names of `ASSUMED_ERRORS`; those the bounds use if None.

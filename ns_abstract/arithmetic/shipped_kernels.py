@@ -20,10 +20,7 @@ SHIPPED = "kernels"
 _V2 = frozenset(("cx16", "popcnt", "sahf", "sse3", "sse4.1", "sse4.2", "ssse3"))
 _V3 = _V2 | {"avx", "avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe", "xsave"}
 #: Features of each level in LLVM's names, the highest level first.
-LEVELS = {
-    "x86-64-v4": _V3 | {"avx512bw", "avx512cd", "avx512dq", "avx512f", "avx512vl"},
-    "x86-64-v3": _V3,
-}
+LEVELS = {"x86-64-v4": _V3 | {"avx512bw", "avx512cd", "avx512dq", "avx512f", "avx512vl"}, "x86-64-v3": _V3}
 
 
 def runs(level: str) -> bool:

@@ -40,13 +40,7 @@ def look_at(eye: ArrayLike, target: ArrayLike, up: ArrayLike = (0.0, 0.0, 1.0)) 
 
 
 def around(
-    target: ArrayLike,
-    azimuth: float,
-    elevation: float,
-    distance: float,
-    *,
-    height: int = 200,
-    width: int = 200,
+    target: ArrayLike, azimuth: float, elevation: float, distance: float, *, height: int = 200, width: int = 200
 ) -> KeyframeCamera:
     """A view of ``target`` from ``distance``; angles in degrees, azimuth from +x towards +y, z up."""
     a, e = np.deg2rad([azimuth, elevation])

@@ -46,8 +46,7 @@ abstract_splatfacto = MethodSpecification(
         mixed_precision=False,
         pipeline=AbstractPipelineConfig(
             datamanager=FullImageDatamanagerConfig(
-                dataparser=NerfstudioDataParserConfig(load_3D_points=True),
-                cache_images_type="uint8",
+                dataparser=NerfstudioDataParserConfig(load_3D_points=True), cache_images_type="uint8"
             ),
             model=AbstractSplatfactoModelConfig(),
         ),
@@ -77,8 +76,7 @@ abstract_nerf = MethodSpecification(
     TrainerConfig(
         method_name="abstract-nerf",
         pipeline=AbstractPipelineConfig(
-            datamanager=VanillaDataManagerConfig(dataparser=BlenderDataParserConfig()),
-            model=AbstractNerfModelConfig(),
+            datamanager=VanillaDataManagerConfig(dataparser=BlenderDataParserConfig()), model=AbstractNerfModelConfig()
         ),
         optimizers={
             name: {"optimizer": RAdamOptimizerConfig(lr=5e-4, eps=1e-08), "scheduler": None}

@@ -58,12 +58,7 @@ class AbstractNerfModelConfig(VanillaModelConfig):
         names = {entry.name for entry in dataclasses.fields(VanillaModelConfig)} - {"_target"}
         settings = {name: value for name, value in vars(config).items() if name in names}
         return cls(
-            **settings,
-            width=256,
-            depth=8,
-            num_frequencies=10,
-            max_frequency_exponent=8.0,
-            num_direction_frequencies=0,
+            **settings, width=256, depth=8, num_frequencies=10, max_frequency_exponent=8.0, num_direction_frequencies=0
         )
 
 

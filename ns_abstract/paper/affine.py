@@ -59,11 +59,7 @@ class Enclosure:
 
     @classmethod
     def lift(cls, value: Enclosure | FormArray | Interval | ArrayLike, basis: Basis | None = None) -> Enclosure:
-        """``value`` as an enclosure; numbers and intervals need ``basis``.
-
-        Raises:
-            TypeError: They have none.
-        """
+        """``value`` as an enclosure; numbers and intervals need ``basis``. Raises TypeError without one."""
         if isinstance(value, Enclosure):
             return value
         if isinstance(value, FormArray):

@@ -204,11 +204,7 @@ class Interval:
         return self._map(lambda end: np.swapaxes(end, -1, -2))
 
     def intersect(self, other: Interval | ArrayLike) -> Interval:
-        """The common part.
-
-        Raises:
-            ValueError: There is none somewhere.
-        """
+        """The common part. Raises ValueError where there is none somewhere."""
         other = Interval.lift(other)
         return Interval(np.maximum(self.lower, other.lower), np.minimum(self.upper, other.upper))
 

@@ -28,12 +28,7 @@ def _unbounded(x: Face) -> Face:
     return constant_like(x, Interval.entire(x.shape))
 
 
-def matrix_inverse(
-    x: Face,
-    reference: Float64Array | None = None,
-    order: int = 2,
-    norm: Norm = "frobenius",
-) -> Face:
+def matrix_inverse(x: Face, reference: Float64Array | None = None, order: int = 2, norm: Norm = "frobenius") -> Face:
     """MATRIXINV (Algorithm 3): ``X^-1`` by a Taylor polynomial around a reference matrix.
 
     With ``R`` a floating-point inverse of the reference and ``D = I - X R``,

@@ -19,15 +19,7 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.io.fields import fail, interval, known
 from ns_abstract.io.jsonio import is_moderate, is_number, load_json, show
 from ns_abstract.perturbation.specification import ROTATIONS, TRANSLATIONS, Perturbation
-from ns_abstract.reach.dynamics import (
-    MOST,
-    Dynamics,
-    matrix,
-    named_file,
-    number,
-    numbers,
-    parse_dynamics,
-)
+from ns_abstract.reach.dynamics import MOST, Dynamics, matrix, named_file, number, numbers, parse_dynamics
 from ns_abstract.reach.learned import LearnedDynamics
 from ns_abstract.verify.picture_properties import PictureProperty, is_of_picture, parse_picture_property
 from ns_abstract.verify.preprocess import Preprocess, parse_preprocess

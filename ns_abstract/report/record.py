@@ -312,11 +312,7 @@ class Report:
         return None
 
     def draw(self, index: int) -> None:
-        """Draw the PNG of a frame that was added, unless it is drawn.
-
-        Raises:
-            InputError: A file cannot be written.
-        """
+        """Draw the PNG of a frame that was added, unless it is drawn. Raises InputError where it cannot be written."""
         try:
             if index in self._undrawn:
                 self._draw(load_frame(self.folder / frame_name(index, "npz"), leaves=False).result)

@@ -81,11 +81,7 @@ class FoundPose:
 
 @dataclass(frozen=True)
 class LocationResult(BlockResult):
-    """The result of a block.
-
-    Attributes:
-        best: The rendered pose with the fewest outliers; None: nothing was rendered.
-    """
+    """The result of a block. ``best``: the rendered pose with the fewest outliers; None: nothing was rendered."""
 
     best: FoundPose | None = None
 

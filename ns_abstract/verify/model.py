@@ -74,12 +74,7 @@ class NetworkModel:
     def bound(self, images: ImageSets, query: Query) -> OutputBounds:
         d = images.dimensions
         output_bounds = bound_outputs(
-            self.network,
-            parametric(images),
-            query.rows,
-            query.offset,
-            memory=self.memory,
-            arithmetic=self.arithmetic,
+            self.network, parametric(images), query.rows, query.offset, memory=self.memory, arithmetic=self.arithmetic
         )
         return output_bounds if d else dataclasses.replace(output_bounds, a=output_bounds.a[..., :0])
 

@@ -79,10 +79,7 @@ class PartQuestion:
         bounds, boxes = self.model.bound_parts(images, counts, ends), [box] * int(counts.prod())
         low, high = (
             np.asarray(margins, np.float64).reshape(counts)
-            for margins in (
-                self.claim.proved(self.query, bounds, boxes),
-                self.claim.refuted(self.query, bounds, boxes),
-            )
+            for margins in (self.claim.proved(self.query, bounds, boxes), self.claim.refuted(self.query, bounds, boxes))
         )
         decided = np.isfinite(low) & (low > 0.0), np.isfinite(high) & (high <= 0.0) & self.refute
         if decided[1].all():

@@ -23,12 +23,7 @@ from ns_abstract.verify.network import ImageSets
 #: What a measure is read off: the picture's colours, its expected depths, or weights.
 Plane = Literal["colors", "depth"] | WeightPlane
 #: Luminance of linear RGB (ITU-R BT.709), and the channels by themselves.
-CHANNELS = {
-    "luminance": (0.2126, 0.7152, 0.0722),
-    "r": (1.0, 0.0, 0.0),
-    "g": (0.0, 1.0, 0.0),
-    "b": (0.0, 0.0, 1.0),
-}
+CHANNELS = {"luminance": (0.2126, 0.7152, 0.0722), "r": (1.0, 0.0, 0.0), "g": (0.0, 1.0, 0.0), "b": (0.0, 0.0, 1.0)}
 
 
 @dataclass(frozen=True)

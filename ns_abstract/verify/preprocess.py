@@ -102,10 +102,7 @@ class Preprocess:
         return values.permute(0, 3, 1, 2) if self.layout == "NCHW" else values
 
     def input_sets(
-        self,
-        linear: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
-        lower: np.ndarray,
-        upper: np.ndarray,
+        self, linear: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray], lower: np.ndarray, upper: np.ndarray
     ) -> ImageSets:
         """Linear sets of network inputs, with every float32 evaluation of `apply`, from those of pictures (V1).
 

@@ -100,12 +100,7 @@ class StoreFile:
     """
 
     def __init__(
-        self,
-        folder: Path,
-        fingerprint: Mapping[str, Any],
-        parameters: Sequence[tuple[str, str]],
-        *,
-        resume: bool,
+        self, folder: Path, fingerprint: Mapping[str, Any], parameters: Sequence[tuple[str, str]], *, resume: bool
     ) -> None:
         self._base: Any = None
         self._fresh = not resume

@@ -205,11 +205,7 @@ class SubBoxProof:
     other: SubBoxProof | None = None
 
     def prove(self, cell: ParameterBox, outputs: np.ndarray, weights: PixelWeights) -> SubBoxOutcome:
-        """Try to prove a cell, if it takes few enough parts.
-
-        Args:
-            outputs: [n] outputs seen in it.
-        """
+        """Try to prove a cell, if it takes few enough parts. ``outputs``: [n] outputs seen in it."""
         return self._chosen._prove(cell, outputs, weights)
 
     @cached_property
@@ -369,11 +365,7 @@ class SubBoxProof:
         return margins
 
     def _bounded(self, work: _CellWork, nodes: Sequence[_PendingBox]) -> list[PictureSets]:
-        """Sets of parts.
-
-        Raises:
-            _StoppedError: There are too many, or one has none.
-        """
+        """Sets of parts. Raises _StoppedError: there are too many, or one has none."""
         work.parts += len(nodes)
         late = work.asked > self.most_parts // 2 and work.asked > _MORE * self.most_parts * work.done
         if late or work.parts > 2.0 * _MORE * self.most_parts:

@@ -9,13 +9,7 @@ import numpy as np
 from ns_abstract.arithmetic.outward import outward
 from ns_abstract.methods.nerf.division import ENDS, Division, division_for, regroup_parts
 from ns_abstract.methods.nerf.ray_bundle import RayBundle
-from ns_abstract.methods.nerf.ray_field import (
-    RAY_TUNING,
-    RayBounds,
-    RayField,
-    RayRequest,
-    typical_displacement,
-)
+from ns_abstract.methods.nerf.ray_field import RAY_TUNING, RayBounds, RayField, RayRequest, typical_displacement
 from ns_abstract.methods.nerf.sample_cells import SampleCellBounds
 from ns_abstract.methods.nerf.sample_paths import BundleBounds, SamplePaths
 

@@ -27,10 +27,7 @@ class Field:
         self.weights = weights
 
         def put(layer: Layer) -> tuple[Tensor, Tensor]:
-            return (
-                torch.from_numpy(layer.weight).to(device, dtype),
-                torch.from_numpy(layer.bias).to(device, dtype),
-            )
+            return (torch.from_numpy(layer.weight).to(device, dtype), torch.from_numpy(layer.bias).to(device, dtype))
 
         self._base = [put(layer) for layer in weights.base]
         self._density, self._color = put(weights.density), put(weights.color)

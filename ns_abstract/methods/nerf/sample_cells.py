@@ -304,13 +304,7 @@ class SampleCellBounds:
         return everything[~empty], sure
 
     def _bound_field(
-        self,
-        level: int,
-        items: RayCells,
-        lines: np.ndarray,
-        radius: np.ndarray,
-        sure: np.ndarray,
-        coarse: float,
+        self, level: int, items: RayCells, lines: np.ndarray, radius: np.ndarray, sure: np.ndarray, coarse: float
     ) -> tuple[np.ndarray, np.ndarray]:
         """`_bound_batch` by the network; where it is not ``sure`` [k], density may also be 0."""
         device, field = self.owner.device, self.field

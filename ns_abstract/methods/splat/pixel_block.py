@@ -311,8 +311,4 @@ def color_ends(forms):
 def listed_fragment(fragments, entry, forms):
     """Where a pixel's fragment stands, its colour in the palette and its row of moves (0: none)."""
     lists, at = fragments.lists, LISTED * entry
-    return (
-        int(lists[at]) * fragments.width,
-        int(lists[at + 1]) * color_size(forms),
-        MOVES * int(lists[at + 2]),
-    )
+    return (int(lists[at]) * fragments.width, int(lists[at + 1]) * color_size(forms), MOVES * int(lists[at + 2]))

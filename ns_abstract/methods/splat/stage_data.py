@@ -36,11 +36,7 @@ class FormShape(NamedTuple):
 
 
 def form_shape(basis: Basis, parts: int = 0, sub_boxes: int = 0) -> FormShape:
-    """``basis`` as kernels take it.
-
-    Raises:
-        ValueError: Curvature is kept for one parameter only.
-    """
+    """``basis`` as kernels take it. Raises ValueError: curvature is kept for one parameter only."""
     if basis.order == 2 and basis.dimensions != 1:
         raise ValueError(f"forms of order 2 have one parameter, not {basis.dimensions}")
     if basis.order == 2 and parts:

@@ -142,11 +142,7 @@ class SplatWeightFrame(SplatFrame):
         self.white, self._renders = white, reference
         # no colour of the scene's, none of its shifts and no background is left
         black = replace(
-            splats,
-            sh=np.zeros((splats.count, 1, 3)),
-            degree=0,
-            background=np.zeros(3),
-            color_shift=np.empty((0, 3)),
+            splats, sh=np.zeros((splats.count, 1, 3)), degree=0, background=np.zeros(3), color_shift=np.empty((0, 3))
         )
         super().__init__(black, rasteriser, arithmetic, pose_set, varied=varied, sums=sums)
         self.bounds = WeightBounds(black, rasteriser, arithmetic, varied, sums)

@@ -17,12 +17,7 @@ from numpy.typing import ArrayLike
 
 from ns_abstract.geometry.keyframe_cameras import KeyframeCamera
 from ns_abstract.io.atomic import write_atomic
-from ns_abstract.methods.run_writer import (
-    background_name,
-    checkpoint_bytes,
-    optimizer_lines,
-    write_run,
-)
+from ns_abstract.methods.run_writer import background_name, checkpoint_bytes, optimizer_lines, write_run
 from ns_abstract.methods.splat.activate import SH_C0
 from ns_abstract.methods.splat.scene import SplatScene
 

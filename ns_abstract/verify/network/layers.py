@@ -102,6 +102,16 @@ class Weighted(LinearLayer):
     def gain(self) -> float:
         return max(1, self.terms) * (1.0 + float(self.weight.abs().max()))
 
+    def product(self, x: Tensor, weight: Tensor) -> Tensor:
+        """Sums of products of the numbers ``x`` [B, *input_shape] with weights in the layer's shape."""
+        raise AssertionError
+
+    def apply(self, inputs: Sequence[Tensor]) -> Tensor:
+        return self.product(inputs[0], self.weight)
+
+    def magnitude(self, inputs: Sequence[Tensor]) -> Tensor:
+        return self.product(inputs[0], self.weight.abs())
+
     @property
     def squared(self) -> Weighted:
         """The layer with the squares of its weights and offset, which keep their signs (N20)."""
@@ -187,21 +197,15 @@ class Convolution(WindowLayer):
         out, taps = self.weight.shape[0] // self.groups, self.weight[0].numel()
         number = active[0].float().unflatten(1, (self.groups, -1)).sum(2)
         ones = torch.ones((1, 1, *self.weight.shape[2:])).expand(self.groups, -1, -1, -1)
-        count = self._convolve(number, ones).repeat_interleave(out, 1).double()
+        count = self.product(number, ones).repeat_interleave(out, 1).double()
         return count + (self.terms - taps)
 
-    def _convolve(self, x: Tensor, weight: Tensor) -> Tensor:
+    def product(self, x: Tensor, weight: Tensor) -> Tensor:
         top, left, bottom, right = self.pads
         padding: tuple[int, int] = (top, left)
         if (top, left) != (bottom, right):
             x, padding = functional.pad(x, (left, right, top, bottom)), (0, 0)
         return functional.conv2d(x, weight.to(x.dtype), None, self.stride, padding, self.dilation, self.groups)
-
-    def apply(self, inputs: Sequence[Tensor]) -> Tensor:
-        return self._convolve(inputs[0], self.weight)
-
-    def magnitude(self, inputs: Sequence[Tensor]) -> Tensor:
-        return self._convolve(inputs[0], self.weight.abs())
 
     @cached_property
     def _trims(self) -> bool:
@@ -241,11 +245,8 @@ class Matrix(Weighted):
     def roundings(self, active: Sequence[Tensor]) -> Tensor | int:
         return active[0].sum(-1, keepdim=True).double() + (self.terms - self.weight.shape[1])
 
-    def apply(self, inputs: Sequence[Tensor]) -> Tensor:
-        return inputs[0] @ self.weight.to(inputs[0].dtype).T
-
-    def magnitude(self, inputs: Sequence[Tensor]) -> Tensor:
-        return inputs[0] @ self.weight.abs().to(inputs[0].dtype).T
+    def product(self, x: Tensor, weight: Tensor) -> Tensor:
+        return x @ weight.to(x.dtype).T
 
     def backward(self, coefficients: Coefficients) -> list[Coefficients]:
         whole = full(coefficients, self.shape, force=True)

@@ -96,13 +96,7 @@ class NeuronBounds:
         return self.intermediate.within(tight, tight.lower, tight.upper)
 
     def _climb(
-        self,
-        index: int,
-        where: Int64,
-        reference: Float64,
-        bounds: BackwardBounds,
-        decides: bool,
-        farther: bool = False,
+        self, index: int, where: Int64, reference: Float64, bounds: BackwardBounds, decides: bool, farther: bool = False
     ) -> None:
         """Raise and lower ends of ``bounds`` with lines of their own; planes stay.
 

@@ -209,7 +209,7 @@ class TransposedConvolution(WindowLayer):
     pads: tuple[int, int] = (0, 0)
     groups: int = 1
 
-    def _spread(self, x: Tensor, weight: Tensor) -> Tensor:
+    def product(self, x: Tensor, weight: Tensor) -> Tensor:
         whole = functional.conv_transpose2d(
             x, weight.to(x.dtype), None, self.stride, groups=self.groups, dilation=self.dilation
         )
@@ -219,12 +219,6 @@ class TransposedConvolution(WindowLayer):
         if any(missing):
             whole = functional.pad(whole, (0, missing[1], 0, missing[0]))
         return whole[:, :, top : top + height, left : left + width]
-
-    def apply(self, inputs: Sequence[Tensor]) -> Tensor:
-        return self._spread(inputs[0], self.weight)
-
-    def magnitude(self, inputs: Sequence[Tensor]) -> Tensor:
-        return self._spread(inputs[0], self.weight.abs())
 
     def backward(self, coefficients: Coefficients) -> list[Coefficients]:
         value = torch.from_numpy(full(coefficients, self.shape, force=True).value)

@@ -8,11 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from ns_abstract.arithmetic.rounding import (
-    HASH_LIGHT_ROUNDING,
-    HASH_SAMPLE_ROUNDING,
-    HASH_UP,
-)
+from ns_abstract.arithmetic.rounding import HASH_LIGHT_ROUNDING, HASH_SAMPLE_ROUNDING, HASH_UP
 from ns_abstract.methods.nerf.hash_bounds.forms import UNCOUNTED, exp_above, exp_below, pose_range
 from ns_abstract.methods.nerf.hash_bounds.light import depths_functional, times
 from ns_abstract.methods.nerf.hsv import shift_box

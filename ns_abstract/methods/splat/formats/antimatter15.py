@@ -14,24 +14,14 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import file_size
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.splat.activate import SH_C0
-from ns_abstract.methods.splat.formats.decoded import (
-    AXES,
-    DecodedSplats,
-    float32_rows,
-    opacity_logits,
-    reserve,
-)
+from ns_abstract.methods.splat.formats.decoded import AXES, DecodedSplats, float32_rows, opacity_logits, reserve
 
 _ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("quat", "u1", 4)])
 _FIELDS = {name: f"{name} of a row" for name in ("scales", "quats", "opacities", "colours")}
 
 
 def decode_splat(path: Path, overrides: Overrides) -> DecodedSplats:
-    """The Gaussians of a .splat file.
-
-    Raises:
-        InputError: Its size is not that of whole rows, or it cannot be read.
-    """
+    """The Gaussians of a .splat file. Raises InputError: its size is not that of whole rows, or it cannot be read."""
     size = file_size(path, ".splat file")
     if size % _ROW.itemsize:
         problem = f"{size} bytes, not a multiple of {_ROW.itemsize}: not a .splat file, or cut off"

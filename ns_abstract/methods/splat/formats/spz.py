@@ -56,11 +56,7 @@ class _Header(NamedTuple):
 
 
 def decode_spz(path: Path, overrides: Overrides) -> DecodedSplats:
-    """The Gaussians of an SPZ file.
-
-    Raises:
-        InputError: Another version, degree 4, extensions, or a damaged file.
-    """
+    """The Gaussians of an SPZ file. Raises InputError: another version, degree 4, extensions, or a damaged file."""
     size = file_size(path, ".spz file")
     with path.open("rb") as stream:
         head = stream.read(_HEADER_4)
