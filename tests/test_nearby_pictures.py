@@ -174,10 +174,10 @@ def _tight(folder: Path, blobs: Inputs, props: list[Any]) -> Any:
     return {"all": [found[0], {"any": found[1:]}]} if found[1:] else found[0]
 
 
-def _cells(whole: ParameterBox, count: int, rng: np.random.Generator) -> list[ParameterBox]:
+def _cells(whole: ParameterBox, count: int, rng: np.random.Generator, widest: float = 4.0) -> list[ParameterBox]:
     found = []
     for _ in range(count):
-        width = 2.0 ** -rng.uniform(4.0, 8.0, whole.dimensions) * (np.array(whole.upper) - whole.lower)
+        width = 2.0 ** -rng.uniform(widest, 2.0 * widest, whole.dimensions) * (np.array(whole.upper) - whole.lower)
         low = np.array(whole.lower) + rng.uniform(size=width.size) * (np.array(whole.upper) - whole.lower - width)
         found.append(ParameterBox(whole.names, whole.units, tuple(low.tolist()), tuple((low + width).tolist())))
     return found
@@ -277,6 +277,92 @@ def test_many_bounds_over_sub_boxes_are_those_of_their_pictures(several: bool, b
     assert count > 0 and np.mean(shares) < 1.0, shares
 
 
+def _attack_narrowed(job: Any, pictures: PlanePictures, cells: list[ParameterBox], poses: int) -> tuple[int, int]:
+    """Compare sets over parts of cells, by what is known of their sub-boxes, with whole pictures; pixels before, after.
+
+    Whatever lies within the bounds of pixels that are settled, every picture of the part has the verdict that it has.
+    """
+    rng, before, after = np.random.default_rng(8), 0, 0
+    claim = job.claim(pictures)
+    channels = [channel for _, some in pictures.weights for channel in some]
+    for cell in cells:
+        near = pictures.near(cell)
+        assert isinstance(near, NearbyPictures)
+        counts = near.sub_box_counts(cell, 32)
+        if counts is None:
+            continue
+        _, ends = near.divided_sets(cell, counts)
+        assert ends is not None
+        # a block of sub-boxes, and the box that it covers
+        first = [int(rng.integers(n)) for n in counts]
+        past = [int(rng.integers(a + 1, min(n, a + 2) + 1)) for a, n in zip(first, counts.tolist(), strict=True)]
+        chosen = np.zeros(counts, bool)
+        chosen[tuple(slice(*span) for span in zip(first, past, strict=True))] = True
+        part = cell
+        for axis, (a, b) in enumerate(zip(first, past, strict=True)):
+            pieces = cell.split(axis, int(counts[axis]))
+            part = part.replace(axis, pieces[a].lower[axis], pieces[b - 1].upper[axis])
+        narrowed = near.narrowed(ends, chosen)
+        assert not (narrowed._known.open & ~near._known.open).any()
+        before, after = before + int(near._known.open.sum()), after + int(narrowed._known.open.sum())
+        sets = narrowed.linear_sets(part)
+        (a_low, b_low, a_high, b_high), lower, upper, _ = sets
+        assert (lower[..., channels] <= upper[..., channels]).all()
+        middle, half, settled = part.middle, 0.5 * (np.array(part.upper) - part.lower), ~narrowed._known.open
+        for pose in (middle, *part.corners(), *part.sample(poses, rng)):
+            whole, scaled = pictures.image(pose), (pose - middle) / half
+            values = whole[..., channels].astype(np.float64)
+            assert ((lower[..., channels] <= values) & (values <= upper[..., channels])).all()
+            low, high = (
+                a[..., channels, :].astype(np.float64) @ scaled + b[..., channels]
+                for a, b in ((a_low, b_low), (a_high, b_high))
+            )
+            assert ((low <= values) & (values <= high)).all()
+            shown = [whole]
+            for side in (lower, upper):
+                shown.append(np.where(settled[..., None], side, whole))
+            verdicts = claim.margin(
+                torch.from_numpy(job.model.outputs(np.stack(shown))), torch.from_numpy(np.stack([pose] * 3))
+            )
+            assert len({bool(margin > 0.0) for margin in verdicts}) == 1
+    return before, after
+
+
+def test_parts_of_a_cell_bound_what_its_sub_boxes_leave_open(blobs: Inputs, tmp_path: Path) -> None:
+    job, pictures = _pictures(tmp_path, blobs, _tight(tmp_path, blobs, [SMALL]))
+    before, after = _attack_narrowed(job, pictures, _cells(pictures.box, 6, np.random.default_rng(1), 3.0), 1)
+    assert 0 < after < 0.8 * before, (after, before)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("several", [False, True])
+def test_many_parts_of_cells_bound_what_is_left_open(several: bool, blobs: Inputs, tmp_path: Path) -> None:
+    job, pictures = _pictures(tmp_path, blobs, _tight(tmp_path, blobs, [ONE, CLEAR, OTHER] if several else [ONE]))
+    before, after = _attack_narrowed(job, pictures, _cells(pictures.box, 30, np.random.default_rng(3), 3.0), 40)
+    assert 0 < after < 0.9 * before, (after, before)
+
+
+def test_sub_boxes_without_bounds_settle_nothing(blobs: Inputs, tmp_path: Path) -> None:
+    """Ends that cross or are no numbers say nothing, and what is settled by the cell's box stays so."""
+    _, pictures = _pictures(tmp_path, blobs, _tight(tmp_path, blobs, [SMALL]))
+    (cell,) = _cells(pictures.box, 1, np.random.default_rng(1))
+    near = pictures.near(cell)
+    assert isinstance(near, NearbyPictures)
+    counts = near.sub_box_counts(cell, 8)
+    assert counts is not None
+    _, ends = near.divided_sets(cell, counts)
+    assert ends is not None
+    chosen = np.zeros(counts, bool)
+    chosen[0] = True
+    for side, value in (("lower", math.nan), ("upper", math.nan), ("lower", 2.0), ("upper", -1.0)):
+        wrong = getattr(ends, side).copy()
+        wrong[0] = value
+        narrowed = near.narrowed(replace(ends, **{side: wrong}), chosen)
+        np.testing.assert_array_equal(narrowed._known.open, near._known.open)
+        np.testing.assert_array_equal(narrowed._known.lower, near._known.lower)
+        np.testing.assert_array_equal(narrowed._known.upper, near._known.upper)
+
+
 def test_claims_that_need_whole_values_have_no_sub_boxes(blobs: Inputs, tmp_path: Path) -> None:
     """Every end would have to be as narrow as it can be; and there are none where every pixel is settled."""
     job, pictures = _pictures(tmp_path, blobs, _tight(tmp_path, blobs, [SMALL]))
@@ -315,6 +401,30 @@ def test_bounds_of_enclosing_boxes_are_attacked(blobs: Inputs, tmp_path: Path, m
     monkeypatch.setattr(type(frame), "bound_parts", dark)
     with pytest.raises(ContradictionError, match="outside of its bounds"):
         pictures.near(_cells(pictures.box, 1, np.random.default_rng(1))[0])
+
+
+def test_bounds_inside_of_enclosing_boxes_are_attacked(
+    blobs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What a box leaves open is drawn where a box inside of it bounds it, and nothing else is."""
+    _, pictures = _pictures(tmp_path, blobs, _tight(tmp_path, blobs, [SMALL]))
+    (cell,) = _cells(pictures.box, 1, np.random.default_rng(1))
+    frame, _ = _frame(pictures)
+    bound_parts, drawn = type(frame).bound_parts, []
+
+    def dark(*arguments: Any) -> Any:
+        found = bound_parts(*arguments)
+        # within a context alone
+        return found if arguments[3] is None else [replace(one, upper=0.0 * one.upper) for one in found]
+
+    image = type(pictures).image
+    monkeypatch.setattr(type(pictures), "image", lambda *a: drawn.append(a[1]) or image(*a))
+    pictures.near(cell)
+    assert len(drawn) == 1
+    _, again = _pictures(tmp_path / "again", blobs, _tight(tmp_path, blobs, [SMALL]))
+    monkeypatch.setattr(type(frame), "bound_parts", dark)
+    with pytest.raises(ContradictionError, match="outside of its bounds"):
+        again.near(cell)
 
 
 def test_few_boxes_are_kept(blobs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

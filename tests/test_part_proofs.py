@@ -16,10 +16,11 @@ from test_certify_search import drive, interval, volume
 from ns_abstract.arithmetic.rounding import SUB_BOX_OVERLAP
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.verify.cells import Cell, CellGrid
-from ns_abstract.verify.part_proofs import CellPart, PartQuestion
+from ns_abstract.verify.part_proofs import CellPart, PartQuestion, narrowed
 from ns_abstract.verify.picture_measures import CellParts, Measure, SubBoxEnds, planes_of, shared_counts
 from ns_abstract.verify.picture_properties import MeasureModel, parse_picture_property
 from ns_abstract.verify.properties import Claim
+from ns_abstract.verify.protocol import DividedImages
 from ns_abstract.verify.search import Search
 from ns_abstract.verify.search_results import ContradictionError
 
@@ -309,6 +310,49 @@ def test_parts_that_are_left_are_bounded_by_themselves(monkeypatch: pytest.Monke
             box = _search(scene).grid.box_of(leaf.cell)
             far = np.maximum(np.abs(box.lower), np.abs(box.upper))
             assert far @ far <= radius**2
+
+
+class Halved(Disc):
+    """Those of `Disc`, with bounds over sub-boxes; ``asked`` are what `narrowed` was given."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.asked: list[tuple[SubBoxEnds, np.ndarray]] = []
+
+    def sub_box_counts(self, box: ParameterBox, most: int) -> np.ndarray:
+        return np.array([4, 4])
+
+    def divided_sets(self, box: ParameterBox, counts: np.ndarray) -> Any:
+        sets = self.linear_sets(box)
+        (planes,) = planes_of(_model().input_sets(tuple(a[None] for a in sets[0]), sets[1][None], sets[2][None]), 1)
+        low, high = planes.over(CellParts.equal(counts, SUB_BOX_OVERLAP), np.arange(PIXELS), 0, np.ones(1))
+        return sets, SubBoxEnds(counts, np.arange(PIXELS), low[..., None], high[..., None])
+
+    def narrowed(self, ends: SubBoxEnds, sub_boxes: np.ndarray) -> Halved:
+        self.asked.append((ends, sub_boxes))
+        return self
+
+
+def test_parts_are_narrowed_by_their_own_sub_boxes() -> None:
+    """What is known of a part that is left are the sub-boxes of the cell that it consists of (Q9)."""
+    scene = Halved()
+    assert isinstance(scene, DividedImages)
+    grid, cell = _search(scene).grid, Cell((32, 32), (64, 64))
+    _, ends = scene.divided_sets(grid.box_of(cell), np.array([4, 4]))
+    part = Cell((48, 40), (64, 48))
+    assert narrowed(scene, cell, part, None) is scene and not scene.asked
+    narrowed(scene, cell, part, ends)
+    expected = np.zeros((4, 4), bool)
+    expected[2:, 1:2] = True
+    ((given, chosen),) = scene.asked
+    assert given is ends
+    np.testing.assert_array_equal(chosen, expected)
+    # the search narrows every part that it bounds once more
+    scene = Halved()
+    leaves, _ = drive(_search(scene))
+    assert scene.asked and volume(leaves) == _search(scene).grid.volume
+    plain, _ = drive(_search(Disc()))
+    assert volume(leaves, "certified") > 0.99 * volume(plain, "certified")
 
 
 @pytest.mark.parametrize("name", ["exception", "no number", "crossed"])

@@ -15,6 +15,7 @@ _SETTLED, _ENCLOSING, _NEARBY = (
     "verify/settled_pixels.py", "verify/enclosing_boxes.py", "api/nearby_pictures.py",
 )  # fmt: skip
 _PARTS, _HOLD = "verify/part_proofs.py", "test_part_proofs.py::test_parts_that_are_decided_are_so_everywhere[2]"
+_LEFT = "test_nearby_pictures.py::test_parts_of_a_cell_bound_what_its_sub_boxes_leave_open"
 _CHANGE = "test_nearby_pictures.py::test_settled_pixels_change_no_verdict"
 _NEAR = "test_nearby_pictures.py::test_pictures_near_a_cell_are_those_of_the_set"
 _RAYS = "test_picture_weights.py::test_the_brightest_rays_are_bounded_first"
@@ -183,8 +184,35 @@ PICTURES = (
     ),
     Fault(
         "near cells: enclosing boxes are believed", _NEARBY, "KnownBoxes._attack",
-        "inside[self._wanted][:, self._channels].all()", "inside.size",
+        "inside[bounded][:, self._channels].all()", "inside.size",
         "test_nearby_pictures.py::test_bounds_of_enclosing_boxes_are_attacked",
+    ),
+    Fault(
+        "near cells: what a box leaves open is not drawn in the boxes inside", _NEARBY, "KnownBoxes._attack",
+        "pictures.image(box.middle)", "0.5 * (lower + upper)",
+        "test_nearby_pictures.py::test_bounds_inside_of_enclosing_boxes_are_attacked",
+    ),
+    Fault(
+        "near parts: the best of the sub-boxes' lower ends counts", _NEARBY, "NearbyPictures.narrowed",
+        "ends.lower[chosen].min(axis=0)", "ends.lower[chosen].max(axis=0)", _LEFT,
+    ),
+    Fault(
+        "near parts: the best of the sub-boxes' upper ends counts", _NEARBY, "NearbyPictures.narrowed",
+        "ends.upper[chosen].max(axis=0)", "ends.upper[chosen].min(axis=0)", _LEFT,
+    ),
+    Fault(
+        "near parts: the sub-boxes are those of the other end", _NEARBY, "NearbyPictures.narrowed",
+        "sub_boxes.ravel()", "sub_boxes.ravel()[::-1]", _LEFT,
+    ),
+    Fault(
+        "near parts: ends that cross settle pixels", _NEARBY, "NearbyPictures.narrowed",
+        "(ends.lower[chosen] <= ends.upper[chosen]).all(axis=0)", "np.isfinite(least)",
+        "test_nearby_pictures.py::test_sub_boxes_without_bounds_settle_nothing",
+    ),
+    Fault(
+        "near parts: a part has what is known of the whole cell's first sub-boxes", _PARTS, "narrowed",
+        "meeting(cell, ends.counts, part)", "np.arange(ends.counts.prod()).reshape(ends.counts) < 1",
+        "test_part_proofs.py::test_parts_are_narrowed_by_their_own_sub_boxes",
     ),
     Fault(
         "near cells: a Gaussian is not drawn", _WEIGHTS, "SplatWeightFrame.drawn_alone",

@@ -100,7 +100,10 @@ class KnownBoxes:
         box = enclosing_box(cell, self._pictures.box, self._motion)
         if box is None:
             return None
-        box_bounds = self._about(box)
+        return self._inside(box, self._about(box))
+
+    def _inside(self, box: ParameterBox, box_bounds: KnownBox) -> NearbyPictures:
+        """Pictures of cells inside of a box."""
         draws = self._drawn(box, box_bounds)
         return NearbyPictures(self._pictures, self._weights, box_bounds, draws, self._measures, self._motion)
 
@@ -108,7 +111,11 @@ class KnownBoxes:
         """What is known of a box, itself inside of one of which this is known."""
         if box not in self._known:
             around = shared_box(box, self._pictures.box, self._motion)
-            self._known[box] = self._examined(box, None if around is None else self._about(around))
+            if around is None:
+                self._known[box] = self._examined(box, None, self._pictures)
+            else:
+                outer = self._about(around)
+                self._known[box] = self._examined(box, outer, self._inside(around, outer))
             while (
                 sum(box_bounds.nbytes for box_bounds in self._known.values()) > _TUNING.memory and len(self._known) > 1
             ):
@@ -127,8 +134,8 @@ class KnownBoxes:
         self._draws.move_to_end(box)
         return self._draws[box][1]
 
-    def _examined(self, box: ParameterBox, outer: KnownBox | None) -> KnownBox:
-        """Bounds over a box, itself inside of one of which ``outer`` is known."""
+    def _examined(self, box: ParameterBox, outer: KnownBox | None, pictures: FrameImages) -> KnownBox:
+        """Bounds over a box, itself inside of one of which ``outer`` is known, with the ``pictures`` there."""
         shape = (*self._wanted.shape, 1 + max(self._channels))
         lower, upper = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
         asked, elements = self._wanted, None
@@ -144,7 +151,7 @@ class KnownBoxes:
             bounds = frame.bound_parts([box], tiles, context, False, pixels[tiles])[0]
             bounds_by_frame.append(bounds)
             place((lower, upper), (bounds.lower, bounds.upper), frame, tiles, channels, asked)
-        self._attack(box, lower, upper)
+        self._attack(box, lower, upper, asked, pictures)
         still = unsettled(self._measures, lower, upper) & asked
         if not still.any():
             return KnownBox(lower, upper, still, None)
@@ -155,15 +162,17 @@ class KnownBoxes:
             drawn_elements.append(DrawnElements(tiles, pixels[tiles], bounds.context))
         return KnownBox(lower, upper, still, tuple(drawn_elements))
 
-    def _attack(self, box: ParameterBox, lower: np.ndarray, upper: np.ndarray) -> None:
-        """Draw the whole picture at the box's middle: what is settled is not drawn again for the cells inside.
+    def _attack(
+        self, box: ParameterBox, lower: np.ndarray, upper: np.ndarray, bounded: np.ndarray, pictures: FrameImages
+    ) -> None:
+        """Draw the ``bounded`` pixels [H, W] at the box's middle: what is settled is not drawn for the cells inside.
 
         Raises:
-            ContradictionError: It lies outside of the bounds.
+            ContradictionError: One lies outside of its bounds.
         """
-        image = self._pictures.image(box.middle)
+        image = pictures.image(box.middle)
         inside = (lower <= image) & (image <= upper)
-        if not inside[self._wanted][:, self._channels].all():
+        if not inside[bounded][:, self._channels].all():
             raise ContradictionError(
                 f"internal error: a picture at {box.middle.tolist()} lies outside of its bounds over {box.lower} to "
                 f"{box.upper}"
@@ -251,6 +260,32 @@ class NearbyPictures:
             place_sets((*linear, lower, upper), bounds, frame, elements.tiles, channels, box_bounds.open)
             slopes = slopes + bounds.slopes
         return (linear, lower, upper, slopes), ends
+
+    def narrowed(self, ends: SubBoxEnds, sub_boxes: np.ndarray) -> NearbyPictures:
+        """Pictures of what some ``sub_boxes`` [counts] of a cell cover, by bounds ``ends`` over all of them (Q9).
+
+        They are for bounds alone: none can be drawn.
+        """
+        box_bounds, chosen = self._known, sub_boxes.ravel()
+        lower, upper = box_bounds.lower.copy(), box_bounds.upper.copy()
+        shape = lower.shape[-1]
+        flat = lower.reshape(-1, shape), upper.reshape(-1, shape)
+        least, most = ends.lower[chosen].min(axis=0), ends.upper[chosen].max(axis=0)
+        # ends that cross or are no numbers bound nothing
+        sane = (ends.lower[chosen] <= ends.upper[chosen]).all(axis=0)
+        pixels = ends.pixels
+        flat[0][pixels] = np.where(sane, np.maximum(flat[0][pixels], least), flat[0][pixels])
+        flat[1][pixels] = np.where(sane, np.minimum(flat[1][pixels], most), flat[1][pixels])
+        still = unsettled(self._measures, lower, upper) & box_bounds.open
+        if box_bounds.elements is None or not still.any():
+            return self
+        elements = []
+        for (frame, _), one in zip(self._weights, box_bounds.elements, strict=True):
+            whole = in_tiles(still, frame.side)
+            tiles = np.flatnonzero(whole.any(axis=(1, 2)))
+            elements.append(DrawnElements(tiles, whole[tiles], one.context))
+        known = KnownBox(lower, upper, still, tuple(elements))
+        return NearbyPictures(self._pictures, self._weights, known, (), self._measures, self._motion)
 
     def _no_ends(self, counts: np.ndarray) -> SubBoxEnds:
         """Ends over ``counts`` [d] sub-boxes of the pixels that are not settled, all zeros."""

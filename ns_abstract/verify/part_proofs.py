@@ -110,6 +110,13 @@ class PartQuestion:
         ]
 
 
+def narrowed(scene: FrameImages, cell: Cell, part: Cell, ends: SubBoxEnds | None) -> FrameImages:
+    """Pictures, for bounds of a ``part`` of a cell alone, by what ``ends`` say of the cell's sub-boxes (Q9)."""
+    if ends is None or not isinstance(scene, DividedImages):
+        return scene
+    return scene.narrowed(ends, meeting(cell, ends.counts, part))
+
+
 def divided_sets(scene: FrameImages, cell: Cell, box: ParameterBox) -> tuple[PixelSets, SubBoxEnds | None]:
     """Sets of a cell with the parameters ``box``, and bounds over sub-boxes of whole units where it has some (Q8)."""
     if isinstance(scene, DividedImages):

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
@@ -170,6 +171,18 @@ def shared_counts(effects: np.ndarray, most_parts: int) -> np.ndarray:
     return counts
 
 
+@lru_cache(maxsize=64)
+def _equal_parts(counts: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Middles and half widths of `CellParts.equal` that do not overlap."""
+    middles, halves = np.zeros((1, 0)), np.zeros((1, 0))
+    for count in counts:
+        # powers of two: these are exact
+        places = (2.0 * np.arange(count) + 1.0) / count - 1.0
+        middles = np.concatenate([np.repeat(middles, count, 0), np.tile(places, len(middles))[:, None]], axis=1)
+        halves = np.concatenate([np.repeat(halves, count, 0), np.full((len(middles), 1), 1.0 / count)], axis=1)
+    return middles, halves
+
+
 @dataclass(frozen=True)
 class CellParts:
     """Equal parts of a cell in its parameters, each scaled to [-1, 1]: middles and half widths [s, d]."""
@@ -185,12 +198,7 @@ class CellParts:
     @classmethod
     def equal(cls, counts: np.ndarray, overlap: float = 0.0) -> CellParts:
         """``counts`` [d] parts along the parameters, powers of two, that reach by ``overlap`` beyond their ends."""
-        middles, halves = np.zeros((1, 0)), np.zeros((1, 0))
-        for count in counts.tolist():
-            # powers of two: these are exact
-            places = (2.0 * np.arange(count) + 1.0) / count - 1.0
-            middles = np.concatenate([np.repeat(middles, count, 0), np.tile(places, len(middles))[:, None]], axis=1)
-            halves = np.concatenate([np.repeat(halves, count, 0), np.full((len(middles), 1), 1.0 / count)], axis=1)
+        middles, halves = _equal_parts(tuple(counts.tolist()))
         return cls(middles, halves + overlap)
 
 
@@ -236,10 +244,15 @@ class PlaneSets:
             a = np.tensordot(self.linear[side][pixels][:, cut].astype(np.float64), channels, (1, 0))
             b = self.linear[side + 1][pixels][:, cut].astype(np.float64) @ channels
             flat = interval[pixels][:, cut].astype(np.float64) @ channels
+            nearer = np.maximum if sign < 0.0 else np.minimum
             size = np.abs(a).sum(axis=1) + np.abs(self.linear[side + 1][pixels][:, cut]) @ channels + np.abs(flat)
-            line = parts.middles @ a.T + b + sign * (parts.halves @ np.abs(a).T)
-            nearest = np.maximum(line, flat) if sign < 0.0 else np.minimum(line, flat)
-            ends.append(nearest + sign * OWN_MARGIN * size)
+            # settled pixels, most of all, are the same in every part
+            whole = np.tile(nearer(b, flat), (len(parts.middles), 1))
+            varies = a.any(axis=1)
+            slopes = a[varies].T
+            line = parts.middles @ slopes + b[varies] + sign * (parts.halves @ np.abs(slopes))
+            whole[:, varies] = nearer(line, flat[varies])
+            ends.append(whole + sign * OWN_MARGIN * size)
         if self.ends is not None:
             place = np.minimum(np.searchsorted(pixels, self.ends.pixels), len(pixels) - 1)
             found = pixels[place] == self.ends.pixels

@@ -68,6 +68,10 @@ class DividedImages(Protocol):
         """
         ...
 
+    def narrowed(self, ends: SubBoxEnds, sub_boxes: np.ndarray) -> FrameImages:
+        """Pictures, for bounds alone, of what some ``sub_boxes`` [counts] of a cell cover, over which ``ends`` hold."""
+        ...
+
 
 @runtime_checkable
 class ComparedCuts(Protocol):

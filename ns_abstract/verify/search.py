@@ -24,7 +24,7 @@ from ns_abstract.verify.cell_samples import CellSamples, Sample, drawn, sample_k
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.margin_descent import descend
 from ns_abstract.verify.network import ImageSets
-from ns_abstract.verify.part_proofs import CellPart, PartQuestion, divided_sets
+from ns_abstract.verify.part_proofs import CellPart, PartQuestion, divided_sets, narrowed
 from ns_abstract.verify.picture_measures import SubBoxEnds
 from ns_abstract.verify.picture_sets import PictureSets
 from ns_abstract.verify.properties import Claim, LinearClaim, Query
@@ -334,7 +334,10 @@ class Search:
         question = PartQuestion(self.claim, self.model, query, refute=not self.every_unit)
         parts: list[CellPart] = []
         for part in question.parts(images, cell.cell, cell.box, ends=cell.ends):
-            finer = [] if part.verdict else question.bounded(cell.scene, self.grid, part.cell)
+            finer = []
+            if part.verdict is None:
+                within = narrowed(cell.scene, cell.cell, part.cell, cell.ends)
+                finer = question.bounded(within, self.grid, part.cell)
             parts += finer or [part]
         return parts
 

@@ -93,6 +93,10 @@ class WeightBounds(SplatBounds):
     ) -> np.ndarray:
         """[n, 6] centres and radii by channel (design.md, Q2)."""
         numbers = candidates[alive]
+        if np.isinf(self.white.nearer).all():
+            colors = np.zeros((n, 6))
+            colors[alive, 0::2] = self.white.selected[numbers]
+            return colors
         low, high = self.white.between(numbers, *self._camera_depth_bounds(forms, camera_magnitude, candidates, alive))
         colors = np.zeros((n, 6))
         colors[alive, 0::2], colors[alive, 1::2] = 0.5 * (low + high), 0.5 * (high - low)
@@ -101,12 +105,7 @@ class WeightBounds(SplatBounds):
     def _camera_depth_bounds(
         self, forms: PoseForms, camera_magnitude: np.ndarray, candidates: np.ndarray, alive: np.ndarray
     ) -> tuple[Float64Array, Float64Array]:
-        """[k] bounds of the depths of candidates ``alive`` over the cell, in every evaluation of the program.
-
-        They are zeros where no channel asks for depths; `WhiteGaussians.between` looks at none then.
-        """
-        if np.isinf(self.white.nearer).all():
-            return np.zeros(alive.size), np.zeros(alive.size)
+        """[k] bounds of the depths of candidates ``alive`` over the cell, in every evaluation of the program."""
         m = forms.rotation.basis.monomials
         low, high = forms.rotation.bounds()
         most = np.maximum(np.abs(low), np.abs(high)).ravel()
