@@ -95,14 +95,17 @@ class SubBoxBounds(SplatBounds):
         # a pixel's middle lies half a pixel behind its number; what is not a number leaves nothing out
         box, size = gaussians.box[alive], np.repeat([across, down], 2) * self.side
         reach = np.where(np.isnan(box), [0, np.inf] * 2, np.floor(box + [-0.5, 1.5] * 2)).clip(0, size).astype(np.int32)
-        alive = alive[touching(np.arange(alive.size), reach, summed_area(laid_out(chosen, across)))]
+        touched = touching(np.arange(alive.size), reach, summed_area(laid_out(chosen, across)))
+        alive, reach = alive[touched], reach[touched]
         most_alpha = min(self.rules.alpha_max, float(self._sums.gaussians.opacity_high.max(initial=0.0)))
         color_ends = _color_ends(colors, alive, self.splats.background, most_alpha * (1.0 + self.charges.threshold))
         for row in np.flatnonzero(ends.any(axis=0)).tolist():
             some, end = np.zeros(pixels.shape, bool), color_ends[row]
             some[pixels] = ends[:, row]
+            chosen[wanted] = some
+            order = alive[touching(np.arange(alive.size), reach, summed_area(laid_out(chosen, across)))]
+            order = order[np.argsort(-end.sign * end.values[order], kind="stable")]
             shown = tile_mask(wanted[some.any(axis=(1, 2))], across * down)
-            order = alive[np.argsort(-end.sign * end.values[alive], kind="stable")]
             lists = TileLists(wanted, *tile_lists(order, gaussians.tiles, shown, across))
             unordered_stage(
                 lists, pixel_sets(some, wanted.size, self.side), inputs, strips_of(inputs.parts), end, threads(), out
