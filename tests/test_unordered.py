@@ -105,3 +105,15 @@ def test_the_latest_projection_is_kept_until_its_memory_is_taken():
     half = box.split(0, 2)[0]
     other = bounds.projected_box(case.camera, case.poses.enclosure(half, 1), half)
     assert other is not bounds.projected_box(case.camera, forms, box)
+
+
+def test_pixels_that_nothing_reaches_show_the_background():
+    """No fragment reaches a corner: its bounds are the background, up to their charge."""
+    case = Case(
+        scene({"mean": (0.0, 0.0, 5.0), "scale": 0.05, "opacity": 0.95}, background=BACKGROUNDS[2]),
+        moves(x=0.1, yaw=0.02),
+    )
+    ends = ends_of(case)
+    background = np.array(BACKGROUNDS[2])[:, None]
+    assert (ends[:, :, 0] <= background).all() and (background <= ends[:, :, 1]).all()
+    assert np.abs(ends - background).max() < 1e-4

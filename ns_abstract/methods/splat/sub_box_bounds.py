@@ -114,7 +114,7 @@ class SubBoxBounds(SplatBounds):
 
 def _color_ends(colors: np.ndarray, alive: np.ndarray, background: np.ndarray, most_alpha: float) -> list[ColorEnd]:
     """The least of the three channels of rows ``alive`` of `Colors.values`, then the most."""
-    parts = colors[alive].reshape(alive.size, 3, -1)
+    parts = colors[alive].reshape(alive.size, 3, colors.shape[1] // 3)
     spread = np.abs(parts[..., 1:]).sum(axis=-1) * UP
     low, high = parts[..., 0] - spread, parts[..., 0] + spread
     darkest = np.minimum(low.min(axis=0, initial=np.inf), background)
