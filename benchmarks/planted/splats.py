@@ -769,8 +769,8 @@ SPLATS = (
         "parts: a fragment of which nothing is known is not there",
         _BLOCK,
         "set_unknown",
-        "(0.0, 1.0, 0.0)",
-        "(0.0, 0.0, 0.0)",
+        "(0.0, 1.0, 0.0, EXPONENT_CUT)",
+        "(0.0, 0.0, 0.0, EXPONENT_CUT)",
         "test_intervals.py::test_blends_over_parts_hold_every_exact_blend[0.3-counts0]",
     ),
     Fault(
