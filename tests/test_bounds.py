@@ -17,7 +17,7 @@ from ns_abstract.arithmetic.rounding import FLOAT32, REAL
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.poses import PoseBox
-from ns_abstract.geometry.tiles import assemble
+from ns_abstract.geometry.tiles import assemble, tile_grid
 from ns_abstract.methods.splat.activate import Splats, rotation_matrices
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, PAPER
@@ -26,6 +26,7 @@ from ns_abstract.methods.splat.intervals import sort_keys as sort_group
 from ns_abstract.methods.splat.projection_errors import FORMS, SPREAD, UNBOUNDED, columns
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.stage_data import SubBoxes, cell_parts, shared_out
+from ns_abstract.methods.splat.sub_box_bounds import SubBoxBounds
 from ns_abstract.perturbation.specification import Perturbation
 
 both_orders = pytest.mark.parametrize("order", [1, 2])
@@ -80,6 +81,20 @@ class Case:
             self.camera, self.poses.enclosure(box, order), **options
         )
 
+    def sub_box_ends(self, box: ParameterBox, counts: np.ndarray, arithmetic=REAL) -> list[np.ndarray]:
+        """As `ends`, in the orders that are uncertain, and in every order."""
+        bounds, forms = SubBoxBounds(self.splats, GSPLAT_1_4_0, arithmetic), self.poses.enclosure(box, 1)
+        tiles = np.arange(math.prod(tile_grid(self.camera, bounds.side)))
+        shape = (tiles.size, bounds.side, bounds.side)
+        pixels, projected = np.ones(shape, bool), bounds.project(self.camera, forms)
+        ordered = bounds.sub_boxes(self.camera, forms, projected, tiles, pixels, counts)
+        unordered = np.full_like(ordered, np.nan)
+        bounds.unordered(
+            self.camera, forms, projected, tiles, pixels, counts, np.ones((pixels.sum(), 6), bool), unordered
+        )
+        found = [assemble(ends.reshape(*shape, -1), self.camera) for ends in (ordered, unordered)]
+        return [ends.reshape(*ends.shape[:2], 2, 3, -1).clip(0.0, 1.0) for ends in found]
+
     def samples(self, box: ParameterBox, count: int) -> np.ndarray:
         """Ends and a line of poses for one parameter; corners and random poses for more."""
         if box.dimensions == 1:
@@ -112,9 +127,9 @@ class Case:
             over_parts = [] if sub_boxes is None else [(cell_parts(sub_boxes.counts), self.ends(cell))]
             if order == 1:
                 divided = shared_out(np.ones(box.dimensions), 16)
-                by_parts = self.bounds(box, 1, arithmetic, floor=floor, parts=divided, keep_parts=True)
+                by_parts = self.bounds(box, 1, arithmetic, floor=floor, parts=divided)
                 assert by_parts.statistics[4] == 0
-                over_parts.append((cell_parts(divided), self.ends(by_parts)))
+                over_parts += [(cell_parts(divided), ends) for ends in self.sub_box_ends(box, divided, arithmetic)]
                 found.append((assemble(by_parts.lower, self.camera), assemble(by_parts.upper, self.camera)))
             pairs = self.poses.enclosure(box, order).rotation.basis.pairs
             for values in self.samples(box, count):

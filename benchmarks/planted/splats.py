@@ -19,6 +19,7 @@ _INTERVALS = "methods/splat/intervals.py"
 _SUB_BOXES = "methods/splat/form_sub_boxes.py"
 _REORDERING = "methods/splat/reordering.py"
 _STAGE_DATA = "methods/splat/stage_data.py"
+_UNORDERED = "methods/splat/unordered_pixels.py"
 _BLOCK = "methods/splat/pixel_block.py"
 _LISTS = "methods/splat/lists.py"
 _PIXELS = "methods/splat/pixels.py"
@@ -79,7 +80,7 @@ SPLATS = (
     Fault(
         "tile cut-off taken for sure",
         _FRAGMENTS,
-        "_find_alphas",
+        "find_alphas",
         "core[0] <= place.tile_x and place.tile_x < core[1] and (core[2] <= place.tile_y) and (place.tile_y < core[3])",
         "True and core[2] <= place.tile_y and (place.tile_y < core[3])",
         "test_bounds.py::test_tile_cut[2]",
@@ -639,7 +640,7 @@ SPLATS = (
     Fault(
         "blend picks alpha's other end",
         _INTERVALS,
-        "_most",
+        "blend_most",
         "where(v > 0.0, a_high, a_low)",
         "where(v > 0.0, a_low, a_high)",
         "test_bounds.py::test_one_layer[2]",
@@ -663,7 +664,7 @@ SPLATS = (
     Fault(
         "parts: both squares move as the first",
         _INTERVALS,
-        "_alphas_of_parts",
+        "part_exponents",
         "fma(middle, values[e + 1], y2)",
         "fma(middle, values[e], y2)",
         "test_intervals.py::test_blends_over_parts_hold_every_exact_blend[0.3-counts0]",
@@ -671,7 +672,7 @@ SPLATS = (
     Fault(
         "parts: the least exponent is that of the middle",
         _INTERVALS,
-        "_alphas_of_parts",
+        "part_exponents",
         "maximum(0.0, y1 - e1)",
         "y1",
         "test_intervals.py::test_one_fragment_over_parts",
@@ -679,10 +680,42 @@ SPLATS = (
     Fault(
         "parts: what may be skipped is drawn",
         _INTERVALS,
-        "_alphas_of_parts",
+        "part_alphas",
         "where(low < values[ends + 4], 0.0, low)",
         "low",
         "test_bounds.py::test_alpha_threshold[1]",
+    ),
+    Fault(
+        "any order: what lies behind shows the last colour of the other end",
+        _UNORDERED,
+        "_add_in_front",
+        "color + 0.0 * high",
+        "0.0 * high",
+        "test_unordered.py::test_bounds_hold_every_order_of_random_stacks[1]",
+    ),
+    Fault(
+        "any order: what is nearer to the background covers as little as it may",
+        _UNORDERED,
+        "_add_behind",
+        "blend_most(behind, color, low, high)",
+        "blend_most(behind, color, low, low)",
+        "test_unordered.py::test_bounds_hold_every_order_of_random_stacks[0]",
+    ),
+    Fault(
+        "any order: strips have no width",
+        _UNORDERED,
+        "_strips_met",
+        "strips.half[k] * abs(values[e])",
+        "0.0",
+        "test_unordered.py::test_strips_hold_what_their_sub_boxes_reach",
+    ),
+    Fault(
+        "any order: no stop hides anything",
+        _UNORDERED,
+        "_write",
+        "_lost_light(stop, sums.boldest[at])",
+        "0.0",
+        "test_bounds.py::test_stop[1]",
     ),
     Fault(
         "parts: only the first eight count",
@@ -711,7 +744,7 @@ SPLATS = (
     Fault(
         "parts: the weakest part of the clamp is forgotten",
         _INTERVALS,
-        "_alphas_of_parts",
+        "part_alphas",
         "minimum(values[ends + 2] * exp_kernel(-farthest), thresholds.most)",
         "values[ends + 2] * exp_kernel(-farthest)",
         "test_bounds.py::test_alpha_clamp[1]",
@@ -736,8 +769,8 @@ SPLATS = (
         "parts: a fragment of which nothing is known is not there",
         _BLOCK,
         "set_unknown",
-        "(0.0, 1.0, 0.0)",
-        "(0.0, 0.0, 0.0)",
+        "(0.0, 1.0, 0.0, EXPONENT_CUT)",
+        "(0.0, 0.0, 0.0, EXPONENT_CUT)",
         "test_intervals.py::test_blends_over_parts_hold_every_exact_blend[0.3-counts0]",
     ),
     Fault(

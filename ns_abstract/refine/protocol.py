@@ -222,13 +222,14 @@ class SubBoxFrame(Protocol):
     """An optional interface of a `Frame`: bounds over each of many equal sub-boxes of a wide cell."""
 
     def sub_box_ends(
-        self, box: ParameterBox, counts: np.ndarray, tiles: np.ndarray, pixels: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray] | None:
+        self, box: ParameterBox, counts: np.ndarray, tiles: np.ndarray, pixels: np.ndarray,
+        ends: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray] | None:  # fmt: skip
         """Lower and upper bounds [n, 3, k] of ``n`` pixels over ``k`` sub-boxes; None: there are none for this set.
 
         There are ``counts`` [d] sub-boxes along the axes, powers of two, at least 8 together, numbered like entries of
         an array of this shape. Each is widened by `SUB_BOX_OVERLAP` of the cell's half-widths. ``pixels`` [t, side,
-        side]: the ``n``.
+        side]: the ``n``. ``ends`` [n, 6]: the lower, then the upper bounds of channels that are worth more work.
         """
         ...
 

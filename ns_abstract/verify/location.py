@@ -42,6 +42,9 @@ class LocationTuning:
     #: Sub-boxes along each of the two parameters that move the picture most; others are not divided, since what is
     #: shared by the sub-boxes of a cell, above all its depth order, loses by every parameter that is wide.
     along: int = 8
+    #: Image motion over a sub-box, pixels, up to which pixels of uncertain orders are bounded whatever the order: it
+    #: takes long, and excludes little of wider ones.
+    unordered: float = 1.6
     #: The part of a box of sub-boxes that has to be left for it to become one cell.
     filled: float = 0.5
     #: Grid lines that cells begin and end at, as a power of two of their width.
@@ -231,11 +234,13 @@ class _Examination:
         counts = sub_box_counts(self.cell, search.along)
         if not isinstance(search.frame, SubBoxFrame) or not search.contract or not resolved(box, counts):
             return None
-        rounds = self._rounds(box, picture, counts)
+        rounds, gaps = self._rounds(box, picture, counts)
+        telling = gaps == gaps.max(axis=-1, keepdims=True)
+        narrow = float(np.linalg.norm(search.moved(box) / counts)) <= tuning.unordered
         while (chosen := rounds.following()) is not None:
             self.bounded += 1
             tiles = np.flatnonzero(chosen.any(axis=(1, 2)))
-            ends = search.frame.sub_box_ends(box, counts, tiles, chosen[tiles])
+            ends = search.frame.sub_box_ends(box, counts, tiles, chosen[tiles], telling[chosen] if narrow else None)
             if ends is None:
                 return None
             rounds.count(*ends, chosen)
@@ -300,7 +305,7 @@ class _Examination:
         search, tiled, tuning = self.search, self.search.tiled, self.search.tuning
         before = self.cell.volume
         linear = search.contract and float(np.linalg.norm(search.moved(box))) <= tuning.contracted
-        rounds, known = self._rounds(box, picture, np.ones(box.dimensions, np.int64)), None
+        (rounds, _), known = self._rounds(box, picture, np.ones(box.dimensions, np.int64)), None
         while True:
             chosen = rounds.following()
             last = chosen is None
@@ -332,25 +337,31 @@ class _Examination:
             if last or self.cell.volume <= (1.0 - tuning.worth) * before:
                 return True
 
-    def _rounds(self, box: ParameterBox, picture: np.ndarray, counts: np.ndarray) -> PixelRounds:
-        """Rounds of pixels for the sub-boxes [counts] of the cell; there are none where too few are likely to help."""
+    def _rounds(self, box: ParameterBox, picture: np.ndarray, counts: np.ndarray) -> tuple[PixelRounds, Float64Array]:
+        """Rounds of pixels for the sub-boxes [counts] of the cell; there are none where too few are likely to help.
+
+        Returns them, and `_gaps` [T, side, side, 6] over the cell's image motion.
+        """
         search, tiled, tuning = self.search, self.search.tiled, self.search.tuning
         moved, known = search.moved(box), int(self.inherited.sum())
         needed = tiled.allowed + 1 - known
         scale = float(np.linalg.norm(moved / counts)) / tuning.reference
         radius = max(1, round(0.5 * float(np.linalg.norm(moved))))
+        gaps = self._gaps(picture, radius, scale)
         order, sure = telling_order(
-            self._gaps(picture, 1, 0.0), self._gaps(picture, radius, scale), search.loose,
+            self._gaps(picture, 1, 0.0).max(axis=-1), gaps.max(axis=-1), search.loose,
             tiled.counted & ~self.inherited, round(tuning.surplus * needed),
         )  # fmt: skip
         alone = counts.prod() == 1
         self.share = (known + sure) / (known + needed) if alone else 0.0
         if alone and self.share < tuning.promise:
             order = order[:0]
-        return PixelRounds(tiled, order, int(np.prod(counts)), self.inherited)
+        return PixelRounds(tiled, order, int(np.prod(counts)), self.inherited), gaps
 
     def _gaps(self, picture: np.ndarray, radius: int, scale: float) -> Float64Array:
-        """[T, side, side] by how much the picture within ``radius`` pixels misses the photo, less expected looseness.
+        """[T, side, side, 6] by how much the picture within ``radius`` pixels misses the photo, less its looseness.
+
+        By its least of three channels, which may lie above what the photo allows, then by its most.
 
         Args:
             picture: Tiles of a render.
@@ -360,7 +371,7 @@ class _Examination:
         search, tiled, side = self.search, self.search.tiled, self.search.frame.side
         least, most = (in_tiles(end, side) for end in nearby(assemble(picture, search.frame.camera), radius))
         below, above = (part * scale for part in search.looseness)
-        return np.maximum(least - below - tiled.high, tiled.low - most - above).max(axis=-1)
+        return np.concatenate([least - below - tiled.high, tiled.low - most - above], axis=-1)
 
     def _bound(self, box: ParameterBox, tiles: np.ndarray, linear: bool, pixels: np.ndarray | None = None) -> Bounds:
         """Bounds of ``tiles``, or of some of their ``pixels`` alone where the frame can leave out the others."""

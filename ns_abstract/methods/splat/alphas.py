@@ -360,6 +360,7 @@ def _alphas_over_parts(record, begin, n, given, block, limits, inputs):
     store(rows, ends + 16, zero + least * (1.0 - slack))
     store(rows, ends + 24, zero + most * (1.0 + slack))
     store(rows, ends + 32, zero + limits.alpha_min_high)
+    store(rows, ends + 40, zero + limits.sigma_max)
     drawn_lanes = 0
     for q in range(0, n, 8):
         ax = load8(batch.offset_x, begin + q)

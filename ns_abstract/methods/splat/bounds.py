@@ -45,6 +45,7 @@ from ns_abstract.methods.splat.stage_data import (
     Parts,
     PixelBounds,
     PixelInputs,
+    ProjectedCell,
     ProjectedGaussians,
     SceneColors,
     SceneGaussians,
@@ -249,6 +250,7 @@ class SplatBounds:
         parts: np.ndarray | None = None,
         keep_parts: bool = False,
         sub_boxes: SubBoxes | None = None,
+        projected: ProjectedCell | None = None,
     ) -> CellBounds:
         """Bounds of the tiles ``wanted`` over the poses enclosed by ``forms`` (design.md, G10).
 
@@ -266,6 +268,7 @@ class SplatBounds:
                 pixels by intervals over each of them, not by forms (B12).
             keep_parts: Whether to return bounds over each of these parts.
             sub_boxes: Bound pixels by forms over each of these, too, and return these bounds as ``parts`` (B13).
+            projected: What `project` returned of the cell, if that is known; then of its candidates.
 
         Raises:
             ValueError: Linear sets, layers or ``sub_boxes`` are asked for together with ``parts``, or numbers of parts
@@ -277,11 +280,9 @@ class SplatBounds:
         with_ends = keep_parts or sub_boxes is not None
         across, down = tile_grid(camera, self.side)
         wanted = np.asarray(np.arange(across * down) if wanted is None else wanted, np.int64)
-        if candidates is None:
-            candidates = np.arange(self.splats.count, dtype=np.int32)
-        poses = _cell_poses(forms)
-        gaussians, alive = self._projected(candidates, poses, camera, shape)
-        colors = self._colors(forms, poses.camera_magnitude, candidates, alive, candidates.size)
+        if projected is None:
+            projected = self.project(camera, forms, candidates)
+        candidates, poses, gaussians, alive, colors = projected
         offsets, entries = tile_lists(
             self._listed(alive, candidates, gaussians), gaussians.tiles, tile_mask(wanted, across * down), across
         )
@@ -311,6 +312,15 @@ class SplatBounds:
             bounds.slopes.sum(axis=0) / (max(wanted.size, 1) * self.side**2 * 3), bounds.statistics.sum(axis=0),
             bounds.parts if with_ends else None,
         )  # fmt: skip
+
+    def project(self, camera: PinholeCamera, forms: PoseForms, candidates: np.ndarray | None = None) -> ProjectedCell:
+        """Project the Gaussians ``candidates``, all if None, over the poses enclosed by ``forms``."""
+        if candidates is None:
+            candidates = np.arange(self.splats.count, dtype=np.int32)
+        poses = _cell_poses(forms)
+        gaussians, alive = self._projected(candidates, poses, camera, form_shape(forms.rotation.basis))
+        colors = self._colors(forms, poses.camera_magnitude, candidates, alive, candidates.size)
+        return ProjectedCell(candidates, poses, gaussians, alive, colors)
 
     def _projected(
         self, candidates: np.ndarray, poses: CellPoses, camera: PinholeCamera, shape: FormShape

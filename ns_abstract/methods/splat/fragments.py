@@ -207,7 +207,7 @@ def _keep_moving(lanes, pixels, number, k, slot, block, stop, dim, moved):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _set_colors(palette, k, color, color_rows, channels):
+def set_colors(palette, k, color, color_rows, channels):
     """Write the colour of list position k: see `Palette`; ``color`` [channels, color_rows] is the Gaussian's."""
     forms, values = palette.forms, palette.values
     at = k * color_size(forms)
@@ -254,7 +254,7 @@ def _colors_behind(first, listed, colors, channels, palette, marks):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _place_batch(start, some, live, listed, inputs, block):
+def place_batch(start, some, live, listed, inputs, block):
     """Find the pixels of `FragmentBatch` for ``some`` positions from ``start`` on that they may be drawn on.
 
     Returns how many there are.
@@ -288,8 +288,8 @@ def _place_batch(start, some, live, listed, inputs, block):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _find_alphas(start, some, used, place, listed, inputs, block):
-    """Write the alphas of `_place_batch`'s positions: fragments from number ``used`` on, and `FragmentBatch.found`."""
+def find_alphas(start, some, used, place, listed, inputs, block):
+    """Write the alphas of `place_batch`'s positions: fragments from number ``used`` on, and `FragmentBatch.found`."""
     batch = block.batch
     for b in range(some):
         i = listed.numbers[start + b]
@@ -365,11 +365,11 @@ def collect_fragments(numbers, place, inputs, block, marks_):
     for start in range(0, length, BATCH):
         some = min(BATCH, length - start)
         begun = live
-        end = _place_batch(start, some, live, listed, inputs, block)
+        end = place_batch(start, some, live, listed, inputs, block)
         # eight at a time, some in excess
         if used + end + 8 > capacity * PIXELS or longest_list(fragments.lengths) + some > capacity:
             return GROW, 0
-        _find_alphas(start, some, used, place, listed, inputs, block)
+        find_alphas(start, some, used, place, listed, inputs, block)
         for b in range(some):
             lanes = batch.found[b]
             begin = batch.begins[b]
@@ -387,7 +387,7 @@ def collect_fragments(numbers, place, inputs, block, marks_):
             if marks[i] == 0:
                 marks[i] = 1
             color = offset_by(pointer(colors), i * color_columns)
-            _set_colors(block.palette, k, color, color_columns // channels, channels)
+            set_colors(block.palette, k, color, color_columns // channels, channels)
             if entries.first[k] == k and entries.last[k] == k:
                 lanes = _keep_drawn(lanes, pixels, used + begin, k, fragments, stop)
                 live, dim = _keep_alone(lanes, pixels, used + begin, k, fragments, stop, live, dim, m)

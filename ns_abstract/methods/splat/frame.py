@@ -18,12 +18,13 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseBox, translation_only
 from ns_abstract.geometry.tiles import laid_out, tile_grid
 from ns_abstract.methods.splat.activate import Splats
-from ns_abstract.methods.splat.bounds import SceneSums, SplatBounds, Stages
+from ns_abstract.methods.splat.bounds import SceneSums, Stages
 from ns_abstract.methods.splat.constants import Rasteriser
 from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW, DEPTH_HIGH, DEPTH_LOW
 from ns_abstract.methods.splat.lists import summed_area, touching
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.stage_data import SubBoxes, shared_out
+from ns_abstract.methods.splat.sub_box_bounds import SubBoxBounds
 from ns_abstract.methods.splat.variations import VariedSplats
 from ns_abstract.perturbation.specification import ROTATIONS
 from ns_abstract.refine.protocol import COLORS, Bounds, Frame, LinearSets, Score, SharedOrder
@@ -150,7 +151,7 @@ class SplatFrame(Frame):
             parameters are then not those of ``pose_set``.
         layers: Whether accumulation and expected depth stand behind the colours, in renders and bounds.
         reference: Makes the renderer with gradients, for steps of `scene_samples`.
-        sums: See `SplatBounds`.
+        sums: See `SubBoxBounds`.
     """
 
     #: What tiles share is most of the work: every call bounds as many as it is given.
@@ -179,7 +180,7 @@ class SplatFrame(Frame):
         self.box = pose_set.box
         self.order = order or (2 if self.box.dimensions == 1 else 1)
         self._reference = reference
-        self.bounds = SplatBounds(splats, rasteriser, arithmetic, varied, sums)
+        self.bounds = SubBoxBounds(splats, rasteriser, arithmetic, varied, sums)
         self.varied = self.bounds.varied
         self.renderer = Renderer(self.varied.nearest, rasteriser)
         self.side = rasteriser.work_tile
@@ -277,17 +278,16 @@ class SplatFrame(Frame):
         return each(lambda box: self._bound(box, tiles, within, candidates, keep_linear, pixels), boxes)
 
     def sub_box_ends(
-        self, box: ParameterBox, counts: np.ndarray, tiles: np.ndarray, pixels: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray] | None:
-        """See `ns_abstract.refine.protocol.SubBoxFrame` (design.md, U5)."""
+        self, box: ParameterBox, counts: np.ndarray, tiles: np.ndarray, pixels: np.ndarray,
+        ends: np.ndarray | None = None,
+    ) -> tuple[np.ndarray, np.ndarray] | None:  # fmt: skip
+        """See `ns_abstract.refine.protocol.SubBoxFrame` (design.md, U5, B14)."""
         if box.dimensions < 2:
             return None
         check_cancelled()
         forms = self.pose_set.enclosure(box, self.order)
-        cell = self.bounds.cell(
-            self.camera, forms, tiles, floor=self._floor, pixels=pixels, parts=counts, keep_parts=True
-        )
-        return part_ends(cell.parts, pixels)
+        projected = self.bounds.projected_box(self.camera, forms, box)
+        return part_ends(self.bounds.sub_boxes(self.camera, forms, projected, tiles, pixels, counts, ends), pixels)
 
     def _bound(
         self, box: ParameterBox, tiles: np.ndarray, within: VisibleContext | None, candidates: np.ndarray | None,

@@ -39,7 +39,7 @@ class BlendBounds(NamedTuple):
     brightest: Any
 
 
-class _Thresholds(NamedTuple):
+class Thresholds(NamedTuple):
     """Least alpha that may be drawn, and what larger ones are lowered to at least."""
 
     drawn: float
@@ -47,14 +47,14 @@ class _Thresholds(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _least(behind, color, a_low, a_high):
+def blend_least(behind, color, a_low, a_high):
     """Least of a fragment of ``color`` over what is at least ``behind`` (design.md, B7)."""
     v = color - behind
     return fma(where(v < 0.0, a_high, a_low), v, behind)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _most(behind, color, a_low, a_high):
+def blend_most(behind, color, a_low, a_high):
     """Most of a fragment of ``color`` over what is at most ``behind`` (design.md, B7)."""
     v = color - behind
     return fma(where(v > 0.0, a_high, a_low), v, behind)
@@ -62,18 +62,18 @@ def _most(behind, color, a_low, a_high):
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _least_moved(behind, color, brightest, a_low, a_high, move):
-    """`_least` of a fragment that may be drawn behind some of those listed behind it (design.md, B12, O2, O3).
+    """`blend_least` of a fragment that may be drawn behind some of those listed behind it (design.md, B12, O2, O3).
 
     ``brightest`` bounds their colours, ``move`` what the swap bound allows.
     """
-    front = _least(behind, color, a_low, a_high)
+    front = blend_least(behind, color, a_low, a_high)
     return maximum(front - move, minimum(front, fma(a_high, min(0.0, color - brightest), behind)))
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _most_moved(behind, color, darkest, a_low, a_high, move):
-    """`_most` of a fragment that may be drawn behind some of those listed behind it; see `_least_moved`."""
-    front = _most(behind, color, a_low, a_high)
+    """`blend_most` of a fragment that may be drawn behind some of those listed behind it; see `_least_moved`."""
+    front = blend_most(behind, color, a_low, a_high)
     return minimum(front + move, maximum(front, fma(a_high, max(0.0, color - darkest), behind)))
 
 
@@ -83,14 +83,14 @@ def blend_interval(behind, values, at, colors, ends):
     a_low, a_high = values[at + ALPHA_LOW], values[at + ALPHA_HIGH]
     c_low, c_high = load4(colors, ends), load4(colors, ends + 4)
     return BlendBounds(
-        _least(behind.low, c_low, a_low, a_high), _most(behind.high, c_high, a_low, a_high),
+        blend_least(behind.low, c_low, a_low, a_high), blend_most(behind.high, c_high, a_low, a_high),
         minimum(behind.darkest, c_low), maximum(behind.brightest, c_high),
     )  # fmt: skip
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _alphas_of_parts(values, at, part, inputs, thresholds):
-    """Least and most alpha of the fragment at ``at`` over eight parts of the cell from ``part`` on (design.md, B12)."""
+def part_exponents(values, at, part, inputs):
+    """Least and most exponent of the fragment at ``at`` over eight parts of the cell from ``part`` on (B12)."""
     middles, count = inputs.parts.middles, inputs.shape.parts
     e = at + EXPONENT
     zero = 0.0 * load8(middles, part)
@@ -106,6 +106,13 @@ def _alphas_of_parts(values, at, part, inputs, thresholds):
     near1, near2, far1, far2 = maximum(0.0, y1 - e1), maximum(0.0, y2 - e2), y1 + e1, y2 + e2
     nearest = minimum((0.5 * (1.0 - FRAGMENT_ROUNDING)) * fma(near1, near1, near2 * near2), EXPONENT_CUT)
     farthest = minimum((0.5 * UP) * fma(far1, far1, far2 * far2), EXPONENT_CUT)
+    return nearest, farthest
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def part_alphas(nearest, farthest, values, at, inputs, thresholds):
+    """Least and most alpha of the fragment at ``at`` over eight parts with these exponents (design.md, B12)."""
+    ends = at + exponent_ends(inputs.shape.monomials)
     high = minimum(values[ends + 3] * exp_kernel(-nearest), values[at + ALPHA_HIGH])
     low = minimum(values[ends + 2] * exp_kernel(-farthest), thresholds.most)
     low = maximum(where(low < values[ends + 4], 0.0, low), values[at + ALPHA_LOW])
@@ -166,9 +173,9 @@ def _ordered_end(value, start, stop, channel, side, block, alphas):
         at = 2 * PART_LANES * order[position]
         a_low, a_high = load8(alphas, at), load8(alphas, at + PART_LANES)
         if side == 0:
-            value = _least(value, keys[position], a_low, a_high)
+            value = blend_least(value, keys[position], a_low, a_high)
         else:
-            value = _most(value, -keys[position], a_low, a_high)
+            value = blend_most(value, -keys[position], a_low, a_high)
     return value
 
 
@@ -179,7 +186,7 @@ def _blend_eight(begin, end, part, reordered, block, inputs, slopes):
     values, colors, forms = fragments.values, palette.values, palette.forms
     alphas = offset_by(out, PART_ENDS + 6 * inputs.shape.parts)
     rules, charges = inputs.rules, inputs.charges
-    thresholds = _Thresholds(rules.alpha_min * (1.0 - charges.threshold), rules.alpha_max * (1.0 - charges.threshold))
+    thresholds = Thresholds(rules.alpha_min * (1.0 - charges.threshold), rules.alpha_max * (1.0 - charges.threshold))
     darkest = load4(palette.background, 0)
     brightest = darkest
     zero = 0.0 * load8(inputs.parts.middles, part)
@@ -201,7 +208,8 @@ def _blend_eight(begin, end, part, reordered, block, inputs, slopes):
             for byte in range(0, 8 * fragments.width, LINE):
                 prefetch(values, ahead, byte)
             at, key, move = listed_fragment(fragments, entry, forms)
-            a_low, a_high = _alphas_of_parts(values, at, part, inputs, thresholds)
+            nearest, farthest = part_exponents(values, at, part, inputs)
+            a_low, a_high = part_alphas(nearest, farthest, values, at, inputs, thresholds)
             c = key + color_ends(forms)
             if stop - start > 1:
                 store(alphas, 2 * PART_LANES * (entry - start), a_low)
@@ -219,12 +227,12 @@ def _blend_eight(begin, end, part, reordered, block, inputs, slopes):
                 high1 = _most_moved(high1, colors[c + 5], out[1], a_low, a_high, share * moves[move + 5])
                 high2 = _most_moved(high2, colors[c + 6], out[2], a_low, a_high, share * moves[move + 6])
             else:
-                low0 = _least(low0, colors[c], a_low, a_high)
-                low1 = _least(low1, colors[c + 1], a_low, a_high)
-                low2 = _least(low2, colors[c + 2], a_low, a_high)
-                high0 = _most(high0, colors[c + 4], a_low, a_high)
-                high1 = _most(high1, colors[c + 5], a_low, a_high)
-                high2 = _most(high2, colors[c + 6], a_low, a_high)
+                low0 = blend_least(low0, colors[c], a_low, a_high)
+                low1 = blend_least(low1, colors[c + 1], a_low, a_high)
+                low2 = blend_least(low2, colors[c + 2], a_low, a_high)
+                high0 = blend_most(high0, colors[c + 4], a_low, a_high)
+                high1 = blend_most(high1, colors[c + 5], a_low, a_high)
+                high2 = blend_most(high2, colors[c + 6], a_low, a_high)
             darkest, brightest = minimum(darkest, load4(colors, c)), maximum(brightest, load4(colors, c + 4))
         if moved and stop - start > 1:
             low0 = maximum(low0, _ordered_end(behind[0], start, stop, 0, 0, block, alphas))

@@ -40,7 +40,7 @@ ALPHA_LOW, ALPHA_HIGH, BEND, BEND_SPREAD, FORM = range(5)
 PART_ENDS = 16
 #: Where pixels are bounded over parts of the cell (B12), a fragment is bounds of alpha and then: centres of y1 and y2,
 #: their slopes, parameter by parameter, their radii over a part; alpha at exponent 0, at its least and its most; and
-#: the alpha below which the fragment may be skipped.
+#: the alpha below which the fragment may be skipped, and the exponent beyond which it is.
 EXPONENT = 2
 #: Exponents are cut here; exp(-60) is far below any threshold.
 EXPONENT_CUT = 60.0
@@ -220,7 +220,7 @@ def bends_of(shape):
 def fragment_width(shape):
     """Numbers of a fragment of forms of ``shape``: whole cache lines."""
     if shape.parts > 0:
-        return -(-(exponent_ends(shape.monomials) + 5) // 8) * 8
+        return -(-(exponent_limit(shape) + 1) // 8) * 8
     return -(-max(FORM + shape.monomials + 1 + bends_of(shape), crossing_column(shape) + 1) // 8) * 8
 
 
@@ -228,6 +228,12 @@ def fragment_width(shape):
 def exponent_ends(m):
     """Where in a fragment the radii stand that follow the exponent's slopes, see `EXPONENT`."""
     return EXPONENT + 2 * m
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def exponent_limit(shape):
+    """Where in a fragment the exponent stands beyond which alpha is below the threshold (B4), see `EXPONENT`."""
+    return exponent_ends(shape.monomials) + 5
 
 
 @njit(cache=True, error_model="numpy")
@@ -276,7 +282,7 @@ def set_unknown(fragments, at, high, m):
             values[at + k] = 0.0
         ends = at + exponent_ends(m)
         values[ends], values[ends + 1] = 0.0, 0.0
-        values[ends + 2], values[ends + 3], values[ends + 4] = (0.0, 1.0, 0.0)
+        values[ends + 2], values[ends + 3], values[ends + 4], values[ends + 5] = (0.0, 1.0, 0.0, EXPONENT_CUT)
         return
     for k in range(FORM + m + 1, FORM + m + 1 + fragments.bends):
         values[at + k] = 0.0

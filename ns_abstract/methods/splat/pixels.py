@@ -103,7 +103,7 @@ def _bound_block(numbers, place, inputs, block, bounds):
 
 
 @njit(cache=True, error_model="numpy")
-def _borrowed_inputs(inputs):
+def borrowed_inputs(inputs):
     """The `PixelInputs` without references to the arrays' owners."""
     gaussians, axes, colors, parts = inputs.gaussians, inputs.axes, inputs.colors, inputs.parts
     gaussians = ProjectedGaussians(
@@ -135,7 +135,7 @@ def _tile_bounds(bounds, number, thread):
 def _pixel_worker(share, lists, pixels, inputs, bounds):
     """One thread's tiles; see `ThreadShare` and `pixel_stage`."""
     sequence, counter = borrowed(share.sequence), pointer(share.counter)
-    inputs = _borrowed_inputs(inputs)
+    inputs = borrowed_inputs(inputs)
     camera = inputs.intrinsics
     side = bounds.lower.shape[1]
     tiles_x = int(math.ceil(camera.width / side))

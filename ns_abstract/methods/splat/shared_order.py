@@ -13,8 +13,8 @@ import numpy as np
 from ns_abstract.arithmetic.rounding import ORDER_ROUNDING, UP
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseForms
-from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.stage_data import ProjectedGaussians, ViewingAxes
+from ns_abstract.methods.splat.sub_box_bounds import SubBoxBounds
 from ns_abstract.refine.protocol import Bounds
 
 
@@ -33,7 +33,7 @@ _TUNING = SharedOrderTuning()
 class BoundedFrame(Protocol):
     """What a splat frame has, see `ns_abstract.methods.splat.frame.SplatFrame`."""
 
-    bounds: SplatBounds
+    bounds: SubBoxBounds
     order: int
 
     def bound(
@@ -44,7 +44,7 @@ class BoundedFrame(Protocol):
         ...
 
 
-class _SharedOrderBounds(SplatBounds):
+class _SharedOrderBounds(SubBoxBounds):
     """Bounds in one given order; or, while there is none, in all orders, with a record of what decides them.
 
     Attributes:
@@ -54,7 +54,7 @@ class _SharedOrderBounds(SplatBounds):
         slope: [m + 1, 3] the form of the viewing axis, its radius last.
     """
 
-    def __init__(self, bounds: SplatBounds) -> None:
+    def __init__(self, bounds: SubBoxBounds) -> None:
         super().__init__(bounds.splats, bounds.rasteriser, bounds.arithmetic, bounds.varied, bounds._sums)
         self.ranks: np.ndarray | None = None
 

@@ -136,6 +136,24 @@ class ProjectedGaussians(NamedTuple):
     depth_error: np.ndarray
 
 
+class ProjectedCell(NamedTuple):
+    """The candidates of a cell as its pixels see them, in memory that the next projection of the same lane takes.
+
+    Attributes:
+        candidates: [n] scene indices.
+        poses: Of the cell.
+        gaussians: Their forms.
+        alive: [k] places among the candidates of those that some pose shows.
+        colors: See `Colors.values`.
+    """
+
+    candidates: np.ndarray
+    poses: CellPoses
+    gaussians: ProjectedGaussians
+    alive: np.ndarray
+    colors: np.ndarray
+
+
 class ViewingAxes(NamedTuple):
     """How the camera looks over a cell.
 
@@ -245,6 +263,53 @@ def cell_parts(counts: np.ndarray, overlap: float = 0.0, levels: Sequence[float]
     squares = np.square(middles).sum(axis=1)
     slope = np.where(counts > 1, 0.5 / np.where(counts > 1, squares, 1.0), 0.0)
     return Parts(middles, 1.0 / counts + overlap, slope, np.array(levels, np.float64))
+
+
+class Strips(NamedTuple):
+    """Strips of `PART_LANES` sub-boxes of a cell, one after the other (design.md, B14).
+
+    Attributes:
+        middles: [d, room] at places in [-1, 1]; those beyond the last strip repeat it.
+        half: [d] by how much the middles of a strip's sub-boxes differ from the strip's.
+        room: Whole lanes of strips.
+    """
+
+    middles: np.ndarray
+    half: np.ndarray
+    room: int
+
+
+def strips_of(parts: Parts) -> Strips:
+    """Those of the sub-boxes ``parts``."""
+    lanes = parts.middles.reshape(parts.half.size, -1, PART_LANES)
+    low, high = lanes.min(axis=2), lanes.max(axis=2)
+    middles = 0.5 * (low + high)
+    room = -(-middles.shape[1] // PART_LANES) * PART_LANES
+    padding = np.repeat(middles[:, -1:], room - middles.shape[1], axis=1)
+    # dyadic, so exact
+    return Strips(np.ascontiguousarray(np.hstack([middles, padding])), (0.5 * (high - low)).max(axis=1), room)
+
+
+class ColorEnd(NamedTuple):
+    """One end of one channel of the Gaussians' colours over a cell (design.md, B14).
+
+    Attributes:
+        values: [n] the end of each Gaussian's colour.
+        sign: 1 for the most, -1 for the least.
+        channel: 0 to 2.
+        row: Where the end stands among the least of the three channels, then the most.
+        opposite: The other end of all colours of the channel and of the background.
+        bright: Greatest absolute value of any colour, at least 1.
+        most_alpha: Of any Gaussian.
+    """
+
+    values: np.ndarray
+    sign: float
+    channel: int
+    row: int
+    opposite: float
+    bright: float
+    most_alpha: float
 
 
 class PixelBounds(NamedTuple):

@@ -1,0 +1,129 @@
+"""Bounds of a splat scene's pixels over many sub-boxes of one cell (design.md, B12, B14)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ns_abstract.arithmetic.rounding import SUB_BOX_OVERLAP, UP
+from ns_abstract.execution.threads import lane, threads
+from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.poses import PoseForms
+from ns_abstract.geometry.tiles import laid_out, tile_grid
+from ns_abstract.methods.splat.bounds import SplatBounds
+from ns_abstract.methods.splat.lists import TileLists, pixel_sets, summed_area, tile_lists, tile_mask, touching
+from ns_abstract.methods.splat.stage_data import (
+    CellPoses,
+    ColorEnd,
+    Colors,
+    FormShape,
+    PixelInputs,
+    ProjectedCell,
+    ProjectedGaussians,
+    cell_parts,
+    form_shape,
+    strips_of,
+)
+from ns_abstract.methods.splat.unordered_pixels import unordered_stage
+
+
+class SubBoxBounds(SplatBounds):
+    """`SplatBounds` with bounds over sub-boxes; takes the same arguments."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._latest: dict[int, tuple[ParameterBox, ProjectedCell] | None] = {}
+
+    def _projected(
+        self, candidates: np.ndarray, poses: CellPoses, camera: PinholeCamera, shape: FormShape
+    ) -> tuple[ProjectedGaussians, np.ndarray]:
+        # it takes the memory of the last one
+        self._latest[lane()] = None
+        return super()._projected(candidates, poses, camera, shape)
+
+    def projected_box(self, camera: PinholeCamera, forms: PoseForms, box: ParameterBox) -> ProjectedCell:
+        """`project` all Gaussians over ``box`` with poses ``forms``, unless the lane's last projection was that."""
+        latest = self._latest.get(lane())
+        if latest is None or latest[0] != box:
+            latest = self._latest[lane()] = box, self.project(camera, forms)
+        return latest[1]
+
+    def sub_boxes(
+        self, camera: PinholeCamera, forms: PoseForms, projected: ProjectedCell, wanted: np.ndarray,
+        pixels: np.ndarray, counts: np.ndarray, ends: np.ndarray | None = None,
+    ) -> np.ndarray:  # fmt: skip
+        """Bounds [t, side, side, 6, k] of ``pixels`` of the tiles ``wanted`` over sub-boxes (design.md, B12, B14).
+
+        They are the least of the three channels, then the most. Ends that are no numbers bound nothing; what stands at
+        other pixels means nothing.
+
+        Args:
+            camera, forms, wanted, pixels: As of `cell`.
+            projected: What `project` returns of the cell.
+            counts: [d] sub-boxes along the cell's axes, powers of two, at least `PART_LANES` together.
+            ends: [n, 6] which ends of the ``n`` pixels are bounded whatever the order where too many orders are
+                uncertain; None: none.
+        """
+        cell = self.cell(camera, forms, wanted, pixels=pixels, parts=counts, keep_parts=True, projected=projected)
+        out = cell.parts
+        assert out is not None
+        if ends is not None and cell.statistics[3]:
+            unknown = (out[pixels][:, :3] == 0.0).all(axis=(1, 2)) & (out[pixels][:, 3:] == 1.0).all(axis=(1, 2))
+            self.unordered(camera, forms, projected, wanted, pixels, counts, ends & unknown[:, None], out)
+        return out
+
+    def unordered(
+        self, camera: PinholeCamera, forms: PoseForms, projected: ProjectedCell, wanted: np.ndarray,
+        pixels: np.ndarray, counts: np.ndarray, ends: np.ndarray, out: np.ndarray,
+    ) -> None:  # fmt: skip
+        """Write those ``ends`` [n, 6] of the ``n`` pixels to ``out`` that hold in every depth order (design.md, B14).
+
+        Other arguments are those of `sub_boxes`.
+        """
+        across, down = tile_grid(camera, self.side)
+        shape = form_shape(forms.rotation.basis, int(counts.prod()))
+        _, poses, gaussians, alive, colors = projected
+        inputs = PixelInputs(
+            gaussians, self._viewing_axes(forms, poses.rotation_magnitude, gaussians), camera.intrinsics,
+            Colors(colors, self.splats.background, self._sums.color_radius, 3, np.zeros(shape.monomials + 1)),
+            self.rules, self.charges, self._cutoffs(-1.0, 1), shape, cell_parts(counts, SUB_BOX_OVERLAP),
+        )  # fmt: skip
+        chosen = np.zeros((across * down, self.side, self.side), bool)
+        chosen[wanted] = pixels
+        # a pixel's middle lies half a pixel behind its number; what is not a number leaves nothing out
+        box, size = gaussians.box[alive], np.repeat([across, down], 2) * self.side
+        reach = np.where(np.isnan(box), [0, np.inf] * 2, np.floor(box + [-0.5, 1.5] * 2)).clip(0, size).astype(np.int32)
+        touched = touching(np.arange(alive.size), reach, summed_area(laid_out(chosen, across)))
+        alive, reach = alive[touched], reach[touched]
+        most_alpha = min(self.rules.alpha_max, float(self._sums.gaussians.opacity_high.max(initial=0.0)))
+        color_ends = _color_ends(colors, alive, self.splats.background, most_alpha * (1.0 + self.charges.threshold))
+        for row in np.flatnonzero(ends.any(axis=0)).tolist():
+            some, end = np.zeros(pixels.shape, bool), color_ends[row]
+            some[pixels] = ends[:, row]
+            chosen[wanted] = some
+            order = alive[touching(np.arange(alive.size), reach, summed_area(laid_out(chosen, across)))]
+            order = order[np.argsort(-end.sign * end.values[order], kind="stable")]
+            shown = tile_mask(wanted[some.any(axis=(1, 2))], across * down)
+            lists = TileLists(wanted, *tile_lists(order, gaussians.tiles, shown, across))
+            unordered_stage(
+                lists, pixel_sets(some, wanted.size, self.side), inputs, strips_of(inputs.parts), end, threads(), out
+            )
+
+
+def _color_ends(colors: np.ndarray, alive: np.ndarray, background: np.ndarray, most_alpha: float) -> list[ColorEnd]:
+    """The least of the three channels of rows ``alive`` of `Colors.values`, then the most."""
+    parts = colors[alive].reshape(alive.size, 3, colors.shape[1] // 3)
+    spread = np.abs(parts[..., 1:]).sum(axis=-1) * UP
+    low, high = parts[..., 0] - spread, parts[..., 0] + spread
+    darkest = np.minimum(low.min(axis=0, initial=np.inf), background)
+    brightest = np.maximum(high.max(axis=0, initial=-np.inf), background)
+    bright = max(1.0, float(brightest.max()), -float(darkest.min()))
+    ends = []
+    for row in range(6):
+        channel, values = row % 3, np.empty(len(colors))
+        values[alive] = (low, high)[row // 3][:, channel]
+        opposite = (brightest, darkest)[row // 3][channel]
+        ends.append(ColorEnd(values, (-1.0, 1.0)[row // 3], channel, row, float(opposite), bright, most_alpha))
+    return ends

@@ -1,0 +1,119 @@
+"""Bounds over sub-boxes that hold in every depth order, at tolerance zero (docs/dev/design.md, B14)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from test_bounds import Case, moves, scene
+
+from ns_abstract.arithmetic.rounding import FLOAT32
+from ns_abstract.geometry.tiles import assemble, tile_grid
+from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
+from ns_abstract.methods.splat.stage_data import PART_LANES, cell_parts, strips_of
+from ns_abstract.methods.splat.sub_box_bounds import SubBoxBounds
+
+COUNTS = np.array([4, 8])
+BACKGROUNDS = ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0), (0.5, 0.4, 0.6))
+
+
+def stack(seed: int, background: tuple[float, float, float], count: int = 60) -> Case:
+    """Many layers at nearly one depth, some of them opaque, whose order depends on the pose."""
+    generator = np.random.default_rng(seed)
+    layers = [
+        {
+            "mean": (*generator.uniform(-1.0, 1.0, 2), generator.uniform(-5.2, -4.8)),
+            "scale": generator.uniform(0.1, 1.2),
+            "opacity": generator.choice([0.02, 0.3, 0.9, 0.998]),
+            "color": generator.uniform(0.0, 1.3, 3),
+        }
+        for _ in range(count)
+    ]
+    return Case(scene(*layers, background=background), moves(x=0.15, yaw=0.04))
+
+
+def ends_of(case: Case) -> np.ndarray:
+    """[H, W, 2, 3, parts] ends over the sub-boxes of the whole set, in every order."""
+    bounds, forms = SubBoxBounds(case.splats, GSPLAT_1_4_0, FLOAT32), case.poses.enclosure(case.poses.box, 1)
+    tiles = np.arange(math.prod(tile_grid(case.camera, bounds.side)))
+    pixels = np.ones((tiles.size, bounds.side, bounds.side), bool)
+    out = np.full((*pixels.shape, 6, COUNTS.prod()), np.nan)
+    projected = bounds.project(case.camera, forms)
+    bounds.unordered(
+        case.camera, forms, projected, tiles, pixels, COUNTS, np.ones((pixels.sum(), 6), bool), out
+    )  # fmt: skip
+    ends = assemble(out.reshape(*pixels.shape, -1), case.camera)
+    return ends.reshape(*ends.shape[:2], 2, 3, -1)
+
+
+@pytest.mark.parametrize("number", range(len(BACKGROUNDS)))
+def test_bounds_hold_every_order_of_random_stacks(number):
+    """Pictures of random poses of each sub-box lie in its bounds, which say something."""
+    generator, parts = np.random.default_rng(number), cell_parts(COUNTS)
+    for seed in range(3):
+        case = stack(seed, BACKGROUNDS[number])
+        ends = ends_of(case)
+        assert np.isfinite(ends).all()
+        for part in range(parts.middles.shape[1]):
+            for place in (
+                parts.middles[:, part],
+                parts.middles[:, part] + parts.half * generator.uniform(-1.0, 1.0, 2),
+            ):
+                image = case.image(case.poses.box.at(place)).clip(0.0, 1.0)
+                assert (ends[:, :, 0, :, part].clip(0.0, 1.0) <= image).all(), (seed, part)
+                assert (image <= ends[:, :, 1, :, part].clip(0.0, 1.0)).all(), (seed, part)
+        width = np.diff(ends.clip(0.0, 1.0), axis=2)
+        assert width.mean() < 0.95
+
+
+def test_strips_hold_what_their_sub_boxes_reach():
+    """A small layer that some sub-box shows is drawn there, wherever it lies among those of a strip."""
+    case = Case(
+        scene({"mean": (0.3, 0.1, -5.0), "scale": 0.05, "opacity": 0.95, "color": (1.0, 0.7, 0.4)}),
+        moves(x=0.6, yaw=0.02),
+    )
+    ends, parts, shown = ends_of(case), cell_parts(COUNTS), 0
+    for part in range(parts.middles.shape[1]):
+        image = case.image(case.poses.box.at(parts.middles[:, part]))
+        assert (ends[:, :, 0, :, part].clip(0.0, 1.0) <= image).all()
+        assert (image <= ends[:, :, 1, :, part].clip(0.0, 1.0)).all()
+        shown += int((image > 0.1).any())
+    assert shown > 16
+
+
+@pytest.mark.parametrize("counts", [(4, 8), (8, 4), (1, 8), (2, 64), (16, 2)])
+def test_strips_cover_their_sub_boxes(counts):
+    """The middles of a strip's sub-boxes lie within its half-width, exactly."""
+    parts = cell_parts(np.array(counts))
+    strips = strips_of(parts)
+    lanes = parts.middles.reshape(2, -1, PART_LANES)
+    away = np.abs(lanes - strips.middles[:, : lanes.shape[1], None])
+    assert (away <= strips.half[:, None, None]).all()
+    assert strips.middles.shape[1] == strips.room and strips.room % PART_LANES == 0
+
+
+def test_the_latest_projection_is_kept_until_its_memory_is_taken():
+    """Rounds of one box share a projection; another projection of the lane ends that."""
+    case = stack(0, BACKGROUNDS[0], 8)
+    bounds, box = SubBoxBounds(case.splats, GSPLAT_1_4_0, FLOAT32), case.poses.box
+    forms = case.poses.enclosure(box, 1)
+    first = bounds.projected_box(case.camera, forms, box)
+    assert bounds.projected_box(case.camera, forms, box) is first
+    bounds.cell(case.camera, forms)
+    assert bounds.projected_box(case.camera, forms, box) is not first
+    half = box.split(0, 2)[0]
+    other = bounds.projected_box(case.camera, case.poses.enclosure(half, 1), half)
+    assert other is not bounds.projected_box(case.camera, forms, box)
+
+
+def test_pixels_that_nothing_reaches_show_the_background():
+    """No fragment reaches a corner: its bounds are the background, up to their charge."""
+    case = Case(
+        scene({"mean": (0.0, 0.0, 5.0), "scale": 0.05, "opacity": 0.95}, background=BACKGROUNDS[2]),
+        moves(x=0.1, yaw=0.02),
+    )
+    ends = ends_of(case)
+    background = np.array(BACKGROUNDS[2])[:, None]
+    assert (ends[:, :, 0] <= background).all() and (background <= ends[:, :, 1]).all()
+    assert np.abs(ends - background).max() < 1e-4
