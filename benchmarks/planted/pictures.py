@@ -58,7 +58,7 @@ PICTURES = (
     ),
     Fault(
         "measures: parts are looked at in their middles", _MEASURES, "PlaneSets.over",
-        "sign * (parts.halves @ np.abs(a).T)", "0.0", _INSIDE,
+        "sign * (parts.halves @ np.abs(slopes))", "0.0", _INSIDE,
     ),
     Fault(
         "measures: a difference takes the lower side of both", _MEASURES, "Measure.bounds", "low - taken[1]",

@@ -19,12 +19,13 @@ from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.representation import ProgramOptions, Representation
 from ns_abstract.methods.runs import RunConfig
 from ns_abstract.methods.splat.activate import SH_C0, Splats, activate
-from ns_abstract.methods.splat.bounds import SceneSums, SplatBounds
+from ns_abstract.methods.splat.bounds import SceneSums
 from ns_abstract.methods.splat.constants import VERSIONS, Rasteriser, raster_rules, rasteriser_named
 from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.load import load_run, load_scene
 from ns_abstract.methods.splat.scene import SplatScene
 from ns_abstract.methods.splat.stage_data import ProjectedGaussians, ViewingAxes
+from ns_abstract.methods.splat.sub_box_bounds import SubBoxBounds
 from ns_abstract.methods.splat.variations import VariedSplats, vary
 from ns_abstract.methods.splat.weights import SplatWeightFrame, WhiteGaussians, plane_mask
 from ns_abstract.perturbation.specification import Perturbation
@@ -252,7 +253,7 @@ class CauseTuning:
 _TUNING = CauseTuning()
 
 
-class _OrderedBounds(SplatBounds):
+class _OrderedBounds(SubBoxBounds):
     """Bounds that assume the depth order of the cell's middle."""
 
     def _viewing_axes(
