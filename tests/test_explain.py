@@ -20,8 +20,8 @@ from ns_abstract.cli import render as render_command
 from ns_abstract.geometry.keyframe_cameras import KeyframeCamera, look_at
 from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.methods.program_options import ProgramOptions
-from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.scene import SplatScene
+from ns_abstract.methods.splat.sub_box_bounds import SubBoxBounds
 from ns_abstract.refine.engine import RefinementGoal
 
 Make = Callable[..., Inputs]
@@ -114,7 +114,7 @@ def test_the_gaussian_that_holds_most(make_blobs: Make) -> None:
     assert found.elements[0][0] == 17 and found.elements[0][1] > 0.3
     assert found.regions[0][1:] == (0, 16, 0, 16) and found.regions[0][0] == pytest.approx(1.0)
     frame: Any = job.frame(0)
-    assert type(frame.bounds) is SplatBounds
+    assert type(frame.bounds) is SubBoxBounds
 
 
 def test_a_single_pose_has_nothing_to_explain(make_blobs: Make) -> None:

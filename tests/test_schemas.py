@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 from test_corpus import LOOP, PREPROCESS, ROWS
 from test_keys import SET
 
@@ -117,6 +118,7 @@ def taken(kind: str, value: Any, folder: Path) -> bool:
 def folder(tmp_path: Path) -> Path:
     lines = "(declare-const Y_0 Real)(declare-const Y_1 Real)(assert (<= Y_0 Y_1))"
     (tmp_path / "unsafe.vnnlib").write_text(lines)
+    Image.new("L", (32, 32), 255).save(tmp_path / "mask.png")
     return tmp_path
 
 

@@ -192,11 +192,11 @@ class Request:
     budget: float
     resume: bool = False
     report: bool = True
-    rows: bool = True
     scene_margin: bool = False
     on_open: Callable[[Store], object] = lambda store: None
     on_progress: Callable[[Any], object] = lambda progress: None
     on_margin: Callable[[SceneMargin], object] = lambda margin: None
+    rows: bool = True
 
 
 @dataclass
