@@ -664,7 +664,7 @@ SPLATS = (
     Fault(
         "parts: both squares move as the first",
         _INTERVALS,
-        "part_exponents",
+        "part_alphas",
         "fma(middle, values[e + 1], y2)",
         "fma(middle, values[e], y2)",
         "test_intervals.py::test_blends_over_parts_hold_every_exact_blend[0.3-counts0]",
@@ -672,7 +672,7 @@ SPLATS = (
     Fault(
         "parts: the least exponent is that of the middle",
         _INTERVALS,
-        "part_exponents",
+        "part_alphas",
         "maximum(0.0, y1 - e1)",
         "y1",
         "test_intervals.py::test_one_fragment_over_parts",

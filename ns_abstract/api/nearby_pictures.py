@@ -284,8 +284,8 @@ class NearbyPictures:
             whole = in_tiles(still, frame.side)
             tiles = np.flatnonzero(whole.any(axis=(1, 2)))
             elements.append(DrawnElements(tiles, whole[tiles], one.context))
-        known = KnownBox(lower, upper, still, tuple(elements))
-        return NearbyPictures(self._pictures, self._weights, known, (), self._measures, self._motion)
+        narrower = KnownBox(lower, upper, still, tuple(elements))
+        return NearbyPictures(self._pictures, self._weights, narrower, (), self._measures, self._motion)
 
     def _no_ends(self, counts: np.ndarray) -> SubBoxEnds:
         """Ends over ``counts`` [d] sub-boxes of the pixels that are not settled, all zeros."""

@@ -242,7 +242,7 @@ class SplatBounds:
         camera: PinholeCamera,
         forms: PoseForms,
         wanted: np.ndarray | None = None,
-        candidates: np.ndarray | None = None,
+        candidates: np.ndarray | ProjectedCell | None = None,
         keep_linear: bool = False,
         floor: float = -1.0,
         layers: bool = False,
@@ -250,7 +250,6 @@ class SplatBounds:
         parts: np.ndarray | None = None,
         keep_parts: bool = False,
         sub_boxes: SubBoxes | None = None,
-        projected: ProjectedCell | None = None,
     ) -> CellBounds:
         """Bounds of the tiles ``wanted`` over the poses enclosed by ``forms`` (design.md, G10).
 
@@ -258,7 +257,8 @@ class SplatBounds:
             camera: Intrinsics and size.
             forms: The cell's poses.
             wanted: Tile numbers; all if None.
-            candidates: Scene indices that may be visible there (from an enclosing cell); all if None.
+            candidates: Scene indices that may be visible there (from an enclosing cell), or what `project` returned of
+                the cell, if that is known; all if None.
             keep_linear: Whether to return the linear sets.
             floor: What no more light comes to may have any colour that is there (B6); negative, and for rasterisers
                 without a stop: every layer counts.
@@ -268,7 +268,6 @@ class SplatBounds:
                 pixels by intervals over each of them, not by forms (B12).
             keep_parts: Whether to return bounds over each of these parts.
             sub_boxes: Bound pixels by forms over each of these, too, and return these bounds as ``parts`` (B13).
-            projected: What `project` returned of the cell, if that is known; then of its candidates.
 
         Raises:
             ValueError: Linear sets, layers or ``sub_boxes`` are asked for together with ``parts``, or numbers of parts
@@ -280,8 +279,7 @@ class SplatBounds:
         with_ends = keep_parts or sub_boxes is not None
         across, down = tile_grid(camera, self.side)
         wanted = np.asarray(np.arange(across * down) if wanted is None else wanted, np.int64)
-        if projected is None:
-            projected = self.project(camera, forms, candidates)
+        projected = candidates if isinstance(candidates, ProjectedCell) else self.project(camera, forms, candidates)
         candidates, poses, gaussians, alive, colors = projected
         offsets, entries = tile_lists(
             self._listed(alive, candidates, gaussians), gaussians.tiles, tile_mask(wanted, across * down), across

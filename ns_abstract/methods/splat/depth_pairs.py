@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from ns_abstract.arithmetic.rounding import ORDER_ROUNDING, TURN_ROOM, UP, WINDOW_ROUNDING
-from ns_abstract.arithmetic.simd.intrinsics import offset_by, prefetch
+from ns_abstract.arithmetic.simd.intrinsics import offset_by, pointer, prefetch
 from ns_abstract.methods.splat.lists import AHEAD
 from ns_abstract.methods.splat.reached_pixels import pixels_at, pixels_once
 
@@ -43,6 +43,18 @@ class BlockList(NamedTuple):
     x0: int
     y0: int
     m: int
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def block_list(numbers, place, inputs):
+    """The `BlockList` of the Gaussians ``numbers`` (rows of ``inputs.gaussians``) at a block's ``place``."""
+    gaussians, axes, colors = inputs.gaussians, inputs.axes, inputs.colors.values
+    return BlockList(
+        pointer(numbers), numbers.size, pointer(gaussians.record), gaussians.record.shape[1], pointer(gaussians.box),
+        pointer(gaussians.tiles), pointer(gaussians.delta), pointer(gaussians.depth_error), pointer(axes.depth),
+        axes.tied, pointer(colors), colors.shape[1], colors.shape[1] // inputs.colors.channels, place.x0, place.y0,
+        inputs.shape.monomials,
+    )  # fmt: skip
 
 
 class DepthWindow(NamedTuple):

@@ -15,7 +15,7 @@ from ns_abstract.arithmetic.rounding import UP
 from ns_abstract.arithmetic.simd.intrinsics import lowest_bit, offset_by, pointer, prefetch, signed
 from ns_abstract.arithmetic.simd.lanes import load8, store
 from ns_abstract.methods.splat.alphas import alphas
-from ns_abstract.methods.splat.depth_pairs import BlockList, DepthWindow, depth_radii, find_pairs
+from ns_abstract.methods.splat.depth_pairs import DepthWindow, block_list, depth_radii, find_pairs
 from ns_abstract.methods.splat.lists import BLOCK, PIXELS
 from ns_abstract.methods.splat.pixel_block import (
     ALPHA_HIGH,
@@ -341,14 +341,9 @@ def collect_fragments(numbers, place, inputs, block, marks_):
     to a stop that the kept fragments ignore.
     """
     fragments, entries, reordering, batch = block.fragments, block.entries, block.reordering, block.batch
-    gaussians, charges, m = inputs.gaussians, inputs.charges, inputs.shape.monomials
+    charges, m = inputs.charges, inputs.shape.monomials
     colors, channels, marks = inputs.colors.values, inputs.colors.channels, pointer(marks_)
-    listed = BlockList(
-        pointer(numbers), numbers.size, pointer(gaussians.record), gaussians.record.shape[1], pointer(gaussians.box),
-        pointer(gaussians.tiles), pointer(gaussians.delta), pointer(gaussians.depth_error),
-        pointer(inputs.axes.depth), inputs.axes.tied, pointer(colors), colors.shape[1], colors.shape[1] // channels,
-        place.x0, place.y0, m,
-    )  # fmt: skip
+    listed = block_list(numbers, place, inputs)
     length, capacity, color_columns = listed.length, fragments.capacity, colors.shape[1]
     stop_light, step = inputs.rules.transmittance_min, charges.transmittance
     stop = _EarlyTermination(

@@ -47,6 +47,13 @@ class Thresholds(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
+def thresholds_of(inputs):
+    """The `Thresholds` of a cell's rules in every evaluation (design.md, B4)."""
+    rules, room = inputs.rules, 1.0 - inputs.charges.threshold
+    return Thresholds(rules.alpha_min * room, rules.alpha_max * room)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
 def blend_least(behind, color, a_low, a_high):
     """Least of a fragment of ``color`` over what is at least ``behind`` (design.md, B7)."""
     v = color - behind
@@ -89,8 +96,8 @@ def blend_interval(behind, values, at, colors, ends):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def part_exponents(values, at, part, inputs):
-    """Least and most exponent of the fragment at ``at`` over eight parts of the cell from ``part`` on (B12)."""
+def part_alphas(values, at, part, inputs, thresholds):
+    """Least and most alpha of the fragment at ``at`` over eight parts of the cell from ``part`` on (design.md, B12)."""
     middles, count = inputs.parts.middles, inputs.shape.parts
     e = at + EXPONENT
     zero = 0.0 * load8(middles, part)
@@ -106,13 +113,6 @@ def part_exponents(values, at, part, inputs):
     near1, near2, far1, far2 = maximum(0.0, y1 - e1), maximum(0.0, y2 - e2), y1 + e1, y2 + e2
     nearest = minimum((0.5 * (1.0 - FRAGMENT_ROUNDING)) * fma(near1, near1, near2 * near2), EXPONENT_CUT)
     farthest = minimum((0.5 * UP) * fma(far1, far1, far2 * far2), EXPONENT_CUT)
-    return nearest, farthest
-
-
-@njit(cache=True, error_model="numpy", forceinline=True)
-def part_alphas(nearest, farthest, values, at, inputs, thresholds):
-    """Least and most alpha of the fragment at ``at`` over eight parts with these exponents (design.md, B12)."""
-    ends = at + exponent_ends(inputs.shape.monomials)
     high = minimum(values[ends + 3] * exp_kernel(-nearest), values[at + ALPHA_HIGH])
     low = minimum(values[ends + 2] * exp_kernel(-farthest), thresholds.most)
     low = maximum(where(low < values[ends + 4], 0.0, low), values[at + ALPHA_LOW])
@@ -185,8 +185,7 @@ def _blend_eight(begin, end, part, reordered, block, inputs, slopes):
     fragments, palette, moves, out = block.fragments, block.palette, block.reordering.moves, block.part_ends
     values, colors, forms = fragments.values, palette.values, palette.forms
     alphas = offset_by(out, PART_ENDS + 6 * inputs.shape.parts)
-    rules, charges = inputs.rules, inputs.charges
-    thresholds = Thresholds(rules.alpha_min * (1.0 - charges.threshold), rules.alpha_max * (1.0 - charges.threshold))
+    thresholds = thresholds_of(inputs)
     darkest = load4(palette.background, 0)
     brightest = darkest
     zero = 0.0 * load8(inputs.parts.middles, part)
@@ -208,8 +207,7 @@ def _blend_eight(begin, end, part, reordered, block, inputs, slopes):
             for byte in range(0, 8 * fragments.width, LINE):
                 prefetch(values, ahead, byte)
             at, key, move = listed_fragment(fragments, entry, forms)
-            nearest, farthest = part_exponents(values, at, part, inputs)
-            a_low, a_high = part_alphas(nearest, farthest, values, at, inputs, thresholds)
+            a_low, a_high = part_alphas(values, at, part, inputs, thresholds)
             c = key + color_ends(forms)
             if stop - start > 1:
                 store(alphas, 2 * PART_LANES * (entry - start), a_low)

@@ -64,6 +64,14 @@ class BlockPlace(NamedTuple):
     wanted: int
 
 
+@njit(cache=True, error_model="numpy", forceinline=True)
+def block_place(tile_x, tile_y, b, side, wanted):
+    """The `BlockPlace` of block ``b``, row by row, of a tile of ``side`` pixels."""
+    blocks = side // BLOCK
+    x0, y0 = tile_x * side + (b % blocks) * BLOCK, tile_y * side + (b // blocks) * BLOCK
+    return BlockPlace(x0, y0, tile_x, tile_y, wanted)
+
+
 class Fragments(NamedTuple):
     """The fragments of a block's pixels.
 

@@ -17,7 +17,7 @@ from ns_abstract.methods.splat.block_buffers import block_of, new_buffers, resiz
 from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW, DEPTH_HIGH, DEPTH_LOW, shade_layers
 from ns_abstract.methods.splat.fragments import GIVE_UP, GROW, apply_stops, collect_fragments, number_groups
 from ns_abstract.methods.splat.lists import BLOCK, TileLists, block_lists, longest_first
-from ns_abstract.methods.splat.pixel_block import BlockPlace, longest_list
+from ns_abstract.methods.splat.pixel_block import block_place, longest_list
 from ns_abstract.methods.splat.reordering import swap_bounds
 from ns_abstract.methods.splat.stage_data import (
     Colors,
@@ -159,8 +159,7 @@ def _pixel_worker(share, lists, pixels, inputs, bounds):
             tile_y * side, side, block_offsets, block_entries,
         )  # fmt: skip
         for b in range(blocks * blocks):
-            x0, y0 = tile_x * side + (b % blocks) * BLOCK, tile_y * side + (b // blocks) * BLOCK
-            place = BlockPlace(x0, y0, tile_x, tile_y, pixels[number, b])
+            place = block_place(tile_x, tile_y, b, side, pixels[number, b])
             if place.x0 >= camera.width or place.y0 >= camera.height:
                 continue
             numbers = block_entries[block_offsets[b] : block_offsets[b + 1]]

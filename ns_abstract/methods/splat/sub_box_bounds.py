@@ -66,7 +66,7 @@ class SubBoxBounds(SplatBounds):
             ends: [n, 6] which ends of the ``n`` pixels are bounded whatever the order where too many orders are
                 uncertain; None: none.
         """
-        cell = self.cell(camera, forms, wanted, pixels=pixels, parts=counts, keep_parts=True, projected=projected)
+        cell = self.cell(camera, forms, wanted, projected, pixels=pixels, parts=counts, keep_parts=True)
         out = cell.parts
         assert out is not None
         if ends is not None and cell.statistics[3]:

@@ -17,11 +17,11 @@ from ns_abstract.arithmetic.rounding import FRAGMENT_ROUNDING, SECOND_ORDER, UP
 from ns_abstract.arithmetic.simd.intrinsics import borrowed, lowest_bit, pointer, signed, taken
 from ns_abstract.arithmetic.simd.lanes import bits, load8, maximum, store
 from ns_abstract.methods.splat.block_buffers import block_of, new_buffers, resized
-from ns_abstract.methods.splat.depth_pairs import BlockList
+from ns_abstract.methods.splat.depth_pairs import block_list
 from ns_abstract.methods.splat.fragments import find_alphas, place_batch
-from ns_abstract.methods.splat.intervals import Thresholds, blend_least, blend_most, part_alphas, part_exponents
+from ns_abstract.methods.splat.intervals import blend_least, blend_most, part_alphas, thresholds_of
 from ns_abstract.methods.splat.lists import BLOCK, PIXELS, TileLists, block_lists, longest_first
-from ns_abstract.methods.splat.pixel_block import BATCH, EXPONENT, BlockPlace, exponent_ends, exponent_limit
+from ns_abstract.methods.splat.pixel_block import BATCH, EXPONENT, block_place, exponent_ends, exponent_limit
 from ns_abstract.methods.splat.pixels import borrowed_inputs
 from ns_abstract.methods.splat.stage_data import PART_LANES, ColorEnd, PixelInputs, Strips
 from ns_abstract.methods.splat.work_sharing import run_by_tiles
@@ -133,8 +133,7 @@ def _add_in_front(values, at, color, q, met, thresholds, inputs, sums):
     while met != 0:
         strip = lowest_bit(met)
         met &= met - 1
-        nearest, farthest = part_exponents(values, at, PART_LANES * strip, inputs)
-        _, high = part_alphas(nearest, farthest, values, at, inputs, thresholds)
+        _, high = part_alphas(values, at, PART_LANES * strip, inputs, thresholds)
         place = PART_LANES * (q * sums.strips + strip)
         light = load8(sums.light, place)
         store(sums.colors, place, fma(light * high, color, load8(sums.colors, place)))
@@ -153,8 +152,7 @@ def _add_behind(values, at, color, sign, q, met, thresholds, inputs, sums):
     while met != 0:
         strip = lowest_bit(met)
         met &= met - 1
-        nearest, farthest = part_exponents(values, at, PART_LANES * strip, inputs)
-        low, high = part_alphas(nearest, farthest, values, at, inputs, thresholds)
+        low, high = part_alphas(values, at, PART_LANES * strip, inputs, thresholds)
         place = PART_LANES * (q * sums.strips + strip)
         behind = load8(sums.behind, place)
         store(sums.boldest, place, maximum(load8(sums.boldest, place), high))
@@ -196,15 +194,8 @@ def _add_batch(start, some, live, front, listed, place, thresholds, inputs, bloc
 @njit(cache=True, error_model="numpy")
 def _bound_block(numbers, place, inputs, block, strips, color_end, out, sums):
     """Write one end of the pixels of a block over each sub-box (design.md, B14)."""
-    listed = BlockList(
-        pointer(numbers), numbers.size, pointer(inputs.gaussians.record), inputs.gaussians.record.shape[1],
-        pointer(inputs.gaussians.box), pointer(inputs.gaussians.tiles), pointer(inputs.gaussians.delta),
-        pointer(inputs.gaussians.depth_error), pointer(inputs.axes.depth), inputs.axes.tied,
-        pointer(inputs.colors.values), inputs.colors.values.shape[1],
-        inputs.colors.values.shape[1] // inputs.colors.channels, place.x0, place.y0, inputs.shape.monomials,
-    )  # fmt: skip
-    charges, rules = inputs.charges, inputs.rules
-    thresholds = Thresholds(rules.alpha_min * (1.0 - charges.threshold), rules.alpha_max * (1.0 - charges.threshold))
+    listed = block_list(numbers, place, inputs)
+    thresholds = thresholds_of(inputs)
     background, sign, length = inputs.colors.background[color_end.channel], color_end.sign, listed.length
     _start(signed(place.wanted), background, sums)
     for k in range(length):
@@ -217,11 +208,11 @@ def _bound_block(numbers, place, inputs, block, strips, color_end, out, sums):
             front = middle + 1
         else:
             past = middle
-    live, seen = signed(place.wanted), 0
-    while seen < front and live != 0:
-        some = min(BATCH, front - seen)
-        live = _add_batch(seen, some, live, True, listed, place, thresholds, inputs, block, strips, color_end, sums)
-        seen += some
+    live, start = signed(place.wanted), 0
+    while start < front and live != 0:
+        some = min(BATCH, front - start)
+        live = _add_batch(start, some, live, True, listed, place, thresholds, inputs, block, strips, color_end, sums)
+        start += some
     past = length
     while past > front and live != 0:
         some = min(BATCH, past - front)
@@ -293,8 +284,7 @@ def _unordered_worker(share, lists, pixels, inputs, strips, color_end, out):
             tile_y * side, side, block_offsets, block_entries,
         )  # fmt: skip
         for b in range(blocks * blocks):
-            x0, y0 = tile_x * side + (b % blocks) * BLOCK, tile_y * side + (b // blocks) * BLOCK
-            place = BlockPlace(x0, y0, tile_x, tile_y, pixels[number, b])
+            place = block_place(tile_x, tile_y, b, side, pixels[number, b])
             if place.wanted == 0 or place.x0 >= camera.width or place.y0 >= camera.height:
                 continue
             numbers = block_entries[block_offsets[b] : block_offsets[b + 1]]
