@@ -103,6 +103,18 @@ def test_a_layer_over_a_more_extreme_one_covers_as_much_as_it_may(near, far):
     assert_holds(case, ends_of(case))
 
 
+@pytest.mark.parametrize(("color", "behind"), [(0.0, 1.0), (1.0, 0.0)])
+def test_a_stop_shows_what_two_layers_would_hide(color, behind):
+    """The second of two opaque layers is not drawn: a stop leaves the background two hundredths at most."""
+    layer = {"scale": 6.0, "opacity": 0.995, "color": (color,) * 3}
+    layers = [layer | {"mean": (0.0, 0.0, -5.0 - 0.1 * k)} for k in range(2)]
+    case = Case(scene(*layers, background=(behind,) * 3), moves(x=0.01, yaw=0.001))
+    ends = ends_of(case)
+    assert_holds(case, ends)
+    assert np.abs(case.image(case.poses.box.at(np.zeros(2))) - color).max() > 4e-3
+    assert np.abs(ends - color).max() < 0.03
+
+
 def test_strips_hold_what_their_sub_boxes_reach():
     """A small layer that some sub-box shows is drawn there, wherever it lies among those of a strip."""
     case = Case(

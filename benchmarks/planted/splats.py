@@ -731,7 +731,7 @@ SPLATS = (
         "_write",
         "_lost_light(stop, sums.boldest[at])",
         "0.0",
-        "test_bounds.py::test_stop[1]",
+        "test_unordered.py::test_a_stop_shows_what_two_layers_would_hide[0.0-1.0]",
     ),
     Fault(
         "parts: only the first eight count",
