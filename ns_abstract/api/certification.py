@@ -22,7 +22,7 @@ from ns_abstract.api.network_question import Question
 from ns_abstract.api.picture_question import PictureQuestion
 from ns_abstract.arithmetic.forms import MAX_DIMENSIONS
 from ns_abstract.execution.cancellation import cancel_when
-from ns_abstract.execution.worker_cache import Recipe
+from ns_abstract.execution.worker_cache import Recipe, built
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.assumptions import Assumption
@@ -133,7 +133,10 @@ class Certification:
     @property
     def recipe(self) -> Recipe[Certification]:
         question = self.question
-        again = partial(_open, self.job.recipe.open, question.absolute(), self.memory, self.arithmetic, self.picture)
+        parts = self.job.recipe.open, question.absolute()
+        again = partial(
+            built, Certification, parts, self.memory, network_arithmetic=self.arithmetic, picture=self.picture
+        )
         return Recipe(again, self.fingerprint, self.job.source.file)
 
     @property
@@ -370,16 +373,6 @@ class Certification:
     def partitions(self, grid: CellGrid) -> int | None:
         """Number of parts of the fixed partition, if there is one."""
         return math.prod(grid.units) if self.property.partitions is not None else None
-
-
-def _open(
-    open_job: Callable[[], Job],
-    ask: Callable[[], AnyQuestion],
-    memory: int,
-    arithmetic: NetworkArithmetic,
-    picture: Picture,
-) -> Certification:
-    return Certification(open_job(), ask(), memory, network_arithmetic=arithmetic, picture=picture)
 
 
 @dataclass(frozen=True)

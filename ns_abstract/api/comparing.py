@@ -17,7 +17,7 @@ from ns_abstract.api.job import Job
 from ns_abstract.api.poses import PoseSet, pose_set
 from ns_abstract.api.scenes import Scene, SceneSource, checked_scene
 from ns_abstract.arithmetic.selfcheck import platform_problems
-from ns_abstract.execution.worker_cache import Recipe
+from ns_abstract.execution.worker_cache import Recipe, built
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import CameraPath, PinholeCamera, load_camera_path
 from ns_abstract.geometry.poses import PoseBox
@@ -104,8 +104,8 @@ class ComparisonJob(Job):
     def recipe(self) -> Recipe[Any]:
         sources = self.source.absolute, self.other.source.absolute
         again = partial(
-            _open, *sources, self.pose_sets, self.tolerance, arithmetic=self.arithmetic, seed=self.seed,
-            memory_limit=self.memory_limit,
+            built, ComparisonJob, [source.open for source in sources], self.pose_sets, tolerance=self.tolerance,
+            arithmetic=self.arithmetic, seed=self.seed, memory_limit=self.memory_limit,
         )  # fmt: skip
         return Recipe(again, self.fingerprint, sources[0].file)
 
@@ -168,12 +168,6 @@ class ComparisonJob(Job):
         first, second = super().describe(), self.other.method.describe()
         alone = [about["bounded"] for about in (first, second) if "bounded" in about]
         return {**first, "other": second, **({"bounded": alone[0]} if alone else {})}
-
-
-def _open(
-    source: SceneSource, other: SceneSource, pose_sets: tuple[PoseBox, ...], tolerance: float | None, **options: Any
-) -> ComparisonJob:
-    return ComparisonJob(source.open(), other.open(), pose_sets, tolerance=tolerance, **options)
 
 
 @contextmanager

@@ -16,12 +16,12 @@ import numpy as np
 
 from ns_abstract.api.assumptions import scene_choices
 from ns_abstract.api.assumptions import set_choices as object_choices
-from ns_abstract.api.scenes import Scene, SceneSource
+from ns_abstract.api.scenes import Scene
 from ns_abstract.arithmetic.kernel_cache import store as kernels
 from ns_abstract.arithmetic.selfcheck import platform_problems
 from ns_abstract.execution.cancellation import WorkCancelledError, cancel_when
 from ns_abstract.execution.threads import most_threads
-from ns_abstract.execution.worker_cache import Recipe
+from ns_abstract.execution.worker_cache import Recipe, built
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.assumptions import Assumption
@@ -107,7 +107,7 @@ class Job:
     def recipe(self) -> Recipe[Job]:
         """How another process opens this job; files are looked for under the same paths."""
         again = partial(
-            _open, self.source.absolute, self.pose_sets, arithmetic=self.arithmetic, seed=self.seed,
+            built, Job, (self.source.absolute.open,), self.pose_sets, arithmetic=self.arithmetic, seed=self.seed,
             memory_limit=self.memory_limit, layers=self.layers,
         )  # fmt: skip
         return Recipe(again, self.fingerprint, self.source.file)
@@ -333,10 +333,6 @@ def require_sound_platform() -> None:
             f"the platform's arithmetic failed the self-check on {socket.gethostname()} ({problems[0]})",
             fix="nothing can be certified there; use another machine",
         )
-
-
-def _open(source: SceneSource, pose_sets: tuple[PoseBox, ...], **options: Any) -> Job:
-    return Job(source.open(), pose_sets, **options)
 
 
 def warm_up(frame: Frame) -> None:

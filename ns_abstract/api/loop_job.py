@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property, lru_cache, partial
 from pathlib import Path
@@ -21,7 +20,7 @@ from ns_abstract.api.network_stamp import network_prints
 from ns_abstract.api.picture_question import PlanePictures
 from ns_abstract.api.scenes import Scene
 from ns_abstract.arithmetic.forms import MAX_DIMENSIONS
-from ns_abstract.execution.worker_cache import Recipe
+from ns_abstract.execution.worker_cache import Recipe, built
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.assumptions import Assumption
@@ -151,9 +150,8 @@ class LoopJob:
     def recipe(self) -> Recipe[LoopJob]:
         loop = self.loop
         # laws of motion do not travel
-        again = partial(
-            _open, self.job.recipe.open, dict(loop.value), loop.network.absolute().parent, self.model.arithmetic
-        )
+        parts = self.job.recipe.open, partial(parse_loop, dict(loop.value), loop.network.absolute().parent)
+        again = partial(built, LoopJob, parts, self.model.arithmetic)
         return Recipe(again, self.fingerprint, self.job.source.file)
 
     @property
@@ -189,10 +187,6 @@ class LoopJob:
             "network_arithmetic": self.model.arithmetic,
             "rules": _RULES,
         }
-
-
-def _open(open_job: Callable[[], Job], value: dict[str, Any], folder: Path, arithmetic: NetworkArithmetic) -> LoopJob:
-    return LoopJob(open_job(), parse_loop(value, folder), arithmetic)
 
 
 def open_loop(

@@ -15,6 +15,7 @@ installation brings along (`shipped_kernels`) are taken where none are kept.
 
 from __future__ import annotations
 
+import glob
 import hashlib
 import json
 import logging
@@ -208,7 +209,7 @@ class KernelStore:
         changed: dict[str, dict[str, str]] = {}
         for index in self.session.rglob("*.nbi"):
             base = index.name.removesuffix(".nbi")
-            files = [index, *index.parent.glob(f"{_escaped(base)}.*.nbc")]
+            files = [index, *index.parent.glob(f"{glob.escape(base)}.*.nbc")]
             if len(files) > 1 and any(self._published.get(path) != _stamp(path) for path in files):
                 place = index.parent.relative_to(self.session).as_posix()
                 changed[f"{place}/{base}"] = {path.name: self._keep(path) for path in files}
@@ -317,10 +318,6 @@ def _stamp(path: Path) -> tuple[int, int]:
     # numba replaces files, it does not change them
     status = path.stat()
     return status.st_ino, status.st_mtime_ns
-
-
-def _escaped(name: str) -> str:
-    return "".join(f"[{c}]" if c in "*?[" else c for c in name)
 
 
 def _in_use(session: Path) -> bool:

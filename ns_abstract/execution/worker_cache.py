@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import pickle
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -26,6 +26,11 @@ class Fingerprinted(Protocol):
 
 T = TypeVar("T")
 F = TypeVar("F", bound=Fingerprinted)
+
+
+def built(make: Callable[..., F], parts: Sequence[Callable[[], Any]], *arguments: Any, **options: Any) -> F:
+    """``make`` of what ``parts`` open and of the other arguments: a recipe's way to open an object again."""
+    return make(*(part() for part in parts), *arguments, **options)
 
 
 class LatestValue(Generic[T]):

@@ -57,10 +57,6 @@ def _guarantee_of(document: Mapping[str, Any]) -> str:
     return short_guarantee(document["guarantee"], document["scene"].get("bounded"))
 
 
-def _command(parts: Sequence[Any]) -> str:
-    return " ".join(shlex.quote(str(part)) for part in parts)
-
-
 @cache
 def _templates() -> Environment:
     environment = Environment(
@@ -71,7 +67,7 @@ def _templates() -> Environment:
         undefined=StrictUndefined,
     )
     environment.filters |= {
-        "command": _command,
+        "command": lambda parts: shlex.join(map(str, parts)),
         "counted": counted,
         "number": number,
         "percent": percent,
