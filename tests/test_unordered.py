@@ -71,7 +71,7 @@ def test_strips_hold_what_their_sub_boxes_reach():
     """A small layer that some sub-box shows is drawn there, wherever it lies among those of a strip."""
     case = Case(
         scene({"mean": (0.3, 0.1, -5.0), "scale": 0.05, "opacity": 0.95, "color": (1.0, 0.7, 0.4)}),
-        moves(x=0.2, yaw=0.6),
+        moves(x=0.05, yaw=0.2),
     )
     ends, parts, shown = ends_of(case), cell_parts(COUNTS), 0
     for part in range(parts.middles.shape[1]):
