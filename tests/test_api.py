@@ -23,10 +23,12 @@ from wall import WALL, write_wall
 
 import ns_abstract as nsa
 from ns_abstract.api import cell_search
+from ns_abstract.api.search_options import SearchOptions
 from ns_abstract.cli import render as render_command
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.keyframe_cameras import look_at
 from ns_abstract.methods import load
+from ns_abstract.methods.nerf.method import NerfMethod
 from ns_abstract.methods.nerf.write import write_nerf_run
 from ns_abstract.methods.splat import bounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
@@ -346,6 +348,11 @@ MISTAKES = {
     "no path": (lambda: nsa.load_scene(None), "path"),  # type: ignore[arg-type]
     "no camera path": (lambda: nsa.load_camera_path(3), "path"),  # type: ignore[arg-type]
     "no folder": (lambda: nsa.check(3), "output_dir"),  # type: ignore[arg-type]
+    "half a sample": (lambda: NerfMethod(tiny_scene(0), num_samples=2.5), "--num-samples"),  # type: ignore[arg-type]
+    "true samples": (lambda: NerfMethod(tiny_scene(0), num_samples=True), "--num-samples"),
+    "a word for a plane": (lambda: NerfMethod(tiny_scene(0), near_plane="x"), "--near-plane"),  # type: ignore[arg-type]
+    "a number for a colour": (lambda: nsa.load_scene("none.yml", background=0.5), "--background"),  # type: ignore[arg-type]
+    "longer than numbers": (lambda: SearchOptions(time_budget=10**400), "time_budget"),
 }
 #: What `ns_abstract.bound` gets, by the name of the argument that its error names.
 BAD_ARGUMENTS: dict[str, Any] = {
@@ -359,6 +366,12 @@ def test_mistakes_name_the_field(name: str) -> None:
     with pytest.raises(nsa.InputError) as caught:
         make()
     assert caught.value.field == field and caught.value.fix and "\n" not in str(caught.value)
+
+
+def test_samples_may_be_of_any_whole_number() -> None:
+    method = NerfMethod(tiny_scene(0), num_samples=np.int64(3), near_plane=np.float32(0.25))  # type: ignore[arg-type]
+    sampling = method.sampling
+    assert (type(sampling.samples), sampling.samples, type(sampling.near), sampling.near) == (int, 3, float, 0.25)
 
 
 @pytest.mark.parametrize("name", BAD_ARGUMENTS)

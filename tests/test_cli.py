@@ -11,6 +11,7 @@ import re
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -784,3 +785,19 @@ def test_many_frames_are_told_in_few_words() -> None:
     assert listed([]) == "" and listed([4]) == "4" and listed([0, 1]) == "0, 1" and listed([0, 1, 3]) == "0, 1, 3"
     assert listed(range(7, 100000)) == "7 to 99999" and listed([0, 2, 3, 4, 9]) == "0, 2 to 4, 9"
     assert listed(range(0, 100, 2)) == "0, 2, 4, 6, 8, 10, 12, 14 and others, 50 together"
+
+
+def test_a_machine_without_a_temporary_folder_is_one_line(
+    blobs: Inputs, call: Callable[..., tuple[int, str]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Libraries look for one while they are imported."""
+
+    def library(options: object) -> int:
+        monkeypatch.setattr(tempfile, "tempdir", None)
+        monkeypatch.setattr(tempfile, "_candidate_tempdir_list", lambda: [str(tmp_path / "missing")])
+        return len(tempfile.gettempdir())
+
+    monkeypatch.setattr(render_command, "render", library)
+    options = ["--load-config", str(blobs.config), "--camera-path-filename", str(blobs.path)]
+    code, err = call([*options, "--output-dir", str(tmp_path / "out")])
+    one_line(code, err, "No usable temporary directory", "TMPDIR")

@@ -109,6 +109,18 @@ def test_frames_are_bounded_beside_the_files_of_others(tmp_path: Path) -> None:
         untouched(tmp_path)
 
 
+def test_a_search_does_not_go_on_with_a_report_of_another_command(tmp_path: Path) -> None:
+    claim(tmp_path).close()
+    Report(tmp_path, run(frames=(0,))).add(frame(0), picture=False)
+    before = {file.name: file.read_bytes() for file in tmp_path.iterdir()}
+    with pytest.raises(InputError) as caught:
+        open_store(tmp_path, resume=True)
+    assert caught.value.field == "--resume" and str(tmp_path / "report.json") in str(caught.value)
+    assert {file.name: file.read_bytes() for file in tmp_path.iterdir()} == before
+    # who does not resume begins a search
+    open_store(tmp_path).close()
+
+
 @pytest.mark.parametrize("name", ["frame_00003.npz", "frame_00000.png", "report.json", "report.html", "cells.sqlite"])
 def test_results_of_others_are_not_replaced(tmp_path: Path, name: str) -> None:
     put(tmp_path, {name: b"mine"})

@@ -179,6 +179,15 @@ def test_search_is_not_resumed(name: str, tmp_path: Path) -> None:
     Store(tmp_path, now, [("x", "m")], {0: {}}, resume=True).close()
 
 
+def test_searches_of_other_commands_are_not_taken_for_older_ones(tmp_path: Path) -> None:
+    """Commands number their rules each for itself."""
+    other = {**computed_by(), "scene": "a", "photo": "b", "rules": 9}
+    Store(tmp_path, other, [("x", "m")], {0: {}}, resume=False).close()
+    with pytest.raises(InputError, match="another photo, rules, loop") as caught:
+        Store(tmp_path, {**computed_by(), "scene": "a", "loop": "c", "rules": 4}, [("x", "m")], {0: {}}, resume=True)
+    assert version.ADVISORY not in str(caught.value)
+
+
 def test_worker_of_another_version_is_refused(blobs: Inputs, monkeypatch: pytest.MonkeyPatch) -> None:
     """The command's work reaches a process that has another version, which never opens the files."""
     opened = open_job(Settings(blobs.config, blobs.path, blobs.spec))

@@ -119,7 +119,7 @@ def test_strips_hold_what_their_sub_boxes_reach():
     """A small layer that some sub-box shows is drawn there, wherever it lies among those of a strip."""
     case = Case(
         scene({"mean": (0.3, 0.1, -5.0), "scale": 0.05, "opacity": 0.95, "color": (1.0, 0.7, 0.4)}),
-        moves(x=0.6, yaw=0.1),
+        moves(x=0.05, yaw=0.2),
     )
     ends, parts, shown = ends_of(case), cell_parts(COUNTS), 0
     for part in range(parts.middles.shape[1]):
@@ -130,7 +130,7 @@ def test_strips_hold_what_their_sub_boxes_reach():
     assert shown > 16
 
 
-@pytest.mark.parametrize("counts", [(4, 8), (8, 4), (1, 8), (2, 64), (16, 2)])
+@pytest.mark.parametrize("counts", [(4, 8), (8, 4), (1, 8), (2, 64), (16, 2), (16, 16)])
 def test_strips_cover_their_sub_boxes(counts):
     """The middles of a strip's sub-boxes lie within its half-width, exactly."""
     parts = cell_parts(np.array(counts))
@@ -139,6 +139,30 @@ def test_strips_cover_their_sub_boxes(counts):
     away = np.abs(lanes - strips.middles[:, : lanes.shape[1], None])
     assert (away <= strips.half[:, None, None]).all()
     assert strips.middles.shape[1] == strips.room and strips.room % PART_LANES == 0
+
+
+def test_sub_boxes_beyond_the_largest_set_of_strips_are_refused():
+    """Strips that no set holds would stay without what they show."""
+    with pytest.raises(ValueError, match="512 sub-boxes are more than 504"):
+        strips_of(cell_parts(np.array([16, 32])))
+
+
+@pytest.mark.parametrize("count", [1, 8])
+def test_a_stop_shows_no_more_than_the_background(count):
+    """A possible stop widens an end to what is left of the list at most, and not where the list ended early."""
+    layers = [
+        {"mean": (0.0, 0.0, -5.0 - 0.001 * k), "scale": 40.0, "opacity": 0.998, "color": (color,) * 3}
+        for k, color in enumerate((0.9, 0.1) * count)
+    ]
+    case = Case(scene(*layers, background=(0.5, 0.5, 0.5)), moves(x=0.001, yaw=0.2))
+    ends, parts = ends_of(case), cell_parts(COUNTS)
+    for part in range(parts.middles.shape[1]):
+        image = case.image(case.poses.box.at(parts.middles[:, part]))
+        assert (ends[:, :, 0, :, part] <= image).all() and (image <= ends[:, :, 1, :, part]).all()
+    # with one layer of each colour the picture is 0.998 of the nearer one's over the background
+    assert ends.min() > 0.1 - 1e-4 and ends.max() < 0.9 + 1e-4
+    if count == 1:
+        assert ends.min() > 0.998 * 0.1 + 0.002 * 0.5 - 1e-3 and ends.max() < 0.998 * 0.9 + 0.002 * 0.5 + 1e-3
 
 
 def test_the_latest_projection_is_kept_until_its_memory_is_taken():

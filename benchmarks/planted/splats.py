@@ -734,6 +734,22 @@ SPLATS = (
         "test_unordered.py::test_a_stop_shows_what_two_layers_would_hide[0.0-1.0]",
     ),
     Fault(
+        "any order: a stop shows black",
+        _UNORDERED,
+        "_write",
+        "sums.light[at] * background",
+        "sums.light[at] * 0.0",
+        "test_unordered.py::test_a_stop_shows_no_more_than_the_background[1]",
+    ),
+    Fault(
+        "any order: sets hold any number of strips",
+        _STAGE_DATA,
+        "strips_of",
+        "lanes.shape[1] > _MOST_STRIPS",
+        "False",
+        "test_unordered.py::test_sub_boxes_beyond_the_largest_set_of_strips_are_refused",
+    ),
+    Fault(
         "parts: only the first eight count",
         _INTERVALS,
         "blend_parts",

@@ -31,6 +31,7 @@ _LEAST_ADDRESS_SPACE = 4 << 30
 _SHORTAGE = (
     "can't allocate memory", "cannot allocate memory", "bad_alloc", "failed to allocate memory", "out of memory",
 )  # fmt: skip
+_NO_TEMPORARY_FOLDER = "No usable temporary directory"
 #: New objects after which garbage is collected: imports make many that stay.
 _GARBAGE = 50_000
 #: Most characters of a complaint about options, which may repeat long options.
@@ -247,10 +248,14 @@ def run(
         sys.stderr.close()
         code = INTERRUPTED
     except Exception as error:
-        if not _is_shortage(error):
-            raise
         detail = " ".join(str(error).split())[:200]
-        print(f"error: not enough memory{': ' + detail if detail else ''}; {relief}", file=sys.stderr)
+        if _is_shortage(error):
+            print(f"error: not enough memory{': ' + detail if detail else ''}; {relief}", file=sys.stderr)
+        elif isinstance(error, FileNotFoundError) and _NO_TEMPORARY_FOLDER in detail:
+            # libraries look for one as they are imported
+            print(f"error: {error.strerror}; set TMPDIR to a folder where files may be made", file=sys.stderr)
+        else:
+            raise
         code = BAD_INPUT
     sys.exit(code)
 

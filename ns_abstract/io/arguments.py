@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
 from numbers import Integral, Real
 from pathlib import Path
@@ -12,22 +13,34 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import FIX_ACCESS, show, unusable
 
 
+def float64_of(value: Any) -> float:
+    """``value`` as float64, infinite where it is too large; NaN where it is no number (bool is none)."""
+    if isinstance(value, bool) or not isinstance(value, Real):
+        return math.nan
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf
+
+
 def positive(value: Any, field: str) -> float:
     """``value`` as a number above 0 and below infinity, from the argument or option ``field``.
 
     Raises:
         InputError: It is none.
     """
-    if isinstance(value, bool) or not isinstance(value, Real) or not 0.0 < float(value) < float("inf"):
+    number = float64_of(value)
+    if not 0.0 < number < math.inf:
         raise unusable(value, field=field, fix="give a positive number")
-    return float(value)
+    return number
 
 
 def at_least(value: Any, least: float, field: str) -> float:
     """``value`` as a finite number that is no smaller than ``least``. Raises InputError where it is none."""
-    if isinstance(value, bool) or not isinstance(value, Real) or not least <= float(value) < float("inf"):
+    number = float64_of(value)
+    if not least <= number < math.inf:
         raise unusable(value, field=field, fix=f"give a number of at least {least:g}")
-    return float(value)
+    return number
 
 
 def whole(value: Any, least: int, field: str) -> int:

@@ -45,7 +45,7 @@ class Overrides:
         if mode not in (None, *MODES):
             raise unusable(mode, field="--rasterize-mode", fix=f"use {' or '.join(MODES)}")
         if color is not None:
-            parts = list(color)
+            parts = list(color) if isinstance(color, Iterable) else [color]
             if len(parts) != 3 or not all(is_number(part) and 0 <= part <= 1 for part in parts):
                 raise unusable(parts, field="--background", fix="give three numbers from 0 to 1")
             object.__setattr__(self, "background", tuple(float(part) for part in parts))

@@ -148,6 +148,11 @@ class StoreFile:
     def _open_base(self, fingerprint: Mapping[str, Any], parameters: Sequence[tuple[str, str]], resume: bool) -> bool:
         """Open the file; whether it is a new one."""
         fresh = self._fresh = not (resume and os.path.lexists(self.file))
+        report = self.folder / "report.json"
+        if fresh and resume and os.path.lexists(report):
+            # every search that has reported has a file: this is another command's result
+            problem, fix = "is of no search that is stored here", "run without --resume to search here, or give another"
+            raise InputError(problem, file=report, field="--resume", fix=f"{fix} --output-dir")
         remove_parts(self.folder)
         images = self.folder / IMAGES
         # what a link leads to is not locked
@@ -297,7 +302,9 @@ class StoreFile:
                 fix=f"leave it out to search again; {ADVISORY}",
             )
         stored, expected = self._get("fingerprint"), json.loads(json.dumps(dict(fingerprint)))
-        if problem := stale(stored, expected):
+        # other keys are those of another command, whose rules have numbers of their own
+        comparable = set(stored) == set(expected) or stored.get("ns_abstract") != expected.get("ns_abstract")
+        if comparable and (problem := stale(stored, expected)):
             raise InputError(
                 f"holds a search {problem}",
                 file=self.file,

@@ -279,9 +279,19 @@ class Strips(NamedTuple):
     room: int
 
 
+#: Most strips: each is a bit of a number, whose last bit is its sign.
+_MOST_STRIPS = 63
+
+
 def strips_of(parts: Parts) -> Strips:
-    """Those of the sub-boxes ``parts``."""
+    """Those of the sub-boxes ``parts``.
+
+    Raises:
+        ValueError: They are more than sets of strips hold, so that some would stay without what they show.
+    """
     lanes = parts.middles.reshape(parts.half.size, -1, PART_LANES)
+    if lanes.shape[1] > _MOST_STRIPS:
+        raise ValueError(f"{parts.middles.shape[1]} sub-boxes are more than {_MOST_STRIPS * PART_LANES}")
     low, high = lanes.min(axis=2), lanes.max(axis=2)
     middles = 0.5 * (low + high)
     room = -(-middles.shape[1] // PART_LANES) * PART_LANES
@@ -300,7 +310,6 @@ class ColorEnd(NamedTuple):
         row: Where the end stands among the least of the three channels, then the most.
         opposite: The other end of all colours of the channel and of the background.
         bright: Greatest absolute value of any colour, at least 1.
-        most_alpha: Of any Gaussian.
     """
 
     values: np.ndarray
@@ -309,7 +318,6 @@ class ColorEnd(NamedTuple):
     row: int
     opposite: float
     bright: float
-    most_alpha: float
 
 
 class PixelBounds(NamedTuple):

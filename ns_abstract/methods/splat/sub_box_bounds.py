@@ -97,8 +97,7 @@ class SubBoxBounds(SplatBounds):
         reach = np.where(np.isnan(box), [0, np.inf] * 2, np.floor(box + [-0.5, 1.5] * 2)).clip(0, size).astype(np.int32)
         touched = touching(np.arange(alive.size), reach, summed_area(laid_out(chosen, across)))
         alive, reach = alive[touched], reach[touched]
-        most_alpha = min(self.rules.alpha_max, float(self._sums.gaussians.opacity_high.max(initial=0.0)))
-        color_ends = _color_ends(colors, alive, self.splats.background, most_alpha * (1.0 + self.charges.threshold))
+        color_ends = _color_ends(colors, alive, self.splats.background)
         for row in np.flatnonzero(ends.any(axis=0)).tolist():
             some, end = np.zeros(pixels.shape, bool), color_ends[row]
             some[pixels] = ends[:, row]
@@ -112,7 +111,7 @@ class SubBoxBounds(SplatBounds):
             )
 
 
-def _color_ends(colors: np.ndarray, alive: np.ndarray, background: np.ndarray, most_alpha: float) -> list[ColorEnd]:
+def _color_ends(colors: np.ndarray, alive: np.ndarray, background: np.ndarray) -> list[ColorEnd]:
     """The least of the three channels of rows ``alive`` of `Colors.values`, then the most."""
     parts = colors[alive].reshape(alive.size, 3, colors.shape[1] // 3)
     spread = np.abs(parts[..., 1:]).sum(axis=-1) * UP
@@ -125,5 +124,5 @@ def _color_ends(colors: np.ndarray, alive: np.ndarray, background: np.ndarray, m
         channel, values = row % 3, np.empty(len(colors))
         values[alive] = (low, high)[row // 3][:, channel]
         opposite = (brightest, darkest)[row // 3][channel]
-        ends.append(ColorEnd(values, (-1.0, 1.0)[row // 3], channel, row, float(opposite), bright, most_alpha))
+        ends.append(ColorEnd(values, (-1.0, 1.0)[row // 3], channel, row, float(opposite), bright))
     return ends

@@ -250,13 +250,12 @@ def _write(place, length, inputs, color_end, out, sums):
             closed = sums.open[q] & (1 << strip) == 0
             for lane in range(PART_LANES):
                 at = PART_LANES * (q * sums.strips + strip) + lane
-                lost = 0.0
-                if closed:
-                    lost = _lost_light(stop, color_end.most_alpha)
-                elif not sums.light[at] * sums.passed[at] > dark:
-                    lost = _lost_light(stop, sums.boldest[at])
-                value = sums.colors[at] + sums.light[at] * sums.behind[at]
-                ends[PART_LANES * strip + lane] = value + sign * (slack + lost * hidden)
+                end = sign * (sums.colors[at] + sums.light[at] * sums.behind[at])
+                # where the list ended early, the end holds every part of it before the background
+                if not closed and not sums.light[at] * sums.passed[at] > dark:
+                    stopped = sign * (sums.colors[at] + sums.light[at] * background)
+                    end = min(end + _lost_light(stop, sums.boldest[at]) * hidden, stopped)
+                ends[PART_LANES * strip + lane] = sign * (end + slack)
 
 
 @njit(cache=True, error_model="numpy", nogil=True)
