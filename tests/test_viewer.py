@@ -8,7 +8,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -250,6 +250,8 @@ def test_key_and_shape() -> None:
     assert view().key == view(width=48, height=40).key
     for other in (view(x=0.02), view(k=1), ViewRequest(camera(), perturbation_of({"yaw": 0.01}))):
         assert other.key != view().key
+    for other in ({"fx": 31.0}, {"cx": 3.0}, {"cy": 30.0}):
+        assert replace(view(), camera=replace(camera(), **other)).key != replace(view(), camera=camera()).key
     assert view().fits(40, 48) and view().fits(41, 48) and not view().fits(48, 48)
     assert perturbation_of({"x": 0.0, "roll": 0.1}) == Perturbation(rotation={"roll": (-0.1, 0.1)})
     stages = view(width=300, height=150).stages(9.0, known=64)

@@ -67,11 +67,15 @@ class ViewRequest:
     perturbation: Perturbation
 
     @property
-    def key(self) -> tuple[bytes, float, str]:
+    def key(self) -> tuple[bytes, tuple[float, ...], str]:
         """Equal for views that differ in the size of the picture only."""
         camera = self.camera
         around = f"{self.perturbation!r} {self.perturbation.scene!r}"
-        return camera.camera_to_world.tobytes(), round(camera.fy / camera.height, 6), around
+        lens = camera.fy / camera.height, camera.fx / camera.fy
+        # a smaller picture's sides are rounded, and its middle is off by that
+        if max(abs(camera.cx - 0.5 * camera.width), abs(camera.cy - 0.5 * camera.height)) > 1.0:
+            lens += camera.cx / camera.fy, camera.cy / camera.fy
+        return camera.camera_to_world.tobytes(), tuple(round(value, 6) for value in lens), around
 
     def at_most(self, side: int | None) -> ViewRequest:
         """This view with a picture of no more than ``side`` pixels along its longest side."""
