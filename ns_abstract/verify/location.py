@@ -24,7 +24,7 @@ from ns_abstract.verify.cell_boxes import aligned, divided, inner_cell, meeting,
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.neighbouring_pixels import nearby, smoothed
 from ns_abstract.verify.photo import Photo
-from ns_abstract.verify.pixel_rounds import BoundedPixels, PixelRounds, telling_order
+from ns_abstract.verify.pixel_rounds import BoundedPixels, PixelRounds, RoundTuning, telling_ends, telling_order
 from ns_abstract.verify.search_results import BlockResult, FinishedCell
 
 #: Grid units along each parameter, as a power of two.
@@ -39,12 +39,21 @@ class LocationTuning:
 
     #: Image motion over a sub-box, pixels, beyond which cells are cut without bounds.
     coarse: float = 4.0
-    #: Sub-boxes along each of the two parameters that move the picture most; others are not divided, since what is
-    #: shared by the sub-boxes of a cell, above all its depth order, loses by every parameter that is wide.
+    #: Sub-boxes along the two parameters that move the picture most, where a set has few; others are not divided, since
+    #: what is shared by the sub-boxes of a cell, above all its depth order, loses by every parameter that is wide.
     along: int = 8
+    #: From so many parameters on, so many sub-boxes are shared out among all of them: a cell that is long along two
+    #: moves the picture by more, and forms lose by the square of that.
+    many: int = 4
+    shared: int = 64
+    #: Rounds of pixels where a set has few parameters, and many: what a cell takes whatever its pixels are, is most of
+    #: the work there, and a first round of more pixels excludes more at once.
+    rounds: tuple[RoundTuning, RoundTuning] = RoundTuning(), RoundTuning(first=2.0)
     #: Image motion over a sub-box, pixels, up to which pixels of uncertain orders are bounded whatever the order: it
     #: takes long, and excludes little of wider ones.
     unordered: float = 1.6
+    #: An end of a pixel that misses the photo by this part of what the best one does may be bounded in its place.
+    telling: float = 0.7
     #: The part of a box of sub-boxes that has to be left for it to become one cell.
     filled: float = 0.5
     #: Grid lines that cells begin and end at, as a power of two of their width.
@@ -111,12 +120,22 @@ class LocationSearch:
         motion = np.maximum(motion, 1e-3 * max(1.0, float(motion.max(initial=0.0))))
         self._pace = motion / width
 
+    @property
+    def many_parameters(self) -> bool:
+        """Whether the set has many parameters."""
+        return self.frame.box.dimensions >= self.tuning.many
+
     @cached_property
     def along(self) -> np.ndarray:
         """[d] sub-boxes along the parameters of a cell."""
-        counts = np.ones(self.frame.box.dimensions, np.int64)
+        d, tuning = self.frame.box.dimensions, self.tuning
+        counts = np.ones(d, np.int64)
         if isinstance(self.frame, SubBoxFrame) and self.contract:
-            counts[np.argsort(-self.moved(self.frame.box), kind="stable")[:2]] = self.tuning.along
+            order = np.argsort(-self.moved(self.frame.box), kind="stable")
+            counts[order[:2]] = tuning.along
+            if self.many_parameters:
+                halvings = tuning.shared.bit_length() - 1
+                counts[order] = [1 << (halvings // d + (k < halvings % d)) for k in range(d)]
         return counts
 
     def moved(self, box: ParameterBox) -> Float64Array:
@@ -235,12 +254,12 @@ class _Examination:
         if not isinstance(search.frame, SubBoxFrame) or not search.contract or not resolved(box, counts):
             return None
         rounds, gaps = self._rounds(box, picture, counts)
-        telling = gaps == gaps.max(axis=-1, keepdims=True)
         narrow = float(np.linalg.norm(search.moved(box) / counts)) <= tuning.unordered
         while (chosen := rounds.following()) is not None:
             self.bounded += 1
             tiles = np.flatnonzero(chosen.any(axis=(1, 2)))
-            ends = search.frame.sub_box_ends(box, counts, tiles, chosen[tiles], telling[chosen] if narrow else None)
+            telling = telling_ends(gaps[chosen], tuning.telling) if narrow else None
+            ends = search.frame.sub_box_ends(box, counts, tiles, chosen[tiles], telling)
             if ends is None:
                 return None
             rounds.count(*ends, chosen)
@@ -356,7 +375,7 @@ class _Examination:
         self.share = (known + sure) / (known + needed) if alone else 0.0
         if alone and self.share < tuning.promise:
             order = order[:0]
-        return PixelRounds(tiled, order, int(np.prod(counts)), self.inherited), gaps
+        return PixelRounds(tiled, order, int(np.prod(counts)), self.inherited, tuning.rounds[search.many_parameters]), gaps
 
     def _gaps(self, picture: np.ndarray, radius: int, scale: float) -> Float64Array:
         """[T, side, side, 6] by how much the picture within ``radius`` pixels misses the photo, less its looseness.
