@@ -9,7 +9,7 @@ import pytest
 from ns_abstract.verify.cell_boxes import meeting
 from ns_abstract.verify.cells import Cell
 from ns_abstract.verify.photo import TiledPhoto
-from ns_abstract.verify.pixel_rounds import BoundedPixels, PixelRounds, RoundTuning, telling_ends, telling_order
+from ns_abstract.verify.pixel_rounds import BoundedPixels, PixelRounds, RoundTuning, telling_order
 
 T, SIDE = 3, 4
 
@@ -192,20 +192,3 @@ def test_rounds_stop_where_pixels_do_not_help() -> None:
         assert rounds.following() is None and rounds.left.all() == left
     # too few pixels for any verdict
     assert PixelRounds(photo, np.arange(4), 8).following() is None
-
-
-def test_each_pixel_has_one_telling_end() -> None:
-    generator = np.random.default_rng(0)
-    for shift in (0.0, -2.0):
-        gaps = generator.random((200, 6)) + shift
-        for nearly in (1.0, 0.7):
-            ends = telling_ends(gaps, nearly)
-            assert (ends.sum(axis=1) == 1).all()
-            most = gaps.max(axis=1)
-            assert (gaps[ends] >= most - (1.0 - nearly) * np.abs(most)).all()
-        assert (telling_ends(gaps, 1.0) == (gaps == gaps.max(axis=1, keepdims=True))).all()
-    # all but one share an end that is nearly the best
-    gaps = np.tile([0.8, 0.9, 1.0, 0.9, 0.9, 0.9], (6, 1)) + 0.11 * np.eye(6)
-    gaps[5] = [1.0, 0.0, 0.0, 0.0, 0.0, 0.0]
-    assert telling_ends(gaps, 0.9).sum(axis=0).tolist() == [1, 0, 5, 0, 0, 0]
-    assert telling_ends(gaps, 1.0).any(axis=0).sum() > 2

@@ -42,7 +42,7 @@ _LEAST_LEAF_BYTES = 64 << 20
 #: Seconds that the ray with which kernels are compiled may take from one kernel to the next.
 _WARM_RAY = 2.0
 #: Functions of the kernels of bounds over sub-boxes, about, and the seconds that one core compiles.
-_SUB_BOX_KERNELS = 40, 18.0
+_SUB_BOX_KERNELS = 114, 17.0
 #: Rays that are rendered to see what a picture takes.
 _LOOK_RAYS = 128
 

@@ -24,7 +24,7 @@ from ns_abstract.verify.cell_boxes import aligned, divided, inner_cell, meeting,
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.neighbouring_pixels import nearby, smoothed
 from ns_abstract.verify.photo import Photo
-from ns_abstract.verify.pixel_rounds import BoundedPixels, PixelRounds, RoundTuning, telling_ends, telling_order
+from ns_abstract.verify.pixel_rounds import BoundedPixels, PixelRounds, RoundTuning, telling_order
 from ns_abstract.verify.search_results import BlockResult, FinishedCell
 
 #: Grid units along each parameter, as a power of two.
@@ -48,12 +48,10 @@ class LocationTuning:
     shared: int = 64
     #: Rounds of pixels where a set has few parameters, and many: what a cell takes whatever its pixels are, is most of
     #: the work there, and a first round of more pixels excludes more at once.
-    rounds: tuple[RoundTuning, RoundTuning] = RoundTuning(), RoundTuning(first=2.0)
+    pixel_rounds: tuple[RoundTuning, RoundTuning] = RoundTuning(), RoundTuning(first=2.0)
     #: Image motion over a sub-box, pixels, up to which pixels of uncertain orders are bounded whatever the order: it
     #: takes long, and excludes little of wider ones.
     unordered: float = 1.6
-    #: An end of a pixel that misses the photo by this part of what the best one does may be bounded in its place.
-    telling: float = 0.7
     #: The part of a box of sub-boxes that has to be left for it to become one cell.
     filled: float = 0.5
     #: Grid lines that cells begin and end at, as a power of two of their width.
@@ -254,12 +252,12 @@ class _Examination:
         if not isinstance(search.frame, SubBoxFrame) or not search.contract or not resolved(box, counts):
             return None
         rounds, gaps = self._rounds(box, picture, counts)
+        telling = gaps == gaps.max(axis=-1, keepdims=True)
         narrow = float(np.linalg.norm(search.moved(box) / counts)) <= tuning.unordered
         while (chosen := rounds.following()) is not None:
             self.bounded += 1
             tiles = np.flatnonzero(chosen.any(axis=(1, 2)))
-            telling = telling_ends(gaps[chosen], tuning.telling) if narrow else None
-            ends = search.frame.sub_box_ends(box, counts, tiles, chosen[tiles], telling)
+            ends = search.frame.sub_box_ends(box, counts, tiles, chosen[tiles], telling[chosen] if narrow else None)
             if ends is None:
                 return None
             rounds.count(*ends, chosen)
@@ -375,7 +373,8 @@ class _Examination:
         self.share = (known + sure) / (known + needed) if alone else 0.0
         if alone and self.share < tuning.promise:
             order = order[:0]
-        return PixelRounds(tiled, order, int(np.prod(counts)), self.inherited, tuning.rounds[search.many_parameters]), gaps
+        preference = tuning.pixel_rounds[search.many_parameters]
+        return PixelRounds(tiled, order, int(np.prod(counts)), self.inherited, preference), gaps
 
     def _gaps(self, picture: np.ndarray, radius: int, scale: float) -> Float64Array:
         """[T, side, side, 6] by how much the picture within ``radius`` pixels misses the photo, less its looseness.

@@ -193,22 +193,3 @@ def telling_order(
     order = [first[np.argsort((loose - likely).reshape(-1)[first], kind="stable")]]
     order.append(rest[np.argsort(-gaps.reshape(-1)[rest], kind="stable")])
     return np.concatenate(order)[:most_pixels], first.size
-
-
-def telling_ends(gaps: Float64Array, nearly: float) -> np.ndarray:
-    """[n, 6] one end of each of ``n`` pixels: one whose gap is the part ``nearly`` of the pixel's largest, or more.
-
-    Of such ends, few different ones are taken, since each costs an order of all Gaussians (design.md, B14).
-
-    Args:
-        gaps: [n, 6] by how much each end is expected to miss the photo.
-        nearly: From 0 to 1.
-    """
-    most = gaps.max(axis=1, keepdims=True)
-    near = gaps >= most - (1.0 - nearly) * np.abs(most)
-    ends = np.zeros(near.shape, bool)
-    while near.any():
-        row = int(np.argmax(near.sum(axis=0)))
-        ends[near[:, row], row] = True
-        near[near[:, row]] = False
-    return ends
