@@ -71,6 +71,54 @@ def test_bounds_hold_every_order_of_random_stacks(number):
         assert width.mean() < 0.95
 
 
+def assert_holds(case: Case, ends: np.ndarray) -> None:
+    """Pictures of the middles and corners of all sub-boxes lie within their ends."""
+    parts = cell_parts(COUNTS)
+    for part in range(parts.middles.shape[1]):
+        for corner in (0.0, -0.999, 0.999):
+            place = parts.middles[:, part] + corner * parts.half
+            image = case.image(case.poses.box.at(place)).clip(0.0, 1.0)
+            assert (ends[:, :, 0, :, part].clip(0.0, 1.0) <= image).all(), (part, corner)
+            assert (image <= ends[:, :, 1, :, part].clip(0.0, 1.0)).all(), (part, corner)
+
+
+def test_what_lies_behind_dim_light_shows_the_last_colour():
+    """Layers of one colour add up to it, although the sum ends at the fifth of them."""
+    layer = {"scale": 6.0, "opacity": 0.7, "color": (1.0, 0.7, 0.4)}
+    layers = [layer | {"mean": (0.0, 0.0, -5.0 - 0.1 * k)} for k in range(9)]
+    case = Case(scene(*layers, background=BACKGROUNDS[0]), moves(x=0.01, yaw=0.001))
+    ends = ends_of(case)
+    assert_holds(case, ends)
+    # the charge of a stop behind alpha 0.7, and little more
+    assert (ends[:, :, 1] - np.array(layer["color"])[:, None]).max() < 1e-3
+
+
+@pytest.mark.parametrize(("near", "far"), [(0.4, 0.0), (0.6, 1.0)])
+def test_a_layer_over_a_more_extreme_one_covers_as_much_as_it_may(near, far):
+    """A small layer's alpha has a range in every sub-box, and what lies behind it is further from the background."""
+    case = Case(
+        scene(
+            {"mean": (0.0, 0.0, -5.0), "scale": 0.3, "opacity": 0.95, "color": (near,) * 3},
+            {"mean": (0.0, 0.0, -5.5), "scale": 6.0, "opacity": 0.9, "color": (far,) * 3},
+            background=(0.5, 0.5, 0.5),
+        ),
+        moves(x=0.3, yaw=0.02),
+    )
+    assert_holds(case, ends_of(case))
+
+
+@pytest.mark.parametrize(("color", "behind"), [(0.0, 1.0), (1.0, 0.0)])
+def test_a_stop_shows_what_two_layers_would_hide(color, behind):
+    """The second of two opaque layers is not drawn: a stop leaves the background two hundredths at most."""
+    layer = {"scale": 6.0, "opacity": 0.995, "color": (color,) * 3}
+    layers = [layer | {"mean": (0.0, 0.0, -5.0 - 0.1 * k)} for k in range(2)]
+    case = Case(scene(*layers, background=(behind,) * 3), moves(x=0.01, yaw=0.001))
+    ends = ends_of(case)
+    assert_holds(case, ends)
+    assert np.abs(case.image(case.poses.box.at(np.zeros(2))) - color).max() > 4e-3
+    assert np.abs(ends - color).max() < 0.03
+
+
 def test_strips_hold_what_their_sub_boxes_reach():
     """A small layer that some sub-box shows is drawn there, wherever it lies among those of a strip."""
     case = Case(

@@ -691,7 +691,7 @@ SPLATS = (
         "_add_in_front",
         "color + 0.0 * high",
         "0.0 * high",
-        "test_unordered.py::test_bounds_hold_every_order_of_random_stacks[1]",
+        "test_unordered.py::test_what_lies_behind_dim_light_shows_the_last_colour",
     ),
     Fault(
         "any order: what is nearer to the background covers as little as it may",
@@ -699,7 +699,23 @@ SPLATS = (
         "_add_behind",
         "blend_most(behind, color, low, high)",
         "blend_most(behind, color, low, low)",
-        "test_unordered.py::test_bounds_hold_every_order_of_random_stacks[0]",
+        "test_unordered.py::test_a_layer_over_a_more_extreme_one_covers_as_much_as_it_may[0.4-0.0]",
+    ),
+    Fault(
+        "any order: what is nearer to the background covers as little as it may, of the least",
+        _UNORDERED,
+        "_add_behind",
+        "blend_least(behind, color, low, high)",
+        "blend_least(behind, color, low, low)",
+        "test_unordered.py::test_a_layer_over_a_more_extreme_one_covers_as_much_as_it_may[0.6-1.0]",
+    ),
+    Fault(
+        "any order: what is beyond the background covers as little as it may",
+        _UNORDERED,
+        "_add_in_front",
+        "_, high = part_alphas(values, at, PART_LANES * strip, inputs, thresholds)",
+        "high, _ = part_alphas(values, at, PART_LANES * strip, inputs, thresholds)",
+        "test_unordered.py::test_strips_hold_what_their_sub_boxes_reach",
     ),
     Fault(
         "any order: strips have no width",
@@ -715,7 +731,7 @@ SPLATS = (
         "_write",
         "_lost_light(stop, sums.boldest[at])",
         "0.0",
-        "test_bounds.py::test_stop[1]",
+        "test_unordered.py::test_a_stop_shows_what_two_layers_would_hide[0.0-1.0]",
     ),
     Fault(
         "parts: only the first eight count",
