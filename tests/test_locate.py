@@ -376,6 +376,10 @@ def test_sub_boxes_are_shared_out_among_many_parameters(
     moved = search.moved(search.frame.box)
     along = search.along[np.argsort(-moved, kind="stable")]
     assert along.tolist() == counts + [1] * (len(moved) - len(counts))
+    # a set that is too wide for bounds begins with parts that tile it
+    first = search.first_cells()
+    assert (len(first) > 1) == bool(np.linalg.norm(moved / search.along) > search.tuning.coarse)
+    assert sum(cell.volume for cell in first) == search.grid.volume
     # without contraction cells are bounded as a whole
     whole = Location(location.job, location.photo.levels, None, PhotoOptions(contract=False)).search(0)
     assert (whole.along == 1).all()

@@ -25,7 +25,7 @@ from ns_abstract.report.figures import percent, short_guarantee
 from ns_abstract.report.location import location_document, location_page, location_pictures
 from ns_abstract.report.notebook import verdicts_html
 from ns_abstract.report.run import CommandRun
-from ns_abstract.verify.cells import CellGrid
+from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.location_cover import PoseCover
 from ns_abstract.verify.location_store import LocationStore
 from ns_abstract.verify.store import Store
@@ -81,6 +81,10 @@ class LocationQuestion(CellQuestion[LocateProgress]):
 
     def grid(self, number: int) -> CellGrid:
         return self.job.search(number).grid
+
+    def first_blocks(self, grid: CellGrid) -> list[list[Cell]]:
+        number = next(number for number, box in self.sets.items() if box == grid.box)
+        return [[cell] for cell in self.job.search(number).first_cells()]
 
     def stored_set(self, number: int) -> Any:
         return self.job.search(number).frame.box

@@ -136,6 +136,15 @@ class LocationSearch:
                 counts[order] = [1 << (halvings // d + (k < halvings % d)) for k in range(d)]
         return counts
 
+    def first_cells(self) -> list[Cell]:
+        """The set's first cell, or its parts where it is too wide for bounds: several can be examined side by side."""
+        (root,) = self.grid.roots()
+        if np.linalg.norm(self.moved(self.grid.box) / self.along) <= self.tuning.coarse:
+            return [root]
+        examination = _Examination(self, root, self.tiled.chosen(()))
+        examination.cut()
+        return examination.children
+
     def moved(self, box: ParameterBox) -> Float64Array:
         """[d] pixels that typical scene elements move by over a cell (an estimate)."""
         return self._pace * (np.array(box.upper) - np.array(box.lower))
@@ -237,7 +246,7 @@ class _Examination:
             if not self._whole(box, picture, number) or self.cell.volume > (1.0 - tuning.worth) * before:
                 break
         if not self.done:
-            self._cut()
+            self.cut()
         return None
 
     @property
@@ -274,7 +283,7 @@ class _Examination:
                 self.leaves.append(FinishedCell(cell, "certified", 1.0, 0.0))
         if len(remaining) == 1 and remaining[0].volume > (1.0 - tuning.worth) * self.cell.volume:
             self.cell = remaining[0]
-            self._cut()
+            self.cut()
         else:
             self.children = remaining
         return True
@@ -444,7 +453,7 @@ class _Examination:
             leaf = FinishedCell(self.cell, "unknown", None, 0.0, reason="the finest cell")
         self.leaves.append(leaf)
 
-    def _cut(self) -> None:
+    def cut(self) -> None:
         """Cut what is left of the cell where the picture moves most."""
         search, tuning = self.search, self.search.tuning
         if self.cell.volume <= max(1.0, tuning.finest ** len(self.cell.first) * search.grid.volume):
