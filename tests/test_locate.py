@@ -359,6 +359,32 @@ def test_known_outliers_exclude_a_cell_without_bounds(blobs: Inputs) -> None:
     assert not any(leaf.verdict == "certified" for leaf in findings.leaves)
 
 
+@pytest.mark.parametrize(
+    ("shifts", "turns", "counts"),
+    [("xy", (), [8, 8]), ("xy", ("yaw",), [8, 8]), ("xyz", ("yaw",), [4, 4, 2, 2]),
+     ("xyz", ("yaw", "pitch", "roll"), [2] * 6)],
+)  # fmt: skip
+def test_sub_boxes_are_shared_out_among_many_parameters(
+    shifts: str, turns: tuple[str, ...], counts: list[int], blobs: Inputs
+) -> None:
+    """Where a set has few, the two that move the picture most have all of them."""
+    camera = nsa.load_camera_path(blobs.path).cameras[0]
+    poses = nsa.PoseSet(camera, translation=dict.fromkeys(shifts, 0.05), rotation=dict.fromkeys(turns, 0.05))
+    scene = nsa.load_scene(blobs.config)
+    location = Location(Job(scene, [poses.of(scene)]), np.zeros((32, 32, 3), np.uint8), None, PhotoOptions())
+    search = location.search(0)
+    moved = search.moved(search.frame.box)
+    along = search.along[np.argsort(-moved, kind="stable")]
+    assert along.tolist() == counts + [1] * (len(moved) - len(counts))
+    # a set that is too wide for bounds begins with parts that tile it
+    first = search.first_cells()
+    assert (len(first) > 1) == bool(np.linalg.norm(moved / search.along) > search.tuning.coarse)
+    assert sum(cell.volume for cell in first) == search.grid.volume
+    # without contraction cells are bounded as a whole
+    whole = Location(location.job, location.photo.levels, None, PhotoOptions(contract=False)).search(0)
+    assert (whole.along == 1).all()
+
+
 @pytest.mark.slow_cases(every=4)
 @pytest.mark.parametrize("seed", range(4))
 def test_the_true_pose_is_never_excluded(seed: int, blobs: Inputs) -> None:

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import math
 
+import numba
 import numpy as np
 import pytest
 from test_bounds import Case, moves, scene
 
 from ns_abstract.arithmetic.rounding import FLOAT32
 from ns_abstract.geometry.tiles import assemble, tile_grid
+from ns_abstract.methods.splat import bounds as splat_bounds
+from ns_abstract.methods.splat import sub_box_bounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
+from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.stage_data import PART_LANES, cell_parts, strips_of
 from ns_abstract.methods.splat.sub_box_bounds import SubBoxBounds
 
@@ -189,3 +193,20 @@ def test_pixels_that_nothing_reaches_show_the_background():
     background = np.array(BACKGROUNDS[2])[:, None]
     assert (ends[:, :, 0] <= background).all() and (background <= ends[:, :, 1]).all()
     assert np.abs(ends - background).max() < 1e-4
+
+
+def test_what_warms_up_is_what_a_search_calls(monkeypatch):
+    """A kernel is compiled for the types of its arguments: those of the warm-up are those of bounds over sub-boxes."""
+    case, calls = stack(0, BACKGROUNDS[0], 8), []
+    frame = SplatFrame(case.splats, GSPLAT_1_4_0, FLOAT32, case.poses)
+    tiles = np.arange(frame.tile_count)
+    pixels = np.ones((tiles.size, frame.side, frame.side), bool)
+    # so that no block has few enough uncertain pairs
+    monkeypatch.setattr(splat_bounds, "PART_PAIR_LIMIT", 1)
+    monkeypatch.setattr(sub_box_bounds, "unordered_stage", lambda *values: calls.append([*map(numba.typeof, values)]))
+    frame.warm_up_sub_boxes()
+    warm = len(calls)
+    assert frame.sub_box_ends(frame.box, COUNTS, tiles, pixels, np.ones((pixels.sum(), 6), bool)) is not None
+    assert len(calls) > warm > 0 and all(call == calls[0] for call in calls)
+    # a set of one parameter has no sub-boxes
+    SplatFrame(case.splats, GSPLAT_1_4_0, FLOAT32, Case(case.splats, moves(x=0.1)).poses).warm_up_sub_boxes()

@@ -128,6 +128,11 @@ LOCATION = (
         "self.inherited.sum() >= search.tiled.allowed", _KNOWN,
     ),
     Fault(
+        "location: a wide set begins without its last part",
+        _SEARCH, "LocationSearch.first_cells", "return examination.children", "return examination.children[:-1]",
+        "test_locate.py::test_sub_boxes_are_shared_out_among_many_parameters",
+    ),
+    Fault(
         "location: the outliers allowed are those of the pixels bounded",
         _ROUNDS, "PixelRounds.left", "self.photo.allowed",
         "self.photo.allowed * self.bounded.sum() // self.photo.counted.sum()",

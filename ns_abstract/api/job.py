@@ -31,7 +31,7 @@ from ns_abstract.io.version import computed_by
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.perturbation.variations import SceneVariation
 from ns_abstract.refine.engine import Refinement, RefinementGoal
-from ns_abstract.refine.protocol import CountedFrame, Frame, Method
+from ns_abstract.refine.protocol import CountedFrame, Frame, Method, SubBoxFrame
 from ns_abstract.refine.result import EXTRA_OUTPUTS, FrameResult, PartResult, TracePoint, joined
 from ns_abstract.report.figures import ShownUnits, number
 
@@ -41,6 +41,8 @@ _WIDE_TURN = 0.5
 _LEAST_LEAF_BYTES = 64 << 20
 #: Seconds that the ray with which kernels are compiled may take from one kernel to the next.
 _WARM_RAY = 2.0
+#: Functions of the kernels of bounds over sub-boxes, about, and the seconds that one core compiles.
+_SUB_BOX_KERNELS = 114, 17.0
 #: Rays that are rendered to see what a picture takes.
 _LOOK_RAYS = 128
 
@@ -344,6 +346,12 @@ def warm_up(frame: Frame) -> None:
         cancel_when(lambda: frame.tilewise and time.perf_counter() - max(begin, kernels().latest) > _WARM_RAY),
     ):
         frame.warm_up()
+
+
+def warm_up_sub_boxes(frame: SubBoxFrame) -> None:
+    """Compile the kernels that bounds over sub-boxes need besides those of `warm_up`."""
+    with kernels().expecting(*_SUB_BOX_KERNELS):
+        frame.warm_up_sub_boxes()
 
 
 def check_frames(frames: Sequence[int] | None, count: int) -> tuple[int, ...]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ns_abstract.api.cell_search import CellQuestion, CellSearch, Request, Row, SearchProgress, result_cells
-from ns_abstract.api.job import Job
+from ns_abstract.api.job import Job, warm_up_sub_boxes
 from ns_abstract.api.location import Location, PhotoOptions, calibrated
 from ns_abstract.api.poses import PoseSet, pose_sets
 from ns_abstract.api.scenes import Scene, checked_scene
@@ -19,12 +19,13 @@ from ns_abstract.api.search_options import SearchKeywords, SearchOptions, Search
 from ns_abstract.execution.cancellation import Deadline
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.io.errors import InputError
+from ns_abstract.refine.protocol import SubBoxFrame
 from ns_abstract.report.certificate import search_figures
 from ns_abstract.report.figures import percent, short_guarantee
 from ns_abstract.report.location import location_document, location_page, location_pictures
 from ns_abstract.report.notebook import verdicts_html
 from ns_abstract.report.run import CommandRun
-from ns_abstract.verify.cells import CellGrid
+from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.location_cover import PoseCover
 from ns_abstract.verify.location_store import LocationStore
 from ns_abstract.verify.store import Store
@@ -81,6 +82,10 @@ class LocationQuestion(CellQuestion[LocateProgress]):
     def grid(self, number: int) -> CellGrid:
         return self.job.search(number).grid
 
+    def first_blocks(self, grid: CellGrid) -> list[list[Cell]]:
+        number = next(number for number, box in self.sets.items() if box == grid.box)
+        return [[cell] for cell in self.job.search(number).first_cells()]
+
     def stored_set(self, number: int) -> Any:
         return self.job.search(number).frame.box
 
@@ -100,7 +105,11 @@ class LocationQuestion(CellQuestion[LocateProgress]):
 
         store.cover = cover
         request.on_open(store)
-        self.job.job.warm_up(next(iter(self.sets)))
+        first = next(iter(self.sets))
+        self.job.job.warm_up(first)
+        frame = self.job.search(first).frame
+        if self.job.options.contract and isinstance(frame, SubBoxFrame):
+            warm_up_sub_boxes(frame)
 
     def reserved(self, seconds: float) -> float:
         return min(_MOST_FOR_COVER, _SHARE_FOR_COVER * seconds)

@@ -233,6 +233,10 @@ class SubBoxFrame(Protocol):
         """
         ...
 
+    def warm_up_sub_boxes(self) -> None:
+        """Compile what `sub_box_ends` needs at first use besides the frame's own kernels."""
+        ...
+
 
 class SharedOrder(Protocol):
     """Two scenes some of whose elements lie at the same places, and so are drawn in the same order in both."""

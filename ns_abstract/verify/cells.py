@@ -88,10 +88,8 @@ class CellGrid:
 
     def box_of(self, cell: Cell) -> ParameterBox:
         """The cell as a box of parameters; neighbours share their ends exactly."""
-        box = self.box
-        for axis, (first, past) in enumerate(zip(cell.first, cell.past, strict=True)):
-            box = box.replace(axis, self.end(axis, first), self.end(axis, past))
-        return box
+        lower, upper = (tuple(itertools.starmap(self.end, enumerate(ends))) for ends in (cell.first, cell.past))
+        return ParameterBox(self.box.names, self.box.units, lower, upper)
 
     def roots(self) -> list[Cell]:
         """The first cells, in order."""

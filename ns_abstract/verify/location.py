@@ -24,7 +24,7 @@ from ns_abstract.verify.cell_boxes import aligned, divided, inner_cell, meeting,
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.neighbouring_pixels import nearby, smoothed
 from ns_abstract.verify.photo import Photo
-from ns_abstract.verify.pixel_rounds import BoundedPixels, PixelRounds, telling_order
+from ns_abstract.verify.pixel_rounds import BoundedPixels, PixelRounds, RoundTuning, telling_order
 from ns_abstract.verify.search_results import BlockResult, FinishedCell
 
 #: Grid units along each parameter, as a power of two.
@@ -39,9 +39,16 @@ class LocationTuning:
 
     #: Image motion over a sub-box, pixels, beyond which cells are cut without bounds.
     coarse: float = 4.0
-    #: Sub-boxes along each of the two parameters that move the picture most; others are not divided, since what is
-    #: shared by the sub-boxes of a cell, above all its depth order, loses by every parameter that is wide.
+    #: Sub-boxes along the two parameters that move the picture most, where a set has few; others are not divided, since
+    #: what is shared by the sub-boxes of a cell, above all its depth order, loses by every parameter that is wide.
     along: int = 8
+    #: From so many parameters on, so many sub-boxes are shared out among all of them: a cell that is long along two
+    #: moves the picture by more, and forms lose by the square of that.
+    many: int = 4
+    shared: int = 64
+    #: Rounds of pixels where a set has few parameters, and many: what a cell takes whatever its pixels are, is most of
+    #: the work there, and a first round of more pixels excludes more at once.
+    pixel_rounds: tuple[RoundTuning, RoundTuning] = RoundTuning(), RoundTuning(first=2.0)
     #: Image motion over a sub-box, pixels, up to which pixels of uncertain orders are bounded whatever the order: it
     #: takes long, and excludes little of wider ones.
     unordered: float = 1.6
@@ -111,13 +118,32 @@ class LocationSearch:
         motion = np.maximum(motion, 1e-3 * max(1.0, float(motion.max(initial=0.0))))
         self._pace = motion / width
 
+    @property
+    def many_parameters(self) -> bool:
+        """Whether the set has many parameters."""
+        return self.frame.box.dimensions >= self.tuning.many
+
     @cached_property
     def along(self) -> np.ndarray:
         """[d] sub-boxes along the parameters of a cell."""
-        counts = np.ones(self.frame.box.dimensions, np.int64)
+        d, tuning = self.frame.box.dimensions, self.tuning
+        counts = np.ones(d, np.int64)
         if isinstance(self.frame, SubBoxFrame) and self.contract:
-            counts[np.argsort(-self.moved(self.frame.box), kind="stable")[:2]] = self.tuning.along
+            order = np.argsort(-self.moved(self.frame.box), kind="stable")
+            counts[order[:2]] = tuning.along
+            if self.many_parameters:
+                halvings = tuning.shared.bit_length() - 1
+                counts[order] = [1 << (halvings // d + (k < halvings % d)) for k in range(d)]
         return counts
+
+    def first_cells(self) -> list[Cell]:
+        """The set's first cell, or its parts where it is too wide for bounds: several can be examined side by side."""
+        (root,) = self.grid.roots()
+        if np.linalg.norm(self.moved(self.grid.box) / self.along) <= self.tuning.coarse:
+            return [root]
+        examination = _Examination(self, root, self.tiled.chosen(()))
+        examination.cut()
+        return examination.children
 
     def moved(self, box: ParameterBox) -> Float64Array:
         """[d] pixels that typical scene elements move by over a cell (an estimate)."""
@@ -220,7 +246,7 @@ class _Examination:
             if not self._whole(box, picture, number) or self.cell.volume > (1.0 - tuning.worth) * before:
                 break
         if not self.done:
-            self._cut()
+            self.cut()
         return None
 
     @property
@@ -257,7 +283,7 @@ class _Examination:
                 self.leaves.append(FinishedCell(cell, "certified", 1.0, 0.0))
         if len(remaining) == 1 and remaining[0].volume > (1.0 - tuning.worth) * self.cell.volume:
             self.cell = remaining[0]
-            self._cut()
+            self.cut()
         else:
             self.children = remaining
         return True
@@ -356,7 +382,8 @@ class _Examination:
         self.share = (known + sure) / (known + needed) if alone else 0.0
         if alone and self.share < tuning.promise:
             order = order[:0]
-        return PixelRounds(tiled, order, int(np.prod(counts)), self.inherited), gaps
+        preference = tuning.pixel_rounds[search.many_parameters]
+        return PixelRounds(tiled, order, int(np.prod(counts)), self.inherited, preference), gaps
 
     def _gaps(self, picture: np.ndarray, radius: int, scale: float) -> Float64Array:
         """[T, side, side, 6] by how much the picture within ``radius`` pixels misses the photo, less its looseness.
@@ -426,7 +453,7 @@ class _Examination:
             leaf = FinishedCell(self.cell, "unknown", None, 0.0, reason="the finest cell")
         self.leaves.append(leaf)
 
-    def _cut(self) -> None:
+    def cut(self) -> None:
         """Cut what is left of the cell where the picture moves most."""
         search, tuning = self.search, self.search.tuning
         if self.cell.volume <= max(1.0, tuning.finest ** len(self.cell.first) * search.grid.volume):

@@ -193,9 +193,7 @@ class SplatFrame(Frame):
 
     def warm_up(self, stage: str | None = None) -> None:
         """Compile the kernels that this frame needs, or those of one of `stages`."""
-        box = self.box
-        for axis in range(box.dimensions):
-            box = box.split(axis, 1024)[0]
+        box = self._narrow
         if stage is None:
             self.bound(box, np.arange(1))
         elif stage != "render":
@@ -206,6 +204,20 @@ class SplatFrame(Frame):
                 self.bounds.stages = whole
         if stage in (None, "render"):
             self.render(box.middle)
+
+    @property
+    def _narrow(self) -> ParameterBox:
+        """A narrow cell at the set's lower ends."""
+        box = self.box
+        for axis in range(box.dimensions):
+            box = box.split(axis, 1024)[0]
+        return box
+
+    def warm_up_sub_boxes(self) -> None:
+        """See `ns_abstract.refine.protocol.SubBoxFrame`."""
+        if self.box.dimensions > 1:
+            forms = self.pose_set.enclosure(self._narrow, self.order)
+            self.bounds.warm_up(self.camera, forms, shared_out(np.ones(self.box.dimensions), _TUNING.parts))
 
     def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
         """Tiles [t, side, side, channels] float32 of the concrete image at parameter values [d]."""

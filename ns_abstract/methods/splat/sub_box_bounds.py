@@ -50,6 +50,12 @@ class SubBoxBounds(SplatBounds):
             latest = self._latest[lane()] = box, self.project(camera, forms)
         return latest[1]
 
+    def warm_up(self, camera: PinholeCamera, forms: PoseForms, counts: np.ndarray) -> None:
+        """Compile what `unordered` needs; arguments are as of `sub_boxes`."""
+        pixels = np.ones((1, self.side, self.side), bool)
+        out, ends = np.empty((*pixels.shape, 6, int(counts.prod()))), np.ones((pixels.size, 6), bool)
+        self.unordered(camera, forms, self.project(camera, forms), np.arange(1), pixels, counts, ends, out)
+
     def sub_boxes(
         self, camera: PinholeCamera, forms: PoseForms, projected: ProjectedCell, wanted: np.ndarray,
         pixels: np.ndarray, counts: np.ndarray, ends: np.ndarray | None = None,
