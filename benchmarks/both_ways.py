@@ -5,11 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from ns_abstract.arithmetic.outward import outward
-from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.box import ParameterBox, shared_out
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.methods.splat.bounds import CellBounds, SplatBounds
-from ns_abstract.methods.splat.stage_data import shared_out
 
 #: Parts of a cell that is bounded over them, too.
 _PARTS = 16

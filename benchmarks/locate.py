@@ -32,7 +32,6 @@ from ns_abstract.api.job import Job
 from ns_abstract.api.location import Location, PhotoOptions
 from ns_abstract.execution.threads import use_threads
 from ns_abstract.geometry.tiles import assemble
-from ns_abstract.refine.protocol import SubBoxFrame
 
 SETS = {
     "six": {"translation": dict.fromkeys("xyz", 0.05), "rotation": dict.fromkeys(("yaw", "pitch", "roll"), 0.05)},
@@ -162,8 +161,8 @@ def searched(scene: nsa.Scene, poses: nsa.PoseSet, seed: int, options: argparse.
     location = Location(Job(scene, [poses.of(scene)]), levels, None, PhotoOptions(NOISE, OUTLIERS))
     search, generator = location.search(0), np.random.default_rng(1)
     search.frame.warm_up()
-    if isinstance(search.frame, SubBoxFrame):
-        search.frame.warm_up_sub_boxes()
+    if (frame := search.sub_box_frame) is not None:
+        frame.warm_up_sub_boxes()
     many = in_units(search, search.plain.box.sample(100_000, generator))
     # shears keep volumes
     whole = np.prod(np.subtract(search.plain.box.upper, search.plain.box.lower))

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from ns_abstract.arithmetic.rounding import FLOAT32, REAL
-from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.box import ParameterBox, shared_out
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble, tile_grid
@@ -25,7 +25,7 @@ from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.intervals import sort_keys as sort_group
 from ns_abstract.methods.splat.projection_errors import FORMS, SPREAD, UNBOUNDED, columns
 from ns_abstract.methods.splat.render import Renderer
-from ns_abstract.methods.splat.stage_data import SubBoxes, cell_parts, shared_out
+from ns_abstract.methods.splat.stage_data import SubBoxes, cell_parts
 from ns_abstract.methods.splat.sub_box_bounds import SubBoxBounds
 from ns_abstract.perturbation.specification import Perturbation
 

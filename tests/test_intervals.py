@@ -12,6 +12,7 @@ from test_bounds import Case, moves, scene
 
 from ns_abstract.arithmetic.rounding import FLOAT32, REAL, UNIT64, charges
 from ns_abstract.arithmetic.simd.intrinsics import pointer
+from ns_abstract.geometry.box import shared_out
 from ns_abstract.methods.splat.block_buffers import block_of, new_buffers
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, raster_rules
@@ -26,7 +27,7 @@ from ns_abstract.methods.splat.pixel_block import (
     fragment_width,
     set_unknown,
 )
-from ns_abstract.methods.splat.stage_data import FormShape, Parts, PixelInputs, SubBoxes, cell_parts, shared_out
+from ns_abstract.methods.splat.stage_data import FormShape, Parts, PixelInputs, SubBoxes, cell_parts
 from ns_abstract.perturbation.specification import Perturbation
 
 BACKGROUND = np.array([0.25, 0.5, 0.75])

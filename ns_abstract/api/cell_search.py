@@ -130,7 +130,7 @@ class CellQuestion(ABC, Generic[P]):
         """The cells of a set whose search begins: the set as one cell, if nothing else is known."""
         return CellGrid.adaptive(self.sets[number], [1] * self.sets[number].dimensions)
 
-    def first_blocks(self, grid: CellGrid) -> list[list[Cell]]:
+    def first_blocks(self, number: int, grid: CellGrid) -> list[list[Cell]]:
         """What the search of a set begins with."""
         return [grid.roots()]
 
@@ -234,7 +234,7 @@ class CellSearch(Generic[P]):
                 grid = store.grid(number, box)
                 if grid is None:
                     grid = question.grid(number)
-                    store.begin(number, grid, question.first_blocks(grid))
+                    store.begin(number, grid, question.first_blocks(number, grid))
                 self.grids[number] = grid
             # sets of an earlier command that were not asked for now
             for tally in store.tallies():

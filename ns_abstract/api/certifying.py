@@ -112,7 +112,7 @@ class CertificateQuestion(CellQuestion[CertifyProgress]):
     def grid(self, number: int) -> CellGrid:
         return self.job.grid(number)
 
-    def first_blocks(self, grid: CellGrid) -> list[list[Cell]]:
+    def first_blocks(self, number: int, grid: CellGrid) -> list[list[Cell]]:
         return self.job.first_blocks(grid)
 
     def stored_set(self, number: int) -> ParameterBox | None:

@@ -19,7 +19,6 @@ from ns_abstract.api.search_options import SearchKeywords, SearchOptions, Search
 from ns_abstract.execution.cancellation import Deadline
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.io.errors import InputError
-from ns_abstract.refine.protocol import SubBoxFrame
 from ns_abstract.report.certificate import search_figures
 from ns_abstract.report.figures import percent, short_guarantee
 from ns_abstract.report.location import location_document, location_page, location_pictures
@@ -82,8 +81,7 @@ class LocationQuestion(CellQuestion[LocateProgress]):
     def grid(self, number: int) -> CellGrid:
         return self.job.search(number).grid
 
-    def first_blocks(self, grid: CellGrid) -> list[list[Cell]]:
-        number = next(number for number, box in self.sets.items() if box == grid.box)
+    def first_blocks(self, number: int, grid: CellGrid) -> list[list[Cell]]:
         return [[cell] for cell in self.job.search(number).first_cells()]
 
     def stored_set(self, number: int) -> Any:
@@ -107,8 +105,7 @@ class LocationQuestion(CellQuestion[LocateProgress]):
         request.on_open(store)
         first = next(iter(self.sets))
         self.job.job.warm_up(first)
-        frame = self.job.search(first).frame
-        if self.job.options.contract and isinstance(frame, SubBoxFrame):
+        if (frame := self.job.search(first).sub_box_frame) is not None:
             warm_up_sub_boxes(frame)
 
     def reserved(self, seconds: float) -> float:

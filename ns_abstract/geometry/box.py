@@ -72,3 +72,11 @@ class ParameterBox:
         lower, upper = list(self.lower), list(self.upper)
         lower[axis], upper[axis] = low, high
         return ParameterBox(self.names, self.units, tuple(lower), tuple(upper))
+
+
+def shared_out(weights: np.ndarray, parts: int) -> np.ndarray:
+    """Numbers of parts [d] along axes, ``parts`` together (a power of two), more where ``weights`` [d] are larger."""
+    counts = np.ones(weights.size, np.int64)
+    while counts.prod() < parts:
+        counts[np.argmax(weights / counts)] *= 2
+    return counts

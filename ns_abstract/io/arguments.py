@@ -43,11 +43,13 @@ def at_least(value: Any, least: float, field: str) -> float:
     return number
 
 
-def whole(value: Any, least: int, field: str) -> int:
-    """``value`` as an integer that is no smaller than ``least``. Raises InputError where it is none."""
-    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
-        raise unusable(value, field=field, fix=f"give a whole number of at least {least}")
-    return int(value)
+def whole(value: Any, least: int, field: str, most: int | None = None) -> int:
+    """``value`` as an integer from ``least`` to ``most``. Raises InputError where it is none."""
+    number = int(value) if isinstance(value, Integral) and not isinstance(value, bool) else None
+    if number is None or number < least or (most is not None and number > most):
+        limits = f"a whole number of at least {least}" if most is None else f"{least} to {most}"
+        raise unusable(value, field=field, fix=f"give {limits}")
+    return number
 
 
 def file_path(value: Any, field: str) -> Path:

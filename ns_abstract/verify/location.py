@@ -17,7 +17,7 @@ import numpy as np
 
 from ns_abstract.arithmetic.rounding import CUT_VALUE_ROUNDING, HALF_UP
 from ns_abstract.execution.cancellation import check_cancelled
-from ns_abstract.geometry.box import Float64Array, ParameterBox
+from ns_abstract.geometry.box import Float64Array, ParameterBox, shared_out
 from ns_abstract.geometry.tiles import assemble, in_tiles
 from ns_abstract.refine.protocol import Bounds, Frame, LinearSets, SubBoxFrame
 from ns_abstract.verify.cell_boxes import aligned, divided, inner_cell, meeting, resolved, slabs, sub_box_counts
@@ -119,6 +119,11 @@ class LocationSearch:
         self._pace = motion / width
 
     @property
+    def sub_box_frame(self) -> SubBoxFrame | None:
+        """The frame, if cells are contracted and it bounds pixels over their sub-boxes."""
+        return self.frame if self.contract and isinstance(self.frame, SubBoxFrame) else None
+
+    @property
     def many_parameters(self) -> bool:
         """Whether the set has many parameters."""
         return self.frame.box.dimensions >= self.tuning.many
@@ -126,20 +131,18 @@ class LocationSearch:
     @cached_property
     def along(self) -> np.ndarray:
         """[d] sub-boxes along the parameters of a cell."""
-        d, tuning = self.frame.box.dimensions, self.tuning
-        counts = np.ones(d, np.int64)
-        if isinstance(self.frame, SubBoxFrame) and self.contract:
-            order = np.argsort(-self.moved(self.frame.box), kind="stable")
-            counts[order[:2]] = tuning.along
-            if self.many_parameters:
-                halvings = tuning.shared.bit_length() - 1
-                counts[order] = [1 << (halvings // d + (k < halvings % d)) for k in range(d)]
+        counts = np.ones(self.frame.box.dimensions, np.int64)
+        order = np.argsort(-self.moved(self.frame.box), kind="stable")
+        if self.sub_box_frame is not None and self.many_parameters:
+            counts[order] = shared_out(np.ones(counts.size), self.tuning.shared)
+        elif self.sub_box_frame is not None:
+            counts[order[:2]] = self.tuning.along
         return counts
 
     def first_cells(self) -> list[Cell]:
         """The set's first cell, or its parts where it is too wide for bounds: several can be examined side by side."""
         (root,) = self.grid.roots()
-        if np.linalg.norm(self.moved(self.grid.box) / self.along) <= self.tuning.coarse:
+        if self.sub_box_motion(self.grid.box, self.along) <= self.tuning.coarse:
             return [root]
         examination = _Examination(self, root, self.tiled.chosen(()))
         examination.cut()
@@ -148,6 +151,10 @@ class LocationSearch:
     def moved(self, box: ParameterBox) -> Float64Array:
         """[d] pixels that typical scene elements move by over a cell (an estimate)."""
         return self._pace * (np.array(box.upper) - np.array(box.lower))
+
+    def sub_box_motion(self, box: ParameterBox, counts: np.ndarray) -> float:
+        """Pixels that they move by over each of ``counts`` [d] sub-boxes of a cell."""
+        return float(np.linalg.norm(self.moved(box) / counts))
 
     @cached_property
     def looseness(self) -> tuple[np.ndarray, np.ndarray]:
@@ -233,7 +240,7 @@ class _Examination:
                 return self._exclude(1.0)
             self._shrink(feasible)
             box = search.grid.box_of(self.cell)
-            moved = float(np.linalg.norm(search.moved(box) / search.along))
+            moved = search.sub_box_motion(box, search.along)
             if box.dimensions and moved > tuning.coarse:
                 break
             picture, number = self._look(box.middle)
@@ -258,15 +265,16 @@ class _Examination:
         """Exclude sub-boxes of the cell; returns whether some were, or None: the frame has no bounds of sub-boxes."""
         search, tuning = self.search, self.search.tuning
         counts = sub_box_counts(self.cell, search.along)
-        if not isinstance(search.frame, SubBoxFrame) or not search.contract or not resolved(box, counts):
+        frame = search.sub_box_frame
+        if frame is None or not resolved(box, counts):
             return None
         rounds, gaps = self._rounds(box, picture, counts)
         telling = gaps == gaps.max(axis=-1, keepdims=True)
-        narrow = float(np.linalg.norm(search.moved(box) / counts)) <= tuning.unordered
+        narrow = search.sub_box_motion(box, counts) <= tuning.unordered
         while (chosen := rounds.following()) is not None:
             self.bounded += 1
             tiles = np.flatnonzero(chosen.any(axis=(1, 2)))
-            ends = search.frame.sub_box_ends(box, counts, tiles, chosen[tiles], telling[chosen] if narrow else None)
+            ends = frame.sub_box_ends(box, counts, tiles, chosen[tiles], telling[chosen] if narrow else None)
             if ends is None:
                 return None
             rounds.count(*ends, chosen)

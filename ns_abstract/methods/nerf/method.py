@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from numbers import Integral
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ import torch
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.differentiable_pose import differentiable_pose
 from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseBox
-from ns_abstract.io.arguments import float64_of
+from ns_abstract.io.arguments import float64_of, whole
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import unusable
 from ns_abstract.methods.nerf.bounds import NerfBounds
@@ -78,12 +77,11 @@ class NerfMethod(FieldMethod):
             )
         if hierarchical and renderer == "paper":
             raise InputError("the paper's renderer samples uniformly", field="--sampling", fix="use uniform")
-        samples = _SAMPLES if num_samples is None else num_samples
-        if isinstance(samples, bool) or not isinstance(samples, Integral) or not 1 <= samples <= _SAMPLES_LIMIT:
-            raise unusable(samples, field="--num-samples", fix=f"give 1 to {_SAMPLES_LIMIT}")
-        near = scene.near if near_plane is None else float64_of(near_plane)
+        samples = whole(_SAMPLES if num_samples is None else num_samples, 1, "--num-samples", _SAMPLES_LIMIT)
+        plane = scene.near if near_plane is None else near_plane
+        near = float64_of(plane)
         if not 0.0 <= near < scene.far:
-            raise unusable(near_plane, field="--near-plane", fix=f"give 0 or more, below {scene.far:g}")
+            raise unusable(plane, field="--near-plane", fix=f"give 0 or more, below {scene.far:g}")
         super().__init__(scene)
         self.scene = scene if occupancy is None else replace(scene, occupancy=occupancy)
         self.workers = workers
@@ -91,7 +89,7 @@ class NerfMethod(FieldMethod):
         self.paper = renderer == "paper"
         background = np.zeros(3) if self.paper else scene.background
         red, green, blue = (float(v) for v in background)
-        self.sampling = Sampling("uniform", near, scene.far, int(samples), 0, (red, green, blue))
+        self.sampling = Sampling("uniform", near, scene.far, samples, 0, (red, green, blue))
         if hierarchical:
             bins, importance = scene.coarse_samples, scene.importance_samples
             self.sampling = Sampling("hierarchical", near, scene.far, bins, importance, (red, green, blue))

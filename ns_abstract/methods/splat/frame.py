@@ -14,7 +14,7 @@ from ns_abstract.arithmetic.outward import outward
 from ns_abstract.arithmetic.rounding import LINEAR_ROUNDING, LINEAR_UP, Arithmetic
 from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.execution.threads import each
-from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.box import ParameterBox, shared_out
 from ns_abstract.geometry.poses import PoseBox, translation_only
 from ns_abstract.geometry.tiles import laid_out, tile_grid
 from ns_abstract.methods.splat.activate import Splats
@@ -23,7 +23,7 @@ from ns_abstract.methods.splat.constants import Rasteriser
 from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW, DEPTH_HIGH, DEPTH_LOW
 from ns_abstract.methods.splat.lists import summed_area, touching
 from ns_abstract.methods.splat.render import Renderer
-from ns_abstract.methods.splat.stage_data import SubBoxes, shared_out
+from ns_abstract.methods.splat.stage_data import SubBoxes
 from ns_abstract.methods.splat.sub_box_bounds import SubBoxBounds
 from ns_abstract.methods.splat.variations import VariedSplats
 from ns_abstract.perturbation.specification import ROTATIONS

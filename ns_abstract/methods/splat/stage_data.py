@@ -244,14 +244,6 @@ def check_parts(counts: np.ndarray, dimensions: int) -> None:
         raise ValueError(f"{counts.tolist()} are no numbers of parts along {dimensions} axes")
 
 
-def shared_out(weights: np.ndarray, parts: int) -> np.ndarray:
-    """Numbers of parts [d] along axes, ``parts`` together (a power of two), more where ``weights`` [d] are larger."""
-    counts = np.ones(weights.size, np.int64)
-    while counts.prod() < parts:
-        counts[np.argmax(weights / counts)] *= 2
-    return counts
-
-
 def cell_parts(counts: np.ndarray, overlap: float = 0.0, levels: Sequence[float] = ()) -> Parts:
     """The parts of a cell, ``counts`` [d] of them along its axes: powers of two, so that all is exact (B12).
 
