@@ -9,7 +9,8 @@ import pytest
 from ns_abstract.verify.cell_boxes import meeting
 from ns_abstract.verify.cells import Cell
 from ns_abstract.verify.photo import TiledPhoto
-from ns_abstract.verify.pixel_rounds import BoundedPixels, PixelRounds, RoundTuning, telling_order
+from ns_abstract.verify.pixel_rounds import BoundedPixels, PixelRounds, RoundTuning
+from ns_abstract.verify.telling_pixels import telling_order
 
 T, SIDE = 3, 4
 

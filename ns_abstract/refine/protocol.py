@@ -217,15 +217,21 @@ class CountedFrame(Protocol):
     compiled: tuple[int, float]
 
 
+#: Channels whose differences are bounded, the first less the second.
+CHANNEL_DIFFERENCES = (0, 1), (1, 2), (0, 2)
+
+
 @runtime_checkable
 class SubBoxFrame(Protocol):
     """An optional interface of a `Frame`: bounds over each of many equal sub-boxes of a wide cell."""
 
     def sub_box_ends(
         self, box: ParameterBox, counts: np.ndarray, tiles: np.ndarray, pixels: np.ndarray,
-        ends: np.ndarray | None = None,
+        ends: np.ndarray | None = None, differences: bool = False,
     ) -> tuple[np.ndarray, np.ndarray] | None:  # fmt: skip
         """Lower and upper bounds [n, 3, k] of ``n`` pixels over ``k`` sub-boxes; None: there are none for this set.
+
+        ``differences``: of `CHANNEL_DIFFERENCES` of the pixels before they are clamped to [0, 1], in place of channels.
 
         There are ``counts`` [d] sub-boxes along the axes, powers of two, at least 8 together, numbered like entries of
         an array of this shape. Each is widened by `SUB_BOX_OVERLAP` of the cell's half-widths. ``pixels`` [t, side,

@@ -22,15 +22,13 @@ from ns_abstract.geometry.tiles import assemble, in_tiles
 from ns_abstract.refine.protocol import Bounds, Frame, LinearSets, SubBoxFrame
 from ns_abstract.verify.cell_boxes import aligned, divided, inner_cell, meeting, resolved, slabs, sub_box_counts
 from ns_abstract.verify.cells import Cell, CellGrid
-from ns_abstract.verify.neighbouring_pixels import nearby, smoothed
 from ns_abstract.verify.photo import Photo
-from ns_abstract.verify.pixel_rounds import BoundedPixels, PixelRounds, RoundTuning, telling_order
+from ns_abstract.verify.pixel_rounds import BoundedPixels, PixelRounds, RoundTuning
 from ns_abstract.verify.search_results import BlockResult, FinishedCell
+from ns_abstract.verify.telling_pixels import DIFFERENCES, PixelOrder, TellingPixels
 
 #: Grid units along each parameter, as a power of two.
 UNITS = 20
-#: Pixels that the looseness of bounds is averaged over, to every side.
-_SMOOTH = 4
 
 
 @dataclass(frozen=True)
@@ -157,28 +155,24 @@ class LocationSearch:
         return float(np.linalg.norm(self.moved(box) / counts))
 
     @cached_property
-    def looseness(self) -> tuple[np.ndarray, np.ndarray]:
-        """By how much bounds of a typical cell go below and above what is rendered nearby: [T, side, side, 3] each.
-
-        From one cell in the middle of the set; a guess that only decides which pixels are bounded.
-        """
+    def telling(self) -> TellingPixels:
+        """Which pixels are bounded, from one cell in the middle of the set."""
         box, frame, reference = self.frame.box, self.frame, self.tuning.reference
         side = np.minimum(
             1.0, reference / math.sqrt(max(1, box.dimensions)) / np.maximum(self.moved(box), self.tuning.still)
         )
-        cell = between(box, -side, side)
-        bounds = frame.bound(cell, np.arange(frame.tile_count), None)
-        picture = assemble(self.plain.render(self.original(cell.middle)), frame.camera)
-        least, most = nearby(picture, max(1, round(0.5 * reference)))
-        gaps = least - assemble(bounds.lower, frame.camera), assemble(bounds.upper, frame.camera) - most
-        below, above = (in_tiles(smoothed(np.maximum(gap, 0.0), _SMOOTH), frame.side) for gap in gaps)
-        return below, above
-
-    @cached_property
-    def loose(self) -> np.ndarray:
-        """[T, side, side] `looseness` of the widest channel, above and below together."""
-        below, above = self.looseness
-        return (below + above).max(axis=-1)
+        cell, tiles = between(box, -side, side), np.arange(frame.tile_count)
+        bounds = frame.bound(cell, tiles, None)
+        ends = [(bounds.lower, bounds.upper)]
+        if self.sub_box_frame is not None and self.along.prod() > 1:
+            pixels = in_tiles(np.ones((frame.camera.height, frame.camera.width), bool), frame.side)
+            known = self.sub_box_frame.sub_box_ends(cell, self.along, tiles, pixels, None, True)
+            if known is not None:
+                lower, upper = np.zeros((2, *pixels.shape, 3))
+                lower[pixels], upper[pixels] = known[0].min(axis=-1), known[1].max(axis=-1)
+                ends.append((lower, upper))
+        picture = assemble(self.plain.render(self.original(cell.middle)), frame.camera)[..., :3]
+        return TellingPixels(self.tiled, frame.camera, picture, reference, tuple(ends))
 
     def examine(self, cells: Sequence[Cell]) -> LocationResult:
         """Exclude the cells, or cut them."""
@@ -268,16 +262,22 @@ class _Examination:
         frame = search.sub_box_frame
         if frame is None or not resolved(box, counts):
             return None
-        rounds, gaps = self._rounds(box, picture, counts)
-        telling = gaps == gaps.max(axis=-1, keepdims=True)
+        rounds, order = self._rounds(box, picture, counts)
         narrow = search.sub_box_motion(box, counts) <= tuning.unordered
         while (chosen := rounds.following()) is not None:
             self.bounded += 1
-            tiles = np.flatnonzero(chosen.any(axis=(1, 2)))
-            ends = frame.sub_box_ends(box, counts, tiles, chosen[tiles], telling[chosen] if narrow else None)
-            if ends is None:
-                return None
-            rounds.count(*ends, chosen)
+            excluding = np.zeros((int(chosen.sum()), rounds.numbers.size), bool)
+            for kind, miss in enumerate(order.misses):
+                pixels = chosen & (order.kinds == kind)
+                if not pixels.any():
+                    continue
+                tiles = np.flatnonzero(pixels.any(axis=(1, 2)))
+                telling = (miss == miss.max(axis=-1, keepdims=True))[pixels] if narrow else None
+                ends = frame.sub_box_ends(box, counts, tiles, pixels[tiles], telling, kind == DIFFERENCES)
+                if ends is None:
+                    return None
+                excluding[pixels[chosen]] = search.tiled.excluding(*ends, pixels, kind == DIFFERENCES)
+            rounds.take(excluding, chosen)
             self.share = min(1.0, rounds.expected)
         self.divisions = self.cell, counts, rounds
         left = rounds.left.reshape(counts)
@@ -371,42 +371,20 @@ class _Examination:
             if last or self.cell.volume <= (1.0 - tuning.worth) * before:
                 return True
 
-    def _rounds(self, box: ParameterBox, picture: np.ndarray, counts: np.ndarray) -> tuple[PixelRounds, Float64Array]:
-        """Rounds of pixels for the sub-boxes [counts] of the cell; there are none where too few are likely to help.
-
-        Returns them, and `_gaps` [T, side, side, 6] over the cell's image motion.
-        """
+    def _rounds(self, box: ParameterBox, picture: np.ndarray, counts: np.ndarray) -> tuple[PixelRounds, PixelOrder]:
+        """Rounds of pixels for the sub-boxes [counts] of the cell; there are none where too few are likely to help."""
         search, tiled, tuning = self.search, self.search.tiled, self.search.tuning
         moved, known = search.moved(box), int(self.inherited.sum())
-        needed = tiled.allowed + 1 - known
-        scale = float(np.linalg.norm(moved / counts)) / tuning.reference
-        radius = max(1, round(0.5 * float(np.linalg.norm(moved))))
-        gaps = self._gaps(picture, radius, scale)
-        order, sure = telling_order(
-            self._gaps(picture, 1, 0.0).max(axis=-1), gaps.max(axis=-1), search.loose,
-            tiled.counted & ~self.inherited, round(tuning.surplus * needed),
+        needed, alone = tiled.allowed + 1 - known, counts.prod() == 1
+        chosen = search.telling.order(
+            picture, max(1, round(0.5 * float(np.linalg.norm(moved)))),
+            float(np.linalg.norm(moved / counts)) / tuning.reference, tiled.counted & ~self.inherited,
+            round(tuning.surplus * needed), differences=not alone,
         )  # fmt: skip
-        alone = counts.prod() == 1
-        self.share = (known + sure) / (known + needed) if alone else 0.0
-        if alone and self.share < tuning.promise:
-            order = order[:0]
+        self.share = (known + chosen.sure) / (known + needed) if alone else 0.0
+        numbers = chosen.numbers[: 0 if alone and self.share < tuning.promise else None]
         preference = tuning.pixel_rounds[search.many_parameters]
-        return PixelRounds(tiled, order, int(np.prod(counts)), self.inherited, preference), gaps
-
-    def _gaps(self, picture: np.ndarray, radius: int, scale: float) -> Float64Array:
-        """[T, side, side, 6] by how much the picture within ``radius`` pixels misses the photo, less its looseness.
-
-        By its least of three channels, which may lie above what the photo allows, then by its most.
-
-        Args:
-            picture: Tiles of a render.
-            radius: Pixels.
-            scale: Part of `LocationSearch.looseness` that is expected of the bounds.
-        """
-        search, tiled, side = self.search, self.search.tiled, self.search.frame.side
-        least, most = (in_tiles(end, side) for end in nearby(assemble(picture, search.frame.camera), radius))
-        below, above = (part * scale for part in search.looseness)
-        return np.concatenate([least - below - tiled.high, tiled.low - most - above], axis=-1)
+        return PixelRounds(tiled, numbers, int(np.prod(counts)), self.inherited, preference), chosen
 
     def _bound(self, box: ParameterBox, tiles: np.ndarray, linear: bool, pixels: np.ndarray | None = None) -> Bounds:
         """Bounds of ``tiles``, or of some of their ``pixels`` alone where the frame can leave out the others."""

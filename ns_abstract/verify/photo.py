@@ -15,7 +15,7 @@ from ns_abstract.arithmetic.network_charges import QUOTIENT, STEP
 from ns_abstract.arithmetic.rounding import BRIGHTNESS_ROUNDING, CUT_ROOM, PHOTO_ROOM, REACH_ROUNDING
 from ns_abstract.geometry.box import Float64Array
 from ns_abstract.geometry.tiles import in_tiles
-from ns_abstract.refine.protocol import LinearSets
+from ns_abstract.refine.protocol import CHANNEL_DIFFERENCES, LinearSets
 from ns_abstract.verify.pixel_parts import most_within
 
 _STEPS = 255.0
@@ -144,6 +144,15 @@ class TiledPhoto:
     brightness: Brightness = Brightness()
     shown: tuple[Float64Array, ...] | None = None
 
+    @cached_property
+    def differences(self) -> tuple[Float64Array, Float64Array]:
+        """Least and greatest `CHANNEL_DIFFERENCES` of a picture that explains a pixel, before it is clamped (U10)."""
+        # what shows an end of [0, 1] may have been anything beyond it
+        low, high = np.where(self.low <= 0.0, -np.inf, self.low), np.where(self.high >= 1.0, np.inf, self.high)
+        first, second = (list(side) for side in zip(*CHANNEL_DIFFERENCES, strict=True))
+        least, most = low[..., first] - high[..., second], high[..., first] - low[..., second]
+        return np.nextafter(least, -np.inf), np.nextafter(most, np.inf)
+
     def chosen(self, numbers: Sequence[int]) -> np.ndarray:
         """[T, side, side] the pixels with these ``numbers``, in the order of ``counted`` flattened."""
         pixels = np.zeros(self.counted.shape, bool)
@@ -165,13 +174,16 @@ class TiledPhoto:
         sane = (lower <= upper).all(axis=-1)
         return sane & self.counted[tiles] & ((lower > self.high[tiles]) | (upper < self.low[tiles])).any(axis=-1)
 
-    def excluding(self, lower: np.ndarray, upper: np.ndarray, pixels: np.ndarray) -> np.ndarray:
-        """[n, k] which of the ``n`` ``pixels`` [T, side, side] exclude which of ``k`` sub-boxes (U2, U5).
+    def excluding(
+        self, lower: np.ndarray, upper: np.ndarray, pixels: np.ndarray, differences: bool = False
+    ) -> np.ndarray:
+        """[n, k] which of the ``n`` ``pixels`` [T, side, side] exclude which of ``k`` sub-boxes (U2, U5, U10).
 
-        Their bounds [n, 3, k] lie beyond what explains them; NaN, crossed bounds and pixels that do not count exclude
-        nothing.
+        Their bounds [n, 3, k], of channels or of `CHANNEL_DIFFERENCES`, lie beyond what explains them; NaN, crossed
+        bounds and pixels that do not count exclude nothing.
         """
-        high, low = self.high[pixels][:, :, None], self.low[pixels][:, :, None]
+        ends = self.differences if differences else (self.low, self.high)
+        low, high = (end[pixels][:, :, None] for end in ends)
         beyond = (lower <= upper).all(axis=1) & ((lower > high) | (upper < low)).any(axis=1)
         return beyond & self.counted[pixels][:, None]
 

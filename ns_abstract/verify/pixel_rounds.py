@@ -113,14 +113,13 @@ class PixelRounds:
         return self.photo.counted & ~self.bounded
 
     def count(self, lower: np.ndarray, upper: np.ndarray, pixels: np.ndarray) -> None:
-        """Count the pixels that exclude sub-boxes, each pixel once.
+        """`take` the ``n`` ``pixels`` [T, side, side] with bounds [n, 3, k] of the pictures of each sub-box."""
+        self.take(self.photo.excluding(lower, upper, pixels), pixels)
 
-        Args:
-            lower, upper: [n, 3, k] bounds of the pictures of each sub-box.
-            pixels: [T, side, side] the ``n`` pixels.
-        """
+    def take(self, excluding: np.ndarray, pixels: np.ndarray) -> None:
+        """Count which of the ``n`` ``pixels`` [T, side, side] exclude which sub-boxes [n, k], each pixel once."""
         fresh = (pixels & ~self.bounded)[pixels]
-        excluding = self.photo.excluding(lower, upper, pixels)[fresh]
+        excluding = excluding[fresh]
         before = float(np.median(self.numbers))
         self.numbers += excluding.sum(axis=0)
         self._excluding.append((np.flatnonzero(pixels & ~self.bounded), excluding))
@@ -175,21 +174,3 @@ class BoundedPixels:
     @property
     def _tiles(self) -> np.ndarray:
         return np.arange(self.photo.counted.shape[0])
-
-
-def telling_order(
-    gaps: Float64Array, likely: Float64Array, loose: Float64Array, counted: np.ndarray, most_pixels: int
-) -> tuple[np.ndarray, int]:
-    """Numbers of the pixels to bound, at most ``most_pixels``, and how many of them are likely to exclude the cell.
-
-    Args:
-        gaps: [T, side, side] by how much the picture in the cell's middle misses the photo there.
-        likely: [T, side, side] by how much all bounds over the cell are expected to.
-        loose: [T, side, side] expected looseness of bounds: where they are loose they also take longer.
-    """
-    sure = counted & (likely > 0.0)
-    some = counted & (gaps > 0.0) & ~sure
-    first, rest = np.flatnonzero(sure), np.flatnonzero(some)
-    order = [first[np.argsort((loose - likely).reshape(-1)[first], kind="stable")]]
-    order.append(rest[np.argsort(-gaps.reshape(-1)[rest], kind="stable")])
-    return np.concatenate(order)[:most_pixels], first.size

@@ -52,6 +52,8 @@ _FAR = 4.0
 _LEFT, _NARROWEST, _AWAY = 0.7, 0.125, 4.0
 #: Corners sampled in a cell without a proof, beside its two ends, and random poses.
 _LATE, _RANDOM = 4, 2
+#: Random poses sampled before the whole set is falsified as one cell; a smaller cell takes its part of these.
+_WITNESSES = 64
 #: Steps of the descent to a counterexample.
 _STEPS = 6
 #: Scenes of a set tried in a cell without a proof.
@@ -136,8 +138,10 @@ class Search:
         self._sample([cell for cell in open_cells if cell.proved], self._attack)
         self._sample([cell for cell in samples if cell.parts], self._attack_parts)
         failing = [cell for cell in open_cells if not (cell.proved or cell.broken)]
+        if self.costly:
+            self._sample(failing, self._late)
         # a cell is falsified as a whole where nothing else is seen
-        self._sample(failing if self.costly else [c for c in samples if c.broken and c.hopeless], self._late)
+        self._sample([cell for cell in samples if cell.broken and cell.hopeless], self._last)
         self._descend_worst_cell(failing)
         if self.varies:
             self._vary(failing)
@@ -191,6 +195,15 @@ class Search:
     def _late(self, cell: CellSamples) -> list[Sample]:
         """Corners and random poses that no sample has been yet."""
         return [(pose, None) for pose in cell.fresh_poses(_generator(cell.cell), _LATE, _RANDOM)]
+
+    def _last(self, cell: CellSamples) -> list[Sample]:
+        """Poses at which the property may hold nevertheless: the more, the larger the cell is."""
+        if self.every_unit:
+            return []
+        number = math.ceil(_WITNESSES * cell.cell.volume / self.grid.volume)
+        corners, least = (0, 0) if self.costly else (_LATE, _RANDOM)
+        poses = cell.fresh_poses(_generator(cell.cell), corners, max(least, number if number > 1 else 0))
+        return [(pose, None) for pose in poses]
 
     def _sample(self, cells: Sequence[CellSamples], choose: Callable[[CellSamples], list[Sample]]) -> None:
         """Add samples to the cells."""

@@ -280,7 +280,7 @@ class SplatBounds:
         across, down = tile_grid(camera, self.side)
         wanted = np.asarray(np.arange(across * down) if wanted is None else wanted, np.int64)
         projected = candidates if isinstance(candidates, ProjectedCell) else self.project(camera, forms, candidates)
-        candidates, poses, gaussians, alive, colors = projected
+        candidates, poses, gaussians, alive, colors, background, color_error = projected
         offsets, entries = tile_lists(
             self._listed(alive, candidates, gaussians), gaussians.tiles, tile_mask(wanted, across * down), across
         )
@@ -294,7 +294,7 @@ class SplatBounds:
             gaussians,
             self._viewing_axes(forms, poses.rotation_magnitude, gaussians),
             camera.intrinsics,
-            Colors(colors, self.splats.background, self._sums.color_radius, 4 if layers else 3, common),
+            Colors(colors, background, color_error, 4 if layers else 3, common),
             self.rules,
             self.charges,
             self._cutoffs(floor, PART_PAIR_LIMIT if keep_parts else PAIR_LIMIT),
@@ -318,7 +318,9 @@ class SplatBounds:
         poses = _cell_poses(forms)
         gaussians, alive = self._projected(candidates, poses, camera, form_shape(forms.rotation.basis))
         colors = self._colors(forms, poses.camera_magnitude, candidates, alive, candidates.size)
-        return ProjectedCell(candidates, poses, gaussians, alive, colors)
+        return ProjectedCell(
+            candidates, poses, gaussians, alive, colors, self.splats.background, self._sums.color_radius
+        )
 
     def _projected(
         self, candidates: np.ndarray, poses: CellPoses, camera: PinholeCamera, shape: FormShape

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ns_abstract.arithmetic.outward import outward
-from ns_abstract.arithmetic.rounding import LINEAR_ROUNDING, LINEAR_UP, Arithmetic
+from ns_abstract.arithmetic.rounding import DIFFERENCE_ROUNDING, LINEAR_ROUNDING, LINEAR_UP, Arithmetic
 from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.execution.threads import each
 from ns_abstract.geometry.box import ParameterBox, shared_out
@@ -291,15 +291,19 @@ class SplatFrame(Frame):
 
     def sub_box_ends(
         self, box: ParameterBox, counts: np.ndarray, tiles: np.ndarray, pixels: np.ndarray,
-        ends: np.ndarray | None = None,
+        ends: np.ndarray | None = None, differences: bool = False,
     ) -> tuple[np.ndarray, np.ndarray] | None:  # fmt: skip
-        """See `ns_abstract.refine.protocol.SubBoxFrame` (design.md, U5, B14)."""
+        """See `ns_abstract.refine.protocol.SubBoxFrame` (design.md, U5, B14, B15)."""
         if box.dimensions < 2:
             return None
         check_cancelled()
         forms = self.pose_set.enclosure(box, self.order)
-        projected = self.bounds.projected_box(self.camera, forms, box)
-        return part_ends(self.bounds.sub_boxes(self.camera, forms, projected, tiles, pixels, counts, ends), pixels)
+        if not differences:
+            projected = self.bounds.projected_box(self.camera, forms, box)
+            return part_ends(self.bounds.sub_boxes(self.camera, forms, projected, tiles, pixels, counts, ends), pixels)
+        projected, scale = self.bounds.projected_differences(self.camera, forms, box)
+        parts = self.bounds.sub_boxes(self.camera, forms, projected, tiles, pixels, counts, ends)
+        return difference_ends(parts, pixels, scale)
 
     def _bound(
         self, box: ParameterBox, tiles: np.ndarray, within: VisibleContext | None, candidates: np.ndarray | None,
@@ -456,6 +460,17 @@ def part_ends(parts: np.ndarray | None, pixels: np.ndarray) -> tuple[np.ndarray,
     # crossed or not a number: nothing is known
     sane = lower <= upper
     return np.where(sane, lower, 0.0).clip(0.0, 1.0), np.where(sane, upper, 1.0).clip(0.0, 1.0)
+
+
+def difference_ends(parts: np.ndarray, pixels: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds [n, 3, k] of `CHANNEL_DIFFERENCES`, from ``parts`` for the colours of `channel_differences`."""
+    ends = parts[pixels]
+    lower, upper = ends[:, :COLORS], ends[:, COLORS:]
+    # [0, 1] stands for nothing that is known (design.md, B15)
+    known = (lower <= upper) & ~((lower == 0.0) & (upper == 1.0)) & (scale > 0.0)
+    with np.errstate(all="ignore"):
+        lower, upper = (lower - 0.5 - DIFFERENCE_ROUNDING) / scale, (upper - 0.5 + DIFFERENCE_ROUNDING) / scale
+    return np.where(known, lower, -np.inf), np.where(known, upper, np.inf)
 
 
 def linear_sets(forms: np.ndarray, lower: np.ndarray, upper: np.ndarray, d: int) -> LinearSets:

@@ -144,7 +144,7 @@ class ProjectedCell(NamedTuple):
         poses: Of the cell.
         gaussians: Their forms.
         alive: [k] places among the candidates of those that some pose shows.
-        colors: See `Colors.values`.
+        colors, background, color_error: See `Colors`.
     """
 
     candidates: np.ndarray
@@ -152,6 +152,8 @@ class ProjectedCell(NamedTuple):
     gaussians: ProjectedGaussians
     alive: np.ndarray
     colors: np.ndarray
+    background: np.ndarray
+    color_error: float
 
 
 class ViewingAxes(NamedTuple):

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ns_abstract.arithmetic.rounding import SUB_BOX_OVERLAP, UP
+from ns_abstract.arithmetic.rounding import DIFFERENCE_ROUNDING, SUB_BOX_OVERLAP, UP
 from ns_abstract.execution.threads import lane, threads
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import PinholeCamera
@@ -27,6 +27,7 @@ from ns_abstract.methods.splat.stage_data import (
     strips_of,
 )
 from ns_abstract.methods.splat.unordered_pixels import unordered_stage
+from ns_abstract.refine.protocol import CHANNEL_DIFFERENCES
 
 
 class SubBoxBounds(SplatBounds):
@@ -35,12 +36,13 @@ class SubBoxBounds(SplatBounds):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self._latest: dict[int, tuple[ParameterBox, ProjectedCell] | None] = {}
+        self._differences: dict[int, tuple[ProjectedCell, ProjectedCell, float] | None] = {}
 
     def _projected(
         self, candidates: np.ndarray, poses: CellPoses, camera: PinholeCamera, shape: FormShape
     ) -> tuple[ProjectedGaussians, np.ndarray]:
         # it takes the memory of the last one
-        self._latest[lane()] = None
+        self._latest[lane()] = self._differences[lane()] = None
         return super()._projected(candidates, poses, camera, shape)
 
     def projected_box(self, camera: PinholeCamera, forms: PoseForms, box: ParameterBox) -> ProjectedCell:
@@ -49,6 +51,16 @@ class SubBoxBounds(SplatBounds):
         if latest is None or latest[0] != box:
             latest = self._latest[lane()] = box, self.project(camera, forms)
         return latest[1]
+
+    def projected_differences(
+        self, camera: PinholeCamera, forms: PoseForms, box: ParameterBox
+    ) -> tuple[ProjectedCell, float]:
+        """`channel_differences` of `projected_box`, unless the lane's last were that."""
+        projected = self.projected_box(camera, forms, box)
+        latest = self._differences.get(lane())
+        if latest is None or latest[0] is not projected:
+            latest = self._differences[lane()] = projected, *channel_differences(projected)
+        return latest[1:]
 
     def warm_up(self, camera: PinholeCamera, forms: PoseForms, counts: np.ndarray) -> None:
         """Compile what `unordered` needs; arguments are as of `sub_boxes`."""
@@ -90,10 +102,10 @@ class SubBoxBounds(SplatBounds):
         """
         across, down = tile_grid(camera, self.side)
         shape = form_shape(forms.rotation.basis, int(counts.prod()))
-        _, poses, gaussians, alive, colors = projected
+        _, poses, gaussians, alive, colors, background, color_error = projected
         inputs = PixelInputs(
             gaussians, self._viewing_axes(forms, poses.rotation_magnitude, gaussians), camera.intrinsics,
-            Colors(colors, self.splats.background, self._sums.color_radius, 3, np.zeros(shape.monomials + 1)),
+            Colors(colors, background, color_error, 3, np.zeros(shape.monomials + 1)),
             self.rules, self.charges, self._cutoffs(-1.0, 1), shape, cell_parts(counts, SUB_BOX_OVERLAP),
         )  # fmt: skip
         chosen = np.zeros((across * down, self.side, self.side), bool)
@@ -103,7 +115,7 @@ class SubBoxBounds(SplatBounds):
         reach = np.where(np.isnan(box), [0, np.inf] * 2, np.floor(box + [-0.5, 1.5] * 2)).clip(0, size).astype(np.int32)
         touched = touching(np.arange(alive.size), reach, summed_area(laid_out(chosen, across)))
         alive, reach = alive[touched], reach[touched]
-        color_ends = _color_ends(colors, alive, self.splats.background)
+        color_ends = _color_ends(colors, alive, background)
         for row in np.flatnonzero(ends.any(axis=0)).tolist():
             some, end = np.zeros(pixels.shape, bool), color_ends[row]
             some[pixels] = ends[:, row]
@@ -115,6 +127,36 @@ class SubBoxBounds(SplatBounds):
             unordered_stage(
                 lists, pixel_sets(some, wanted.size, self.side), inputs, strips_of(inputs.parts), end, threads(), out
             )
+
+
+def channel_differences(projected: ProjectedCell) -> tuple[ProjectedCell, float]:
+    """The cell with differences of channels for colours, in memory of its own, and their scale (design.md, B15).
+
+    The three channels are ``1/2 + scale * (first - second)`` for the pairs of `CHANNEL_DIFFERENCES`. The scale keeps
+    them in [0, 1]; it is 0 where colours have no finite bound.
+    """
+    alive, background = projected.alive, projected.background
+    first, second = (list(side) for side in zip(*CHANNEL_DIFFERENCES, strict=True))
+    columns = projected.colors.shape[1] // 3
+    forms = projected.colors[alive].reshape(alive.size, 3, columns)
+    brightest = np.abs(forms).sum(axis=-1).max(initial=max(1.0, float(np.abs(background).max()))) * UP
+    if not np.isfinite(brightest):
+        return projected, 0.0
+    scale = 0.5 / float(brightest)
+    forms = scale * forms
+    differences = forms[:, first] - forms[:, second]
+    differences[..., 0] += 0.5
+    if columns > 1:
+        size = 1.0 + np.abs(forms).sum(axis=-1)
+        room = DIFFERENCE_ROUNDING * (size[:, first] + size[:, second])
+        differences[..., -1] = (forms[:, first, -1] + forms[:, second, -1]) * UP + room
+    colors = np.empty_like(projected.colors)
+    colors[alive] = differences.reshape(alive.size, -1)
+    return projected._replace(
+        colors=colors,
+        background=scale * (background[first] - background[second]) + 0.5,
+        color_error=projected.color_error + DIFFERENCE_ROUNDING,
+    ), scale
 
 
 def _color_ends(colors: np.ndarray, alive: np.ndarray, background: np.ndarray) -> list[ColorEnd]:
