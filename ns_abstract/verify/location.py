@@ -18,14 +18,14 @@ import numpy as np
 from ns_abstract.arithmetic.rounding import CUT_VALUE_ROUNDING, HALF_UP
 from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import Float64Array, ParameterBox, shared_out
-from ns_abstract.geometry.tiles import assemble, in_tiles
+from ns_abstract.geometry.tiles import assemble
 from ns_abstract.refine.protocol import Bounds, Frame, LinearSets, SubBoxFrame
 from ns_abstract.verify.cell_boxes import aligned, divided, inner_cell, meeting, resolved, slabs, sub_box_counts
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.photo import Photo
 from ns_abstract.verify.pixel_rounds import BoundedPixels, PixelRounds, RoundTuning
 from ns_abstract.verify.search_results import BlockResult, FinishedCell
-from ns_abstract.verify.telling_pixels import DIFFERENCES, PixelOrder, TellingPixels
+from ns_abstract.verify.telling_pixels import DIFFERENCES, PixelOrder, TellingPixels, TypicalCell, typical_cell
 
 #: Grid units along each parameter, as a power of two.
 UNITS = 20
@@ -57,9 +57,9 @@ class LocationTuning:
     contracted: float = 0.3
     #: Pixels that are bounded to exclude a cell: so many times those that may show anything.
     surplus: float = 4.0
-    #: Image motion over the cell whose bounds tell how loose they are; pixels that must be likely to be excluded, as a
-    #: part of those that exclude a cell, for it to be bounded.
-    reference: float = 2.4
+    #: Image motion over the cell whose bounds tell how loose they are, and over its parts where bounds are over parts.
+    reference: tuple[float, float] = 2.4, 1.8
+    #: Pixels that must be likely to be excluded, as a part of those that exclude a cell, for it to be bounded.
     promise: float = 0.6
     #: Image motion below which a parameter counts as one that moves nothing.
     still: float = 1e-12
@@ -156,23 +156,25 @@ class LocationSearch:
 
     @cached_property
     def telling(self) -> TellingPixels:
-        """Which pixels are bounded, from one cell in the middle of the set."""
-        box, frame, reference = self.frame.box, self.frame, self.tuning.reference
+        """Which pixels of a cell are bounded: a guess, by one cell in the middle of the set."""
+        one = np.ones_like(self.along)
+        typical = self._typical(self.along) or self._typical(one)
+        assert typical is not None
+        return TellingPixels(self.tiled, self.frame.camera, typical)
+
+    def _typical(self, counts: np.ndarray) -> TypicalCell | None:
+        """Of a cell with ``counts`` [d] parts."""
+        box, camera = self.frame.box, self.frame.camera
+        least, reference = self.tuning.still, self.tuning.reference[int(counts.prod()) > 1]
         side = np.minimum(
-            1.0, reference / math.sqrt(max(1, box.dimensions)) / np.maximum(self.moved(box), self.tuning.still)
+            1.0, reference * counts / math.sqrt(max(1, box.dimensions)) / np.maximum(self.moved(box), least)
         )
-        cell, tiles = between(box, -side, side), np.arange(frame.tile_count)
-        bounds = frame.bound(cell, tiles, None)
-        ends = [(bounds.lower, bounds.upper)]
-        if self.sub_box_frame is not None and self.along.prod() > 1:
-            pixels = in_tiles(np.ones((frame.camera.height, frame.camera.width), bool), frame.side)
-            known = self.sub_box_frame.sub_box_ends(cell, self.along, tiles, pixels, None, True)
-            if known is not None:
-                lower, upper = np.zeros((2, *pixels.shape, 3))
-                lower[pixels], upper[pixels] = known[0].min(axis=-1), known[1].max(axis=-1)
-                ends.append((lower, upper))
-        picture = assemble(self.plain.render(self.original(cell.middle)), frame.camera)[..., :3]
-        return TellingPixels(self.tiled, frame.camera, picture, reference, tuple(ends))
+        cell = between(box, -side, side)
+
+        def draw(values: Float64Array) -> np.ndarray:
+            return assemble(self.plain.render(self.original(values)), camera)[..., :3]
+
+        return typical_cell(self.frame, cell, counts, max(self.sub_box_motion(cell, counts), least), draw)
 
     def examine(self, cells: Sequence[Cell]) -> LocationResult:
         """Exclude the cells, or cut them."""
@@ -378,7 +380,7 @@ class _Examination:
         needed, alone = tiled.allowed + 1 - known, counts.prod() == 1
         chosen = search.telling.order(
             picture, max(1, round(0.5 * float(np.linalg.norm(moved)))),
-            float(np.linalg.norm(moved / counts)) / tuning.reference, tiled.counted & ~self.inherited,
+            float(np.linalg.norm(moved / counts)), tiled.counted & ~self.inherited,
             round(tuning.surplus * needed), differences=not alone,
         )  # fmt: skip
         self.share = (known + chosen.sure) / (known + needed) if alone else 0.0

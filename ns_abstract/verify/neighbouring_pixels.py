@@ -1,4 +1,4 @@
-"""Ends and means of an image over the neighbourhood of each pixel."""
+"""Ends and means of an image over the neighbourhood of each pixel, and images that show the same elsewhere."""
 
 from __future__ import annotations
 
@@ -30,3 +30,44 @@ def smoothed(image: np.ndarray, radius: int) -> np.ndarray:
         behind = tuple(slice(None, -count) if k == axis else slice(None) for k in range(image.ndim))
         image = (sums[ahead] - sums[behind]) / count
     return image
+
+
+def filled(image: np.ndarray, known: np.ndarray, radius: int, other: float) -> np.ndarray:
+    """An image [H, W, ...] with means over ``known`` [H, W] pixels within ``radius`` where it is NaN, or ``other``."""
+    weight = known.reshape(*known.shape, *[1] * (image.ndim - 2)).astype(np.float64)
+    number, total = smoothed(weight, radius), smoothed(np.where(weight > 0.0, image, 0.0), radius)
+    # sums of whole numbers that should be 0 are not quite
+    some = number > 0.5 / (2 * radius + 1) ** 2
+    mean = np.where(some, total / np.where(some, number, 1.0), other)
+    return np.where(np.isnan(image), mean, image)
+
+
+def best_shift(image: np.ndarray, other: np.ndarray) -> tuple[int, int]:
+    """Rows and columns by which ``image`` [H, W] is shifted to look most like ``other`` [H, W], at most by half.
+
+    The least mean square over what both show then, by Fourier transforms.
+    """
+    size = tuple(2 * n for n in image.shape)
+    inside = np.fft.rfft2(np.ones(image.shape), size)
+
+    def products(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.fft.irfft2(np.conj(a) * b, size)
+
+    middle = 0.5 * (image.mean() + other.mean())
+    pair = image - middle, other - middle
+    first, second = (np.fft.rfft2(part, size) for part in pair)
+    squares = [np.fft.rfft2(part**2, size) for part in pair]
+    common = products(inside, inside)
+    miss = products(squares[0], inside) + products(inside, squares[1]) - 2.0 * products(first, second)
+    miss = np.where(common > 0.25 * image.size, miss / np.maximum(common, 1.0), np.inf)
+    place = np.unravel_index(int(np.argmin(miss)), miss.shape)
+    rows, columns = (int(k) if 2 * k < n else int(k) - n for k, n in zip(place, size, strict=True))
+    return rows, columns
+
+
+def shifted(image: np.ndarray, rows: int, columns: int) -> np.ndarray:
+    """An image [H, W, ...] moved down and to the right, its edges repeated."""
+    down, right = (
+        np.clip(np.arange(n) - move, 0, n - 1) for n, move in zip(image.shape[:2], (rows, columns), strict=True)
+    )
+    return image[down[:, None], right[None, :]]

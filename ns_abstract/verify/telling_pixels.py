@@ -5,21 +5,26 @@ All of it is a guess from a render: it decides which pixels are bounded, not wha
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from ns_abstract.geometry.box import Float64Array
+from ns_abstract.geometry.box import Float64Array, ParameterBox
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.tiles import assemble, in_tiles
-from ns_abstract.refine.protocol import CHANNEL_DIFFERENCES
-from ns_abstract.verify.neighbouring_pixels import nearby, smoothed
+from ns_abstract.refine.protocol import CHANNEL_DIFFERENCES, Frame, SubBoxFrame
+from ns_abstract.verify.neighbouring_pixels import best_shift, filled, nearby, shifted
 from ns_abstract.verify.photo import TiledPhoto
 
 #: What is bounded of a pixel: its channels, or differences of these.
 CHANNELS, DIFFERENCES = range(2)
-#: Pixels that the looseness of bounds is averaged over, to every side.
-_SMOOTH = 4
+#: Of a typical cell: most pixels that are bounded, how many times as far apart are those whose bounds take more work,
+#: and most parts whose middles are drawn.
+_MOST_PIXELS, _FEWER, _MOST_PICTURES = 4096, 3, 8
+#: What bounds lose at most.
+_ALL = 2.0
 
 
 @dataclass(frozen=True)
@@ -40,60 +45,130 @@ class PixelOrder:
     misses: tuple[Float64Array, ...]
 
 
+@dataclass(frozen=True)
+class TypicalCell:
+    """What bounds over parts of a cell lose.
+
+    Attributes:
+        picture: [H, W, 3] in its middle.
+        motion: Image motion over a part, pixels.
+        losses: By kind, [H, W, 3] by how much bounds go below, and above, what is rendered nearby. There are those of
+            `CHANNELS` alone, or both.
+    """
+
+    picture: np.ndarray
+    motion: float
+    losses: tuple[list[Float64Array], ...]
+
+
 class TellingPixels:
-    """Chooses pixels of a photo.
+    """Chooses pixels of a photo, by what bounds over a typical cell lose at the same content.
 
     Args:
         photo: In tiles.
         camera: Of the photo.
-        picture: [H, W, 3] in the middle of a typical cell.
-        motion: Image motion over that cell, pixels.
-        ends: By kind, lower and upper bounds [T, side, side, 3] over that cell; one of `CHANNELS` alone, or both.
+        typical: Of a cell in the middle of the set.
     """
 
-    def __init__(
-        self, photo: TiledPhoto, camera: PinholeCamera, picture: np.ndarray, motion: float,
-        ends: tuple[tuple[np.ndarray, np.ndarray], ...],
-    ) -> None:  # fmt: skip
-        self.photo, self.camera, self.side = photo, camera, photo.counted.shape[1]
-        self._looseness = []
-        for kind, (lower, upper) in enumerate(ends):
-            least, most = nearby(_values(picture, kind), max(1, round(0.5 * motion)))
-            gaps = least - assemble(lower, camera), assemble(upper, camera) - most
-            # by how much bounds go below and above what is rendered nearby; no more than all that there is
-            self._looseness.append([in_tiles(smoothed(gap.clip(0.0, 2.0), _SMOOTH), self.side) for gap in gaps])
-        self._loose = [(below + above).max(axis=-1) for below, above in self._looseness]
+    def __init__(self, photo: TiledPhoto, camera: PinholeCamera, typical: TypicalCell) -> None:
+        self.photo, self.camera, self.side, self.typical = photo, camera, photo.counted.shape[1], typical
 
     def order(
-        self, tiles: np.ndarray, radius: int, scale: float, counted: np.ndarray, most_pixels: int, differences: bool
+        self, tiles: np.ndarray, radius: int, motion: float, counted: np.ndarray, most_pixels: int, differences: bool
     ) -> PixelOrder:
         """The pixels to bound of a cell whose middle shows ``tiles``.
 
         Args:
             radius: Pixels that the picture moves by over half of the cell.
-            scale: Part of the typical cell's looseness that is expected of the bounds.
+            motion: Pixels that it moves by over one of its parts.
             counted: [T, side, side] pixels that may be chosen.
             most_pixels: So many at most.
             differences: Whether differences may be bounded.
         """
         picture = assemble(tiles, self.camera)[..., :3]
-        kinds = range(len(self._looseness) if differences else 1)
-        misses = tuple(self._misses(picture, kind, radius, scale) for kind in kinds)
+        kinds = range(len(self.typical.losses) if differences else 1)
+        shift = best_shift(self.typical.picture.mean(axis=-1), picture.mean(axis=-1))
+        losses = [[in_tiles(shifted(loss, *shift), self.side) for loss in self.typical.losses[kind]] for kind in kinds]
+        scale = motion / self.typical.motion
+        misses = tuple(self._misses(picture, kind, radius, [scale * loss for loss in losses[kind]]) for kind in kinds)
         likely = np.stack([miss.max(axis=-1) for miss in misses])
-        gaps = np.stack([self._misses(picture, kind, 1, 0.0).max(axis=-1) for kind in kinds])
-        loose = np.stack([self._loose[kind] for kind in kinds])
+        gaps = np.stack([self._misses(picture, kind, 1, [0.0, 0.0]).max(axis=-1) for kind in kinds])
+        loose = np.stack([(below + above).max(axis=-1) for below, above in losses])
         worth = np.where(likely > 0.0, likely - loose, -np.inf)
         chosen = np.where((likely > 0.0).any(axis=0), worth.argmax(axis=0), gaps.argmax(axis=0))
         gaps, likely, loose = (np.take_along_axis(part, chosen[None], axis=0)[0] for part in (gaps, likely, loose))
         numbers, sure = telling_order(gaps, likely, loose, counted, most_pixels)
         return PixelOrder(numbers, sure, chosen, misses)
 
-    def _misses(self, picture: np.ndarray, kind: int, radius: int, scale: float) -> Float64Array:
-        """See `PixelOrder`: by what the picture shows within ``radius`` pixels, and a part of the looseness."""
+    def _misses(
+        self, picture: np.ndarray, kind: int, radius: int, losses: Sequence[Float64Array | float]
+    ) -> Float64Array:
+        """See `PixelOrder`: by what the picture shows within ``radius`` pixels, and what bounds lose."""
         least, most = (in_tiles(end, self.side) for end in nearby(_values(picture, kind), radius))
-        below, above = (part * scale for part in self._looseness[kind])
         low, high = self.photo.differences if kind == DIFFERENCES else (self.photo.low, self.photo.high)
-        return np.concatenate([least - below - high, low - most - above], axis=-1)
+        return np.concatenate([least - losses[0] - high, low - most - losses[1]], axis=-1)
+
+
+def typical_cell(
+    frame: Frame, cell: ParameterBox, counts: np.ndarray, motion: float, draw: Callable[[Float64Array], np.ndarray]
+) -> TypicalCell | None:
+    """What bounds over the parts of a cell lose; None: the frame has no bounds over parts of it.
+
+    Args:
+        counts: [d] parts along its axes; one part is the cell.
+        motion: Image motion over a part, pixels.
+        draw: The picture [H, W, 3] at parameters [d].
+    """
+    camera, tiles, parts = frame.camera, np.arange(frame.tile_count), int(counts.prod())
+    step = math.ceil(math.sqrt(camera.height * camera.width / _MOST_PIXELS))
+    # of blocks whose orders are too many, few pixels are bounded whatever the order
+    some, few = (_lattice((camera.height, camera.width), k * step) for k in (1, _FEWER))
+    chosen, worked = in_tiles(some, frame.side), in_tiles(few, frame.side)
+    places = np.unique(np.linspace(0, parts - 1, min(parts, _MOST_PICTURES)).astype(np.int64))
+    middles = (2.0 * np.stack(np.unravel_index(places, counts), axis=-1) + 1.0) / counts - 1.0
+    pictures = [draw(cell.at(middle)) for middle in middles]
+    losses = []
+    for kind in (CHANNELS, DIFFERENCES)[: 1 if parts == 1 else 2]:
+        if parts == 1:
+            bounds = frame.bound(cell, tiles, None)
+            lower, upper = (end[chosen][..., None] for end in (bounds.lower, bounds.upper))
+        elif isinstance(frame, SubBoxFrame):
+            ends = np.repeat(worked[chosen][:, None], 6, axis=1)
+            known = frame.sub_box_ends(cell, counts, tiles, chosen, ends, kind == DIFFERENCES)
+            if known is None:
+                return None
+            lower, upper = (end[..., places] for end in known)
+        else:
+            return None
+        pairs = [
+            _losses(_values(picture, kind), motion, lower[..., k], upper[..., k], chosen, camera)
+            for k, picture in enumerate(pictures)
+        ]
+        sides = [np.mean([pair[k] for pair in pairs], axis=0) for k in (0, 1)]
+        sources = few & np.isfinite(sides[0]).all(axis=-1) & np.isfinite(sides[1]).all(axis=-1)
+        losses.append([filled(side, sources, 2 * _FEWER * step, _ALL) for side in sides])
+    return TypicalCell(draw(cell.middle), motion, tuple(losses))
+
+
+def _lattice(shape: tuple[int, int], step: int) -> np.ndarray:
+    """[H, W] every so many pixels, from the middle of the first ones on."""
+    pixels = np.zeros(shape, bool)
+    pixels[step // 2 :: step, step // 2 :: step] = True
+    return pixels
+
+
+def _losses(
+    values: np.ndarray, motion: float, lower: np.ndarray, upper: np.ndarray, pixels: np.ndarray, camera: PinholeCamera
+) -> list[Float64Array]:
+    """By how much bounds [n, 3] of ``n`` pixels go below and above ``values`` [H, W, 3] nearby; NaN elsewhere."""
+    least, most = (in_tiles(end, pixels.shape[1])[pixels] for end in nearby(values, max(1, round(0.5 * motion))))
+    nothing = np.all((lower <= 0.0) & (upper >= 1.0) | ~(np.isfinite(lower) & np.isfinite(upper)), axis=-1)
+    losses = []
+    for gap in (least - lower, upper - most):
+        tiles = np.full((*pixels.shape, 3), np.nan)
+        tiles[pixels] = np.where(nothing[:, None], np.nan, gap.clip(0.0, _ALL))
+        losses.append(assemble(tiles, camera))
+    return losses
 
 
 def _values(picture: np.ndarray, kind: int) -> np.ndarray:
