@@ -21,13 +21,14 @@ from ns_abstract.geometry.tiles import assemble, tile_grid
 from ns_abstract.methods.splat.activate import Splats, rotation_matrices
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, PAPER
-from ns_abstract.methods.splat.frame import SplatFrame
+from ns_abstract.methods.splat.frame import SplatFrame, difference_ends
 from ns_abstract.methods.splat.intervals import sort_keys as sort_group
 from ns_abstract.methods.splat.projection_errors import FORMS, SPREAD, UNBOUNDED, columns
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.stage_data import SubBoxes, cell_parts
-from ns_abstract.methods.splat.sub_box_bounds import SubBoxBounds
+from ns_abstract.methods.splat.sub_box_bounds import SubBoxBounds, channel_differences
 from ns_abstract.perturbation.specification import Perturbation
+from ns_abstract.refine.protocol import CHANNEL_DIFFERENCES
 
 both_orders = pytest.mark.parametrize("order", [1, 2])
 TURN = (0.8, 0.3, -0.4, 0.33)
@@ -84,16 +85,32 @@ class Case:
     def sub_box_ends(self, box: ParameterBox, counts: np.ndarray, arithmetic=REAL) -> list[np.ndarray]:
         """As `ends`, in the orders that are uncertain, and in every order."""
         bounds, forms = SubBoxBounds(self.splats, GSPLAT_1_4_0, arithmetic), self.poses.enclosure(box, 1)
+        found = self._orders(bounds, forms, bounds.project(self.camera, forms), counts)
+        return [self._laid_out(ends).clip(0.0, 1.0) for ends in found]
+
+    def difference_ends(self, box: ParameterBox, counts: np.ndarray, arithmetic=REAL) -> list[np.ndarray]:
+        """As `sub_box_ends`, of differences of channels."""
+        bounds, forms = SubBoxBounds(self.splats, GSPLAT_1_4_0, arithmetic), self.poses.enclosure(box, 1)
+        projected, scale = channel_differences(bounds.project(self.camera, forms))
+        found = []
+        for parts in self._orders(bounds, forms, projected, counts):
+            ends = difference_ends(parts, np.ones(parts.shape[:3], bool), scale)
+            found.append(self._laid_out(np.concatenate(ends, axis=1).reshape(parts.shape)))
+        return found
+
+    def _orders(self, bounds: SubBoxBounds, forms, projected, counts: np.ndarray) -> list[np.ndarray]:
+        """Ends [T, side, side, 6, parts] in the orders that are uncertain, and in every order."""
         tiles = np.arange(math.prod(tile_grid(self.camera, bounds.side)))
-        shape = (tiles.size, bounds.side, bounds.side)
-        pixels, projected = np.ones(shape, bool), bounds.project(self.camera, forms)
+        pixels = np.ones((tiles.size, bounds.side, bounds.side), bool)
         ordered = bounds.sub_boxes(self.camera, forms, projected, tiles, pixels, counts)
-        unordered = np.full_like(ordered, np.nan)
-        bounds.unordered(
-            self.camera, forms, projected, tiles, pixels, counts, np.ones((pixels.sum(), 6), bool), unordered
-        )
-        found = [assemble(ends.reshape(*shape, -1), self.camera) for ends in (ordered, unordered)]
-        return [ends.reshape(*ends.shape[:2], 2, 3, -1).clip(0.0, 1.0) for ends in found]
+        unordered, every = np.full_like(ordered, np.nan), np.ones((pixels.sum(), 6), bool)
+        bounds.unordered(self.camera, forms, projected, tiles, pixels, counts, every, unordered)
+        return [ordered, unordered]
+
+    def _laid_out(self, ends: np.ndarray) -> np.ndarray:
+        """[H, W, 2, 3, parts] from tiles [T, side, side, 6, parts]."""
+        image = assemble(ends.reshape(*ends.shape[:3], -1), self.camera)
+        return image.reshape(*image.shape[:2], 2, 3, -1)
 
     def samples(self, box: ParameterBox, count: int) -> np.ndarray:
         """Ends and a line of poses for one parameter; corners and random poses for more."""
@@ -104,8 +121,7 @@ class Case:
 
     def ends(self, cell) -> np.ndarray:
         """Lower and upper bounds [H, W, 2, 3, parts] over parts or sub-boxes of a cell."""
-        ends = assemble(cell.parts.reshape(*cell.parts.shape[:3], -1), self.camera)
-        return ends.reshape(*ends.shape[:2], 2, 3, -1).clip(0.0, 1.0)
+        return self._laid_out(cell.parts).clip(0.0, 1.0)
 
     def check(
         self, order: int, parts: int = 2, count: int = 9, arithmetic=REAL, floor: float = -1.0
@@ -125,11 +141,13 @@ class Case:
             linear = assemble(cell.linear, self.camera)
             found = [(lower, upper)]
             over_parts = [] if sub_boxes is None else [(cell_parts(sub_boxes.counts), self.ends(cell))]
+            differences = []
             if order == 1:
                 divided = shared_out(np.ones(box.dimensions), 16)
                 by_parts = self.bounds(box, 1, arithmetic, floor=floor, parts=divided)
                 assert by_parts.statistics[4] == 0
                 over_parts += [(cell_parts(divided), ends) for ends in self.sub_box_ends(box, divided, arithmetic)]
+                differences = [(cell_parts(divided), ends) for ends in self.difference_ends(box, divided, arithmetic)]
                 found.append((assemble(by_parts.lower, self.camera), assemble(by_parts.upper, self.camera)))
             pairs = self.poses.enclosure(box, order).rotation.basis.pairs
             for values in self.samples(box, count):
@@ -145,11 +163,24 @@ class Case:
                     within = (np.abs(p[:, None] - sub.middles) <= sub.half[:, None]).all(axis=0)
                     assert within.any()
                     assert (ends[:, :, 0, :, within] <= image).all() and (ends[:, :, 1, :, within] >= image).all()
+                for sub, ends in differences:
+                    within = (np.abs(p[:, None] - sub.middles) <= sub.half[:, None]).all(axis=0)
+                    assert_differences(image, ends[..., within])
                 for low, high in found:
                     assert (low <= image).all() and (image <= high).all(), (box, values, worst(low, image, high))
                 least, most = np.minimum(least, image), np.maximum(most, image)
             lowest, highest = np.minimum(lowest, lower), np.maximum(highest, upper)
         return highest - lowest, most - least
+
+
+def assert_differences(image: np.ndarray, ends: np.ndarray) -> None:
+    """Differences of channels of a picture lie within their ``ends`` [H, W, 2, 3, k] where none is clamped."""
+    inside = (image > 0.0) & (image < 1.0)
+    for k, (first, second) in enumerate(CHANNEL_DIFFERENCES):
+        values, low, high = (image[..., first] - image[..., second])[..., None], ends[:, :, 0, k], ends[:, :, 1, k]
+        known = (inside[..., first] & inside[..., second])[..., None]
+        # the subtraction of two float64 numbers that stand for the program's float32 ones is exact or nearly so
+        assert (~known | ((low <= values) & (values <= high))).all()
 
 
 def worst(lower: np.ndarray, image: np.ndarray, upper: np.ndarray) -> float:

@@ -125,8 +125,8 @@ JUMP_ROUNDING, SWAP_ROUNDING = UNIT64, 2.0 * UNIT64
 SUB_BOX_OVERLAP, SUB_BOX_LINES = 2.0**-24, 2.0**-26
 #: B12: a grid's line and the middle and half-width of a cell, relative to the sizes of its ends: 6; 10 to spare.
 SUB_BOX_LINE_ROUNDING = 16.0 * UNIT64
-#: B15: a difference of two products and its sum with 1/2, of the sum of their sizes and 1: 4 roundings; the same of a
-#: bound less 1/2 and its quotient by the scale, of 1: 3. 12 to spare.
+#: B15: differences of two products whose sizes add up to 1 at most, and a sum with 1/2, absolute: 4 roundings; the same
+#: of a bound less 1/2 and its quotient by the scale: 3. 12 to spare.
 DIFFERENCE_ROUNDING = 16.0 * UNIT64
 #: B12: a part's share of a swap bound: a quotient and two products, 3; 5 to spare.
 MOVE_SHARE_UP = 1.0 + 8.0 * UNIT64

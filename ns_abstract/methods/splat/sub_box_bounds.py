@@ -136,25 +136,27 @@ def channel_differences(projected: ProjectedCell) -> tuple[ProjectedCell, float]
     them in [0, 1]; it is 0 where colours have no finite bound.
     """
     alive, background = projected.alive, projected.background
-    first, second = (list(side) for side in zip(*CHANNEL_DIFFERENCES, strict=True))
     columns = projected.colors.shape[1] // 3
     forms = projected.colors[alive].reshape(alive.size, 3, columns)
-    brightest = np.abs(forms).sum(axis=-1).max(initial=max(1.0, float(np.abs(background).max()))) * UP
+    sizes = np.abs(forms).sum(axis=-1)
+    brightest = sizes.max(initial=max(1.0, float(np.abs(background).max()))) * UP
     if not np.isfinite(brightest):
         return projected, 0.0
     scale = 0.5 / float(brightest)
-    forms = scale * forms
-    differences = forms[:, first] - forms[:, second]
+    # the sizes are at most 1/2 with the scale
+    forms *= scale
+    differences = np.empty_like(forms)
+    for k, (first, second) in enumerate(CHANNEL_DIFFERENCES):
+        np.subtract(forms[:, first], forms[:, second], out=differences[:, k])
+        if columns > 1:
+            differences[:, k, -1] = (forms[:, first, -1] + forms[:, second, -1]) * UP + 2.0 * DIFFERENCE_ROUNDING
     differences[..., 0] += 0.5
-    if columns > 1:
-        size = 1.0 + np.abs(forms).sum(axis=-1)
-        room = DIFFERENCE_ROUNDING * (size[:, first] + size[:, second])
-        differences[..., -1] = (forms[:, first, -1] + forms[:, second, -1]) * UP + room
     colors = np.empty_like(projected.colors)
-    colors[alive] = differences.reshape(alive.size, -1)
+    colors[alive] = differences.reshape(alive.size, 3 * columns)
+    behind = np.array([background[first] - background[second] for first, second in CHANNEL_DIFFERENCES])
     return projected._replace(
         colors=colors,
-        background=scale * (background[first] - background[second]) + 0.5,
+        background=scale * behind + 0.5,
         color_error=projected.color_error + DIFFERENCE_ROUNDING,
     ), scale
 

@@ -1,0 +1,148 @@
+"""Bounds of differences of channels over sub-boxes, at tolerance zero (docs/dev/design.md, B15, U10)."""
+
+from __future__ import annotations
+
+import dataclasses
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from test_bounds import Case, assert_differences, moves, scene
+from test_unordered import BACKGROUNDS, COUNTS, stack
+
+from ns_abstract.arithmetic.rounding import FLOAT32
+from ns_abstract.geometry.tiles import assemble
+from ns_abstract.methods.splat import bounds as splat_bounds
+from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
+from ns_abstract.methods.splat.frame import SplatFrame, difference_ends
+from ns_abstract.methods.splat.stage_data import cell_parts
+from ns_abstract.methods.splat.sub_box_bounds import SubBoxBounds, channel_differences
+from ns_abstract.refine.protocol import CHANNEL_DIFFERENCES
+from ns_abstract.verify.photo import Brightness, Photo
+
+#: Colours and pictures are halved so many times, exactly, so that nothing of them is clamped.
+DARKER = 0.125
+
+
+def darker(case: Case) -> Case:
+    """The same scene with colours, which depend on no direction, and a background of a part of the light."""
+    splats = dataclasses.replace(case.splats, sh=DARKER * case.splats.sh, background=DARKER * case.splats.background)
+    again = Case(case.splats, moves(x=0.1))
+    again.camera, again.poses, again.splats, again.renderer = (
+        case.camera,
+        case.poses,
+        splats,
+        type(case.renderer)(splats, GSPLAT_1_4_0),
+    )
+    return again
+
+
+@pytest.mark.parametrize("number", range(len(BACKGROUNDS)))
+def test_differences_hold_pictures_before_they_are_clamped(number):
+    """Colours up to 1.3: pictures of the middles and of random poses of each sub-box lie within both kinds of ends."""
+    generator, parts = np.random.default_rng(number), cell_parts(COUNTS)
+    for seed in range(2):
+        case = stack(seed, BACKGROUNDS[number])
+        dark, found = darker(case), case.difference_ends(case.poses.box, COUNTS, FLOAT32)
+        for part in range(parts.middles.shape[1]):
+            for turn in (0.0, 1.0):
+                place = parts.middles[:, part] + turn * parts.half * generator.uniform(-1.0, 1.0, 2)
+                image = dark.image(case.poses.box.at(place)).astype(np.float64) / DARKER
+                for ends in found:
+                    for k, (first, second) in enumerate(CHANNEL_DIFFERENCES):
+                        value = image[..., first] - image[..., second]
+                        assert (ends[:, :, 0, k, part] <= value).all() and (value <= ends[:, :, 1, k, part]).all()
+        assert np.diff(found[1], axis=2).mean() < 1.9
+
+
+def test_layers_of_one_hue_have_narrow_differences():
+    """Grey layers over white: channels vary by nearly all that there is, their differences by what is rounded."""
+    generator = np.random.default_rng(3)
+    layers = [
+        {
+            "mean": (*generator.uniform(-1.0, 1.0, 2), generator.uniform(-5.2, -4.8)),
+            "scale": generator.uniform(0.1, 1.2),
+            "opacity": 0.9,
+            "color": np.full(3, generator.uniform(0.0, 1.0)),
+        }
+        for _ in range(40)
+    ]
+    case = Case(scene(*layers, background=(1.0, 1.0, 1.0)), moves(x=0.15, yaw=0.04))
+    channels, differences = (
+        np.diff(find(case.poses.box, COUNTS, FLOAT32)[1], axis=2) for find in (case.sub_box_ends, case.difference_ends)
+    )
+    assert channels.mean() > 0.3 and differences.max() < 1e-3
+
+
+def test_colours_without_a_finite_bound_bound_nothing():
+    case = stack(0, BACKGROUNDS[0], 8)
+    bounds, forms = SubBoxBounds(case.splats, GSPLAT_1_4_0, FLOAT32), case.poses.enclosure(case.poses.box, 1)
+    projected = bounds.project(case.camera, forms)
+    projected.colors[projected.alive[0]] = np.nan
+    again, scale = channel_differences(projected)
+    assert scale == 0.0 and again is projected
+    pixels = np.ones((1, 2, 2), bool)
+    low, high = difference_ends(np.full((1, 2, 2, 6, 8), 0.5), pixels, scale)
+    assert (low == -np.inf).all() and (high == np.inf).all()
+
+
+def test_what_is_not_known_stays_unknown():
+    """[0, 1] says nothing of a difference, nor do ends that cross or are no numbers."""
+    pixels, parts = np.ones((1, 2, 2), bool), np.zeros((1, 2, 2, 6, 3))
+    parts[..., :3, :], parts[..., 3:, :] = [0.0, 0.6, np.nan], [1.0, 0.4, 1.0]
+    low, high = difference_ends(parts, pixels, 0.5)
+    assert (low == -np.inf).all() and (high == np.inf).all()
+
+
+def test_a_frame_bounds_differences_of_blocks_of_many_orders(monkeypatch):
+    """Where no block's orders are few enough, those ends that are named are bounded in every order, and hold."""
+    monkeypatch.setattr(splat_bounds, "PART_PAIR_LIMIT", 1)
+    case = stack(1, BACKGROUNDS[2])
+    frame = SplatFrame(case.splats, GSPLAT_1_4_0, FLOAT32, case.poses)
+    pixels = np.ones((frame.tile_count, frame.side, frame.side), bool)
+    known = {}
+    for ends in (None, np.ones((pixels.sum(), 6), bool)):
+        low, high = frame.sub_box_ends(frame.box, COUNTS, np.arange(frame.tile_count), pixels, ends, True)
+        shape = (*pixels.shape, 3 * COUNTS.prod())
+        image = np.stack([assemble(end.reshape(shape), case.camera) for end in (low, high)], axis=2)
+        image = image.reshape(*image.shape[:3], 3, -1)
+        parts = cell_parts(COUNTS)
+        for part in range(0, parts.middles.shape[1], 5):
+            picture = case.image(case.poses.box.at(parts.middles[:, part])).astype(np.float64)
+            assert_differences(picture, image[..., part : part + 1])
+        known[ends is None] = np.isfinite(image).mean()
+    assert known[True] < 0.5 < known[False]
+
+
+@pytest.mark.parametrize("brightness", [Brightness(), Brightness((0.5, 2.0), (-0.1, 0.2))])
+def test_pictures_that_explain_a_pixel_have_differences_within_its_ends(brightness):
+    """Values before the clamp to [0, 1], of which some photo's values were made, at the ends of the noise, exactly."""
+    generator, noise = np.random.default_rng(0), 0.02
+    raw = generator.choice([-0.3, 0.0, 1e-9, 0.2, 0.7, 1.0, 1.4], (40, 50, 3)) * generator.uniform(
+        0.9, 1.1, (40, 50, 3)
+    )
+    gain, offset = brightness.gain[0], brightness.offset[1]
+    shown = np.clip(gain * np.clip(raw, 0.0, 1.0) + offset, 0.0, 1.0)
+    levels = np.rint(255.0 * np.clip(shown + generator.choice([-noise, 0.0, noise], raw.shape), 0.0, 1.0))
+    photo = Photo(levels.astype(np.uint8), noise, 0.0, np.ones((40, 50), bool), brightness)
+    (low,), (high,) = photo.tiled(50).differences
+    for k, (first, second) in enumerate(CHANNEL_DIFFERENCES):
+        for value, a, b in zip(
+            raw.reshape(-1, 3).tolist(), low[:40, ..., k].ravel(), high[:40, ..., k].ravel(), strict=True
+        ):
+            exact = Fraction(value[first]) - Fraction(value[second])
+            assert (a == -np.inf or Fraction(float(a)) <= exact) and (b == np.inf or exact <= Fraction(float(b)))
+    grey = Photo(np.full((4, 4, 3), 128, np.uint8), noise, 0.0, np.ones((4, 4), bool)).tiled(4).differences
+    # twice the noise and the rounding of both channels
+    assert np.abs(grey).max() < 2.0 * noise + 1.01 / 255.0
+
+
+def test_differences_exclude_what_channels_leave():
+    """A grey photo of a scene of a red and a green that may be anything between them and black."""
+    photo = Photo(np.full((4, 4, 3), 60, np.uint8), 0.01, 0.0, np.ones((4, 4), bool)).tiled(4)
+    shape = (16, 3, 2)
+    assert not photo.excluding(np.zeros(shape), np.ones(shape), photo.counted).any()
+    low = np.broadcast_to(np.array([[0.1, -np.inf], [-np.inf, -np.inf], [-np.inf, -np.inf]]), shape)
+    assert photo.excluding(low, np.full(shape, np.inf), photo.counted, True).tolist() == [[True, False]] * 16
+    # as a channel's lower bound it would exclude nothing
+    assert not photo.excluding(low, np.full(shape, np.inf), photo.counted).any()
