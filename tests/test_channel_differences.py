@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from fractions import Fraction
 
 import numpy as np
@@ -72,6 +73,35 @@ def test_layers_of_one_hue_have_narrow_differences():
         np.diff(find(case.poses.box, COUNTS, FLOAT32)[1], axis=2) for find in (case.sub_box_ends, case.difference_ends)
     )
     assert channels.mean() > 0.3 and differences.max() < 1e-3
+
+
+@pytest.mark.parametrize("columns", [1, 4])
+def test_forms_of_differences_hold_those_of_any_colours(columns):
+    """Forms of two channels at the ends of their radii, at random places and corners, exactly."""
+    generator, case = np.random.default_rng(columns), stack(0, BACKGROUNDS[2], 8)
+    bounds, forms = SubBoxBounds(case.splats, GSPLAT_1_4_0, FLOAT32), case.poses.enclosure(case.poses.box, 1)
+    colors = generator.normal(size=(8, 3 * columns)) * generator.choice([1e-9, 0.1, 1.0], (8, 3 * columns))
+    projected = bounds.project(case.camera, forms)._replace(alive=np.arange(8), colors=colors)
+    colors.reshape(8, 3, columns)[..., -1] = np.abs(colors.reshape(8, 3, columns)[..., -1])
+    again, scale = channel_differences(projected)
+    assert 0.0 < scale <= 0.5
+    for row, mixed in zip(colors.reshape(8, 3, columns), again.colors.reshape(8, 3, columns), strict=True):
+        places = (
+            [[1, *generator.choice([-1.0, 1.0, 0.3, -0.7], columns - 1)[:-1]] for _ in range(4)]
+            if columns > 1
+            else [[1]]
+        )
+        for place, sign, (k, (first, second)) in itertools.product(places, (-1, 1), enumerate(CHANNEL_DIFFERENCES)):
+            values = [
+                sum(Fraction(a) * Fraction(p) for a, p in zip(form.tolist(), place, strict=False)) for form in row
+            ]
+            radii = [Fraction(form[-1]) if columns > 1 else Fraction(0) for form in row.tolist()]
+            exact = Fraction(scale) * (values[first] - values[second] + sign * (radii[first] + radii[second]))
+            middle = sum(Fraction(a) * Fraction(p) for a, p in zip(mixed[k].tolist(), place, strict=False)) - Fraction(
+                1, 2
+            )
+            room = Fraction(float(mixed[k, -1])) if columns > 1 else Fraction(again.color_error - projected.color_error)
+            assert abs(exact - middle) <= room
 
 
 def test_colours_without_a_finite_bound_bound_nothing():

@@ -439,7 +439,7 @@ CERTIFICATES = (
     ),
     Fault(
         "search: cells fail as a whole by three poses", "verify/search.py", "Search.examine",
-        "[c for c in samples if c.broken and c.hopeless]", "[]",
+        "[cell for cell in samples if cell.broken and cell.hopeless]", "[]",
         "test_certify_search.py::test_cells_of_cheap_models_fail_as_a_whole_only_after_a_second_look",
     ),
     Fault(

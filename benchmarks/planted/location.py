@@ -6,6 +6,9 @@ _PHOTO, _SEARCH, _COVER = "verify/photo.py", "verify/location.py", "verify/locat
 _CELLS, _ROUNDS = "verify/cell_boxes.py", "verify/pixel_rounds.py"
 _ENDS = "test_locate.py::test_a_photo_allows_its_noise_and_every_rounding"
 _BRIGHT = "test_locate_sequence.py::test_values_before_any_brightness_are_held"
+_DIFFERENCES = (
+    "test_channel_differences.py::test_pictures_that_explain_a_pixel_have_differences_within_its_ends[brightness0]"
+)
 _REACH = "test_locate.py::test_contraction_keeps_every_pose_that_explains_the_photo"
 _NUMBERS = "test_locate.py::test_what_is_no_number_explains_and_excludes_nothing"
 _SLABS = "test_locate.py::test_slabs_and_the_inner_cell_tile_a_cell"
@@ -51,6 +54,24 @@ LOCATION = (
         "location: the photo's own rounding is not charged",
         _PHOTO, "Photo.shown", "self.noise + (0.5 + STEP) / _STEPS + QUOTIENT + PHOTO_ROOM",
         "self.noise + 0.5 / _STEPS", _ENDS,
+    ),
+    Fault(
+        "location: differences of clamped values are taken for what they are",
+        _PHOTO, "TiledPhoto.differences", "np.where(self.high >= 1.0, np.inf, self.high)", "self.high", _DIFFERENCES,
+    ),
+    Fault(
+        "location: differences of values clamped at 0 are taken for what they are",
+        _PHOTO, "TiledPhoto.differences", "np.where(self.low <= 0.0, -np.inf, self.low)", "self.low", _DIFFERENCES,
+    ),
+    Fault(
+        "location: both channels of a difference at the same end",
+        _PHOTO, "TiledPhoto.differences", "low[..., first] - high[..., second]", "low[..., first] - low[..., second]",
+        _DIFFERENCES,
+    ),
+    Fault(
+        "location: differences are compared with channels",
+        _PHOTO, "TiledPhoto.excluding", "self.differences if differences else (self.low, self.high)",
+        "(self.low, self.high)", "test_channel_differences.py::test_differences_exclude_what_channels_leave",
     ),
     Fault(
         "location: as many pixels as are allowed cut a cell",

@@ -20,6 +20,8 @@ _SUB_BOXES = "methods/splat/form_sub_boxes.py"
 _REORDERING = "methods/splat/reordering.py"
 _STAGE_DATA = "methods/splat/stage_data.py"
 _UNORDERED = "methods/splat/unordered_pixels.py"
+_SUB_BOX_BOUNDS = "methods/splat/sub_box_bounds.py"
+_FRAME = "methods/splat/frame.py"
 _BLOCK = "methods/splat/pixel_block.py"
 _LISTS = "methods/splat/lists.py"
 _PIXELS = "methods/splat/pixels.py"
@@ -748,6 +750,54 @@ SPLATS = (
         "lanes.shape[1] > _MOST_STRIPS",
         "False",
         "test_unordered.py::test_sub_boxes_beyond_the_largest_set_of_strips_are_refused",
+    ),
+    Fault(
+        "differences: the second channel's radius is left out",
+        _SUB_BOX_BOUNDS,
+        "channel_differences",
+        "(forms[:, first, -1] + forms[:, second, -1]) * UP",
+        "forms[:, first, -1] * UP",
+        "test_channel_differences.py::test_forms_of_differences_hold_those_of_any_colours[4]",
+    ),
+    Fault(
+        "differences: the second channel less the first",
+        _SUB_BOX_BOUNDS,
+        "channel_differences",
+        "np.subtract(forms[:, first], forms[:, second], out=differences[:, k])",
+        "np.subtract(forms[:, second], forms[:, first], out=differences[:, k])",
+        "test_bounds.py::test_depth_swap[1]",
+    ),
+    Fault(
+        "differences: the background's are not in the middle",
+        _SUB_BOX_BOUNDS,
+        "channel_differences",
+        "scale * behind + 0.5",
+        "scale * behind",
+        "test_bounds.py::test_depth_swap[1]",
+    ),
+    Fault(
+        "differences: the background's are not scaled",
+        _SUB_BOX_BOUNDS,
+        "channel_differences",
+        "scale * behind + 0.5",
+        "behind + 0.5",
+        "test_bounds.py::test_depth_swap[1]",
+    ),
+    Fault(
+        "differences: what a block of many orders shows is known",
+        _FRAME,
+        "difference_ends",
+        "~((lower == 0.0) & (upper == 1.0))",
+        "True",
+        "test_channel_differences.py::test_what_is_not_known_stays_unknown",
+    ),
+    Fault(
+        "differences: ends that cross bound something",
+        _FRAME,
+        "difference_ends",
+        "lower <= upper",
+        "lower == lower",
+        "test_channel_differences.py::test_what_is_not_known_stays_unknown",
     ),
     Fault(
         "parts: only the first eight count",

@@ -463,7 +463,7 @@ def part_ends(parts: np.ndarray | None, pixels: np.ndarray) -> tuple[np.ndarray,
 
 
 def difference_ends(parts: np.ndarray, pixels: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds [n, 3, k] of `CHANNEL_DIFFERENCES`, from ``parts`` for the colours of `channel_differences`."""
+    """Bounds [n, 3, k] of `CHANNEL_DIFFERENCES`, from ``parts`` for those of the colours (design.md, B15)."""
     ends = parts[pixels]
     lower, upper = ends[:, :COLORS], ends[:, COLORS:]
     # [0, 1] stands for nothing that is known (design.md, B15)

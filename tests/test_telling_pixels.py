@@ -1,0 +1,85 @@
+"""Which pixels of a photo are bounded: those that tell most, by what bounds lose where the same is seen."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from test_bounds import Case, moves, scene
+
+from ns_abstract.arithmetic.rounding import FLOAT32
+from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.tiles import assemble
+from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
+from ns_abstract.methods.splat.frame import SplatFrame
+from ns_abstract.verify.neighbouring_pixels import best_shift, filled, shifted, smoothed
+from ns_abstract.verify.photo import Photo
+from ns_abstract.verify.telling_pixels import CHANNELS, DIFFERENCES, TellingPixels, TypicalCell, typical_cell
+
+SIDE = 8
+CAMERA = PinholeCamera(np.eye(4)[:3], 8.0, 8.0, 4.0, 4.0, SIDE, SIDE)
+
+
+@pytest.mark.parametrize("move", [(0, 0), (3, -2), (-5, 7), (11, 0)])
+def test_images_that_show_the_same_elsewhere_are_found(move):
+    generator = np.random.default_rng(0)
+    large = smoothed(generator.uniform(size=(60, 70)), 2)
+    image, other = large[12:48, 12:58], large[12 - move[0] : 48 - move[0], 12 - move[1] : 58 - move[1]]
+    assert best_shift(image, other) == move
+    rows, columns = (slice(max(0, k), n + min(0, k)) for k, n in zip(move, image.shape, strict=True))
+    assert np.array_equal(shifted(image, *move)[rows, columns], other[rows, columns])
+
+
+def test_edges_are_repeated_by_a_shift():
+    image = np.arange(12.0).reshape(3, 4)
+    assert shifted(image, 1, -2).tolist() == [[2, 3, 3, 3], [2, 3, 3, 3], [6, 7, 7, 7]]
+
+
+def test_what_is_not_known_is_filled_with_means_nearby():
+    image, known = np.full((9, 9, 2), np.nan), np.zeros((9, 9), bool)
+    known[3, 3] = known[5, 5] = True
+    image[3, 3], image[5, 5] = [1.0, 2.0], [3.0, 6.0]
+    found = filled(image, known, 2, 7.0)
+    assert np.allclose(found[4, 4], [2.0, 4.0]) and np.allclose(found[6, 6], [3.0, 6.0])
+    assert np.array_equal(found[3, 3], [1.0, 2.0]) and np.array_equal(found[8, 8], [7.0, 7.0])
+
+
+def test_differences_tell_where_channels_do_not():
+    """Channels may be anything, and the differences of a grey scene are 0: differences alone miss a red photo."""
+    levels = np.full((SIDE, SIDE, 3), 100, np.uint8)
+    levels[:, 4:] = [200, 60, 60]
+    photo = Photo(levels, 0.02, 0.0, np.ones((SIDE, SIDE), bool)).tiled(SIDE)
+    picture = np.full((SIDE, SIDE, 3), 0.6)
+    loose, tight = np.full((SIDE, SIDE, 3), 1.0), np.zeros((SIDE, SIDE, 3))
+    telling = TellingPixels(photo, CAMERA, TypicalCell(picture, 1.0, ([loose, loose], [tight, tight])))
+    order = telling.order(picture[None], 1, 1.0, photo.counted, 100, differences=True)
+    inside = assemble(order.kinds, CAMERA)
+    # a pixel beside the edge misses as well
+    assert (inside[:, 5:] == DIFFERENCES).all() and (inside[:, :3] == CHANNELS).all()
+    assert order.sure == (inside == DIFFERENCES).sum() and len(order.numbers) == SIDE * SIDE
+    assert (order.kinds.reshape(-1)[order.numbers[: order.sure]] == DIFFERENCES).all()
+    alone = telling.order(picture[None], 1, 1.0, photo.counted, 100, differences=False)
+    assert alone.sure == 0 and len(alone.misses) == 1 and (alone.kinds == CHANNELS).all()
+    # where the motion is a tenth, channels lose a tenth
+    near = telling.order(picture[None], 1, 0.1, photo.counted, 100, differences=True)
+    assert near.sure == SIDE * SIDE and (near.kinds == CHANNELS).all()
+
+
+def test_losses_of_a_typical_cell():
+    """Over parts there are losses of channels and of differences, over the cell of channels; a wall loses nothing."""
+    layers = [{"mean": (0.0, 0.0, -5.0), "scale": 30.0, "opacity": 0.9, "color": (0.2, 0.5, 0.7)}]
+    layers.append({"mean": (0.0, 0.0, -4.0), "scale": 0.2, "opacity": 0.9, "color": (0.9, 0.5, 0.1)})
+    case = Case(scene(*layers), moves(x=0.3, yaw=0.05))
+    frame = SplatFrame(case.splats, GSPLAT_1_4_0, FLOAT32, case.poses)
+    box = case.poses.box
+    typical = typical_cell(frame, box, np.array([4, 2]), 1.0, case.image)
+    assert typical is not None and len(typical.losses) == 2
+    for below, above in typical.losses:
+        assert below.shape == (16, 16, 3) and np.isfinite(below).all() and (below >= 0.0).all()
+        assert max(below[0].max(), above[0].max()) < 0.002
+        assert max(below.max(), above.max()) > 0.01
+    whole = typical_cell(frame, box, np.array([1, 1]), 1.0, case.image)
+    assert whole is not None and len(whole.losses) == 1
+    assert whole.losses[0][0].mean() > typical.losses[0][0].mean()
+    one = Case(case.splats, moves(x=0.3))
+    line = SplatFrame(one.splats, GSPLAT_1_4_0, FLOAT32, one.poses)
+    assert typical_cell(line, one.poses.box, np.array([8]), 1.0, one.image) is None
