@@ -233,6 +233,15 @@ def test_photos_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
         assert warning is None if told is None else told in (warning or "")
 
 
+def test_photos_that_are_no_files_are_not_left_out(tmp_path: Path) -> None:
+    for name in ("1.png", "3.png", "._1.png"):
+        (tmp_path / name).touch()
+    assert [photo.name for photo in sequence_photos(tmp_path)] == ["1.png", "3.png"]
+    (tmp_path / "2.png").symlink_to(tmp_path / "gone.png")
+    with pytest.raises(nsa.InputError, match="2.png: --image-sequence: is no file"):
+        sequence_photos(tmp_path)
+
+
 @pytest.fixture
 def travelled(blobs: Inputs, tmp_path: Path) -> tuple[list[str], np.ndarray, Path]:
     """Options of a sequence of three photos and one that no pose made, the poses, and the folder of results."""

@@ -44,22 +44,26 @@ def read_photo(file: Path, field: str = "--image") -> np.ndarray:
 
 
 def sequence_photos(folder: Path, field: str = "--image-sequence") -> list[Path]:
-    """The pictures of a folder, in the order of their names.
+    """The pictures of a folder, in the order of their names, but for hidden ones.
 
     Raises:
-        InputError: There is no such folder, it cannot be listed or holds none, or the numbers in the names have another
-            order than the names.
+        InputError: There is no such folder, it cannot be listed or holds none, one of them is no file, or the numbers
+            in the names have another order than the names.
     """
     if not os.path.isdir(folder):
         raise InputError("no such folder", file=folder, field=field, fix="give a folder of photos")
     try:
-        photos = sorted(file for file in folder.iterdir() if file.suffix.lower() in _ENDINGS and file.is_file())
+        named = (file for file in folder.iterdir() if not file.name.startswith("."))
+        photos = sorted(file for file in named if file.suffix.lower() in _ENDINGS)
     except OSError as error:
         problem = f"cannot be listed: {error.strerror or type(error).__name__}"
         raise InputError(problem, file=folder, field=field, fix="check the permissions") from None
     if not photos:
         fix = f"give a folder with files that end in {', '.join(_ENDINGS)}"
         raise InputError("holds no photos", file=folder, field=field, fix=fix)
+    # left out, the motion from the photo before to the one behind would be another
+    if (lost := next((photo for photo in photos if not photo.is_file()), None)) is not None:
+        raise InputError("is no file", file=lost, field=field, fix="copy the photo there, or remove it")
     for before, after in itertools.pairwise(photos):
         if _numbered(after) < _numbered(before):
             problem = f"{show(before.name)} comes before {show(after.name)} by name, and behind it by number"
