@@ -238,7 +238,7 @@ def test_photos_that_are_no_files_are_not_left_out(tmp_path: Path) -> None:
         (tmp_path / name).touch()
     assert [photo.name for photo in sequence_photos(tmp_path)] == ["1.png", "3.png"]
     (tmp_path / "2.png").symlink_to(tmp_path / "gone.png")
-    with pytest.raises(nsa.InputError, match="2.png: --image-sequence: is no file"):
+    with pytest.raises(nsa.InputError, match=r"2\.png: --image-sequence: is no file"):
         sequence_photos(tmp_path)
 
 
