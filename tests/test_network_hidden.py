@@ -244,6 +244,18 @@ def test_weights_of_4_bits_are_read(kind: int, tmp_path: Path) -> None:
     assert (low <= wanted).all() and (wanted <= high).all() and (high - low < 1e-5).all()
 
 
+def test_operator_sets_that_are_stated_twice_are_refused(tmp_path: Path) -> None:
+    for sets, good in (((("", 17),), True), ((("ai.onnx", 17), ("", 17)), True), ((("", 12), ("ai.onnx", 13)), False)):
+        f = OnnxFile((2, 3))
+        f.node("Softmax", axis=-1)
+        model = f.model()
+        del model.opset_import[:]
+        model.opset_import.extend(helper.make_opsetid(domain, version) for domain, version in sets)
+        (tmp_path / "net.onnx").write_bytes(model.SerializeToString())
+        with nullcontext() if good else pytest.raises(InputError, match="states the operator sets 12, 13"):
+            read_onnx(tmp_path / "net.onnx")
+
+
 def test_norms_that_are_computed_in_half_precision_are_refused(tmp_path: Path) -> None:
     for kind, good in ((TensorProto.FLOAT, True), (TensorProto.FLOAT16, False), (TensorProto.BFLOAT16, False)):
         f = OnnxFile((4,))
