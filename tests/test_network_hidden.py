@@ -256,6 +256,14 @@ def test_operator_sets_that_are_stated_twice_are_refused(tmp_path: Path) -> None
             read_onnx(tmp_path / "net.onnx")
 
 
+def test_constants_that_are_stored_twice_are_refused(tmp_path: Path) -> None:
+    f = OnnxFile((4,))
+    f.node("Mul", f.last, f.constant(2.0))
+    f.constants.append(helper.make_tensor(f.constants[0].name, TensorProto.FLOAT, [], [3.0]))
+    with pytest.raises(InputError, match="initializer c0: is stored twice"):
+        read_onnx(f.write(tmp_path / "net.onnx"))
+
+
 def test_norms_that_are_computed_in_half_precision_are_refused(tmp_path: Path) -> None:
     for kind, good in ((TensorProto.FLOAT, True), (TensorProto.FLOAT16, False), (TensorProto.BFLOAT16, False)):
         f = OnnxFile((4,))

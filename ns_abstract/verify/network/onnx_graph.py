@@ -155,6 +155,10 @@ class OnnxReader:
         #: constants that evaluations may round differently; `constants` holds numbers within
         self.enclosed: dict[str, EnclosedConstant] = {}
         for tensor in graph.initializer:
+            if tensor.name in self.constants:
+                # programs take one or the other
+                problem, fix = "is stored twice", "export the network again"
+                raise InputError(problem, file=path, field=f"initializer {tensor.name}", fix=fix)
             self.constants[tensor.name] = self.stored.array(tensor, f"initializer {tensor.name}")
         if graph.sparse_initializer:
             raise InputError("sparse constants are not supported", file=path, fix="store them as dense tensors")
