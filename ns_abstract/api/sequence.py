@@ -97,7 +97,7 @@ def following(
         # along the path a camera leaves one segment for another
         apart = [[hull.get(name, (0.0, 0.0)) for hull in hulls.values()] for name in (*TRANSLATIONS, *ROTATIONS)]
         ends = [(min(low for low, _ in ranges), max(high for _, high in ranges)) for ranges in apart]
-        joined = dict(zip((*TRANSLATIONS, *ROTATIONS), ends, strict=True))
+        joined: dict[str, Range] = dict(zip((*TRANSLATIONS, *ROTATIONS), ends, strict=True))
         hulls = dict.fromkeys(sets, joined)
     return {number: grown(sets[number], hull, motion) for number, hull in hulls.items()}
 
