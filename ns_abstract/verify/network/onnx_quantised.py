@@ -68,6 +68,25 @@ def _refuse_products(r: OnnxReader, node: onnx.NodeProto) -> None:
             raise InputError(problem, fix=fix)
 
 
+def _refuse_tables(r: OnnxReader, node: onnx.NodeProto) -> None:
+    """Refuse a Softmax between steps of 8 bits: onnxruntime takes its exponentials from a table of integers (N25)."""
+    makers = {name: maker for maker in r.graph.node for name in maker.output}
+
+    def behind(name: str) -> onnx.NodeProto | None:
+        maker = makers.get(name)
+        while maker is not None and maker.op_type in (*_LAID_OUT, "Dropout"):
+            maker = makers.get(maker.input[0])
+        return maker
+
+    softmax = behind(node.input[0])
+    if softmax is None or softmax.op_type != "Softmax":
+        return
+    before = behind(softmax.input[0])
+    if before is not None and before.op_type == "DequantizeLinear":
+        fix = "onnxruntime computes it with a table of integers: leave the values before or behind it in floats"
+        raise InputError(f"rounds {softmax.name or softmax.output[0]} (Softmax) of steps to 8 bits", fix=fix)
+
+
 def quantize(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     """A value rounded to steps; what reads it must dequantise it."""
     a.ignore("axis", "saturate")
@@ -80,6 +99,8 @@ def quantize(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
         raise InputError(f"attribute output_dtype = {kind}, its zero has type {zero.dtype}", fix="give one of them")
     if kind not in _RANGES or not LEAST_DIVISOR < step < 1.0 / LEAST_DIVISOR or (zero is not None and zero.size != 1):
         raise InputError(f"scale {step:g} of type {kind}", fix="use 8 or 16 bits and one positive scale")
+    if kind.itemsize == 1:
+        _refuse_tables(r, node)
     offset = 0 if zero is None else int(np.reshape(zero, -1)[0])
     low, high = (step * (end - offset) for end in _RANGES[kind])
     index = r.builder.curve(x.index, Quantised, least=low, most=high, step=step)
