@@ -7,10 +7,12 @@ import errno
 import json
 import os
 import re
+import shutil
 import signal
 import sqlite3
 import subprocess
 import sys
+from collections.abc import Callable
 from contextlib import closing
 from functools import partial
 from pathlib import Path
@@ -18,11 +20,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import InProcess, Inputs
 from test_certify_search import fill, open_store, search_of
 from test_report import frame, read, run
 
 import ns_abstract
 from ns_abstract.api import certificate_report
+from ns_abstract.cli.render import main as render_main
+from ns_abstract.io.atomic import write_json
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.folder import MARK, claim, remove_parts, unwritable
 from ns_abstract.io.version import computed_by
@@ -172,6 +177,62 @@ def test_parts_of_images_are_removed(tmp_path: Path) -> None:
 
 
 # ---------------------------------------------------------------- one at a time
+
+
+def _mark_anew(folder: Path) -> None:
+    (folder / MARK).unlink()
+    (folder / MARK).touch()
+
+
+@pytest.mark.parametrize("change, held", [
+    (lambda folder: None, True),
+    (lambda folder: (folder / MARK).unlink(), True),
+    (_mark_anew, False),
+    (lambda folder: shutil.rmtree(folder) or claim(folder).close(), False),
+    (lambda folder: folder.rename(folder.with_name("moved")) and folder.mkdir(), False),
+    (shutil.rmtree, False),
+])  # fmt: skip
+def test_results_are_not_written_to_a_folder_that_replaced_the_locked_one(
+    change: Callable[[Path], object], held: bool, tmp_path: Path
+) -> None:
+    folder = tmp_path / "out"
+    first = claim(folder)
+    (folder / "below").mkdir()
+    change(folder)
+    if folder.exists():
+        (folder / "below").mkdir(exist_ok=True)
+    for file in (folder / "report.json", folder / "below" / "report.json"):
+        if held:
+            write_json(file, 1)
+            continue
+        with pytest.raises(OSError):
+            write_json(file, 1)
+        assert not file.exists()
+    write_json(tmp_path / "elsewhere.json", 1)
+    # what is no longer claimed is free
+    first.close()
+    (folder / "below").mkdir(parents=True, exist_ok=True)
+    write_json(folder / "below" / "report.json", 2)
+
+
+def test_a_command_whose_folder_was_replaced_ends_with_one_line(
+    blobs: Inputs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, in_process: InProcess
+) -> None:
+    """The folder belongs to another command by the time that the first result comes: nothing is written there."""
+    folder = tmp_path / "out"
+    add = Report.add
+
+    def replaced(self: Report, *given: Any, **more: Any) -> Any:
+        if not (folder / "other").exists():
+            shutil.rmtree(folder)
+            claim(folder).close()
+            (folder / "other").touch()
+        return add(self, *given, **more)
+
+    monkeypatch.setattr(Report, "add", replaced)
+    code, _, err = in_process(render_main, blobs.options(folder, frames=0, workers=1, time_budget=5))
+    assert code == 2 and "removed or replaced" in err and err.count("error:") == 1
+    assert sorted(file.name for file in folder.iterdir()) == [MARK, "other"]
 
 
 def test_a_folder_is_claimed_by_one_command(tmp_path: Path) -> None:

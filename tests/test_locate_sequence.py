@@ -15,13 +15,14 @@ from test_locate import taken
 
 import ns_abstract as nsa
 from ns_abstract.api.location import calibrate, training_data
-from ns_abstract.api.sequence import grown
+from ns_abstract.api.sequence import following, grown
 from ns_abstract.cli.certify import main as certify_main
 from ns_abstract.cli.locate import main
 from ns_abstract.geometry.camera_path import load_camera_path
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.io.folder import claim
+from ns_abstract.io.photos import missing_photos, sequence_photos
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.verify.photo import Brightness, Photo
 
@@ -167,6 +168,78 @@ def test_a_grown_set_holds_every_pose_that_a_motion_leads_to() -> None:
             assert Fraction(box.lower[k]) <= Fraction(hull[name][0]) + Fraction(low)
             assert Fraction(box.upper[k]) >= Fraction(hull[name][1]) + Fraction(high)
             assert box.upper[k] - box.lower[k] <= hull[name][1] - hull[name][0] + high - low + 1e-12
+
+
+def test_a_camera_leaves_one_segment_for_another() -> None:
+    """Poses along the path and off it, of the next photo: on the same segment, and on one where nothing was left."""
+    rng = RNG(7)
+    matrices = [np.eye(4) for _ in range(4)]
+    for k, matrix in enumerate(matrices):
+        matrix[:3, 3] = (0.3 * k, 0.0, 0.1 * k)
+    cameras = [nsa.Camera(matrix, fov=45.0, width=8, height=8) for matrix in matrices]
+    off = [{"x": (-0.1, 0.1)}, {"x": (-0.1, 0.1)}, {}]
+    turns = {"yaw": (-0.1, 0.1)}
+    swept = [Perturbation(translation=shift, rotation=turns, sweep="segments") for shift in off]
+    sets = {k: PoseBox.around(cameras[k], swept[k], cameras[k + 1]) for k in range(3)}
+    motion = {"yaw": (-0.02, 0.05)}
+
+    def report(k: int, left: tuple[list[float], list[float]] | None) -> dict[str, Any]:
+        hull = None if left is None else {"lower": left[0], "upper": left[1]}
+        return {"index": k, "parameters": [{"name": name} for name in sets[k].box.names], "hull": hull}
+
+    left = [([0.02, -0.05, 0.9], [0.03, 0.0, 1.0]), None, ([0.02, 0.0], [0.06, 0.1])]
+    found = following(sets, [report(k, hull) for k, hull in enumerate(left)], motion)
+    assert sorted(found) == [0, 1, 2]
+    for poses in found.values():
+        box = dict(zip(poses.box.names, zip(poses.box.lower, poses.box.upper, strict=True), strict=True))
+        assert box["segment"] == (0.0, 1.0)
+        for _ in range(50):
+            turn = rng.choice([rng.uniform(-0.05, 0.0), rng.uniform(0.02, 0.06), 0.06, -0.05])
+            assert box["yaw"][0] <= turn - 0.02 and turn + 0.05 <= box["yaw"][1]
+        assert box["yaw"] == pytest.approx((-0.07, 0.11))
+        if "x" in box:
+            # the last segment has no offset: 0 is one that the camera comes from
+            assert box["x"] == pytest.approx((0.0, 0.03), abs=1e-12)
+    # around keyframes a set is left by the motion alone, and nothing follows from nothing
+    sets = {k: PoseBox.around(cameras[k], Perturbation(translation=off[0])) for k in range(3)}
+    assert list(following(sets, [report(0, ([0.02], [0.03])), report(1, None), report(2, None)], {})) == [0]
+    assert following(sets, [report(k, None) for k in range(3)], {}) == {}
+
+
+def test_photos_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
+    def folder(*names: str) -> Path:
+        place = tmp_path / str(len(list(tmp_path.iterdir())))
+        place.mkdir()
+        for name in names:
+            (place / name).touch()
+        return place
+
+    for names in (
+        ("9.png", "10.png"), ("a1_9.jpg", "a1_10.jpg"), ("IMG_3.png", "img_2.png"), ("b2c1.png", "b10c1.png"),
+    ):  # fmt: skip
+        with pytest.raises(nsa.InputError, match="by name, and behind it by number"):
+            sequence_photos(folder(*names))
+    for names in (("09.png", "10.png"), ("IMG_002.JPG", "IMG_010.JPG"), ("left.png", "right.png"), ("a.png",)):
+        photos = sequence_photos(folder(*names))
+        assert [photo.name for photo in photos] == list(names) and missing_photos(photos) is None
+    # every second one, or times that are not quite even, are no gap
+    for names, told in (
+        (("f02.png", "f04.png", "f06.png"), None),
+        (("1403636579.png", "1403636629.png", "1403636678.png"), None),
+        (("f1.png", "f2.png", "f4.png"), "between f2.png and f4.png"),
+        (("1403636579.png", "1403636629.png", "1403636729.png"), "between 1403636629.png and 1403636729.png"),
+    ):
+        warning = missing_photos(sequence_photos(folder(*names)))
+        assert warning is None if told is None else told in (warning or "")
+
+
+def test_photos_that_are_no_files_are_not_left_out(tmp_path: Path) -> None:
+    for name in ("1.png", "3.png", "._1.png"):
+        (tmp_path / name).touch()
+    assert [photo.name for photo in sequence_photos(tmp_path)] == ["1.png", "3.png"]
+    (tmp_path / "2.png").symlink_to(tmp_path / "gone.png")
+    with pytest.raises(nsa.InputError, match=r"2\.png: --image-sequence: is no file"):
+        sequence_photos(tmp_path)
 
 
 @pytest.fixture

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from onnx import TensorProto, helper
 from onnx_files import OnnxFile
 from test_network_reading import at, run
 
@@ -152,3 +154,123 @@ def test_shapes_that_do_not_fit_are_named(op: str, tmp_path: Path) -> None:
     f.write(tmp_path / "net.onnx")
     with pytest.raises(InputError, match=r"shapes .*4 and .*3 do not fit"):
         load_network(tmp_path / "net.onnx")
+
+
+# ---------------------------------------------------------------- types
+
+
+@pytest.mark.parametrize("kind", [TensorProto.INT8, TensorProto.UINT8, TensorProto.INT16, TensorProto.UINT16])
+def test_steps_without_a_zero_have_the_type_that_the_node_names(kind: int, tmp_path: Path) -> None:
+    """Where their range ends lies far from every input that the reading is compared at."""
+    f = OnnxFile((2,), opset=21)
+    scale = f.constant(100.0)
+    f.node("QuantizeLinear", f.node("Relu"), scale, output_dtype=kind)
+    f.node("DequantizeLinear", f.last, scale)
+    file = f.write(tmp_path / "net.onnx")
+    for value in (-5.0, 3.0, 12_000.0, 20_000.0, 30_000.0, 4e6, 7e6):
+        point = np.full(2, value, np.float32)
+        low, high = at(file, point)
+        found = run(file, point)
+        assert (low <= found).all() and (found <= high).all() and (high - low < 4e3).all(), value
+
+
+def test_a_zero_of_another_type_than_the_steps_is_refused(tmp_path: Path) -> None:
+    f = OnnxFile((2,), opset=21)
+    given = [f.constant(0.1), f.constant(0, np.uint8)]
+    f.node("QuantizeLinear", f.last, *given, output_dtype=TensorProto.INT8)
+    f.node("DequantizeLinear", f.last, *given)
+    with pytest.raises(InputError, match="output_dtype = int8, its zero has type uint8"):
+        read_onnx(f.write(tmp_path / "net.onnx"))
+
+
+def _limit(f: OnnxFile, limit: str) -> None:
+    f.node("Clip", "image", "", f.node("Cast", limit, to=TensorProto.FLOAT))
+
+
+def _stored_limit(kind: int) -> Callable[[OnnxFile], None]:
+    """A limit of Clip that no input reaches at which the reading is compared."""
+
+    def build(f: OnnxFile) -> None:
+        f.constants.append(helper.make_tensor("limit", kind, [], [4e4 if kind == TensorProto.BFLOAT16 else 3.0]))
+        _limit(f, "limit")
+
+    return build
+
+
+def _cast_limit(kind: int) -> Callable[[OnnxFile], None]:
+    return lambda f: _limit(f, f.node("Cast", f.constant(40_010.0), to=kind))
+
+
+def _node_limit(f: OnnxFile) -> None:
+    value = helper.make_tensor("", TensorProto.BFLOAT16, [], [4e4])
+    f.nodes.append(helper.make_node("Constant", [], ["limit"], value=value))
+    _limit(f, "limit")
+
+
+def _four_bits(f: OnnxFile) -> None:
+    f.constants.append(helper.make_tensor("zero", TensorProto.INT4, [], [0]))
+    scale = f.constant(1000.0)
+    f.node("QuantizeLinear", f.last, scale, "zero")
+    f.node("DequantizeLinear", f.last, scale, "zero")
+
+
+OTHER_TYPES: dict[str, tuple[Callable[[OnnxFile], None], str]] = {
+    "bfloat16 stored": (_stored_limit(TensorProto.BFLOAT16), "initializer limit: has type BFLOAT16"),
+    "bfloat16 of a node": (_node_limit, "Constant.*has type BFLOAT16"),
+    "float8 stored": (_stored_limit(TensorProto.FLOAT8E4M3FN), "has type FLOAT8E4M3FN"),
+    "cast to bfloat16": (_cast_limit(TensorProto.BFLOAT16), "Cast.*has type BFLOAT16"),
+    "cast to float8": (_cast_limit(TensorProto.FLOAT8E5M2), "Cast.*has type FLOAT8E5M2"),
+    "cast to 4 bits": (_cast_limit(TensorProto.INT4), "Cast.*has type INT4"),
+    "a zero of 4 bits": (_four_bits, "QuantizeLinear.*reads numbers of 4 bits"),
+}
+
+
+@pytest.mark.parametrize("name", OTHER_TYPES)
+def test_types_that_numpy_holds_otherwise_are_refused(name: str, tmp_path: Path) -> None:
+    build, words = OTHER_TYPES[name]
+    f = OnnxFile((2,), opset=21)
+    build(f)
+    with pytest.raises(InputError, match=words):
+        load_network(f.write(tmp_path / "net.onnx"))
+
+
+@pytest.mark.parametrize("kind", [TensorProto.INT4, TensorProto.UINT4])
+def test_weights_of_4_bits_are_read(kind: int, tmp_path: Path) -> None:
+    f = OnnxFile((4,), opset=21)
+    f.constants.append(helper.make_tensor("weights", kind, [4], [7, 3, 0, 5]))
+    f.node("Mul", "image", f.node("DequantizeLinear", "weights", f.constant(0.5)))
+    low, high = at(f.write(tmp_path / "net.onnx"), np.ones(4, np.float32))
+    wanted = np.array([3.5, 1.5, 0.0, 2.5])
+    assert (low <= wanted).all() and (wanted <= high).all() and (high - low < 1e-5).all()
+
+
+def test_operator_sets_that_are_stated_twice_are_refused(tmp_path: Path) -> None:
+    for sets, good in (((("", 17),), True), ((("ai.onnx", 17), ("", 17)), True), ((("", 12), ("ai.onnx", 13)), False)):
+        f = OnnxFile((2, 3))
+        f.node("Softmax", axis=-1)
+        model = f.model()
+        del model.opset_import[:]
+        model.opset_import.extend(helper.make_opsetid(domain, version) for domain, version in sets)
+        (tmp_path / "net.onnx").write_bytes(model.SerializeToString())
+        with nullcontext() if good else pytest.raises(InputError, match="states the operator sets 12, 13"):
+            read_onnx(tmp_path / "net.onnx")
+
+
+def test_constants_that_are_stored_twice_are_refused(tmp_path: Path) -> None:
+    f = OnnxFile((4,))
+    f.node("Mul", f.last, f.constant(2.0))
+    f.constants.append(helper.make_tensor(f.constants[0].name, TensorProto.FLOAT, [], [3.0]))
+    with pytest.raises(InputError, match="initializer c0: is stored twice"):
+        read_onnx(f.write(tmp_path / "net.onnx"))
+
+
+def test_norms_that_are_computed_in_half_precision_are_refused(tmp_path: Path) -> None:
+    for kind, good in ((TensorProto.FLOAT, True), (TensorProto.FLOAT16, False), (TensorProto.BFLOAT16, False)):
+        f = OnnxFile((4,))
+        f.node("LayerNormalization", f.last, f.constant(np.ones(4)), stash_type=kind)
+        file = f.write(tmp_path / "net.onnx")
+        if good:
+            load_network(file)
+            continue
+        with pytest.raises(InputError, match=f"stash_type = {kind}"):
+            load_network(file)

@@ -608,3 +608,31 @@ def test_integers_that_are_read_as_values_are_refused(tmp_path: Path) -> None:
     f.node("Identity", integers)
     with pytest.raises(InputError, match="reads integers"):
         load_network(f.write(tmp_path / "net.onnx"))
+
+
+def softmax_between_steps(file: Path, through: str, before: bool, integers: type) -> Path:
+    f = OnnxFile((2, 8))
+    # 16 bits are of operator set 21
+    f.opset = 21 if integers is np.uint16 else f.opset
+    x = quantised(f, f.last, 0.02, 128, integers) if before else f.last
+    if through:
+        x = f.node(through, x)
+    f.node("Softmax", x, axis=-1)
+    quantised(f, f.last, 1.0 / 255.0, 0, integers)
+    return f.write(file)
+
+
+@pytest.mark.parametrize("through", ["", "Identity", "Transpose"])
+def test_a_softmax_between_steps_of_8_bits_is_refused(through: str, tmp_path: Path) -> None:
+    """There onnxruntime takes exponentials from a table of integers, and its outputs leave the bounds."""
+    with pytest.raises(InputError, match=r"\(Softmax\) of steps to 8 bits"):
+        load_network(softmax_between_steps(tmp_path / "net.onnx", through, True, np.uint8))
+
+
+@pytest.mark.parametrize("before, integers", [(False, np.uint8), (True, np.uint16)])
+def test_a_softmax_that_is_computed_in_floats_is_contained(before: bool, integers: type, tmp_path: Path) -> None:
+    file = softmax_between_steps(tmp_path / "net.onnx", "", before, integers)
+    for point in 2.0 * np.random.default_rng(2).normal(size=(10, 2, 8)).astype(np.float32):
+        low, high = at(file, point)
+        value = run(file, point)
+        assert (low <= value).all() and (value <= high).all()

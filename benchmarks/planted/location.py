@@ -42,6 +42,21 @@ LOCATION = (
         "test_locate_sequence.py::test_a_grown_set_holds_every_pose_that_a_motion_leads_to",
     ),
     Fault(
+        "location: a camera stays on its segment",
+        "api/sequence.py", "following", 'any("segment" in poses.box.names for poses in sets.values())', "False",
+        "test_locate_sequence.py::test_a_camera_leaves_one_segment_for_another",
+    ),
+    Fault(
+        "location: offsets of one segment alone go on",
+        "api/sequence.py", "following", "max(high for _, high in ranges)", "ranges[0][1]",
+        "test_locate_sequence.py::test_a_camera_leaves_one_segment_for_another",
+    ),
+    Fault(
+        "location: photos in the order of their names alone",
+        "io/photos.py", "sequence_photos", "_numbered(after) < _numbered(before)", "False",
+        "test_locate_sequence.py::test_photos_come_in_the_order_of_their_numbers",
+    ),
+    Fault(
         "location: a rounded product takes an outlier away",
         "verify/pixel_parts.py", "most_within", "max(k for k in (near - 1, near, near + 1) if k / count <= part)",
         "near", "test_pixel_parts.py::test_photos_may_miss_as_many_pixels_as_is_said",

@@ -109,4 +109,13 @@ PROCESSES = (
         "next((package / SHIPPED / level).iterdir())",
         "test_shipped_kernels.py::test_highest_level_that_the_processor_has",
     ),
+    Fault(
+        "folders: results go where another command works by now",
+        "io/folder.py",
+        "require_held",
+        "not one.holds()",
+        "False",
+        "test_folders.py::test_a_command_whose_folder_was_replaced_ends_with_one_line",
+        compiled=True,
+    ),
 )

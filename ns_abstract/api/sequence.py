@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import itertools
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,6 +27,8 @@ from ns_abstract.report.run import plain
 
 Range = tuple[float, float]
 _REPORT = "report.json"
+#: Of how one photo's sets follow from another's: results of different rules are not continued.
+_RULES = 2
 
 
 def load_motion(file: Path, sets: Mapping[int, PoseBox], dataset_scale: float | None) -> dict[str, Range]:
@@ -44,6 +46,11 @@ def load_motion(file: Path, sets: Mapping[int, PoseBox], dataset_scale: float | 
         if present:
             raise InputError("is no motion", file=file, field=name, fix="state translation and rotation alone")
     ranges = {name: ends for name, ends in {**motion.translation, **motion.rotation}.items() if ends != (0.0, 0.0)}
+    if len({poses.perturbation.frame for poses in sets.values()}) > 1 and any(
+        "segment" in poses.box.names for poses in sets.values()
+    ):
+        fix = "give all entries of the path the same frame"
+        raise InputError("sets of camera and world axes follow each other", field="perturbation.frame", fix=fix)
     for poses in sets.values():
         if set(ranges) & set(TRANSLATIONS) and poses.perturbation.frame != motion.frame:
             fix = f'write "frame": "{poses.perturbation.frame}", as the set has'
@@ -68,6 +75,31 @@ def grown(poses: PoseBox, hull: Mapping[str, Range], motion: Mapping[str, Range]
             ends = np.nextafter(hull[name][0] + low, -np.inf), np.nextafter(hull[name][1] + high, np.inf)
             box = box.replace(axis, float(ends[0]), float(ends[1]))
     return poses.within(box)
+
+
+def following(
+    sets: Mapping[int, PoseBox], frames: Sequence[Mapping[str, Any]], motion: Mapping[str, Range]
+) -> dict[int, PoseBox]:
+    """By number, the sets that the next photo may come from: none where nothing is left (U7).
+
+    Args:
+        sets: Those of the first photo.
+        frames: What reports of one photo say of each: ``index``, ``parameters`` and ``hull``.
+        motion: As for `grown`.
+    """
+    hulls: dict[int, dict[str, Range]] = {}
+    for frame in frames:
+        if frame["hull"] is not None:
+            names = [entry["name"] for entry in frame["parameters"]]
+            ends = zip(frame["hull"]["lower"], frame["hull"]["upper"], strict=True)
+            hulls[frame["index"]] = dict(zip(names, ends, strict=True))
+    if hulls and any("segment" in poses.box.names for poses in sets.values()):
+        # along the path a camera leaves one segment for another
+        apart = [[hull.get(name, (0.0, 0.0)) for hull in hulls.values()] for name in (*TRANSLATIONS, *ROTATIONS)]
+        ends = [(min(low for low, _ in ranges), max(high for _, high in ranges)) for ranges in apart]
+        joined: dict[str, Range] = dict(zip((*TRANSLATIONS, *ROTATIONS), ends, strict=True))
+        hulls = dict.fromkeys(sets, joined)
+    return {number: grown(sets[number], hull, motion) for number, hull in hulls.items()}
 
 
 def _seal(entry: Mapping[str, Any]) -> str:
@@ -105,7 +137,7 @@ class PhotoSequence:
         self.job = job
         self.sets = {k: job.pose_sets[k] for k in check_frames(self.frames, job.frame_count)}
         self.ranges = load_motion(self.motion, self.sets, job.method.dataset_scale)
-        text = json.dumps([self.first.fingerprint, self.ranges, sorted(self.sets)], sort_keys=True)
+        text = json.dumps([_RULES, self.first.fingerprint, self.ranges, sorted(self.sets)], sort_keys=True)
         self.fingerprint = hashlib.sha256(text.encode()).hexdigest()
         self.entries: list[dict[str, Any]] = self._stored() if self.resume else []
 
@@ -168,13 +200,7 @@ class PhotoSequence:
         """By number, the set of photo ``k``."""
         if k == 0:
             return self.sets
-        alive = {}
-        for frame in self.entries[k - 1]["frames"]:
-            if frame["hull"] is not None:
-                names = [entry["name"] for entry in frame["parameters"]]
-                hull = dict(zip(names, zip(frame["hull"]["lower"], frame["hull"]["upper"], strict=True), strict=True))
-                alive[frame["index"]] = grown(self.sets[frame["index"]], hull, self.ranges)
-        return alive
+        return following(self.sets, self.entries[k - 1]["frames"], self.ranges)
 
     def _location(self, k: int, poses: tuple[PoseBox, ...]) -> Location:
         image, first = self.images[k], self.first

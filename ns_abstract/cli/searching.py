@@ -21,6 +21,7 @@ from ns_abstract.api.sequence import open_sequence
 from ns_abstract.cli.common import SignalStop, plain_console
 from ns_abstract.cli.sets import stated
 from ns_abstract.execution.engine_options import EngineOptions
+from ns_abstract.io.photos import missing_photos
 from ns_abstract.report.certificate import coverage
 from ns_abstract.report.figures import frames_listed, percent
 from ns_abstract.report.progress import ProgressBar
@@ -106,6 +107,8 @@ def locate_photos(options: Locate, stop: SignalStop) -> None:
         photos = open_sequence(
             settings, options.image_sequence, options.motion, options.output_dir, options.frames, options.resume
         )
+    if (warning := missing_photos(photos.images)) is not None:
+        console.print(f"warning: {warning}")
     untold = [photos.first]
 
     def search(location: Location, frames: tuple[int, ...], folder: Path) -> dict[str, Any]:

@@ -9,6 +9,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from ns_abstract.io.folder import require_held
+
 
 def write_atomic(
     path: str | os.PathLike[str], write: Callable[[BinaryIO], object], *, scratch: Path | None = None
@@ -17,9 +19,10 @@ def write_atomic(
 
     Whoever opens ``path`` sees the old file or the whole new one, also after a crash, a kill or a loss of power between
     the two. ``scratch``: folder of the temporary file, on the same file system; the file's own by default. Raises
-    OSError: the folder cannot be written; ``path`` is as before.
+    OSError: the folder cannot be written, or is another one than this process has locked; ``path`` is as before.
     """
     path = Path(path)
+    require_held(path)
     temporary = (scratch or path.parent) / f".{path.name}.{secrets.token_hex(4)}.part"
     try:
         with open(temporary, "xb") as stream:

@@ -7,6 +7,7 @@ import fcntl
 import os
 import re
 import stat
+import weakref
 from pathlib import Path
 from typing import BinaryIO
 
@@ -33,20 +34,62 @@ _FIXES = {
     **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), _FULL),
     **dict.fromkeys((errno.ENOTDIR, errno.EEXIST, errno.EISDIR), "name a folder, not a file or what is below one"),
     errno.ENAMETOOLONG: "choose a shorter name",
+    errno.ESTALE: "run the command again, and leave its folder where it is",
 }
 
 
-def claim(folder: Path) -> BinaryIO:
+class Claim:
+    """A result folder that this process has locked; open until `close`, or the end of a ``with`` statement."""
+
+    def __init__(self, folder: Path, lock: BinaryIO) -> None:
+        self.folder, self._lock = folder.absolute(), lock
+        self._folder_stat = os.stat(folder)
+        _held.add(self)
+
+    def holds(self) -> bool:
+        """Whether the folder is still the one that was locked, and no other command has locked it anew."""
+        if not os.path.samestat(os.stat(self.folder), self._folder_stat):
+            return False
+        try:
+            return os.path.samestat(os.lstat(self.folder / MARK), os.fstat(self._lock.fileno()))
+        except FileNotFoundError:
+            return True
+
+    def close(self) -> None:
+        """Unlock the folder."""
+        _held.discard(self)
+        self._lock.close()
+
+    def __enter__(self) -> Claim:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self.close()
+
+
+#: The folders that this process has locked.
+_held: weakref.WeakSet[Claim] = weakref.WeakSet()
+
+
+def require_held(file: Path) -> None:
+    """Raise OSError where ``file`` would lie in a folder that was locked, and that another one has replaced since."""
+    within = file.absolute().parents
+    for one in list(_held):
+        if one.folder in within and not one.holds():
+            raise OSError(errno.ESTALE, "the folder was removed or replaced since the command began")
+
+
+def claim(folder: Path) -> Claim:
     """Create a result folder, or take one over, for one command.
 
-    Returns an open file; the folder is locked until it is closed, or its process ends. Raises InputError where another
+    Returns the claim; the folder is locked until it is closed, or its process ends. Raises InputError where another
     command writes there, the folder cannot be written, or files that this program did not write stand where results
     would.
     """
     try:
         folder.mkdir(parents=True, exist_ok=True)
         _refuse_strangers(folder)
-        return _locked(folder)
+        return Claim(folder, _locked(folder))
     except OSError as error:
         raise unwritable(folder, error) from None
 

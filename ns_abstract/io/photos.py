@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import io
+import itertools
 import os
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ns_abstract.io.errors import InputError, first_line
-from ns_abstract.io.jsonio import read_bytes
+from ns_abstract.io.jsonio import read_bytes, show
 
 #: Most pixels of a photo or a mask, and most bytes of a mask of greys.
 _MOST_PIXELS, _MOST_MASK_BYTES = 1 << 26, 64 << 20
@@ -42,18 +44,53 @@ def read_photo(file: Path, field: str = "--image") -> np.ndarray:
 
 
 def sequence_photos(folder: Path, field: str = "--image-sequence") -> list[Path]:
-    """The pictures of a folder, in the order of their names.
+    """The pictures of a folder, in the order of their names, but for hidden ones.
 
     Raises:
-        InputError: There is no such folder, or it holds none.
+        InputError: There is no such folder, it cannot be listed or holds none, one of them is no file, or the numbers
+            in the names have another order than the names.
     """
     if not os.path.isdir(folder):
         raise InputError("no such folder", file=folder, field=field, fix="give a folder of photos")
-    photos = sorted(file for file in folder.iterdir() if file.suffix.lower() in _ENDINGS and file.is_file())
+    try:
+        named = (file for file in folder.iterdir() if not file.name.startswith("."))
+        photos = sorted(file for file in named if file.suffix.lower() in _ENDINGS)
+    except OSError as error:
+        problem = f"cannot be listed: {error.strerror or type(error).__name__}"
+        raise InputError(problem, file=folder, field=field, fix="check the permissions") from None
     if not photos:
         fix = f"give a folder with files that end in {', '.join(_ENDINGS)}"
         raise InputError("holds no photos", file=folder, field=field, fix=fix)
+    # left out, the motion from the photo before to the one behind would be another
+    if (lost := next((photo for photo in photos if not photo.is_file()), None)) is not None:
+        raise InputError("is no file", file=lost, field=field, fix="copy the photo there, or remove it")
+    for before, after in itertools.pairwise(photos):
+        if _numbered(after) < _numbered(before):
+            problem = f"{show(before.name)} comes before {show(after.name)} by name, and behind it by number"
+            fix = "rename them with numbers of as many digits, and in one case"
+            raise InputError(problem, file=folder, field=field, fix=fix)
     return photos
+
+
+def missing_photos(photos: Sequence[Path]) -> str | None:
+    """Where numbers are left out between photos in the order of their names; None: nowhere, or they have no number."""
+    parts = [_numbered(photo) for photo in photos]
+    if len({len(part) for part in parts}) > 1:
+        return None
+    varied = [k for k in range(len(parts[0])) if len({part[k] for part in parts}) > 1]
+    if len(varied) != 1 or not varied[0] % 2:
+        return None
+    steps = [after[varied[0]] - before[varied[0]] for before, after in itertools.pairwise(parts)]
+    at = next((k for k, step in enumerate(steps) if step >= 2 * min(steps)), None)
+    if at is None:
+        return None
+    pair = f"{photos[at].name} and {photos[at + 1].name}"
+    return f"photos may be missing between {pair}: the motion must allow for the way from one to the other"
+
+
+def _numbered(photo: Path) -> list[Any]:
+    """Parts of a photo's name: text at even places, numbers at odd ones."""
+    return [int(part) if k % 2 else part for k, part in enumerate(re.split(r"([0-9]+)", photo.name.casefold()))]
 
 
 def read_mask(file: Path, size: tuple[int, int], field: str = "--mask") -> np.ndarray:

@@ -13,7 +13,6 @@ from typing import NamedTuple
 
 import numpy as np
 import onnx
-from onnx import TensorProto
 
 from ns_abstract.arithmetic.network_charges import (
     CONSTANT_SUMS,
@@ -33,6 +32,7 @@ from ns_abstract.arithmetic.network_charges import (
 )
 from ns_abstract.io.errors import InputError
 from ns_abstract.verify.network.onnx_fold import COMPARES, GROWS, LIBRARIES, MOVES, SHAPES, STEPS, fold
+from ns_abstract.verify.network.onnx_tensors import number_type
 
 Interval64 = tuple[np.ndarray, np.ndarray]
 _FIX = "fold constants when exporting, in float64"
@@ -372,14 +372,7 @@ def _cast(
         other = values[1]
         kind = other.kind if isinstance(other, EnclosedConstant) else np.asarray(other).dtype
     else:
-        to = next((a.i for a in node.attribute if a.name == "to"), 0)
-        try:
-            kind = np.dtype(onnx.helper.tensor_dtype_to_np_dtype(to))
-        except (KeyError, ValueError, TypeError):
-            raise InputError(f"casts to type {to}", fix="use float32") from None
-    if kind.kind not in "fiub" or (kind.kind == "f" and kind.itemsize not in FORMATS):
-        name = TensorProto.DataType.Name(to) if node.op_type == "Cast" else str(kind)
-        raise InputError(f"casts a constant to {name}", fix="use float32")
+        kind = number_type(next((a.i for a in node.attribute if a.name == "to"), 0))
     if isinstance(operand, EnclosedConstant):
         if kind.kind != "f":
             ends = [np.asarray(end).astype(kind) for end in (*operand.real, *operand.evaluated)]

@@ -29,10 +29,12 @@ Rule = Callable[["OnnxReader", onnx.NodeProto, "Attributes"], None]
 
 
 def operator_set(model: onnx.ModelProto, path: Path) -> int:
-    version = 0
-    for entry in model.opset_import:
-        if entry.domain in ("", "ai.onnx"):
-            version = entry.version
+    versions = {entry.version for entry in model.opset_import if entry.domain in ("", "ai.onnx")}
+    if len(versions) > 1:
+        # programs take one or the other
+        problem = f"states the operator sets {', '.join(map(str, sorted(versions)))}"
+        raise InputError(problem, file=path, field="opset_import", fix="export the network again")
+    version = next(iter(versions), 0)
     if version not in _OPSETS:
         raise InputError(
             f"operator set {version} is not supported",
@@ -153,6 +155,10 @@ class OnnxReader:
         #: constants that evaluations may round differently; `constants` holds numbers within
         self.enclosed: dict[str, EnclosedConstant] = {}
         for tensor in graph.initializer:
+            if tensor.name in self.constants:
+                # programs take one or the other
+                problem, fix = "is stored twice", "export the network again"
+                raise InputError(problem, file=path, field=f"initializer {tensor.name}", fix=fix)
             self.constants[tensor.name] = self.stored.array(tensor, f"initializer {tensor.name}")
         if graph.sparse_initializer:
             raise InputError("sparse constants are not supported", file=path, fix="store them as dense tensors")

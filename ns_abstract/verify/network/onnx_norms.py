@@ -99,7 +99,7 @@ def _layer_norm(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     x = r.value(node)
     rank = len(x.whole)
     axis = int(a.get("axis", -1)) % rank
-    a.ignore("stash_type")
+    a.only("stash_type", onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE)
     if axis < x.batched or any(node.output[1:]):
         raise InputError(f"attribute axis = {axis} is not supported", fix="normalise over axes of the item alone")
     inner = list(range(axis - x.batched, rank - x.batched))
@@ -113,7 +113,7 @@ def _group_norm(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     shape = r.builder.shape(x)
     channels = shape[0]
     groups = channels if node.op_type == "InstanceNormalization" else int(a.get("num_groups", 0))
-    a.ignore("stash_type")
+    a.only("stash_type", onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE)
     if groups < 1 or channels % groups or len(shape) < 2:
         raise InputError(f"attribute num_groups = {groups} of {channels} channels", fix="it must divide them")
     split = (groups, channels // groups, *shape[1:])

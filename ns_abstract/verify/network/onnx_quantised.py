@@ -11,6 +11,7 @@ from ns_abstract.verify.network.composite_activations import Quantised
 from ns_abstract.verify.network.constant_enclosures import EnclosedConstant, exact_constant, scaled_integers
 from ns_abstract.verify.network.onnx_choices import without_choices
 from ns_abstract.verify.network.onnx_graph import Attributes, OnnxReader
+from ns_abstract.verify.network.onnx_tensors import number_type
 
 #: Operators that lay a matrix out otherwise and do not change its numbers.
 _LAID_OUT = ("Transpose", "Identity", "Reshape", "Squeeze", "Unsqueeze", "Flatten", "Cast")
@@ -23,7 +24,7 @@ def dequantize(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     """``(q - zero) scale``: of constants a constant, of values what their `quantize` has left."""
     axis = int(a.get("axis", 1))
     a.only("block_size", 0)
-    a.ignore("output_dtype")
+    a.only("output_dtype", onnx.TensorProto.FLOAT, 0)
     scale, zero = r.weight(node, 1), r.constant(node, 2)
     if node.input[0] in r.constants:
         q = r.weight(node, 0)
@@ -67,15 +68,39 @@ def _refuse_products(r: OnnxReader, node: onnx.NodeProto) -> None:
             raise InputError(problem, fix=fix)
 
 
+def _refuse_tables(r: OnnxReader, node: onnx.NodeProto) -> None:
+    """Refuse a Softmax between steps of 8 bits: onnxruntime takes its exponentials from a table of integers (N25)."""
+    makers = {name: maker for maker in r.graph.node for name in maker.output}
+
+    def behind(name: str) -> onnx.NodeProto | None:
+        maker = makers.get(name)
+        while maker is not None and maker.op_type in (*_LAID_OUT, "Dropout"):
+            maker = makers.get(maker.input[0])
+        return maker
+
+    softmax = behind(node.input[0])
+    if softmax is None or softmax.op_type != "Softmax":
+        return
+    before = behind(softmax.input[0])
+    if before is not None and before.op_type == "DequantizeLinear":
+        fix = "onnxruntime computes it with a table of integers: leave the values before or behind it in floats"
+        raise InputError(f"rounds {softmax.name or softmax.output[0]} (Softmax) of steps to 8 bits", fix=fix)
+
+
 def quantize(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     """A value rounded to steps; what reads it must dequantise it."""
-    a.ignore("axis", "saturate", "output_dtype")
+    a.ignore("axis", "saturate")
     a.only("block_size", 0)
     x, scale, zero = r.value(node), r.weight(node, 1), r.constant(node, 2)
     step = _scalar(scale)
-    kind = np.dtype(np.uint8) if zero is None else zero.dtype
+    named = a.get("output_dtype", 0)
+    kind = number_type(named) if named else np.dtype(np.uint8) if zero is None else zero.dtype
+    if zero is not None and zero.dtype != kind:
+        raise InputError(f"attribute output_dtype = {kind}, its zero has type {zero.dtype}", fix="give one of them")
     if kind not in _RANGES or not LEAST_DIVISOR < step < 1.0 / LEAST_DIVISOR or (zero is not None and zero.size != 1):
         raise InputError(f"scale {step:g} of type {kind}", fix="use 8 or 16 bits and one positive scale")
+    if kind.itemsize == 1:
+        _refuse_tables(r, node)
     offset = 0 if zero is None else int(np.reshape(zero, -1)[0])
     low, high = (step * (end - offset) for end in _RANGES[kind])
     index = r.builder.curve(x.index, Quantised, least=low, most=high, step=step)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +35,13 @@ PACKED = ".onnx.gz"
 #: Domains of the operators that runtimes have themselves, with what begins so before a dot.
 _OWN = ("", "ai.onnx", "com.microsoft", "com.ms")
 _FIX = "export the network again"
+_T = onnx.TensorProto
+#: Types whose numbers numpy holds as they are.
+_TYPES = frozenset((_T.FLOAT, _T.DOUBLE, _T.FLOAT16, _T.BOOL, _T.INT8, _T.INT16, _T.INT32, _T.INT64)) | frozenset(
+    (_T.UINT8, _T.UINT16, _T.UINT32, _T.UINT64)
+)
+#: Types that numpy holds in bytes, and the operators that need no more than their numbers.
+_FOUR_BITS, _OF_FOUR_BITS = (_T.INT4, _T.UINT4), ("DequantizeLinear", "Cast")
 
 
 def parse_model(path: Path) -> onnx.ModelProto:
@@ -59,7 +68,31 @@ def parse_model(path: Path) -> onnx.ModelProto:
     if not model.graph.node or not model.graph.output:
         raise InputError("holds no network", file=path, field="graph", fix=_FIX)
     _check_attributes(model, path)
-    return _inlined(model, path) if model.functions else model
+    model = _inlined(model, path) if model.functions else model
+    _check_types(model.graph, path)
+    return model
+
+
+def number_type(data_type: int) -> np.dtype:
+    """numpy's type of an ONNX type (N23). Raises InputError where numpy holds its bits, or a wider type, instead."""
+    if data_type not in _TYPES:
+        known = data_type in _T.DataType.values()
+        name = _T.DataType.Name(data_type) if known else str(data_type)  # pyright: ignore[reportArgumentType]
+        raise InputError(f"has type {name}", fix="use float32")
+    return np.dtype(onnx.helper.tensor_dtype_to_np_dtype(data_type))
+
+
+def _check_types(graph: onnx.GraphProto, path: Path) -> None:
+    """Refuse constants of types that numpy does not hold as they are, but for the numbers of four bits."""
+    four = {tensor.name for tensor in graph.initializer if tensor.data_type in _FOUR_BITS}
+    for node in graph.node:
+        field = f"node {node.name or ', '.join(node.output)} ({node.op_type})"
+        for attribute in node.attribute:
+            if attribute.type == onnx.AttributeProto.TENSOR and attribute.t.data_type not in _TYPES:
+                with _at(path, field):
+                    number_type(attribute.t.data_type)
+        if not four.isdisjoint(node.input) and node.op_type not in _OF_FOUR_BITS:
+            raise InputError("reads numbers of 4 bits", file=path, field=field, fix="use 8 bits")
 
 
 def _check_attributes(model: onnx.ModelProto, path: Path) -> None:
@@ -87,6 +120,15 @@ def unpacked_model(path: Path) -> bytes:
         total += len(part)
         check_memory(_COPIES * total, path, "the network")
     return b"".join(parts)
+
+
+@contextmanager
+def _at(path: Path, field: str) -> Iterator[None]:
+    """Say where an error is."""
+    try:
+        yield
+    except InputError as error:
+        raise InputError(error.problem, file=path, field=field, fix=error.fix) from None
 
 
 def _inlined(model: onnx.ModelProto, path: Path) -> onnx.ModelProto:
@@ -154,12 +196,11 @@ class StoredTensors:
         if count > _LARGEST:
             problem = f"has {count:,} numbers"
             raise InputError(problem, file=self.path, field=field, fix=f"at most {_LARGEST:,} are read")
-        try:
-            kind = onnx.helper.tensor_dtype_to_np_dtype(tensor.data_type)
-        except (KeyError, ValueError, TypeError):
-            raise InputError(f"has type {tensor.data_type}", file=self.path, field=field, fix="use float32") from None
-        if kind.kind not in "fiub":
-            raise InputError(f"has type {kind}", file=self.path, field=field, fix="use float32")
+        if tensor.data_type in _FOUR_BITS:
+            kind = np.dtype(np.int8 if tensor.data_type == _T.INT4 else np.uint8)
+        else:
+            with _at(self.path, field):
+                kind = number_type(tensor.data_type)
         if tensor.data_location == onnx.TensorProto.EXTERNAL:
             array = self._external(tensor, field, kind, count)
         else:
@@ -167,8 +208,6 @@ class StoredTensors:
                 array = numpy_helper.to_array(tensor)
             except Exception as error:  # numpy_helper raises whatever it meets
                 raise InputError(f"cannot be read ({error})", file=self.path, field=field, fix=_FIX) from None
-        if array.dtype.kind not in "fiub":
-            raise InputError(f"has type {array.dtype}", file=self.path, field=field, fix="use float32")
         # what a mask sets to minus infinity is refused where something else than a softmax reads it
         if array.dtype.kind == "f" and not (np.isfinite(array) | np.isneginf(array)).all():
             raise InputError("holds numbers that are not finite", file=self.path, field=field, fix="train again")
