@@ -181,6 +181,29 @@ def test_cells_of_cheap_models_fail_as_a_whole_only_after_a_second_look() -> Non
     assert 0.53 < volume(leaves, "falsified") / whole < 1.0 - true + 0.01
 
 
+class Peak(Ramp):
+    """Pictures whose brightness is greatest at one x, and is bounded by numbers alone."""
+
+    def image(self, values: np.ndarray) -> np.ndarray:
+        return np.full((2, 2, 3), 0.5 - 0.2 * abs(values[0] - 0.35), np.float32)
+
+    def linear_sets(self, box: ParameterBox) -> Any:
+        ends = [abs(end[0] - 0.35) for end in (box.lower, box.upper)]
+        nearest = 0.0 if box.lower[0] <= 0.35 <= box.upper[0] else min(ends)
+        a = np.zeros((2, 2, 3, 1))
+        low, high = (np.full((2, 2, 3), 0.5 - 0.2 * reach) for reach in (max(ends), nearest))
+        return (a, low - self.slack, a, high + self.slack), low - self.slack, high + self.slack, np.array([0.2])
+
+
+@pytest.mark.parametrize("costly", [False, True])
+def test_a_wide_cell_fails_as_a_whole_only_after_many_looks(costly: bool) -> None:
+    """The property holds on a 25th of the set, where no corner nor middle of the whole set lies."""
+    search = search_of(Peak(slack=1e-5), Threshold(0.492), (1,), costly=costly)
+    leaves, _ = drive(search, 200)
+    assert 0.03 < volume(leaves, "certified") / search.grid.volume < 0.041
+    assert not overlapping(leaves)
+
+
 class Compared(Ramp):
     """A ramp whose bounds say that cuts along y alone help."""
 
