@@ -119,11 +119,12 @@ def typical_cell(
         motion: Image motion over a part, pixels.
         draw: The picture [H, W, 3] at parameters [d].
     """
-    camera, tiles, parts = frame.camera, np.arange(frame.tile_count), int(counts.prod())
+    camera, parts = frame.camera, int(counts.prod())
     step = math.ceil(math.sqrt(camera.height * camera.width / _MOST_PIXELS))
     # of blocks whose orders are too many, few pixels are bounded whatever the order
     some, few = (_lattice((camera.height, camera.width), k * step) for k in (1, _FEWER))
     chosen, worked = in_tiles(some, frame.side), in_tiles(few, frame.side)
+    tiles = np.flatnonzero(chosen.any(axis=(1, 2)))
     places = np.unique(np.linspace(0, parts - 1, min(parts, _MOST_PICTURES)).astype(np.int64))
     middles = (2.0 * np.stack(np.unravel_index(places, counts), axis=-1) + 1.0) / counts - 1.0
     pictures = [draw(cell.at(middle)) for middle in middles]
@@ -131,13 +132,17 @@ def typical_cell(
     for kind in (CHANNELS, DIFFERENCES)[: 1 if parts == 1 else 2]:
         if parts == 1:
             bounds = frame.bound(cell, tiles, None)
-            lower, upper = (end[chosen][..., None] for end in (bounds.lower, bounds.upper))
+            lower, upper = (end[chosen[tiles]][..., None] for end in (bounds.lower, bounds.upper))
         elif isinstance(frame, SubBoxFrame):
             ends = np.repeat(worked[chosen][:, None], 6, axis=1)
-            known = frame.sub_box_ends(cell, counts, tiles, chosen, ends, kind == DIFFERENCES)
+            known = frame.sub_box_ends(cell, counts, tiles, chosen[tiles], ends, kind == DIFFERENCES)
             if known is None:
                 return None
-            lower, upper = (end[..., places] for end in known)
+            # what is known of no end would be known with more work
+            nothing: np.ndarray = (
+                (known[0] <= 0.0) & (known[1] >= 1.0) | ~(np.isfinite(known[0]) & np.isfinite(known[1]))
+            ).all(axis=1)
+            lower, upper = (np.where(nothing[:, None], np.nan, end)[..., places] for end in known)
         else:
             return None
         pairs = [
@@ -162,11 +167,10 @@ def _losses(
 ) -> list[Float64Array]:
     """By how much bounds [n, 3] of ``n`` pixels go below and above ``values`` [H, W, 3] nearby; NaN elsewhere."""
     least, most = (in_tiles(end, pixels.shape[1])[pixels] for end in nearby(values, max(1, round(0.5 * motion))))
-    nothing = np.all((lower <= 0.0) & (upper >= 1.0) | ~(np.isfinite(lower) & np.isfinite(upper)), axis=-1)
     losses = []
     for gap in (least - lower, upper - most):
         tiles = np.full((*pixels.shape, 3), np.nan)
-        tiles[pixels] = np.where(nothing[:, None], np.nan, gap.clip(0.0, _ALL))
+        tiles[pixels] = gap.clip(0.0, _ALL)
         losses.append(assemble(tiles, camera))
     return losses
 
