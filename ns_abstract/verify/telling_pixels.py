@@ -139,9 +139,8 @@ def typical_cell(
             if known is None:
                 return None
             # what is known of no end would be known with more work
-            nothing: np.ndarray = (
-                (known[0] <= 0.0) & (known[1] >= 1.0) | ~(np.isfinite(known[0]) & np.isfinite(known[1]))
-            ).all(axis=1)
+            vain = (known[0] <= 0.0) & (known[1] >= 1.0) | ~(np.isfinite(known[0]) & np.isfinite(known[1]))
+            nothing = np.logical_and.reduce(vain, axis=1)
             lower, upper = (np.where(nothing[:, None], np.nan, end)[..., places] for end in known)
         else:
             return None
