@@ -141,7 +141,7 @@ LOCATION = (
     ),
     Fault(
         "location: a round counts a pixel twice",
-        _ROUNDS, "PixelRounds.count", "(pixels & ~self.bounded)[pixels]", "pixels[pixels]",
+        _ROUNDS, "PixelRounds.take", "(pixels & ~self.bounded)[pixels]", "pixels[pixels]",
         "test_pixel_rounds.py::test_a_pixel_counts_once",
     ),
     Fault(

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ns_abstract.arithmetic.outward import outward
-from ns_abstract.arithmetic.rounding import DIFFERENCE_ROUNDING, LINEAR_ROUNDING, LINEAR_UP, Arithmetic
+from ns_abstract.arithmetic.rounding import CHANNEL_DIFFERENCE_ROUNDING, LINEAR_ROUNDING, LINEAR_UP, Arithmetic
 from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.execution.threads import each
 from ns_abstract.geometry.box import ParameterBox, shared_out
@@ -469,7 +469,10 @@ def difference_ends(parts: np.ndarray, pixels: np.ndarray, scale: float) -> tupl
     # [0, 1] stands for nothing that is known (design.md, B15)
     known = (lower <= upper) & ~((lower == 0.0) & (upper == 1.0)) & (scale > 0.0)
     with np.errstate(all="ignore"):
-        lower, upper = (lower - 0.5 - DIFFERENCE_ROUNDING) / scale, (upper - 0.5 + DIFFERENCE_ROUNDING) / scale
+        lower, upper = (
+            (lower - 0.5 - CHANNEL_DIFFERENCE_ROUNDING) / scale,
+            (upper - 0.5 + CHANNEL_DIFFERENCE_ROUNDING) / scale,
+        )
     return np.where(known, lower, -np.inf), np.where(known, upper, np.inf)
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ns_abstract.arithmetic.rounding import DIFFERENCE_ROUNDING, SUB_BOX_OVERLAP, UP
+from ns_abstract.arithmetic.rounding import CHANNEL_DIFFERENCE_ROUNDING, SUB_BOX_OVERLAP, UP
 from ns_abstract.execution.threads import lane, threads
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import PinholeCamera
@@ -149,7 +149,7 @@ def channel_differences(projected: ProjectedCell) -> tuple[ProjectedCell, float]
     for k, (first, second) in enumerate(CHANNEL_DIFFERENCES):
         np.subtract(forms[:, first], forms[:, second], out=differences[:, k])
         if columns > 1:
-            differences[:, k, -1] = (forms[:, first, -1] + forms[:, second, -1]) * UP + 2.0 * DIFFERENCE_ROUNDING
+            differences[:, k, -1] = (forms[:, first, -1] + forms[:, second, -1]) * UP + CHANNEL_DIFFERENCE_ROUNDING
     differences[..., 0] += 0.5
     colors = np.empty_like(projected.colors)
     colors[alive] = differences.reshape(alive.size, 3 * columns)
@@ -157,7 +157,7 @@ def channel_differences(projected: ProjectedCell) -> tuple[ProjectedCell, float]
     return projected._replace(
         colors=colors,
         background=scale * behind + 0.5,
-        color_error=projected.color_error + DIFFERENCE_ROUNDING,
+        color_error=projected.color_error + CHANNEL_DIFFERENCE_ROUNDING,
     ), scale
 
 
