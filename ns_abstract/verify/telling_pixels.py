@@ -94,8 +94,9 @@ class TellingPixels:
         likely = np.stack([miss.max(axis=-1) for miss in misses])
         gaps = np.stack([self._misses(picture, kind, 1, [0.0, 0.0]).max(axis=-1) for kind in kinds])
         loose = np.stack([(below + above).max(axis=-1) for below, above in losses])
-        # differences where channels are not likely to exclude, but they are: of pixels of two kinds each takes a call
-        chosen = np.where((likely > 0.0).any(axis=0), (likely > 0.0).argmax(axis=0), 0)
+        # of those that are likely to exclude the tighter one
+        worth = np.where(likely > 0.0, likely - loose, -np.inf)
+        chosen = np.where((likely > 0.0).any(axis=0), worth.argmax(axis=0), gaps.argmax(axis=0))
         gaps, likely, loose = (np.take_along_axis(part, chosen[None], axis=0)[0] for part in (gaps, likely, loose))
         numbers, sure = telling_order(gaps, likely, loose, counted, most_pixels)
         return PixelOrder(numbers, sure, chosen, misses)
