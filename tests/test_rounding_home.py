@@ -173,6 +173,15 @@ def test_every_charge_says_what_it_is_for() -> None:
     assert wrong == {}
 
 
+@pytest.mark.parametrize("home", ["rounding.py", "network_charges.py"])
+def test_a_charge_is_defined_once(home: str) -> None:
+    """A second definition of a name would change what was charged by the first one."""
+    tree = ast.parse((HOME.parent / home).read_text())
+    stored = [node for statement in tree.body for node in ast.walk(statement) if isinstance(statement, ast.Assign)]
+    names = [node.id for node in stored if isinstance(node, ast.Name) and isinstance(node.ctx, ast.Store)]
+    assert names and sorted(set(names)) == sorted(names)
+
+
 def test_every_charge_is_used() -> None:
     used: set[str] = set()
     for path in PACKAGE.rglob("*.py"):
