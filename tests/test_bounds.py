@@ -21,12 +21,12 @@ from ns_abstract.geometry.tiles import assemble, tile_grid
 from ns_abstract.methods.splat.activate import Splats, rotation_matrices
 from ns_abstract.methods.splat.bounds import SplatBounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0, PAPER
-from ns_abstract.methods.splat.frame import SplatFrame, difference_ends
+from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.intervals import sort_keys as sort_group
 from ns_abstract.methods.splat.projection_errors import FORMS, SPREAD, UNBOUNDED, columns
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.stage_data import SubBoxes, cell_parts
-from ns_abstract.methods.splat.sub_box_bounds import SubBoxBounds, channel_differences
+from ns_abstract.methods.splat.sub_box_bounds import SubBoxBounds, channel_differences, difference_ends
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.refine.protocol import CHANNEL_DIFFERENCES
 

@@ -15,9 +15,9 @@ from ns_abstract.arithmetic.rounding import FLOAT32
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.methods.splat import bounds as splat_bounds
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
-from ns_abstract.methods.splat.frame import SplatFrame, difference_ends
+from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.stage_data import cell_parts
-from ns_abstract.methods.splat.sub_box_bounds import SubBoxBounds, channel_differences
+from ns_abstract.methods.splat.sub_box_bounds import SubBoxBounds, channel_differences, difference_ends
 from ns_abstract.refine.protocol import CHANNEL_DIFFERENCES
 from ns_abstract.verify.photo import Brightness, Photo
 

@@ -43,7 +43,7 @@ LOCATION = (
     ),
     Fault(
         "location: a camera stays on its segment",
-        "api/sequence.py", "following", 'any("segment" in poses.box.names for poses in sets.values())', "False",
+        "api/sequence.py", "following", '_along_path(sets)', "False",
         "test_locate_sequence.py::test_a_camera_leaves_one_segment_for_another",
     ),
     Fault(
@@ -80,7 +80,8 @@ LOCATION = (
     ),
     Fault(
         "location: both channels of a difference at the same end",
-        _PHOTO, "TiledPhoto.differences", "low[..., first] - high[..., second]", "low[..., first] - low[..., second]",
+        _PHOTO, "TiledPhoto.differences", "low[..., FIRST_CHANNELS] - high[..., SECOND_CHANNELS]",
+        "low[..., FIRST_CHANNELS] - low[..., SECOND_CHANNELS]",
         _DIFFERENCES,
     ),
     Fault(

@@ -21,7 +21,6 @@ _REORDERING = "methods/splat/reordering.py"
 _STAGE_DATA = "methods/splat/stage_data.py"
 _UNORDERED = "methods/splat/unordered_pixels.py"
 _SUB_BOX_BOUNDS = "methods/splat/sub_box_bounds.py"
-_FRAME = "methods/splat/frame.py"
 _BLOCK = "methods/splat/pixel_block.py"
 _LISTS = "methods/splat/lists.py"
 _PIXELS = "methods/splat/pixels.py"
@@ -785,7 +784,7 @@ SPLATS = (
     ),
     Fault(
         "differences: what a block of many orders shows is known",
-        _FRAME,
+        _SUB_BOX_BOUNDS,
         "difference_ends",
         "~((lower == 0.0) & (upper == 1.0))",
         "True",
@@ -793,7 +792,7 @@ SPLATS = (
     ),
     Fault(
         "differences: ends that cross bound something",
-        _FRAME,
+        _SUB_BOX_BOUNDS,
         "difference_ends",
         "lower <= upper",
         "lower == lower",

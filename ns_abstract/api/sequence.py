@@ -46,9 +46,7 @@ def load_motion(file: Path, sets: Mapping[int, PoseBox], dataset_scale: float | 
         if present:
             raise InputError("is no motion", file=file, field=name, fix="state translation and rotation alone")
     ranges = {name: ends for name, ends in {**motion.translation, **motion.rotation}.items() if ends != (0.0, 0.0)}
-    if len({poses.perturbation.frame for poses in sets.values()}) > 1 and any(
-        "segment" in poses.box.names for poses in sets.values()
-    ):
+    if _along_path(sets) and len({poses.perturbation.frame for poses in sets.values()}) > 1:
         fix = "give all entries of the path the same frame"
         raise InputError("sets of camera and world axes follow each other", field="perturbation.frame", fix=fix)
     for poses in sets.values():
@@ -77,6 +75,11 @@ def grown(poses: PoseBox, hull: Mapping[str, Range], motion: Mapping[str, Range]
     return poses.within(box)
 
 
+def _along_path(sets: Mapping[int, PoseBox]) -> bool:
+    """Whether a camera may leave one set for another: they are segments of one path."""
+    return any("segment" in poses.box.names for poses in sets.values())
+
+
 def following(
     sets: Mapping[int, PoseBox], frames: Sequence[Mapping[str, Any]], motion: Mapping[str, Range]
 ) -> dict[int, PoseBox]:
@@ -93,8 +96,7 @@ def following(
             names = [entry["name"] for entry in frame["parameters"]]
             ends = zip(frame["hull"]["lower"], frame["hull"]["upper"], strict=True)
             hulls[frame["index"]] = dict(zip(names, ends, strict=True))
-    if hulls and any("segment" in poses.box.names for poses in sets.values()):
-        # along the path a camera leaves one segment for another
+    if hulls and _along_path(sets):
         apart = [[hull.get(name, (0.0, 0.0)) for hull in hulls.values()] for name in (*TRANSLATIONS, *ROTATIONS)]
         ends = [(min(low for low, _ in ranges), max(high for _, high in ranges)) for ranges in apart]
         joined: dict[str, Range] = dict(zip((*TRANSLATIONS, *ROTATIONS), ends, strict=True))

@@ -38,7 +38,7 @@ _FIXES = {
 }
 
 
-class Claim:
+class LockedFolder:
     """A result folder that this process has locked; open until `close`, or the end of a ``with`` statement."""
 
     def __init__(self, folder: Path, lock: BinaryIO) -> None:
@@ -60,7 +60,7 @@ class Claim:
         _held.discard(self)
         self._lock.close()
 
-    def __enter__(self) -> Claim:
+    def __enter__(self) -> LockedFolder:
         return self
 
     def __exit__(self, *_error: object) -> None:
@@ -68,7 +68,7 @@ class Claim:
 
 
 #: The folders that this process has locked.
-_held: weakref.WeakSet[Claim] = weakref.WeakSet()
+_held: weakref.WeakSet[LockedFolder] = weakref.WeakSet()
 
 
 def require_held(file: Path) -> None:
@@ -79,7 +79,7 @@ def require_held(file: Path) -> None:
             raise OSError(errno.ESTALE, "the folder was removed or replaced since the command began")
 
 
-def claim(folder: Path) -> Claim:
+def claim(folder: Path) -> LockedFolder:
     """Create a result folder, or take one over, for one command.
 
     Returns the claim; the folder is locked until it is closed, or its process ends. Raises InputError where another
@@ -89,7 +89,7 @@ def claim(folder: Path) -> Claim:
     try:
         folder.mkdir(parents=True, exist_ok=True)
         _refuse_strangers(folder)
-        return Claim(folder, _locked(folder))
+        return LockedFolder(folder, _locked(folder))
     except OSError as error:
         raise unwritable(folder, error) from None
 

@@ -219,6 +219,7 @@ class CountedFrame(Protocol):
 
 #: Channels whose differences are bounded, the first less the second.
 CHANNEL_DIFFERENCES = (0, 1), (1, 2), (0, 2)
+FIRST_CHANNELS, SECOND_CHANNELS = ([pair[k] for pair in CHANNEL_DIFFERENCES] for k in (0, 1))
 
 
 @runtime_checkable

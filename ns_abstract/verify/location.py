@@ -380,7 +380,7 @@ class _Examination:
         needed, alone = tiled.allowed + 1 - known, counts.prod() == 1
         chosen = search.telling.order(
             picture, max(1, round(0.5 * float(np.linalg.norm(moved)))),
-            float(np.linalg.norm(moved / counts)), tiled.counted & ~self.inherited,
+            search.sub_box_motion(box, counts), tiled.counted & ~self.inherited,
             round(tuning.surplus * needed), differences=not alone,
         )  # fmt: skip
         self.share = (known + chosen.sure) / (known + needed) if alone else 0.0

@@ -15,7 +15,7 @@ from ns_abstract.arithmetic.network_charges import QUOTIENT, STEP
 from ns_abstract.arithmetic.rounding import BRIGHTNESS_ROUNDING, CUT_ROOM, PHOTO_ROOM, REACH_ROUNDING
 from ns_abstract.geometry.box import Float64Array
 from ns_abstract.geometry.tiles import in_tiles
-from ns_abstract.refine.protocol import CHANNEL_DIFFERENCES, LinearSets
+from ns_abstract.refine.protocol import FIRST_CHANNELS, SECOND_CHANNELS, LinearSets
 from ns_abstract.verify.pixel_parts import most_within
 
 _STEPS = 255.0
@@ -149,8 +149,8 @@ class TiledPhoto:
         """Least and greatest `CHANNEL_DIFFERENCES` of a picture that explains a pixel, before it is clamped (U10)."""
         # what shows an end of [0, 1] may have been anything beyond it
         low, high = np.where(self.low <= 0.0, -np.inf, self.low), np.where(self.high >= 1.0, np.inf, self.high)
-        first, second = (list(side) for side in zip(*CHANNEL_DIFFERENCES, strict=True))
-        least, most = low[..., first] - high[..., second], high[..., first] - low[..., second]
+        least = low[..., FIRST_CHANNELS] - high[..., SECOND_CHANNELS]
+        most = high[..., FIRST_CHANNELS] - low[..., SECOND_CHANNELS]
         return np.nextafter(least, -np.inf), np.nextafter(most, np.inf)
 
     def chosen(self, numbers: Sequence[int]) -> np.ndarray:

@@ -14,7 +14,7 @@ import numpy as np
 from ns_abstract.geometry.box import Float64Array, ParameterBox
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.tiles import assemble, in_tiles
-from ns_abstract.refine.protocol import CHANNEL_DIFFERENCES, Frame, SubBoxFrame
+from ns_abstract.refine.protocol import FIRST_CHANNELS, SECOND_CHANNELS, Frame, SubBoxFrame
 from ns_abstract.verify.neighbouring_pixels import best_shift, filled, nearby, shifted
 from ns_abstract.verify.photo import TiledPhoto
 
@@ -125,34 +125,48 @@ def typical_cell(
     # of blocks whose orders are too many, few pixels are bounded whatever the order
     some, few = (_lattice((camera.height, camera.width), k * step) for k in (1, _FEWER))
     chosen, worked = in_tiles(some, frame.side), in_tiles(few, frame.side)
-    tiles = np.flatnonzero(chosen.any(axis=(1, 2)))
+    bounds = _bounds_over_parts(frame, cell, counts, chosen, worked)
+    if bounds is None:
+        return None
     places = np.unique(np.linspace(0, parts - 1, min(parts, _MOST_PICTURES)).astype(np.int64))
     middles = (2.0 * np.stack(np.unravel_index(places, counts), axis=-1) + 1.0) / counts - 1.0
     pictures = [draw(cell.at(middle)) for middle in middles]
     losses = []
-    for kind in (CHANNELS, DIFFERENCES)[: 1 if parts == 1 else 2]:
-        if parts == 1:
-            bounds = frame.bound(cell, tiles, None)
-            lower, upper = (end[chosen[tiles]][..., None] for end in (bounds.lower, bounds.upper))
-        elif isinstance(frame, SubBoxFrame):
-            ends = np.repeat(worked[chosen][:, None], 6, axis=1)
-            known = frame.sub_box_ends(cell, counts, tiles, chosen[tiles], ends, kind == DIFFERENCES)
-            if known is None:
-                return None
-            # what is known of no end would be known with more work
-            vain = (known[0] <= 0.0) & (known[1] >= 1.0) | ~(np.isfinite(known[0]) & np.isfinite(known[1]))
-            nothing = np.logical_and.reduce(vain, axis=1)
-            lower, upper = (np.where(nothing[:, None], np.nan, end)[..., places] for end in known)
-        else:
-            return None
+    for kind, (lower, upper) in enumerate(bounds):
         pairs = [
             _losses(_values(picture, kind), motion, lower[..., k], upper[..., k], chosen, camera)
-            for k, picture in enumerate(pictures)
+            for k, picture in zip(places, pictures, strict=True)
         ]
         sides = [np.mean([pair[k] for pair in pairs], axis=0) for k in (0, 1)]
         sources = few & np.isfinite(sides[0]).all(axis=-1) & np.isfinite(sides[1]).all(axis=-1)
         losses.append([filled(side, sources, 2 * _FEWER * step, _ALL) for side in sides])
     return TypicalCell(draw(cell.middle), motion, tuple(losses))
+
+
+def _bounds_over_parts(
+    frame: Frame, cell: ParameterBox, counts: np.ndarray, pixels: np.ndarray, worked: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray]] | None:
+    """By kind, bounds [n, 3, k] of the ``n`` ``pixels`` over the parts of a cell, NaN where nothing is known.
+
+    Those ``worked`` at are bounded whatever the order. None: the frame has no bounds over parts of the cell.
+    """
+    tiles = np.flatnonzero(pixels.any(axis=(1, 2)))
+    if counts.prod() == 1:
+        whole = frame.bound(cell, tiles, None)
+        return [(whole.lower[pixels[tiles]][..., None], whole.upper[pixels[tiles]][..., None])]
+    if not isinstance(frame, SubBoxFrame):
+        return None
+    ends, bounds = np.repeat(worked[pixels][:, None], 6, axis=1), []
+    for kind in (CHANNELS, DIFFERENCES):
+        pair = frame.sub_box_ends(cell, counts, tiles, pixels[tiles], ends, kind == DIFFERENCES)
+        if pair is None:
+            return None
+        lower, upper = pair
+        # what is known of no end would be known with more work
+        vain = (lower <= 0.0) & (upper >= 1.0) | ~(np.isfinite(lower) & np.isfinite(upper))
+        nothing = np.logical_and.reduce(vain, axis=1)[:, None]
+        bounds.append((np.where(nothing, np.nan, lower), np.where(nothing, np.nan, upper)))
+    return bounds
 
 
 def _lattice(shape: tuple[int, int], step: int) -> np.ndarray:
@@ -179,8 +193,7 @@ def _values(picture: np.ndarray, kind: int) -> np.ndarray:
     """What is bounded of a picture [H, W, 3]."""
     if kind == CHANNELS:
         return picture
-    first, second = (list(side) for side in zip(*CHANNEL_DIFFERENCES, strict=True))
-    return picture[..., first] - picture[..., second]
+    return picture[..., FIRST_CHANNELS] - picture[..., SECOND_CHANNELS]
 
 
 def telling_order(

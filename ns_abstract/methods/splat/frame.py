@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ns_abstract.arithmetic.outward import outward
-from ns_abstract.arithmetic.rounding import CHANNEL_DIFFERENCE_ROUNDING, LINEAR_ROUNDING, LINEAR_UP, Arithmetic
+from ns_abstract.arithmetic.rounding import LINEAR_ROUNDING, LINEAR_UP, Arithmetic
 from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.execution.threads import each
 from ns_abstract.geometry.box import ParameterBox, shared_out
@@ -24,7 +24,7 @@ from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW
 from ns_abstract.methods.splat.lists import summed_area, touching
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.stage_data import SubBoxes
-from ns_abstract.methods.splat.sub_box_bounds import SubBoxBounds
+from ns_abstract.methods.splat.sub_box_bounds import SubBoxBounds, difference_ends, part_ends
 from ns_abstract.methods.splat.variations import VariedSplats
 from ns_abstract.perturbation.specification import ROTATIONS
 from ns_abstract.refine.protocol import COLORS, Bounds, Frame, LinearSets, Score, SharedOrder
@@ -450,30 +450,6 @@ class SplatFrame(Frame):
                 [self.camera.fx * x / z + self.camera.cx, self.camera.fy * y / z + self.camera.cy], axis=1
             )
         return np.where(np.isfinite(pixels), pixels, 0.0), z
-
-
-def part_ends(parts: np.ndarray | None, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper bounds [n, 3, k] of the ``n`` chosen ``pixels`` [t, side, side] from `PixelBounds.parts`."""
-    assert parts is not None
-    ends = parts[pixels]
-    lower, upper = ends[:, :COLORS], ends[:, COLORS:]
-    # crossed or not a number: nothing is known
-    sane = lower <= upper
-    return np.where(sane, lower, 0.0).clip(0.0, 1.0), np.where(sane, upper, 1.0).clip(0.0, 1.0)
-
-
-def difference_ends(parts: np.ndarray, pixels: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds [n, 3, k] of `CHANNEL_DIFFERENCES`, from ``parts`` for those of the colours (design.md, B15)."""
-    ends = parts[pixels]
-    lower, upper = ends[:, :COLORS], ends[:, COLORS:]
-    # [0, 1] stands for nothing that is known (design.md, B15)
-    known = (lower <= upper) & ~((lower == 0.0) & (upper == 1.0)) & (scale > 0.0)
-    with np.errstate(all="ignore"):
-        lower, upper = (
-            (lower - 0.5 - CHANNEL_DIFFERENCE_ROUNDING) / scale,
-            (upper - 0.5 + CHANNEL_DIFFERENCE_ROUNDING) / scale,
-        )
-    return np.where(known, lower, -np.inf), np.where(known, upper, np.inf)
 
 
 def linear_sets(forms: np.ndarray, lower: np.ndarray, upper: np.ndarray, d: int) -> LinearSets:

@@ -27,7 +27,7 @@ from ns_abstract.methods.splat.stage_data import (
     strips_of,
 )
 from ns_abstract.methods.splat.unordered_pixels import unordered_stage
-from ns_abstract.refine.protocol import CHANNEL_DIFFERENCES
+from ns_abstract.refine.protocol import CHANNEL_DIFFERENCES, COLORS, FIRST_CHANNELS, SECOND_CHANNELS
 
 
 class SubBoxBounds(SplatBounds):
@@ -36,12 +36,12 @@ class SubBoxBounds(SplatBounds):
     def __init__(self, *arguments: Any, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self._latest: dict[int, tuple[ParameterBox, ProjectedCell] | None] = {}
-        self._differences: dict[int, tuple[ProjectedCell, ProjectedCell, float] | None] = {}
+        self._differences: dict[int, tuple[ProjectedCell, float] | None] = {}
 
     def _projected(
         self, candidates: np.ndarray, poses: CellPoses, camera: PinholeCamera, shape: FormShape
     ) -> tuple[ProjectedGaussians, np.ndarray]:
-        # it takes the memory of the last one
+        # it takes the memory of the last one, of which the differences are
         self._latest[lane()] = self._differences[lane()] = None
         return super()._projected(candidates, poses, camera, shape)
 
@@ -57,10 +57,10 @@ class SubBoxBounds(SplatBounds):
     ) -> tuple[ProjectedCell, float]:
         """`channel_differences` of `projected_box`, unless the lane's last were that."""
         projected = self.projected_box(camera, forms, box)
-        latest = self._differences.get(lane())
-        if latest is None or latest[0] is not projected:
-            latest = self._differences[lane()] = projected, *channel_differences(projected)
-        return latest[1:]
+        differences = self._differences.get(lane())
+        if differences is None:
+            differences = self._differences[lane()] = channel_differences(projected)
+        return differences
 
     def warm_up(self, camera: PinholeCamera, forms: PoseForms, counts: np.ndarray) -> None:
         """Compile what `unordered` needs; arguments are as of `sub_boxes`."""
@@ -153,7 +153,7 @@ def channel_differences(projected: ProjectedCell) -> tuple[ProjectedCell, float]
     differences[..., 0] += 0.5
     colors = np.empty_like(projected.colors)
     colors[alive] = differences.reshape(alive.size, 3 * columns)
-    behind = np.array([background[first] - background[second] for first, second in CHANNEL_DIFFERENCES])
+    behind = background[FIRST_CHANNELS] - background[SECOND_CHANNELS]
     return projected._replace(
         colors=colors,
         background=scale * behind + 0.5,
@@ -176,3 +176,27 @@ def _color_ends(colors: np.ndarray, alive: np.ndarray, background: np.ndarray) -
         opposite = (brightest, darkest)[row // 3][channel]
         ends.append(ColorEnd(values, (-1.0, 1.0)[row // 3], channel, row, float(opposite), bright))
     return ends
+
+
+def part_ends(parts: np.ndarray | None, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper bounds [n, 3, k] of the ``n`` chosen ``pixels`` [t, side, side] from `PixelBounds.parts`."""
+    assert parts is not None
+    ends = parts[pixels]
+    lower, upper = ends[:, :COLORS], ends[:, COLORS:]
+    # crossed or not a number: nothing is known
+    sane = lower <= upper
+    return np.where(sane, lower, 0.0).clip(0.0, 1.0), np.where(sane, upper, 1.0).clip(0.0, 1.0)
+
+
+def difference_ends(parts: np.ndarray, pixels: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds [n, 3, k] of `CHANNEL_DIFFERENCES`, from ``parts`` for those of the colours (design.md, B15)."""
+    ends = parts[pixels]
+    lower, upper = ends[:, :COLORS], ends[:, COLORS:]
+    # [0, 1] stands for nothing that is known (design.md, B15)
+    sane = (lower <= upper) & ~((lower == 0.0) & (upper == 1.0)) & (scale > 0.0)
+    with np.errstate(all="ignore"):
+        lower, upper = (
+            (lower - 0.5 - CHANNEL_DIFFERENCE_ROUNDING) / scale,
+            (upper - 0.5 + CHANNEL_DIFFERENCE_ROUNDING) / scale,
+        )
+    return np.where(sane, lower, -np.inf), np.where(sane, upper, np.inf)

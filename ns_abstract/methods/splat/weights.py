@@ -21,11 +21,11 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.bounds import SceneSums
 from ns_abstract.methods.splat.constants import Rasteriser
-from ns_abstract.methods.splat.frame import SplatFrame, SplatSample, TileBounds, VisibleContext, part_ends
+from ns_abstract.methods.splat.frame import SplatFrame, SplatSample, TileBounds, VisibleContext
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.scene import Float64Array, SplatScene
 from ns_abstract.methods.splat.stage_data import CellPoses, SubBoxes
-from ns_abstract.methods.splat.sub_box_bounds import SubBoxBounds
+from ns_abstract.methods.splat.sub_box_bounds import SubBoxBounds, part_ends
 from ns_abstract.methods.splat.variations import VariedSplats, selected
 from ns_abstract.refine.protocol import MOST_PLANES, SceneSample, WeightPlane
 

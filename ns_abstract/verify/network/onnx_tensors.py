@@ -76,8 +76,8 @@ def parse_model(path: Path) -> onnx.ModelProto:
 def number_type(data_type: int) -> np.dtype:
     """numpy's type of an ONNX type (N23). Raises InputError where numpy holds its bits, or a wider type, instead."""
     if data_type not in _TYPES:
-        known = data_type in _T.DataType.values()
-        name = _T.DataType.Name(data_type) if known else str(data_type)  # pyright: ignore[reportArgumentType]
+        named = data_type in _T.DataType.values()
+        name = _T.DataType.Name(data_type) if named else str(data_type)  # pyright: ignore[reportArgumentType]
         raise InputError(f"has type {name}", fix="use float32")
     return np.dtype(onnx.helper.tensor_dtype_to_np_dtype(data_type))
 
