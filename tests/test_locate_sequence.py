@@ -314,6 +314,19 @@ def test_a_sequence_is_followed_and_resumed(
     assert code == 2 and "locked by a command" in err and json.loads((folder / "report.json").read_text()) == again
 
 
+@pytest.mark.parametrize("name", ["size", "kind"])
+def test_a_photo_that_cannot_be_used_is_refused_before_the_first_is_located(
+    name: str, travelled: tuple[list[str], np.ndarray, Path], in_process: InProcess
+) -> None:
+    options, _, folder = travelled
+    last = Path(options[options.index("--image-sequence") + 1]) / "4.png"
+    Image.new("RGB" if name == "size" else "L", (32, 31) if name == "size" else (32, 32)).save(last)
+    code, _, err = in_process(main, options)
+    words = {"size": "has 32 x 31 pixels, '0.png' 32 x 32", "kind": "holds pixels of kind L"}[name]
+    assert code == 2 and words in err and str(last) in err and err.count("\n") == 1
+    assert not folder.exists()
+
+
 #: What others may make of a sequence's report.
 CHANGES: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {
     "no images": lambda r: {key: value for key, value in r.items() if key != "images"},

@@ -339,4 +339,4 @@ def _photo(file: Path, entry: Any, k: int) -> np.ndarray:
     name = entry.get("file_path") if isinstance(entry, dict) else None
     if not isinstance(name, str) or not name:
         raise InputError("names no photo", file=file, field=f"frames[{k}].file_path", fix="write the photo's name")
-    return read_photo(file_beside(file.parent, name), _OPTION)
+    return read_photo(file_beside(file.parent, name), _OPTION, as_stored=True)

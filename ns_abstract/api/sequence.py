@@ -19,8 +19,8 @@ from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.io.atomic import write_json
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.folder import claim
-from ns_abstract.io.jsonio import load_json
-from ns_abstract.io.photos import read_mask, read_photo, sequence_photos
+from ns_abstract.io.jsonio import load_json, show
+from ns_abstract.io.photos import photo_size, read_mask, read_photo, sequence_photos
 from ns_abstract.io.stamps import file_stamp
 from ns_abstract.perturbation.specification import ROTATIONS, TRANSLATIONS, load_perturbation
 from ns_abstract.report.run import plain
@@ -104,6 +104,16 @@ def following(
     return {number: grown(sets[number], hull, motion) for number, hull in hulls.items()}
 
 
+def _check_sizes(images: Sequence[Path]) -> None:
+    """Refuse, before hours go into those before it, a photo that cannot be used."""
+    field = "--image-sequence"
+    height, width = photo_size(images[0], field)
+    for image in images[1:]:
+        if (size := photo_size(image, field)) != (height, width):
+            problem = f"has {size[1]} x {size[0]} pixels, {show(images[0].name)} {width} x {height}"
+            raise InputError(problem, file=image, field=field, fix=f"resize it to {width} x {height}")
+
+
 def _seal(entry: Mapping[str, Any]) -> str:
     """SHA-256 of what is known of a photo, without which a report that others have changed would be continued."""
     sealed = {name: value for name, value in entry.items() if name != "sha256"}
@@ -137,6 +147,7 @@ class PhotoSequence:
         job = self.first.job
         assert isinstance(job, PathJob)
         self.job = job
+        _check_sizes(self.images)
         self.sets = {k: job.pose_sets[k] for k in check_frames(self.frames, job.frame_count)}
         self.ranges = load_motion(self.motion, self.sets, job.method.dataset_scale)
         text = json.dumps([_RULES, self.first.fingerprint, self.ranges, sorted(self.sets)], sort_keys=True)

@@ -6,7 +6,8 @@ import io
 import itertools
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,26 +22,33 @@ _MOST_PIXELS, _MOST_MASK_BYTES = 1 << 26, 64 << 20
 _WHITE = 128
 #: Formats that hold values without loss of meaning: a .jpg's compression is noise like others.
 _FORMATS = ("PNG", "JPEG", "BMP", "TIFF", "WEBP", "PPM")
+#: Kinds of pixels of a photo, as Pillow names them.
+_COLORS = ("RGB", "RGBA", "P", "PA", "LA")
+#: EXIF's number of how a picture is to be turned before it is shown; 1: not at all.
+_ORIENTATION = 0x112
 #: Names of pictures in a folder.
 _ENDINGS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp", ".ppm")
 
 
-def read_photo(file: Path, field: str = "--image") -> np.ndarray:
+def read_photo(file: Path, field: str = "--image", *, as_stored: bool = False) -> np.ndarray:
     """The values [H, W, 3] uint8 of a photo of 8 bits by channel.
 
+    ``as_stored``: take the pixels as Nerfstudio takes those of a training photo, which looks at no note of the camera
+    on how it was turned; other photos that are to be shown turned are refused.
+
     Raises:
-        InputError: The file is missing, is no such photo, or is partly transparent.
+        InputError: The file is missing, is no such photo, holds several, or is partly transparent.
     """
-    image = _opened(file, field)
-    if image.mode in ("RGBA", "PA", "LA"):
-        image = image.convert("RGBA")
-        if image.getchannel("A").getextrema() != (255, 255):
-            raise InputError("is partly transparent", file=file, field=field, fix="save it without an alpha channel")
-    if image.mode not in ("RGB", "RGBA", "P"):
-        raise InputError(
-            f"holds pixels of kind {image.mode}", file=file, field=field, fix="save it as RGB with 8 bits by channel"
-        )
-    return np.array(image.convert("RGB"), np.uint8)
+    with _opened(file, field, as_stored) as image:
+        _refuse_kind(image, file, field)
+        return np.array(_opaque(image, file, field), np.uint8)[..., :3]
+
+
+def photo_size(file: Path, field: str) -> tuple[int, int]:
+    """Height and width of a photo by its head; raises InputError where that shows that `read_photo` refuses it."""
+    with _opened(file, field) as image:
+        _refuse_kind(image, file, field)
+        return image.height, image.width
 
 
 def sequence_photos(folder: Path, field: str = "--image-sequence") -> list[Path]:
@@ -99,12 +107,13 @@ def read_mask(file: Path, size: tuple[int, int], field: str = "--mask") -> np.nd
     Raises:
         InputError: The file is missing, of another size, or holds other values.
     """
-    values = np.array(_opened(file, field).convert("RGBA"), np.uint8)
+    with _opened(file, field) as image:
+        values = np.array(_opaque(image, file, field), np.uint8)[..., :3]
     if values.shape[:2] != size:
         fix = f"resize it to {size[1]} x {size[0]} with nearest neighbours"
         raise InputError(f"has {values.shape[1]} x {values.shape[0]} pixels", file=file, field=field, fix=fix)
-    white, black = (values[..., :3] == 255).all(axis=-1), (values[..., :3] == 0).all(axis=-1)
-    if not (white | black).all() or (values[..., 3] != 255).any():
+    white, black = (values == 255).all(axis=-1), (values == 0).all(axis=-1)
+    if not (white | black).all():
         raise InputError(
             "has pixels that are neither black nor white", file=file, field=field,
             fix="write white where pixels count and black elsewhere",
@@ -114,21 +123,9 @@ def read_mask(file: Path, size: tuple[int, int], field: str = "--mask") -> np.nd
 
 def read_grey_mask(file: Path) -> np.ndarray:
     """Return [H, W] bool: the white pixels of a .png. Raises InputError where it cannot be read, or is no .png."""
-    from PIL import Image
-
     data = read_bytes(file, "mask", _MOST_MASK_BYTES)
-    try:
-        with Image.open(io.BytesIO(data), formats=("PNG",)) as image:
-            width, height = image.size
-            if width * height > _MOST_PIXELS:
-                raise InputError(f"{width} x {height} pixels", file=file, fix="give a mask of the picture's size")
-            _refuse_other_bits(image, file)
-            return np.asarray(image.convert("L")) >= _WHITE
-    except InputError:
-        raise
-    except Exception as error:  # Pillow raises many types on damaged files
-        text = " ".join(str(error).split())[:120] or type(error).__name__
-        raise InputError(f"no .png: {text}", file=file, fix="write a .png, white where pixels count") from None
+    with _opened(file, None, png=data) as image:
+        return np.asarray(_opaque(image, file, None).convert("L")) >= _WHITE
 
 
 def other_bits(image: Any) -> bool:
@@ -143,29 +140,56 @@ def other_bits(image: Any) -> bool:
     return False
 
 
-def _refuse_other_bits(image: Any, file: Path, field: str | None = None) -> None:
-    if other_bits(image):
-        raise InputError("does not hold 8 bits by channel", file=file, field=field, fix="save it as a PNG of 8 bits")
+@contextmanager
+def _opened(
+    file: Path,
+    field: str | None,
+    as_stored: bool = False,
+    png: bytes | None = None,
+) -> Iterator[Any]:
+    """A picture of 8 bits by channel, whose pixels are read inside the block; every error there is one of the file.
 
-
-def _opened(file: Path, field: str) -> Any:
+    ``png``: what the file holds, where it must be a .png.
+    """
     from PIL import Image
 
     if not os.path.isfile(file):
         raise InputError("no such file", file=file, field=field, fix="give an existing picture")
     try:
-        with Image.open(file, formats=_FORMATS) as image:
+        opened = file if png is None else io.BytesIO(png)
+        with Image.open(opened, formats=_FORMATS if png is None else ("PNG",)) as image:
             if image.width * image.height > _MOST_PIXELS:
+                raise InputError(f"has {image.width} x {image.height} pixels", fix="give a smaller one")
+            if other_bits(image):
+                raise InputError("does not hold 8 bits by channel", fix="save it as a PNG of 8 bits")
+            # further pictures of a camera's .jpg are smaller ones of the same
+            if image.format != "MPO" and getattr(image, "n_frames", 1) > 1:
+                raise InputError(f"holds {image.n_frames} pictures", fix="give one by file")
+            if not as_stored and image.getexif().get(_ORIENTATION, 1) != 1:
                 raise InputError(
-                    f"has {image.width} x {image.height} pixels", file=file, field=field, fix="give a smaller one"
+                    "is to be shown turned or mirrored (its EXIF orientation)",
+                    fix="turn the pixels themselves, for example with: mogrify -auto-orient",
                 )
-            _refuse_other_bits(image, file, field)
-            image.load()
-            return image.copy()
-    except InputError:
-        raise
-    # decoders raise what they like
-    except Exception as error:
+            yield image
+    except InputError as error:
+        raise InputError(error.problem, file=file, field=field, fix=error.fix) from None
+    except Exception as error:  # decoders raise what they like
+        problem = f"{'cannot be read' if png is None else 'no .png'}: {first_line(error)}"
+        raise InputError(problem, file=file, field=field, fix="give a PNG of 8 bits") from None
+
+
+def _refuse_kind(image: Any, file: Path, field: str) -> None:
+    if image.mode not in _COLORS:
         raise InputError(
-            f"cannot be read: {first_line(error)}", file=file, field=field, fix="give a PNG of 8 bits"
-        ) from None
+            f"holds pixels of kind {image.mode}", file=file, field=field, fix="save it as RGB with 8 bits by channel"
+        )
+
+
+def _opaque(image: Any, file: Path, field: str | None) -> Any:
+    """An opened image as RGB or RGBA of full opacity. Raises InputError where a pixel is transparent."""
+    if image.mode not in ("RGBA", "PA", "LA") and "transparency" not in image.info:
+        return image.convert("RGB")
+    image = image.convert("RGBA")
+    if image.getchannel("A").getextrema() != (255, 255):
+        raise InputError("is partly transparent", file=file, field=field, fix="save it without an alpha channel")
+    return image
