@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
+import os
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -136,6 +138,26 @@ def test_verdicts_of_a_claim_about_the_picture(tmp_path: Path) -> None:
                 assert examiner.margin(np.array(row["counterexample"])) == row["margin"] <= 0.0
     stored = list((tmp_path / "counterexamples").glob("set_*.npz"))
     assert len(stored) == sum(row["verdict"] == "falsified" for rows in search.rows.values() for row in rows)
+
+
+@pytest.mark.parametrize("fails", ["examine", "store"])
+def test_a_search_that_fails_is_told_as_interrupted(
+    fails: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not as one that the time budget ended, or as one that goes on."""
+
+    def fail(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    question = BrightnessQuestion(Brightness())
+    monkeypatch.setattr(question.examiner, "examine", fail)
+    if fails == "store":
+        # then the last report cannot be made
+        monkeypatch.setattr(Store, "finish", fail)
+    with pytest.raises((InputError, OSError), match="No space left"):
+        run(question, tmp_path)
+    assert json.loads((tmp_path / "report.json").read_text())["state"] == "interrupted"
+    assert question.states == ["running", "interrupted"][: 2 if fails == "examine" else 1]
 
 
 @pytest.mark.slow

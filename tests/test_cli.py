@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import importlib.util
 import json
 import os
@@ -557,6 +558,19 @@ def test_budget_too_small_for_every_frame(blobs: Inputs, tmp_path: Path, call: C
     document = report(tmp_path)
     assert (document["state"], document["missing"], document["interrupted"]) == ("budget", [1, 2], False)
     check_samples(blobs, tmp_path, 0)
+
+
+@pytest.mark.parametrize("place", ["save_frame", "save_picture"])
+def test_a_full_disk_is_not_told_as_the_end_of_the_time(
+    place: str, blobs: Inputs, tmp_path: Path, in_process: InProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: Any, **__: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(f"ns_abstract.report.record.{place}", full)
+    code, _, err = in_process(render_command.main, blobs.options(tmp_path, frames=0, time_budget=0.5))
+    assert code == 2 and "No space left on device; make room there" in err
+    assert report(tmp_path)["state"] == "interrupted"
 
 
 @pytest.mark.slow

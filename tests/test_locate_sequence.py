@@ -14,8 +14,9 @@ from PIL import Image
 from test_locate import taken
 
 import ns_abstract as nsa
-from ns_abstract.api.location import calibrate, training_data
-from ns_abstract.api.sequence import following, grown
+from ns_abstract.api.files import Settings
+from ns_abstract.api.location import LocateSettings, Location, calibrate, training_data
+from ns_abstract.api.sequence import following, grown, open_sequence
 from ns_abstract.cli.certify import main as certify_main
 from ns_abstract.cli.locate import main
 from ns_abstract.geometry.camera_path import load_camera_path
@@ -325,6 +326,33 @@ def test_a_photo_that_cannot_be_used_is_refused_before_the_first_is_located(
     words = {"size": "has 32 x 31 pixels, '0.png' 32 x 32", "kind": "holds pixels of kind L"}[name]
     assert code == 2 and words in err and str(last) in err and err.count("\n") == 1
     assert not folder.exists()
+
+
+def test_a_sequence_that_is_cut_off_is_not_told_as_done(blobs: Inputs, tmp_path: Path) -> None:
+    """After a photo there is a report, which says that there are more."""
+    (tmp_path / "photos").mkdir()
+    for k in range(2):
+        Image.new("RGB", (32, 32)).save(tmp_path / "photos" / f"{k}.png")
+    (tmp_path / "motion.json").write_text('{"version": 1}')
+    files = Settings(blobs.config, blobs.path)
+    settings = LocateSettings(files, tmp_path / "photos" / "0.png")
+    photos = open_sequence(settings, tmp_path / "photos", tmp_path / "motion.json", tmp_path / "out", (0,), False)
+    names = photos.sets[0].box.names
+    found = {
+        "answer": "possible", "possible_volume": 1.0, "hull": None, "best": None, "seconds": 1.0, "state": "done",
+        "frames": [{
+            "index": 0, "parameters": [{"name": name} for name in names],
+            "hull": {"lower": photos.sets[0].box.lower, "upper": photos.sets[0].box.upper},
+        }],
+    }  # fmt: skip
+    states = []
+
+    def search(location: Location, frames: tuple[int, ...], folder: Path) -> dict[str, Any]:
+        if (tmp_path / "out" / "report.json").exists():
+            states.append(json.loads((tmp_path / "out" / "report.json").read_text())["state"])
+        return found
+
+    assert photos.follow(search)["state"] == "done" and states == ["running"]
 
 
 #: What others may make of a sequence's report.

@@ -10,7 +10,7 @@ import math
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Generic, Protocol, TypeVar
@@ -26,6 +26,7 @@ from ns_abstract.execution.stopping import StopRequest
 from ns_abstract.execution.threads import use_threads
 from ns_abstract.execution.worker_cache import Recipe, load
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.io.errors import InputError
 from ns_abstract.io.folder import first_command
 from ns_abstract.report.certificate import LastReport
 from ns_abstract.report.figures import percent
@@ -276,6 +277,8 @@ class CellSearch(Generic[P]):
             stack.callback(store.close)
             stack.enter_context(store.errors_as_input())
             stack.enter_context(stop.last_words(self.last.interrupted))
+            stack.push(self._ended)
+            failed = True
             try:
                 with stop.at_once():
                     question.prepare(self, request)
@@ -289,14 +292,21 @@ class CellSearch(Generic[P]):
                 question.after(self, searched)
                 if request.scene_margin and not stop():
                     self._margins(whole)
+                failed = False
             finally:
                 # also after a failure: what is finished is written
                 question.finish(self)
                 store.finish(self.grids)
-                document = self.report("interrupted" if stop() else "budget" if store.open_blocks else "done")
+                document = self.report("interrupted" if stop() or failed else "budget" if store.open_blocks else "done")
             if request.rows:
                 self.rows = {tally.frame: store.leaves(tally.frame) for tally in store.tallies()}
         return document
+
+    def _ended(self, kind: type[BaseException] | None, *_error: object) -> None:
+        """Say of the last report, if it could not be brought up to date, that the search has ended."""
+        if kind is not None:
+            with suppress(InputError):
+                self.last.interrupted()
 
     def tell_progress(self) -> None:
         """Tell who asked where the search stands."""

@@ -204,10 +204,10 @@ class PhotoSequence:
             self.entries.append(
                 {"image": stamp, "folder": folder, **{name: document[name] for name in reported}} | {"frames": frames}
             )
-            self._write()
             if document["state"] == "interrupted":
                 break
-        return self._write()
+            self._write("running")
+        return self._write("interrupted" if self.entries[-1]["state"] == "interrupted" else "done")
 
     def _sets(self, k: int) -> dict[int, PoseBox]:
         """By number, the set of photo ``k``."""
@@ -222,10 +222,10 @@ class PhotoSequence:
         job = PathJob(self.job.settings, self.job.scene, self.job.path, poses)
         return Location(job, levels, mask, first.options, image, first.calibration)
 
-    def _write(self) -> dict[str, Any]:
+    def _write(self, state: str) -> dict[str, Any]:
+        """Bring report.json up to date; ``state``: "running", "done" or "interrupted"."""
         entries = self.entries
         left = len(self.images) - len(entries)
-        state = entries[-1]["state"] if entries and entries[-1]["state"] == "interrupted" else "done"
         document = plain(
             {
                 "version": 1,

@@ -141,6 +141,7 @@ def _bounded(
         missing = set(report.missing)
         pending = sorted(report.pending, key=lambda index: index not in missing)
         budget = _SECONDS_BY_FRAME * max(1, len(pending)) if options.time_budget is None else options.time_budget
+        failed = True
         try:
             if pending and options.where.engine == "local":
                 with stop.at_once():
@@ -152,9 +153,10 @@ def _bounded(
                 )  # fmt: skip
                 for result in results:
                     take(report, result)
+            failed = False
         finally:
             # also after a failure: what is finished is written
-            report.finish("interrupted" if stop() else "budget" if report.missing else "done")
+            report.finish("interrupted" if stop() or failed else "budget" if report.missing else "done")
     if report.missing:
         console.print(f"no bounds yet for {frames_listed(report.missing)}: raise --time-budget, --resume")
     _say_what_next(console, report, pending)

@@ -339,8 +339,8 @@ class Report:
     def finish(self, outcome: Outcome) -> dict[str, Any]:
         """Write the last report.json and report.html.
 
-        ``outcome``: "done", "budget" (the time ended first) or "interrupted" (by a signal). Returns the content of
-        report.json.
+        ``outcome``: "done", "budget" (the time ended first) or "interrupted" (by a signal or an error). Returns the
+        content of report.json.
         """
         self._state = outcome
         # first what must not be lost
