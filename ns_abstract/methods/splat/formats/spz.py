@@ -143,6 +143,9 @@ def _packed_streams(path: Path, size: int) -> tuple[_Header, dict[str, NDArray[n
         raise InputError(problem, file=path, fix="check the permissions") from None
     if len(data) == wanted and not inflate.eof:
         raise InputError("a gzip stream without its end: cut off", file=path, fix=_FIX)
+    if inflate.unused_data:
+        # other programs join a second stream to the first
+        raise InputError("bytes behind the gzip stream", file=path, fix=_FIX)
     return header, _split(header, data, path)
 
 
