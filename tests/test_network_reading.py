@@ -514,6 +514,14 @@ def quantised(f: OnnxFile, x: str, scale: float, zero: int, kind: type = np.uint
     return f.node("DequantizeLinear", f.last, *given)
 
 
+def integer_constants(f: OnnxFile, rng: np.random.Generator, shape: tuple[int, ...], step: float) -> tuple[str, str]:
+    """Weights of 8 bits and a bias of 32 bits, for values in steps of ``step``."""
+    fine = f.constant(0.005)
+    w = f.node("DequantizeLinear", f.constant(rng.integers(-127, 128, shape), np.int8), fine)
+    bias = f.constant(rng.integers(-2000, 2000, shape[0]), np.int32)
+    return w, f.node("DequantizeLinear", bias, f.constant(np.float32(0.005) * np.float32(step)))
+
+
 @pytest.mark.parametrize("axis", [None, 0])
 def test_stored_integers_are_weights(axis: int | None, tmp_path: Path) -> None:
     f, rng = OnnxFile((4,)), np.random.default_rng(0)
@@ -542,18 +550,83 @@ def test_stored_integers_are_weights(axis: int | None, tmp_path: Path) -> None:
 @pytest.mark.parametrize("seed", range(3))
 def test_values_that_are_rounded_to_steps_are_contained(seed: int, tmp_path: Path) -> None:
     f = OnnxFile((4,), seed=seed)
-    x = quantised(f, f.last, 0.05, 128)
-    f.last = x
-    f.gemm(4, 6)
+    x, rng = quantised(f, f.last, 0.05, 128), np.random.default_rng(seed)
+    f.node("Gemm", x, *integer_constants(f, rng, (6, 4), 0.05), transB=1)
     f.node("Relu")
     quantised(f, f.last, 0.03, 0)
     f.gemm(6, 2)
-    file, rng = f.write(tmp_path / "net.onnx"), np.random.default_rng(seed)
+    file = f.write(tmp_path / "net.onnx")
     for _ in range(40):
         point = rng.normal(size=4).astype(np.float32) * 4.0
         low, high = at(file, point)
         value = run(file, point)
         assert (low <= value).all() and (value <= high).all() and (high - low < 1.0).all()
+
+
+def product_of_steps(file: Path, product: str, floats: str, before: str = "", behind: str = "") -> Path:
+    """Values of 8 bits times constants, rounded to steps again unless ``behind`` is "end".
+
+    ``floats``: which of the constants are no stored integers.
+    """
+    f, rng = OnnxFile((8, 1, 1) if product == "Conv" else (8,)), np.random.default_rng(0)
+    x = quantised(f, f.last, 0.02, 128)
+    if before:
+        f.last = x
+        x = f.node(before, **({"perm": [0, 1, 2, 3]} if before == "Transpose" and product == "Conv" else {}))
+    shape = (6, 8, 1, 1) if product == "Conv" else (6, 8)
+    w, b = integer_constants(f, rng, shape if product != "MatMul" else (8, 6), 0.02)
+    if "weights" in floats:
+        w = f.constant(rng.normal(size=shape if product != "MatMul" else (8, 6)))
+    if "bias" in floats:
+        b = f.constant(rng.normal(size=6))
+    if product == "MatMul":
+        f.node("MatMul", x, w)
+        if "bias" in floats:
+            f.node("Add", f.last, b)
+    else:
+        f.node(
+            product,
+            x,
+            w,
+            *([b] if behind != "BatchNormalization" else []),
+            **({"transB": 1} if product == "Gemm" else {}),
+        )
+    if behind == "BatchNormalization":
+        f.node(behind, f.last, *(f.constant(v) for v in rng.uniform(0.5, 1.0, (4, 6))))
+    elif behind not in ("", "end"):
+        f.node(behind)
+    if behind != "end":
+        quantised(f, f.last, 0.05, 128)
+    return f.write(file)
+
+
+PRODUCTS_OF_STEPS = [
+    ("Gemm", "weights", "", ""), ("Gemm", "bias", "", ""), ("Gemm", "weights", "Identity", ""),
+    ("Conv", "weights", "Transpose", ""), ("Conv", "bias", "", "Relu"), ("Conv", "", "", "BatchNormalization"),
+    ("MatMul", "bias", "", ""), ("MatMul", "weights, bias", "Identity", "Relu"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("product, floats, before, behind", PRODUCTS_OF_STEPS)
+def test_floats_that_onnxruntime_rounds_are_refused(
+    product: str, floats: str, before: str, behind: str, tmp_path: Path
+) -> None:
+    """It stores such weights in 8 bits and rounds the bias, and its outputs leave the bounds."""
+    with pytest.raises(InputError, match="which gives steps again"):
+        load_network(product_of_steps(tmp_path / "net.onnx", product, floats, before, behind))
+
+
+@pytest.mark.parametrize("product, floats, behind", [("Gemm", "weights, bias", "end"), ("Conv", "weights, bias", "end"),
+    ("Gemm", "", ""), ("Conv", "", "Relu"), ("MatMul", "", "")])  # fmt: skip
+def test_products_of_steps_that_are_not_rounded_are_contained(
+    product: str, floats: str, behind: str, tmp_path: Path
+) -> None:
+    file = product_of_steps(tmp_path / "net.onnx", product, floats, "", behind)
+    size = (8, 1, 1) if product == "Conv" else (8,)
+    for point in 2.0 * np.random.default_rng(1).normal(size=(20, *size)).astype(np.float32):
+        low, high = at(file, point)
+        value = run(file, point)
+        assert (low <= value).all() and (value <= high).all()
 
 
 def bytes_times_values(file: Path, through: str, product: str, integers: type = np.int8) -> Path:

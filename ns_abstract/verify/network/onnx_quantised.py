@@ -15,6 +15,22 @@ from ns_abstract.verify.network.onnx_tensors import number_type
 
 #: Operators that lay a matrix out otherwise and do not change its numbers.
 _LAID_OUT = ("Transpose", "Identity", "Reshape", "Squeeze", "Unsqueeze", "Flatten", "Cast")
+#: Operators that onnxruntime moves steps past, or leaves out.
+_PASSED = (
+    *_LAID_OUT,
+    "Dropout",
+    "MaxPool",
+    "Slice",
+    "Gather",
+    "Split",
+    "Concat",
+    "Pad",
+    "DepthToSpace",
+    "SpaceToDepth",
+)
+#: Products of which it rounds the constants, and what it joins to them.
+_PRODUCTS = ("Conv", "ConvTranspose", "Gemm", "MatMul")
+_JOINED = ("Add", "Sub", "Mul", "Div", "BatchNormalization")
 _RANGES = {
     np.dtype(kind): (np.iinfo(kind).min, np.iinfo(kind).max) for kind in (np.int8, np.uint8, np.int16, np.uint16)
 }
@@ -42,7 +58,41 @@ def dequantize(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
     own = _scalar(scale), 0 if zero is None else int(np.reshape(zero, -1)[0])
     if quantised is None or quantised != own:
         raise InputError("has another scale than the QuantizeLinear before it", fix="quantise with one scale a value")
+    _refuse_rounded_constants(r, node)
     r.values[node.output[0]] = r.values[node.input[0]]
+
+
+def _refuse_rounded_constants(r: OnnxReader, node: onnx.NodeProto) -> None:
+    """Refuse a product of steps with float weights or a float bias where its result is rounded to steps, too.
+
+    onnxruntime then stores such weights in 8 bits, and rounds the bias to multiples of both scales' product (N25).
+    """
+    # steps, where onnxruntime moves them; results of products of steps, and whether floats are among their constants
+    steps, results = set(node.output), dict[str, tuple[onnx.NodeProto, bool]]()
+    integers = {name for one in r.graph.node if one.op_type == "DequantizeLinear" for name in one.output}
+    values = {r.input_name}
+    for reader in r.graph.node:
+        if not values.isdisjoint(reader.input):
+            values.update(reader.output)
+        floats = any(name and name not in values | integers for name in reader.input[1:])
+        first = reader.input[0] if reader.input else ""
+        if first in steps and reader.op_type in _PRODUCTS:
+            # a matrix product becomes a Gemm with what is added to it
+            results[reader.output[0]] = reader, floats and reader.op_type != "MatMul"
+        elif not steps.isdisjoint(reader.input) and reader.op_type in _PASSED:
+            steps.update(reader.output)
+        found = next((results[name] for name in reader.input if name in results), None)
+        if found is None:
+            continue
+        if reader.op_type in ("Relu", "Clip", *_PASSED):
+            results.update(dict.fromkeys(reader.output, found))
+        elif reader.op_type in _JOINED and len(values.intersection(reader.input)) == 1:
+            results[reader.output[0]] = found[0], found[1] or not integers.issuperset(set(reader.input) - values)
+        elif reader.op_type == "QuantizeLinear" and found[1]:
+            product = f"{found[0].name or found[0].output[0]} ({found[0].op_type})"
+            problem = f"gives steps to {product}, whose weights or bias are floats, and which gives steps again"
+            fix = "onnxruntime rounds these floats, too: store them as integers, and give their DequantizeLinear"
+            raise InputError(problem, fix=fix)
 
 
 def _refuse_products(r: OnnxReader, node: onnx.NodeProto) -> None:
