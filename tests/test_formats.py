@@ -346,6 +346,20 @@ def _bomb(folder: Path) -> Path:
     return file
 
 
+def _many_members(folder: Path) -> Path:
+    """A zip archive whose list of members names one member four hundred thousand times."""
+    file = folder / "scene.sog"
+    with zipfile.ZipFile(file, "w") as archive:
+        archive.writestr("a", b"")
+    data = file.read_bytes()
+    at = data.index(b"PK\1\2")
+    entry, end, count = data[at : data.index(b"PK\5\6")], bytearray(data[data.index(b"PK\5\6") :]), 400_000
+    # what counts is the size of the list, not the number of members
+    struct.pack_into("<HHI", end, 8, 9, 9, count * len(entry))
+    file.write_bytes(data[:at] + count * entry + end)
+    return file
+
+
 def _spz_bytes(change: Callable[[bytearray], Any], version: int = 3) -> Callable[[Path], Path]:
     """A changed header or body, packed again."""
 
@@ -433,6 +447,7 @@ BAD: dict[str, tuple[Callable[[Path], Path], tuple[str, ...]]] = {
     "sog: 16 bits": (_image("sh0.webp", lambda d: deep_png(np.zeros((4, 4, 3), np.uint16))), ("8 bits",)),
     "sog: empty picture": (_image("sh0.webp", lambda d: b""), ("sh0.webp",)),
     "sog: zip bomb": (_bomb, ("bytes unpacked",)),
+    "sog: a list of many members": (_many_members, ("list of members",)),
     "sog: cut": (lambda folder: _cut(_meta(lambda m: None)(folder), 900), ("damaged archive",)),
     "sog: text": (lambda folder: _text(folder / "scene.sog", "PK\x03\x04 and more"), ("damaged archive",)),
     # SPZ

@@ -12,6 +12,7 @@ import numpy as np
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import file_size, show
+from ns_abstract.io.packed import open_zip
 
 _MEMBERS_LIMIT = 10_000
 #: Most bytes of a header: a shape, and a record type of some fields.
@@ -67,7 +68,7 @@ def open_archive(path: Path, what: str, fix: str) -> Iterator[Archive]:
     """
     file_size(path, what)
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_zip(path) as archive:
             yield Archive(archive)
     except InputError as error:
         raise InputError(error.problem, file=error.file or path, field=error.field, fix=error.fix or fix) from None

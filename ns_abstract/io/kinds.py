@@ -7,6 +7,7 @@ import zlib
 from pathlib import Path
 
 from ns_abstract.io.errors import InputError
+from ns_abstract.io.packed import open_zip
 
 #: Bytes that are looked at.
 _HEAD = 512
@@ -103,7 +104,7 @@ def _other_kind(path: Path, head: bytes) -> tuple[str, str] | None:
 
 def _kind_of_zip(path: Path) -> tuple[str, str]:
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_zip(path) as archive:
             names = [Path(name).name for name in archive.namelist()]
     except (OSError, zipfile.BadZipFile, ValueError, RuntimeError):
         names = []

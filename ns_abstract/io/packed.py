@@ -5,8 +5,10 @@ from __future__ import annotations
 import gzip
 import hashlib
 import io
+import zipfile
 import zlib
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
@@ -15,6 +17,8 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import file_size
 
 _CHUNK = 1 << 20
+#: Bytes that the list of an archive's members may take: Python's objects of it take ten times as much.
+_LIST_LIMIT = 16 << 20
 
 
 class _Read(io.RawIOBase):
@@ -45,3 +49,32 @@ def unpacked(path: Path, limit: int) -> Iterator[bytes]:
                 yield part
     except (OSError, EOFError, zlib.error) as error:
         raise InputError(f"cannot be unpacked: {error}", file=path, fix="copy it again") from None
+
+
+class _LimitedReader(io.BufferedReader):
+    """A file of which not more than ``limit`` bytes are read at once."""
+
+    limit: int | None = _LIST_LIMIT
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(io.FileIO(path))
+        self._path, self._size = path, path.stat().st_size
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        wanted = size if size is not None and size >= 0 else self._size - self.tell()
+        if self.limit is not None and wanted > self.limit:
+            problem = f"an archive whose list of members takes {wanted:,} bytes, more than {self.limit:,}"
+            raise InputError(problem, file=self._path, fix="check that this is the file meant")
+        return super().read(size)
+
+
+@contextmanager
+def open_zip(path: Path) -> Iterator[zipfile.ZipFile]:
+    """A zip archive, open inside the block.
+
+    Raises InputError where its list of members, which zipfile reads whole, is too long. Raises what zipfile raises of
+    damaged files.
+    """
+    with _LimitedReader(path) as stream, zipfile.ZipFile(stream) as archive:
+        stream.limit = None
+        yield archive

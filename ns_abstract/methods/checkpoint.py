@@ -24,6 +24,7 @@ from ns_abstract.io.errors import InputError, first_line
 from ns_abstract.io.jsonio import file_size, show
 from ns_abstract.io.kinds import refuse_other_kind
 from ns_abstract.io.memory import check_memory
+from ns_abstract.io.packed import open_zip
 from ns_abstract.methods.checkpoint_pickle import RECOPY, Placeholder, read_structure
 
 PICKLE_BYTES_LIMIT = 16 * 2**20
@@ -130,7 +131,7 @@ def read_checkpoint(path: Path) -> Any:
         with path.open("rb") as stream:
             if stream.read(4) != b"PK\x03\x04":
                 raise InputError("not a PyTorch checkpoint", file=path, fix=RECOPY)
-        with zipfile.ZipFile(path) as archive:
+        with open_zip(path) as archive:
             index = _validated_pickle_member(archive, path, size)
             data = archive.read(index)
             storages = _Storages(path, archive, index.filename.removesuffix("data.pkl"))

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from ns_abstract.io.errors import InputError, visible
 from ns_abstract.io.jsonio import is_moderate, load_json, parse_json, read_bytes, show
+from ns_abstract.io.packed import open_zip
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.splat.formats.decoded import (
     AXES,
@@ -49,7 +50,7 @@ _PICTURE_SPARE = 2**16
 def is_archive(path: Path) -> bool:
     """Whether a zip archive holds the description of a SOG scene; a damaged one is judged by its name."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_zip(path) as archive:
             return any(name.rpartition("/")[2] == META for name in archive.namelist())
     except (OSError, zipfile.BadZipFile, ValueError, RuntimeError):
         return path.suffix.lower() == ".sog"
@@ -66,7 +67,7 @@ def decode_sog(path: Path, overrides: Overrides) -> DecodedSplats:
         files = (file, *(file.parent / name for name in _names(meta, file)))
         return _Description(meta, file, lambda name: _beside(file, name)).decoded(files, overrides)
     try:
-        with zipfile.ZipFile(path) as archive:
+        with open_zip(path) as archive:
             entries = _entries(archive, path)
             if META not in entries:
                 raise InputError("a zip archive without meta.json", file=path, fix=_FIX)
