@@ -493,6 +493,9 @@ BAD: dict[str, tuple[Callable[[Path], Path], tuple[str, ...]]] = {
     "glb: required text": (_gltf(lambda r: r.update(extensionsRequired="KHR")), ("extensionsRequired",)),
     "glb: two primitives": (_gltf(lambda r: r["meshes"].append(r["meshes"][0])), ("2 things",)),
     "glb: no Gaussians": (_gltf(lambda r: r["meshes"][0]["primitives"][0].pop("extensions")), ("no Gaussians",)),
+    "glb: extensions of a number": (
+        _gltf(lambda r: r["meshes"][0]["primitives"][0].update(extensions=2)), ("meshes", "found 2"),
+    ),
     "glb: two nodes": (_gltf(lambda r: r["nodes"].append({"mesh": 0})), ("one node",)),
     "glb: no node": (_gltf(lambda r: r.update(nodes=[])), ("one node",)),
     "glb: turned node": (_gltf(lambda r: r["nodes"][0].update(rotation=[0, 1, 0, 0])), ("nodes[0].rotation",)),

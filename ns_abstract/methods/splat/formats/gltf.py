@@ -145,7 +145,10 @@ def _primitive(root: dict[str, Any]) -> dict[str, int]:
         raise InputError(f"needs {show(others)}: {others}"[:200], field="extensionsRequired", fix=_PLY)
     meshes, nodes = _list(root.get("meshes", []), "meshes"), _list(root.get("nodes", []), "nodes")
     primitives = [p for k, mesh in enumerate(meshes) for p in _list(mesh.get("primitives"), f"meshes[{k}].primitives")]
-    splats = [p for p in primitives if _EXTENSION in (p.get("extensions") or {})]
+    for primitive in primitives:
+        if not isinstance(primitive.get("extensions", {}), dict):
+            raise unusable(primitive["extensions"], field="meshes", fix=_AGAIN)
+    splats = [p for p in primitives if _EXTENSION in p.get("extensions", {})]
     if not splats:
         raise InputError(f"holds no Gaussians ({_EXTENSION})", field="meshes", fix=_PLY)
     if len(primitives) > 1:
