@@ -74,9 +74,8 @@ def _refuse_rounded_constants(r: OnnxReader, node: onnx.NodeProto) -> None:
     for reader in r.graph.node:
         if not values.isdisjoint(reader.input):
             values.update(reader.output)
-        floats = any(name and name not in values | integers for name in reader.input[1:])
-        first = reader.input[0] if reader.input else ""
-        if first in steps and reader.op_type in _PRODUCTS:
+        if not steps.isdisjoint(reader.input[:2]) and reader.op_type in _PRODUCTS:
+            floats = any(name and name not in values | integers for name in reader.input)
             # a matrix product becomes a Gemm with what is added to it
             results[reader.output[0]] = reader, floats and reader.op_type != "MatMul"
         elif not steps.isdisjoint(reader.input) and reader.op_type in _PASSED:
