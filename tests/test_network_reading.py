@@ -515,10 +515,10 @@ def quantised(f: OnnxFile, x: str, scale: float, zero: int, kind: type = np.uint
 
 
 def integer_constants(f: OnnxFile, rng: np.random.Generator, shape: tuple[int, ...], step: float) -> tuple[str, str]:
-    """Weights of 8 bits and a bias of 32 bits, for values in steps of ``step``."""
+    """Weights of 8 bits and a bias of 32 bits for 6 results, for values in steps of ``step``."""
     fine = f.constant(0.005)
     w = f.node("DequantizeLinear", f.constant(rng.integers(-127, 128, shape), np.int8), fine)
-    bias = f.constant(rng.integers(-2000, 2000, shape[0]), np.int32)
+    bias = f.constant(rng.integers(-2000, 2000, 6), np.int32)
     return w, f.node("DequantizeLinear", bias, f.constant(np.float32(0.005) * np.float32(step)))
 
 
@@ -581,7 +581,7 @@ def product_of_steps(file: Path, product: str, floats: str, before: str = "", be
         b = f.constant(rng.normal(size=6))
     if product == "MatMul":
         f.node("MatMul", x, w)
-        if "bias" in floats:
+        if floats:
             f.node("Add", f.last, b)
     else:
         f.node(
@@ -614,6 +614,29 @@ def test_floats_that_onnxruntime_rounds_are_refused(
     """It stores such weights in 8 bits and rounds the bias, and its outputs leave the bounds."""
     with pytest.raises(InputError, match="which gives steps again"):
         load_network(product_of_steps(tmp_path / "net.onnx", product, floats, before, behind))
+
+
+@pytest.mark.parametrize("product, behind", [("Gemm", ""), ("Gemm", "end"), ("Conv", "Relu"), ("MatMul", "")])
+@pytest.mark.parametrize("kind", ["scale", "zero"])
+def test_a_bias_whose_scale_onnxruntime_does_not_read_is_refused(
+    kind: str, product: str, behind: str, tmp_path: Path
+) -> None:
+    """It takes the product of the scales of steps and weights, and its outputs leave the bounds."""
+    file = product_of_steps(tmp_path / "net.onnx", product, "sum" if product == "MatMul" else "", "", behind)
+    load_network(file)
+    model = onnx.load(file)
+    made = {name: node for node in model.graph.node for name in node.output}
+    reader = next(node for node in model.graph.node if node.op_type == ("Add" if product == "MatMul" else product))
+    bias = made[reader.input[-1]]
+    if kind == "scale":
+        model.graph.initializer.append(numpy_helper.from_array(np.float32(0.005 * 0.02 * 1.05), "other"))
+        bias.input[1] = "other"
+    else:
+        model.graph.initializer.append(numpy_helper.from_array(np.int32(1), "other"))
+        bias.input.append("other")
+    file.write_bytes(model.SerializeToString())
+    with pytest.raises(InputError, match="whose bias has another scale"):
+        load_network(file)
 
 
 @pytest.mark.parametrize("product, floats, behind", [("Gemm", "weights, bias", "end"), ("Conv", "weights, bias", "end"),

@@ -76,6 +76,8 @@ def _refuse_rounded_constants(r: OnnxReader, node: onnx.NodeProto) -> None:
             values.update(reader.output)
         if not steps.isdisjoint(reader.input[:2]) and reader.op_type in _PRODUCTS:
             floats = any(name and name not in values | integers for name in reader.input)
+            for name in reader.input[2:]:
+                _refuse_other_scales(r, node, reader, name)
             # a matrix product becomes a Gemm with what is added to it
             results[reader.output[0]] = reader, floats and reader.op_type != "MatMul"
         elif not steps.isdisjoint(reader.input) and reader.op_type in _PASSED:
@@ -86,12 +88,44 @@ def _refuse_rounded_constants(r: OnnxReader, node: onnx.NodeProto) -> None:
         if reader.op_type in ("Relu", "Clip", *_PASSED):
             results.update(dict.fromkeys(reader.output, found))
         elif reader.op_type in _JOINED and len(values.intersection(reader.input)) == 1:
+            for name in set(reader.input) - values:
+                _refuse_other_scales(r, node, found[0], name)
             results[reader.output[0]] = found[0], found[1] or not integers.issuperset(set(reader.input) - values)
         elif reader.op_type == "QuantizeLinear" and found[1]:
             product = f"{found[0].name or found[0].output[0]} ({found[0].op_type})"
             problem = f"gives steps to {product}, whose weights or bias are floats, and which gives steps again"
             fix = "onnxruntime rounds these floats, too: store them as integers, and give their DequantizeLinear"
             raise InputError(problem, fix=fix)
+
+
+def _refuse_other_scales(r: OnnxReader, node: onnx.NodeProto, product: onnx.NodeProto, bias: str) -> None:
+    """Refuse a bias of 32 bits whose scale is not that of steps times weights: onnxruntime takes that one (N25)."""
+    makers = {name: maker for maker in r.graph.node for name in maker.output}
+
+    def stored(name: str) -> onnx.NodeProto | None:
+        maker = makers.get(name)
+        while maker is not None and maker.op_type in _LAID_OUT:
+            maker = makers.get(maker.input[0])
+        return maker if maker is not None and maker.op_type == "DequantizeLinear" else None
+
+    def number(one: onnx.NodeProto, place: int) -> np.ndarray:
+        name = one.input[place] if place < len(one.input) else ""
+        maker = makers.get(name)
+        if maker is not None and maker.op_type == "Constant" and maker.attribute[0].name == "value":
+            return r.stored.array(maker.attribute[0].t, f"node {maker.name} (Constant)")
+        return np.zeros(()) if not name else r.constants.get(name, np.full((), np.nan))
+
+    integers, weights = stored(bias), stored(product.input[1])
+    if integers is None or weights is None or number(integers, 0).dtype not in (np.int32, np.float64):
+        return
+    expected = (number(node, 1).astype(np.float64) * number(weights, 1)).astype(np.float32).reshape(-1)
+    scale = number(integers, 1).reshape(-1)
+    alike = scale.size in (1, expected.size) or expected.size == 1
+    if not (alike and (scale == expected).all()) or number(integers, 2).any():
+        problem = (
+            f"gives steps to {product.name or product.output[0]} ({product.op_type}), whose bias has another scale"
+        )
+        raise InputError(problem, fix="onnxruntime takes the scale of the steps times that of the weights: store that")
 
 
 def _refuse_products(r: OnnxReader, node: onnx.NodeProto) -> None:
