@@ -629,10 +629,10 @@ def test_a_bias_whose_scale_onnxruntime_does_not_read_is_refused(
     reader = next(node for node in model.graph.node if node.op_type == ("Add" if product == "MatMul" else product))
     bias = made[reader.input[-1]]
     if kind == "scale":
-        model.graph.initializer.append(numpy_helper.from_array(np.float32(0.005 * 0.02 * 1.05), "other"))
+        model.graph.initializer.append(numpy_helper.from_array(np.array(1.05e-4, np.float32), "other"))
         bias.input[1] = "other"
     else:
-        model.graph.initializer.append(numpy_helper.from_array(np.int32(1), "other"))
+        model.graph.initializer.append(numpy_helper.from_array(np.array(1, np.int32), "other"))
         bias.input.append("other")
     file.write_bytes(model.SerializeToString())
     with pytest.raises(InputError, match="whose bias has another scale"):
