@@ -617,7 +617,7 @@ def test_floats_that_onnxruntime_rounds_are_refused(
 
 
 @pytest.mark.parametrize("product, behind", [("Gemm", ""), ("Gemm", "end"), ("Conv", "Relu"), ("MatMul", "")])
-@pytest.mark.parametrize("kind", ["scale", "zero"])
+@pytest.mark.parametrize("kind", ["scale", "zero", "alpha"])
 def test_a_bias_whose_scale_onnxruntime_does_not_read_is_refused(
     kind: str, product: str, behind: str, tmp_path: Path
 ) -> None:
@@ -628,7 +628,9 @@ def test_a_bias_whose_scale_onnxruntime_does_not_read_is_refused(
     made = {name: node for node in model.graph.node for name in node.output}
     reader = next(node for node in model.graph.node if node.op_type == ("Add" if product == "MatMul" else product))
     bias = made[reader.input[-1]]
-    if kind == "scale":
+    if product == "Gemm" and kind == "alpha":
+        reader.attribute.append(helper.make_attribute("alpha", 0.5))
+    elif kind == "scale":
         model.graph.initializer.append(numpy_helper.from_array(np.array(1.05e-4, np.float32), "other"))
         bias.input[1] = "other"
     else:

@@ -99,7 +99,10 @@ def _refuse_rounded_constants(r: OnnxReader, node: onnx.NodeProto) -> None:
 
 
 def _refuse_other_scales(r: OnnxReader, node: onnx.NodeProto, product: onnx.NodeProto, bias: str) -> None:
-    """Refuse a bias of 32 bits whose scale is not that of steps times weights: onnxruntime takes that one (N25)."""
+    """Refuse a bias of 32 bits whose scale is not that of steps times weights: onnxruntime takes that one (N25).
+
+    It takes alpha for a part of it, too.
+    """
     makers = {name: maker for maker in r.graph.node for name in maker.output}
 
     def stored(name: str) -> onnx.NodeProto | None:
@@ -121,7 +124,8 @@ def _refuse_other_scales(r: OnnxReader, node: onnx.NodeProto, product: onnx.Node
     expected = (number(node, 1).astype(np.float64) * number(weights, 1)).astype(np.float32).reshape(-1)
     scale = number(integers, 1).reshape(-1)
     alike = scale.size in (1, expected.size) or expected.size == 1
-    if not (alike and (scale == expected).all()) or number(integers, 2).any():
+    factors = [a.f for a in product.attribute if a.name in ("alpha", "beta")]
+    if not (alike and (scale == expected).all()) or number(integers, 2).any() or factors.count(1.0) < len(factors):
         problem = (
             f"gives steps to {product.name or product.output[0]} ({product.op_type}), whose bias has another scale"
         )
