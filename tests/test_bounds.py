@@ -13,9 +13,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ns_abstract.arithmetic.rounding import FLOAT32, REAL
+from ns_abstract.arithmetic.rounding import FLOAT32, REAL, SUB_BOX_OVERLAP
 from ns_abstract.geometry.box import ParameterBox, shared_out
 from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.motion_cells import MotionCells
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble, tile_grid
 from ns_abstract.methods.splat.activate import Splats, rotation_matrices
@@ -82,11 +83,26 @@ class Case:
             self.camera, self.poses.enclosure(box, order), **options
         )
 
-    def sub_box_ends(self, box: ParameterBox, counts: np.ndarray, arithmetic=REAL) -> list[np.ndarray]:
+    def sub_box_ends(self, box: ParameterBox, counts: np.ndarray | MotionCells, arithmetic=REAL) -> list[np.ndarray]:
         """As `ends`, in the orders that are uncertain, and in every order."""
         bounds, forms = SubBoxBounds(self.splats, GSPLAT_1_4_0, arithmetic), self.poses.enclosure(box, 1)
         found = self._orders(bounds, forms, bounds.project(self.camera, forms), counts)
         return [self._laid_out(ends).clip(0.0, 1.0) for ends in found]
+
+    def motion_cells(self, box: ParameterBox) -> MotionCells:
+        """Cells of linear maps at random: any map is sound (B16)."""
+        generator, shape = np.random.default_rng(box.dimensions), (self.camera.height * self.camera.width, 2)
+        pixels = generator.normal(size=(*shape, box.dimensions)) * (generator.uniform(size=(*shape, 1)) < 0.9)
+        return MotionCells.of(pixels, 1, np.array([4, 2]))
+
+    def check_motion(self, cells: MotionCells, ends: np.ndarray, p: np.ndarray, image: np.ndarray) -> None:
+        """Each pixel of the ``image`` at scaled parameters ``p`` [d] lies within the ends over its motion cells."""
+        parts = cell_parts(cells.counts, SUB_BOX_OVERLAP)
+        motion = (cells.motion[:, :2] @ p).reshape(*image.shape[:2], 2, 1)
+        within = (np.abs(motion - parts.middles) <= parts.half[:, None]).all(axis=2)
+        assert within.any(axis=-1).all()
+        low, high = (np.where(within[:, :, None], ends[:, :, side], float(side)) for side in (0, 1))
+        assert (low <= image[..., None]).all() and (image[..., None] <= high).all()
 
     def difference_ends(self, box: ParameterBox, counts: np.ndarray, arithmetic=REAL) -> list[np.ndarray]:
         """As `sub_box_ends`, of differences of channels."""
@@ -98,7 +114,7 @@ class Case:
             found.append(self._laid_out(np.concatenate(ends, axis=1).reshape(parts.shape)))
         return found
 
-    def _orders(self, bounds: SubBoxBounds, forms, projected, counts: np.ndarray) -> list[np.ndarray]:
+    def _orders(self, bounds: SubBoxBounds, forms, projected, counts: np.ndarray | MotionCells) -> list[np.ndarray]:
         """Ends [T, side, side, 6, parts] in the orders that are uncertain, and in every order."""
         tiles = np.arange(math.prod(tile_grid(self.camera, bounds.side)))
         pixels = np.ones((tiles.size, bounds.side, bounds.side), bool)
@@ -149,6 +165,8 @@ class Case:
                 over_parts += [(cell_parts(divided), ends) for ends in self.sub_box_ends(box, divided, arithmetic)]
                 differences = [(cell_parts(divided), ends) for ends in self.difference_ends(box, divided, arithmetic)]
                 found.append((assemble(by_parts.lower, self.camera), assemble(by_parts.upper, self.camera)))
+            motion = self.motion_cells(box) if order == 1 and box.dimensions > 1 else None
+            by_motion = [] if motion is None else self.sub_box_ends(box, motion, arithmetic)
             pairs = self.poses.enclosure(box, order).rotation.basis.pairs
             for values in self.samples(box, count):
                 image = self.image(values)
@@ -163,6 +181,8 @@ class Case:
                     within = (np.abs(p[:, None] - sub.middles) <= sub.half[:, None]).all(axis=0)
                     assert within.any()
                     assert (ends[:, :, 0, :, within] <= image).all() and (ends[:, :, 1, :, within] >= image).all()
+                for ends in by_motion:
+                    self.check_motion(motion, ends, p, image)
                 for sub, ends in differences:
                     within = (np.abs(p[:, None] - sub.middles) <= sub.half[:, None]).all(axis=0)
                     assert_differences(image, ends[..., within])

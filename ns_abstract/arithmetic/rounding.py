@@ -125,6 +125,11 @@ JUMP_ROUNDING, SWAP_ROUNDING = UNIT64, 2.0 * UNIT64
 SUB_BOX_OVERLAP, SUB_BOX_LINES = 2.0**-24, 2.0**-26
 #: B12: a grid's line and the middle and half-width of a cell, relative to the sizes of its ends: 6; 10 to spare.
 SUB_BOX_LINE_ROUNDING = 16.0 * UNIT64
+#: B16: a slope less its part along the motion, a product and two sums, and their sum of at most 8 terms, 11; and the
+#: part's own sum of three terms, 3; 2 to spare, of sizes of both.
+MOTION_ROUNDING = 16.0 * UNIT64
+#: B16: no charge: a block's motion is scaled so that its rows' sizes, sums of at most 8 terms, are at most 1.
+MOTION_SCALE = 1.0 - 2.0**-30
 #: B15: differences of two products whose sizes add up to 1 at most, and a sum with 1/2, absolute: 4 roundings; the same
 #: of a bound less 1/2 and its quotient by the scale: 3. 12 to spare.
 CHANNEL_DIFFERENCE_ROUNDING = 16.0 * UNIT64

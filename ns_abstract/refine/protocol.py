@@ -14,6 +14,7 @@ import numpy as np
 
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.motion_cells import MotionCells
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.perturbation.variations import Selection
@@ -224,10 +225,18 @@ FIRST_CHANNELS, SECOND_CHANNELS = ([pair[k] for pair in CHANNEL_DIFFERENCES] for
 
 @runtime_checkable
 class SubBoxFrame(Protocol):
-    """An optional interface of a `Frame`: bounds over each of many equal sub-boxes of a wide cell."""
+    """An optional interface of a `Frame`: bounds over each of many equal parts of a wide cell."""
+
+    def motion_cells(self, box: ParameterBox, counts: np.ndarray) -> MotionCells | None:
+        """`MotionCells`, ``counts`` [2] of them, over a cell of poses; None: there are none for this set."""
+        ...
+
+    def parallax(self, box: ParameterBox) -> np.ndarray:
+        """[d] pixels that typical elements move by, over each parameter's range, beside what their block does."""
+        ...
 
     def sub_box_ends(
-        self, box: ParameterBox, counts: np.ndarray, tiles: np.ndarray, pixels: np.ndarray,
+        self, box: ParameterBox, counts: np.ndarray | MotionCells, tiles: np.ndarray, pixels: np.ndarray,
         ends: np.ndarray | None = None, differences: bool = False,
     ) -> tuple[np.ndarray, np.ndarray] | None:  # fmt: skip
         """Lower and upper bounds [n, 3, k] of ``n`` pixels over ``k`` sub-boxes; None: there are none for this set.
@@ -235,7 +244,7 @@ class SubBoxFrame(Protocol):
         ``differences``: of `CHANNEL_DIFFERENCES` of the pixels before they are clamped to [0, 1], in place of channels.
 
         There are ``counts`` [d] sub-boxes along the axes, powers of two, at least 8 together, numbered like entries of
-        an array of this shape. Each is widened by `SUB_BOX_OVERLAP` of the cell's half-widths. ``pixels`` [t, side,
+        an array of this shape; or cells of the image motion. Each is widened by `SUB_BOX_OVERLAP` of the cell's half-widths. ``pixels`` [t, side,
         side]: the ``n``. ``ends`` [n, 6]: the lower, then the upper bounds of channels that are worth more work.
         """
         ...

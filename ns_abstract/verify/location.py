@@ -18,14 +18,16 @@ import numpy as np
 from ns_abstract.arithmetic.rounding import CUT_VALUE_ROUNDING, HALF_UP
 from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import Float64Array, ParameterBox, shared_out
+from ns_abstract.geometry.motion_cells import MotionCells
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.refine.protocol import Bounds, Frame, LinearSets, SubBoxFrame
 from ns_abstract.verify.cell_boxes import aligned, divided, inner_cell, meeting, resolved, slabs, sub_box_counts
 from ns_abstract.verify.cells import Cell, CellGrid
+from ns_abstract.verify.motion_boxes import MotionBoxes
 from ns_abstract.verify.photo import Photo
 from ns_abstract.verify.pixel_rounds import BoundedPixels, PixelRounds, RoundTuning
 from ns_abstract.verify.search_results import BlockResult, FinishedCell
-from ns_abstract.verify.telling_pixels import DIFFERENCES, PixelOrder, TellingPixels, TypicalCell, typical_cell
+from ns_abstract.verify.telling_pixels import DIFFERENCES, PixelOrder, TellingPixels, typical_cell
 
 #: Grid units along each parameter, as a power of two.
 UNITS = 20
@@ -35,38 +37,35 @@ UNITS = 20
 class LocationTuning:
     """Preferences of the search. None of them decides whether an excluded cell holds no pose of the photo."""
 
-    #: Image motion over a sub-box, pixels, beyond which cells are cut without bounds.
-    coarse: float = 4.0
-    #: Sub-boxes along the two parameters that move the picture most, where a set has few; others are not divided, since
-    #: what is shared by the sub-boxes of a cell, above all its depth order, loses by every parameter that is wide.
-    along: int = 8
-    #: From so many parameters on, so many sub-boxes are shared out among all of them: a cell that is long along two
-    #: moves the picture by more, and forms lose by the square of that.
-    many: int = 4
-    shared: int = 64
-    #: Rounds of pixels where a set has few parameters, and many: what a cell takes whatever its pixels are, is most of
-    #: the work there, and a first round of more pixels excludes more at once.
-    pixel_rounds: tuple[RoundTuning, RoundTuning] = RoundTuning(), RoundTuning(first=2.0)
-    #: Image motion over a sub-box, pixels, up to which pixels of uncertain orders are bounded whatever the order: it
-    #: takes long, and excludes little of wider ones.
+    #: Pixels by which bounds are wide (`LocationSearch.widths`) beyond which cells are cut without bounds, and up to which
+    #: pixels of uncertain orders are bounded whatever the order: it takes long, and excludes little of wider cells.
+    coarse: float = 1.6
     unordered: float = 1.6
+    #: Cells of the image motion along its two axes; what of the motion widens bounds nevertheless.
+    motion_cells: tuple[int, int] = (8, 8)
+    motion_share: float = 0.25
+    #: Sub-boxes of a cell: they cost a look at each pixel's motion cells, no bounds.
+    sub_boxes: int = 4096
+    #: Rounds of pixels. What a cell takes whatever its pixels are is most of the work, and a first round of more pixels
+    #: excludes more at once.
+    pixel_rounds: RoundTuning = RoundTuning(first=1.6)
     #: The part of a box of sub-boxes that has to be left for it to become one cell.
     filled: float = 0.5
     #: Grid lines that cells begin and end at, as a power of two of their width.
     aligned: int = 5
     contracted: float = 0.3
     #: Pixels that are bounded to exclude a cell: so many times those that may show anything.
-    surplus: float = 4.0
-    #: Image motion over the cell whose bounds tell how loose they are, and over its parts where bounds are over parts.
-    reference: tuple[float, float] = 2.4, 1.8
+    surplus: float = 6.0
+    #: Width of the cell whose bounds tell how loose they are, without and with motion cells.
+    reference: tuple[float, float] = 2.4, 0.9
     #: Pixels that must be likely to be excluded, as a part of those that exclude a cell, for it to be bounded.
     promise: float = 0.6
     #: Image motion below which a parameter counts as one that moves nothing.
     still: float = 1e-12
-    #: How many pixels bounds exclude, about, as a power of the motion; ends of the part of it that cuts aim at.
+    #: How many pixels bounds exclude, about, as a power of their width; ends of the part of it that cuts aim at.
     power: float = 2.5
     least_aim: float = 0.35
-    most_aim: float = 0.85
+    most_aim: float = 0.65
     #: Part of a cell's volume that a contraction must take for it to be bounded again, and how often.
     worth: float = 0.4
     rounds: int = 4
@@ -114,7 +113,10 @@ class LocationSearch:
         motion = np.nan_to_num(np.asarray(frame.motion(box), np.float64), nan=0.0, posinf=0.0)
         # what moves nothing is cut for the bounds' sake now and then
         motion = np.maximum(motion, 1e-3 * max(1.0, float(motion.max(initial=0.0))))
-        self._pace = motion / width
+        self._pace = self._width_pace = motion / width
+        if self.by_motion:
+            assert isinstance(frame, SubBoxFrame)
+            self._width_pace = (frame.parallax(box) + self.tuning.motion_share * motion) / width
 
     @property
     def sub_box_frame(self) -> SubBoxFrame | None:
@@ -122,25 +124,18 @@ class LocationSearch:
         return self.frame if self.contract and isinstance(self.frame, SubBoxFrame) else None
 
     @property
-    def many_parameters(self) -> bool:
-        """Whether the set has many parameters."""
-        return self.frame.box.dimensions >= self.tuning.many
+    def by_motion(self) -> bool:
+        """Whether wide cells are bounded over cells of the image motion (U11)."""
+        return self.sub_box_frame is not None and self.frame.box.dimensions > 1
 
-    @cached_property
-    def along(self) -> np.ndarray:
+    def along(self, box: ParameterBox) -> np.ndarray:
         """[d] sub-boxes along the parameters of a cell."""
-        counts = np.ones(self.frame.box.dimensions, np.int64)
-        order = np.argsort(-self.moved(self.frame.box), kind="stable")
-        if self.sub_box_frame is not None and self.many_parameters:
-            counts[order] = shared_out(np.ones(counts.size), self.tuning.shared)
-        elif self.sub_box_frame is not None:
-            counts[order[:2]] = self.tuning.along
-        return counts
+        return shared_out(self.moved(box), self.tuning.sub_boxes)
 
     def first_cells(self) -> list[Cell]:
         """The set's first cell, or its parts where it is too wide for bounds: several can be examined side by side."""
         (root,) = self.grid.roots()
-        if self.sub_box_motion(self.grid.box, self.along) <= self.tuning.coarse:
+        if self.width(self.grid.box) <= self.tuning.coarse:
             return [root]
         examination = _Examination(self, root, self.tiled.chosen(()))
         examination.cut()
@@ -150,31 +145,28 @@ class LocationSearch:
         """[d] pixels that typical scene elements move by over a cell (an estimate)."""
         return self._pace * (np.array(box.upper) - np.array(box.lower))
 
-    def sub_box_motion(self, box: ParameterBox, counts: np.ndarray) -> float:
-        """Pixels that they move by over each of ``counts`` [d] sub-boxes of a cell."""
-        return float(np.linalg.norm(self.moved(box) / counts))
+    def widths(self, box: ParameterBox) -> Float64Array:
+        """[d] pixels by which parameters widen bounds over a cell: motion that motion cells do not follow (a guess)."""
+        return self._width_pace * (np.array(box.upper) - np.array(box.lower))
+
+    def width(self, box: ParameterBox) -> float:
+        """Norm of the `widths`."""
+        return float(np.linalg.norm(self.widths(box)))
 
     @cached_property
     def telling(self) -> TellingPixels:
         """Which pixels of a cell are bounded: a guess, by one cell in the middle of the set."""
-        one = np.ones_like(self.along)
-        typical = self._typical(self.along) or self._typical(one)
-        assert typical is not None
+        box, least, reference = self.frame.box, self.tuning.still, self.tuning.reference[self.by_motion]
+        side = np.minimum(1.0, reference / math.sqrt(max(1, box.dimensions)) / np.maximum(self.widths(box), least))
+        cell = between(box, -side, side)
+        picture = assemble(self.plain.render(self.original(cell.middle)), self.frame.camera)[..., :3]
+        typical = typical_cell(self.frame, cell, self.motion_cells(cell), max(self.width(cell), least), picture)
         return TellingPixels(self.tiled, self.frame.camera, typical)
 
-    def _typical(self, counts: np.ndarray) -> TypicalCell | None:
-        """Of a cell with ``counts`` [d] parts."""
-        box, camera = self.frame.box, self.frame.camera
-        least, reference = self.tuning.still, self.tuning.reference[int(counts.prod()) > 1]
-        side = np.minimum(
-            1.0, reference * counts / math.sqrt(max(1, box.dimensions)) / np.maximum(self.moved(box), least)
-        )
-        cell = between(box, -side, side)
-
-        def draw(values: Float64Array) -> np.ndarray:
-            return assemble(self.plain.render(self.original(values)), camera)[..., :3]
-
-        return typical_cell(self.frame, cell, counts, max(self.sub_box_motion(cell, counts), least), draw)
+    def motion_cells(self, box: ParameterBox) -> MotionCells | None:
+        """Those of a cell, if its pixels are bounded over them."""
+        frame = self.sub_box_frame
+        return None if frame is None else frame.motion_cells(box, np.array(self.tuning.motion_cells))
 
     def examine(self, cells: Sequence[Cell]) -> LocationResult:
         """Exclude the cells, or cut them."""
@@ -236,11 +228,10 @@ class _Examination:
                 return self._exclude(1.0)
             self._shrink(feasible)
             box = search.grid.box_of(self.cell)
-            moved = search.sub_box_motion(box, search.along)
-            if box.dimensions and moved > tuning.coarse:
+            if box.dimensions and search.width(box) > tuning.coarse:
                 break
             picture, number = self._look(box.middle)
-            if moved > tuning.contracted:
+            if search.by_motion and float(np.linalg.norm(search.moved(box))) > tuning.contracted:
                 some = self._sub_boxes(box, picture)
                 if some:
                     return None
@@ -260,13 +251,17 @@ class _Examination:
     def _sub_boxes(self, box: ParameterBox, picture: np.ndarray) -> bool | None:
         """Exclude sub-boxes of the cell; returns whether some were, or None: the frame has no bounds of sub-boxes."""
         search, tuning = self.search, self.search.tuning
-        counts = sub_box_counts(self.cell, search.along)
-        frame = search.sub_box_frame
-        if frame is None or not resolved(box, counts):
+        frame, cells, counts = (
+            search.sub_box_frame,
+            search.motion_cells(box),
+            sub_box_counts(self.cell, search.along(box)),
+        )
+        if frame is None or cells is None or not resolved(box, counts):
             return None
+        boxes = MotionBoxes(cells, counts, search.frame.camera)
         rounds, order = self._rounds(box, picture, counts)
-        narrow = search.sub_box_motion(box, counts) <= tuning.unordered
-        while (chosen := rounds.following()) is not None:
+        narrow = search.width(box) <= tuning.unordered
+        while (chosen := rounds.following(*order.towards(boxes.moved[rounds.left]))) is not None:
             self.bounded += 1
             excluding = np.zeros((int(chosen.sum()), rounds.numbers.size), bool)
             for kind, miss in enumerate(order.misses):
@@ -275,12 +270,13 @@ class _Examination:
                     continue
                 tiles = np.flatnonzero(pixels.any(axis=(1, 2)))
                 telling = (miss == miss.max(axis=-1, keepdims=True))[pixels] if narrow else None
-                ends = frame.sub_box_ends(box, counts, tiles, pixels[tiles], telling, kind == DIFFERENCES)
+                ends = frame.sub_box_ends(box, cells, tiles, pixels[tiles], telling, kind == DIFFERENCES)
                 if ends is None:
                     return None
-                excluding[pixels[chosen]] = search.tiled.excluding(*ends, pixels, kind == DIFFERENCES)
+                known = search.tiled.excluding(*ends, pixels, kind == DIFFERENCES)
+                excluding[pixels[chosen]] = boxes.excluded(known, pixels)
             rounds.take(excluding, chosen)
-            self.share = min(1.0, rounds.expected)
+        self.share = min(1.0, rounds.expected)
         self.divisions = self.cell, counts, rounds
         left = rounds.left.reshape(counts)
         if left.all():
@@ -291,7 +287,7 @@ class _Examination:
                 remaining.append(cell)
             else:
                 self.leaves.append(FinishedCell(cell, "certified", 1.0, 0.0))
-        if len(remaining) == 1 and remaining[0].volume > (1.0 - tuning.worth) * self.cell.volume:
+        if len(remaining) == 1:
             self.cell = remaining[0]
             self.cut()
         else:
@@ -341,9 +337,12 @@ class _Examination:
         search, tiled, tuning = self.search, self.search.tiled, self.search.tuning
         before = self.cell.volume
         linear = search.contract and float(np.linalg.norm(search.moved(box))) <= tuning.contracted
-        (rounds, _), known = self._rounds(box, picture, np.ones(box.dimensions, np.int64)), None
+        (rounds, telling), known = self._rounds(box, picture, np.ones(box.dimensions, np.int64)), None
+        order = telling.everywhere
+        if order[0].size < tuning.promise * (tiled.allowed + 1 - int(self.inherited.sum())):
+            order = order[0][:0], order[1][:0]
         while True:
-            chosen = rounds.following()
+            chosen = rounds.following(*order)
             last = chosen is None
             if chosen is None:
                 if not linear:
@@ -377,16 +376,12 @@ class _Examination:
         """Rounds of pixels for the sub-boxes [counts] of the cell; there are none where too few are likely to help."""
         search, tiled, tuning = self.search, self.search.tiled, self.search.tuning
         moved, known = search.moved(box), int(self.inherited.sum())
-        needed, alone = tiled.allowed + 1 - known, counts.prod() == 1
         chosen = search.telling.order(
-            picture, max(1, round(0.5 * float(np.linalg.norm(moved)))),
-            search.sub_box_motion(box, counts), tiled.counted & ~self.inherited,
-            round(tuning.surplus * needed), differences=not alone,
+            picture, max(1, round(0.5 * float(np.linalg.norm(moved)))), search.width(box),
+            tiled.counted & ~self.inherited, round(tuning.surplus * (tiled.allowed + 1 - known)),
+            differences=counts.prod() > 1,
         )  # fmt: skip
-        self.share = (known + chosen.sure) / (known + needed) if alone else 0.0
-        numbers = chosen.numbers[: 0 if alone and self.share < tuning.promise else None]
-        preference = tuning.pixel_rounds[search.many_parameters]
-        return PixelRounds(tiled, numbers, int(np.prod(counts)), self.inherited, preference), chosen
+        return PixelRounds(tiled, int(np.prod(counts)), self.inherited, tuning.pixel_rounds), chosen
 
     def _bound(self, box: ParameterBox, tiles: np.ndarray, linear: bool, pixels: np.ndarray | None = None) -> Bounds:
         """Bounds of ``tiles``, or of some of their ``pixels`` alone where the frame can leave out the others."""
@@ -446,8 +441,7 @@ class _Examination:
         search, tuning = self.search, self.search.tuning
         if self.cell.volume <= max(1.0, tuning.finest ** len(self.cell.first) * search.grid.volume):
             return self._finish()
-        # of a sub-box
-        moved = search.moved(search.grid.box_of(self.cell)) / search.along
+        moved = search.widths(search.grid.box_of(self.cell))
         total = float(np.linalg.norm(moved))
         aim = tuning.coarse
         if total <= tuning.coarse:

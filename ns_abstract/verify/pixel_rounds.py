@@ -6,7 +6,6 @@ by a small part of the photo's pixels: flat places, whose bounds hardly widen wi
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,88 +22,77 @@ class RoundTuning:
     Attributes:
         first: Pixels of the first round: so many times those that exclude a cell.
         spare: Pixels of a later round: so many times those that are expected to decide it.
-        typical: The quantile of sub-boxes that is to be excluded before rounds end.
-        hopeless: Part of the needed pixels that has to be expected of the remaining ones for another round.
+        hopeless: Part of the missing pixels that has to be expected of the remaining ones for another round.
         few: Part of the sub-boxes of which no more are left when rounds end: a narrower cell holds them.
         least_missing: Part of the needed pixels that a later round looks for at least.
-        least_rate: Part of a round's pixels that is taken to exclude at least.
+        least_rate: Part of the expected pixels that is taken to exclude at least.
     """
 
     first: float = 1.35
     spare: float = 1.3
-    typical: float = 0.1
     hopeless: float = 0.6
     few: float = 0.25
     least_missing: float = 0.1
-    least_rate: float = 0.1
+    least_rate: float = 0.02
 
 
 class PixelRounds:
     """Counts for each sub-box of a cell the pixels that exclude it, while these are bounded a part at a time (U8).
 
     Args:
-        order: [n] numbers of the pixels to bound, in the order of `TiledPhoto.counted` flattened, the first one first.
         inherited: [T, side, side] counted pixels that exclude the whole cell by bounds over a larger one (U9); they are
             not bounded again. None: there are none.
 
     Attributes:
         bounded: [T, side, side] pixels whose bounds were counted, and those inherited.
         numbers: [k] pixels so far that exclude each sub-box.
+        expected: Pixels that would exclude what is left if all were bounded, as a part of those that are needed.
     """
 
     def __init__(
-        self,
-        photo: TiledPhoto,
-        order: np.ndarray,
-        sub_boxes: int,
-        inherited: np.ndarray | None = None,
-        tuning: RoundTuning | None = None,
+        self, photo: TiledPhoto, sub_boxes: int, inherited: np.ndarray | None = None, tuning: RoundTuning | None = None
     ) -> None:
         self.photo, self.tuning = photo, tuning or RoundTuning()
         self.inherited = np.zeros(photo.counted.shape, bool) if inherited is None else inherited
         self.bounded = self.inherited.copy()
-        self.order = order[~self.bounded.reshape(-1)[order]]
         self.numbers = np.full(sub_boxes, int(self.inherited.sum()), np.int64)
+        self.expected = 1.0
         self._excluding: list[tuple[np.ndarray, np.ndarray]] = []
-        self.taken = 0
         self._rate = 1.0
+        self._ordered, self._shares = np.zeros(0, np.int64), np.zeros(0)
 
     @property
     def left(self) -> np.ndarray:
         """[k] which sub-boxes are not excluded: no more pixels exclude them than are outliers of the whole photo."""
         return self.numbers <= self.photo.allowed
 
-    @property
-    def typical(self) -> float:
-        """Number of pixels that exclude a sub-box which few others fall behind."""
-        return float(np.quantile(self.numbers, self.tuning.typical))
+    def following(self, order: np.ndarray, shares: Float64Array) -> np.ndarray | None:
+        """[T, side, side] pixels of the next round; None: few sub-boxes are left, or more pixels hardly help.
 
-    @property
-    def expected(self) -> float:
-        """Pixels that would exclude a typical sub-box if all were bounded, as a part of those that are needed."""
-        rest = self._rate * (self.order.size - self.taken)
-        return (float(np.median(self.numbers)) + rest) / (self.photo.allowed + 1)
-
-    def following(self) -> np.ndarray | None:
-        """[T, side, side] pixels of the next round; None: few sub-boxes are left, or more pixels hardly help."""
-        left, needed = float(self.left.mean()), self.photo.allowed + 1
+        Args:
+            order: [n] numbers of pixels, in the order of `TiledPhoto.counted` flattened, the first one first.
+            shares: [n] part of what is left that each is likely to exclude.
+        """
+        left, needed = self.left, self.photo.allowed + 1
+        fresh = ~self.bounded.reshape(-1)[order]
+        order, foreseen = order[fresh], shares[fresh].cumsum()
         # a cell without sub-boxes is left as a whole
-        if left <= (self.tuning.few if self.numbers.size > 1 else 0.0) or self.taken >= self.order.size:
+        few = self.tuning.few if left.size > 1 else 0.0
+        if not left.any():
+            self.expected = 1.0
             return None
-        if not self.taken:
-            missing = needed - int(self.inherited.sum())
-            if self.order.size < missing:
-                return None
-            count = self.tuning.first * missing
-        elif self.expected < self.tuning.hopeless:
+        typical = float(np.median(self.numbers[left]))
+        rest = self._rate * float(foreseen[-1]) if foreseen.size else 0.0
+        self.expected = (typical + rest) / needed
+        missing = max(needed - typical, self.tuning.least_missing * needed)
+        if left.mean() <= few or rest < self.tuning.hopeless * missing:
             return None
-        else:
-            missing = max(needed - self.typical, self.tuning.least_missing * needed)
-            count = self.tuning.spare * missing / max(self._rate, self.tuning.least_rate)
-        past = min(self.taken + max(1, math.ceil(count)), self.order.size)
+        first = not self._excluding
+        wanted = (self.tuning.first if first else self.tuning.spare) * missing
+        past = min(int(np.searchsorted(self._rate * foreseen, wanted)) + 1, order.size)
+        self._ordered, self._shares = order[:past], shares[fresh][:past]
         chosen = np.zeros(self.bounded.shape, bool)
-        chosen.reshape(-1)[self.order[self.taken : past]] = True
-        self.taken = past
+        chosen.reshape(-1)[order[:past]] = True
         return chosen
 
     @property
@@ -120,12 +108,16 @@ class PixelRounds:
         """Count which of the ``n`` ``pixels`` [T, side, side] exclude which sub-boxes [n, k], each pixel once."""
         fresh = (pixels & ~self.bounded)[pixels]
         excluding = excluding[fresh]
-        before = float(np.median(self.numbers))
-        self.numbers += excluding.sum(axis=0)
+        more = excluding.sum(axis=0)
+        self.numbers += more
         self._excluding.append((np.flatnonzero(pixels & ~self.bounded), excluding))
         self.bounded |= pixels
-        if fresh.any():
-            self._rate = (float(np.median(self.numbers)) - before) / int(fresh.sum())
+        # the last half of the round tells what comes next
+        last = slice(self._ordered.size // 2, None)
+        if self.left.any() and self._shares[last].sum() > 0.0:
+            late = np.isin(self._excluding[-1][0], self._ordered[last])
+            found = float(excluding[late][:, self.left].sum(axis=0).mean())
+            self._rate = max(found / float(self._shares[last].sum()), self.tuning.least_rate)
 
     def excluded(self, sub_boxes: np.ndarray) -> np.ndarray:
         """[T, side, side] the pixels so far that exclude each of some ``sub_boxes`` [k], of which there is one (U9)."""

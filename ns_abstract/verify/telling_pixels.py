@@ -6,13 +6,14 @@ All of it is a guess from a render: it decides which pixels are bounded, not wha
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ns_abstract.geometry.box import Float64Array, ParameterBox
 from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.motion_cells import MotionCells
 from ns_abstract.geometry.tiles import assemble, in_tiles
 from ns_abstract.refine.protocol import FIRST_CHANNELS, SECOND_CHANNELS, Frame, SubBoxFrame
 from ns_abstract.verify.neighbouring_pixels import best_shift, filled, nearby, shifted
@@ -20,44 +21,69 @@ from ns_abstract.verify.photo import TiledPhoto
 
 #: What is bounded of a pixel: its channels, or differences of these.
 CHANNELS, DIFFERENCES = range(2)
-#: Of a typical cell: most pixels that are bounded, how many times as far apart are those whose bounds take more work,
-#: and most parts whose middles are drawn.
-_MOST_PIXELS, _FEWER, _MOST_PICTURES = 4096, 3, 8
-#: What bounds lose at most.
-_ALL = 2.0
+#: Of a typical cell: most pixels that are bounded, and how many times as far apart are those whose bounds take more work.
+_MOST_PIXELS, _FEWER = 4096, 3
+#: What bounds lose at most, and as which power of their width.
+_ALL, _POWER = 2.0, 1.5
 
 
 @dataclass(frozen=True)
 class PixelOrder:
-    """The pixels to bound of a cell.
+    """The pixels to bound of a cell, in the order of `TiledPhoto.counted` flattened.
 
     Attributes:
-        numbers: [n] in the order of `TiledPhoto.counted` flattened, the most telling and cheapest first.
-        sure: How many of them are likely to exclude the cell.
+        steps: [m, 2] columns and rows that the picture may have moved by.
+        missed: [m, n] whether bounds are likely to miss the photo there at each of ``n`` pixels.
+        numbers: [n] these pixels.
+        worth: [n] what else comes first: by how much bounds miss, less how loose they are, as these take longer.
+        most: So many pixels at most.
         kinds: [T, side, side] whether `CHANNELS` or `DIFFERENCES` of a pixel tell more.
-        misses: By kind, [T, side, side, 6] by how much bounds over the cell are expected to miss the photo: the lower
-            ones of three values, which may lie above what the photo allows, then the upper ones.
+        misses: By kind, [T, side, side, 6] by how much bounds in the cell's middle are expected to miss the photo: the
+            lower ones of three values, which may lie above what the photo allows, then the upper ones.
     """
 
+    steps: np.ndarray
+    missed: np.ndarray
     numbers: np.ndarray
-    sure: int
+    worth: Float64Array
+    most: int
     kinds: np.ndarray
     misses: tuple[Float64Array, ...]
+
+    def towards(self, moved: Float64Array) -> tuple[np.ndarray, Float64Array]:
+        """Numbers of pixels, the most telling and cheapest first, for poses that move the picture by ``moved`` [k, 2].
+
+        And the part of these poses that each is likely to exclude.
+        """
+        nearest = np.abs(moved[:, None] - self.steps).sum(axis=-1).argmin(axis=1)
+        weights = np.bincount(nearest, minlength=len(self.steps)) / max(1, len(moved))
+        return self._sorted(weights @ self.missed)
+
+    @property
+    def everywhere(self) -> tuple[np.ndarray, Float64Array]:
+        """The pixels that are likely to exclude all of the cell, and 1 for each."""
+        numbers, shares = self._sorted(self.missed.mean(axis=0))
+        return numbers[shares >= 1.0], shares[shares >= 1.0]
+
+    def _sorted(self, shares: Float64Array) -> tuple[np.ndarray, Float64Array]:
+        some = np.flatnonzero(shares > 0.0)
+        order = some[np.argsort(-4.0 * shares[some] - self.worth[some], kind="stable")][: self.most]
+        return self.numbers[order], shares[order]
 
 
 @dataclass(frozen=True)
 class TypicalCell:
-    """What bounds over parts of a cell lose.
+    """What bounds over a cell, or its motion cells, lose.
 
     Attributes:
         picture: [H, W, 3] in its middle.
-        motion: Image motion over a part, pixels.
+        width: Pixels by which bounds over it are wide.
         losses: By kind, [H, W, 3] by how much bounds go below, and above, what is rendered nearby. There are those of
             `CHANNELS` alone, or both.
     """
 
     picture: np.ndarray
-    motion: float
+    width: float
     losses: tuple[list[Float64Array], ...]
 
 
@@ -72,15 +98,17 @@ class TellingPixels:
 
     def __init__(self, photo: TiledPhoto, camera: PinholeCamera, typical: TypicalCell) -> None:
         self.photo, self.camera, self.side, self.typical = photo, camera, photo.counted.shape[1], typical
+        pairs = (photo.low, photo.high), photo.differences
+        self.ends = [[assemble(end, camera) for end in pair] for pair in pairs]
 
     def order(
-        self, tiles: np.ndarray, radius: int, motion: float, counted: np.ndarray, most_pixels: int, differences: bool
+        self, tiles: np.ndarray, radius: int, width: float, counted: np.ndarray, most_pixels: int, differences: bool
     ) -> PixelOrder:
         """The pixels to bound of a cell whose middle shows ``tiles``.
 
         Args:
             radius: Pixels that the picture moves by over half of the cell.
-            motion: Pixels that it moves by over one of its parts.
+            width: Pixels by which bounds over it are wide.
             counted: [T, side, side] pixels that may be chosen.
             most_pixels: So many at most.
             differences: Whether differences may be bounded.
@@ -88,83 +116,91 @@ class TellingPixels:
         picture = assemble(tiles, self.camera)[..., :3]
         kinds = range(len(self.typical.losses) if differences else 1)
         shift = best_shift(self.typical.picture.mean(axis=-1), picture.mean(axis=-1))
-        losses = [[in_tiles(shifted(loss, *shift), self.side) for loss in self.typical.losses[kind]] for kind in kinds]
-        scale = motion / self.typical.motion
-        misses = tuple(self._misses(picture, kind, radius, [scale * loss for loss in losses[kind]]) for kind in kinds)
-        likely = np.stack([miss.max(axis=-1) for miss in misses])
-        gaps = np.stack([self._misses(picture, kind, 1, [0.0, 0.0]).max(axis=-1) for kind in kinds])
-        loose = np.stack([(below + above).max(axis=-1) for below, above in losses])
-        # of those that are likely to exclude the tighter one
-        worth = np.where(likely > 0.0, likely - loose, -np.inf)
-        chosen = np.where((likely > 0.0).any(axis=0), worth.argmax(axis=0), gaps.argmax(axis=0))
-        gaps, likely, loose = (np.take_along_axis(part, chosen[None], axis=0)[0] for part in (gaps, likely, loose))
-        numbers, sure = telling_order(gaps, likely, loose, counted, most_pixels)
-        return PixelOrder(numbers, sure, chosen, misses)
+        scale = (width / self.typical.width) ** _POWER
+        losses = [[scale * shifted(loss, *shift) for loss in self.typical.losses[kind]] for kind in kinds]
+        misses = tuple(self._misses(picture, kind, losses[kind]) for kind in kinds)
+        steps = np.array([(x, y) for y in _steps(radius) for x in _steps(radius)])
+        everywhere = [self._moved_misses(picture, kind, steps, losses[kind]) for kind in kinds]
+        loose = [in_tiles((below + above).max(axis=-1), self.side)[counted] for below, above in losses]
+        missed = np.stack([part[:, counted] for part in everywhere])
+        worth = missed.min(axis=1) - np.stack(loose)
+        kinds_of = ((missed > 0.0).mean(axis=1) + 0.25 * worth).argmax(axis=0)
+        missed, worth = (
+            np.take_along_axis(part, index, axis=0)[0]
+            for part, index in ((missed, kinds_of[None, None]), (worth, kinds_of[None]))
+        )
+        chosen = np.zeros(counted.shape, np.int64)
+        chosen[counted] = kinds_of
+        return PixelOrder(steps, missed > 0.0, np.flatnonzero(counted), worth, most_pixels, chosen, misses)
 
-    def _misses(
-        self, picture: np.ndarray, kind: int, radius: int, losses: Sequence[Float64Array | float]
-    ) -> Float64Array:
-        """See `PixelOrder`: by what the picture shows within ``radius`` pixels, and what bounds lose."""
-        least, most = (in_tiles(end, self.side) for end in nearby(_values(picture, kind), radius))
-        low, high = self.photo.differences if kind == DIFFERENCES else (self.photo.low, self.photo.high)
-        return np.concatenate([least - losses[0] - high, low - most - losses[1]], axis=-1)
+    def _moved_misses(
+        self, picture: np.ndarray, kind: int, steps: np.ndarray, losses: Sequence[Float64Array]
+    ) -> np.ndarray:
+        """[m, T, side, side] by how much bounds are expected to miss the photo where the picture moved by ``steps``."""
+        least, most = nearby(_values(picture, kind), 1)
+        ends = least - losses[0], most + losses[1]
+        low, high = self.ends[kind]
+        misses = []
+        for column, row in steps.tolist():
+            below, above = (shifted(end, row, column) for end in ends)
+            misses.append(in_tiles(np.maximum(below - high, low - above).max(axis=-1), self.side))
+        return np.stack(misses)
+
+    def _misses(self, picture: np.ndarray, kind: int, losses: Sequence[Float64Array | float]) -> Float64Array:
+        """See `PixelOrder`: by what the picture shows next to each pixel, and what bounds lose."""
+        least, most = nearby(_values(picture, kind), 1)
+        low, high = self.ends[kind]
+        return in_tiles(np.concatenate([least - losses[0] - high, low - most - losses[1]], axis=-1), self.side)
 
 
 def typical_cell(
-    frame: Frame, cell: ParameterBox, counts: np.ndarray, motion: float, draw: Callable[[Float64Array], np.ndarray]
-) -> TypicalCell | None:
-    """What bounds over the parts of a cell lose; None: the frame has no bounds over parts of it.
+    frame: Frame, cell: ParameterBox, cells: MotionCells | None, width: float, picture: np.ndarray
+) -> TypicalCell:
+    """What bounds over the motion cells in the middle of a cell lose.
 
     Args:
-        counts: [d] parts along its axes; one part is the cell.
-        motion: Image motion over a part, pixels.
-        draw: The picture [H, W, 3] at parameters [d].
+        cells: Its motion cells; None: it is bounded as a whole.
+        width: Pixels by which bounds over it are wide.
+        picture: [H, W, 3] in its middle.
     """
-    camera, parts = frame.camera, int(counts.prod())
+    camera = frame.camera
     step = math.ceil(math.sqrt(camera.height * camera.width / _MOST_PIXELS))
     # of blocks whose orders are too many, few pixels are bounded whatever the order
     some, few = (_lattice((camera.height, camera.width), k * step) for k in (1, _FEWER))
     chosen, worked = in_tiles(some, frame.side), in_tiles(few, frame.side)
-    bounds = _bounds_over_parts(frame, cell, counts, chosen, worked)
-    if bounds is None:
-        return None
-    places = np.unique(np.linspace(0, parts - 1, min(parts, _MOST_PICTURES)).astype(np.int64))
-    middles = (2.0 * np.stack(np.unravel_index(places, counts), axis=-1) + 1.0) / counts - 1.0
-    pictures = [draw(cell.at(middle)) for middle in middles]
+    bounds = _bounds_in_the_middle(frame, cell, cells, chosen, worked)
     losses = []
     for kind, (lower, upper) in enumerate(bounds):
-        pairs = [
-            _losses(_values(picture, kind), motion, lower[..., k], upper[..., k], chosen, camera)
-            for k, picture in zip(places, pictures, strict=True)
-        ]
-        sides = [np.mean([pair[k] for pair in pairs], axis=0) for k in (0, 1)]
+        sides = _losses(_values(picture, kind), width, lower, upper, chosen, camera)
         sources = few & np.isfinite(sides[0]).all(axis=-1) & np.isfinite(sides[1]).all(axis=-1)
         losses.append([filled(side, sources, 2 * _FEWER * step, _ALL) for side in sides])
-    return TypicalCell(draw(cell.middle), motion, tuple(losses))
+    return TypicalCell(picture, width, tuple(losses))
 
 
-def _bounds_over_parts(
-    frame: Frame, cell: ParameterBox, counts: np.ndarray, pixels: np.ndarray, worked: np.ndarray
-) -> list[tuple[np.ndarray, np.ndarray]] | None:
-    """By kind, bounds [n, 3, k] of the ``n`` ``pixels`` over the parts of a cell, NaN where nothing is known.
+def _bounds_in_the_middle(
+    frame: Frame, cell: ParameterBox, cells: MotionCells | None, pixels: np.ndarray, worked: np.ndarray
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """By kind, bounds [n, 3] of the ``n`` ``pixels`` over the middle of a cell, NaN where nothing is known.
 
-    Those ``worked`` at are bounded whatever the order. None: the frame has no bounds over parts of the cell.
+    Those ``worked`` at are bounded whatever the order.
     """
     tiles = np.flatnonzero(pixels.any(axis=(1, 2)))
-    if counts.prod() == 1:
+    if cells is None:
         whole = frame.bound(cell, tiles, None)
-        return [(whole.lower[pixels[tiles]][..., None], whole.upper[pixels[tiles]][..., None])]
-    if not isinstance(frame, SubBoxFrame):
-        return None
+        return [(whole.lower[pixels[tiles]], whole.upper[pixels[tiles]])]
+    assert isinstance(frame, SubBoxFrame)
+    # those that meet in the middle
+    middle = np.zeros(cells.counts, bool)
+    middle[tuple(slice((n - 1) // 2, n // 2 + 1) for n in cells.counts.tolist())] = True
+    middle = middle.ravel()
     ends, bounds = np.repeat(worked[pixels][:, None], 6, axis=1), []
     for kind in (CHANNELS, DIFFERENCES):
-        pair = frame.sub_box_ends(cell, counts, tiles, pixels[tiles], ends, kind == DIFFERENCES)
-        if pair is None:
-            return None
-        lower, upper = pair
+        pair = frame.sub_box_ends(cell, cells, tiles, pixels[tiles], ends, kind == DIFFERENCES)
+        assert pair is not None
+        lower, upper = pair[0][..., middle].mean(axis=-1), pair[1][..., middle].mean(axis=-1)
         # what is known of no end would be known with more work
         vain = (lower <= 0.0) & (upper >= 1.0) | ~(np.isfinite(lower) & np.isfinite(upper))
-        nothing = np.logical_and.reduce(vain, axis=1)[:, None]
+        nothing = vain.all(axis=1)[:, None]
         bounds.append((np.where(nothing, np.nan, lower), np.where(nothing, np.nan, upper)))
     return bounds
 
@@ -196,19 +232,6 @@ def _values(picture: np.ndarray, kind: int) -> np.ndarray:
     return picture[..., FIRST_CHANNELS] - picture[..., SECOND_CHANNELS]
 
 
-def telling_order(
-    gaps: Float64Array, likely: Float64Array, loose: Float64Array, counted: np.ndarray, most_pixels: int
-) -> tuple[np.ndarray, int]:
-    """Numbers of the pixels to bound, at most ``most_pixels``, and how many of them are likely to exclude the cell.
-
-    Args:
-        gaps: [T, side, side] by how much the picture in the cell's middle misses the photo there.
-        likely: [T, side, side] by how much all bounds over the cell are expected to.
-        loose: [T, side, side] expected looseness of bounds: where they are loose they also take longer.
-    """
-    sure = counted & (likely > 0.0)
-    some = counted & (gaps > 0.0) & ~sure
-    first, rest = np.flatnonzero(sure), np.flatnonzero(some)
-    order = [first[np.argsort((loose - likely).reshape(-1)[first], kind="stable")]]
-    order.append(rest[np.argsort(-gaps.reshape(-1)[rest], kind="stable")])
-    return np.concatenate(order)[:most_pixels], first.size
+def _steps(radius: int) -> range:
+    """Pixels that a picture may move by along an axis, two apart."""
+    return range(1 - radius, radius, 2) if radius > 1 else range(1)

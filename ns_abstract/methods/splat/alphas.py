@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 from numba import njit
 
 from ns_abstract.arithmetic.elementary import exp_kernel, fma
-from ns_abstract.arithmetic.rounding import EXP_OF_PARTS, FRAGMENT_ROUNDING, TURN_DOWN, UP
+from ns_abstract.arithmetic.rounding import EXP_OF_PARTS, FRAGMENT_ROUNDING, MOTION_ROUNDING, TURN_DOWN, UP
 from ns_abstract.arithmetic.simd.intrinsics import signed
 from ns_abstract.arithmetic.simd.lanes import bits, load8, maximum, minimum, store, store_columns, where
 from ns_abstract.methods.splat.alpha_ranges import (
@@ -23,6 +23,7 @@ from ns_abstract.methods.splat.alpha_ranges import (
     fitted_exponential,
     thresholded,
 )
+from ns_abstract.methods.splat.lists import PIXELS
 from ns_abstract.methods.splat.pixel_block import (
     ALPHA_HIGH,
     ALPHA_LOW,
@@ -347,6 +348,34 @@ def _alphas_of_several(record, begin, n, given, block, limits, charges, antialia
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
+def _along_motion(rows, at, motion, r, size, inputs):
+    """Replace the slopes of y1 or y2 by those along the pixels' image motion (design.md, B16).
+
+    The slope by parameter k = 1 ... m - 1 stands in ``rows`` [., 8] at ``at`` + 16 k, and the sum of their sizes is
+    ``size``; those by the two axes of the motion, which stands at ``motion``, come to the first two places.
+
+    Returns:
+        The radius over a part, from the form's radius ``r``, and the size of the slopes before and after.
+    """
+    d, half = inputs.shape.dimensions, inputs.parts.half
+    first = 0.0 * size
+    second = first
+    for k in range(d):
+        slope = load8(rows, at + 16 * (k + 1))
+        first = fma(slope, load8(rows, motion + 8 * (2 * d + k)), first)
+        second = fma(slope, load8(rows, motion + 8 * (3 * d + k)), second)
+    rest = r
+    for k in range(d):
+        along = fma(first, load8(rows, motion + 8 * k), second * load8(rows, motion + 8 * (d + k)))
+        rest = rest + abs(load8(rows, at + 16 * (k + 1)) - along)
+    store(rows, at + 16, first)
+    store(rows, at + 32, second)
+    first, second = abs(first), abs(second)
+    size = size + first + second
+    return fma(half[0], first, fma(half[1], second, fma(MOTION_ROUNDING, size, rest))), size
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
 def _alphas_over_parts(record, begin, n, given, block, limits, inputs):
     """`alphas` where pixels are bounded over parts of the cell: bounds over all of it, exponents (design.md, B12)."""
     batch, rows, fragments = block.batch, block.batch.rows, block.fragments
@@ -368,19 +397,28 @@ def _alphas_over_parts(record, begin, n, given, block, limits, inputs):
         c1, c2, l1, l2, r1, r2 = _whitened(record, forms, ax, ay, rows, 8 * EXPONENT, m)
         store(rows, 8 * EXPONENT, c1)
         store(rows, 8 * EXPONENT + 8, c2)
-        slope, e1, e2 = 0.0 * ax, r1, r2
+        slope, e1, e2, s1, s2 = 0.0 * ax, r1, r2, l1, l2
         for k in range(1, m):
             at = 8 * EXPONENT + 16 * k
             g1, g2 = load8(rows, at), load8(rows, at + 8)
             slope = slope + abs(fma(c1, g1, c2 * g2))
-            e1 = fma(half[k - 1], abs(g1), e1)
-            e2 = fma(half[k - 1], abs(g2), e2)
+            if not inputs.shape.by_motion:
+                e1 = fma(half[k - 1], abs(g1), e1)
+                e2 = fma(half[k - 1], abs(g2), e2)
+        if inputs.shape.by_motion:
+            motion = 8 * fragments.width
+            for lane in range(8):
+                pixel = int(batch.pixels[begin + min(q + lane, n - 1)])
+                for k in range(4 * (m - 1)):
+                    rows[motion + 8 * k + lane] = block.motion[k * PIXELS + pixel]
+            e1, s1 = _along_motion(rows, 8 * EXPONENT, motion, r1, l1, inputs)
+            e2, s2 = _along_motion(rows, 8 * EXPONENT + 8, motion, r2, l2, inputs)
         c1 = abs(c1)
         c2 = abs(c2)
         # float evaluation moves the exponent by kappa, and a part's centre is rounded
         off = kappa + FRAGMENT_ROUNDING
-        store(rows, ends, fma(off, c1 + l1 + r1, e1) * UP)
-        store(rows, ends + 8, fma(off, c2 + l2 + r2, e2) * UP)
+        store(rows, ends, fma(off, c1 + s1 + r1, e1) * UP)
+        store(rows, ends + 8, fma(off, c2 + s2 + r2, e2) * UP)
         # over the whole cell
         s0 = 0.5 * (c1 * c1 + c2 * c2)
         radius = fma(c1, r1, fma(c2, r2, fma(FRAGMENT_ROUNDING, fma(c1, l1 + r1, fma(c2, l2 + r2, s0)), slope)))

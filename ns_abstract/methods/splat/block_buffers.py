@@ -53,6 +53,7 @@ class Buffers(NamedTuple):
     part_ends: np.ndarray
     sums: np.ndarray
     ray: np.ndarray
+    motion: np.ndarray
     positions: np.ndarray
     depths: np.ndarray
     palette: np.ndarray
@@ -103,7 +104,7 @@ def new_buffers(shape, forms, pair_limit, background):
         offsets=np.zeros((2, BATCH * PIXELS + 8)),
         pixels=np.empty(BATCH * PIXELS, np.uint8),
         batch=np.empty((2, BATCH + 1), np.int64),
-        rows=np.zeros((width + 2 * m, 8)),
+        rows=np.zeros((width + max(2 * m, 4 * shape.dimensions), 8)),
         lengths=np.empty(PIXELS, np.uint32),
         background=behind,
         nothing=np.zeros(4),
@@ -111,6 +112,7 @@ def new_buffers(shape, forms, pair_limit, background):
         part_ends=_part_ends(shape, _CAPACITY),
         sums=np.zeros(4 * (3 * m + 5 + bends_of(shape))),
         ray=np.empty(3),
+        motion=np.zeros(4 * shape.dimensions * PIXELS),
         positions=np.empty((7, _POSITIONS), np.int64),
         depths=np.empty((2, _POSITIONS)),
         palette=np.zeros(_POSITIONS * color_size(forms)),
@@ -163,6 +165,7 @@ def resized(old, positions, capacity, shape, forms):
         part_ends=part_ends,
         sums=old.sums,
         ray=old.ray,
+        motion=old.motion,
         positions=places,
         depths=depths,
         palette=palette,
@@ -239,4 +242,5 @@ def block_of(buffers, shape, forms):
         pointer(buffers.part_ends),
         pointer(buffers.sums),
         pointer(buffers.ray),
+        pointer(buffers.motion),
     )

@@ -27,6 +27,7 @@ from ns_abstract.arithmetic.rounding import (
 )
 from ns_abstract.execution.threads import lane, threads
 from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.motion_cells import MotionCells
 from ns_abstract.geometry.poses import PoseForms
 from ns_abstract.geometry.tiles import tile_grid
 from ns_abstract.methods.splat.activate import Splats
@@ -164,9 +165,11 @@ class SceneSums:
 
 
 def _divided(
-    basis: Basis, parts: np.ndarray | None, keep_parts: bool, sub_boxes: SubBoxes | None
+    basis: Basis, parts: np.ndarray | MotionCells | None, keep_parts: bool, sub_boxes: SubBoxes | None
 ) -> tuple[FormShape, Parts]:
     """The forms of a cell, and its equal parts or sub-boxes, if it is to be divided; see `SplatBounds.cell`."""
+    if isinstance(parts, MotionCells):
+        return divided_by(basis, parts)
     counts = parts if sub_boxes is None else sub_boxes.counts
     if counts is None:
         return form_shape(basis), cell_parts(np.ones(basis.dimensions, np.int64))
@@ -174,6 +177,16 @@ def _divided(
     if sub_boxes is None:
         return form_shape(basis, int(counts.prod())), cell_parts(counts, SUB_BOX_OVERLAP * keep_parts)
     return form_shape(basis, 0, int(counts.prod())), cell_parts(counts, SUB_BOX_OVERLAP, sub_boxes.levels)
+
+
+def divided_by(basis: Basis, parts: np.ndarray | MotionCells) -> tuple[FormShape, Parts]:
+    """The forms of a cell that has parts over which bounds are kept, and these parts."""
+    if isinstance(parts, MotionCells):
+        check_parts(parts.counts, 2)
+        shape = form_shape(basis, int(parts.counts.prod()), by_motion=True)
+        return shape, cell_parts(parts.counts, SUB_BOX_OVERLAP)._replace(motion=parts.motion, side=parts.side)
+    check_parts(parts, basis.dimensions)
+    return form_shape(basis, int(parts.prod())), cell_parts(parts, SUB_BOX_OVERLAP)
 
 
 def _cell_poses(forms: PoseForms) -> CellPoses:
@@ -247,7 +260,7 @@ class SplatBounds:
         floor: float = -1.0,
         layers: bool = False,
         pixels: np.ndarray | None = None,
-        parts: np.ndarray | None = None,
+        parts: np.ndarray | MotionCells | None = None,
         keep_parts: bool = False,
         sub_boxes: SubBoxes | None = None,
     ) -> CellBounds:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -15,18 +14,19 @@ from ns_abstract.arithmetic.rounding import LINEAR_ROUNDING, LINEAR_UP, Arithmet
 from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.execution.threads import each
 from ns_abstract.geometry.box import ParameterBox, shared_out
+from ns_abstract.geometry.motion_cells import MotionCells
 from ns_abstract.geometry.poses import PoseBox, translation_only
 from ns_abstract.geometry.tiles import laid_out, tile_grid
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.bounds import SceneSums, Stages
 from ns_abstract.methods.splat.constants import Rasteriser
 from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW, DEPTH_HIGH, DEPTH_LOW
+from ns_abstract.methods.splat.image_motion import ImageMotion
 from ns_abstract.methods.splat.lists import summed_area, touching
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.stage_data import SubBoxes
 from ns_abstract.methods.splat.sub_box_bounds import SubBoxBounds, difference_ends, part_ends
 from ns_abstract.methods.splat.variations import VariedSplats
-from ns_abstract.perturbation.specification import ROTATIONS
 from ns_abstract.refine.protocol import COLORS, Bounds, Frame, LinearSets, Score, SharedOrder
 
 if TYPE_CHECKING:
@@ -37,13 +37,6 @@ if TYPE_CHECKING:
 class FrameTuning:
     """Preferences of splats' frames. None of them decides whether a bound holds."""
 
-    #: Gaussians and poses looked at to estimate how far the picture moves.
-    motion_gaussians: int = 2000
-    motion_poses: int = 9
-    #: Step of the difference quotient, as a part of the parameter's range.
-    motion_step: float = 2.0**-10
-    #: A compensation by less than this part of a rotation's range is left out.
-    shear_matters: float = 2.0**-7
     #: Light that is not followed further: the part of the excess that may be allowed, and at most, and no less than
     #: so many times the rasteriser's stop.
     floor_share: float = 0.2
@@ -187,9 +180,11 @@ class SplatFrame(Frame):
         self._stop = rasteriser.transmittance_min
         self._floor = -1.0
         self.across, self.down = tile_grid(self.camera, self.side)
-        if sheared and (shear := self._shear()):
+        self._image_motion = ImageMotion(pose_set, splats.means, self.renderer)
+        if sheared and (shear := self._image_motion.shear()):
             self.pose_set = pose_set.sheared(shear)
             self.box = self.pose_set.box
+            self._image_motion = ImageMotion(self.pose_set, splats.means, self.renderer)
 
     def warm_up(self, stage: str | None = None) -> None:
         """Compile the kernels that this frame needs, or those of one of `stages`."""
@@ -290,7 +285,7 @@ class SplatFrame(Frame):
         return each(lambda box: self._bound(box, tiles, within, candidates, keep_linear, pixels), boxes)
 
     def sub_box_ends(
-        self, box: ParameterBox, counts: np.ndarray, tiles: np.ndarray, pixels: np.ndarray,
+        self, box: ParameterBox, counts: np.ndarray | MotionCells, tiles: np.ndarray, pixels: np.ndarray,
         ends: np.ndarray | None = None, differences: bool = False,
     ) -> tuple[np.ndarray, np.ndarray] | None:  # fmt: skip
         """See `ns_abstract.refine.protocol.SubBoxFrame` (design.md, U5, B14, B15)."""
@@ -304,6 +299,23 @@ class SplatFrame(Frame):
         projected, scale = self.bounds.projected_differences(self.camera, forms, box)
         parts = self.bounds.sub_boxes(self.camera, forms, projected, tiles, pixels, counts, ends)
         return difference_ends(parts, pixels, scale)
+
+    def motion_cells(self, box: ParameterBox, counts: np.ndarray) -> MotionCells | None:
+        """See `ns_abstract.refine.protocol.SubBoxFrame` (design.md, B16)."""
+        motion = self._image_motion
+        return None if box.dimensions < 2 else MotionCells.of(motion.of_squares(box), motion.side, counts)
+
+    def parallax(self, box: ParameterBox) -> np.ndarray:
+        """See `ns_abstract.refine.protocol.SubBoxFrame`."""
+        return self._image_motion.parallax(box)
+
+    def motion(self, box: ParameterBox) -> np.ndarray:
+        """[d] pixels that typical Gaussians move by over each parameter's range (an estimate)."""
+        return self._image_motion.typical(box)
+
+    def depths(self) -> np.ndarray:
+        """[n] depths of typical Gaussians that lie in the picture of the middle pose."""
+        return self._image_motion.depths()
 
     def _bound(
         self, box: ParameterBox, tiles: np.ndarray, within: VisibleContext | None, candidates: np.ndarray | None,
@@ -373,83 +385,6 @@ class SplatFrame(Frame):
         chosen[tiles] = True if pixels is None else pixels
         table = summed_area(laid_out(chosen, self.across))
         return within.visible[touching(np.arange(within.visible.size), within.reach, table)]
-
-    def _shear(self) -> dict[str, dict[str, float]]:
-        """For each rotation, how much of it undoes what one unit of another parameter moves typical Gaussians by."""
-        box, middle = self.box, self.box.middle
-        names = [name for name in ROTATIONS if name in box.names]
-        others = [name for name in box.names if name not in ROTATIONS]
-        means, width = self._typical_means(), np.array(box.upper) - np.array(box.lower)
-        here, visible = self._seen(middle, means)
-        if not names or not others or not visible.any():
-            return {}
-
-        def moved(name: str) -> np.ndarray:
-            step = np.zeros(box.dimensions)
-            step[box.names.index(name)] = _TUNING.motion_step * width[box.names.index(name)]
-            return ((self._project(middle + step, means)[0] - here)[visible] / step.sum()).ravel()
-
-        turns, shifts = (np.stack([moved(name) for name in group], axis=1) for group in (names, others))
-        factors = -np.linalg.lstsq(turns, shifts, rcond=None)[0]
-        shears: dict[str, dict[str, float]] = {}
-        # few bits: the last ones depend on the library's threads, results must not
-        mantissa, exponent = np.frexp(factors)
-        factors = np.ldexp(np.round(mantissa * 256.0), exponent - 8)
-        for name, row in zip(names, factors.tolist(), strict=True):
-            least = _TUNING.shear_matters * width[box.names.index(name)]
-            useful = {
-                other: factor
-                for other, factor in zip(others, row, strict=True)
-                if math.isfinite(factor) and abs(factor) * width[box.names.index(other)] > least
-            }
-            if useful:
-                shears[name] = useful
-        return shears
-
-    def _typical_means(self) -> np.ndarray:
-        means = self.bounds.splats.means
-        if means.shape[0] > _TUNING.motion_gaussians:
-            means = means[np.random.default_rng(0).choice(means.shape[0], _TUNING.motion_gaussians, replace=False)]
-        return means
-
-    def _seen(self, values: np.ndarray, means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Pixels [n, 2] of ``means`` and which of them [n] lie in the picture."""
-        here, z = self._project(values, means)
-        size = self.camera.width, self.camera.height
-        return here, (z > 0.01) & (here > 0).all(axis=1) & (here < size).all(axis=1)
-
-    def motion(self, box: ParameterBox) -> np.ndarray:
-        """[d] pixels that typical Gaussians move by over each parameter's range (an estimate)."""
-        d, means = box.dimensions, self._typical_means()
-        low, high = np.array(box.lower), np.array(box.upper)
-        total = np.zeros(d)
-        for values in (box.middle, *box.sample(_TUNING.motion_poses - 1, np.random.default_rng(0))):
-            here, visible = self._seen(values, means)
-            if not visible.any():
-                continue
-            for k in range(d):
-                step = np.zeros(d)
-                step[k] = (high[k] - low[k]) * _TUNING.motion_step
-                there, _ = self._project(values + step, means)
-                moved = np.linalg.norm(there[visible] - here[visible], axis=1) / _TUNING.motion_step
-                total[k] = max(total[k], float(np.quantile(moved, 0.75)))
-        return total
-
-    def depths(self) -> np.ndarray:
-        """[n] depths of typical Gaussians that lie in the picture of the middle pose."""
-        means = self._typical_means()
-        _, visible = self._seen(self.box.middle, means)
-        return self._project(self.box.middle, means)[1][visible]
-
-    def _project(self, values: np.ndarray, means: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        # as the parameters go on: taken back into the set, a shift would come without the turn that undoes it
-        rotation, position = self.pose_set.world_to_camera(values, beyond=True)
-        x, y, z = rotation @ (means - position).T
-        with np.errstate(all="ignore"):
-            pixels = np.stack(
-                [self.camera.fx * x / z + self.camera.cx, self.camera.fy * y / z + self.camera.cy], axis=1
-            )
-        return np.where(np.isfinite(pixels), pixels, 0.0), z
 
 
 def linear_sets(forms: np.ndarray, lower: np.ndarray, upper: np.ndarray, d: int) -> LinearSets:

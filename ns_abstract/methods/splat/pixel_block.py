@@ -204,6 +204,7 @@ class PixelBlock(NamedTuple):
             least of three channels and the most in each part or sub-box, [6, parts]; then scratch for a list's alphas.
         sums: [3 m + bends + 5, 4] scratch by channel: polynomials, then what `blend` and `depths` need beside them.
         ray: [3] the block's central ray at the cell's middle, world axes, of unit depth.
+        motion: [4, d, PIXELS] the pixels' `MotionCells.motion`, where parts are those of the image motion.
     """
 
     fragments: Fragments
@@ -216,6 +217,22 @@ class PixelBlock(NamedTuple):
     part_ends: np.ndarray
     sums: np.ndarray
     ray: np.ndarray
+    motion: np.ndarray
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def take_motion(place, inputs, block):
+    """Set the motion of the pixels at ``place``, where parts are those of the image motion (design.md, B16)."""
+    if not inputs.shape.by_motion:
+        return
+    width, height, numbers = int(inputs.intrinsics.width), int(inputs.intrinsics.height), 4 * inputs.shape.dimensions
+    side = inputs.parts.side
+    across = (width + side - 1) // side
+    for q in range(PIXELS):
+        # no pixel beyond the picture is wanted
+        column, row = min(place.x0 + q % BLOCK, width - 1), min(place.y0 + q // BLOCK, height - 1)
+        for k in range(numbers):
+            block.motion[k * PIXELS + q] = inputs.parts.motion[numbers * (row // side * across + column // side) + k]
 
 
 @njit(cache=True, error_model="numpy")

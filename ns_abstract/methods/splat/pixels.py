@@ -17,7 +17,7 @@ from ns_abstract.methods.splat.block_buffers import block_of, new_buffers, resiz
 from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW, DEPTH_HIGH, DEPTH_LOW, shade_layers
 from ns_abstract.methods.splat.fragments import GIVE_UP, GROW, apply_stops, collect_fragments, number_groups
 from ns_abstract.methods.splat.lists import BLOCK, TileLists, block_lists, longest_first
-from ns_abstract.methods.splat.pixel_block import block_place, longest_list
+from ns_abstract.methods.splat.pixel_block import block_place, longest_list, take_motion
 from ns_abstract.methods.splat.reordering import swap_bounds
 from ns_abstract.methods.splat.stage_data import (
     Colors,
@@ -74,6 +74,7 @@ def _bound_block(numbers, place, inputs, block, bounds):
     _set_trivial(signed(~place.wanted), left, above, bounds, m)
     if place.wanted == 0:
         return True
+    take_motion(place, inputs, block)
     u = (place.x0 + 0.5 * BLOCK - camera.cx) / camera.fx
     v = (place.y0 + 0.5 * BLOCK - camera.cy) / camera.fy
     for k in range(3):
@@ -114,7 +115,14 @@ def borrowed_inputs(inputs):
     colors = Colors(
         borrowed(colors.values), borrowed(colors.background), colors.error, colors.channels, borrowed(colors.common)
     )
-    parts = Parts(pointer(parts.middles), pointer(parts.half), pointer(parts.slope), borrowed(parts.levels))
+    parts = Parts(
+        pointer(parts.middles),
+        pointer(parts.half),
+        pointer(parts.slope),
+        borrowed(parts.levels),
+        pointer(parts.motion),
+        parts.side,
+    )
     return PixelInputs(
         gaussians, axes, inputs.intrinsics, colors, inputs.rules, inputs.charges, inputs.cutoffs, inputs.shape, parts
     )

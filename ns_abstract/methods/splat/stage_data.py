@@ -25,7 +25,8 @@ class FormShape(NamedTuple):
     """The forms of a cell, as `Basis` tells: ``order`` 2 for one parameter, else 1.
 
     Pixels have no forms where the cell has ``parts``, over which intervals bound them (B12). Their forms are bounded
-    over each of its ``sub_boxes``, too, where it has some (B13).
+    over each of its ``sub_boxes``, too, where it has some (B13). Parts divide ``part_axes`` axes: those of the
+    parameters, or ``by_motion`` the two of the image motion at a block (B16).
     """
 
     dimensions: int
@@ -33,15 +34,18 @@ class FormShape(NamedTuple):
     monomials: int
     parts: int = 0
     sub_boxes: int = 0
+    part_axes: int = 0
+    by_motion: bool = False
 
 
-def form_shape(basis: Basis, parts: int = 0, sub_boxes: int = 0) -> FormShape:
+def form_shape(basis: Basis, parts: int = 0, sub_boxes: int = 0, by_motion: bool = False) -> FormShape:
     """``basis`` as kernels take it. Raises ValueError: curvature is kept for one parameter only."""
     if basis.order == 2 and basis.dimensions != 1:
         raise ValueError(f"forms of order 2 have one parameter, not {basis.dimensions}")
     if basis.order == 2 and parts:
         raise ValueError("cells of one parameter have no parts")
-    return FormShape(basis.dimensions, basis.order, basis.monomials, parts, sub_boxes)
+    axes = 2 if by_motion else basis.dimensions
+    return FormShape(basis.dimensions, basis.order, basis.monomials, parts, sub_boxes, axes, by_motion)
 
 
 class SceneGaussians(NamedTuple):
@@ -219,20 +223,23 @@ class SubBoxes(NamedTuple):
 
 
 class Parts(NamedTuple):
-    """Equal parts of a cell, at places and of widths in [-1, 1] (design.md, B12, B13).
+    """Equal parts of a cell, at places and of widths in [-1, 1] (design.md, B12, B13, B16).
 
     Attributes:
-        middles: [d, parts].
-        half: [d] half-widths.
-        slope: [d] turns the sum of ``middles`` times the ends of a quantity over the parts into its slope; 0 where an
-            axis is not divided.
+        middles: [axes, parts].
+        half: [axes] half-widths.
+        slope: [axes] turns the sum of ``middles`` times the ends of a quantity over the parts into its slope; 0 where
+            an axis is not divided.
         levels: See `SubBoxes`.
+        motion, side: See `MotionCells`; [0, 4, d]: axes are those of the parameters.
     """
 
     middles: np.ndarray
     half: np.ndarray
     slope: np.ndarray
     levels: np.ndarray
+    motion: np.ndarray
+    side: int
 
 
 def check_parts(counts: np.ndarray, dimensions: int) -> None:
@@ -247,7 +254,7 @@ def check_parts(counts: np.ndarray, dimensions: int) -> None:
 
 
 def cell_parts(counts: np.ndarray, overlap: float = 0.0, levels: Sequence[float] = ()) -> Parts:
-    """The parts of a cell, ``counts`` [d] of them along its axes: powers of two, so that all is exact (B12).
+    """The parts of a cell, ``counts`` [axes] of them along its axes: powers of two, so that all is exact (B12).
 
     They reach beyond their ends by ``overlap`` of the cell's half-width.
     """
@@ -256,7 +263,8 @@ def cell_parts(counts: np.ndarray, overlap: float = 0.0, levels: Sequence[float]
     middles = np.ascontiguousarray(grid.reshape(counts.size, counts.prod()))
     squares = np.square(middles).sum(axis=1)
     slope = np.where(counts > 1, 0.5 / np.where(counts > 1, squares, 1.0), 0.0)
-    return Parts(middles, 1.0 / counts + overlap, slope, np.array(levels, np.float64))
+    none = np.zeros((0, 4, counts.size))
+    return Parts(middles, 1.0 / counts + overlap, slope, np.array(levels, np.float64), none, 1)
 
 
 class Strips(NamedTuple):

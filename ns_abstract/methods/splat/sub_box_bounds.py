@@ -6,13 +6,14 @@ from typing import Any
 
 import numpy as np
 
-from ns_abstract.arithmetic.rounding import CHANNEL_DIFFERENCE_ROUNDING, SUB_BOX_OVERLAP, UP
+from ns_abstract.arithmetic.rounding import CHANNEL_DIFFERENCE_ROUNDING, UP
 from ns_abstract.execution.threads import lane, threads
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.geometry.motion_cells import MotionCells
 from ns_abstract.geometry.poses import PoseForms
 from ns_abstract.geometry.tiles import laid_out, tile_grid
-from ns_abstract.methods.splat.bounds import SplatBounds
+from ns_abstract.methods.splat.bounds import SplatBounds, divided_by
 from ns_abstract.methods.splat.lists import TileLists, pixel_sets, summed_area, tile_lists, tile_mask, touching
 from ns_abstract.methods.splat.stage_data import (
     CellPoses,
@@ -22,8 +23,6 @@ from ns_abstract.methods.splat.stage_data import (
     PixelInputs,
     ProjectedCell,
     ProjectedGaussians,
-    cell_parts,
-    form_shape,
     strips_of,
 )
 from ns_abstract.methods.splat.unordered_pixels import unordered_stage
@@ -70,7 +69,7 @@ class SubBoxBounds(SplatBounds):
 
     def sub_boxes(
         self, camera: PinholeCamera, forms: PoseForms, projected: ProjectedCell, wanted: np.ndarray,
-        pixels: np.ndarray, counts: np.ndarray, ends: np.ndarray | None = None,
+        pixels: np.ndarray, counts: np.ndarray | MotionCells, ends: np.ndarray | None = None,
     ) -> np.ndarray:  # fmt: skip
         """Bounds [t, side, side, 6, k] of ``pixels`` of the tiles ``wanted`` over sub-boxes (design.md, B12, B14).
 
@@ -80,7 +79,8 @@ class SubBoxBounds(SplatBounds):
         Args:
             camera, forms, wanted, pixels: As of `cell`.
             projected: What `project` returns of the cell.
-            counts: [d] sub-boxes along the cell's axes, powers of two, at least `PART_LANES` together.
+            counts: [d] sub-boxes along the cell's axes, powers of two, at least `PART_LANES` together; or cells of the
+                image motion in their place.
             ends: [n, 6] which ends of the ``n`` pixels are bounded whatever the order where too many orders are
                 uncertain; None: none.
         """
@@ -94,19 +94,19 @@ class SubBoxBounds(SplatBounds):
 
     def unordered(
         self, camera: PinholeCamera, forms: PoseForms, projected: ProjectedCell, wanted: np.ndarray,
-        pixels: np.ndarray, counts: np.ndarray, ends: np.ndarray, out: np.ndarray,
+        pixels: np.ndarray, counts: np.ndarray | MotionCells, ends: np.ndarray, out: np.ndarray,
     ) -> None:  # fmt: skip
         """Write those ``ends`` [n, 6] of the ``n`` pixels to ``out`` that hold in every depth order (design.md, B14).
 
         Other arguments are those of `sub_boxes`.
         """
         across, down = tile_grid(camera, self.side)
-        shape = form_shape(forms.rotation.basis, int(counts.prod()))
+        shape, parts = divided_by(forms.rotation.basis, counts)
         _, poses, gaussians, alive, colors, background, color_error = projected
         inputs = PixelInputs(
             gaussians, self._viewing_axes(forms, poses.rotation_magnitude, gaussians), camera.intrinsics,
             Colors(colors, background, color_error, 3, np.zeros(shape.monomials + 1)),
-            self.rules, self.charges, self._cutoffs(-1.0, 1), shape, cell_parts(counts, SUB_BOX_OVERLAP),
+            self.rules, self.charges, self._cutoffs(-1.0, 1), shape, parts,
         )  # fmt: skip
         chosen = np.zeros((across * down, self.side, self.side), bool)
         chosen[wanted] = pixels

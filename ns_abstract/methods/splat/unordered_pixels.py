@@ -21,7 +21,14 @@ from ns_abstract.methods.splat.depth_pairs import block_list
 from ns_abstract.methods.splat.fragments import find_alphas, place_batch
 from ns_abstract.methods.splat.intervals import blend_least, blend_most, part_alphas, thresholds_of
 from ns_abstract.methods.splat.lists import BLOCK, PIXELS, TileLists, block_lists, longest_first
-from ns_abstract.methods.splat.pixel_block import BATCH, EXPONENT, block_place, exponent_ends, exponent_limit
+from ns_abstract.methods.splat.pixel_block import (
+    BATCH,
+    EXPONENT,
+    block_place,
+    exponent_ends,
+    exponent_limit,
+    take_motion,
+)
 from ns_abstract.methods.splat.pixels import borrowed_inputs
 from ns_abstract.methods.splat.stage_data import PART_LANES, ColorEnd, PixelInputs, Strips
 from ns_abstract.methods.splat.work_sharing import run_by_tiles
@@ -98,10 +105,10 @@ def _start(wanted, background, sums):
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _strips_met(values, at, strips, inputs):
     """The set of strips in which the fragment at ``at`` may reach the threshold (design.md, B4, B12, B14)."""
-    d = inputs.shape.dimensions
+    axes = inputs.shape.part_axes
     ends = at + exponent_ends(inputs.shape.monomials)
     e1, e2, e = values[ends], values[ends + 1], at + EXPONENT
-    for k in range(d):
+    for k in range(axes):
         e += 2
         e1 += strips.half[k] * abs(values[e])
         e2 += strips.half[k] * abs(values[e + 1])
@@ -112,7 +119,7 @@ def _strips_met(values, at, strips, inputs):
         e = at + EXPONENT
         zero = 0.0 * load8(strips.middles, strip)
         y1, y2 = zero + values[e], zero + values[e + 1]
-        for k in range(d):
+        for k in range(axes):
             e += 2
             middle = load8(strips.middles, room * k + strip)
             y1 = fma(middle, values[e], y1)
@@ -194,6 +201,7 @@ def _add_batch(start, some, live, front, listed, place, thresholds, inputs, bloc
 @njit(cache=True, error_model="numpy")
 def _bound_block(numbers, place, inputs, block, strips, color_end, out, sums):
     """Write one end of the pixels of a block over each sub-box (design.md, B14)."""
+    take_motion(place, inputs, block)
     listed = block_list(numbers, place, inputs)
     thresholds = thresholds_of(inputs)
     background, sign, length = inputs.colors.background[color_end.channel], color_end.sign, listed.length

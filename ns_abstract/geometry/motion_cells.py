@@ -1,0 +1,50 @@
+"""Cells of the image motion at each square of some pixels of a picture (docs/dev/design.md, B16)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ns_abstract.arithmetic.rounding import MOTION_SCALE
+from ns_abstract.geometry.box import Float64Array
+
+
+@dataclass(frozen=True, eq=False)
+class MotionCells:
+    """Equal cells of the image motion at each square of some pixels of a picture.
+
+    At a square the motion is ``q = A p``, in [-1, 1]^2, of the parameters p in [-1, 1]^d of a cell of poses.
+
+    Attributes:
+        counts: [2] numbers of cells along the axes, powers of two, at least 8 together.
+        motion: [squares, 4, d] the rows of A, the sizes of whose entries add up to at most 1, and then those of its
+            transposed pseudo-inverse; squares row by row.
+        side: Pixels across a square.
+        typical: [2, d] columns and rows that the picture moves by for each parameter (an estimate).
+    """
+
+    counts: np.ndarray
+    motion: Float64Array
+    side: int
+    typical: Float64Array
+
+    @classmethod
+    def of(cls, pixels: Float64Array, side: int, counts: np.ndarray) -> MotionCells:
+        """Those of squares that move by ``pixels`` [squares, 2, d] for each parameter."""
+        size = np.abs(pixels).sum(axis=-1, keepdims=True)
+        rows = MOTION_SCALE * pixels / np.where(size > 0.0, size, 1.0)
+        motion = np.ascontiguousarray(np.concatenate([rows, _inverse(rows)], axis=1))
+        return cls(counts, motion, side, pixels.mean(axis=0))
+
+
+def square_numbers(columns: np.ndarray, rows: np.ndarray, width: int, side: int) -> np.ndarray:
+    """Numbers of the squares of ``side`` pixels that pixels lie in, row by row, in a picture of so many columns."""
+    return rows // side * -(-width // side) + columns // side
+
+
+def _inverse(rows: Float64Array) -> Float64Array:
+    """Transposed pseudo-inverses [n, 2, d] of matrices ``rows`` [n, 2, d], regularised where these have rank 1."""
+    products = rows @ rows.swapaxes(1, 2)
+    trace = np.trace(products, axis1=1, axis2=2)[:, None, None]
+    return np.linalg.solve(products + (1e-6 * trace + (trace == 0.0)) * np.eye(2), rows)
