@@ -231,6 +231,16 @@ def test_depth_swap(order):
     case.check(order, parts=3)
 
 
+def test_motion_cells_hold_every_map():
+    """Three layers of small blobs that move by pixels, over motion cells of maps at random (B16)."""
+    generator = np.random.default_rng(3)
+    layers = [
+        {"mean": tuple(place), "scale": 0.15, "opacity": 0.8, "color": tuple(generator.uniform(size=3))}
+        for place in generator.uniform((-1.5, -1.5, -6.0), (1.5, 1.5, -4.0), (40, 3))
+    ]
+    Case(scene(*layers), moves(x=0.1, yaw=0.03, pitch=0.02, roll=0.05)).check(1, parts=1, count=40)
+
+
 @both_orders
 def test_order_of_layers_that_differ_in_one_channel(order):
     """Layers of one colour keep no order, and two that share a channel are not of one colour (O5)."""

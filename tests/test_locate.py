@@ -359,30 +359,25 @@ def test_known_outliers_exclude_a_cell_without_bounds(blobs: Inputs) -> None:
     assert not any(leaf.verdict == "certified" for leaf in findings.leaves)
 
 
-@pytest.mark.parametrize(
-    ("shifts", "turns", "counts"),
-    [("xy", (), [8, 8]), ("xy", ("yaw",), [8, 8]), ("xyz", ("yaw",), [4, 4, 2, 2]),
-     ("xyz", ("yaw", "pitch", "roll"), [2] * 6)],
-)  # fmt: skip
-def test_sub_boxes_are_shared_out_among_many_parameters(
-    shifts: str, turns: tuple[str, ...], counts: list[int], blobs: Inputs
-) -> None:
-    """Where a set has few, the two that move the picture most have all of them."""
+@pytest.mark.parametrize(("shifts", "turns"), [("xy", ()), ("xy", ("yaw",)), ("xyz", ("yaw", "pitch", "roll"))])
+def test_sub_boxes_are_shared_out_by_motion(shifts: str, turns: tuple[str, ...], blobs: Inputs) -> None:
     camera = nsa.load_camera_path(blobs.path).cameras[0]
     poses = nsa.PoseSet(camera, translation=dict.fromkeys(shifts, 0.05), rotation=dict.fromkeys(turns, 0.05))
     scene = nsa.load_scene(blobs.config)
     location = Location(Job(scene, [poses.of(scene)]), np.zeros((32, 32, 3), np.uint8), None, PhotoOptions())
     search = location.search(0)
-    moved = search.moved(search.frame.box)
-    along = search.along[np.argsort(-moved, kind="stable")]
-    assert along.tolist() == counts + [1] * (len(moved) - len(counts))
+    box = search.frame.box
+    counts, moved = search.along(box), search.moved(box)
+    # parts of all axes move the picture by about as much
+    assert counts.prod() == search.tuning.sub_boxes and (counts & (counts - 1) == 0).all()
+    assert (moved / counts).max() <= 2.0 * np.where(counts > 1, moved / counts, np.inf).min() + 1e-9
     # a set that is too wide for bounds begins with parts that tile it
     first = search.first_cells()
-    assert (len(first) > 1) == bool(np.linalg.norm(moved / search.along) > search.tuning.coarse)
+    assert (len(first) > 1) == (search.width(box) > search.tuning.coarse)
     assert sum(cell.volume for cell in first) == search.grid.volume
     # without contraction cells are bounded as a whole
     whole = Location(location.job, location.photo.levels, None, PhotoOptions(contract=False)).search(0)
-    assert (whole.along == 1).all()
+    assert whole.motion_cells(box) is None and search.motion_cells(box) is not None
 
 
 @pytest.mark.slow_cases(every=4)

@@ -10,7 +10,6 @@ from ns_abstract.verify.cell_boxes import meeting
 from ns_abstract.verify.cells import Cell
 from ns_abstract.verify.photo import TiledPhoto
 from ns_abstract.verify.pixel_rounds import BoundedPixels, PixelRounds, RoundTuning
-from ns_abstract.verify.telling_pixels import telling_order
 
 T, SIDE = 3, 4
 
@@ -40,9 +39,10 @@ def test_rounds_exclude_what_all_pixels_do_and_never_the_true_pose(seed: int) ->
     lower, upper = ends.min(axis=0) - 1e-9, ends.max(axis=0) + 1e-9
     order = generator.permutation(np.flatnonzero(counted))
     # rounds that go on as long as there are pixels
-    rounds = PixelRounds(photo, order, parts, tuning=RoundTuning(first=1.0, hopeless=0.0, few=0.0))
+    rounds = PixelRounds(photo, parts, tuning=RoundTuning(first=1.0, hopeless=0.0, few=0.0))
+    shares = np.ones(order.size)
     seen = np.zeros_like(counted)
-    while (chosen := rounds.following()) is not None:
+    while (chosen := rounds.following(order, shares)) is not None:
         assert not (chosen & seen).any()
         seen |= chosen
         rounds.count(lower[chosen], upper[chosen], chosen)
@@ -60,7 +60,7 @@ def test_a_pixel_counts_once() -> None:
     photo = photo_of(np.zeros((T, SIDE, SIDE, 3)), 20)
     pixels = np.zeros((T, SIDE, SIDE), bool)
     pixels[0] = True
-    rounds = PixelRounds(photo, np.arange(T * SIDE * SIDE), 2)
+    rounds = PixelRounds(photo, 2)
     ends = np.full((16, 3, 2), 0.5)
     for _ in range(2):
         rounds.count(ends, ends, pixels)
@@ -81,7 +81,7 @@ def test_a_part_inherits_what_excludes_all_of_it(seed: int) -> None:
     ends = np.stack([a[..., None] * lines[:-1] + b[..., None], a[..., None] * lines[1:] + b[..., None]])
     lower, upper = ends.min(axis=0) - 1e-9, ends.max(axis=0) + 1e-9
     known = generator.random((T, SIDE, SIDE)) < 0.7
-    rounds = PixelRounds(photo, np.flatnonzero(counted), 16)
+    rounds = PixelRounds(photo, 16)
     rounds.count(lower[known], upper[known], known)
     cell, most = Cell((64,), (128,)), 0
     for first in range(64, 128, 3):
@@ -99,9 +99,9 @@ def test_a_part_inherits_what_excludes_all_of_it(seed: int) -> None:
         assert (inherited == known & counted & beyond.any(axis=-2)[..., met].all(axis=-1)).all()
         most = max(most, int(inherited.sum()))
         # they count once, whether they are bounded again or not
-        heir = PixelRounds(photo, np.flatnonzero(counted), 1, inherited)
-        assert not inherited.reshape(-1)[heir.order].any()
-        assert heir.order.size == int((counted & ~inherited).sum())
+        heir = PixelRounds(photo, 1, inherited)
+        chosen = heir.following(np.flatnonzero(counted), np.ones(int(counted.sum())))
+        assert chosen is None or not (chosen & inherited).any()
         ends = np.stack([picture[..., 0], picture[..., -1]])
         tight = ends.min(axis=0)[..., None], ends.max(axis=0)[..., None]
         everywhere = np.ones_like(counted)
@@ -117,8 +117,8 @@ def test_heirs_are_excluded_by_fewer_pixels() -> None:
     photo = photo_of(np.zeros((T, SIDE, SIDE, 3)), 4)
     inherited = np.zeros((T, SIDE, SIDE), bool)
     inherited[1, 0, :3] = True
-    rounds = PixelRounds(photo, np.arange(T * SIDE * SIDE), 8, inherited)
-    chosen = rounds.following()
+    rounds = PixelRounds(photo, 8, inherited)
+    chosen = rounds.following(np.arange(T * SIDE * SIDE), np.ones(T * SIDE * SIDE))
     assert chosen is not None and chosen.sum() == 3 and not (chosen & inherited).any() and rounds.left.all()
     rounds.count(np.ones((3, 3, 8)), np.ones((3, 3, 8)), chosen)
     assert rounds.numbers.tolist() == [6] * 8 and not rounds.left.any()
@@ -133,11 +133,10 @@ def test_heirs_are_excluded_by_fewer_pixels() -> None:
 def test_the_outliers_are_those_of_the_whole_photo() -> None:
     """A few pixels are bounded; as many of these may be outliers as of the whole photo."""
     photo = photo_of(np.zeros((T, SIDE, SIDE, 3)), 4)
-    order = np.arange(T * SIDE * SIDE)
     for count in (4, 5):
         pixels = np.zeros(T * SIDE * SIDE, bool)
         pixels[:count] = True
-        rounds = PixelRounds(photo, order, 1)
+        rounds = PixelRounds(photo, 1)
         ends = np.ones((count, 3, 1))
         rounds.count(ends, ends, pixels.reshape(T, SIDE, SIDE))
         assert rounds.left.tolist() == [count == 4]
@@ -147,7 +146,7 @@ def test_pixels_that_do_not_count_exclude_nothing() -> None:
     counted = np.zeros((T, SIDE, SIDE), bool)
     counted[0, 0] = True
     photo = photo_of(np.zeros((T, SIDE, SIDE, 3)), 0, counted)
-    rounds = PixelRounds(photo, np.arange(4), 1)
+    rounds = PixelRounds(photo, 1)
     ends = np.ones((T * SIDE * SIDE - 4, 3, 1))
     rounds.count(ends, ends, ~counted)
     assert rounds.left.all() and rounds.rest.sum() == 4
@@ -171,25 +170,33 @@ def test_pixels_that_were_not_bounded_exclude_and_cut_nothing() -> None:
         assert least[0] <= wanted[0] and most[0] >= wanted[1]
 
 
-def test_likely_and_tight_pixels_come_first() -> None:
-    gaps = np.array([[[0.3, 0.2, -0.1, 0.4], [0.5, 0.1, 0.6, 0.2]]])
-    likely = np.array([[[0.2, -0.1, -0.2, 0.3], [0.3, -0.3, 0.1, -0.1]]])
-    loose = np.array([[[0.0, 0.0, 0.0, 0.0], [0.2, 0.0, 0.0, 0.0]]])
-    counted = np.ones((1, 2, 4), bool)
-    counted[0, 1, 2] = False
-    order, sure = telling_order(gaps, likely, loose, counted, 5)
-    assert order.tolist() == [3, 0, 4, 1, 7] and sure == 3
-
-
 def test_rounds_stop_where_pixels_do_not_help() -> None:
     """One round is enough where its pixels exclude everything, and where they exclude nothing."""
     photo = photo_of(np.zeros((T, SIDE, SIDE, 3)), 4)
+    order, shares = np.arange(T * SIDE * SIDE), np.ones(T * SIDE * SIDE)
     for value, left in ((1.0, False), (0.0, True)):
-        rounds = PixelRounds(photo, np.arange(T * SIDE * SIDE), 8)
-        chosen = rounds.following()
+        rounds = PixelRounds(photo, 8)
+        chosen = rounds.following(order, shares)
         assert chosen is not None and chosen.sum() == 7
         ends = np.full((7, 3, 8), value)
         rounds.count(ends, ends, chosen)
-        assert rounds.following() is None and rounds.left.all() == left
+        assert rounds.following(order, shares) is None and rounds.left.all() == left
     # too few pixels for any verdict
-    assert PixelRounds(photo, np.arange(4), 8).following() is None
+    assert PixelRounds(photo, 8).following(order[:2], shares[:2]) is None
+    # pixels that are likely to exclude half of what is left count half
+    chosen = PixelRounds(photo, 8).following(order, 0.5 * shares)
+    assert chosen is not None and chosen.sum() == 14
+
+
+def test_the_last_pixels_of_a_round_tell_how_many_more_help() -> None:
+    """The first half of a round excludes, the second does not: what comes next would not, either."""
+    photo = photo_of(np.zeros((T, SIDE, SIDE, 3)), 7)
+    order, shares = np.arange(T * SIDE * SIDE), np.ones(T * SIDE * SIDE)
+    for late, goes_on in ((False, False), (True, True)):
+        rounds = PixelRounds(photo, 2, tuning=RoundTuning(first=1.0))
+        chosen = rounds.following(order, shares)
+        assert chosen is not None and chosen.sum() == 8
+        excluding = np.arange(8)[:, None] % 2 == 0 if late else np.arange(8)[:, None] < 4
+        rounds.take(np.repeat(excluding, 2, axis=1), chosen)
+        assert rounds.numbers.tolist() == [4, 4]
+        assert (rounds.following(order, shares) is not None) == goes_on

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from test_bounds import Case, moves, scene
@@ -54,15 +56,41 @@ def test_differences_tell_where_channels_do_not():
     order = telling.order(picture[None], 1, 1.0, photo.counted, 100, differences=True)
     inside = assemble(order.kinds, CAMERA)
     # a pixel beside the edge misses as well
-    assert (inside[:, 5:] == DIFFERENCES).all() and (inside[:, :3] == CHANNELS).all()
-    assert order.sure == (inside == DIFFERENCES).sum() and len(order.numbers) == SIDE * SIDE
-    assert (order.kinds.reshape(-1)[order.numbers[: order.sure]] == DIFFERENCES).all()
+    assert (inside[:, 5:] == DIFFERENCES).all()
+    numbers, shares = order.everywhere
+    assert (
+        sorted(numbers) == [8 * row + column for row in range(SIDE) for column in range(4, SIDE)]
+        and (shares == 1.0).all()
+    )
+    assert (order.kinds.reshape(-1)[numbers] == DIFFERENCES).all()
     alone = telling.order(picture[None], 1, 1.0, photo.counted, 100, differences=False)
-    assert alone.sure == 0 and len(alone.misses) == 1 and (alone.kinds == CHANNELS).all()
-    # where the motion is a tenth, channels lose a tenth, and where both may exclude the tighter ones do
+    assert not alone.everywhere[0].size and len(alone.misses) == 1 and (alone.kinds == CHANNELS).all()
+    # where bounds are a tenth as wide, channels lose less, and where both may exclude the tighter ones do
     near = telling.order(picture[None], 1, 0.1, photo.counted, 100, differences=True)
     inside = assemble(near.kinds, CAMERA)
-    assert near.sure == SIDE * SIDE and (inside[:, 5:] == DIFFERENCES).all() and (inside[:, :3] == CHANNELS).all()
+    assert (
+        near.everywhere[0].size == SIDE * SIDE
+        and (inside[:, 4:] == DIFFERENCES).all()
+        and (inside[:, :4] == CHANNELS).all()
+    )
+
+
+def test_pixels_are_chosen_towards_what_is_left():
+    """A white wall ends in the middle of a grey photo: where the wall moved in, other pixels miss the photo."""
+    photo = Photo(np.full((SIDE, SIDE, 3), 128, np.uint8), 0.02, 0.0, np.ones((SIDE, SIDE), bool)).tiled(SIDE)
+    picture = np.full((SIDE, SIDE, 3), 0.5)
+    picture[:, 4:] = 1.0
+    none = [np.zeros((SIDE, SIDE, 3))] * 2
+    telling = TellingPixels(photo, CAMERA, TypicalCell(picture, 1.0, (none,)))
+    order = telling.order(picture[None], 3, 1.0, photo.counted, 100, differences=False)
+    for columns, first in ((2, 7), (0, 5), (-2, 3)):
+        # a pixel beside the edge may show either
+        numbers, shares = order.towards(np.full((5, 2), [columns, 0.0]))
+        assert sorted(set(numbers % SIDE)) == list(range(first, SIDE)) and (shares == 1.0).all()
+    numbers, shares = order.towards(np.array([[2.0, 0.0], [-2.0, 0.0]]))
+    assert (shares[numbers % SIDE < 7] == 0.5).all() and (shares[numbers % SIDE == 7] == 1.0).all()
+    # the most telling first, and no more than are asked for
+    assert (np.diff(shares) <= 0.0).all() and len(replace(order, most=3).towards(np.zeros((1, 2)))[0]) == 3
 
 
 def test_losses_of_a_typical_cell():
@@ -72,15 +100,15 @@ def test_losses_of_a_typical_cell():
     case = Case(scene(*layers), moves(x=0.3, yaw=0.05))
     frame = SplatFrame(case.splats, GSPLAT_1_4_0, FLOAT32, case.poses)
     box = case.poses.box
-    typical = typical_cell(frame, box, np.array([4, 2]), 1.0, case.image)
-    assert typical is not None and len(typical.losses) == 2
+    cells = frame.motion_cells(box, np.array([4, 2]))
+    typical = typical_cell(frame, box, cells, 1.0, case.image(box.middle))
+    assert len(typical.losses) == 2
     for below, above in typical.losses:
         assert below.shape == (16, 16, 3) and np.isfinite(below).all() and (below >= 0.0).all()
         assert max(below[0].max(), above[0].max()) < 0.002
         assert max(below.max(), above.max()) > 0.01
-    whole = typical_cell(frame, box, np.array([1, 1]), 1.0, case.image)
-    assert whole is not None and len(whole.losses) == 1
-    assert whole.losses[0][0].mean() > typical.losses[0][0].mean()
+    whole = typical_cell(frame, box, None, 1.0, case.image(box.middle))
+    assert len(whole.losses) == 1 and whole.losses[0][0].mean() > typical.losses[0][0].mean()
     one = Case(case.splats, moves(x=0.3))
     line = SplatFrame(one.splats, GSPLAT_1_4_0, FLOAT32, one.poses)
-    assert typical_cell(line, one.poses.box, np.array([8]), 1.0, one.image) is None
+    assert line.motion_cells(one.poses.box, np.array([8, 8])) is None

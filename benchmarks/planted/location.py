@@ -3,7 +3,8 @@
 from planted.fault import Fault
 
 _PHOTO, _SEARCH, _COVER = "verify/photo.py", "verify/location.py", "verify/location_cover.py"
-_CELLS, _ROUNDS = "verify/cell_boxes.py", "verify/pixel_rounds.py"
+_CELLS, _ROUNDS, _MOTION = "verify/cell_boxes.py", "verify/pixel_rounds.py", "verify/motion_boxes.py"
+_MET = "test_motion_boxes.py::test_sub_boxes_are_excluded_by_all_motion_cells_of_their_poses[2-1]"
 _ENDS = "test_locate.py::test_a_photo_allows_its_noise_and_every_rounding"
 _BRIGHT = "test_locate_sequence.py::test_values_before_any_brightness_are_held"
 _DIFFERENCES = (
@@ -167,7 +168,7 @@ LOCATION = (
     Fault(
         "location: a wide set begins without its last part",
         _SEARCH, "LocationSearch.first_cells", "return examination.children", "return examination.children[:-1]",
-        "test_locate.py::test_sub_boxes_are_shared_out_among_many_parameters",
+        "test_locate.py::test_sub_boxes_are_shared_out_by_motion[xyz-turns2]",
     ),
     Fault(
         "location: the outliers allowed are those of the pixels bounded",
@@ -186,6 +187,38 @@ LOCATION = (
         "location: pixels that do not count exclude sub-boxes",
         _PHOTO, "TiledPhoto.excluding", "beyond & self.counted[pixels][:, None]", "beyond",
         "test_pixel_rounds.py::test_pixels_that_do_not_count_exclude_nothing",
+    ),
+    Fault(
+        "motion cells: slopes beside the motion are left out",
+        "methods/splat/alphas.py", "_along_motion", "rest + abs(load8(rows, at + 16 * (k + 1)) - along)", "rest",
+        "test_bounds.py::test_motion_cells_hold_every_map", compiled=True,
+    ),
+    Fault(
+        "motion cells: the first axis of the motion alone widens a part",
+        "methods/splat/alphas.py", "_along_motion", "half[1]", "0.0 * half[1]",
+        "test_bounds.py::test_motion_cells_hold_every_map", compiled=True,
+    ),
+    Fault(
+        "motion cells: a pixel takes its neighbour's motion",
+        "methods/splat/pixel_block.py", "take_motion", "place.x0 + q % BLOCK", "place.x0 + (q + 1) % BLOCK",
+        "test_bounds.py::test_motion_cells_hold_every_map", compiled=True,
+    ),
+    Fault(
+        "motion cells: the image of a box is its middle's",
+        _MOTION, "_excluded", "(q0 + reach0)", "q0", _MET, compiled=True,
+    ),
+    Fault(
+        "motion cells: the last one that a box meets is left out",
+        _MOTION, "_excluded", "min(max(int(0.5 * columns * (q1 + reach1)), 0), columns - 1) + 1",
+        "min(max(int(0.5 * columns * (q1 + reach1)), 0), columns - 1)", _MET, compiled=True,
+    ),
+    Fault(
+        "motion cells: a pixel in tiles has the motion of another",
+        _MOTION, "MotionBoxes.excluded", "across * side + column", "column", _MET,
+    ),
+    Fault(
+        "motion cells: the motion leaves its square",
+        "geometry/motion_cells.py", "MotionCells.of", "MOTION_SCALE * pixels", "2.0 * pixels", _MET,
     ),
     Fault(
         "location: a shear moves the ends of boxes one way",

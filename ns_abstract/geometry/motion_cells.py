@@ -10,6 +10,14 @@ from ns_abstract.arithmetic.rounding import MOTION_SCALE
 from ns_abstract.geometry.box import Float64Array
 
 
+@dataclass(frozen=True)
+class MotionCellTuning:
+    """Preferences. None of them decides whether a bound holds."""
+
+    #: What is added to both directions of the motion, as a part of its squares, before it is inverted.
+    regular: float = 1e-6
+
+
 @dataclass(frozen=True, eq=False)
 class MotionCells:
     """Equal cells of the image motion at each square of some pixels of a picture.
@@ -47,4 +55,4 @@ def _inverse(rows: Float64Array) -> Float64Array:
     """Transposed pseudo-inverses [n, 2, d] of matrices ``rows`` [n, 2, d], regularised where these have rank 1."""
     products = rows @ rows.swapaxes(1, 2)
     trace = np.trace(products, axis1=1, axis2=2)[:, None, None]
-    return np.linalg.solve(products + (1e-6 * trace + (trace == 0.0)) * np.eye(2), rows)
+    return np.linalg.solve(products + (MotionCellTuning.regular * trace + (trace == 0.0)) * np.eye(2), rows)

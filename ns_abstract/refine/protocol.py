@@ -244,8 +244,9 @@ class SubBoxFrame(Protocol):
         ``differences``: of `CHANNEL_DIFFERENCES` of the pixels before they are clamped to [0, 1], in place of channels.
 
         There are ``counts`` [d] sub-boxes along the axes, powers of two, at least 8 together, numbered like entries of
-        an array of this shape; or cells of the image motion. Each is widened by `SUB_BOX_OVERLAP` of the cell's half-widths. ``pixels`` [t, side,
-        side]: the ``n``. ``ends`` [n, 6]: the lower, then the upper bounds of channels that are worth more work.
+        an array of this shape; or cells of the image motion. Each is widened by `SUB_BOX_OVERLAP` of the half-widths.
+        ``pixels`` [t, side, side]: the ``n``. ``ends`` [n, 6]: the lower, then the upper bounds of channels that are
+        worth more work.
         """
         ...
 

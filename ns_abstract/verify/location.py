@@ -37,8 +37,8 @@ UNITS = 20
 class LocationTuning:
     """Preferences of the search. None of them decides whether an excluded cell holds no pose of the photo."""
 
-    #: Pixels by which bounds are wide (`LocationSearch.widths`) beyond which cells are cut without bounds, and up to which
-    #: pixels of uncertain orders are bounded whatever the order: it takes long, and excludes little of wider cells.
+    #: Widths (see `LocationSearch.widths`) beyond which cells are cut without bounds, and up to which pixels of
+    #: uncertain orders are bounded whatever the order: it takes long, and excludes little of wider cells.
     coarse: float = 1.6
     unordered: float = 1.6
     #: Cells of the image motion along its two axes; what of the motion widens bounds nevertheless.
@@ -48,7 +48,7 @@ class LocationTuning:
     sub_boxes: int = 4096
     #: Rounds of pixels. What a cell takes whatever its pixels are is most of the work, and a first round of more pixels
     #: excludes more at once.
-    pixel_rounds: RoundTuning = RoundTuning(first=1.6)
+    pixel_rounds: RoundTuning = field(default_factory=lambda: RoundTuning(first=1.6))
     #: The part of a box of sub-boxes that has to be left for it to become one cell.
     filled: float = 0.5
     #: Grid lines that cells begin and end at, as a power of two of their width.
@@ -287,7 +287,7 @@ class _Examination:
                 remaining.append(cell)
             else:
                 self.leaves.append(FinishedCell(cell, "certified", 1.0, 0.0))
-        if len(remaining) == 1:
+        if len(remaining) == 1 and remaining[0].volume > (1.0 - tuning.worth) * self.cell.volume:
             self.cell = remaining[0]
             self.cut()
         else:

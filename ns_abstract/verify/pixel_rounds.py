@@ -85,7 +85,7 @@ class PixelRounds:
         rest = self._rate * float(foreseen[-1]) if foreseen.size else 0.0
         self.expected = (typical + rest) / needed
         missing = max(needed - typical, self.tuning.least_missing * needed)
-        if left.mean() <= few or rest < self.tuning.hopeless * missing:
+        if not order.size or left.mean() <= few or rest < self.tuning.hopeless * missing:
             return None
         first = not self._excluding
         wanted = (self.tuning.first if first else self.tuning.spare) * missing

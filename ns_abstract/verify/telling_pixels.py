@@ -21,7 +21,7 @@ from ns_abstract.verify.photo import TiledPhoto
 
 #: What is bounded of a pixel: its channels, or differences of these.
 CHANNELS, DIFFERENCES = range(2)
-#: Of a typical cell: most pixels that are bounded, and how many times as far apart are those whose bounds take more work.
+#: Of a typical cell: most pixels that are bounded, and how many times as far apart are those that take more work.
 _MOST_PIXELS, _FEWER = 4096, 3
 #: What bounds lose at most, and as which power of their width.
 _ALL, _POWER = 2.0, 1.5
