@@ -72,3 +72,8 @@ def _excluded(kept, motion, middles, half, out):
             left = min(max(int(0.5 * columns * (q1 - reach1)), 0), columns - 1)
             right = min(max(int(0.5 * columns * (q1 + reach1)), 0), columns - 1) + 1
             out[pixel, box] = sums[bottom, right] - sums[top, right] - sums[bottom, left] + sums[top, left] == 0
+
+
+def warm_up() -> None:
+    """Compile what `MotionBoxes.excluded` needs."""
+    _excluded(np.zeros((1, 9, 9), np.int32), np.zeros((1, 4, 2)), np.zeros((1, 2)), np.ones(2), np.empty((1, 1), bool))
