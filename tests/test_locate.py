@@ -368,12 +368,15 @@ def test_sub_boxes_are_shared_out_by_motion(shifts: str, turns: tuple[str, ...],
     search = location.search(0)
     box = search.frame.box
     counts, moved = search.along(box), search.moved(box)
-    # parts of all axes move the picture by about as much
-    assert counts.prod() == search.tuning.sub_boxes and (counts & (counts - 1) == 0).all()
-    assert (moved / counts).max() <= 2.0 * np.where(counts > 1, moved / counts, np.inf).min() + 1e-9
+    if len(moved) >= search.tuning.many:
+        # parts of all axes move the picture by about as much
+        assert counts.prod() == search.tuning.sub_boxes and (counts & (counts - 1) == 0).all()
+        assert (moved / counts).max() <= 2.0 * np.where(counts > 1, moved / counts, np.inf).min() + 1e-9
+    else:
+        assert counts[np.argsort(-moved)].tolist() == [8, 8, 1][: len(moved)]
     # a set that is too wide for bounds begins with parts that tile it
     first = search.first_cells()
-    assert (len(first) > 1) == (search.width(box) > search.tuning.coarse)
+    assert (len(first) > 1) == (search.width(box) > search.coarse)
     assert sum(cell.volume for cell in first) == search.grid.volume
     # without contraction cells are bounded as a whole
     whole = Location(location.job, location.photo.levels, None, PhotoOptions(contract=False)).search(0)

@@ -37,15 +37,20 @@ UNITS = 20
 class LocationTuning:
     """Preferences of the search. None of them decides whether an excluded cell holds no pose of the photo."""
 
-    #: Widths (see `LocationSearch.widths`) beyond which cells are cut without bounds, and up to which pixels of
-    #: uncertain orders are bounded whatever the order: it takes long, and excludes little of wider cells.
-    coarse: float = 1.6
-    unordered: float = 1.6
-    #: Cells of the image motion along its two axes; what of the motion widens bounds nevertheless.
+    #: From so many parameters on, pixels are bounded over cells of the image motion, so many along its two axes; what of
+    #: the motion widens bounds all the same. Sub-boxes then cost a look at each pixel's motion cells, no bounds.
+    many: int = 4
     motion_cells: tuple[int, int] = (8, 8)
     motion_share: float = 0.25
-    #: Sub-boxes of a cell: they cost a look at each pixel's motion cells, no bounds.
     sub_boxes: int = 4096
+    #: In sets of fewer, sub-boxes along the two parameters that move the picture most: these move it more beside the
+    #: motion of what a pixel shows.
+    along: int = 8
+    #: Widths (see `LocationSearch.widths`) beyond which cells are cut without bounds, in sets of few parameters and of
+    #: many; and up to which pixels of uncertain orders are bounded whatever the order: it takes long, and excludes
+    #: little of wider cells.
+    coarse: tuple[float, float] = 4.0, 1.6
+    unordered: float = 1.6
     #: Rounds of pixels. What a cell takes whatever its pixels are is most of the work, and a first round of more pixels
     #: excludes more at once.
     pixel_rounds: RoundTuning = field(default_factory=lambda: RoundTuning(first=1.6))
@@ -56,8 +61,8 @@ class LocationTuning:
     contracted: float = 0.3
     #: Pixels that are bounded to exclude a cell: so many times those that may show anything.
     surplus: float = 6.0
-    #: Width of the cell whose bounds tell how loose they are, without and with motion cells.
-    reference: tuple[float, float] = 2.4, 0.9
+    #: Width of the cell whose bounds tell how loose they are, without parts, with sub-boxes and with motion cells.
+    reference: tuple[float, float, float] = 2.4, 1.8, 0.9
     #: Pixels that must be likely to be excluded, as a part of those that exclude a cell, for it to be bounded.
     promise: float = 0.6
     #: Image motion below which a parameter counts as one that moves nothing.
@@ -65,7 +70,7 @@ class LocationTuning:
     #: How many pixels bounds exclude, about, as a power of their width; ends of the part of it that cuts aim at.
     power: float = 2.5
     least_aim: float = 0.35
-    most_aim: float = 0.65
+    most_aim: tuple[float, float] = 0.85, 0.65
     #: Part of a cell's volume that a contraction must take for it to be bounded again, and how often.
     worth: float = 0.4
     rounds: int = 4
@@ -113,7 +118,8 @@ class LocationSearch:
         motion = np.nan_to_num(np.asarray(frame.motion(box), np.float64), nan=0.0, posinf=0.0)
         # what moves nothing is cut for the bounds' sake now and then
         motion = np.maximum(motion, 1e-3 * max(1.0, float(motion.max(initial=0.0))))
-        self._pace = self._width_pace = motion / width
+        self._pace = motion / width
+        self._width_pace = self._pace / self.along(box)
         if self.by_motion:
             assert isinstance(frame, SubBoxFrame)
             self._width_pace = (frame.parallax(box) + self.tuning.motion_share * motion) / width
@@ -126,16 +132,26 @@ class LocationSearch:
     @property
     def by_motion(self) -> bool:
         """Whether wide cells are bounded over cells of the image motion (U11)."""
-        return self.sub_box_frame is not None and self.frame.box.dimensions > 1
+        return self.sub_box_frame is not None and self.frame.box.dimensions >= self.tuning.many
 
     def along(self, box: ParameterBox) -> np.ndarray:
         """[d] sub-boxes along the parameters of a cell."""
-        return shared_out(self.moved(box), self.tuning.sub_boxes)
+        if self.by_motion:
+            return shared_out(self.moved(box), self.tuning.sub_boxes)
+        counts = np.ones(box.dimensions, np.int64)
+        if self.sub_box_frame is not None:
+            counts[np.argsort(-self.moved(self.frame.box), kind="stable")[:2]] = self.tuning.along
+        return counts
+
+    @property
+    def coarse(self) -> float:
+        """The width beyond which cells are cut without bounds."""
+        return self.tuning.coarse[self.by_motion]
 
     def first_cells(self) -> list[Cell]:
         """The set's first cell, or its parts where it is too wide for bounds: several can be examined side by side."""
         (root,) = self.grid.roots()
-        if self.width(self.grid.box) <= self.tuning.coarse:
+        if self.width(self.grid.box) <= self.coarse:
             return [root]
         examination = _Examination(self, root, self.tiled.chosen(()))
         examination.cut()
@@ -146,7 +162,7 @@ class LocationSearch:
         return self._pace * (np.array(box.upper) - np.array(box.lower))
 
     def widths(self, box: ParameterBox) -> Float64Array:
-        """[d] pixels by which parameters widen bounds over a cell: motion that motion cells do not follow (a guess)."""
+        """[d] pixels by which parameters widen bounds over a cell: motion that its parts do not follow (a guess)."""
         return self._width_pace * (np.array(box.upper) - np.array(box.lower))
 
     def width(self, box: ParameterBox) -> float:
@@ -156,17 +172,24 @@ class LocationSearch:
     @cached_property
     def telling(self) -> TellingPixels:
         """Which pixels of a cell are bounded: a guess, by one cell in the middle of the set."""
-        box, least, reference = self.frame.box, self.tuning.still, self.tuning.reference[self.by_motion]
+        box, least, parts = self.frame.box, self.tuning.still, self.sub_box_frame is not None
+        parts = parts and box.dimensions > 1
+        reference = self.tuning.reference[parts + self.by_motion]
         side = np.minimum(1.0, reference / math.sqrt(max(1, box.dimensions)) / np.maximum(self.widths(box), least))
         cell = between(box, -side, side)
         picture = assemble(self.plain.render(self.original(cell.middle)), self.frame.camera)[..., :3]
-        typical = typical_cell(self.frame, cell, self.motion_cells(cell), max(self.width(cell), least), picture)
+        divided = self.parts(cell) if parts else None
+        typical = typical_cell(self.frame, cell, divided, max(self.width(cell), least), picture)
         return TellingPixels(self.tiled, self.frame.camera, typical)
 
     def motion_cells(self, box: ParameterBox) -> MotionCells | None:
-        """Those of a cell, if its pixels are bounded over them."""
+        """Those of a cell, if the frame bounds pixels over them."""
         frame = self.sub_box_frame
         return None if frame is None else frame.motion_cells(box, np.array(self.tuning.motion_cells))
+
+    def parts(self, box: ParameterBox) -> MotionCells | np.ndarray | None:
+        """What pixels are bounded over: motion cells, or numbers [d] of sub-boxes."""
+        return self.motion_cells(box) if self.by_motion else self.along(box)
 
     def examine(self, cells: Sequence[Cell]) -> LocationResult:
         """Exclude the cells, or cut them."""
@@ -228,10 +251,11 @@ class _Examination:
                 return self._exclude(1.0)
             self._shrink(feasible)
             box = search.grid.box_of(self.cell)
-            if box.dimensions and search.width(box) > tuning.coarse:
+            if box.dimensions and search.width(box) > search.coarse:
                 break
             picture, number = self._look(box.middle)
-            if search.by_motion and float(np.linalg.norm(search.moved(box))) > tuning.contracted:
+            moved = float(np.linalg.norm(search.moved(box))) if search.by_motion else search.width(box)
+            if moved > tuning.contracted:
                 some = self._sub_boxes(box, picture)
                 if some:
                     return None
@@ -270,11 +294,12 @@ class _Examination:
                     continue
                 tiles = np.flatnonzero(pixels.any(axis=(1, 2)))
                 telling = (miss == miss.max(axis=-1, keepdims=True))[pixels] if narrow else None
-                ends = frame.sub_box_ends(box, cells, tiles, pixels[tiles], telling, kind == DIFFERENCES)
+                parts = cells if search.by_motion else counts
+                ends = frame.sub_box_ends(box, parts, tiles, pixels[tiles], telling, kind == DIFFERENCES)
                 if ends is None:
                     return None
                 known = search.tiled.excluding(*ends, pixels, kind == DIFFERENCES)
-                excluding[pixels[chosen]] = boxes.excluded(known, pixels)
+                excluding[pixels[chosen]] = boxes.excluded(known, pixels) if search.by_motion else known
             rounds.take(excluding, chosen)
         self.share = min(1.0, rounds.expected)
         self.divisions = self.cell, counts, rounds
@@ -443,9 +468,11 @@ class _Examination:
             return self._finish()
         moved = search.widths(search.grid.box_of(self.cell))
         total = float(np.linalg.norm(moved))
-        aim = tuning.coarse
-        if total <= tuning.coarse:
-            aim = total * min(max(self.share ** (1.0 / tuning.power), tuning.least_aim), tuning.most_aim)
+        aim = search.coarse
+        if total <= search.coarse:
+            aim = total * min(
+                max(self.share ** (1.0 / tuning.power), tuning.least_aim), tuning.most_aim[search.by_motion]
+            )
         parts = [1] * len(moved)
         sizes = [past - first for first, past in zip(self.cell.first, self.cell.past, strict=True)]
         while np.prod(parts) < 2 or (2 * np.prod(parts) <= tuning.parts and total > aim):

@@ -154,12 +154,12 @@ class TellingPixels:
 
 
 def typical_cell(
-    frame: Frame, cell: ParameterBox, cells: MotionCells | None, width: float, picture: np.ndarray
+    frame: Frame, cell: ParameterBox, parts: MotionCells | np.ndarray | None, width: float, picture: np.ndarray
 ) -> TypicalCell:
-    """What bounds over the motion cells in the middle of a cell lose.
+    """What bounds over the parts in the middle of a cell lose.
 
     Args:
-        cells: Its motion cells; None: it is bounded as a whole.
+        parts: Its motion cells, or numbers [d] of sub-boxes; None: it is bounded as a whole.
         width: Pixels by which bounds over it are wide.
         picture: [H, W, 3] in its middle.
     """
@@ -168,7 +168,7 @@ def typical_cell(
     # of blocks whose orders are too many, few pixels are bounded whatever the order
     some, few = (_lattice((camera.height, camera.width), k * step) for k in (1, _FEWER))
     chosen, worked = in_tiles(some, frame.side), in_tiles(few, frame.side)
-    bounds = _bounds_in_the_middle(frame, cell, cells, chosen, worked)
+    bounds = _bounds_in_the_middle(frame, cell, parts, chosen, worked)
     losses = []
     for kind, (lower, upper) in enumerate(bounds):
         sides = _losses(_values(picture, kind), width, lower, upper, chosen, camera)
@@ -178,24 +178,25 @@ def typical_cell(
 
 
 def _bounds_in_the_middle(
-    frame: Frame, cell: ParameterBox, cells: MotionCells | None, pixels: np.ndarray, worked: np.ndarray
+    frame: Frame, cell: ParameterBox, parts: MotionCells | np.ndarray | None, pixels: np.ndarray, worked: np.ndarray
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """By kind, bounds [n, 3] of the ``n`` ``pixels`` over the middle of a cell, NaN where nothing is known.
 
     Those ``worked`` at are bounded whatever the order.
     """
     tiles = np.flatnonzero(pixels.any(axis=(1, 2)))
-    if cells is None:
+    if parts is None:
         whole = frame.bound(cell, tiles, None)
         return [(whole.lower[pixels[tiles]], whole.upper[pixels[tiles]])]
     assert isinstance(frame, SubBoxFrame)
     # those that meet in the middle
-    middle = np.zeros(cells.counts, bool)
-    middle[tuple(slice((n - 1) // 2, n // 2 + 1) for n in cells.counts.tolist())] = True
+    counts = parts.counts if isinstance(parts, MotionCells) else parts
+    middle = np.zeros(counts, bool)
+    middle[tuple(slice((n - 1) // 2, n // 2 + 1) for n in counts.tolist())] = True
     middle = middle.ravel()
     ends, bounds = np.repeat(worked[pixels][:, None], 6, axis=1), []
     for kind in (CHANNELS, DIFFERENCES):
-        pair = frame.sub_box_ends(cell, cells, tiles, pixels[tiles], ends, kind == DIFFERENCES)
+        pair = frame.sub_box_ends(cell, parts, tiles, pixels[tiles], ends, kind == DIFFERENCES)
         assert pair is not None
         lower, upper = pair[0][..., middle].mean(axis=-1), pair[1][..., middle].mean(axis=-1)
         # what is known of no end would be known with more work
