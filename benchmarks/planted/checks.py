@@ -142,8 +142,8 @@ CHECKS = (
         "checker: a frame may have a second entry",
         _RESULTS,
         "structure",
-        "if entries[1:] else []",
-        "if False else []",
+        "entries[1:]",
+        "None",
         f"{_KINDS}::test_parts_and_margins_of_a_report_are_those_of_the_cells",
     ),
     Fault(

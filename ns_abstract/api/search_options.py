@@ -14,7 +14,7 @@ from ns_abstract.api.bounding import listener
 from ns_abstract.api.cell_search import CellQuestion, CellSearch, Request, Row
 from ns_abstract.execution.starting import EngineName, started
 from ns_abstract.execution.stopping import interruptible
-from ns_abstract.io.arguments import positive, whole
+from ns_abstract.io.arguments import flag, positive, whole
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 
@@ -63,7 +63,7 @@ class SearchOptions:
     def __post_init__(self) -> None:
         positive(self.time_budget, "time_budget")
         whole(self.workers, 1, "workers")
-        if self.resume and self.output_dir is None:
+        if flag(self.resume, "resume") and self.output_dir is None:
             raise InputError("given without output_dir", field="resume", fix="give the folder to go on with")
 
     @property
@@ -92,7 +92,7 @@ class SearchOptions:
             if folder is None:
                 folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="ns-abstract-"))
             stop = stack.enter_context(interruptible())
-            request = Request(self.time_budget, self.resume, report, scene_margin)
+            request = Request(self.time_budget, self.resume, report, flag(scene_margin, "scene_margin"))
             search = CellSearch(question, Path(folder))
             document = search.run(
                 lambda engines: engines.enter_context(started(self.engine, self.scheduler_address, workers)),

@@ -9,6 +9,9 @@ from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import DTypeLike
+
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import FIX_ACCESS, show, unusable
 
@@ -50,6 +53,25 @@ def whole(value: Any, least: int, field: str, most: int | None = None) -> int:
         limits = f"a whole number of at least {least}" if most is None else f"{least} to {most}"
         raise unusable(value, field=field, fix=f"give {limits}")
     return number
+
+
+def flag(value: Any, field: str) -> bool:
+    """``value`` as a bool, from the argument ``field``.
+
+    Raises:
+        InputError: It is none; texts such as "no" would count as true.
+    """
+    if not isinstance(value, bool | np.bool_):
+        raise unusable(value, field=field, fix="give True or False")
+    return bool(value)
+
+
+def array_of(value: Any, dtype: DTypeLike | None = None) -> np.ndarray | None:
+    """``value`` as an array; None where it is none, such as a tensor that requires gradients."""
+    try:
+        return np.asarray(value, dtype)
+    except Exception:  # what libraries' objects raise is theirs
+        return None
 
 
 def file_path(value: Any, field: str) -> Path:
