@@ -10,6 +10,7 @@ import sqlite3
 import subprocess
 import sys
 import threading
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ from wall import WALL, write_wall
 
 import ns_abstract as nsa
 from ns_abstract.api import cell_search
+from ns_abstract.api.comparing import check_comparison
 from ns_abstract.api.locating import photo_levels
 from ns_abstract.api.location import PhotoOptions
 from ns_abstract.api.search_options import SearchOptions
@@ -384,6 +386,9 @@ MISTAKES = {
     "another renderer": (lambda: nsa.load_scene("none.yml", renderer=3), "--renderer"),  # type: ignore[arg-type]
     "an array for a mode": (lambda: nsa.load_scene("none.yml", rasterize_mode=np.zeros(2)), "--rasterize-mode"),  # type: ignore[arg-type]
     "a word for a choice": (lambda: nsa.load_scene("none.yml", drop_nan_gaussians="no"), "--drop-nan-gaussians"),  # type: ignore[arg-type]
+    "another engine": (lambda: SearchOptions(engine="fast"), "engine"),  # type: ignore[arg-type]
+    "a number for an output folder": (lambda: SearchOptions(output_dir=3), "output_dir"),  # type: ignore[arg-type]
+    "a word for a tolerance": (lambda: check_comparison("wide", 1.05, None, ""), "tolerance"),  # type: ignore[arg-type]
     "a word for resume": (lambda: SearchOptions(resume="no", output_dir="x"), "resume"),  # type: ignore[arg-type]
     "a word for noise": (lambda: PhotoOptions(noise="some"), "--noise"),  # type: ignore[arg-type]
     "a list for outliers": (lambda: PhotoOptions(outliers=[0.1]), "--outliers"),  # type: ignore[arg-type]
@@ -411,6 +416,13 @@ def test_samples_may_be_of_any_whole_number() -> None:
     method = NerfMethod(tiny_scene(0), num_samples=np.int64(3), near_plane=np.float32(0.25))  # type: ignore[arg-type]
     sampling = method.sampling
     assert (type(sampling.samples), sampling.samples, type(sampling.near), sampling.near) == (int, 3, float, 0.25)
+
+
+def test_numbers_of_other_libraries_can_stand_in_reports(tmp_path: Path) -> None:
+    options = SearchOptions(time_budget=Fraction(1, 2), workers=np.int64(2), resume=np.bool_(True), output_dir=tmp_path)  # type: ignore[arg-type]
+    assert json.loads(json.dumps(options.settings))["time_budget"] == 0.5 and options.resume is True
+    photo = PhotoOptions(np.float32(0.25), Fraction(1, 8), np.bool_(False), (1, np.float32(1.5)))  # type: ignore[arg-type]
+    assert json.loads(json.dumps(vars(photo)))["gain"] == [1.0, 1.5] and photo.contract is False
 
 
 @pytest.mark.parametrize("name", BAD_ARGUMENTS)

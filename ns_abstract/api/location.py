@@ -73,7 +73,7 @@ class PhotoOptions:
             if not 0.0 <= float64_of(value) < 1.0:
                 raise unusable(value, field=f"--{name}", fix="give a number from 0 to below 1")
             object.__setattr__(self, name, float64_of(value))
-        flag(self.contract, "contract")
+        object.__setattr__(self, "contract", flag(self.contract, "contract"))
 
 
 class Location:

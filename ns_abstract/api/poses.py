@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from ns_abstract.api.scenes import Scene, checked_scene, not_a_camera
 from ns_abstract.geometry import poses
 from ns_abstract.geometry.camera_path import PinholeCamera, checked_pose, checked_side, focal_length, stated_intrinsics
-from ns_abstract.io.arguments import array_of, file_path, positive
+from ns_abstract.io.arguments import array_of, file_path, plain, positive
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import unusable
 from ns_abstract.perturbation.specification import Perturbation, parse_perturbation
@@ -68,17 +68,6 @@ class Camera(PinholeCamera):
         super().__init__(pose, *lens[:4], across, down)
 
 
-def _plain(value: Any) -> Any:
-    """``value`` as a perturbation file has it: numpy's numbers, arrays and tuples become JSON's."""
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    if isinstance(value, Mapping):
-        return {name: _plain(entry) for name, entry in value.items()}
-    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
-        return [_plain(entry) for entry in value]
-    return value
-
-
 @dataclass(frozen=True, init=False, eq=False)
 class PoseSet:
     """A camera and what may vary around it.
@@ -122,14 +111,14 @@ class PoseSet:
     ) -> None:
         value: dict[str, Any] = {
             "version": 1,
-            "frame": _plain(frame),
-            "units": _plain(units),
-            "angle_units": _plain(angle_units),
-            "translation": {} if translation is None else _plain(translation),
-            "rotation": {} if rotation is None else _plain(rotation),
+            "frame": plain(frame),
+            "units": plain(units),
+            "angle_units": plain(angle_units),
+            "translation": {} if translation is None else plain(translation),
+            "rotation": {} if rotation is None else plain(rotation),
         }
         if orbit is not None:
-            value["orbit"] = _plain(orbit)
+            value["orbit"] = plain(orbit)
         if following is not None:
             value["sweep"] = "segments"
         self._fill(camera, value, following, None)

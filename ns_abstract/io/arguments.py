@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import math
 import os
+from collections.abc import Mapping, Sequence
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
@@ -72,6 +73,17 @@ def array_of(value: Any, dtype: DTypeLike | None = None) -> np.ndarray | None:
         return np.asarray(value, dtype)
     except Exception:  # what libraries' objects raise is theirs
         return None
+
+
+def plain(value: Any) -> Any:
+    """``value`` as a file of JSON has it: numpy's numbers and arrays, and tuples, become numbers and lists."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {name: plain(entry) for name, entry in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        return [plain(entry) for entry in value]
+    return value
 
 
 def file_path(value: Any, field: str) -> Path:
