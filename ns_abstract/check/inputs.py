@@ -281,7 +281,7 @@ def _pose(entry: dict[str, Any]) -> Array:
 def _camera(root: dict[str, Any], entry: dict[str, Any], down: float) -> CheckedCamera:
     width, height = int(root["render_width"]), int(root["render_height"])
     own = {key: root.get(key) if entry.get(key) is None else entry[key] for key in ("fx", "fy", "cx", "cy")}
-    fov = root.get("default_fov") if entry.get("fov") is None else entry["fov"]
+    fov = entry["fov"] if "fov" in entry else root.get("default_fov")
     fx, fy, cx, cy = lens(own, fov, width, height)
     if down != 1.0:
         # nerfstudio holds the factor and the centre in float32

@@ -353,6 +353,9 @@ def _focal(entry: dict[str, Any], root: dict[str, Any], field: str, height: int)
     """Focal length in pixels from the entry's vertical field of view, or from the path's default."""
     field = f"{field}.fov"
     fov = entry.get("fov")
+    if "fov" in entry and fov is None and field.startswith("camera_path"):
+        # Nerfstudio takes a focal length of 50 pixels for null, whatever default_fov says
+        raise unusable(None, field=field, fix="write degrees, or fx in pixels: Nerfstudio draws null with fx = 50")
     if fov is None:
         fov = root.get("default_fov")
         if fov is None:
