@@ -478,6 +478,20 @@ def statement(blobs: Inputs, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return certified(tmp_path_factory.mktemp("stated"), blobs, {"all": parts})
 
 
+def test_statements_say_nothing_that_is_passed_over() -> None:
+    dark = {"type": "picture", "max": 0.5}
+    assert parsed({"all": [dark], "preprocess": {"resize": [4, 4]}}, (4, 4), 1.0)
+    for root in (
+        {"any": [dark], "type": "picture", "min": 0.9},
+        {"any": [dark], "all": [dark]},
+        dark | {"weight": 0.5},
+        dark | {"preprocess": {"mean": [0.5, 0.5, 0.5]}},
+        {"type": "mask"},
+    ):
+        with pytest.raises(BadInput, match="which is not checked"):
+            parsed(root, (4, 4), 1.0)
+
+
 @pytest.mark.slow
 def test_a_statement_is_proved_again_and_others_are_not(statement: Path, tmp_path: Path) -> None:
     folder = Path(shutil.copytree(statement, tmp_path / "copy"))

@@ -155,6 +155,22 @@ CHECKS = (
         f"{_KINDS}::test_parts_and_margins_of_a_report_are_those_of_the_cells",
     ),
     Fault(
+        "checker: what stands beside the parts of a statement is passed over",
+        _STATEMENTS,
+        "parsed",
+        "root.keys() - _COMMON - {name}",
+        "None",
+        f"{_KINDS}::test_statements_say_nothing_that_is_passed_over",
+    ),
+    Fault(
+        "checker: unknown keys of a statement are passed over",
+        _STATEMENTS,
+        "parsed",
+        'root.keys() - _COMMON - {*_KEYS.get(kind, "").split()}',
+        "set()",
+        f"{_KINDS}::test_statements_say_nothing_that_is_passed_over",
+    ),
+    Fault(
         "checker: least margins are believed",
         _RESULTS,
         "_tallies",
