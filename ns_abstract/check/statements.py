@@ -68,7 +68,7 @@ def parsed(root: dict[str, Any], size: tuple[int, int], scale: float) -> Combine
     for name, pick in (("all", np.min), ("any", np.max)):
         if name in root and not root.keys() - _COMMON - {name}:
             return CombinedMargins(pick, [parsed(part, size, scale) for part in root[name]])
-    kind, weight, first = root.get("type"), float(root.get("weight", 0.5)), _region(root.get("region"), size)
+    kind, weight, first = str(root.get("type")), float(root.get("weight", 0.5)), _region(root.get("region"), size)
     below, above = (lambda v: float(np.nextafter(v, -np.inf))), (lambda v: float(np.nextafter(v, np.inf)))
     more = root.keys() - _COMMON - {*_KEYS.get(kind, "").split()} | (root.get("preprocess") or {}).keys() - {"resize"}
     if more or (kind == "visible" and list(root["select"]) != ["box"]) or root.get("measure") == "expected":
