@@ -10,12 +10,14 @@ import sqlite3
 import subprocess
 import sys
 import threading
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnxruntime
 import pytest
+import torch
 from certifying import classifier, linear
 from conftest import Inputs
 from nerfs import tiny_scene
@@ -23,6 +25,9 @@ from wall import WALL, write_wall
 
 import ns_abstract as nsa
 from ns_abstract.api import cell_search
+from ns_abstract.api.comparing import check_comparison
+from ns_abstract.api.locating import photo_levels
+from ns_abstract.api.location import PhotoOptions
 from ns_abstract.api.search_options import SearchOptions
 from ns_abstract.cli import render as render_command
 from ns_abstract.geometry.camera_path import PinholeCamera
@@ -300,6 +305,23 @@ def test_nerf(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- arguments
 
 
+def test_places_of_a_path_count_from_its_end_too(tmp_path: Path) -> None:
+    entries = [
+        {"camera_to_world": np.eye(4).tolist(), "fov": 30.0 + k, "perturbation": {"hue": k / 8}} for k in range(3)
+    ]
+    file = tmp_path / "path.json"
+    for cycle in (False, True):
+        file.write_text(json.dumps({"render_height": 4, "render_width": 4, "camera_path": entries, "is_cycle": cycle}))
+        path = nsa.load_camera_path(file)
+        # behind the last entry nothing follows, unless the path closes
+        assert path.following(-1) is path.following(2) is (path.cameras[0] if cycle else None)
+        assert path.following(-3) is path.cameras[1] and path.perturbation_of(-1) == {"hue": 0.25}
+        for index in (3, -4, 0.5, True, None):
+            for ask in (path.following, path.perturbation_of):
+                with pytest.raises(nsa.InputError, match="index"):
+                    ask(index)  # type: ignore[arg-type]
+
+
 def test_camera_is_that_of_the_path(blobs: Inputs) -> None:
     theirs = nsa.load_camera_path(blobs.path).cameras[0]
     ours = nsa.Camera(theirs.camera_to_world, fov=45.0, width=theirs.width, height=theirs.height)
@@ -352,11 +374,33 @@ MISTAKES = {
     "true samples": (lambda: NerfMethod(tiny_scene(0), num_samples=True), "--num-samples"),
     "a word for a plane": (lambda: NerfMethod(tiny_scene(0), near_plane="x"), "--near-plane"),  # type: ignore[arg-type]
     "a number for a colour": (lambda: nsa.load_scene("none.yml", background=0.5), "--background"),  # type: ignore[arg-type]
+    "a tensor with gradients": (lambda: nsa.Camera(torch.eye(4, requires_grad=True)), "camera_to_world"),
+    "an array for a word": (lambda: nsa.PoseSet(straight(), frame=np.zeros(2)), "frame"),  # type: ignore[arg-type]
+    "a number for a camera": (lambda: nsa.PoseSet(straight(), following=3), "following"),  # type: ignore[arg-type]
+    "a number for a folder": (lambda: nsa.PoseSet.from_json(straight(), {}, folder=3), "folder"),  # type: ignore[arg-type]
+    "a negative scale": (
+        lambda: nsa.PoseSet(straight(), {"x": 1}, units="dataset").perturbation(-1.0),
+        "dataset_scale",
+    ),
+    "a set of no scene": (lambda: nsa.PoseSet(straight()).of(None), "scene"),  # type: ignore[arg-type]
+    "another renderer": (lambda: nsa.load_scene("none.yml", renderer=3), "--renderer"),  # type: ignore[arg-type]
+    "an array for a mode": (lambda: nsa.load_scene("none.yml", rasterize_mode=np.zeros(2)), "--rasterize-mode"),  # type: ignore[arg-type]
+    "a word for a choice": (lambda: nsa.load_scene("none.yml", drop_nan_gaussians="no"), "--drop-nan-gaussians"),  # type: ignore[arg-type]
+    "another engine": (lambda: SearchOptions(engine="fast"), "engine"),  # type: ignore[arg-type]
+    "a number for an output folder": (lambda: SearchOptions(output_dir=3), "output_dir"),  # type: ignore[arg-type]
+    "a word for a tolerance": (lambda: check_comparison("wide", 1.05, None, ""), "tolerance"),  # type: ignore[arg-type]
+    "a word for resume": (lambda: SearchOptions(resume="no", output_dir="x"), "resume"),  # type: ignore[arg-type]
+    "a word for noise": (lambda: PhotoOptions(noise="some"), "--noise"),  # type: ignore[arg-type]
+    "a list for outliers": (lambda: PhotoOptions(outliers=[0.1]), "--outliers"),  # type: ignore[arg-type]
+    "words for a gain": (lambda: PhotoOptions(gain=("a", "b")), "--brightness-gain"),  # type: ignore[arg-type]
+    "a word for contract": (lambda: PhotoOptions(contract="no"), "contract"),  # type: ignore[arg-type]
+    "a photo of words": (lambda: photo_levels(torch.zeros(2, 2, 3, requires_grad=True)), "photo"),
     "longer than numbers": (lambda: SearchOptions(time_budget=10**400), "time_budget"),
 }
 #: What `ns_abstract.bound` gets, by the name of the argument that its error names.
 BAD_ARGUMENTS: dict[str, Any] = {
     "poses": None, "time_budget": "long", "target_ratio": None, "workers": 0.5, "seed": -1, "--memory-limit": "x",
+    "keep_cells": "no",
 }  # fmt: skip
 
 
@@ -372,6 +416,13 @@ def test_samples_may_be_of_any_whole_number() -> None:
     method = NerfMethod(tiny_scene(0), num_samples=np.int64(3), near_plane=np.float32(0.25))  # type: ignore[arg-type]
     sampling = method.sampling
     assert (type(sampling.samples), sampling.samples, type(sampling.near), sampling.near) == (int, 3, float, 0.25)
+
+
+def test_numbers_of_other_libraries_can_stand_in_reports(tmp_path: Path) -> None:
+    options = SearchOptions(time_budget=Fraction(1, 2), workers=np.int64(2), resume=np.bool_(True), output_dir=tmp_path)  # type: ignore[arg-type]
+    assert json.loads(json.dumps(options.settings))["time_budget"] == 0.5 and options.resume is True
+    photo = PhotoOptions(np.float32(0.25), Fraction(1, 8), np.bool_(False), (1, np.float32(1.5)))  # type: ignore[arg-type]
+    assert json.loads(json.dumps(vars(photo)))["gain"] == [1.0, 1.5] and photo.contract is False
 
 
 @pytest.mark.parametrize("name", BAD_ARGUMENTS)

@@ -446,11 +446,14 @@ def rewrite(folder: Path, change: Callable[[dict[str, np.ndarray]], object], fra
         arrays = {name: archive[name] for name in archive.files}
     change(arrays)
     np.savez(file, **arrays)  # pyright: ignore[reportArgumentType]
-    outer, inner = (
-        float(np.linalg.norm(arrays[f"{of}upper"] - arrays[f"{of}lower"], axis=-1).mean(dtype=np.float64))
-        for of in ("", "witness_")
-    )
-    figures = {"mpg": outer, "mpg_witness": inner, "ratio": outer / inner}
+    gaps = {
+        end: np.linalg.norm(arrays[f"{of}upper"] - arrays[f"{of}lower"], axis=-1).astype(np.float64)
+        for of, end in (("", ""), ("witness_", "_witness"))
+    }
+    figures = {
+        f"{name}{end}": float(f(gap)) for end, gap in gaps.items() for name, f in (("mpg", np.mean), ("xpg", np.max))
+    }
+    figures["ratio"] = figures["mpg"] / figures["mpg_witness"]
     report(folder, lambda d: d["frames"][frame].update(figures))
     report(folder, lambda d: d["sha256"].update({file.name: hashlib.sha256(file.read_bytes()).hexdigest()}))
 
@@ -526,13 +529,21 @@ def test_cells_that_leave_a_gap_are_refuted(copy: Path, in_process: InProcess) -
 
 @pytest.mark.slow
 def test_figures_that_are_not_the_bounds_are_refuted(copy: Path) -> None:
-    figures = {name: json.loads((copy / "report.json").read_text())["frames"][0][name] for name in ("mpg", "ratio")}
+    (frame,) = json.loads((copy / "report.json").read_text())["frames"]
+    figures = {name: frame[name] for name in ("mpg", "ratio", "xpg", "xpg_witness")}
     for name, value in figures.items():
         report(copy, lambda d, n=name, v=value: d["frames"][0].update({n: 0.99 * v}))
         wrong = check(copy, claims=2)
         assert wrong.exit_code == 1 and any(text.startswith(f"frame 0: {name} is") for text in wrong.structure)
         report(copy, lambda d, n=name, v=value: d["frames"][0].update({n: v}))
     assert check(copy, claims=2).structure == []
+    # another set of poses, and a second entry, which nobody would look at
+    sides = [{**side, "lower": 2.0 * side["lower"]} for side in frame["parameters"]]
+    report(copy, lambda d: d["frames"][0].update(parameters=sides))
+    assert check(copy, claims=2).structure == ["frame 0: the report says another set of poses"]
+    report(copy, lambda d: d.update(frames=[frame, frame | {"mpg": 0.0, "ratio": 1.0}]))
+    assert set(check(copy, claims=2).structure) == {"frame 0: the report has more than one entry of it"}
+    report(copy, lambda d: d.update(frames=[frame]))
     # a rendered picture outside of the bounds
     rewrite(copy, lambda a: a["witness_upper"].__setitem__((3, 4, 1), a["upper"][3, 4, 1] + np.float32(0.01)))
     assert "frame 0: a picture that was rendered lies outside of the bounds" in check(copy, claims=2).structure

@@ -44,7 +44,7 @@ from ns_abstract.check.inputs import BadInput, read_poses, read_scene
 from ns_abstract.check.loops import LoopRuns, _lifted
 from ns_abstract.check.networks import read_network
 from ns_abstract.check.poses import CheckedCamera, Poses
-from ns_abstract.check.results import StoredCells, read_verdicts
+from ns_abstract.check.results import StoredCells, read_verdicts, structure
 from ns_abstract.check.splats import (
     FLOAT,
     ActivatedScene,
@@ -252,7 +252,11 @@ def rewrite(folder: Path, change: str) -> None:
     digests = (hashlib.sha256(json.dumps(list(row)).encode()).digest() for row in rows)
     seal = {"rows": len(rows), "sum": f"{sum(int.from_bytes(d, 'big') for d in digests) % (1 << 256):064x}"}
     file = folder / "report.json"
-    file.write_text(json.dumps(json.loads(file.read_text()) | {"cells_seal": seal}))
+    document = json.loads(file.read_text()) | {"cells_seal": seal}
+    for frame in document.get("frames", []):
+        margins = [row[4] for row in rows if row[0] == frame["index"] and row[3] == "certified"]
+        frame["least_margin"] = min(margins, default=None)
+    file.write_text(json.dumps(document))
 
 
 @pytest.mark.slow
@@ -419,6 +423,25 @@ def test_a_forged_headline_is_found(number: int, copy: Path, in_process: InProce
     assert code == 1 and wrong in out
 
 
+def test_parts_and_margins_of_a_report_are_those_of_the_cells() -> None:
+    box = {"box_lower": np.array([[0.0], [0.25], [0.5]]), "box_upper": np.array([[0.25], [0.5], [1.0]])}
+    verdicts: list[Any] = [("certified", 0.25, None), ("certified", 0.125, None), ("open", None, None)]
+    cells = StoredCells(0, ("x",), np.zeros(1), np.ones(1), box, verdicts)
+    counts = {"certified": 2, "falsified": 0, "unknown": 0}
+    frame = {
+        "index": 0,
+        "cells": counts,
+        "coverage": {"certified": 0.5, "falsified": 0.0, "unknown": 0.5},
+        "least_margin": 0.125,
+    }
+    assert structure(cells, {"frames": [frame]}) == []
+    parts = frame | {"coverage": {"certified": 0.5, "falsified": 0.0, "unknown": 0.0}}
+    assert structure(cells, {"frames": [parts]}) == ["unknown cells are 0.5 of the set, the report says 0"]
+    assert structure(cells, {"frames": [frame | {"least_margin": 0.25}]}) == ["the least margin is 0.125, not 0.25"]
+    twice = [frame | {"coverage": {"certified": 1.0}}, frame]
+    assert structure(cells, {"frames": twice}) == ["the report has more than one entry of it"]
+
+
 @pytest.mark.slow
 def test_an_edited_table_is_refused(copy: Path, in_process: InProcess) -> None:
     with sqlite3.connect(copy / "cells.sqlite") as base:
@@ -453,6 +476,20 @@ def statement(blobs: Inputs, tmp_path_factory: pytest.TempPathFactory) -> Path:
         {"any": [{"type": "clear", "distance": 0.1}, {"type": "visible", "select": box, "weight": 0.99}]},
     ]
     return certified(tmp_path_factory.mktemp("stated"), blobs, {"all": parts})
+
+
+def test_statements_say_nothing_that_is_passed_over() -> None:
+    dark = {"type": "picture", "max": 0.5}
+    assert parsed({"all": [dark], "preprocess": {"resize": [4, 4]}}, (4, 4), 1.0)
+    for root in (
+        {"any": [dark], "type": "picture", "min": 0.9},
+        {"any": [dark], "all": [dark]},
+        dark | {"weight": 0.5},
+        dark | {"preprocess": {"mean": [0.5, 0.5, 0.5]}},
+        {"type": "mask"},
+    ):
+        with pytest.raises(BadInput, match="which is not checked"):
+            parsed(root, (4, 4), 1.0)
 
 
 @pytest.mark.slow

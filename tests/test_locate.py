@@ -376,7 +376,7 @@ def test_sub_boxes_are_shared_out_by_motion(shifts: str, turns: tuple[str, ...],
         assert counts[np.argsort(-moved)].tolist() == [8, 8, 1][: len(moved)]
     # a set that is too wide for bounds begins with parts that tile it
     first = search.first_cells()
-    assert (len(first) > 1) == (search.width(box) > search.coarse)
+    assert (len(first) > 1) == (search.width(box) > search.tuning.coarse[search.by_motion])
     assert sum(cell.volume for cell in first) == search.grid.volume
     # without contraction cells are bounded as a whole
     whole = Location(location.job, location.photo.levels, None, PhotoOptions(contract=False)).search(0)

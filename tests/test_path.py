@@ -143,8 +143,7 @@ def test_accepted_variants(tmp_path: Path) -> None:
         "extra": [1],
     }
     del data["fps"]
-    data["camera_path"][0]["fov"] = None
-    del data["camera_path"][1]["fov"]
+    del data["camera_path"][0]["fov"], data["camera_path"][1]["fov"]
     data["camera_path"][1]["camera_to_world"] = [POSE[i : i + 4] for i in range(0, 16, 4)]
     path = load_camera_path(write(tmp_path, b"\xef\xbb\xbf" + json.dumps(data).encode()))
     assert path.cameras[0].height == 200 and isinstance(path.cameras[0].height, int)
@@ -262,6 +261,8 @@ BAD: dict[str, tuple[Any, tuple[str, ...]]] = {
     "fov 180": (_entry(fov=180), ("camera_path[1].fov", "180")),
     "fov negative": (_entry(fov=-3.0), ("camera_path[1].fov",)),
     "fov text": (_entry(fov="45"), ("camera_path[1].fov",)),
+    # Nerfstudio draws it with a focal length of 50 pixels, not with default_fov
+    "fov null": (_entry(fov=None), ("camera_path[1].fov", "null")),
     "fov true": (_entry(fov=True), ("camera_path[1].fov",)),
     "fov tiny": (_entry(fov=1e-300), ("camera_path[1].fov", "focal")),
     "no fov at all": (_no_fov(), ("camera_path[1].fov", "default_fov")),

@@ -9,6 +9,14 @@ _CAMERAS, _DATA_SET = "geometry/camera_files.py", "test_camera_files.py"
 
 INPUTS = (
     Fault(
+        "a field of view that is null is the path's default",
+        _PATH,
+        "_focal",
+        '"fov" in entry',
+        "False",
+        "test_path.py::test_bad_path[fov null]",
+    ),
+    Fault(
         "sets may be as wide as no float64 is",
         "perturbation/specification.py",
         "_refuse_huge",

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.io.arguments import array_of
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import is_number, show, unusable
@@ -227,10 +228,8 @@ def point_of(whole: ParameterBox, values: Any) -> NDArray[np.float64]:
     """
     if isinstance(values, Mapping) and set(values) == set(whole.names):
         values = [values[name] for name in whole.names]
-    try:
-        point = np.asarray(values, np.float64).reshape(-1)
-    except (TypeError, ValueError):
-        point = np.full(whole.dimensions, np.nan)
+    numbers = array_of(values, np.float64)
+    point = np.full(whole.dimensions, np.nan) if numbers is None else numbers.reshape(-1)
     if point.shape != (whole.dimensions,) or not whole.contains(point):
         ends = zip(whole.names, whole.lower, whole.upper, strict=True)
         sides = ", ".join(f"{name} from {low:g} to {high:g}" for name, low, high in ends)

@@ -23,7 +23,7 @@ from ns_abstract.execution.stopping import StopRequest, interruptible
 from ns_abstract.execution.threads import use_threads
 from ns_abstract.execution.worker_cache import Recipe, load
 from ns_abstract.geometry.camera_path import PinholeCamera
-from ns_abstract.io.arguments import at_least, positive, whole
+from ns_abstract.io.arguments import at_least, flag, positive, whole
 from ns_abstract.io.errors import InputError
 from ns_abstract.refine.engine import RefinementGoal, groups, shared_goal
 from ns_abstract.refine.result import FrameResult, PartResult, TracePoint
@@ -344,7 +344,9 @@ def bound(
         scene, [pose_box], arithmetic=arithmetic, seed=seed, memory_limit=memory_limit, workers=workers,
         layers=[name for name in names if name != "rgb"],
     )  # fmt: skip
-    result, guarantee, interrupted = bound_alone(job, time_budget, on_progress, target_ratio, keep_cells)
+    result, guarantee, interrupted = bound_alone(
+        job, time_budget, on_progress, target_ratio, flag(keep_cells, "keep_cells")
+    )
     about = {
         "guarantee": guarantee,
         "renderer": job.method.program,

@@ -104,10 +104,10 @@ def check(
     Raises:
         InputError: A file or a field in it cannot be used.
     """
-    if whole(claims, 1, "claims") > _MOST_CLAIMS:
+    claims, seconds, seed = whole(claims, 1, "claims"), positive(seconds, "seconds"), whole(seed, 0, "seed")
+    if claims > _MOST_CLAIMS:
         raise unusable(claims, field="claims", fix=f"give a number of at most {_MOST_CLAIMS:,}")
-    positive(seconds, "seconds")
-    if whole(seed, 0, "seed") >= 2**63:
+    if seed >= 2**63:
         raise unusable(seed, field="seed", fix="give a number below 2**63")
     moved = {
         "load_config": load_config,

@@ -23,9 +23,10 @@ from ns_abstract.geometry.camera_path import CameraPath, PinholeCamera, load_cam
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.geometry.transform import DataparserTransform
-from ns_abstract.io.arguments import at_least, positive
+from ns_abstract.io.arguments import at_least, float64_of, positive
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import unusable
 from ns_abstract.refine.difference import DifferenceFrame
 from ns_abstract.refine.goal import RefinementGoal
 from ns_abstract.refine.largest import LargestDifference
@@ -342,8 +343,8 @@ def check_comparison(tolerance: float | None, target_ratio: float, budget: float
     def name(word: str) -> str:
         return f"--{word}".replace("_", "-") if prefix else word
 
-    if tolerance is not None and not 0.0 <= tolerance <= 1.0:
-        raise InputError(f"found {tolerance}", field=name("tolerance"), fix="give a number from 0 to 1")
+    if tolerance is not None and not 0.0 <= float64_of(tolerance) <= 1.0:
+        raise unusable(tolerance, field=name("tolerance"), fix="give a number from 0 to 1")
     if budget is not None:
         positive(budget, name("time_budget"))
     at_least(target_ratio, 1.0, name("target_ratio"))

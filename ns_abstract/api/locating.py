@@ -18,7 +18,9 @@ from ns_abstract.api.scenes import Scene, checked_scene
 from ns_abstract.api.search_options import SearchKeywords, SearchOptions, SearchResult
 from ns_abstract.execution.cancellation import Deadline
 from ns_abstract.geometry.camera_path import PinholeCamera
+from ns_abstract.io.arguments import array_of, flag
 from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import unusable
 from ns_abstract.report.certificate import search_figures
 from ns_abstract.report.figures import percent, short_guarantee
 from ns_abstract.report.location import location_document, location_page, location_pictures
@@ -245,9 +247,10 @@ def locate(
     """
     search_options = SearchOptions(**search)
     sets = pose_sets(poses)
-    if unknown := set(brightness or {}) - {"gain", "offset"}:
-        raise InputError(f"found {sorted(unknown)[0]!r}", field="brightness", fix="give gain, offset or both")
-    options = PhotoOptions(noise, outliers, contract, **{k: tuple(v) for k, v in (brightness or {}).items()})  # pyright: ignore[reportArgumentType]
+    ends = {} if brightness is None else brightness
+    if not isinstance(ends, Mapping) or not {"gain", "offset"}.issuperset(ends):
+        raise unusable(ends, field="brightness", fix='give {"gain": [low, high]}, "offset", or both')
+    options = PhotoOptions(noise, outliers, contract, **{k: _ends(v) for k, v in ends.items()})
     job = Job(
         checked_scene(scene),
         [entry.of(scene) for entry in sets],
@@ -255,7 +258,7 @@ def locate(
         workers=search_options.workers,
         memory_limit=memory_limit,
     )
-    options, calibration = calibrated(scene, job, options) if calibrate else (options, None)
+    options, calibration = calibrated(scene, job, options) if flag(calibrate, "calibrate") else (options, None)
     counted = None if mask is None else _checked_mask(mask, job)
     location = Location(job, photo_levels(photo), counted, options, calibration=calibration)
     settings = {**search_options.settings, **vars(options)}
@@ -268,9 +271,16 @@ def locate(
     return located(location, rows, document)
 
 
+def _ends(value: Any) -> Any:
+    """An array's numbers as a sequence; other values as they are."""
+    return value.tolist() if isinstance(value, np.ndarray) else value
+
+
 def photo_levels(photo: ArrayLike) -> np.ndarray:
     """[H, W, 3] uint8 levels of a photo. Raises InputError where it is none, or holds other numbers than k/255."""
-    values = np.asarray(photo)
+    values = array_of(photo)
+    if values is None:
+        raise unusable(photo, field="photo", fix="give [H, W, 3] uint8, or numbers in [0, 1]")
     if values.ndim != 3 or values.shape[2] != 3 or values.dtype.kind not in "fu":
         raise InputError(
             f"found {values.dtype} of shape {list(values.shape)}", field="photo",
@@ -291,7 +301,9 @@ def photo_levels(photo: ArrayLike) -> np.ndarray:
 
 
 def _checked_mask(mask: ArrayLike, job: Job) -> np.ndarray:
-    values, camera = np.asarray(mask), job.pose_sets[0].camera
+    values, camera = array_of(mask), job.pose_sets[0].camera
+    if values is None:
+        raise unusable(mask, field="mask", fix=f"give [{camera.height}, {camera.width}] bool")
     if values.dtype != bool or values.shape != (camera.height, camera.width):
         raise InputError(
             f"found {values.dtype} of shape {list(values.shape)}", field="mask",

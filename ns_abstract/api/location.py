@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -20,8 +20,9 @@ from ns_abstract.execution.worker_cache import Recipe
 from ns_abstract.geometry.camera_path import load_camera_path
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
+from ns_abstract.io.arguments import flag, float64_of
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.jsonio import file_beside, load_json
+from ns_abstract.io.jsonio import file_beside, load_json, unusable
 from ns_abstract.io.photos import read_mask, read_photo
 from ns_abstract.methods.runs import Tagged, read_config
 from ns_abstract.perturbation.specification import Perturbation
@@ -62,13 +63,17 @@ class PhotoOptions:
 
     def __post_init__(self) -> None:
         for name, ends, least, most in (("gain", self.gain, 0.1, 10.0), ("offset", self.offset, -1.0, 1.0)):
-            if not (len(ends) == 2 and least <= ends[0] <= ends[1] <= most):
+            numbers = tuple(map(float64_of, ends)) if isinstance(ends, Sequence) else ()
+            if not (len(numbers) == 2 and least <= numbers[0] <= numbers[1] <= most):
                 fix = f"give two numbers from {least:g} to {most:g}, the smaller one first"
-                raise InputError(f"found {list(ends)}", field=f"--brightness-{name}", fix=fix)
-        if not 0.0 <= self.noise < 1.0:
-            raise InputError(f"found {self.noise}", field="--noise", fix="give a number from 0 to below 1")
-        if not 0.0 <= self.outliers < 1.0:
-            raise InputError(f"found {self.outliers}", field="--outliers", fix="give a number from 0 to below 1")
+                raise unusable(ends, field=f"--brightness-{name}", fix=fix)
+            object.__setattr__(self, name, numbers)
+        for name in ("noise", "outliers"):
+            value = getattr(self, name)
+            if not 0.0 <= float64_of(value) < 1.0:
+                raise unusable(value, field=f"--{name}", fix="give a number from 0 to below 1")
+            object.__setattr__(self, name, float64_of(value))
+        object.__setattr__(self, "contract", flag(self.contract, "contract"))
 
 
 class Location:

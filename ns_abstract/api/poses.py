@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ns_abstract.api.scenes import Scene, not_a_camera
+from ns_abstract.api.scenes import Scene, checked_scene, not_a_camera
 from ns_abstract.geometry import poses
 from ns_abstract.geometry.camera_path import PinholeCamera, checked_pose, checked_side, focal_length, stated_intrinsics
+from ns_abstract.io.arguments import array_of, file_path, plain, positive
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.jsonio import show
+from ns_abstract.io.jsonio import unusable
 from ns_abstract.perturbation.specification import Perturbation, parse_perturbation
 
 Limit = float | Sequence[float]
@@ -52,11 +53,9 @@ class Camera(PinholeCamera):
         cx: float | None = None,
         cy: float | None = None,
     ) -> None:
-        try:
-            matrix = np.asarray(camera_to_world, np.float64)
-        except (TypeError, ValueError):
-            problem = f"found {show(camera_to_world)}"
-            raise InputError(problem, field="camera_to_world", fix="give a 4x4 or 3x4 matrix of numbers") from None
+        matrix = array_of(camera_to_world, np.float64)
+        if matrix is None:
+            raise unusable(camera_to_world, field="camera_to_world", fix="give a 4x4 or 3x4 matrix of numbers")
         if matrix.shape == (3, 4):
             matrix = np.concatenate([matrix, [[0.0, 0.0, 0.0, 1.0]]])
         if matrix.shape != (4, 4):
@@ -67,17 +66,6 @@ class Camera(PinholeCamera):
         own = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
         lens = stated_intrinsics(own, lambda: focal_length(fov, down, "fov"), down, across)
         super().__init__(pose, *lens[:4], across, down)
-
-
-def _plain(value: Any) -> Any:
-    """``value`` as a perturbation file has it: numpy's numbers, arrays and tuples become JSON's."""
-    if isinstance(value, np.ndarray | np.generic):
-        return value.tolist()
-    if isinstance(value, Mapping):
-        return {name: _plain(entry) for name, entry in value.items()}
-    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
-        return [_plain(entry) for entry in value]
-    return value
 
 
 @dataclass(frozen=True, init=False, eq=False)
@@ -123,14 +111,14 @@ class PoseSet:
     ) -> None:
         value: dict[str, Any] = {
             "version": 1,
-            "frame": frame,
-            "units": units,
-            "angle_units": angle_units,
-            "translation": {} if translation is None else _plain(translation),
-            "rotation": {} if rotation is None else _plain(rotation),
+            "frame": plain(frame),
+            "units": plain(units),
+            "angle_units": plain(angle_units),
+            "translation": {} if translation is None else plain(translation),
+            "rotation": {} if rotation is None else plain(rotation),
         }
         if orbit is not None:
-            value["orbit"] = _plain(orbit)
+            value["orbit"] = plain(orbit)
         if following is not None:
             value["sweep"] = "segments"
         self._fill(camera, value, following, None)
@@ -175,11 +163,13 @@ class PoseSet:
     ) -> None:
         if not isinstance(camera, PinholeCamera):
             raise not_a_camera(camera)
+        if following is not None and not isinstance(following, PinholeCamera):
+            raise not_a_camera(following, "following")
         specification = {
             "camera": camera,
             "specification": dict(value) if isinstance(value, Mapping) else value,
             "following": following,
-            "folder": None if folder is None else Path(folder),
+            "folder": None if folder is None else file_path(folder, "folder"),
         }
         for name, entry in specification.items():
             object.__setattr__(self, name, entry)
@@ -187,8 +177,16 @@ class PoseSet:
         self.perturbation()
 
     def perturbation(self, dataset_scale: float | None = 1.0) -> Perturbation:
-        """What varies, in normalised units; ``dataset_scale``: normalised units per unit of the data set, or None."""
-        return parse_perturbation(self.specification, dataset_scale=dataset_scale, field_prefix="", folder=self.folder)
+        """What varies, in normalised units.
+
+        Args:
+            dataset_scale: Normalised units per unit of the data set; None: not known.
+
+        Raises:
+            InputError: The set is stated in units of the data set, and the scale is not known or no positive number.
+        """
+        scale = None if dataset_scale is None else positive(dataset_scale, "dataset_scale")
+        return parse_perturbation(self.specification, dataset_scale=scale, field_prefix="", folder=self.folder)
 
     def of(self, scene: Scene) -> poses.PoseBox:
         """The set for a scene, whose units it may be stated in.
@@ -196,7 +194,9 @@ class PoseSet:
         Raises:
             InputError: The set cannot be made.
         """
-        return poses.PoseBox.around(self.camera, self.perturbation(scene.method().dataset_scale), self.following)
+        return poses.PoseBox.around(
+            self.camera, self.perturbation(checked_scene(scene).method().dataset_scale), self.following
+        )
 
     @property
     def parameters(self) -> tuple[str, ...]:

@@ -24,7 +24,7 @@ from ns_abstract.api.loop_report import LoopReport
 from ns_abstract.api.scenes import Scene, checked_scene
 from ns_abstract.api.search_options import SearchKeywords, SearchOptions, SearchResult
 from ns_abstract.execution.cancellation import Deadline
-from ns_abstract.io.arguments import file_path
+from ns_abstract.io.arguments import file_path, flag
 from ns_abstract.reach.search import QUESTIONS
 from ns_abstract.report.figures import percent
 from ns_abstract.verify.cells import CellGrid
@@ -209,7 +209,7 @@ def reach(
     job = open_loop(
         checked_scene(scene), file_path(loop, "loop"), options.arithmetic, network_arithmetic, options.workers
     )
-    question = LoopQuestion(job, options.settings, ("ns_abstract.reach",), film=film)
+    question = LoopQuestion(job, options.settings, ("ns_abstract.reach",), film=flag(film, "film"))
     rows, document = options.search(question, on_progress, workers=options.workers, scene_margin=scene_margin)
     return result(job, rows, document)
 

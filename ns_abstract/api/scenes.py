@@ -142,10 +142,10 @@ def checked_scene(value: Any) -> Scene:
     return value
 
 
-def not_a_camera(value: Any) -> InputError:
-    """The error of an argument ``camera`` that is no camera."""
+def not_a_camera(value: Any, field: str = "camera") -> InputError:
+    """The error of the argument ``field`` that is no camera."""
     fix = "give an ns_abstract.Camera, or one of a path's .cameras"
-    return InputError(f"found {type(value).__name__}", field="camera", fix=fix)
+    return InputError(f"found {type(value).__name__}", field=field, fix=fix)
 
 
 def load_scene(

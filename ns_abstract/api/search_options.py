@@ -8,15 +8,16 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypedDict, TypeVar
+from typing import Any, TypedDict, TypeVar, get_args
 
 from ns_abstract.api.bounding import listener
 from ns_abstract.api.cell_search import CellQuestion, CellSearch, Request, Row
 from ns_abstract.execution.starting import EngineName, started
 from ns_abstract.execution.stopping import interruptible
-from ns_abstract.io.arguments import positive, whole
+from ns_abstract.io.arguments import file_path, flag, positive, whole
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import unusable
 
 P = TypeVar("P")
 R = TypeVar("R", bound="SearchResult")
@@ -61,8 +62,17 @@ class SearchOptions:
     scheduler_address: str | None = None
 
     def __post_init__(self) -> None:
-        positive(self.time_budget, "time_budget")
-        whole(self.workers, 1, "workers")
+        checked = {
+            "time_budget": positive(self.time_budget, "time_budget"),
+            "workers": whole(self.workers, 1, "workers"),
+            "resume": flag(self.resume, "resume"),
+        }
+        for name, value in checked.items():
+            object.__setattr__(self, name, value)
+        if self.output_dir is not None:
+            file_path(self.output_dir, "output_dir")
+        if self.engine not in get_args(EngineName):
+            raise unusable(self.engine, field="engine", fix=f"use {' or '.join(get_args(EngineName))}")
         if self.resume and self.output_dir is None:
             raise InputError("given without output_dir", field="resume", fix="give the folder to go on with")
 
@@ -92,7 +102,7 @@ class SearchOptions:
             if folder is None:
                 folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="ns-abstract-"))
             stop = stack.enter_context(interruptible())
-            request = Request(self.time_budget, self.resume, report, scene_margin)
+            request = Request(self.time_budget, self.resume, report, flag(scene_margin, "scene_margin"))
             search = CellSearch(question, Path(folder))
             document = search.run(
                 lambda engines: engines.enter_context(started(self.engine, self.scheduler_address, workers)),

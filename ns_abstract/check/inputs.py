@@ -30,8 +30,7 @@ _COLORS = {
 _TEXT = 256 << 20
 #: The mode that a comment of a .ply file stands for.
 _MODES = {("splatrendermode", "mip"): "antialiased", ("splatrendermode", "default"): "classic"}
-_MODES |= {("antialiased", "1"): "antialiased", ("antialiased", "true"): "antialiased"}
-_MODES |= {("antialiased", "0"): "classic", ("antialiased", "false"): "classic"}
+_MODES |= {("antialiased", w): ("antialiased", "classic")[w in ("0", "false")] for w in ("1", "true", "0", "false")}
 _MOVED = "say with --load-config where the scene lies now"
 _SCENE = "give the run of the result"
 _CONVERT = "of another format: ns-abstract-export ply --load-config FILE --output-filename scene.ply, then check with "
@@ -72,8 +71,7 @@ def read_json(file: Path, what: str, fix: str | None = None) -> dict[str, Any]:
 def read_scene(file: Path, report: dict[str, Any]) -> ActivatedScene | CheckedField:
     """The scene that a result is about, from config.yml, its folder or .ply: what its digest says, or nothing."""
     settings, about, renderer = report["settings"], report["scene"], report["renderer"]
-    folder = file.is_dir()
-    file = file / "config.yml" if folder else file
+    file, folder = file / "config.yml" if file.is_dir() else file, file.is_dir()
     if not file.is_file():
         raise BadInput("no such run", file, fix=_CONVERT if folder else _MOVED)
     if renderer["name"] == "nerf-uniform":
@@ -254,13 +252,12 @@ def read_poses(path: Path, given: dict[str, Any] | None, frame: int, settings: d
             low, high = (-value, value) if isinstance(value, (int, float)) else value
             ranges[name] = (float(factor * low), float(factor * high))
         following = _pose(entries[(frame + 1) % len(entries)]) if swept else None
-    for name in ("scene", "hue", "saturation"):
-        if spec.get(name) is not None:
-            raise BadInput(f"the set varies {name}, which this program does not check", path, f"perturbation.{name}")
+    if varied := [name for name in ("scene", "hue", "saturation") if spec.get(name) is not None]:
+        raise BadInput(f"the set varies {varied[0]}, which is not checked", path, f"perturbation.{varied[0]}")
     free = [(name, low, high) for name, (low, high) in ranges.items() if low < high]
     point = {n: a for n, (a, b) in ranges.items() if a == b and (a != 0.0 or n in ("segment", "azimuth"))}
-    names = tuple(name for name, _, _ in free)
-    return Poses(camera, names, point, spec.get("frame", "camera") == "world", about, following), free
+    world = spec.get("frame", "camera") == "world"
+    return Poses(camera, tuple(name for name, _, _ in free), point, world, about, following), free
 
 
 def given_set(settings: dict[str, Any], moved: Path | None) -> dict[str, Any] | None:
@@ -284,7 +281,7 @@ def _pose(entry: dict[str, Any]) -> Array:
 def _camera(root: dict[str, Any], entry: dict[str, Any], down: float) -> CheckedCamera:
     width, height = int(root["render_width"]), int(root["render_height"])
     own = {key: root.get(key) if entry.get(key) is None else entry[key] for key in ("fx", "fy", "cx", "cy")}
-    fov = root.get("default_fov") if entry.get("fov") is None else entry["fov"]
+    fov = entry["fov"] if "fov" in entry else root.get("default_fov")
     fx, fy, cx, cy = lens(own, fov, width, height)
     if down != 1.0:
         # nerfstudio holds the factor and the centre in float32

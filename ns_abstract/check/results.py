@@ -75,8 +75,8 @@ def read_cells(folder: Path, name: str, index: int, digest: object) -> StoredCel
                 raise BadInput("keeps no cells", file, fix="run ns-abstract-render with --save-cells")
             arrays, table = {key: archive[key] for key in _KINDS}, archive["parameters"]
         (n, d), picture, side = arrays["box_lower"].shape, arrays["lower"].shape, arrays["b_lower"].shape[1]
-        shapes = {"": picture, "witness": picture, "tile": (n, 2), "box": (n, d)}
-        shapes |= {"b": (n, side, side, 3), "A": (n, side, side, 3, d)}
+        square = n, side, side, 3
+        shapes = {"": picture, "witness": picture, "tile": (n, 2), "box": (n, d), "b": square, "A": (*square, d)}
         for key, array in arrays.items():
             shape, kind = shapes[key if key == "tile" else key.rpartition("_")[0]], np.dtype(_KINDS[key])
             if array.shape != shape or array.dtype != kind or picture[2:] != (3,):
@@ -105,9 +105,8 @@ def read_verdicts(folder: Path, report: dict[str, Any]) -> list[StoredCells]:
         columns = "rowid, frame, lower, upper, verdict, margin, seconds, counterexample"
         for number, *row in base.execute(f"SELECT {columns} FROM cells LIMIT {_ROWS}"):
             frame, low, high, verdict, margin, _, example = row
-            boxes = [json.loads(low), json.loads(high)]
-            entry = (boxes, "open" if number in left else verdict, margin, json.loads(example or "null"))
-            by_frame.setdefault(frame, []).append(entry)
+            boxes, kind = [json.loads(low), json.loads(high)], "open" if number in left else verdict
+            by_frame.setdefault(frame, []).append((boxes, kind, margin, json.loads(example or "null")))
             if number not in left:
                 total += int.from_bytes(hashlib.sha256(json.dumps(row).encode()).digest(), "big")
                 rows += 1
@@ -133,24 +132,29 @@ def _initial(loop: dict[str, Any]) -> list[list[Any]]:
 
 def structure(cells: StoredCells, report: dict[str, Any]) -> list[str]:
     """What is wrong with a frame's cells: they must be a partition of the set, every pixel bounded, counts right."""
+    entries = [f for f in report.get("frames", ()) if f["index"] == cells.index]
+    # what an entry says that nobody looks at would stand unchecked
+    wrong = ["the report has more than one entry of it"] if entries[1:] else []
     if cells.verdicts is not None:
-        return _tallies(cells, report)
-    a, wrong = cells.arrays, []
+        return wrong + _tallies(cells, report)
+    a, entry = cells.arrays, entries[0]
     (height, width, _), side = a["lower"].shape, a["b_lower"].shape[1]
-    if not (a["lower"] <= a["upper"]).all():
-        wrong.append("a lower bound exceeds the upper bound")
-    if not ((a["lower"] <= a["witness_lower"]) & (a["witness_upper"] <= a["upper"])).all():
-        wrong.append("a picture that was rendered lies outside of the bounds")
-    entry = next(f for f in report["frames"] if f["index"] == cells.index)
-    gaps = [np.linalg.norm(a[f"{k}upper"] - a[f"{k}lower"], axis=-1).mean(dtype=float) for k in ("", "witness_")]
+    places = {(r, c) for r in range(0, height, side) for c in range(0, width, side)}
+    ranges = [list(p) for p in zip(cells.names, cells.lower, cells.upper, strict=True)]
+    inside = (a["lower"] <= a["witness_lower"]) & (a["witness_upper"] <= a["upper"])
+    claims = {
+        "a lower bound exceeds the upper bound": (a["lower"] <= a["upper"]).all(),
+        "a picture that was rendered lies outside of the bounds": inside.all(),
+        "the report says another set of poses": ranges == [[p[key] for key in _BOX] for p in entry["parameters"]],
+        "the cells' tiles are not those of the picture": set(map(tuple, a["tile"].tolist())) == places,
+    }
+    wrong += [text for text, holds in claims.items() if not holds]
+    gaps = [np.linalg.norm(a[f"{k}upper"] - a[f"{k}lower"], axis=-1).astype(float) for k in ("", "witness_")]
     # there is no ratio where no picture differs
-    ratio = entry["mpg"] / (entry["mpg_witness"] or np.inf)
-    for name, gap in (("mpg", gaps[0]), ("mpg_witness", gaps[1]), ("ratio", ratio)):
+    found = [*(f(gap) for gap in gaps for f in (np.mean, np.max)), entry["mpg"] / (entry["mpg_witness"] or np.inf)]
+    for name, gap in zip(("mpg", "xpg", "mpg_witness", "xpg_witness", "ratio"), found, strict=True):
         if not abs(gap - (entry[name] or 0.0)) <= 1e-6 + 1e-5 * gap:
             wrong.append(f"{name} is {gap:.9g}, the report says {entry[name]}")
-    places = {(r, c) for r in range(0, height, side) for c in range(0, width, side)}
-    if set(map(tuple, a["tile"].tolist())) != places:
-        wrong.append("the cells' tiles are not those of the picture")
     checked: dict[bytes, Fraction | None] = {}
     for tile in np.unique(a["tile"], axis=0):
         members = (a["tile"] == tile).all(axis=1)
@@ -179,16 +183,17 @@ def _tallies(cells: StoredCells, report: dict[str, Any]) -> list[str]:
     if covered is None:
         return ["cells overlap, or leave the set"]
     for kind in ("certified", "falsified", "unknown"):
-        # a loop's report counts what is still to be examined as unknown
-        chosen = (verdicts == kind) | ((verdicts == "open") & loop & (kind == "unknown"))
-        if int(chosen.sum()) != entry["cells"][kind]:
-            wrong.append(f"the report counts {entry['cells'][kind]} {kind} cells, the table {int(chosen.sum())}")
-        share = partition(low[chosen], high[chosen], *whole)
-        if kind != "unknown" and (share is None or abs(share - entry[kind]) > 1e-9):
+        # what is still to be examined is unknown; of cells, only a loop's report counts it so
+        part = (verdicts == kind) | ((verdicts == "open") & (kind == "unknown"))
+        count = int((part if loop else verdicts == kind).sum())
+        if count != entry["cells"][kind]:
+            wrong.append(f"the report counts {entry['cells'][kind]} {kind} cells, the table {count}")
+        share = partition(low[part], high[part], *whole)
+        if share is None or not abs(share - entry[kind]) <= 1e-9:
             wrong.append(f"{kind} cells are {float(share or 0):.9g} of the set, the report says {entry[kind]:.9g}")
-    if covered != 1:
-        wrong.append("the cells are no partition of the set")
-    return wrong
+    least = min((v[1] for v in cells.verdicts or () if v[0] == "certified" and v[1] is not None), default=None)
+    wrong += [] if entry["least_margin"] == least else [f"the least margin is {least}, not {entry['least_margin']}"]
+    return wrong + ([] if covered == 1 else ["the cells are no partition of the set"])
 
 
 def partition(low: Array, high: Array, first: Array, last: Array) -> Fraction | None:
@@ -205,7 +210,6 @@ def partition(low: Array, high: Array, first: Array, last: Array) -> Fraction | 
 
     def volume(a: Array, b: Array) -> Fraction:
         # a float64 is a rational number
-        sides = (Fraction(y) - Fraction(x) for x, y in zip(a.tolist(), b.tolist(), strict=True))
-        return math.prod(sides, start=Fraction(1))
+        return math.prod(map(Fraction.__sub__, map(Fraction, b.tolist()), map(Fraction, a.tolist())), start=Fraction(1))
 
     return sum(map(volume, low, high), Fraction(0)) / volume(first, last)

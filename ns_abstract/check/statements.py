@@ -11,6 +11,9 @@ import numpy as np
 from ns_abstract.check.forms import Affine, Array, U, total
 from ns_abstract.check.inputs import BadInput
 
+#: Keys of every statement, and of a kind; others could say more than what is proved.
+_COMMON, _KEYS = {"preprocess", "partitions", "$schema"}, {"picture": "type channel statistic region minus min max"}
+_KEYS |= {"visible": "type select region weight fraction pixels", "clear": "type distance region weight units measure"}
 _CHANNELS = {"luminance": (0.2126, 0.7152, 0.0722), "r": (1.0, 0.0, 0.0), "g": (0.0, 1.0, 0.0), "b": (0.0, 0.0, 1.0)}
 
 
@@ -63,14 +66,14 @@ class Measured(NamedTuple):
 def parsed(root: dict[str, Any], size: tuple[int, int], scale: float) -> CombinedMargins | Measured:
     """The statement of a property or a part of it; ``size`` is height and width, ``scale`` that of `dataset_scale`."""
     for name, pick in (("all", np.min), ("any", np.max)):
-        if name in root:
+        if name in root and not root.keys() - _COMMON - {name}:
             return CombinedMargins(pick, [parsed(part, size, scale) for part in root[name]])
-    kind, weight = root.get("type"), float(root.get("weight", 0.5))
-    first = _region(root.get("region"), size)
+    kind, weight, first = str(root.get("type")), float(root.get("weight", 0.5)), _region(root.get("region"), size)
     below, above = (lambda v: float(np.nextafter(v, -np.inf))), (lambda v: float(np.nextafter(v, np.inf)))
-    if "mask" in root or (kind == "visible" and list(root["select"]) != ["box"]) or root.get("measure") == "expected":
-        fix = "audit one of regions that are boxes, of Gaussians in a box, and of weights"
-        raise BadInput("has a mask, a selection or a depth that is not checked", "report.json", "property", fix)
+    more = root.keys() - _COMMON - {*_KEYS.get(kind, "").split()} | (root.get("preprocess") or {}).keys() - {"resize"}
+    if more or (kind == "visible" and list(root["select"]) != ["box"]) or root.get("measure") == "expected":
+        problem = f"has {', '.join(sorted(more)) or 'a selection or depth'}, which is not checked"
+        raise BadInput(problem, "report.json", "property", "audit boxes of pixels or of Gaussians, and weights")
     if kind == "visible":
         # as many as are that part of the region, or more
         part = 1 + int((np.arange(1, len(first)) / len(first) < root.get("fraction", 0.0)).sum())
@@ -79,8 +82,6 @@ def parsed(root: dict[str, Any], size: tuple[int, int], scale: float) -> Combine
     if kind == "clear":
         distance = float(root["distance"]) * (scale if root.get("units") == "dataset" else 1.0)
         return Measured(distance, (1.0, 0.0, 0.0), [first], 1, -math.inf, weight)
-    if kind != "picture":
-        raise BadInput(f"found {kind!r}, which is not checked", "report.json", "property.type")
     rank = {"mean": 0, "least": -1, "greatest": 1}[root.get("statistic", "mean")]
     regions = [first, *([_region(root["minus"], size)] if "minus" in root else [])]
     low, high = below(float(root.get("min", -math.inf))), above(float(root.get("max", math.inf)))

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from ns_abstract.geometry.camera_files import FileCamera, inria_cameras, is_inria, transforms_cameras
 from ns_abstract.geometry.path_keys import ENTRY, KEYFRAME, PATH
 from ns_abstract.geometry.transform import DataparserTransform
-from ns_abstract.io.arguments import file_path
+from ns_abstract.io.arguments import file_path, whole
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import InputTuning, is_moderate, is_number, load_json, parse_json, show, unusable
 from ns_abstract.io.keys import sentence
@@ -127,8 +127,14 @@ class CameraPath:
 
     def perturbation_of(self, index: int) -> Mapping[str, Any] | None:
         """The perturbation object that holds for camera ``index``: its own, else the path's."""
-        own = self.overrides[index]
+        own = self.overrides[self._place(index)]
         return self.perturbation if own is None else own
+
+    def _place(self, index: int) -> int:
+        """``index`` from 0; negative ones count from the end, as of lists."""
+        count = len(self.cameras)
+        number = whole(index, -count, "index", count - 1)
+        return number + count if number < 0 else number
 
     @property
     def perturbations(self) -> tuple[Mapping[str, Any] | None, ...]:
@@ -137,6 +143,7 @@ class CameraPath:
 
     def following(self, index: int) -> PinholeCamera | None:
         """The camera after ``index``: after the last one the first where the path closes, else None."""
+        index = self._place(index)
         if index + 1 < len(self.cameras):
             return self.cameras[index + 1]
         return self.cameras[0] if self.is_cycle and len(self.cameras) > 1 else None
@@ -346,6 +353,9 @@ def _focal(entry: dict[str, Any], root: dict[str, Any], field: str, height: int)
     """Focal length in pixels from the entry's vertical field of view, or from the path's default."""
     field = f"{field}.fov"
     fov = entry.get("fov")
+    if "fov" in entry and fov is None and field.startswith("camera_path"):
+        # Nerfstudio takes a focal length of 50 pixels for null, whatever default_fov says
+        raise unusable(None, field=field, fix="write degrees, or fx in pixels: Nerfstudio draws null with fx = 50")
     if fov is None:
         fov = root.get("default_fov")
         if fov is None:

@@ -48,7 +48,7 @@ ENTRY = KeyTable(
     "An entry of `camera_path`",
     (
         Key("camera_to_world", "used", "the pose", f"{_READ}:154"),
-        Key("fov", "used", "the vertical field of view", f"{_READ}:167"),
+        Key("fov", "used", "the vertical field of view; null is refused", f"{_READ}:167"),
         Key("aspect", "irrelevant", "the picture has render_width and render_height", f"{_PANEL}:1113"),
         Key("render_time", "irrelevant", _TIME, f"{_READ}:173"),
         Key("camera_type", "refused", _TYPE, "", ("perspective",), fix=_SAVE_AGAIN),

@@ -5,9 +5,13 @@ from __future__ import annotations
 import errno
 import math
 import os
+from collections.abc import Mapping, Sequence
 from numbers import Integral, Real
 from pathlib import Path
 from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import FIX_ACCESS, show, unusable
@@ -50,6 +54,36 @@ def whole(value: Any, least: int, field: str, most: int | None = None) -> int:
         limits = f"a whole number of at least {least}" if most is None else f"{least} to {most}"
         raise unusable(value, field=field, fix=f"give {limits}")
     return number
+
+
+def flag(value: Any, field: str) -> bool:
+    """``value`` as a bool, from the argument ``field``.
+
+    Raises:
+        InputError: It is none; texts such as "no" would count as true.
+    """
+    if not isinstance(value, bool | np.bool_):
+        raise unusable(value, field=field, fix="give True or False")
+    return bool(value)
+
+
+def array_of(value: Any, dtype: DTypeLike | None = None) -> np.ndarray | None:
+    """``value`` as an array; None where it is none, such as a tensor that requires gradients."""
+    try:
+        return np.asarray(value, dtype)
+    except Exception:  # what libraries' objects raise is theirs
+        return None
+
+
+def plain(value: Any) -> Any:
+    """``value`` as a file of JSON has it: numpy's numbers and arrays, and tuples, become numbers and lists."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    if isinstance(value, Mapping):
+        return {name: plain(entry) for name, entry in value.items()}
+    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
+        return [plain(entry) for entry in value]
+    return value
 
 
 def file_path(value: Any, field: str) -> Path:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Literal, TypedDict
+from typing import Any, Literal, TypedDict
 
+from ns_abstract.io.arguments import array_of, flag
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import is_number, unusable
@@ -42,10 +43,14 @@ class Overrides:
 
     def __post_init__(self) -> None:
         mode, color, step = self.rasterize_mode, self.background, self.load_step
-        if mode not in (None, *MODES):
+        for name in ("assume_splatfacto", "drop_nan_gaussians"):
+            object.__setattr__(self, name, flag(getattr(self, name), "--" + name.replace("_", "-")))
+        if mode is not None and not (isinstance(mode, str) and mode in MODES):
             raise unusable(mode, field="--rasterize-mode", fix=f"use {' or '.join(MODES)}")
         if color is not None:
-            parts = list(color) if isinstance(color, Iterable) else [color]
+            array = None if isinstance(color, list | tuple) else array_of(color)
+            parts: list[Any] = list(color) if isinstance(color, list | tuple) else [color]
+            parts = parts if array is None else array.ravel().tolist()
             if len(parts) != 3 or not all(is_number(part) and 0 <= part <= 1 for part in parts):
                 raise unusable(parts, field="--background", fix="give three numbers from 0 to 1")
             object.__setattr__(self, "background", tuple(float(part) for part in parts))

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Literal
 
 from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import unusable
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,12 @@ class ProgramOptions:
     That makes it another scene, for which the bounds hold."""
     device: Literal["cpu", "cuda"] | None = None
     """NeRF. cuda: bound the field on a GPU, in float64. Default: cpu."""
+
+    def __post_init__(self) -> None:
+        for name in ("renderer", "gsplat_version", "sampling", "device"):
+            value = getattr(self, name)
+            if value is not None and not isinstance(value, str):
+                raise unusable(value, field="--" + name.replace("_", "-"), fix="give a text, or leave it out")
 
     def refuse(self, names: tuple[str, ...], problem: str) -> None:
         """Refuse options of other representations. Raises InputError where one of ``names`` is given."""

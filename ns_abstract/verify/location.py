@@ -37,8 +37,8 @@ UNITS = 20
 class LocationTuning:
     """Preferences of the search. None of them decides whether an excluded cell holds no pose of the photo."""
 
-    #: From so many parameters on, pixels are bounded over cells of the image motion, so many along its two axes; what of
-    #: the motion widens bounds all the same. Sub-boxes then cost a look at each pixel's motion cells, no bounds.
+    #: From so many parameters on, pixels are bounded over cells of the image motion, so many along its two axes; part of
+    #: it widens bounds all the same. Sub-boxes then cost a look at each pixel's motion cells, no bounds.
     many: int = 4
     motion_cells: tuple[int, int] = (8, 8)
     motion_share: float = 0.25
@@ -143,15 +143,10 @@ class LocationSearch:
             counts[np.argsort(-self.moved(self.frame.box), kind="stable")[:2]] = self.tuning.along
         return counts
 
-    @property
-    def coarse(self) -> float:
-        """The width beyond which cells are cut without bounds."""
-        return self.tuning.coarse[self.by_motion]
-
     def first_cells(self) -> list[Cell]:
         """The set's first cell, or its parts where it is too wide for bounds: several can be examined side by side."""
         (root,) = self.grid.roots()
-        if self.width(self.grid.box) <= self.coarse:
+        if self.width(self.grid.box) <= self.tuning.coarse[self.by_motion]:
             return [root]
         examination = _Examination(self, root, self.tiled.chosen(()))
         examination.cut()
@@ -172,8 +167,8 @@ class LocationSearch:
     @cached_property
     def telling(self) -> TellingPixels:
         """Which pixels of a cell are bounded: a guess, by one cell in the middle of the set."""
-        box, least, parts = self.frame.box, self.tuning.still, self.sub_box_frame is not None
-        parts = parts and box.dimensions > 1
+        box, least = self.frame.box, self.tuning.still
+        parts = self.sub_box_frame is not None and box.dimensions > 1
         reference = self.tuning.reference[parts + self.by_motion]
         side = np.minimum(1.0, reference / math.sqrt(max(1, box.dimensions)) / np.maximum(self.widths(box), least))
         cell = between(box, -side, side)
@@ -251,7 +246,7 @@ class _Examination:
                 return self._exclude(1.0)
             self._shrink(feasible)
             box = search.grid.box_of(self.cell)
-            if box.dimensions and search.width(box) > search.coarse:
+            if box.dimensions and search.width(box) > tuning.coarse[search.by_motion]:
                 break
             picture, number = self._look(box.middle)
             moved = float(np.linalg.norm(search.moved(box))) if search.by_motion else search.width(box)
@@ -468,11 +463,10 @@ class _Examination:
             return self._finish()
         moved = search.widths(search.grid.box_of(self.cell))
         total = float(np.linalg.norm(moved))
-        aim = search.coarse
-        if total <= search.coarse:
-            aim = total * min(
-                max(self.share ** (1.0 / tuning.power), tuning.least_aim), tuning.most_aim[search.by_motion]
-            )
+        aim = tuning.coarse[search.by_motion]
+        if total <= aim:
+            most = tuning.most_aim[search.by_motion]
+            aim = total * min(max(self.share ** (1.0 / tuning.power), tuning.least_aim), most)
         parts = [1] * len(moved)
         sizes = [past - first for first, past in zip(self.cell.first, self.cell.past, strict=True)]
         while np.prod(parts) < 2 or (2 * np.prod(parts) <= tuning.parts and total > aim):

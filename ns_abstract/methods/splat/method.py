@@ -15,12 +15,13 @@ from ns_abstract.arithmetic.rounding import arithmetic as arithmetic_named
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.poses import COLOR_SHIFTS, PoseBox, PoseForms
 from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import unusable
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.representation import ProgramOptions, Representation
 from ns_abstract.methods.runs import RunConfig
 from ns_abstract.methods.splat.activate import SH_C0, Splats, activate
 from ns_abstract.methods.splat.bounds import SceneSums
-from ns_abstract.methods.splat.constants import VERSIONS, Rasteriser, raster_rules, rasteriser_named
+from ns_abstract.methods.splat.constants import RASTERISERS, VERSIONS, Rasteriser, raster_rules, rasteriser_named
 from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.load import load_run, load_scene
 from ns_abstract.methods.splat.scene import SplatScene
@@ -228,6 +229,8 @@ def _method(scene: SplatScene, options: ProgramOptions, arithmetic: str | None, 
     options.refuse(nerf, "is for runs of vanilla-nerf, this run is a splat")
     if options.renderer == "paper":
         options.refuse(("gsplat_version",), "the paper's renderer is not gsplat")
+    if options.renderer not in (None, *RASTERISERS):
+        raise unusable(options.renderer, field="--renderer", fix=f"use {' or '.join(RASTERISERS)}")
     if options.gsplat_version not in (None, *VERSIONS):
         raise InputError(
             f"found {options.gsplat_version}", field="--gsplat-version", fix=f"use one of {', '.join(VERSIONS)}"
