@@ -37,8 +37,8 @@ UNITS = 20
 class LocationTuning:
     """Preferences of the search. None of them decides whether an excluded cell holds no pose of the photo."""
 
-    #: From so many parameters on, pixels are bounded over cells of the image motion, so many along its two axes; part of
-    #: it widens bounds all the same. Sub-boxes then cost a look at each pixel's motion cells, no bounds.
+    #: From so many parameters on, pixels are bounded over cells of the image motion, so many along its two axes; part
+    #: of it widens bounds all the same. Sub-boxes then cost a look at each pixel's motion cells, no bounds.
     many: int = 4
     motion_cells: tuple[int, int] = (8, 8)
     motion_share: float = 0.25
