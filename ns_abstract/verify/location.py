@@ -270,11 +270,8 @@ class _Examination:
     def _sub_boxes(self, box: ParameterBox, picture: np.ndarray) -> bool | None:
         """Exclude sub-boxes of the cell; returns whether some were, or None: the frame has no bounds of sub-boxes."""
         search, tuning = self.search, self.search.tuning
-        frame, cells, counts = (
-            search.sub_box_frame,
-            search.motion_cells(box),
-            sub_box_counts(self.cell, search.along(box)),
-        )
+        frame, cells = search.sub_box_frame, search.motion_cells(box)
+        counts = sub_box_counts(self.cell, search.along(box))
         if frame is None or cells is None or not resolved(box, counts):
             return None
         boxes = MotionBoxes(cells, counts, search.frame.camera)
@@ -393,13 +390,13 @@ class _Examination:
                 return True
 
     def _rounds(self, box: ParameterBox, picture: np.ndarray, counts: np.ndarray) -> tuple[PixelRounds, PixelOrder]:
-        """Rounds of pixels for the sub-boxes [counts] of the cell; there are none where too few are likely to help."""
+        """Rounds of pixels for the sub-boxes [counts] of the cell, and the pixels that they choose from."""
         search, tiled, tuning = self.search, self.search.tiled, self.search.tuning
-        moved, known = search.moved(box), int(self.inherited.sum())
+        moved, needed = float(np.linalg.norm(search.moved(box))), tiled.allowed + 1 - int(self.inherited.sum())
+        parts = bool(counts.prod() > 1)
         chosen = search.telling.order(
-            picture, max(1, round(0.5 * float(np.linalg.norm(moved)))), search.width(box),
-            tiled.counted & ~self.inherited, round(tuning.surplus * (tiled.allowed + 1 - known)),
-            differences=counts.prod() > 1,
+            picture, max(1, round(0.5 * moved)), search.width(box) if parts else moved,
+            tiled.counted & ~self.inherited, round(tuning.surplus * needed), differences=parts,
         )  # fmt: skip
         return PixelRounds(tiled, int(np.prod(counts)), self.inherited, tuning.pixel_rounds), chosen
 
