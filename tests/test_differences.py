@@ -420,7 +420,8 @@ def test_floors_of_splats(change: str) -> None:
     assert most < 0.05 if change == "same" else most <= 1.5 * found.largest.value
 
 
-def test_sheared_sets_and_groups_of_tiles() -> None:
+def test_sheared_sets_and_groups_of_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ns_abstract.api.poses.checked_scene", lambda opened: opened)
     scene, given = blob_scene(count=20), ring()[1]
     first, second = (_opened(s) for s in (scene, rounded(scene)))
     camera = nsa.Camera(given.camera_to_world, given.fov, given.width, given.height)
@@ -437,7 +438,8 @@ def test_sheared_sets_and_groups_of_tiles() -> None:
         assert (assemble(job.frame(0).render(values), poses.camera) <= found.upper).all()
 
 
-def test_results_name_both_scenes() -> None:
+def test_results_name_both_scenes(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("ns_abstract.api.poses.checked_scene", lambda opened: opened)
     given = ring()[1]
     camera = nsa.Camera(given.camera_to_world, given.fov, given.width, given.height)
     first, second = (_opened(s) for s in (blob_scene(count=5), rounded(blob_scene(count=5))))

@@ -46,7 +46,9 @@ def _blended(values, palette, shape, parts, rules, charges_, unknown, out, slope
         if unknown[e]:
             set_unknown(block.fragments, e * width, values[e, ALPHA_HIGH], shape.monomials)
     buffers.palette[: palette.size] = palette
-    of_parts = Parts(pointer(parts.middles), pointer(parts.half), pointer(parts.slope), parts.levels)
+    of_parts = Parts(
+        pointer(parts.middles), pointer(parts.half), pointer(parts.slope), parts.levels, parts.motion, parts.side
+    )
     inputs = PixelInputs(None, None, None, None, rules, charges_, None, shape, of_parts)
     ends = blend_parts(0, count, False, block, inputs, pointer(slopes))
     for k in range(4):
@@ -62,7 +64,7 @@ class _Pixel:
         generator = np.random.default_rng(seed)
         self.d, self.counts = len(counts), np.array(counts)
         self.parts = cell_parts(self.counts)
-        self.shape = FormShape(self.d, 1, self.d + 1, int(self.counts.prod()))
+        self.shape = FormShape(self.d, 1, self.d + 1, int(self.counts.prod()), 0, self.d)
         scale = 2.0**-10
         self.centers = np.round(generator.uniform(-3.0, 3.0, (fragments, 2)) / scale) * scale
         self.slopes = np.round(generator.uniform(-size, size, (fragments, self.d, 2)) / scale) * scale

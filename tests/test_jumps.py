@@ -85,7 +85,8 @@ def _by_sub_box(values, lists, colors, background, inputs, count, limit, crossin
     set_blend(t, out, crossings, inputs.shape.dimensions)
     store(out, 20, blend.since)
     gather_crossings(0, count, blend.crossings, offset_by(out, 20), fragments, crossings, out, inputs.shape)
-    given = Parts(pointer(inputs.parts.middles), pointer(inputs.parts.half), inputs.parts.slope, inputs.parts.levels)
+    parts = inputs.parts
+    given = Parts(pointer(parts.middles), pointer(parts.half), parts.slope, parts.levels, parts.motion, parts.side)
     bound_sub_boxes(blend.crossings, limit, out, crossings, _SubBoxInputs(given, inputs.shape), ends)
     return blend.crossings
 

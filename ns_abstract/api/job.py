@@ -34,7 +34,6 @@ from ns_abstract.refine.engine import Refinement, RefinementGoal
 from ns_abstract.refine.protocol import CountedFrame, Frame, Method, SubBoxFrame
 from ns_abstract.refine.result import EXTRA_OUTPUTS, FrameResult, PartResult, TracePoint, joined
 from ns_abstract.report.figures import ShownUnits, number
-from ns_abstract.verify import motion_boxes
 
 #: Radians of a rotation beyond which a set asks whether degrees were meant.
 _WIDE_TURN = 0.5
@@ -351,6 +350,8 @@ def warm_up(frame: Frame) -> None:
 
 def warm_up_sub_boxes(frame: SubBoxFrame) -> None:
     """Compile the kernels that bounds over sub-boxes need besides those of `warm_up`."""
+    from ns_abstract.verify import motion_boxes
+
     with kernels().expecting(*_SUB_BOX_KERNELS):
         frame.warm_up_sub_boxes()
         motion_boxes.warm_up()

@@ -20,7 +20,7 @@ class MotionCellTuning:
 
 @dataclass(frozen=True, eq=False)
 class MotionCells:
-    """Equal cells of the image motion at each square of some pixels of a picture.
+    """Equal cells of the image motion at each square of some pixels of a picture (design.md, B16).
 
     At a square the motion is ``q = A p``, in [-1, 1]^2, of the parameters p in [-1, 1]^d of a cell of poses.
 

@@ -8,13 +8,14 @@ import os
 from collections.abc import Mapping, Sequence
 from numbers import Integral, Real
 from pathlib import Path
-from typing import Any
-
-import numpy as np
-from numpy.typing import DTypeLike
+from typing import TYPE_CHECKING, Any
 
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import FIX_ACCESS, show, unusable
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import DTypeLike
 
 
 def float64_of(value: Any) -> float:
@@ -62,6 +63,8 @@ def flag(value: Any, field: str) -> bool:
     Raises:
         InputError: It is none; texts such as "no" would count as true.
     """
+    import numpy as np  # not for ``--help``
+
     if not isinstance(value, bool | np.bool_):
         raise unusable(value, field=field, fix="give True or False")
     return bool(value)
@@ -69,6 +72,8 @@ def flag(value: Any, field: str) -> bool:
 
 def array_of(value: Any, dtype: DTypeLike | None = None) -> np.ndarray | None:
     """``value`` as an array; None where it is none, such as a tensor that requires gradients."""
+    import numpy as np
+
     try:
         return np.asarray(value, dtype)
     except Exception:  # what libraries' objects raise is theirs
@@ -77,6 +82,8 @@ def array_of(value: Any, dtype: DTypeLike | None = None) -> np.ndarray | None:
 
 def plain(value: Any) -> Any:
     """``value`` as a file of JSON has it: numpy's numbers and arrays, and tuples, become numbers and lists."""
+    import numpy as np
+
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
     if isinstance(value, Mapping):

@@ -12,7 +12,7 @@ from ns_abstract.geometry.motion_cells import MotionCells, square_numbers
 
 
 class MotionBoxes:
-    """Sub-boxes of a cell, and the motion cells that the poses of each may show at each pixel of the picture.
+    """Sub-boxes of a cell, and the motion cells that the poses of each may show at each pixel (design.md, U11).
 
     Args:
         cells: Motion cells of the cell.

@@ -129,7 +129,7 @@ class ImageMotion:
         return 1 if self._camera.width * self._camera.height <= _TUNING.most_squares else _TUNING.neighbourhood
 
     def of_squares(self, box: ParameterBox) -> np.ndarray:
-        """[squares, 2, d] pixels that what each square shows in a cell's middle moves by over half of it (an estimate).
+        """[squares, 2, d] pixels that a square's content moves by over half of a cell (B16), estimated in its middle.
 
         Squares of `side` pixels stand row by row.
         """
