@@ -63,9 +63,11 @@ def flag(value: Any, field: str) -> bool:
     Raises:
         InputError: It is none; texts such as "no" would count as true.
     """
+    if isinstance(value, bool):
+        return value
     import numpy as np  # not for ``--help``
 
-    if not isinstance(value, bool | np.bool_):
+    if not isinstance(value, np.bool_):
         raise unusable(value, field=field, fix="give True or False")
     return bool(value)
 
