@@ -64,7 +64,7 @@ class _Pixel:
         generator = np.random.default_rng(seed)
         self.d, self.counts = len(counts), np.array(counts)
         self.parts = cell_parts(self.counts)
-        self.shape = FormShape(self.d, 1, self.d + 1, int(self.counts.prod()), 0, self.d)
+        self.shape = FormShape(self.d, 1, self.d + 1, int(self.counts.prod()))
         scale = 2.0**-10
         self.centers = np.round(generator.uniform(-3.0, 3.0, (fragments, 2)) / scale) * scale
         self.slopes = np.round(generator.uniform(-size, size, (fragments, self.d, 2)) / scale) * scale

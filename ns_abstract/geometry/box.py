@@ -74,6 +74,13 @@ class ParameterBox:
         return ParameterBox(self.names, self.units, tuple(lower), tuple(upper))
 
 
+def part_middles(counts: np.ndarray) -> Float64Array:
+    """[d, k] middles in [-1, 1] of equal parts, ``counts`` [d] along the axes, numbered like entries of an array."""
+    along = [(2.0 * np.arange(n) + 1.0) / n - 1.0 for n in counts.tolist()]
+    grid = np.array(np.meshgrid(*along, indexing="ij"), np.float64)
+    return np.ascontiguousarray(grid.reshape(counts.size, counts.prod()))
+
+
 def shared_out(weights: np.ndarray, parts: int) -> np.ndarray:
     """Numbers of parts [d] along axes, ``parts`` together (a power of two), more where ``weights`` [d] are larger."""
     counts = np.ones(weights.size, np.int64)

@@ -132,7 +132,7 @@ class LocationSearch:
     @property
     def by_motion(self) -> bool:
         """Whether wide cells are bounded over cells of the image motion (U11)."""
-        return self.sub_box_frame is not None and self.frame.box.dimensions >= self.tuning.many
+        return self.has_parts and self.frame.box.dimensions >= self.tuning.many
 
     def along(self, box: ParameterBox) -> np.ndarray:
         """[d] sub-boxes along the parameters of a cell."""
@@ -168,13 +168,11 @@ class LocationSearch:
     def telling(self) -> TellingPixels:
         """Which pixels of a cell are bounded: a guess, by one cell in the middle of the set."""
         box, least = self.frame.box, self.tuning.still
-        parts = self.sub_box_frame is not None and box.dimensions > 1
-        reference = self.tuning.reference[parts + self.by_motion]
+        reference = self.tuning.reference[self.has_parts + self.by_motion]
         side = np.minimum(1.0, reference / math.sqrt(max(1, box.dimensions)) / np.maximum(self.widths(box), least))
         cell = between(box, -side, side)
         picture = assemble(self.plain.render(self.original(cell.middle)), self.frame.camera)[..., :3]
-        divided = self.parts(cell) if parts else None
-        typical = typical_cell(self.frame, cell, divided, max(self.width(cell), least), picture)
+        typical = typical_cell(self.frame, cell, self.parts(cell), max(self.width(cell), least), picture)
         return TellingPixels(self.tiled, self.frame.camera, typical)
 
     def motion_cells(self, box: ParameterBox) -> MotionCells | None:
@@ -182,8 +180,15 @@ class LocationSearch:
         frame = self.sub_box_frame
         return None if frame is None else frame.motion_cells(box, np.array(self.tuning.motion_cells))
 
+    @property
+    def has_parts(self) -> bool:
+        """Whether pixels of wide cells are bounded over parts of them."""
+        return self.sub_box_frame is not None and self.frame.box.dimensions > 1
+
     def parts(self, box: ParameterBox) -> MotionCells | np.ndarray | None:
-        """What pixels are bounded over: motion cells, or numbers [d] of sub-boxes."""
+        """The parts of a cell: motion cells, or numbers [d] of sub-boxes; None: it has none."""
+        if not self.has_parts:
+            return None
         return self.motion_cells(box) if self.by_motion else self.along(box)
 
     def examine(self, cells: Sequence[Cell]) -> LocationResult:
@@ -274,7 +279,7 @@ class _Examination:
         counts = sub_box_counts(self.cell, search.along(box))
         if frame is None or cells is None or not resolved(box, counts):
             return None
-        boxes = MotionBoxes(cells, counts, search.frame.camera)
+        boxes, parts = MotionBoxes(cells, counts, search.frame.camera), cells if search.by_motion else counts
         rounds, order = self._rounds(box, picture, counts)
         narrow = search.width(box) <= tuning.unordered
         while (chosen := rounds.following(*order.towards(boxes.moved[rounds.left]))) is not None:
@@ -286,7 +291,6 @@ class _Examination:
                     continue
                 tiles = np.flatnonzero(pixels.any(axis=(1, 2)))
                 telling = (miss == miss.max(axis=-1, keepdims=True))[pixels] if narrow else None
-                parts = cells if search.by_motion else counts
                 ends = frame.sub_box_ends(box, parts, tiles, pixels[tiles], telling, kind == DIFFERENCES)
                 if ends is None:
                     return None

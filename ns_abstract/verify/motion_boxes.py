@@ -6,7 +6,7 @@ import numpy as np
 from numba import njit
 
 from ns_abstract.arithmetic.rounding import SUB_BOX_OVERLAP
-from ns_abstract.geometry.box import Float64Array
+from ns_abstract.geometry.box import Float64Array, part_middles
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.motion_cells import MotionCells, square_numbers
 
@@ -25,9 +25,7 @@ class MotionBoxes:
 
     def __init__(self, cells: MotionCells, counts: np.ndarray, camera: PinholeCamera) -> None:
         self.cells, self._width = cells, camera.width
-        along = [(2.0 * np.arange(n) + 1.0) / n - 1.0 for n in counts.tolist()]
-        grid = np.meshgrid(*along, indexing="ij")
-        self._middles: Float64Array = np.stack([axis.ravel() for axis in grid], axis=1)
+        self._middles: Float64Array = np.ascontiguousarray(part_middles(counts).T)
         self._half: Float64Array = 1.0 / counts + SUB_BOX_OVERLAP
         self.moved = self._middles @ cells.typical.T
 

@@ -25,6 +25,8 @@ CHANNELS, DIFFERENCES = range(2)
 _MOST_PIXELS, _FEWER = 4096, 3
 #: What bounds lose at most, and as which power of their width.
 _ALL, _POWER = 2.0, 1.5
+#: What the worth of a pixel counts beside the part of a cell that it is likely to exclude.
+_WORTH = 0.25
 
 
 @dataclass(frozen=True)
@@ -67,13 +69,13 @@ class PixelOrder:
 
     def _sorted(self, shares: Float64Array) -> tuple[np.ndarray, Float64Array]:
         some = np.flatnonzero(shares > 0.0)
-        order = some[np.argsort(-4.0 * shares[some] - self.worth[some], kind="stable")][: self.most]
+        order = some[np.argsort(-_score(shares[some], self.worth[some]), kind="stable")][: self.most]
         return self.numbers[order], shares[order]
 
 
 @dataclass(frozen=True)
 class TypicalCell:
-    """What bounds over a cell, or its motion cells, lose.
+    """What bounds over a cell, or its parts, lose.
 
     Attributes:
         picture: [H, W, 3] in its middle.
@@ -118,27 +120,22 @@ class TellingPixels:
         shift = best_shift(self.typical.picture.mean(axis=-1), picture.mean(axis=-1))
         scale = (width / self.typical.width) ** _POWER
         losses = [[scale * shifted(loss, *shift) for loss in self.typical.losses[kind]] for kind in kinds]
-        misses = tuple(self._misses(picture, kind, losses[kind]) for kind in kinds)
         steps = np.array([(x, y) for y in _steps(radius) for x in _steps(radius)])
-        everywhere = [self._moved_misses(picture, kind, steps, losses[kind]) for kind in kinds]
+        ends = [_ends(picture, kind, losses[kind]) for kind in kinds]
+        misses = tuple(self._misses(kind, pair) for kind, pair in enumerate(ends))
+        everywhere = [self._moved_misses(kind, pair, steps) for kind, pair in enumerate(ends)]
         loose = [in_tiles((below + above).max(axis=-1), self.side)[counted] for below, above in losses]
         missed = np.stack([part[:, counted] for part in everywhere])
         worth = missed.min(axis=1) - np.stack(loose)
-        kinds_of = ((missed > 0.0).mean(axis=1) + 0.25 * worth).argmax(axis=0)
-        missed, worth = (
-            np.take_along_axis(part, index, axis=0)[0]
-            for part, index in ((missed, kinds_of[None, None]), (worth, kinds_of[None]))
-        )
+        kinds_of = _score((missed > 0.0).mean(axis=1), worth).argmax(axis=0)
+        missed = np.take_along_axis(missed, kinds_of[None, None], axis=0)[0]
+        worth = np.take_along_axis(worth, kinds_of[None], axis=0)[0]
         chosen = np.zeros(counted.shape, np.int64)
         chosen[counted] = kinds_of
         return PixelOrder(steps, missed > 0.0, np.flatnonzero(counted), worth, most_pixels, chosen, misses)
 
-    def _moved_misses(
-        self, picture: np.ndarray, kind: int, steps: np.ndarray, losses: Sequence[Float64Array]
-    ) -> np.ndarray:
-        """[m, T, side, side] by how much bounds are expected to miss the photo where the picture moved by ``steps``."""
-        least, most = nearby(_values(picture, kind), 1)
-        ends = least - losses[0], most + losses[1]
+    def _moved_misses(self, kind: int, ends: tuple[Float64Array, Float64Array], steps: np.ndarray) -> np.ndarray:
+        """[m, T, side, side] by how much bounds ``ends`` miss the photo where the picture moved by ``steps``."""
         low, high = self.ends[kind]
         misses = []
         for column, row in steps.tolist():
@@ -146,11 +143,10 @@ class TellingPixels:
             misses.append(in_tiles(np.maximum(below - high, low - above).max(axis=-1), self.side))
         return np.stack(misses)
 
-    def _misses(self, picture: np.ndarray, kind: int, losses: Sequence[Float64Array | float]) -> Float64Array:
-        """See `PixelOrder`: by what the picture shows next to each pixel, and what bounds lose."""
-        least, most = nearby(_values(picture, kind), 1)
+    def _misses(self, kind: int, ends: tuple[Float64Array, Float64Array]) -> Float64Array:
+        """See `PixelOrder`: by how much bounds ``ends`` miss the photo."""
         low, high = self.ends[kind]
-        return in_tiles(np.concatenate([least - losses[0] - high, low - most - losses[1]], axis=-1), self.side)
+        return in_tiles(np.concatenate([ends[0] - high, low - ends[1]], axis=-1), self.side)
 
 
 def typical_cell(
@@ -231,6 +227,17 @@ def _values(picture: np.ndarray, kind: int) -> np.ndarray:
     if kind == CHANNELS:
         return picture
     return picture[..., FIRST_CHANNELS] - picture[..., SECOND_CHANNELS]
+
+
+def _ends(picture: np.ndarray, kind: int, losses: Sequence[Float64Array]) -> tuple[Float64Array, Float64Array]:
+    """Bounds [H, W, 3] that are expected of a picture: what it shows next to each pixel, and what they lose."""
+    least, most = nearby(_values(picture, kind), 1)
+    return least - losses[0], most + losses[1]
+
+
+def _score(shares: Float64Array, worth: Float64Array) -> Float64Array:
+    """Which pixels come first, the largest; see `PixelOrder`."""
+    return shares + _WORTH * worth
 
 
 def _steps(radius: int) -> range:

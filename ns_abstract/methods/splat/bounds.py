@@ -168,25 +168,23 @@ def _divided(
     basis: Basis, parts: np.ndarray | MotionCells | None, keep_parts: bool, sub_boxes: SubBoxes | None
 ) -> tuple[FormShape, Parts]:
     """The forms of a cell, and its equal parts or sub-boxes, if it is to be divided; see `SplatBounds.cell`."""
-    if isinstance(parts, MotionCells):
-        return divided_by(basis, parts)
-    counts = parts if sub_boxes is None else sub_boxes.counts
-    if counts is None:
-        return form_shape(basis), cell_parts(np.ones(basis.dimensions, np.int64))
-    check_parts(counts, basis.dimensions)
+    if parts is not None:
+        return divided_by(basis, parts, SUB_BOX_OVERLAP * keep_parts)
     if sub_boxes is None:
-        return form_shape(basis, int(counts.prod())), cell_parts(counts, SUB_BOX_OVERLAP * keep_parts)
+        return form_shape(basis), cell_parts(np.ones(basis.dimensions, np.int64))
+    counts = sub_boxes.counts
+    check_parts(counts, basis.dimensions)
     return form_shape(basis, 0, int(counts.prod())), cell_parts(counts, SUB_BOX_OVERLAP, sub_boxes.levels)
 
 
-def divided_by(basis: Basis, parts: np.ndarray | MotionCells) -> tuple[FormShape, Parts]:
-    """The forms of a cell that has parts over which bounds are kept, and these parts."""
-    if isinstance(parts, MotionCells):
-        check_parts(parts.counts, 2)
-        shape = form_shape(basis, int(parts.counts.prod()), by_motion=True)
-        return shape, cell_parts(parts.counts, SUB_BOX_OVERLAP)._replace(motion=parts.motion, side=parts.side)
-    check_parts(parts, basis.dimensions)
-    return form_shape(basis, int(parts.prod())), cell_parts(parts, SUB_BOX_OVERLAP)
+def divided_by(basis: Basis, parts: np.ndarray | MotionCells, overlap: float) -> tuple[FormShape, Parts]:
+    """The forms of a cell that is bounded over ``parts``, and these parts; see `cell_parts`."""
+    if not isinstance(parts, MotionCells):
+        check_parts(parts, basis.dimensions)
+        return form_shape(basis, int(parts.prod())), cell_parts(parts, overlap)
+    check_parts(parts.counts, 2)
+    equal = cell_parts(parts.counts, overlap)._replace(motion=parts.motion, side=parts.side)
+    return form_shape(basis, int(parts.counts.prod()), by_motion=True), equal
 
 
 def _cell_poses(forms: PoseForms) -> CellPoses:

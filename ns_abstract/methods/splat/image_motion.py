@@ -49,9 +49,15 @@ class ImageMotion:
 
     def __init__(self, pose_set: PoseBox, means: np.ndarray, renderer: Renderer) -> None:
         self.pose_set, self._camera, self._renderer = pose_set, pose_set.camera, renderer
+        self._all_means = means
+
+    @cached_property
+    def _means(self) -> np.ndarray:
+        """[n, 3] of typical Gaussians."""
+        means = self._all_means
         if means.shape[0] > _TUNING.gaussians:
             means = means[np.random.default_rng(0).choice(means.shape[0], _TUNING.gaussians, replace=False)]
-        self._means = means
+        return means
 
     def shear(self) -> dict[str, dict[str, float]]:
         """For each rotation, how much of it undoes what one unit of another parameter moves typical Gaussians by."""

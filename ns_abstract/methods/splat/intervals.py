@@ -23,6 +23,7 @@ from ns_abstract.methods.splat.pixel_block import (
     color_ends,
     exponent_ends,
     listed_fragment,
+    part_axes,
 )
 from ns_abstract.methods.splat.stage_data import PART_LANES
 
@@ -102,7 +103,7 @@ def part_alphas(values, at, part, inputs, thresholds):
     e = at + EXPONENT
     zero = 0.0 * load8(middles, part)
     y1, y2 = zero + values[e], zero + values[e + 1]
-    for k in range(inputs.shape.part_axes):
+    for k in range(part_axes(inputs.shape)):
         e += 2
         middle = load8(middles, count * k + part)
         y1 = fma(middle, values[e], y1)
@@ -124,7 +125,7 @@ def _add_parts(out, slopes, channel, low, high, part, inputs):
     """Write eight parts' ends of a channel to ``out`` and add them to the sums ``slopes``, see `blend_parts`."""
     store(out, PART_ENDS + inputs.shape.parts * channel + part, low)
     store(out, PART_ENDS + inputs.shape.parts * (3 + channel) + part, high)
-    for k in range(inputs.shape.part_axes):
+    for k in range(part_axes(inputs.shape)):
         middle = load8(inputs.parts.middles, inputs.shape.parts * k + part)
         slopes[4 * k + channel] += lane_sum(middle * (low + high))
 
@@ -259,7 +260,7 @@ def blend_parts(begin, end, reordered, block, inputs, slopes):
     darkest, brightest = _blend_eight(begin, end, 0, reordered, block, inputs, slopes)
     for part in range(PART_LANES, inputs.shape.parts, PART_LANES):
         _blend_eight(begin, end, part, reordered, block, inputs, slopes)
-    for k in range(inputs.shape.part_axes):
+    for k in range(part_axes(inputs.shape)):
         store(slopes, 4 * k, parts.slope[k] * load4(slopes, 4 * k))
     for side in range(2):
         for channel in range(3):

@@ -220,6 +220,12 @@ class PixelBlock(NamedTuple):
     motion: np.ndarray
 
 
+@njit(cache=True, error_model="numpy", inline="always")
+def part_axes(shape):
+    """Number of axes that the parts of a cell divide."""
+    return 2 if shape.by_motion else shape.dimensions
+
+
 @njit(cache=True, error_model="numpy", forceinline=True)
 def take_motion(place, inputs, block):
     """Set the motion of the pixels at ``place``, where parts are those of the image motion (design.md, B16)."""

@@ -14,6 +14,7 @@ import numpy as np
 
 from ns_abstract.arithmetic.forms import Basis
 from ns_abstract.arithmetic.rounding import Charges
+from ns_abstract.geometry.box import part_middles
 from ns_abstract.geometry.camera_path import Intrinsics
 from ns_abstract.methods.splat.constants import RasterRules
 
@@ -25,8 +26,8 @@ class FormShape(NamedTuple):
     """The forms of a cell, as `Basis` tells: ``order`` 2 for one parameter, else 1.
 
     Pixels have no forms where the cell has ``parts``, over which intervals bound them (B12). Their forms are bounded
-    over each of its ``sub_boxes``, too, where it has some (B13). Parts divide ``part_axes`` axes: those of the
-    parameters, or ``by_motion`` the two of the image motion at a block (B16).
+    over each of its ``sub_boxes``, too, where it has some (B13). Parts divide the axes of the parameters, or
+    ``by_motion`` the two of the image motion (B16).
     """
 
     dimensions: int
@@ -34,7 +35,6 @@ class FormShape(NamedTuple):
     monomials: int
     parts: int = 0
     sub_boxes: int = 0
-    part_axes: int = 0
     by_motion: bool = False
 
 
@@ -44,8 +44,7 @@ def form_shape(basis: Basis, parts: int = 0, sub_boxes: int = 0, by_motion: bool
         raise ValueError(f"forms of order 2 have one parameter, not {basis.dimensions}")
     if basis.order == 2 and parts:
         raise ValueError("cells of one parameter have no parts")
-    axes = 2 if by_motion else basis.dimensions
-    return FormShape(basis.dimensions, basis.order, basis.monomials, parts, sub_boxes, axes, by_motion)
+    return FormShape(basis.dimensions, basis.order, basis.monomials, parts, sub_boxes, by_motion)
 
 
 class SceneGaussians(NamedTuple):
@@ -258,9 +257,7 @@ def cell_parts(counts: np.ndarray, overlap: float = 0.0, levels: Sequence[float]
 
     They reach beyond their ends by ``overlap`` of the cell's half-width.
     """
-    along = [(2.0 * np.arange(n) + 1.0) / n - 1.0 for n in counts.tolist()]
-    grid = np.array(np.meshgrid(*along, indexing="ij"), np.float64)
-    middles = np.ascontiguousarray(grid.reshape(counts.size, counts.prod()))
+    middles = part_middles(counts)
     squares = np.square(middles).sum(axis=1)
     slope = np.where(counts > 1, 0.5 / np.where(counts > 1, squares, 1.0), 0.0)
     none = np.zeros((0, 4, counts.size))

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ns_abstract.arithmetic.rounding import CHANNEL_DIFFERENCE_ROUNDING, UP
+from ns_abstract.arithmetic.rounding import CHANNEL_DIFFERENCE_ROUNDING, SUB_BOX_OVERLAP, UP
 from ns_abstract.execution.threads import lane, threads
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import PinholeCamera
@@ -101,7 +101,7 @@ class SubBoxBounds(SplatBounds):
         Other arguments are those of `sub_boxes`.
         """
         across, down = tile_grid(camera, self.side)
-        shape, parts = divided_by(forms.rotation.basis, counts)
+        shape, parts = divided_by(forms.rotation.basis, counts, SUB_BOX_OVERLAP)
         _, poses, gaussians, alive, colors, background, color_error = projected
         inputs = PixelInputs(
             gaussians, self._viewing_axes(forms, poses.rotation_magnitude, gaussians), camera.intrinsics,

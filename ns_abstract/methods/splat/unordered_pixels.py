@@ -27,6 +27,7 @@ from ns_abstract.methods.splat.pixel_block import (
     block_place,
     exponent_ends,
     exponent_limit,
+    part_axes,
     take_motion,
 )
 from ns_abstract.methods.splat.pixels import borrowed_inputs
@@ -105,7 +106,7 @@ def _start(wanted, background, sums):
 @njit(cache=True, error_model="numpy", forceinline=True)
 def _strips_met(values, at, strips, inputs):
     """The set of strips in which the fragment at ``at`` may reach the threshold (design.md, B4, B12, B14)."""
-    axes = inputs.shape.part_axes
+    axes = part_axes(inputs.shape)
     ends = at + exponent_ends(inputs.shape.monomials)
     e1, e2, e = values[ends], values[ends + 1], at + EXPONENT
     for k in range(axes):
