@@ -656,8 +656,8 @@ SPLATS = (
     ),
     Fault(
         "parts are where their ends begin",
-        _STAGE_DATA,
-        "cell_parts",
+        "geometry/box.py",
+        "part_middles",
         "(2.0 * np.arange(n) + 1.0) / n - 1.0",
         "(2.0 * np.arange(n)) / n - 1.0",
         "test_intervals.py::test_parts_cover_the_cell[counts0]",
