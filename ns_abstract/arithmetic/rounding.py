@@ -133,6 +133,9 @@ MOTION_SCALE = 1.0 - 2.0**-30
 #: B15: differences of two products whose sizes add up to 1 at most, and a sum with 1/2, absolute: 4 roundings; the same
 #: of a bound less 1/2 and its quotient by the scale: 3. 12 to spare.
 CHANNEL_DIFFERENCE_ROUNDING = 16.0 * UNIT64
+#: B14: by fragment, what is left in a band has 8 roundings and the part that is reached 2, of a range of colours that
+#: is twice as wide as the brightest; 12 to spare.
+BAND_ROUNDING = 32.0 * UNIT64
 #: B12: a part's share of a swap bound: a quotient and two products, 3; 5 to spare.
 MOVE_SHARE_UP = 1.0 + 8.0 * UNIT64
 #: B11: light has two roundings by layer of `LAYER_ROUNDING`; a weight as many as so many layers more.

@@ -290,8 +290,10 @@ class _Examination:
                 if not pixels.any():
                     continue
                 tiles = np.flatnonzero(pixels.any(axis=(1, 2)))
-                telling = (miss == miss.max(axis=-1, keepdims=True))[pixels] if narrow else None
-                ends = frame.sub_box_ends(box, parts, tiles, pixels[tiles], telling, kind == DIFFERENCES)
+                telling, goals = (miss == miss.max(axis=-1, keepdims=True))[pixels], None
+                if narrow:
+                    goals = np.where(telling, search.tiled.goals(pixels, kind == DIFFERENCES), np.nan)
+                ends = frame.sub_box_ends(box, parts, tiles, pixels[tiles], goals, kind == DIFFERENCES)
                 if ends is None:
                     return None
                 known = search.tiled.excluding(*ends, pixels, kind == DIFFERENCES)

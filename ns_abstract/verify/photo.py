@@ -174,6 +174,11 @@ class TiledPhoto:
         sane = (lower <= upper).all(axis=-1)
         return sane & self.counted[tiles] & ((lower > self.high[tiles]) | (upper < self.low[tiles])).any(axis=-1)
 
+    def goals(self, pixels: np.ndarray, differences: bool = False) -> np.ndarray:
+        """[n, 6] what lower, then upper bounds of the ``n`` ``pixels`` [T, side, side] exclude beyond (U5, U10)."""
+        low, high = self.differences if differences else (self.low, self.high)
+        return np.concatenate([high[pixels], low[pixels]], axis=-1)
+
     def excluding(
         self, lower: np.ndarray, upper: np.ndarray, pixels: np.ndarray, differences: bool = False
     ) -> np.ndarray:

@@ -190,9 +190,9 @@ def _bounds_in_the_middle(
     middle = np.zeros(counts, bool)
     middle[tuple(slice((n - 1) // 2, n // 2 + 1) for n in counts.tolist())] = True
     middle = middle.ravel()
-    ends, bounds = np.repeat(worked[pixels][:, None], 6, axis=1), []
+    goals, bounds = np.repeat(np.where(worked[pixels], np.inf, np.nan)[:, None], 6, axis=1), []
     for kind in (CHANNELS, DIFFERENCES):
-        pair = frame.sub_box_ends(cell, parts, tiles, pixels[tiles], ends, kind == DIFFERENCES)
+        pair = frame.sub_box_ends(cell, parts, tiles, pixels[tiles], goals, kind == DIFFERENCES)
         assert pair is not None
         lower, upper = pair[0][..., middle].mean(axis=-1), pair[1][..., middle].mean(axis=-1)
         # what is known of no end would be known with more work

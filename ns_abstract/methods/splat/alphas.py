@@ -407,8 +407,9 @@ def _alphas_over_parts(record, begin, n, given, block, limits, inputs):
                 e2 = fma(half[k - 1], abs(g2), e2)
         if inputs.shape.by_motion:
             motion = 8 * fragments.width
-            for lane in range(8):
-                pixel = int(batch.pixels[begin + min(q + lane, n - 1)])
+            # what is not a pixel keeps what it had
+            for lane in range(min(n - q, 8)):
+                pixel = int(batch.pixels[begin + q + lane])
                 for k in range(4 * (m - 1)):
                     rows[motion + 8 * k + lane] = block.motion[k * PIXELS + pixel]
             e1, s1 = _along_motion(rows, 8 * EXPONENT, motion, r1, l1, inputs)

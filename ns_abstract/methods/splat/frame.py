@@ -286,7 +286,7 @@ class SplatFrame(Frame):
 
     def sub_box_ends(
         self, box: ParameterBox, counts: np.ndarray | MotionCells, tiles: np.ndarray, pixels: np.ndarray,
-        ends: np.ndarray | None = None, differences: bool = False,
+        goals: np.ndarray | None = None, differences: bool = False,
     ) -> tuple[np.ndarray, np.ndarray] | None:  # fmt: skip
         """See `ns_abstract.refine.protocol.SubBoxFrame` (design.md, U5, B14, B15)."""
         if box.dimensions < 2:
@@ -295,9 +295,10 @@ class SplatFrame(Frame):
         forms = self.pose_set.enclosure(box, self.order)
         if not differences:
             projected = self.bounds.projected_box(self.camera, forms, box)
-            return part_ends(self.bounds.sub_boxes(self.camera, forms, projected, tiles, pixels, counts, ends), pixels)
+            return part_ends(self.bounds.sub_boxes(self.camera, forms, projected, tiles, pixels, counts, goals), pixels)
         projected, scale = self.bounds.projected_differences(self.camera, forms, box)
-        parts = self.bounds.sub_boxes(self.camera, forms, projected, tiles, pixels, counts, ends)
+        scaled = None if goals is None else 0.5 + scale * goals
+        parts = self.bounds.sub_boxes(self.camera, forms, projected, tiles, pixels, counts, scaled)
         return difference_ends(parts, pixels, scale)
 
     def motion_cells(self, box: ParameterBox, counts: np.ndarray) -> MotionCells | None:

@@ -62,6 +62,15 @@ def _set_trivial_parts(pixels, left, above, bounds):
                 ends[channel, part], ends[3 + channel, part] = 0.0, 1.0
 
 
+@njit(cache=True, error_model="numpy", forceinline=True)
+def ray_at(x, y, inputs, ray):
+    """Write the ray [3] of unit depth through the picture's point (x, y) at the cell's middle, world axes."""
+    camera, direction = inputs.intrinsics, inputs.axes.middle
+    u, v = (x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy
+    for k in range(3):
+        ray[k] = direction[k] * u + direction[3 + k] * v + direction[6 + k]
+
+
 @njit(cache=True, error_model="numpy")
 def _bound_block(numbers, place, inputs, block, bounds):
     """Bounds of one block of pixels. Returns whether the buffers sufficed.
@@ -69,16 +78,12 @@ def _bound_block(numbers, place, inputs, block, bounds):
     ``numbers`` are the rows of the Gaussians that may reach it, nearest first; ``bounds`` the tile's parts of
     `PixelBounds`, where ``linear`` starts with the tile's or is empty and ``statistics`` is the thread's row.
     """
-    camera, direction, ray = inputs.intrinsics, inputs.axes.middle, block.ray
     left, above, m = place.x0 % bounds.lower.shape[0], place.y0 % bounds.lower.shape[0], inputs.shape.monomials
     _set_trivial(signed(~place.wanted), left, above, bounds, m)
     if place.wanted == 0:
         return True
     take_motion(place, inputs, block)
-    u = (place.x0 + 0.5 * BLOCK - camera.cx) / camera.fx
-    v = (place.y0 + 0.5 * BLOCK - camera.cy) / camera.fy
-    for k in range(3):
-        ray[k] = direction[k] * u + direction[3 + k] * v + direction[6 + k]
+    ray_at(place.x0 + 0.5 * BLOCK, place.y0 + 0.5 * BLOCK, inputs, block.ray)
     pairs, slots = collect_fragments(numbers, place, inputs, block, bounds.marks)
     if pairs == GROW:
         return False

@@ -299,23 +299,19 @@ def strips_of(parts: Parts) -> Strips:
     return Strips(np.ascontiguousarray(np.hstack([middles, padding])), (0.5 * (high - low)).max(axis=1), room)
 
 
-class ColorEnd(NamedTuple):
-    """One end of one channel of the Gaussians' colours over a cell (design.md, B14).
+class ColorEnds(NamedTuple):
+    """Ends of the Gaussians' colours over a cell: the least of three channels, signs changed, then the most (B14).
 
     Attributes:
-        values: [n] the end of each Gaussian's colour.
-        sign: 1 for the most, -1 for the least.
-        channel: 0 to 2.
-        row: Where the end stands among the least of the three channels, then the most.
-        opposite: The other end of all colours of the channel and of the background.
+        values: [6, n] colours.
+        background: [6].
+        opposite: [6] least of all colours of the row and of the background, where the row holds the most.
         bright: Greatest absolute value of any colour, at least 1.
     """
 
     values: np.ndarray
-    sign: float
-    channel: int
-    row: int
-    opposite: float
+    background: np.ndarray
+    opposite: np.ndarray
     bright: float
 
 

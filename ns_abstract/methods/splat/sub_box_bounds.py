@@ -14,10 +14,11 @@ from ns_abstract.geometry.motion_cells import MotionCells
 from ns_abstract.geometry.poses import PoseForms
 from ns_abstract.geometry.tiles import laid_out, tile_grid
 from ns_abstract.methods.splat.bounds import SplatBounds, divided_by
+from ns_abstract.methods.splat.depth_range_pixels import depth_range_stage
 from ns_abstract.methods.splat.lists import TileLists, pixel_sets, summed_area, tile_lists, tile_mask, touching
 from ns_abstract.methods.splat.stage_data import (
     CellPoses,
-    ColorEnd,
+    ColorEnds,
     Colors,
     FormShape,
     PixelInputs,
@@ -25,7 +26,6 @@ from ns_abstract.methods.splat.stage_data import (
     ProjectedGaussians,
     strips_of,
 )
-from ns_abstract.methods.splat.unordered_pixels import unordered_stage
 from ns_abstract.refine.protocol import CHANNEL_DIFFERENCES, COLORS, FIRST_CHANNELS, SECOND_CHANNELS
 
 
@@ -62,14 +62,14 @@ class SubBoxBounds(SplatBounds):
         return differences
 
     def warm_up(self, camera: PinholeCamera, forms: PoseForms, counts: np.ndarray) -> None:
-        """Compile what `unordered` needs; arguments are as of `sub_boxes`."""
+        """Compile what `by_depth_ranges` needs; arguments are as of `sub_boxes`."""
         pixels = np.ones((1, self.side, self.side), bool)
-        out, ends = np.empty((*pixels.shape, 6, int(counts.prod()))), np.ones((pixels.size, 6), bool)
-        self.unordered(camera, forms, self.project(camera, forms), np.arange(1), pixels, counts, ends, out)
+        out, goals = np.empty((*pixels.shape, 6, int(counts.prod()))), np.full((pixels.size, 6), np.inf)
+        self.by_depth_ranges(camera, forms, self.project(camera, forms), np.arange(1), pixels, counts, goals, out)
 
     def sub_boxes(
         self, camera: PinholeCamera, forms: PoseForms, projected: ProjectedCell, wanted: np.ndarray,
-        pixels: np.ndarray, counts: np.ndarray | MotionCells, ends: np.ndarray | None = None,
+        pixels: np.ndarray, counts: np.ndarray | MotionCells, goals: np.ndarray | None = None,
     ) -> np.ndarray:  # fmt: skip
         """Bounds [t, side, side, 6, k] of ``pixels`` of the tiles ``wanted`` over sub-boxes (design.md, B12, B14).
 
@@ -81,24 +81,24 @@ class SubBoxBounds(SplatBounds):
             projected: What `project` returns of the cell.
             counts: [d] sub-boxes along the cell's axes, powers of two, at least `PART_LANES` together; or cells of the
                 image motion in their place.
-            ends: [n, 6] which ends of the ``n`` pixels are bounded whatever the order where too many orders are
-                uncertain; None: none.
+            goals: [n, 6] see `depth_range_stage`, for pixels whose depth orders are too many; None: none is wanted.
         """
         cell = self.cell(camera, forms, wanted, projected, pixels=pixels, parts=counts, keep_parts=True)
         out = cell.parts
         assert out is not None
-        if ends is not None and cell.statistics[3]:
+        if goals is not None and cell.statistics[3]:
             unknown = (out[pixels][:, :3] == 0.0).all(axis=(1, 2)) & (out[pixels][:, 3:] == 1.0).all(axis=(1, 2))
-            self.unordered(camera, forms, projected, wanted, pixels, counts, ends & unknown[:, None], out)
+            asked = np.where(unknown[:, None], goals, np.nan)
+            self.by_depth_ranges(camera, forms, projected, wanted, pixels, counts, asked, out)
         return out
 
-    def unordered(
+    def by_depth_ranges(
         self, camera: PinholeCamera, forms: PoseForms, projected: ProjectedCell, wanted: np.ndarray,
-        pixels: np.ndarray, counts: np.ndarray | MotionCells, ends: np.ndarray, out: np.ndarray,
+        pixels: np.ndarray, counts: np.ndarray | MotionCells, goals: np.ndarray, out: np.ndarray,
     ) -> None:  # fmt: skip
-        """Write those ``ends`` [n, 6] of the ``n`` pixels to ``out`` that hold in every depth order (design.md, B14).
+        """Write ends of the ``n`` pixels to ``out`` from the ranges of the Gaussians' depths (design.md, B14).
 
-        Other arguments are those of `sub_boxes`.
+        Arguments are those of `sub_boxes`.
         """
         across, down = tile_grid(camera, self.side)
         shape, parts = divided_by(forms.rotation.basis, counts, SUB_BOX_OVERLAP)
@@ -114,19 +114,16 @@ class SubBoxBounds(SplatBounds):
         box, size = gaussians.box[alive], np.repeat([across, down], 2) * self.side
         reach = np.where(np.isnan(box), [0, np.inf] * 2, np.floor(box + [-0.5, 1.5] * 2)).clip(0, size).astype(np.int32)
         touched = touching(np.arange(alive.size), reach, summed_area(laid_out(chosen, across)))
-        alive, reach = alive[touched], reach[touched]
-        color_ends = _color_ends(colors, alive, background)
-        for row in np.flatnonzero(ends.any(axis=0)).tolist():
-            some, end = np.zeros(pixels.shape, bool), color_ends[row]
-            some[pixels] = ends[:, row]
-            chosen[wanted] = some
-            order = alive[touching(np.arange(alive.size), reach, summed_area(laid_out(chosen, across)))]
-            order = order[np.argsort(-end.sign * end.values[order], kind="stable")]
-            shown = tile_mask(wanted[some.any(axis=(1, 2))], across * down)
-            lists = TileLists(wanted, *tile_lists(order, gaussians.tiles, shown, across))
-            unordered_stage(
-                lists, pixel_sets(some, wanted.size, self.side), inputs, strips_of(inputs.parts), end, threads(), out
-            )
+        alive = alive[touched]
+        order = alive[np.argsort(gaussians.depth[alive], kind="stable")]
+        shown = tile_mask(wanted[pixels.any(axis=(1, 2))], across * down)
+        lists = TileLists(wanted, *tile_lists(order, gaussians.tiles, shown, across))
+        by_pixel = np.full((*pixels.shape, 6), np.nan)
+        by_pixel[pixels] = goals
+        depth_range_stage(
+            lists, pixel_sets(~np.isnan(by_pixel).all(axis=-1), wanted.size, self.side), by_pixel, inputs,
+            strips_of(inputs.parts), _color_ends(colors, alive, background), threads(), out,
+        )  # fmt: skip
 
 
 def channel_differences(projected: ProjectedCell) -> tuple[ProjectedCell, float]:
@@ -161,21 +158,17 @@ def channel_differences(projected: ProjectedCell) -> tuple[ProjectedCell, float]
     ), scale
 
 
-def _color_ends(colors: np.ndarray, alive: np.ndarray, background: np.ndarray) -> list[ColorEnd]:
-    """The least of the three channels of rows ``alive`` of `Colors.values`, then the most."""
+def _color_ends(colors: np.ndarray, alive: np.ndarray, background: np.ndarray) -> ColorEnds:
+    """The ends of rows ``alive`` of `Colors.values`."""
     parts = colors[alive].reshape(alive.size, 3, colors.shape[1] // 3)
     spread = np.abs(parts[..., 1:]).sum(axis=-1) * UP
-    low, high = parts[..., 0] - spread, parts[..., 0] + spread
-    darkest = np.minimum(low.min(axis=0, initial=np.inf), background)
-    brightest = np.maximum(high.max(axis=0, initial=-np.inf), background)
-    bright = max(1.0, float(brightest.max()), -float(darkest.min()))
-    ends = []
-    for row in range(6):
-        channel, values = row % 3, np.empty(len(colors))
-        values[alive] = (low, high)[row // 3][:, channel]
-        opposite = (brightest, darkest)[row // 3][channel]
-        ends.append(ColorEnd(values, (-1.0, 1.0)[row // 3], channel, row, float(opposite), bright))
-    return ends
+    ends = np.concatenate([spread - parts[..., 0], spread + parts[..., 0]], axis=1).T
+    values, behind = np.empty((6, len(colors))), np.concatenate([-background, background])
+    values[:, alive] = ends
+    # the other end of each row's colours, with its sign
+    opposite = np.minimum(-ends.max(axis=1, initial=-np.inf)[[3, 4, 5, 0, 1, 2]], behind)
+    bright = max(1.0, float(ends.max(initial=-np.inf)), float(np.abs(background).max()))
+    return ColorEnds(values, behind, opposite, bright)
 
 
 def part_ends(parts: np.ndarray | None, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

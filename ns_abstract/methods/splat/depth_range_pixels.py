@@ -1,0 +1,586 @@
+"""Pixels over sub-boxes of a cell from the ranges of the Gaussians' depths (design.md, B14).
+
+SIMD lanes are eight sub-boxes.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from ns_abstract.arithmetic.elementary import exp_kernel, fma
+from ns_abstract.arithmetic.rounding import BAND_ROUNDING, FRAGMENT_ROUNDING, SECOND_ORDER, UP
+from ns_abstract.arithmetic.simd.intrinsics import borrowed, lowest_bit, offset_by, pointer, signed, taken
+from ns_abstract.arithmetic.simd.lanes import bits, load8, maximum, minimum, store, where
+from ns_abstract.methods.splat.block_buffers import block_of, new_buffers, resized
+from ns_abstract.methods.splat.depth_pairs import block_list, depth_radii
+from ns_abstract.methods.splat.fragments import find_alphas, place_batch
+from ns_abstract.methods.splat.intervals import part_alphas, sort_keys, thresholds_of
+from ns_abstract.methods.splat.lists import BLOCK, TileLists, block_lists, longest_first
+from ns_abstract.methods.splat.pixel_block import (
+    ALPHA_HIGH,
+    BATCH,
+    EXPONENT,
+    EXPONENT_CUT,
+    block_place,
+    exponent_ends,
+    exponent_limit,
+    part_axes,
+    take_motion,
+)
+from ns_abstract.methods.splat.pixels import borrowed_inputs, ray_at
+from ns_abstract.methods.splat.reached_pixels import pixels_once
+from ns_abstract.methods.splat.stage_data import PART_LANES, ColorEnds, PixelInputs, Strips
+from ns_abstract.methods.splat.work_sharing import run_by_tiles
+
+#: Bits of a set of eight lanes.
+_ALL = 255
+
+
+@dataclass(frozen=True)
+class DepthRangeTuning:
+    """How many bands of colour there are, and where lists end. Neither decides whether a bound holds."""
+
+    #: Bands of colour.
+    bands: int = 8
+    #: Light behind which bands are not chosen for what is drawn.
+    shown: float = 2.0**-4
+    #: Least range of colours that is divided.
+    least: float = 2.0**-20
+    #: How much of an end is not looked at any more.
+    worth: float = 2.0**-8
+
+
+_BANDS = DepthRangeTuning.bands
+_SHOWN = DepthRangeTuning.shown
+_LEAST = DepthRangeTuning.least
+_WORTH = DepthRangeTuning.worth
+
+
+class _End(NamedTuple):
+    """One row of `ColorEnds`: number, colours, background, the opposite end, and the brightest of all rows."""
+
+    row: int
+    colors: np.ndarray
+    background: float
+    opposite: float
+    bright: float
+
+
+class _Work(NamedTuple):
+    """Memory for the fragments of one pixel, nearest end of their depths first; [room] where nothing else is said.
+
+    Attributes:
+        sets: The set of the block's pixels that each of its Gaussians reaches.
+        numbers: The rows of the Gaussians that reach the pixel.
+        found: Whether alpha may reach the threshold.
+        near, far: Ends of the depth (`_depth_ranges`); ``far`` in its own order, which ``by_far`` tells.
+        by_far: The fragments, farthest ends last.
+        met: The sets of strips in which alpha may reach the threshold.
+        below: How many bands the colour is beyond.
+        share: Part of the next band that it reaches, or 0.
+        low: [room, 2, parts] least alpha over the sub-boxes, and most light that a stop there leaves.
+        colors, weights, keys: Scratch.
+        order: Scratch.
+    """
+
+    sets: np.ndarray
+    numbers: np.ndarray
+    found: np.ndarray
+    near: np.ndarray
+    far: np.ndarray
+    by_far: np.ndarray
+    met: np.ndarray
+    below: np.ndarray
+    share: np.ndarray
+    low: np.ndarray
+    colors: np.ndarray
+    weights: np.ndarray
+    keys: np.ndarray
+    order: np.ndarray
+
+
+class _Sums(NamedTuple):
+    """Sums of a pixel over strips of eight sub-boxes; lanes are the sub-boxes of a strip.
+
+    Attributes:
+        levels: [bands + 1] colours that the bands lie between, the last of which none is beyond.
+        lit, light, less: [strips, bands, 8] the part of a band that the picture reaches is at most ``lit``, ``light``
+            times that of what follows, and ``less``, which is not positive, times what it is at the band's end.
+        least, most: [strips, 8] light that the fragments so far leave, whatever their order.
+        lost: [strips, 8] most light that a stop leaves.
+    """
+
+    levels: np.ndarray
+    lit: np.ndarray
+    light: np.ndarray
+    less: np.ndarray
+    least: np.ndarray
+    most: np.ndarray
+    lost: np.ndarray
+
+
+@njit(cache=True, error_model="numpy")
+def _new_work(room):
+    """`_Work` for lists of ``room`` Gaussians, but for what lanes are."""
+    return (
+        np.empty(room, np.int64), np.empty(room, np.uint32), np.empty(room, np.int64), np.empty(room), np.empty(room),
+        np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room, np.int64), np.empty(room),
+    ), (
+        np.empty(room + 1), np.empty(room + 1), np.empty(room + 1), np.empty(room + 1, np.int64),
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy")
+def _work_of(rooms, low):
+    """The `_Work` in ``rooms`` and ``low``, which the caller keeps alive for as long as it is used."""
+    first, last = rooms
+    return _Work(
+        first[0], first[1], first[2], first[3], first[4], first[5], first[6], first[7], first[8],
+        pointer(low), last[0], last[1], last[2], last[3],
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _strips_met(values, at, strips, inputs):
+    """The set of strips in which the fragment at ``at`` may reach the threshold (design.md, B4, B12, B14)."""
+    axes = part_axes(inputs.shape)
+    ends = at + exponent_ends(inputs.shape.monomials)
+    e1, e2, e = values[ends], values[ends + 1], at + EXPONENT
+    for k in range(axes):
+        e += 2
+        e1 += strips.half[k] * abs(values[e])
+        e2 += strips.half[k] * abs(values[e + 1])
+    e1 *= UP
+    e2 *= UP
+    met, room = 0, strips.room
+    for strip in range(0, room, PART_LANES):
+        e = at + EXPONENT
+        zero = 0.0 * load8(strips.middles, strip)
+        y1, y2 = zero + values[e], zero + values[e + 1]
+        for k in range(axes):
+            e += 2
+            middle = load8(strips.middles, room * k + strip)
+            y1 = fma(middle, values[e], y1)
+            y2 = fma(middle, values[e + 1], y2)
+        near1, near2 = maximum(0.0, abs(y1) - e1), maximum(0.0, abs(y2) - e2)
+        nearest = (0.5 * (1.0 - FRAGMENT_ROUNDING)) * fma(near1, near1, near2 * near2)
+        beyond = nearest > values[at + exponent_limit(inputs.shape)]
+        met |= (_ALL - bits(beyond)) << strip
+    return met
+
+
+@njit(cache=True, error_model="numpy")
+def _depth_ranges(count, x, y, inputs, block, work):
+    """Sort the ``count`` Gaussians of the pixel at (x, y) by the near ends of their depths (design.md, O1, B14).
+
+    Where the far end of one is below the near end of another, it is drawn before it at every pose.
+    """
+    numbers, near, far = work.numbers, work.near, work.far
+    ray_at(x + 0.5, y + 0.5, inputs, block.ray)
+    room, _ = depth_radii(
+        borrowed(numbers[:count]), inputs.gaussians, inputs.axes.depth, block.ray, inputs.shape.monomials, block.entries
+    )
+    for k in range(count):
+        # where nothing is known, all have one place
+        near[k], work.keys[k] = 0.0, 0.0
+        if room > 0.0:
+            deep = block.entries.depth[k]
+            reach = (block.entries.depth_radius[k] + FRAGMENT_ROUNDING * abs(deep)) * UP
+            near[k], work.keys[k] = room * deep - reach, room * deep + reach
+    sort_keys(near, work.order, count)
+    for k in range(count):
+        far[k] = work.keys[work.order[k]]
+        work.found[k] = numbers[work.order[k]]
+    for k in range(count):
+        numbers[k] = work.found[k]
+    sort_keys(far, work.by_far, count)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _find_some(start, count, q, place, listed, inputs, block, work):
+    """Find what is known of the alphas of the next fragments of pixel q; returns how many are known then."""
+    some = min(BATCH, count - start)
+    place_batch(start, some, signed(1 << q), listed, inputs, block)
+    find_alphas(start, some, signed(start), place, listed, inputs, block)
+    for b in range(some):
+        work.found[start + b] = block.batch.found[b]
+    return start + some
+
+
+@njit(cache=True, error_model="numpy")
+def _find_visible(count, q, place, listed, inputs, block, work):
+    """Weights of the fragments at the middle pose, as far as light comes; returns how many are known.
+
+    Nothing that is proved depends on them. The background is one more.
+    """
+    values, width = block.fragments.values, block.fragments.width
+    ends = exponent_ends(inputs.shape.monomials)
+    light, known = 1.0, 0
+    while known < count and light > _SHOWN:
+        first = known
+        known = _find_some(first, count, q, place, listed, inputs, block, work)
+        for k in range(first, known):
+            at = k * width
+            y1, y2 = values[at + EXPONENT], values[at + EXPONENT + 1]
+            alpha = 0.0
+            if work.found[k] != 0:
+                exponent = min(0.5 * (y1 * y1 + y2 * y2), EXPONENT_CUT)
+                alpha = min(values[at + ends + 3] * exp_kernel(-exponent), values[at + ALPHA_HIGH])
+            work.weights[k] = light * alpha
+            light *= 1.0 - alpha
+    work.weights[known] = light
+    return known
+
+
+@njit(cache=True, error_model="numpy")
+def _set_levels(known, count, end, work, sums):
+    """Choose levels among the colours of the ``known`` fragments: half by their weights, half by their range."""
+    levels, colors, most, total = sums.levels, work.colors, end.background, work.weights[known]
+    for k in range(count):
+        most = max(most, end.colors[work.numbers[k]])
+    for k in range(known):
+        total += work.weights[k]
+        colors[k] = end.colors[work.numbers[k]]
+    colors[known] = end.background
+    sort_keys(colors, work.order, known + 1)
+    first, last, level, seen = colors[0], colors[0], 0, 0.0
+    span = max(colors[known] - first, _LEAST)
+    for k in range(known + 1):
+        # the part of all that is divided up to this colour, without it and with it
+        reached = 0.5 * (colors[k] - first) / span
+        while level < _BANDS - 1 and level / (_BANDS - 1) < reached + seen:
+            levels[level] = last = min(max(last, first + 2.0 * span * (level / (_BANDS - 1) - seen)), colors[k])
+            level += 1
+        seen += 0.5 * work.weights[work.order[k]] / total
+        while level < _BANDS - 1 and level / (_BANDS - 1) <= reached + seen:
+            levels[level] = last = colors[k]
+            level += 1
+    while level < _BANDS:
+        levels[level] = colors[known]
+        level += 1
+    levels[_BANDS] = max(most, colors[known])
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _cover(e, open_, dark, parts, work, sums):
+    """Let fragment e cover what comes behind it in the bands that its colour does not reach (design.md, B14).
+
+    It is a stop only where all that may come before it leaves no more light than ``dark``.
+    """
+    met, below, share = work.met[e] & open_, work.below[e], work.share[e]
+    while met != 0:
+        strip = lowest_bit(met)
+        met &= met - 1
+        part = PART_LANES * strip
+        low = load8(work.low, 2 * parts * e + part)
+        lost = where(load8(sums.least, part) > dark, 0.0, load8(work.low, 2 * parts * e + parts + part))
+        store(sums.lost, part, maximum(load8(sums.lost, part), lost))
+        left, first = 1.0 - low, below
+        store(sums.most, part, load8(sums.most, part) * left)
+        if share > 0.0:
+            at = PART_LANES * (strip * _BANDS + below)
+            covered = (1.0 - share) * low
+            store(sums.less, at, fma(left, load8(sums.less, at), -covered * load8(sums.light, at)))
+            first += 1
+        for band in range(first, _BANDS):
+            at = PART_LANES * (strip * _BANDS + band)
+            store(sums.light, at, load8(sums.light, at) * left)
+            store(sums.less, at, load8(sums.less, at) * left)
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _show(k, met, values, at, thresholds, charges, inputs, work, sums):
+    """Draw fragment k in the bands that its colour reaches, as much of it as there may be (design.md, B14)."""
+    below, share, parts = work.below[k], work.share[k], inputs.shape.parts
+    while met != 0:
+        strip = lowest_bit(met)
+        met &= met - 1
+        part = PART_LANES * strip
+        low, high = part_alphas(values, at, part, inputs, thresholds)
+        left = 1.0 - high
+        store(work.low, 2 * parts * k + part, low)
+        lost = minimum(charges.stop / maximum(left, charges.stop), charges.grown * load8(sums.most, part))
+        store(work.low, 2 * parts * k + parts + part, lost)
+        store(sums.least, part, load8(sums.least, part) * left)
+        for band in range(below):
+            place = PART_LANES * (strip * _BANDS + band)
+            light, less = load8(sums.light, place), load8(sums.less, place)
+            store(sums.lit, place, fma(light + less, high, load8(sums.lit, place)))
+            store(sums.light, place, light * left)
+            store(sums.less, place, less * left)
+        if share > 0.0:
+            place = PART_LANES * (strip * _BANDS + below)
+            light, drawn = load8(sums.light, place), share * high
+            store(sums.lit, place, fma(light, drawn, load8(sums.lit, place)))
+            store(sums.light, place, light * (1.0 - drawn))
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _close_settled(open_, goal, charges, sums):
+    """Let all of the light be lit where no more of it matters; returns the strips that stay open.
+
+    That is where little is left, where the ends are below ``goal`` anyhow, or beyond it already.
+    """
+    some = open_
+    while some != 0:
+        strip = lowest_bit(some)
+        some &= some - 1
+        begin = PART_LANES * strip * _BANDS
+        rest = 0.0 * load8(sums.light, begin)
+        end = rest + sums.levels[0]
+        for band in range(_BANDS):
+            step = sums.levels[band + 1] - sums.levels[band]
+            end = fma(step, load8(sums.lit, begin + PART_LANES * band), end)
+            rest = fma(step, load8(sums.light, begin + PART_LANES * band), rest)
+        most = end + rest + (charges.slack + charges.hidden * load8(sums.lost, PART_LANES * strip))
+        if bits(rest <= _WORTH) | bits(end >= goal) | bits(most <= goal) == _ALL:
+            for band in range(_BANDS):
+                at = begin + PART_LANES * band
+                store(sums.lit, at, load8(sums.lit, at) + load8(sums.light, at))
+            open_ &= ~(1 << strip)
+    return open_
+
+
+class _EndCharges(NamedTuple):
+    """What is added to an end (design.md, B6, B8, B14).
+
+    Attributes:
+        slack: For rounding, and for what was left out.
+        hidden: Most by which light that a stop leaves raises an end.
+        stop: Light at which fragments stop; not positive: they do not.
+        dark: Least light of all fragments beyond which none stopped.
+        grown: By how much the program's light may be more.
+    """
+
+    slack: float
+    hidden: float
+    stop: float
+    dark: float
+    grown: float
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _charges_of(count, inputs, end):
+    """The `_EndCharges` of a pixel of ``count`` fragments."""
+    charges = inputs.charges
+    # rounding of the program's own sums and products
+    rounding = (charges.blend_fragment * count + charges.blend_pixel) * end.bright * SECOND_ORDER
+    own = BAND_ROUNDING * (count + _BANDS) * end.bright
+    slack = rounding + own + inputs.colors.error + inputs.cutoffs.negligible * end.bright
+    # a stop shows the background in place of what lies behind it
+    hidden = (abs(end.opposite - end.background) + rounding) * (1.0 + charges.lost_light)
+    stop = inputs.rules.transmittance_min * (1.0 + charges.transmittance)
+    # two roundings of the light by fragment
+    grown = 1.0 + charges.transmittance * count
+    return _EndCharges(slack, hidden, stop, stop * grown, grown)
+
+
+@njit(cache=True, error_model="numpy")
+def _note_stops(closed, last, past, count, parts, work, sums):
+    """Let each fragment up to ``last`` whose far end is not passed be a stop in the strips ``closed``."""
+    if closed == 0:
+        return
+    for place in range(past, count):
+        e = work.by_far[place]
+        met = work.met[e] & closed if e <= last else 0
+        while met != 0:
+            part = PART_LANES * lowest_bit(met)
+            met &= met - 1
+            lost = load8(work.low, 2 * parts * e + parts + part)
+            store(sums.lost, part, maximum(load8(sums.lost, part), lost))
+
+
+@njit(cache=True, error_model="numpy", forceinline=True)
+def _share_of(color, band, levels):
+    """The part of a band that a colour which is not beyond it reaches."""
+    if band >= _BANDS or not color > levels[band]:
+        return 0.0
+    return (color - levels[band]) / (levels[band + 1] - levels[band])
+
+
+@njit(cache=True, error_model="numpy")
+def _bound_end(q, count, known, goal, place, listed, inputs, block, strips, end, work, sums, out):
+    """Write one end of pixel q over each sub-box (design.md, B14); returns how many fragments are known then."""
+    values, width, parts, levels = block.fragments.values, block.fragments.width, inputs.shape.parts, sums.levels
+    charges, thresholds = _charges_of(count, inputs, end), thresholds_of(inputs)
+    for lane in range(_BANDS * parts):
+        sums.lit[lane], sums.light[lane], sums.less[lane] = 0.0, 1.0, 0.0
+    for lane in range(parts):
+        sums.least[lane], sums.most[lane], sums.lost[lane] = 1.0, 1.0, 0.0
+    open_, past = (1 << (parts // PART_LANES)) - 1, 0
+    for k in range(count):
+        if open_ == 0:
+            break
+        if k == known:
+            known = _find_some(k, count, q, place, listed, inputs, block, work)
+        while past < count and work.far[past] < work.near[k]:
+            _cover(work.by_far[past], open_, charges.dark, parts, work, sums)
+            past += 1
+        work.met[k] = 0
+        if work.found[k] != 0:
+            color, below = end.colors[listed.numbers[k]], 0
+            while below < _BANDS and levels[below + 1] <= color:
+                below += 1
+            work.below[k], work.share[k] = below, _share_of(color, below, levels)
+            work.met[k] = _strips_met(values, k * width, strips, inputs) & open_
+            _show(k, work.met[k], values, k * width, thresholds, charges, inputs, work, sums)
+        if k % BATCH == BATCH - 1:
+            still = _close_settled(open_, goal, charges, sums)
+            # what may come before these is not known
+            _note_stops(open_ & ~still, k, past, count, parts, work, sums)
+            open_ = still
+    if open_ != 0:
+        while past < count:
+            _cover(work.by_far[past], open_, charges.dark, parts, work, sums)
+            past += 1
+    _write(q, open_, charges, place, end, sums, out)
+    return known
+
+
+@njit(cache=True, error_model="numpy")
+def _write(q, open_, charges, place, end, sums, out):
+    """Write pixel q's ends with their charges to ``out`` [side, side, 6, parts] (design.md, B6, B8, B14).
+
+    ``open_``: the strips that the background may be seen in.
+    """
+    side, levels = out.shape[0], sums.levels
+    ends = out[place.y0 % side + q // BLOCK, place.x0 % side + q % BLOCK, end.row]
+    for lane in range(ends.size):
+        strip = lane // PART_LANES
+        shown = open_ & (1 << strip) != 0
+        value = levels[0]
+        for band in range(_BANDS):
+            at = PART_LANES * (strip * _BANDS + band) + lane % PART_LANES
+            lit = sums.lit[at]
+            if shown and end.background >= levels[band + 1]:
+                lit += sums.light[at] + sums.less[at]
+            elif shown:
+                lit += _share_of(end.background, band, levels) * sums.light[at]
+            value += (levels[band + 1] - levels[band]) * min(lit, 1.0)
+        value = min(value + sums.lost[lane] * charges.hidden, levels[_BANDS])
+        value += charges.slack
+        ends[lane] = value if end.row >= 3 else -value
+
+
+@njit(cache=True, error_model="numpy")
+def _bound_pixel(q, count, goals, place, inputs, block, strips, color_ends, work, sums, out):
+    """Write those ends of pixel q of a block, which ``count`` Gaussians reach, that have ``goals`` (design.md, B14)."""
+    _depth_ranges(count, place.x0 + q % BLOCK, place.y0 + q // BLOCK, inputs, block, work)
+    listed = block_list(borrowed(work.numbers[:count]), place, inputs)
+    for k in range(count):
+        block.entries.has_pixels[k] = 1
+        block.entries.pixels[k] = signed(1 << q)
+    visible = known = _find_visible(count, q, place, listed, inputs, block, work)
+    for row in range(6):
+        goal = goals[row] if row >= 3 else -goals[row]
+        if math.isnan(goal):
+            continue
+        if math.isinf(goal):
+            # everything matters
+            goal = np.nan
+        end = _End(
+            row, pointer(color_ends.values[row]), color_ends.background[row], color_ends.opposite[row],
+            color_ends.bright,
+        )  # fmt: skip
+        _set_levels(visible, count, end, work, sums)
+        known = _bound_end(q, count, known, goal, place, listed, inputs, block, strips, end, work, sums, out)
+
+
+@njit(cache=True, error_model="numpy")
+def _bound_block(numbers, goals, place, inputs, block, strips, color_ends, work, sums, out):
+    """Write the ends of the wanted pixels of a block that have ``goals`` over each sub-box (design.md, B14)."""
+    take_motion(place, inputs, block)
+    listed, sets, pixels = block_list(numbers, place, inputs), work.sets, signed(place.wanted)
+    for k in range(listed.length):
+        block.entries.has_pixels[k] = 0
+        sets[k] = pixels_once(k, listed, block.entries, block.fragments.per_pixel)
+    side = out.shape[0]
+    while pixels != 0:
+        q = lowest_bit(pixels)
+        pixels = signed(pixels & (pixels - 1))
+        count = 0
+        for k in range(listed.length):
+            if sets[k] >> q & 1 != 0:
+                work.numbers[count] = numbers[k]
+                count += 1
+        _bound_pixel(
+            q, count, goals[place.y0 % side + q // BLOCK, place.x0 % side + q % BLOCK], place, inputs, block, strips,
+            color_ends, work, sums, out,
+        )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy", nogil=True)
+def _depth_range_worker(share, lists, pixels, goals, inputs, strips, color_ends, out):
+    """One thread's tiles; see `ThreadShare` and `depth_range_stage`."""
+    sequence, counter = borrowed(share.sequence), pointer(share.counter)
+    inputs = borrowed_inputs(inputs)
+    strips = Strips(pointer(strips.middles), pointer(strips.half), strips.room)
+    camera, side = inputs.intrinsics, out.shape[1]
+    tiles_x, blocks = int(math.ceil(camera.width / side)), side // BLOCK
+    forms = max(inputs.colors.values.shape[1] // inputs.colors.channels - 1, 1)
+    buffers = new_buffers(inputs.shape, forms, 1, inputs.colors.background)
+    block, room, parts = block_of(buffers, inputs.shape, forms), buffers.depths.shape[1], inputs.shape.parts
+    rooms, low = _new_work(room), np.empty(2 * room * parts)
+    work, lanes = _work_of(rooms, low), np.empty((3 * _BANDS + 3) * parts)
+    size, rest = _BANDS * parts, 3 * _BANDS * parts
+    sums = _Sums(
+        np.empty(_BANDS + 1), pointer(lanes), offset_by(pointer(lanes), size), offset_by(pointer(lanes), 2 * size),
+        offset_by(pointer(lanes), rest), offset_by(pointer(lanes), rest + parts),
+        offset_by(pointer(lanes), rest + 2 * parts),
+    )  # fmt: skip
+    block_offsets, block_entries = np.empty(blocks * blocks + 1, np.int64), np.empty(4096, np.uint32)
+    while True:
+        turn = taken(counter)
+        if turn >= sequence.size:
+            break
+        number = sequence[turn]
+        tile = lists.wanted[number]
+        tile_x, tile_y = tile % tiles_x, tile // tiles_x
+        block_entries = block_lists(
+            lists.entries[lists.offsets[tile] : lists.offsets[tile + 1]], inputs.gaussians.box, tile_x * side,
+            tile_y * side, side, block_offsets, block_entries,
+        )  # fmt: skip
+        for b in range(blocks * blocks):
+            place = block_place(tile_x, tile_y, b, side, pixels[number, b])
+            if place.wanted == 0 or place.x0 >= camera.width or place.y0 >= camera.height:
+                continue
+            numbers = block_entries[block_offsets[b] : block_offsets[b + 1]]
+            if numbers.size >= buffers.depths.shape[1]:
+                # a pixel's fragments stand one after the other
+                room = 2 * numbers.size
+                buffers = resized(buffers, room, max(buffers.lists.shape[1], room // 64 + 1), inputs.shape, forms)
+                block, rooms, low = block_of(buffers, inputs.shape, forms), _new_work(room), np.empty(2 * room * parts)
+                work = _work_of(rooms, low)
+            _bound_block(
+                borrowed(numbers), goals[number], place, inputs, block, strips, color_ends, work, sums, out[number]
+            )
+    # the owners of the memory live to here
+    return len(buffers) + len(rooms) + low.size + lanes.size
+
+
+def depth_range_stage(
+    lists: TileLists, pixels: np.ndarray, goals: np.ndarray, inputs: PixelInputs, strips: Strips,
+    color_ends: ColorEnds, threads: int, out: np.ndarray,
+) -> None:  # fmt: skip
+    """Ends of pixels of the tiles ``lists.wanted`` over each sub-box of a cell (design.md, B14).
+
+    Args:
+        lists: Of all tiles of the image.
+        pixels: [t, blocks] the set of the pixels of each block that are wanted, blocks row by row.
+        goals: [t, side, side, 6] values of the least of three channels, then of the most. Nothing else matters than on
+            which side of its goal an end is; infinite: all does; NaN: the end is not wanted.
+        inputs: Of the cell, which has parts: the sub-boxes.
+        strips: Of eight sub-boxes each.
+        color_ends: Of the Gaussians.
+        threads: Number of threads.
+        out: [t, side, side, 6, parts] receives the ends that are wanted. What is no number bounds nothing.
+    """
+    run_by_tiles(
+        _depth_range_worker, longest_first(lists.wanted, lists.offsets), threads, lists, pixels, goals, inputs,
+        strips, color_ends, out,
+    )  # fmt: skip
