@@ -82,9 +82,10 @@ def read_scene(file: Path, report: dict[str, Any]) -> ActivatedScene | CheckedFi
         stored, mode, background, sigmoid, degree = (_read_ply if ply else _read_splats)(file, settings)
         mode, background = settings.get("rasterize_mode") or mode, settings.get("background") or background
         background = np.array(background, np.float32)
-        if mode != about.get("rasterize_mode") or background.tolist() != about.get("background"):
-            raise BadInput("the result was made with another mode or background", file, fix=_SCENE)
         stored = [np.ascontiguousarray(a, np.float32) for a in _drawn(stored, file, settings)]
+        stated = [about.get(name) for name in ("rasterize_mode", "background", "gaussians")]
+        if stated != [mode, background.tolist(), len(stored[0])]:
+            raise BadInput("the result was made with another mode, background or number of Gaussians", file, fix=_SCENE)
         digest = hashlib.sha256(b"".join(a.tobytes() for a in (*stored, background)))
         digest.update(repr(("sigmoid" if sigmoid else "sh", degree, mode)).encode())
         scene = activated(stored, sigmoid, degree, mode == "antialiased", background, renderer["version"])

@@ -35,14 +35,13 @@ class CheckedLayer(NamedTuple):
 
 
 class CheckedNetwork(NamedTuple):
-    """A network of layers, each behind those that it needs, with the names of its input and of the output that counts.
-
-    ``unit`` is the unit roundoff of its evaluation; 0: the network of real numbers.
-    """
+    """A network of layers, each behind those that it needs."""
 
     layers: list[CheckedLayer]
+    #: The names of its input and of the output that counts.
     source: str
     output: str
+    #: Unit roundoff of its evaluation; 0: the network of real numbers.
     unit: float
 
     def outputs(self, picture: Affine, rows: Array | None = None) -> Affine:
