@@ -511,9 +511,7 @@ def changed(document: Any, place: tuple[Any, ...], value: Any) -> Any:
     """A copy of a JSON document with another value at a place."""
     if not place:
         return value
-    copied = list(document) if isinstance(document, list) else dict(document)
-    if isinstance(document, dict):
-        copied.setdefault(place[0], None)
+    copied: Any = list(document) if isinstance(document, list) else {place[0]: None, **document}
     copied[place[0]] = changed(copied[place[0]], place[1:], value)
     return copied
 
