@@ -19,7 +19,7 @@ import torch
 from certifying import classifier, write_onnx
 from conftest import InProcess, Inputs, blob_scene, ring
 from nerfs import UNIFORM, tiny_weights, view
-from onnx import helper
+from onnx import helper, numpy_helper
 from scene_files import ply
 from splat_files import (
     glb_parts,
@@ -312,6 +312,13 @@ def test_operators_are_those_of_the_format(tmp_path: Path) -> None:
     model.graph.node[0].attribute.append(helper.make_attribute("strides", [1, 1]))
     onnx.save(model, str(file))
     with pytest.raises(ValueError, match="strides"):
+        read_network(file, None, 0.0)
+    # a runtime would compute in halves
+    model.ParseFromString(plain)
+    for tensor in model.graph.initializer:
+        tensor.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(tensor).astype(np.float16), tensor.name))
+    onnx.save(model, str(file))
+    with pytest.raises(ValueError, match="inputs"):
         read_network(file, None, 0.0)
 
 
@@ -827,6 +834,16 @@ def test_a_filter_is_refused(tmp_path: Path) -> None:
     file = ply(tmp_path / "scene.ply", scene, filter_3D=np.full(5, 0.1, np.float32))
     report = {"settings": {}, "scene": {}, "renderer": {"name": "gsplat"}, "fingerprint": {}}
     with pytest.raises(BadInput, match="filter"):
+        read_scene(file, report)
+
+
+def test_bands_that_are_not_drawn_are_refused(tmp_path: Path) -> None:
+    """This program draws the bands up to 3; others would be left out."""
+    scene = blob_scene(2, degree=3)
+    more = {f"f_rest_{k}": np.full(2, 0.1, np.float32) for k in range(45, 72)}
+    file = ply(tmp_path / "scene.ply", scene, **more)
+    report = {"settings": {}, "scene": {}, "renderer": {"name": "gsplat"}, "fingerprint": {}}
+    with pytest.raises(BadInput, match="degree 4"):
         read_scene(file, report)
 
 

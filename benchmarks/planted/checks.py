@@ -227,6 +227,22 @@ CHECKS = (
         f"{_KINDS}::test_loops_that_say_two_things_are_not_followed",
     ),
     Fault(
+        "checker: bands above the third are left out",
+        "check/inputs.py",
+        "read_scene",
+        "degree > 3",
+        "degree > 4",
+        f"{_KINDS}::test_bands_that_are_not_drawn_are_refused",
+    ),
+    Fault(
+        "checker: networks of halves are read",
+        _NETWORKS,
+        "read_network",
+        "t.data_type in (onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE)",
+        "True",
+        f"{_KINDS}::test_operators_are_those_of_the_format",
+    ),
+    Fault(
         "checker: least margins are believed",
         _RESULTS,
         "_tallies",

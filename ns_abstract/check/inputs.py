@@ -81,9 +81,11 @@ def read_scene(file: Path, report: dict[str, Any]) -> ActivatedScene | CheckedFi
             ply = stream.read(4) in (b"ply\n", b"ply\r")
         stored, mode, background, sigmoid, degree = (_read_ply if ply else _read_splats)(file, settings)
         mode, background = settings.get("rasterize_mode") or mode, settings.get("background") or background
+        if degree > 3:
+            raise BadInput(f"has spherical harmonics of degree {degree}", file, fix=_SCENE)
         background = np.array(background, np.float32)
         stored = [np.ascontiguousarray(a, np.float32) for a in _drawn(stored, file, settings)]
-        stated = [about.get(name) for name in ("rasterize_mode", "background", "gaussians")]
+        stated = [about.get("rasterize_mode"), about.get("background"), about.get("gaussians", len(stored[0]))]
         if stated != [mode, background.tolist(), len(stored[0])]:
             raise BadInput("the result was made with another mode, background or number of Gaussians", file, fix=_SCENE)
         digest = hashlib.sha256(b"".join(a.tobytes() for a in (*stored, background)))
