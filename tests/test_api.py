@@ -451,6 +451,11 @@ def test_methods_of_scenes_and_results_name_the_field(wall: nsa.Scene, blobs: In
         ("seed", lambda: nsa.compare(wall, wall, straight(8), seed=-1)),
         ("on_progress", lambda: nsa.compare(wall, wall, straight(8), on_progress="x")),  # type: ignore[arg-type]
         (None, lambda: nsa.PoseSet(straight(8), translation={"x": held})),
+        ("network_arithmetic", lambda: nsa.reach(splats, report, network_arithmetic="Float32")),  # type: ignore[arg-type]
+        ("network_arithmetic", lambda: nsa.certify(wall, straight(8), None, {}, network_arithmetic=np.eye(2))),  # type: ignore[arg-type]
+        ("picture", lambda: nsa.certify(wall, straight(8), None, {}, picture=np.eye(2))),  # type: ignore[arg-type]
+        ("engine", lambda: nsa.certify(wall, straight(8), None, {}, engine=np.eye(2))),  # type: ignore[arg-type]
+        ("workers", lambda: nsa.certify(wall, straight(8), None, {}, workers=10**400)),
     ):
         with pytest.raises(nsa.InputError) as caught:
             call()

@@ -267,6 +267,7 @@ def certify(
     """
     options = SearchOptions(**search)
     one_of(picture, ("float", "8-bit"), "picture")
+    one_of(network_arithmetic, ("float32", "real"), "network_arithmetic")
     source = plain(property) if isinstance(property, Mapping) else file_path(property, "property")
     question = asked(None if model is None else file_path(model, "model"), PropertySource.of(source))
     drawn = [question.drawn(entry.of(checked_scene(scene))) for entry in pose_sets(poses)]
