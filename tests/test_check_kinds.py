@@ -9,6 +9,7 @@ import shutil
 import sqlite3
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -835,6 +836,20 @@ def test_a_filter_is_refused(tmp_path: Path) -> None:
     report = {"settings": {}, "scene": {}, "renderer": {"name": "gsplat"}, "fingerprint": {}}
     with pytest.raises(BadInput, match="filter"):
         read_scene(file, report)
+
+
+@pytest.mark.parametrize("place", ["scene", "renderer"])
+def test_rays_are_those_that_the_report_states(place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rays = {"near": 0.0, "far": 6.0, "samples": 8, "background": [1.0, 0.5, 1.0]}
+    field, digest = SimpleNamespace(**rays), hashlib.sha256()
+    monkeypatch.setattr(inputs, "_read_field", lambda *_: (field, digest))
+    file = write_json(tmp_path / "config.yml", {})
+    report: dict[str, Any] = {"settings": {}, "fingerprint": {"scene": digest.hexdigest()}}
+    report |= {"scene": {**rays, "name": "a"}, "renderer": {**rays, "name": "nerf-uniform"}}
+    assert read_scene(file, report) is field
+    for name, value in (("near", 1.0), ("far", 5.0), ("samples", 9), ("background", [1.0, 0.5, 0.9])):
+        with pytest.raises(BadInput, match="other samples or another background"):
+            read_scene(file, report | {place: {**report[place], name: value}})
 
 
 def test_bands_that_are_not_drawn_are_refused(tmp_path: Path) -> None:

@@ -243,6 +243,14 @@ CHECKS = (
         f"{_KINDS}::test_operators_are_those_of_the_format",
     ),
     Fault(
+        "checker: a report may state other rays than were bounded",
+        "check/inputs.py",
+        "read_scene",
+        "part.get(name, value) != value",
+        "False",
+        f"{_KINDS}::test_rays_are_those_that_the_report_states[scene]",
+    ),
+    Fault(
         "checker: least margins are believed",
         _RESULTS,
         "_tallies",

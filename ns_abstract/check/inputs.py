@@ -76,6 +76,9 @@ def read_scene(file: Path, report: dict[str, Any]) -> ActivatedScene | CheckedFi
         raise BadInput("no such run", file, fix=_CONVERT if folder else _MOVED)
     if renderer["name"] == "nerf-uniform":
         scene, digest = _read_field(file, settings, renderer)
+        rays = {"near": scene.near, "far": scene.far, "samples": scene.samples, "background": list(scene.background)}
+        if any(part.get(name, value) != value for part in (about, renderer) for name, value in rays.items()):
+            raise BadInput("the result was made with other samples or another background", file, fix=_SCENE)
     else:
         with file.open("rb") as stream:
             ply = stream.read(4) in (b"ply\n", b"ply\r")
@@ -231,11 +234,9 @@ def dataset_scale(config: Path) -> float:
 
 
 def read_poses(path: Path, given: dict[str, Any] | None, frame: int, settings: dict[str, Any], scale: float) -> Any:
-    """The poses of a frame of the camera path, and its box of parameters as [(name, lower, upper)].
-
-    The perturbation object ``given``, of another file or of options, wins over the path's; ``settings`` are the options
-    that the result was made with, ``scale`` is that of `dataset_scale`.
-    """
+    """The poses of a frame of the camera path, and its box of parameters as [(name, lower, upper)]."""
+    # the perturbation object ``given``, of another file or of options, wins over the path's; ``settings`` are the
+    # options that the result was made with, ``scale`` is that of `dataset_scale`
     root = read_json(path, "camera path", "say with --camera-path-filename where it lies now")
     with reading(path, f"frame {frame} or its set of poses cannot be read"):
         entries, entry = root["camera_path"], root["camera_path"][frame]
