@@ -400,7 +400,7 @@ MISTAKES = {
 #: What `ns_abstract.bound` gets, by the name of the argument that its error names.
 BAD_ARGUMENTS: dict[str, Any] = {
     "poses": None, "time_budget": "long", "target_ratio": None, "workers": 0.5, "seed": -1, "--memory-limit": "x",
-    "keep_cells": "no",
+    "keep_cells": "no", "outputs": 3, "on_progress": "x",
 }  # fmt: skip
 
 
@@ -431,6 +431,37 @@ def test_bad_arguments_are_named(name: str, wall: nsa.Scene) -> None:
     with pytest.raises(nsa.InputError) as caught:
         nsa.bound(wall, **arguments)
     assert caught.value.field == name and caught.value.fix
+
+
+def test_methods_of_scenes_and_results_name_the_field(wall: nsa.Scene, blobs: Inputs, tmp_path: Path) -> None:
+    splats, held = nsa.load_scene(blobs.config), []
+    held.append(held)
+    result = nsa.bound(wall, straight(8))
+    report = tmp_path / "none"
+    for field, call in (
+        ("--arithmetic", lambda: splats.method(np.arange(3))),  # type: ignore[arg-type]
+        ("--arithmetic", lambda: splats.method("x" * 10_000)),
+        ("--background", lambda: splats.on_background(3, "here")),  # type: ignore[arg-type]
+        ("--background", lambda: splats.on_background((0.0, 0.0, 2.0), "here")),
+        ("path", lambda: result.save(None)),  # type: ignore[arg-type]
+        ("path", lambda: result.save("a\0b")),
+        ("on_progress", lambda: nsa.check(report, on_progress=3)),  # type: ignore[arg-type]
+        ("time_budget", lambda: nsa.compare(wall, wall, straight(8), time_budget=None)),  # type: ignore[arg-type]
+        ("workers", lambda: nsa.compare(wall, wall, straight(8), workers=0)),
+        ("seed", lambda: nsa.compare(wall, wall, straight(8), seed=-1)),
+        ("on_progress", lambda: nsa.compare(wall, wall, straight(8), on_progress="x")),  # type: ignore[arg-type]
+        (None, lambda: nsa.PoseSet(straight(8), translation={"x": held})),
+        ("network_arithmetic", lambda: nsa.reach(splats, report, network_arithmetic="Float32")),  # type: ignore[arg-type]
+        ("network_arithmetic", lambda: nsa.certify(wall, straight(8), None, {}, network_arithmetic=np.eye(2))),  # type: ignore[arg-type]
+        ("picture", lambda: nsa.certify(wall, straight(8), None, {}, picture=np.eye(2))),  # type: ignore[arg-type]
+        ("engine", lambda: nsa.certify(wall, straight(8), None, {}, engine=np.eye(2))),  # type: ignore[arg-type]
+        ("workers", lambda: nsa.certify(wall, straight(8), None, {}, workers=10**400)),
+    ):
+        with pytest.raises(nsa.InputError) as caught:
+            call()
+        assert caught.value.field == field and caught.value.fix and len(str(caught.value)) < 300
+    color = splats.on_background((0.5, 0.25, 1.0), "here").background
+    assert color == (0.5, 0.25, 1.0) and splats.background != color
 
 
 def test_a_camera_is_the_set_of_its_pose(wall: nsa.Scene, tmp_path: Path) -> None:

@@ -541,6 +541,8 @@ def test_figures_that_are_not_the_bounds_are_refuted(copy: Path) -> None:
     sides = [{**side, "lower": 2.0 * side["lower"]} for side in frame["parameters"]]
     report(copy, lambda d: d["frames"][0].update(parameters=sides))
     assert check(copy, claims=2).structure == ["frame 0: the report says another set of poses"]
+    report(copy, lambda d: d.update(frames=[frame | {"height": 2 * frame["height"]}]))
+    assert check(copy, claims=2).structure == ["frame 0: the report says another size"]
     report(copy, lambda d: d.update(frames=[frame, frame | {"mpg": 0.0, "ratio": 1.0}]))
     assert set(check(copy, claims=2).structure) == {"frame 0: the report has more than one entry of it"}
     report(copy, lambda d: d.update(frames=[frame]))
@@ -618,6 +620,7 @@ BAD: dict[str, tuple[Callable[[Path], object], str]] = {
     "not finite": (lambda f: rewrite(f, lambda a: a["A_lower"].fill(np.nan)), "not finite"),
     "another version": (lambda f: report(f, lambda d: d.update(version=2)), "version"),
     "another scene": (lambda f: report(f, lambda d: d["fingerprint"].update(scene="0")), "not the scene"),
+    "other Gaussians": (lambda f: report(f, lambda d: d["scene"].update(gaussians=9)), "number of Gaussians"),
     "another mode": (lambda f: report(f, lambda d: d["scene"].update(rasterize_mode="antialiased")), "another mode"),
     "another program": (lambda f: report(f, lambda d: d["renderer"].update(name="paper")), "gsplat and nerf-uniform"),
     "moved run": (lambda f: report(f, lambda d: d["settings"].update(load_config="/nowhere")), "--load-config"),

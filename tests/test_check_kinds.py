@@ -9,6 +9,7 @@ import shutil
 import sqlite3
 import sys
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ import torch
 from certifying import classifier, write_onnx
 from conftest import InProcess, Inputs, blob_scene, ring
 from nerfs import UNIFORM, tiny_weights, view
-from onnx import helper
+from onnx import helper, numpy_helper
 from scene_files import ply
 from splat_files import (
     glb_parts,
@@ -55,7 +56,7 @@ from ns_abstract.check.splats import (
     projected,
     reaches,
 )
-from ns_abstract.check.statements import parsed
+from ns_abstract.check.statements import followed, parsed
 from ns_abstract.cli import certify as certify_command
 from ns_abstract.cli import check as check_command
 from ns_abstract.demo.writing import write_loop_demo
@@ -313,6 +314,13 @@ def test_operators_are_those_of_the_format(tmp_path: Path) -> None:
     onnx.save(model, str(file))
     with pytest.raises(ValueError, match="strides"):
         read_network(file, None, 0.0)
+    # a runtime would compute in halves
+    model.ParseFromString(plain)
+    for tensor in model.graph.initializer:
+        tensor.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(tensor).astype(np.float16), tensor.name))
+    onnx.save(model, str(file))
+    with pytest.raises(ValueError, match="inputs"):
+        read_network(file, None, 0.0)
 
 
 @pytest.mark.slow
@@ -427,7 +435,7 @@ def test_parts_and_margins_of_a_report_are_those_of_the_cells() -> None:
     box = {"box_lower": np.array([[0.0], [0.25], [0.5]]), "box_upper": np.array([[0.25], [0.5], [1.0]])}
     verdicts: list[Any] = [("certified", 0.25, None), ("certified", 0.125, None), ("open", None, None)]
     cells = StoredCells(0, ("x",), np.zeros(1), np.ones(1), box, verdicts)
-    counts = {"certified": 2, "falsified": 0, "unknown": 0}
+    counts = {"certified": 2, "falsified": 0, "unknown": 0, "open": 1}
     frame = {
         "index": 0,
         "cells": counts,
@@ -438,6 +446,8 @@ def test_parts_and_margins_of_a_report_are_those_of_the_cells() -> None:
     parts = frame | {"coverage": {"certified": 0.5, "falsified": 0.0, "unknown": 0.0}}
     assert structure(cells, {"frames": [parts]}) == ["unknown cells are 0.5 of the set, the report says 0"]
     assert structure(cells, {"frames": [frame | {"least_margin": 0.25}]}) == ["the least margin is 0.125, not 0.25"]
+    none = frame | {"cells": counts | {"open": 0}}
+    assert structure(cells, {"frames": [none]}) == ["the report counts 0 cells to be examined, the table 1"]
     twice = [frame | {"coverage": {"certified": 1.0}}, frame]
     assert structure(cells, {"frames": twice}) == ["the report has more than one entry of it"]
 
@@ -487,9 +497,88 @@ def test_statements_say_nothing_that_is_passed_over() -> None:
         dark | {"weight": 0.5},
         dark | {"preprocess": {"mean": [0.5, 0.5, 0.5]}},
         {"type": "mask"},
+        {"type": "classification"},
+        {"all": [dark | {"preprocess": {"resize": [2, 2]}}]},
+        dark | {"max": True},
+        dark | {"min": "-0.5"},
+        dark | {"region": [-3, -3, -1, -1]},
+        {"type": "clear", "distance": 0.1, "measure": "median"},
+        {"type": "clear", "distance": 0.1, "units": "metres"},
+        {"type": "visible", "select": {"box": [[0, 0, 0], [1, 1, 1]]}, "pixels": 1.5},
+        {"type": "visible", "select": {"box": [[0, 0, 0], [1, 1, 1]], "list": "some.npy"}},
     ):
         with pytest.raises(BadInput, match="which is not checked"):
             parsed(root, (4, 4), 1.0)
+    with pytest.raises(BadInput, match="outside of the picture"):
+        parsed(dark | {"region": [2, 2, 5, 4]}, (4, 4), 1.0)
+    many = {"type": "visible", "select": {"box": [[0, 0, 0], [1, 1, 1]]}, "pixels": 12, "fraction": 0.1}
+    assert parsed(many, (4, 4), 1.0).rank == 12
+
+
+def changed(document: Any, place: tuple[Any, ...], value: Any) -> Any:
+    """A copy of a JSON document with another value at a place."""
+    if not place:
+        return value
+    copied: Any = list(document) if isinstance(document, list) else {place[0]: None, **document}
+    copied[place[0]] = changed(copied[place[0]], place[1:], value)
+    return copied
+
+
+#: A property or loop, and what it may not say because this program would pass over it or read something else.
+PASSED_OVER = {
+    "class": (
+        {"label": -1}, {"label": 0.9}, {"label": False}, {"label": "0"}, {"confidence": 0.9}, {"type": "detection"},
+    ),
+    "input": (
+        {"channels": "GRAY"}, {"layout": "NHWC"}, {"crop": [1, 1]}, {"resize": [8.5, 8]}, {"mean": ["0.5", 0, 0]},
+    ),
+    "loop": (
+        {"wind": 1.0}, {"steps": 2.5}, {"disturbance": {"across": [0.5, -0.5]}}, {"disturbance": {"across": -0.5}},
+        {"disturbance": {"acros": 0.5}}, {"initial": {"along": [1, 0]}}, {"control": {"delay": 3}},
+        {"control": {"clip": [[-1, 1], [1, -1]]}}, {"dynamics": {"type": "affine", "drag": 1.0}},
+        {"dynamics": {"type": "unicycle"}}, {"camera": {"orbit": 1.0}}, {"goal": {"half_space": {}}},
+        {"unsafe": [{"type": "clear"}]}, {"unsafe": [{"box": {"along": [1.0, 0.0]}}]},
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("kind", PASSED_OVER)
+def test_nothing_of_a_property_or_loop_is_passed_over(kind: str) -> None:
+    for value in PASSED_OVER[kind]:
+        with pytest.raises(BadInput, match="which is not checked"):
+            followed(value, kind, ("along", "across"))
+    followed({"type": "classification", "label": 3}, "class")
+    followed({"resize": [8, 8], "mean": [0.5, 0.4, 0.3], "channels": "BGR", "range": [1, 0]}, "input")
+    loop = {
+        "initial": {"along": -1.0, "across": [-0.2, 0.1]}, "disturbance": {"along": [-0.2, -0.1], "across": 0.1},
+        "control": {"clip": [[-1, 1], [-2, 2]], "gain": [[1, -1]], "goal": [1, -1]},
+        "unsafe": [{"half_space": {"normal": [1, -1], "at_least": -0.5}}, {"box": {"along": [None, -1]}}],
+        "goal": {"box": {"across": [0.1, None]}, "when": "any"},
+    }  # fmt: skip
+    followed(loop, "loop", ("along", "across"))
+
+
+def test_loops_that_say_two_things_are_not_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A goal that is a half-space would be taken for reached where it may be; a camera has one position."""
+    loop = {
+        "state": ["x", "y"], "steps": 2, "initial": {"x": [0, 1], "y": 0}, "dynamics": {"type": "affine"},
+        "camera": {"camera_to_world": np.eye(4).tolist(), "position": {"matrix": [[1, 0], [0, 1], [0, 0]]}},
+        "unsafe": [{"half_space": {"normal": [1, 0], "at_least": 5}}], "goal": {"box": {"x": [0, 9]}},
+    }  # fmt: skip
+    seeing = type("", (), {"shape": {"resize": [8, 8]}})
+    monkeypatch.setattr(sys.modules[LoopRuns.__module__], "SeeingNetwork", lambda *_: seeing)
+    cells = StoredCells(1, ("x",), np.zeros(1), np.ones(1), {})
+    assert LoopRuns(cells, None, {"loop": loop}, tmp_path).seen == [0, 1]
+    half = {"half_space": {"normal": [1, 0], "at_least": 0.1}}
+    for place, value in (
+        (("goal",), half),
+        (("goal",), {"when": "any"}),
+        (("goal", "half_space"), half["half_space"]),
+        (("unsafe", 0, "box"), {"y": [5.0, None]}),
+        (("camera", "camera_to_world", 0, 3), 5.0),
+    ):
+        with pytest.raises(BadInput, match=r"not checked|does not follow"):
+            LoopRuns(cells, None, {"loop": changed(loop, place, value)}, tmp_path)
 
 
 @pytest.mark.slow
@@ -746,6 +835,30 @@ def test_a_filter_is_refused(tmp_path: Path) -> None:
     file = ply(tmp_path / "scene.ply", scene, filter_3D=np.full(5, 0.1, np.float32))
     report = {"settings": {}, "scene": {}, "renderer": {"name": "gsplat"}, "fingerprint": {}}
     with pytest.raises(BadInput, match="filter"):
+        read_scene(file, report)
+
+
+@pytest.mark.parametrize("place", ["scene", "renderer"])
+def test_rays_are_those_that_the_report_states(place: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    rays = {"near": 0.0, "far": 6.0, "samples": 8, "background": [1.0, 0.5, 1.0]}
+    field, digest = SimpleNamespace(**rays), hashlib.sha256()
+    monkeypatch.setattr(inputs, "_read_field", lambda *_: (field, digest))
+    file = write_json(tmp_path / "config.yml", {})
+    report: dict[str, Any] = {"settings": {}, "fingerprint": {"scene": digest.hexdigest()}}
+    report |= {"scene": {**rays, "name": "a"}, "renderer": {**rays, "name": "nerf-uniform"}}
+    assert read_scene(file, report) is field
+    for name, value in (("near", 1.0), ("far", 5.0), ("samples", 9), ("background", [1.0, 0.5, 0.9])):
+        with pytest.raises(BadInput, match="other samples or another background"):
+            read_scene(file, report | {place: {**report[place], name: value}})
+
+
+def test_bands_that_are_not_drawn_are_refused(tmp_path: Path) -> None:
+    """This program draws the bands up to 3; others would be left out."""
+    scene = blob_scene(2, degree=3)
+    more = {f"f_rest_{k}": np.full(2, 0.1, np.float32) for k in range(45, 72)}
+    file = ply(tmp_path / "scene.ply", scene, **more)
+    report = {"settings": {}, "scene": {}, "renderer": {"name": "gsplat"}, "fingerprint": {}}
+    with pytest.raises(BadInput, match="degree 4"):
         read_scene(file, report)
 
 

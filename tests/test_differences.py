@@ -477,6 +477,20 @@ def test_verdicts() -> None:
     assert overall(["certified", "certified"], True) == "certified"
 
 
+def test_last_digits_of_renders_break_no_tolerance() -> None:
+    """Two versions that draw the same picture but for its last digits in float64; a difference of 1e-9 is one."""
+    scene, given = blob_scene(), ring()[0]
+    camera = nsa.Camera(given.camera_to_world, given.fov, given.width, given.height)
+    poses = PoseBox.around(camera, parse_perturbation({"rotation": {"yaw": 0.1}}, field_prefix=""), None)
+    first, second = (SplatMethod(scene, None, "float32", version) for version in ("1.4.0", "1.6.0"))
+    frame = DifferenceFrame(first.frame(poses), second.frame(poses))
+    rendered = [f.precise(frame.box.middle) for f in (first.frame(poses), second.frame(poses))]
+    assert 0.0 < np.abs(rendered[0] - rendered[1]).max() < 1e-13
+    assert frame.render(frame.box.middle).max() == 0.0 and frame.largest is not None and frame.largest.value == 0.0
+    moved = SplatMethod(replace(scene, sh=scene.sh + np.float32(1e-7)), None, "float32")
+    assert DifferenceFrame(first.frame(poses), moved.frame(poses)).render(frame.box.middle).max() > 1e-9
+
+
 # ---------------------------------------------------------------- the command
 
 

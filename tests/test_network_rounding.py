@@ -13,9 +13,12 @@ import pytest
 import torch
 from onnx_files import OnnxFile, image_sets, session
 
+from ns_abstract.io.errors import InputError
+from ns_abstract.verify.model import NetworkModel
 from ns_abstract.verify.network import ImageSets, Network, bound_outputs, load_network
 from ns_abstract.verify.network.bounds import NetworkBounds
 from ns_abstract.verify.network.rounding import partial_sums
+from ns_abstract.verify.preprocess import Preprocess
 
 Layers = list[tuple[np.ndarray, np.ndarray]]
 #: A product that is lost when it is added to 1 in float32, and 1 stays.
@@ -416,3 +419,17 @@ def test_scales_that_may_be_folded(tmp_path: Path) -> None:
     kinds = [type(node.layer).__name__ for node in network.nodes]
     assert kinds == ["Convolution", "LeakyRelu", "Convolution", "Gather", "ScaleLayer", "LeakyRelu", "Convolution"]
     assert network.scaled == {3, 4, 5}
+
+
+def test_other_words_are_no_arithmetic(tmp_path: Path) -> None:
+    """The exact network alone was bounded under them, and reports named every float32 evaluation."""
+    network, _ = network_of([(np.full((2, 64), 0.1), np.zeros(2))], tmp_path)
+    for word in ("Float32", "half", "", None, 3, ["float32"]):
+        with pytest.raises(InputError, match="network_arithmetic: found"):
+            NetworkModel(network, Preprocess(), 1 << 28, word)  # type: ignore[arg-type]
+    images, rows = still(np.linspace(0.0, 1.0, 64)[None]), np.eye(2)
+    usual, real, other = (
+        bound_outputs(network, images, rows, np.zeros(2), arithmetic=word).lower  # type: ignore[arg-type]
+        for word in ("float32", "real", "Float32")
+    )
+    assert (real > usual).all() and (other == usual).all()

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import io
+import json
 import math
 import re
+import subprocess
 import sys
 from pathlib import Path
 from types import SimpleNamespace
@@ -13,7 +15,7 @@ from typing import Any
 import numpy as np
 import pytest
 from certifying import classifier
-from conftest import Inputs
+from conftest import Inputs, environment
 from rich.console import Console
 
 import ns_abstract as nsa
@@ -115,3 +117,42 @@ def test_work_tells_what_the_display_needs(blobs: Inputs, tmp_path: Path) -> Non
         assert parts(point.sentence) == pytest.approx(100.0, abs=0.02) and point.total_budget == 4.0
     assert cert.certified + cert.falsified + cert.unknown == pytest.approx(1.0)
     assert np.isfinite([point.elapsed for point in found]).all()
+
+
+SPEAKS = """
+import sys, time
+from ns_abstract.cli.common import run
+from ns_abstract.report.progress import plain_console
+
+def main(options):
+    sys.stdin.readline()
+    sys.stderr.write("left in the stream")
+    try:
+        {call}
+    except SystemExit:
+        raise AssertionError
+run(main, lambda: None)
+"""
+
+
+@pytest.mark.parametrize("call", ["plain_console().print('lost')", "print('lost', file=sys.stderr, flush=True)"])
+def test_a_reader_that_has_gone_interrupts(call: str) -> None:
+    """rich would end the process with code 1, before a report says that the work was interrupted."""
+    script = [sys.executable, "-c", SPEAKS.format(call=call)]
+    process = subprocess.Popen(script, stdin=subprocess.PIPE, stderr=subprocess.PIPE, env=environment(), text=True)
+    assert process.stderr is not None and process.stdin is not None
+    process.stderr.close()
+    process.stdin.write("\n")
+    process.stdin.close()
+    assert process.wait(timeout=60) == 3
+
+
+@pytest.mark.slow
+def test_a_report_says_that_its_reader_has_gone(blobs: Inputs, tmp_path: Path) -> None:
+    options = map(str, blobs.options(tmp_path, time_budget=60))
+    script = [sys.executable, "-c", "from ns_abstract.cli.render import main; main()", *options]
+    process = subprocess.Popen(script, stderr=subprocess.PIPE, env=environment())
+    assert process.stderr is not None
+    process.stderr.close()
+    assert process.wait(timeout=120) == 3
+    assert json.loads((tmp_path / "report.json").read_text())["state"] == "interrupted"

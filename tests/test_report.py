@@ -665,6 +665,14 @@ def test_page_escapes(tmp_path):
     assert all(a.startswith(("data:image/png;base64,", "frame_0")) for a in reader.addresses)
 
 
+def test_pages_turn_no_text_round(tmp_path):
+    """A file's name would look like another; accents and line ends stay."""
+    name = "frame\u202egnp.exe\u200b \ud800 caf\u00e9"
+    reader = written(tmp_path, [frame(0)], command=("run", name), limits=("one\ntwo",), scene={"name": name})
+    assert "\u202e" not in reader.text and "frame\\u202egnp.exe\\u200b \\ud800 café" in reader.text
+    assert "one\ntwo" in reader.text
+
+
 @pytest.mark.parametrize("count", [0, 1, 2, 30])
 def test_page_of_many_frames(tmp_path, count):
     results = [frame(k, 3, 4, seed=k, spread=0.01 * (k + 1)) for k in range(count)]

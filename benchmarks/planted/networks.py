@@ -313,4 +313,20 @@ NETWORKS = (
         "False",
         _HIDDEN + "test_types_that_numpy_holds_otherwise_are_refused[a zero of 4 bits]",
     ),
+    Fault(
+        "other words for float32 are the exact network",
+        _NETWORK + "intermediate_bounds.py",
+        "IntermediateBounds.__init__",
+        'arithmetic != "real"',
+        'arithmetic == "float32"',
+        "test_network_rounding.py::test_other_words_are_no_arithmetic",
+    ),
+    Fault(
+        "any word is an arithmetic of networks",
+        "verify/model.py",
+        "NetworkModel.__init__",
+        'one_of(arithmetic, get_args(NetworkArithmetic), "network_arithmetic")',
+        "None",
+        "test_network_rounding.py::test_other_words_are_no_arithmetic",
+    ),
 )

@@ -144,12 +144,21 @@ RESULTS = (
         "test_assumptions.py::test_certificate",
     ),
     Fault(
+        "the page turns texts round",
+        "report/html.py",
+        "_in_order",
+        "unicodedata.category(c) in _UNSEEN",
+        "False",
+        "test_report.py::test_pages_turn_no_text_round",
+    ),
+    Fault(
         "the page shows what files say as markup",
         "report/html.py",
         "_templates",
         """Environment(
             loader=FileSystemLoader(_FOLDER / "templates"),
             autoescape=True,
+            finalize=_in_order,
             trim_blocks=True,
             lstrip_blocks=True,
             undefined=StrictUndefined,

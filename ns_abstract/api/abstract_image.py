@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.io.arguments import array_of
+from ns_abstract.io.arguments import array_of, file_path
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import is_number, show, unusable
@@ -167,9 +167,10 @@ class BoundResult:
         """Write an npz with the names of the files of ns-abstract-render.
 
         Raises:
+            InputError: ``path`` can name no file.
             OSError: The file cannot be written.
         """
-        save_frame(path, self.frame, status=self.status, about=self.about)
+        save_frame(file_path(path, "path"), self.frame, status=self.status, about=self.about)
 
     def _lines(self) -> list[str]:
         box = self.parameters

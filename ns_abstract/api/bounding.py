@@ -23,8 +23,9 @@ from ns_abstract.execution.stopping import StopRequest, interruptible
 from ns_abstract.execution.threads import use_threads
 from ns_abstract.execution.worker_cache import Recipe, load
 from ns_abstract.geometry.camera_path import PinholeCamera
-from ns_abstract.io.arguments import at_least, flag, positive, whole
+from ns_abstract.io.arguments import at_least, callback, flag, positive, whole, workers_of
 from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import unusable
 from ns_abstract.refine.engine import RefinementGoal, groups, shared_goal
 from ns_abstract.refine.result import FrameResult, PartResult, TracePoint
 from ns_abstract.report.figures import short_guarantee
@@ -336,9 +337,13 @@ def bound(
     """
     positive(time_budget, "time_budget")
     at_least(target_ratio, 1.0, "target_ratio")
-    whole(workers, 1, "workers")
+    workers_of(workers)
     whole(seed, 0, "seed")
-    names = [outputs] if isinstance(outputs, str) else list(outputs)
+    try:
+        names = [outputs] if isinstance(outputs, str) else list(outputs)
+    except TypeError:
+        fix = 'give a list of "rgb", "depth" and "accumulation"'
+        raise unusable(outputs, field="outputs", fix=fix) from None
     pose_box = pose_set(poses).of(checked_scene(scene))
     job = Job(
         scene, [pose_box], arithmetic=arithmetic, seed=seed, memory_limit=memory_limit, workers=workers,
@@ -383,7 +388,12 @@ def bound_alone(
 
 
 def listener(stop: StopRequest, on_progress: Callable[[Any], object] | None) -> Callable[[Any], None]:
-    """``on_progress`` as the work calls it: where it returns False or is interrupted, the work is asked to stop."""
+    """``on_progress`` as the work calls it: where it returns False or is interrupted, the work is asked to stop.
+
+    Raises:
+        InputError: It cannot be called.
+    """
+    callback(on_progress)
 
     def told(progress: Any) -> None:
         if on_progress is None:

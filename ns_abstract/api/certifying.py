@@ -29,7 +29,7 @@ from ns_abstract.api.search_options import SearchKeywords, SearchOptions, Search
 from ns_abstract.execution.cancellation import Deadline
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import PinholeCamera
-from ns_abstract.io.arguments import file_path, plain
+from ns_abstract.io.arguments import file_path, one_of, plain
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.memory import allowed_memory
 from ns_abstract.report.certificate import coverage, verdict
@@ -266,8 +266,8 @@ def certify(
         InputError: An argument cannot be used.
     """
     options = SearchOptions(**search)
-    if picture not in ("float", "8-bit"):
-        raise InputError(f"found {picture}", field="picture", fix="use float or 8-bit")
+    one_of(picture, ("float", "8-bit"), "picture")
+    one_of(network_arithmetic, ("float32", "real"), "network_arithmetic")
     source = plain(property) if isinstance(property, Mapping) else file_path(property, "property")
     question = asked(None if model is None else file_path(model, "model"), PropertySource.of(source))
     drawn = [question.drawn(entry.of(checked_scene(scene))) for entry in pose_sets(poses)]

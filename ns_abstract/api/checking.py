@@ -12,7 +12,7 @@ from typing import Any
 
 from ns_abstract.check.audit import ClaimOutcome, opened, outcomes
 from ns_abstract.check.inputs import BadInput
-from ns_abstract.io.arguments import file_path, positive, whole
+from ns_abstract.io.arguments import callback, file_path, positive, whole
 from ns_abstract.io.atomic import write_json
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import unusable
@@ -104,6 +104,7 @@ def check(
     Raises:
         InputError: A file or a field in it cannot be used.
     """
+    callback(on_progress)
     claims, seconds, seed = whole(claims, 1, "claims"), positive(seconds, "seconds"), whole(seed, 0, "seed")
     if claims > _MOST_CLAIMS:
         raise unusable(claims, field="claims", fix=f"give a number of at most {_MOST_CLAIMS:,}")

@@ -23,7 +23,7 @@ from ns_abstract.geometry.camera_path import CameraPath, PinholeCamera, load_cam
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.geometry.transform import DataparserTransform
-from ns_abstract.io.arguments import at_least, float64_of, positive
+from ns_abstract.io.arguments import at_least, float64_of, positive, whole, workers_of
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import unusable
@@ -312,7 +312,9 @@ def compare(
         InputError: An argument cannot be used, or the scenes are in different frames.
         KeyboardInterrupt: Ctrl-C came before the first render, or twice.
     """
-    check_comparison(tolerance, target_ratio, time_budget, prefix="")
+    check_comparison(tolerance, target_ratio, positive(time_budget, "time_budget"), prefix="")
+    workers_of(workers)
+    whole(seed, 0, "seed")
     job = ComparisonJob(
         checked_scene(scene), checked_scene(other_scene), [pose_set(poses).of(scene)], tolerance=tolerance,
         arithmetic=arithmetic, seed=seed,

@@ -24,7 +24,7 @@ from ns_abstract.api.loop_report import LoopReport
 from ns_abstract.api.scenes import Scene, checked_scene
 from ns_abstract.api.search_options import SearchKeywords, SearchOptions, SearchResult
 from ns_abstract.execution.cancellation import Deadline
-from ns_abstract.io.arguments import file_path, flag
+from ns_abstract.io.arguments import file_path, flag, one_of
 from ns_abstract.reach.search import QUESTIONS
 from ns_abstract.report.figures import percent
 from ns_abstract.verify.cells import CellGrid
@@ -206,6 +206,7 @@ def reach(
         InputError: An argument cannot be used.
     """
     options = SearchOptions(**search)
+    one_of(network_arithmetic, ("float32", "real"), "network_arithmetic")
     job = open_loop(
         checked_scene(scene), file_path(loop, "loop"), options.arithmetic, network_arithmetic, options.workers
     )

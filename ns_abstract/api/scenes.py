@@ -14,7 +14,7 @@ from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.geometry.transform import DataparserTransform
-from ns_abstract.io.arguments import file_path
+from ns_abstract.io.arguments import file_path, one_of
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
 from ns_abstract.methods.load import open_scene
@@ -71,8 +71,8 @@ class Scene:
         Raises:
             InputError: An option does not go with the scene.
         """
-        if arithmetic not in (None, "float32", "real"):
-            raise InputError(f"found {arithmetic}", field="--arithmetic", fix="use float32 or real")
+        if arithmetic is not None:
+            one_of(arithmetic, ("float32", "real"), "--arithmetic")
         key = arithmetic, workers if self.rays else 1
         if key not in self._methods:
             self._methods[key] = self._representation.method(self._content, self.source.options, arithmetic, workers)
@@ -115,9 +115,13 @@ class Scene:
         return None if unsaid or isinstance(color, str) else tuple(map(float, color))
 
     def on_background(self, color: tuple[float, ...], origin: str) -> Scene:
-        """The same splats, not read again, before an RGB ``color``; ``origin`` says where it is from."""
-        scene, (red, green, blue) = copy(self), color
-        overrides = replace(self.source.overrides, background=(red, green, blue))
+        """The same splats, not read again, before an RGB ``color``; ``origin`` says where it is from.
+
+        Raises:
+            InputError: It is no color of three numbers from 0 to 1.
+        """
+        scene, overrides = copy(self), replace(self.source.overrides, background=color)  # pyright: ignore[reportArgumentType]
+        color = overrides.background or color
         scene.source, scene._methods = replace(self.source, overrides=overrides), {}
         record = assumption_of("background", None, "", color, origin)
         choices = tuple(record if entry.name == record.name else entry for entry in self.assumptions)

@@ -14,10 +14,9 @@ from ns_abstract.api.bounding import listener
 from ns_abstract.api.cell_search import CellQuestion, CellSearch, Request, Row
 from ns_abstract.execution.starting import EngineName, started
 from ns_abstract.execution.stopping import interruptible
-from ns_abstract.io.arguments import file_path, flag, positive, whole
+from ns_abstract.io.arguments import file_path, flag, one_of, positive, workers_of
 from ns_abstract.io.assumptions import Assumption
 from ns_abstract.io.errors import InputError
-from ns_abstract.io.jsonio import unusable
 
 P = TypeVar("P")
 R = TypeVar("R", bound="SearchResult")
@@ -64,15 +63,14 @@ class SearchOptions:
     def __post_init__(self) -> None:
         checked = {
             "time_budget": positive(self.time_budget, "time_budget"),
-            "workers": whole(self.workers, 1, "workers"),
+            "workers": workers_of(self.workers),
             "resume": flag(self.resume, "resume"),
         }
         for name, value in checked.items():
             object.__setattr__(self, name, value)
         if self.output_dir is not None:
             file_path(self.output_dir, "output_dir")
-        if self.engine not in get_args(EngineName):
-            raise unusable(self.engine, field="engine", fix=f"use {' or '.join(get_args(EngineName))}")
+        one_of(self.engine, get_args(EngineName), "engine")
         if self.resume and self.output_dir is None:
             raise InputError("given without output_dir", field="resume", fix="give the folder to go on with")
 

@@ -162,6 +162,9 @@ LINEAR_UP, LINEAR_ROUNDING = 1.0 + 2.0**-40, 2.0**-44
 #: Y1, Y2, Y3: a difference of two bounds in at most 12 parameters, relative to the sum of all sizes: at most 92
 #: differences and terms of a sum, each rounded at most 2^3 times, and the sum's 2^7 u: 2^8 u; twice as much is charged.
 DIFFERENCE_ROUNDING = 2.0**-44
+#: Y4: the last digits of a picture that is blended in float64 of some hundred Gaussians; two pictures that differ less
+#: are taken for the same one, which breaks no tolerance.
+RENDERED_DIGITS = 2.0**-40
 #: B8: alphas below are left out by the paper's rasteriser, which draws all; so much is added for each that is.
 NEGLIGIBLE_ALPHA = 2.0**-40
 #: G7: the covariance's relative error x below which the exponent's is at most x (1 + 2 x), below 0.695: an inverse by

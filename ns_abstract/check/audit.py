@@ -19,14 +19,15 @@ from ns_abstract.check.verdicts import Verdicts, of_class, of_statement
 
 
 class ClaimOutcome(NamedTuple):
-    """What came of a claim: True: proved; False: refuted; None: open when its time was over.
+    """What came of a claim."""
 
-    ``float32``: of every float32 evaluation, else of real numbers. ``uniform``: drawn so. ``found``: what is wrong.
-    """
-
+    #: True: proved; False: refuted; None: open when its time was over.
     verdict: bool | None
+    #: Whether of every float32 evaluation, else of real numbers.
     float32: bool
+    #: Whether it was drawn so.
     uniform: bool
+    #: What is wrong.
     found: dict[str, Any]
 
 

@@ -30,15 +30,14 @@ class BoxClaim(NamedTuple):
 
 
 class ClaimMargins(NamedTuple):
-    """By how much a claim holds over B boxes of parameters; negative: by how much it does not.
+    """By how much a claim holds over B boxes of parameters; negative: by how much it does not."""
 
-    Lower and upper bounds [B] over all poses; which of what was looked at matters [B, n] (None: all of it); by how much
-    the parameters move it [d, B] (None: nobody knows).
-    """
-
+    #: Lower and upper bounds [B] over all poses.
     least: Array
     most: Array
+    #: Which of what was looked at matters [B, n]; None: all of it.
     near: Array | None = None
+    #: By how much the parameters move it [d, B]; None: nobody knows.
     motion: Array | None = None
 
 

@@ -16,13 +16,7 @@ _LIBRARY, _SOFTPLUS_CUT, SYMBOLS = 1e-12, 2.1e-9, 256
 
 
 class CheckedField:
-    """A field's layers, and where rays are sampled.
-
-    Attributes:
-        base, density, head, color: Lists of (weight [out, in], bias [out]); ReLU behind those of base and head.
-        counts: Number of frequencies, and exponent of the highest, of positions and directions.
-        arrays: All weights and biases in the order of the digest.
-    """
+    """A field's layers, and where rays are sampled."""
 
     def __init__(
         self, tensors: dict[str, Array], near: float, far: float, samples: int, background: tuple[float, ...]
@@ -35,12 +29,15 @@ class CheckedField:
             return [(tensors[f"{k}.weight"].astype(np.float64), tensors[f"{k}.bias"].astype(np.float64)) for k in keys]
 
         names = ("mlp_base", "field_output_density", "mlp_head", "field_heads.0")
+        # (weight [out, in], bias [out]) of every layer; ReLU behind those of base and head
         self.base, self.density, self.head, self.color = map(layers, names)
         parts = (*self.base, *self.density, *self.head, *self.color)
         if 2 * len(parts) != len(tensors):
             raise ValueError("other tensors")
+        # in the order of the digest
         self.arrays = [a.astype(np.float32) for part in parts for a in part]
         widths = self.base[0][0].shape[1], self.head[0][0].shape[1] - self.base[-1][0].shape[0]
+        # number of frequencies, and exponent of the highest, of positions and directions
         self.counts = tuple(((w - 3) // 6, m) for w, m in zip(widths, (8.0, 4.0), strict=True))
 
     def pixels(self, cam: CheckedCamera, view: CameraForms, pixel: tuple[Array, Array]) -> Affine:

@@ -76,15 +76,21 @@ def read_scene(file: Path, report: dict[str, Any]) -> ActivatedScene | CheckedFi
         raise BadInput("no such run", file, fix=_CONVERT if folder else _MOVED)
     if renderer["name"] == "nerf-uniform":
         scene, digest = _read_field(file, settings, renderer)
+        rays = {"near": scene.near, "far": scene.far, "samples": scene.samples, "background": list(scene.background)}
+        if any(part.get(name, value) != value for part in (about, renderer) for name, value in rays.items()):
+            raise BadInput("the result was made with other samples or another background", file, fix=_SCENE)
     else:
         with file.open("rb") as stream:
             ply = stream.read(4) in (b"ply\n", b"ply\r")
         stored, mode, background, sigmoid, degree = (_read_ply if ply else _read_splats)(file, settings)
         mode, background = settings.get("rasterize_mode") or mode, settings.get("background") or background
+        if degree > 3:
+            raise BadInput(f"has spherical harmonics of degree {degree}", file, fix=_SCENE)
         background = np.array(background, np.float32)
-        if mode != about.get("rasterize_mode") or background.tolist() != about.get("background"):
-            raise BadInput("the result was made with another mode or background", file, fix=_SCENE)
         stored = [np.ascontiguousarray(a, np.float32) for a in _drawn(stored, file, settings)]
+        stated = [about.get("rasterize_mode"), about.get("background"), about.get("gaussians", len(stored[0]))]
+        if stated != [mode, background.tolist(), len(stored[0])]:
+            raise BadInput("the result was made with another mode, background or number of Gaussians", file, fix=_SCENE)
         digest = hashlib.sha256(b"".join(a.tobytes() for a in (*stored, background)))
         digest.update(repr(("sigmoid" if sigmoid else "sh", degree, mode)).encode())
         scene = activated(stored, sigmoid, degree, mode == "antialiased", background, renderer["version"])
@@ -228,11 +234,9 @@ def dataset_scale(config: Path) -> float:
 
 
 def read_poses(path: Path, given: dict[str, Any] | None, frame: int, settings: dict[str, Any], scale: float) -> Any:
-    """The poses of a frame of the camera path, and its box of parameters as [(name, lower, upper)].
-
-    The perturbation object ``given``, of another file or of options, wins over the path's; ``settings`` are the options
-    that the result was made with, ``scale`` is that of `dataset_scale`.
-    """
+    """The poses of a frame of the camera path, and its box of parameters as [(name, lower, upper)]."""
+    # the perturbation object ``given``, of another file or of options, wins over the path's; ``settings`` are the
+    # options that the result was made with, ``scale`` is that of `dataset_scale`
     root = read_json(path, "camera path", "say with --camera-path-filename where it lies now")
     with reading(path, f"frame {frame} or its set of poses cannot be read"):
         entries, entry = root["camera_path"], root["camera_path"][frame]

@@ -11,7 +11,11 @@ from ns_abstract.check.forms import Affine, Array, U, fixed, parameters, product
 from ns_abstract.check.inputs import BadInput, lens
 from ns_abstract.check.poses import TURNS, CameraForms, CheckedCamera, Poses
 from ns_abstract.check.results import StoredCells
+from ns_abstract.check.statements import FREE, followed
 from ns_abstract.check.verdicts import SeeingNetwork
+
+#: Keys of a loop that name things.
+_NAMES = ("network", "state", "units")
 
 
 class LoopRuns:
@@ -20,17 +24,14 @@ class LoopRuns:
     def __init__(self, cells: StoredCells, scene: Any, report: dict[str, Any], model: Path) -> None:
         self.loop, self.cells = report["loop"], cells
         loop, self.seeing = self.loop, SeeingNetwork(scene, report, model, report["loop"])
-        if loop["dynamics"].get("type") != "affine":
-            problem = "has dynamics that this program does not follow"
-            raise BadInput(problem, "report.json", "loop.dynamics.type", "audit an affine loop")
+        followed({k: v for k, v in loop.items() if k not in (*FREE, *_NAMES)}, "loop", loop["state"])
+        pose = np.array(loop["camera"]["camera_to_world"], np.float64)[:3]
         # nothing is reached without a goal
-        areas = [*(loop.get("unsafe") or []), *([loop["goal"]] if cells.index else [])]
-        if not all("box" in area or "half_space" in area for area in areas):
-            problem = "has properties of the picture, which this program does not follow along a loop"
-            raise BadInput(problem, "report.json", "loop.unsafe", "audit a loop whose areas are boxes or half-spaces")
+        unclear = (cells.index and "box" not in loop["goal"]) or pose[:, 3].any()
+        if unclear or any(len(area) != 1 for area in loop.get("unsafe") or []):
+            raise BadInput("has an area or a camera that this program does not follow", "report.json", "loop")
         height, width = self.seeing.shape["resize"]
         stated = lens(loop["camera"], loop["camera"].get("fov", 45.0), width, height)
-        pose = np.array(loop["camera"]["camera_to_world"], np.float64)[:3]
         self.camera = CheckedCamera(pose, *stated, int(width), int(height))
         self.steps, self.names = int(loop["steps"]), list(loop["state"])
         self.position = {"offset": [0.0] * 3} | loop["camera"]["position"]

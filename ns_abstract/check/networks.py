@@ -35,14 +35,13 @@ class CheckedLayer(NamedTuple):
 
 
 class CheckedNetwork(NamedTuple):
-    """A network of layers, each behind those that it needs, with the names of its input and of the output that counts.
-
-    ``unit`` is the unit roundoff of its evaluation; 0: the network of real numbers.
-    """
+    """A network of layers, each behind those that it needs."""
 
     layers: list[CheckedLayer]
+    #: The names of its input and of the output that counts.
     source: str
     output: str
+    #: Unit roundoff of its evaluation; 0: the network of real numbers.
     unit: float
 
     def outputs(self, picture: Affine, rows: Array | None = None) -> Affine:
@@ -77,9 +76,10 @@ def read_network(file: Path, output: str | None, unit: float) -> CheckedNetwork:
 
     if file.stat().st_size > _MOST_BYTES:
         raise ValueError("the network is too large")
-    model = onnx.load(str(file))
-    graph = model.graph
-    read = {t.name: np.array(onnx.numpy_helper.to_array(t), np.float64) for t in graph.initializer}
+    graph = (model := onnx.load(str(file))).graph
+    # constants of halves would be evaluated in halves
+    stored = [t for t in graph.initializer if t.data_type in (onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE)]
+    read = {t.name: np.array(onnx.numpy_helper.to_array(t), np.float64) for t in stored}
     names = [o.name for o in graph.output]
     if (output is None and len(names) != 1) or output not in (None, *names):
         raise ValueError("the output is not said")

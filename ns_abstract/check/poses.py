@@ -28,22 +28,19 @@ class CheckedCamera:
 
 @dataclass(frozen=True)
 class Poses:
-    """The poses of a frame, by the rules of the perturbation file.
+    """The poses of a frame, by the rules of the perturbation file."""
 
-    Attributes:
-        camera: The keyframe's camera.
-        names: Parameters in the order of a result's boxes.
-        values: Those of zero width.
-        world: Whether shifts are along world axes.
-        orbit: Target [3] and axis [3], or None.
-        following: Pose [3, 4] at the end of the segment, or None.
-    """
-
+    #: The keyframe's camera.
     camera: CheckedCamera
+    #: Parameters in the order of a result's boxes.
     names: tuple[str, ...]
+    #: Those of zero width.
     values: dict[str, float] = field(default_factory=dict)
+    #: Whether shifts are along world axes.
     world: bool = False
+    #: Target [3] and axis [3], or None.
     orbit: tuple[Array, Array] | None = None
+    #: Pose [3, 4] at the end of the segment, or None.
     following: Array | None = None
 
     def given(self, low: Array, high: Array) -> dict[str, Affine]:
@@ -86,18 +83,16 @@ class Poses:
 class CameraForms:
     """Where cameras stand over boxes of parameters, all forms [B].
 
-    Attributes:
-        turn: Camera-to-world rotation, OpenGL axes.
-        rotation, shift, origin: x_camera = rotation (x_world - origin) + shift, OpenCV axes; ``origin`` [B, 3] numbers.
-        position: The camera's place less ``origin``.
-        stretch: By how much the keyframe's matrix is no rotation.
+    x_camera = ``rotation`` (x_world - ``origin``) + ``shift``, OpenCV axes; ``origin`` [B, 3] are numbers.
     """
 
     def __init__(self, turn: list[list[Affine]], place: list[Affine], keyframe: Array) -> None:
         square = keyframe[:, :3] @ keyframe[:, :3].T
+        # by how much the keyframe's matrix is no rotation
         self.stretch = np.full(len(place[0].c), float(np.linalg.norm(square - np.eye(3))) + _BASE)
-        # OpenGL to OpenCV: y and z change their sign
+        # camera-to-world rotation, OpenGL axes, and the camera's place less the origin
         self.turn, self.position = turn, [e - e.c for e in place]
+        # OpenGL to OpenCV: y and z change their sign
         self.rotation = [[turn[s][r] * (1.0, -1.0, -1.0)[r] for s in range(3)] for r in range(3)]
         self.shift = [row[0] for row in product(self.rotation, [[-e] for e in self.position])]
         self.origin = np.stack([e.c for e in place], axis=-1)

@@ -30,20 +30,17 @@ _WHERE = "give the output folder of ns-abstract-render, ns-abstract-certify or n
 
 @dataclass(frozen=True)
 class StoredCells:
-    """Cells of a frame, or of a question about a loop; arrays as docs/results.md describes them.
+    """Cells of a frame, or of a question about a loop; arrays as docs/results.md describes them."""
 
-    Attributes:
-        index: Number of the frame or question.
-        names, lower, upper: Parameters of the set and their ranges.
-        arrays: ``box_lower`` and ``box_upper`` [n, d]; of pictures, those of the frame file by name.
-        verdicts: Of a certificate or loop, by cell: verdict, margin, counterexample.
-    """
-
+    #: Number of the frame or question.
     index: int
+    #: Parameters of the set and their ranges.
     names: tuple[str, ...]
     lower: Array
     upper: Array
+    #: ``box_lower`` and ``box_upper`` [n, d]; of pictures, those of the frame file by name.
     arrays: dict[str, Array]
+    #: Of a certificate or loop, by cell: verdict, margin, counterexample.
     verdicts: list[tuple[str, float | None, list[float] | None]] | None = None
 
 
@@ -146,6 +143,7 @@ def structure(cells: StoredCells, report: dict[str, Any]) -> list[str]:
         "a lower bound exceeds the upper bound": (a["lower"] <= a["upper"]).all(),
         "a picture that was rendered lies outside of the bounds": inside.all(),
         "the report says another set of poses": ranges == [[p[key] for key in _BOX] for p in entry["parameters"]],
+        "the report says another size": [entry["height"], entry["width"]] == [height, width],
         "the cells' tiles are not those of the picture": set(map(tuple, a["tile"].tolist())) == places,
     }
     wrong += [text for text, holds in claims.items() if not holds]
@@ -191,6 +189,8 @@ def _tallies(cells: StoredCells, report: dict[str, Any]) -> list[str]:
         share = partition(low[part], high[part], *whole)
         if share is None or not abs(share - entry[kind]) <= 1e-9:
             wrong.append(f"{kind} cells are {float(share or 0):.9g} of the set, the report says {entry[kind]:.9g}")
+    if (left := int((verdicts == "open").sum())) != entry["cells"].get("open", left):
+        wrong.append(f"the report counts {entry['cells']['open']} cells to be examined, the table {left}")
     least = min((v[1] for v in cells.verdicts or () if v[0] == "certified" and v[1] is not None), default=None)
     wrong += [] if entry["least_margin"] == least else [f"the least margin is {least}, not {entry['least_margin']}"]
     return wrong + ([] if covered == 1 else ["the cells are no partition of the set"])

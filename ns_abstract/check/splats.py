@@ -26,14 +26,15 @@ TOGETHER, _LIBRARY, _FLUSHED = 20_000, 1e-9, 1e-30
 
 
 class VersionRules(NamedTuple):
-    """What differs between gsplat's versions: alpha's cap, least compensation, tiles that cut, tiles of ellipses.
+    """What differs between gsplat's versions."""
 
-    Where tiles do not cut they hold every pixel with an alpha above the threshold, in real numbers; in float32 `_kept`.
-    """
-
+    #: Alpha's cap, and the least compensation.
     cap: float
     least_factor: float
+    #: Whether tiles cut. Else they hold every pixel with an alpha above the threshold, in real numbers; in float32
+    #: `_kept`.
     tiles: bool
+    #: Whether tiles are of ellipses.
     ellipses: bool
 
 
@@ -46,19 +47,16 @@ RULES = {
 
 @dataclass(frozen=True)
 class ActivatedScene:
-    """A scene's activated Gaussians: float64 arrays and how far they may be from the real numbers.
+    """A scene's activated Gaussians: float64 arrays and how far they may be from the real numbers."""
 
-    Attributes:
-        means: [N, 3], exact.
-        axes: [N, 3, 3], column k is the k-th axis times its scale; entries are within 96 U ``scales`` [N, 3].
-        opacity: [N], within a relative 32 U.
-        sh: [N, K, 3] coefficients, or [N, 1, 3] logits where ``sigmoid``.
-    """
-
+    #: [N, 3], exact.
     means: Array
+    #: [N, 3, 3], column k is the k-th axis times its scale; entries are within 96 U ``scales`` [N, 3].
     axes: Array
     scales: Array
+    #: [N], within a relative 32 U.
     opacity: Array
+    #: [N, K, 3] coefficients, or [N, 1, 3] logits where ``sigmoid``.
     sh: Array
     sigmoid: bool
     degree: int
@@ -150,20 +148,19 @@ def _points(splats: ActivatedScene, view: CameraForms, index: Array, unit: float
 
 
 class ProjectedForms(NamedTuple):
-    """Gaussians on the image plane, forms [B, n]: all that does not depend on the pixel.
-
-    ``axes`` are the three columns of the covariance's root, ``errors`` those of the covariance's entries in float32,
-    ``kappa`` the exponent's relative error there; ``color`` [3, B, n].
-    """
+    """Gaussians on the image plane, forms [B, n]: all that does not depend on the pixel."""
 
     centre: list[Affine]
+    #: The three columns of the covariance's root.
     axes: list[list[Affine]]
     squares: list[Affine]
     inverse: Affine
     opacity: Affine
     depth: Affine
+    #: Those of the covariance's entries in float32, and the exponent's relative one there.
     errors: list[Array]
     kappa: Array
+    #: [3, B, n].
     color: Any = None
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,10 +11,52 @@ import numpy as np
 from ns_abstract.check.forms import Affine, Array, U, total
 from ns_abstract.check.inputs import BadInput
 
-#: Keys of every statement, and of a kind; others could say more than what is proved.
-_COMMON, _KEYS = {"preprocess", "partitions", "$schema"}, {"picture": "type channel statistic region minus min max"}
-_KEYS |= {"visible": "type select region weight fraction pixels", "clear": "type distance region weight units measure"}
+#: Keys of objects, by their kind or the key that holds them, and words that may stand under a key.
+_KEYS = {
+    "picture": "type channel statistic region minus min max", "visible": "type select region weight fraction pixels",
+    "clear": "type distance region weight units measure", "all": "", "any": "", "select": "box",
+    "class": "type label", "preprocess": "resize", "input": "resize mean std layout channels range",
+    "loop": "version initial steps sampling_time dynamics disturbance camera control unsafe goal",
+    "dynamics": "type A B c", "control": "gain goal clip", "unsafe": "box half_space", "goal": "box when",
+    "half_space": "normal at_least", "camera": "camera_to_world fov fx fy cx cy position yaw pitch roll",
+    "position": "offset matrix", "yaw": "offset row", "pitch": "offset row", "roll": "offset row",
+}  # fmt: skip
+_WORDS = {
+    "type": "affine classification clear picture visible", "layout": "NCHW", "channels": "RGB BGR", "region": "all",
+    "channel": "luminance r g b", "statistic": "mean least greatest", "measure": "weight", "when": "end any",
+    "units": "normalised dataset",
+}  # fmt: skip
+#: Keys of whole numbers from 0 on, and of ranges by state.
+_WHOLE, _RANGES = ("label", "pixels", "region", "minus", "resize", "steps"), ("initial", "disturbance", "box")
+#: Keys that are read elsewhere, or say nothing; what to do with others.
+FREE = ("$schema", "output", "partitions", "preprocess")
+_FIX = "audit a result of what docs/check.md names"
 _CHANNELS = {"luminance": (0.2126, 0.7152, 0.0722), "r": (1.0, 0.0, 0.0), "g": (0.0, 1.0, 0.0), "b": (0.0, 0.0, 1.0)}
+
+
+def followed(value: Any, key: str, states: Collection[str] = ()) -> None:
+    """Refuse what would be passed over or taken for something else: other keys, words, and numbers that are none.
+
+    ``key`` is an object's kind, or holds the value; ``states`` are those of a loop, whose names are keys of ranges.
+    """
+    wrong, ranges = [], key == "clip" or key.startswith("range of ")
+    if isinstance(value, dict):
+        wrong = sorted(value.keys() - set(_KEYS[key].split() if key in _KEYS else states))
+        for name, part in value.items():
+            followed(part, f"range of {key}" if key in _RANGES else name, states)
+    elif isinstance(value, list):
+        ends = [v for v in value if isinstance(v, (int, float))]
+        wrong = ends if ranges and ends != sorted(ends) else []
+        for part in value:
+            followed(part, "clip" if ranges else key, states)
+    elif isinstance(value, (bool, str)):
+        wrong = [] if value in _WORDS.get(key, "").split() else [value]
+    elif value is not None:
+        least = 0 if key in _WHOLE or key == "range of disturbance" else -math.inf
+        whole = key not in _WHOLE or isinstance(value, int)
+        wrong = [] if whole and math.isfinite(value) and value >= least else [value]
+    if wrong:
+        raise BadInput(f"has {', '.join(map(str, wrong))}, which is not checked", "report.json", key, _FIX)
 
 
 class CombinedMargins(NamedTuple):
@@ -33,13 +75,13 @@ class Measured(NamedTuple):
     """A number of a plane lies between ``low`` and ``high``.
 
     The plane is ``paint``: colours (None), the weights of Gaussians in a box ([2, 3]) or nearer than a distance. Its
-    channels are weighted. What is measured of a second region of numbered pixels is subtracted. The pixel of a ``rank``
-    counts, 1 the largest one; 0: the mean; -1: the least.
+    channels are weighted. What is measured of a second region of numbered pixels is subtracted.
     """
 
     paint: Any
     channels: tuple[float, ...]
     regions: list[Array]
+    #: The pixel that counts, 1 the largest one; 0: the mean; -1: the least.
     rank: int
     low: float
     high: float
@@ -63,21 +105,19 @@ class Measured(NamedTuple):
         return np.where(np.isnan(lower), -np.inf, lower), np.where(np.isnan(upper), np.inf, upper)
 
 
-def parsed(root: dict[str, Any], size: tuple[int, int], scale: float) -> CombinedMargins | Measured:
-    """The statement of a property or a part of it; ``size`` is height and width, ``scale`` that of `dataset_scale`."""
-    for name, pick in (("all", np.min), ("any", np.max)):
-        if name in root and not root.keys() - _COMMON - {name}:
-            return CombinedMargins(pick, [parsed(part, size, scale) for part in root[name]])
-    kind, weight, first = str(root.get("type")), float(root.get("weight", 0.5)), _region(root.get("region"), size)
+def parsed(root: dict[str, Any], size: tuple[int, int], scale: float, beside: Collection[str] = FREE) -> Any:
+    """The statement of a property (of a part, without keys ``beside``); height and width; `dataset_scale`."""
+    kind, picks = "all" if "all" in root else "any" if "any" in root else root["type"], {"all": np.min, "any": np.max}
+    followed({k: v for k, v in root.items() if k not in beside and not (k == kind and k in picks)}, str(kind))
+    followed(root.get("preprocess") or {}, "preprocess")
+    if kind in picks:
+        return CombinedMargins(picks[kind], [parsed(part, size, scale, ()) for part in root[kind]])
+    weight, first = float(root.get("weight", 0.5)), _region(root.get("region"), size)
     below, above = (lambda v: float(np.nextafter(v, -np.inf))), (lambda v: float(np.nextafter(v, np.inf)))
-    more = root.keys() - _COMMON - {*_KEYS.get(kind, "").split()} | (root.get("preprocess") or {}).keys() - {"resize"}
-    if more or (kind == "visible" and list(root["select"]) != ["box"]) or root.get("measure") == "expected":
-        problem = f"has {', '.join(sorted(more)) or 'a selection or depth'}, which is not checked"
-        raise BadInput(problem, "report.json", "property", "audit boxes of pixels or of Gaussians, and weights")
     if kind == "visible":
         # as many as are that part of the region, or more
         part = 1 + int((np.arange(1, len(first)) / len(first) < root.get("fraction", 0.0)).sum())
-        rank = part if "fraction" in root else int(root.get("pixels", 1))
+        rank = max(part, root.get("pixels", 1))
         return Measured(np.array(root["select"]["box"], float), (1.0, 0.0, 0.0), [first], rank, below(weight), math.inf)
     if kind == "clear":
         distance = float(root["distance"]) * (scale if root.get("units") == "dataset" else 1.0)
@@ -91,4 +131,6 @@ def parsed(root: dict[str, Any], size: tuple[int, int], scale: float) -> Combine
 def _region(box: Any, size: tuple[int, int]) -> Array:
     """Numbers of the pixels in [x0, y0, x1, y1], or all."""
     x0, y0, x1, y1 = (0, 0, size[1], size[0]) if box in (None, "all") else box
+    if not (x0 < x1 <= size[1] and y0 < y1 <= size[0]):
+        raise BadInput("has a region outside of the picture", "report.json", "property", _FIX)
     return np.arange(size[0] * size[1]).reshape(size)[y0:y1, x0:x1].ravel()

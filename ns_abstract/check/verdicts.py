@@ -16,7 +16,7 @@ from ns_abstract.check.networks import read_network
 from ns_abstract.check.poses import CameraForms, CheckedCamera, Poses
 from ns_abstract.check.results import StoredCells
 from ns_abstract.check.splats import FLOAT, ActivatedScene, pictures
-from ns_abstract.check.statements import parsed
+from ns_abstract.check.statements import FREE, followed, parsed
 
 #: Lower and upper bounds [B] of a margin over boxes [B, d]; the last argument is the unit of the pictures' rounding.
 Bounds = Callable[[Array, Array, float], tuple[Array, Array]]
@@ -82,8 +82,7 @@ class SeeingNetwork:
         self.scene, self.shape = scene, about.get("preprocess") or {}
         if not same_network(model, report["model"]):
             raise BadInput("is not the network of the result (sha256)", model, fix="say with --model where it lies now")
-        if self.shape.get("layout", "NCHW") != "NCHW":
-            raise BadInput("takes pictures that this program does not make", model, "preprocess.layout")
+        followed(self.shape, "input")
         try:
             self.network = read_network(model, about.get("output"), FLOAT if in_float32(report) else 0.0)
         except Exception as error:  # onnx raises whatever a damaged file makes it run into
@@ -107,6 +106,7 @@ def of_class(scene: Any, poses: Poses, report: dict[str, Any], model: Path) -> B
     about = report["property"]
     if about.get("type") != "classification":
         raise BadInput(f"{about.get('type')!r} is a property that this program does not check", model, "type")
+    followed({k: v for k, v in about.items() if k not in FREE}, "class")
     seeing, label = SeeingNetwork(scene, report, model, about), int(about["label"])
     camera, unit_rows = resized(poses.camera, seeing.shape), np.eye(int(report["model"]["output"][-1]))
     rivals = np.delete(unit_rows[label] - unit_rows, label, axis=0)

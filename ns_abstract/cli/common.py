@@ -20,7 +20,7 @@ from types import FrameType
 from typing import Any, NoReturn
 
 from ns_abstract.execution.stopping import StopRequest, is_interruption
-from ns_abstract.io.errors import InputError, visible
+from ns_abstract.io.errors import InputError
 
 DONE, BAD_INPUT, INTERRUPTED = 0, 2, 3
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -182,18 +182,6 @@ def _named(lines: list[str]) -> list[str]:
     return [match[2] for match in matches if len(match[1]) == outermost]
 
 
-def plain_console() -> Any:
-    """A console on stderr that prints texts as they are, without characters that a terminal acts upon."""
-    from rich.console import Console
-
-    class Plain(Console):
-        def print(self, *objects: Any, **more: Any) -> None:
-            texts = (visible(o) if isinstance(o, str) else o for o in objects)
-            super().print(*texts, **{"markup": False, "soft_wrap": True, **more})
-
-    return Plain(stderr=True, highlight=False)
-
-
 def run(
     main: Callable[..., int], options: Callable[[], Any], relief: str = "raise --downscale-factor or free memory"
 ) -> NoReturn:
@@ -245,7 +233,10 @@ def run(
         sys.unraisablehook = lambda _: None
         code = INTERRUPTED
     except BrokenPipeError:
-        sys.stderr.close()
+        # what is left in the streams goes nowhere; flushing it at the end would fail again
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        for stream in (1, 2):
+            os.dup2(nowhere, stream)
         code = INTERRUPTED
     except Exception as error:
         detail = " ".join(str(error).split())[:200]

@@ -28,13 +28,12 @@ class Demo:
 
 
 def demo(options: Demo) -> int:
-    from rich.console import Console
-
     from ns_abstract.demo import writing
+    from ns_abstract.report.progress import plain_console
 
     folder = options.output_dir
     writing.refuse_others(folder)
-    console = Console(stderr=True, highlight=False)
+    console = plain_console()
     try:
         with console.status("modelling the airfield, rendering its data set"):
             config, files = writing.write_demo(folder)

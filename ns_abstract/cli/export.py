@@ -248,13 +248,13 @@ def _schemas(options: Schemas) -> list[str]:
 
 
 def _occupancy(options: Occupancy) -> list[str]:
-    from rich.console import Console
     from rich.progress import Progress
 
     from ns_abstract.methods.load import load_any
     from ns_abstract.methods.nerf.field import Field
     from ns_abstract.methods.nerf.occupancy import sample_grid
     from ns_abstract.methods.nerf.scene import NerfScene
+    from ns_abstract.report.progress import plain_console
 
     lower, upper = options.aabb[:3], options.aabb[3:]
     if not all(-float("inf") < low < high < float("inf") for low, high in zip(lower, upper, strict=True)):
@@ -267,7 +267,7 @@ def _occupancy(options: Occupancy) -> list[str]:
     if not isinstance(scene, NerfScene):
         raise InputError("is no run of vanilla-nerf", file=options.load_config, fix="give a run of vanilla-nerf")
     density = Field(scene.fine).density
-    with Progress(console=Console(stderr=True)) as bar:
+    with Progress(console=plain_console()) as bar:
         task = bar.add_task("sampling the field", total=1.0)
         grid = sample_grid(
             lambda points: density(points)[0], lower, upper, options.resolution, options.threshold,

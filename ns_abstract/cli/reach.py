@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from ns_abstract.cli.common import DONE, INTERRUPTED, SignalStop, command, plain_console, run
+from ns_abstract.cli.common import DONE, INTERRUPTED, SignalStop, command, run
 from ns_abstract.cli.sets import EngineOptions, Overrides, Program, ProgramOptions, SceneOverrides, Where, stated
 from ns_abstract.io.arguments import positive
 
@@ -62,6 +62,7 @@ def reach(options: Reach) -> int:
             from ns_abstract.cli.searching import kept_cells, say_if_late, searched
             from ns_abstract.reach.page import runs_text
             from ns_abstract.report.figures import percent
+            from ns_abstract.report.progress import plain_console
 
             scene = SceneSource(options.load_config, options.program, options.overrides).open()
             workers = options.where.processes

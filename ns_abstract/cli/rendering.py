@@ -17,14 +17,14 @@ from ns_abstract.api.explaining import check_explained, explain
 from ns_abstract.api.files import open_job
 from ns_abstract.api.job import Job, check_frames, platform_problems
 from ns_abstract.cli.commands import Compare, Render
-from ns_abstract.cli.common import SignalStop, plain_console
+from ns_abstract.cli.common import SignalStop
 from ns_abstract.cli.sets import stated
 from ns_abstract.io.folder import claim
 from ns_abstract.refine.protocol import Method
 from ns_abstract.refine.result import FrameResult, Leaves
 from ns_abstract.report.comparison import ComparisonReport
 from ns_abstract.report.figures import frames_listed, number
-from ns_abstract.report.progress import ProgressBar, ShownProgress
+from ns_abstract.report.progress import ProgressBar, ShownProgress, plain_console
 from ns_abstract.report.record import Report, RunRecord, failed_self_check
 
 R = TypeVar("R", bound=Report)
@@ -133,16 +133,16 @@ def _bounded(
         workers = bounding.local_workers(job) if options.where.engine == "dask" else 1
         engine = stack.enter_context(options.where.started(workers))
         report = make(_run_record(job, options, frames, problems))
-        for text in (*(f"warning: {p}" for p in problems), *(f"not used: {reason}" for reason in report.ignored)):
-            console.print(text)
-        introduce(report)
-        stack.enter_context(stop.last_words(report.interrupted))
-        # a frame without bounds comes before one that could be tighter
-        missing = set(report.missing)
-        pending = sorted(report.pending, key=lambda index: index not in missing)
-        budget = _SECONDS_BY_FRAME * max(1, len(pending)) if options.time_budget is None else options.time_budget
         failed = True
         try:
+            for text in (*(f"warning: {p}" for p in problems), *(f"not used: {reason}" for reason in report.ignored)):
+                console.print(text)
+            introduce(report)
+            stack.enter_context(stop.last_words(report.interrupted))
+            # a frame without bounds comes before one that could be tighter
+            missing = set(report.missing)
+            pending = sorted(report.pending, key=lambda index: index not in missing)
+            budget = _SECONDS_BY_FRAME * max(1, len(pending)) if options.time_budget is None else options.time_budget
             if pending and options.where.engine == "local":
                 with stop.at_once():
                     compile_beside(job, pending[0])

@@ -18,13 +18,13 @@ from ns_abstract.api.job import Job, check_frames
 from ns_abstract.api.locating import LocationQuestion
 from ns_abstract.api.location import Location, open_location
 from ns_abstract.api.sequence import open_sequence
-from ns_abstract.cli.common import SignalStop, plain_console
+from ns_abstract.cli.common import SignalStop
 from ns_abstract.cli.sets import stated
 from ns_abstract.execution.engine_options import EngineOptions
 from ns_abstract.io.photos import missing_photos
 from ns_abstract.report.certificate import coverage
 from ns_abstract.report.figures import frames_listed, percent
-from ns_abstract.report.progress import ProgressBar
+from ns_abstract.report.progress import ProgressBar, plain_console
 from ns_abstract.verify.store import Store
 
 if TYPE_CHECKING:

@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import DTypeLike
 
+#: Lists and mappings inside one another in what `plain` takes, and processes.
+_DEEPEST = 64
+_MOST_WORKERS = 1 << 16
+
 
 def float64_of(value: Any) -> float:
     """``value`` as float64, infinite where it is too large; NaN where it is no number (bool is none)."""
@@ -82,17 +86,39 @@ def array_of(value: Any, dtype: DTypeLike | None = None) -> np.ndarray | None:
         return None
 
 
-def plain(value: Any) -> Any:
-    """``value`` as a file of JSON has it: numpy's numbers and arrays, and tuples, become numbers and lists."""
+def one_of(value: Any, names: Sequence[str], field: str) -> str:
+    """``value``, which is one of ``names``. Raises InputError where it is none."""
+    if not (isinstance(value, str) and value in names):
+        raise unusable(value, field=field, fix=f"use {' or '.join(names)}")
+    return value
+
+
+def workers_of(value: Any) -> int:
+    """``value`` as a number of processes. Raises InputError where no machine has so many."""
+    return whole(value, 1, "workers", _MOST_WORKERS)
+
+
+def callback(value: Any) -> None:
+    """Raise InputError where ``on_progress`` is neither None nor something that can be called."""
+    if value is not None and not callable(value):
+        raise unusable(value, field="on_progress", fix="give a function of one argument, or None")
+
+
+def plain(value: Any, depth: int = 0) -> Any:
+    """``value`` as a file of JSON has it: numpy's numbers and arrays, and tuples, become numbers and lists.
+
+    ``depth``: how many lists and mappings hold it. Raises InputError where these are more than any file needs.
+    """
     import numpy as np
 
     if isinstance(value, np.ndarray | np.generic):
         return value.tolist()
+    held = isinstance(value, Mapping) or (isinstance(value, Sequence) and not isinstance(value, str | bytes))
+    if held and depth >= _DEEPEST:
+        raise InputError("is nested too deeply, or holds itself", fix="give numbers, lists and mappings as in a file")
     if isinstance(value, Mapping):
-        return {name: plain(entry) for name, entry in value.items()}
-    if isinstance(value, Sequence) and not isinstance(value, str | bytes):
-        return [plain(entry) for entry in value]
-    return value
+        return {name: plain(entry, depth + 1) for name, entry in value.items()}
+    return [plain(entry, depth + 1) for entry in value] if held else value
 
 
 def file_path(value: Any, field: str) -> Path:

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ns_abstract.arithmetic.outward import outward
-from ns_abstract.arithmetic.rounding import DIFFERENCE_ROUNDING, UNIT32
+from ns_abstract.arithmetic.rounding import DIFFERENCE_ROUNDING, RENDERED_DIGITS, UNIT32
 from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.refine.frame_tiles import pixels_inside
@@ -188,7 +188,7 @@ class DifferenceFrame(Frame):
 def _picture(frame: Frame, values: np.ndarray, tiles: np.ndarray | None) -> tuple[np.ndarray, float]:
     """Colours of a render in float64, and by how much each may be rounded."""
     if isinstance(frame, PreciseFrame):
-        return frame.precise(values, tiles)[..., :COLORS], 0.0
+        return frame.precise(values, tiles)[..., :COLORS], RENDERED_DIGITS
     return frame.render(values, tiles)[..., :COLORS].astype(np.float64), UNIT32
 
 

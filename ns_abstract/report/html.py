@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import hashlib
 import shlex
+import unicodedata
 from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
@@ -16,6 +17,8 @@ from markupsafe import Markup
 from ns_abstract.report.figures import ShownUnits, number, percent, short_guarantee
 
 _FOLDER = Path(__file__).parent
+#: Categories of Unicode: controls, formats such as changes of direction, halves of pairs, ends of lines.
+_UNSEEN = ("Cc", "Cf", "Cs", "Zl", "Zp")
 #: Sentences on a search that left cells unexamined, by the state of its report.
 SEARCH_STATES = {
     "running": "The command was still running, or was killed, when this page was written.",
@@ -53,6 +56,13 @@ def plain_text(value: Any) -> str:
     return str(value)
 
 
+def _in_order(value: Any) -> Any:
+    """A value of a template; of a text, characters that are not seen or turn others round stand as their numbers."""
+    if not isinstance(value, str) or isinstance(value, Markup) or value.isprintable():
+        return value
+    return "".join(ascii(c)[1:-1] if unicodedata.category(c) in _UNSEEN and c not in "\n\t" else c for c in value)
+
+
 def _guarantee_of(document: Mapping[str, Any]) -> str:
     return short_guarantee(document["guarantee"], document["scene"].get("bounded"))
 
@@ -62,6 +72,7 @@ def _templates() -> Environment:
     environment = Environment(
         loader=FileSystemLoader(_FOLDER / "templates"),
         autoescape=True,
+        finalize=_in_order,
         trim_blocks=True,
         lstrip_blocks=True,
         undefined=StrictUndefined,

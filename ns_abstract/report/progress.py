@@ -9,10 +9,29 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, Protocol
 
+from ns_abstract.io.errors import visible
 from ns_abstract.report.figures import number
 
 #: Seconds between lines where nothing can be redrawn.
 _EVERY = 15.0
+
+
+def plain_console() -> Any:
+    """A console on stderr that prints texts as they are, without characters that a terminal acts upon.
+
+    Where nobody reads any more it raises BrokenPipeError, as files do; rich ends the process with code 1.
+    """
+    from rich.console import Console
+
+    class Plain(Console):
+        def print(self, *objects: Any, **more: Any) -> None:
+            texts = (visible(o) if isinstance(o, str) else o for o in objects)
+            super().print(*texts, **{"markup": False, "soft_wrap": True, **more})
+
+        def on_broken_pipe(self) -> None:
+            raise BrokenPipeError
+
+    return Plain(stderr=True, highlight=False)
 
 
 class WorkProgress(Protocol):
@@ -107,7 +126,6 @@ class ProgressBar:
             self._console.print(f"{point.done:4.0%} · {point.sentence} · {used}", markup=False, soft_wrap=True)
 
     def _begin(self, point: WorkProgress) -> None:
-        from rich.console import Console
         from rich.progress import BarColumn, Progress, TextColumn
 
         self._first, self._said = point, time.monotonic()
@@ -116,7 +134,7 @@ class ProgressBar:
             display = import_module("IPython.display").display
             self._cell = display({"text/plain": ""}, raw=True, display_id=True)
             return
-        self._console = self._console or Console(stderr=True, highlight=False)
+        self._console = self._console or plain_console()
         if self._console.is_terminal:
             columns = BarColumn(bar_width=20), TextColumn("{task.fields[sentence]} · {task.fields[used]}", markup=False)
             self._bar = Progress(*columns, console=self._console, transient=True)

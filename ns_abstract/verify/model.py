@@ -5,10 +5,12 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 from functools import cached_property
+from typing import get_args
 
 import numpy as np
 import torch
 
+from ns_abstract.io.arguments import one_of
 from ns_abstract.verify.network import (
     ImageSets,
     Network,
@@ -27,12 +29,18 @@ from ns_abstract.verify.properties import Query
 
 
 class NetworkModel:
-    """A network with its preprocessing, for `ns_abstract.verify.search.Search`; bounds take ``memory`` bytes."""
+    """A network with its preprocessing, for `ns_abstract.verify.search.Search`; bounds take ``memory`` bytes.
+
+    Raises:
+        InputError: ``arithmetic`` is none of the two.
+    """
 
     def __init__(
         self, network: Network, preprocess: Preprocess, memory: int, arithmetic: NetworkArithmetic = "float32"
     ) -> None:
         self.network, self.preprocess, self.memory = network, preprocess, memory
+        # another word would be bounded as the exact network, and reported as every float32 evaluation
+        one_of(arithmetic, get_args(NetworkArithmetic), "network_arithmetic")
         self.arithmetic: NetworkArithmetic = arithmetic
 
     @cached_property

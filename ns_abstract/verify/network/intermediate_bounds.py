@@ -50,7 +50,7 @@ class IntermediateBounds:
     ) -> None:
         self.network, self.middle, self.usable = network, middle, usable
         self.count, self.d = len(middle), image.slopes.shape[-1]
-        self.in_float32 = arithmetic == "float32"
+        self.in_float32 = arithmetic != "real"
         self.flush = np.zeros(self.count)
         self.image, self.columns = image, columns_of(*image)
         # every number is passed by a few times at most
