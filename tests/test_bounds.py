@@ -84,7 +84,7 @@ class Case:
         )
 
     def sub_box_ends(self, box: ParameterBox, counts: np.ndarray | MotionCells, arithmetic=REAL) -> list[np.ndarray]:
-        """As `ends`, in the orders that are uncertain, and in every order."""
+        """As `ends`, by pairs of uncertain order, and by ranges of depths."""
         bounds, forms = SubBoxBounds(self.splats, GSPLAT_1_4_0, arithmetic), self.poses.enclosure(box, 1)
         found = self._orders(bounds, forms, bounds.project(self.camera, forms), counts)
         return [self._laid_out(ends).clip(0.0, 1.0) for ends in found]
@@ -115,13 +115,13 @@ class Case:
         return found
 
     def _orders(self, bounds: SubBoxBounds, forms, projected, counts: np.ndarray | MotionCells) -> list[np.ndarray]:
-        """Ends [T, side, side, 6, parts] in the orders that are uncertain, and in every order."""
+        """Ends [T, side, side, 6, parts] by pairs of uncertain order, and by ranges of depths."""
         tiles = np.arange(math.prod(tile_grid(self.camera, bounds.side)))
         pixels = np.ones((tiles.size, bounds.side, bounds.side), bool)
         ordered = bounds.sub_boxes(self.camera, forms, projected, tiles, pixels, counts)
-        unordered, every = np.full_like(ordered, np.nan), np.ones((pixels.sum(), 6), bool)
-        bounds.unordered(self.camera, forms, projected, tiles, pixels, counts, every, unordered)
-        return [ordered, unordered]
+        by_ranges, goals = np.full_like(ordered, np.nan), np.full((pixels.sum(), 6), np.inf)
+        bounds.by_depth_ranges(self.camera, forms, projected, tiles, pixels, counts, goals, by_ranges)
+        return [ordered, by_ranges]
 
     def _laid_out(self, ends: np.ndarray) -> np.ndarray:
         """[H, W, 2, 3, parts] from tiles [T, side, side, 6, parts]."""

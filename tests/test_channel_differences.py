@@ -9,7 +9,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 from test_bounds import Case, assert_differences, moves, scene
-from test_unordered import BACKGROUNDS, COUNTS, stack
+from test_depth_ranges import BACKGROUNDS, COUNTS, stack
 
 from ns_abstract.arithmetic.rounding import FLOAT32
 from ns_abstract.geometry.tiles import assemble
@@ -61,7 +61,7 @@ def test_layers_of_one_hue_have_narrow_differences():
     generator = np.random.default_rng(3)
     layers = [
         {
-            "mean": (*generator.uniform(-1.0, 1.0, 2), generator.uniform(-5.2, -4.8)),
+            "mean": (*generator.uniform(-1.0, 1.0, 2), generator.uniform(-5.01, -4.99)),
             "scale": generator.uniform(0.1, 1.2),
             "opacity": 0.9,
             "color": np.full(3, generator.uniform(0.0, 1.0)),
@@ -125,14 +125,14 @@ def test_what_is_not_known_stays_unknown():
 
 
 def test_a_frame_bounds_differences_of_blocks_of_many_orders(monkeypatch):
-    """Where no block's orders are few enough, those ends that are named are bounded in every order, and hold."""
+    """Where no block's orders are few enough, those ends that have goals are bounded by ranges of depths, and hold."""
     monkeypatch.setattr(splat_bounds, "PART_PAIR_LIMIT", 1)
     case = stack(1, BACKGROUNDS[2])
     frame = SplatFrame(case.splats, GSPLAT_1_4_0, FLOAT32, case.poses)
     pixels = np.ones((frame.tile_count, frame.side, frame.side), bool)
     known = {}
-    for ends in (None, np.ones((pixels.sum(), 6), bool)):
-        low, high = frame.sub_box_ends(frame.box, COUNTS, np.arange(frame.tile_count), pixels, ends, True)
+    for goals in (None, np.full((pixels.sum(), 6), np.inf)):
+        low, high = frame.sub_box_ends(frame.box, COUNTS, np.arange(frame.tile_count), pixels, goals, True)
         shape = (*pixels.shape, 3 * COUNTS.prod())
         image = np.stack([assemble(end.reshape(shape), case.camera) for end in (low, high)], axis=2)
         image = image.reshape(*image.shape[:3], 3, -1)
@@ -140,7 +140,7 @@ def test_a_frame_bounds_differences_of_blocks_of_many_orders(monkeypatch):
         for part in range(0, parts.middles.shape[1], 5):
             picture = case.image(case.poses.box.at(parts.middles[:, part])).astype(np.float64)
             assert_differences(picture, image[..., part : part + 1])
-        known[ends is None] = np.isfinite(image).mean()
+        known[goals is None] = np.isfinite(image).mean()
     assert known[True] < 0.5 < known[False]
 
 

@@ -47,10 +47,10 @@ class LocationTuning:
     #: motion of what a pixel shows.
     along: int = 8
     #: Widths (see `LocationSearch.widths`) beyond which cells are cut without bounds, in sets of few parameters and of
-    #: many; and up to which pixels of uncertain orders are bounded whatever the order: it takes long, and excludes
-    #: little of wider cells.
+    #: many; and up to which pixels of too many uncertain orders are bounded from ranges of depths: it takes
+    #: long, and excludes little of wider cells.
     coarse: tuple[float, float] = 4.0, 1.6
-    unordered: float = 1.6
+    by_depth_ranges: float = 1.6
     #: Rounds of pixels. What a cell takes whatever its pixels are is most of the work, and a first round of more pixels
     #: excludes more at once.
     pixel_rounds: RoundTuning = field(default_factory=lambda: RoundTuning(first=1.6))
@@ -281,7 +281,7 @@ class _Examination:
             return None
         boxes, parts = MotionBoxes(cells, counts, search.frame.camera), cells if search.by_motion else counts
         rounds, order = self._rounds(box, picture, counts)
-        narrow = search.width(box) <= tuning.unordered
+        narrow = search.width(box) <= tuning.by_depth_ranges
         while (chosen := rounds.following(*order.towards(boxes.moved[rounds.left]))) is not None:
             self.bounded += 1
             excluding = np.zeros((int(chosen.sum()), rounds.numbers.size), bool)

@@ -161,7 +161,7 @@ def typical_cell(
     """
     camera = frame.camera
     step = math.ceil(math.sqrt(camera.height * camera.width / _MOST_PIXELS))
-    # of blocks whose orders are too many, few pixels are bounded whatever the order
+    # of blocks whose orders are too many, few pixels are bounded from ranges of depths
     some, few = (_lattice((camera.height, camera.width), k * step) for k in (1, _FEWER))
     chosen, worked = in_tiles(some, frame.side), in_tiles(few, frame.side)
     bounds = _bounds_in_the_middle(frame, cell, parts, chosen, worked)
@@ -178,7 +178,7 @@ def _bounds_in_the_middle(
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """By kind, bounds [n, 3] of the ``n`` ``pixels`` over the middle of a cell, NaN where nothing is known.
 
-    Those ``worked`` at are bounded whatever the order.
+    Those ``worked`` at are bounded from ranges of depths.
     """
     tiles = np.flatnonzero(pixels.any(axis=(1, 2)))
     if parts is None:

@@ -1,4 +1,4 @@
-"""Bounds over sub-boxes that hold in every depth order, at tolerance zero (docs/dev/design.md, B14)."""
+"""Bounds over sub-boxes from the ranges of the Gaussians' depths, at tolerance zero (docs/dev/design.md, B14)."""
 
 from __future__ import annotations
 
@@ -37,22 +37,20 @@ def stack(seed: int, background: tuple[float, float, float], count: int = 60) ->
     return Case(scene(*layers, background=background), moves(x=0.15, yaw=0.04))
 
 
-def ends_of(case: Case) -> np.ndarray:
-    """[H, W, 2, 3, parts] ends over the sub-boxes of the whole set, in every order."""
+def ends_of(case: Case, goal: float = math.inf) -> np.ndarray:
+    """[H, W, 2, 3, parts] ends over the sub-boxes of the whole set; only their sides of ``goal`` matter."""
     bounds, forms = SubBoxBounds(case.splats, GSPLAT_1_4_0, FLOAT32), case.poses.enclosure(case.poses.box, 1)
     tiles = np.arange(math.prod(tile_grid(case.camera, bounds.side)))
     pixels = np.ones((tiles.size, bounds.side, bounds.side), bool)
     out = np.full((*pixels.shape, 6, COUNTS.prod()), np.nan)
-    projected = bounds.project(case.camera, forms)
-    bounds.unordered(
-        case.camera, forms, projected, tiles, pixels, COUNTS, np.ones((pixels.sum(), 6), bool), out
-    )  # fmt: skip
+    projected, goals = bounds.project(case.camera, forms), np.full((pixels.sum(), 6), goal)
+    bounds.by_depth_ranges(case.camera, forms, projected, tiles, pixels, COUNTS, goals, out)
     ends = assemble(out.reshape(*pixels.shape, -1), case.camera)
     return ends.reshape(*ends.shape[:2], 2, 3, -1)
 
 
 @pytest.mark.parametrize("number", range(len(BACKGROUNDS)))
-def test_bounds_hold_every_order_of_random_stacks(number):
+def test_bounds_hold_pictures_of_random_stacks(number):
     """Pictures of random poses of each sub-box lie in its bounds, which say something."""
     generator, parts = np.random.default_rng(number), cell_parts(COUNTS)
     for seed in range(3):
@@ -82,8 +80,8 @@ def assert_holds(case: Case, ends: np.ndarray) -> None:
             assert (image <= ends[:, :, 1, :, part].clip(0.0, 1.0)).all(), (part, corner)
 
 
-def test_what_lies_behind_dim_light_shows_the_last_colour():
-    """Layers of one colour add up to it, although the sum ends at the fifth of them."""
+def test_layers_of_one_colour_add_up_to_it():
+    """Nine layers of one colour show no other, although what lies behind the fifth hardly matters."""
     layer = {"scale": 6.0, "opacity": 0.7, "color": (1.0, 0.7, 0.4)}
     layers = [layer | {"mean": (0.0, 0.0, -5.0 - 0.1 * k)} for k in range(9)]
     case = Case(scene(*layers, background=BACKGROUNDS[0]), moves(x=0.01, yaw=0.001))
@@ -91,6 +89,48 @@ def test_what_lies_behind_dim_light_shows_the_last_colour():
     assert_holds(case, ends)
     # the charge of a stop behind alpha 0.7, and little more
     assert (ends[:, :, 1] - np.array(layer["color"])[:, None]).max() < 1e-3
+
+
+@pytest.mark.parametrize(("front", "behind"), [(0.0, 1.0), (1.0, 0.0)])
+def test_what_is_surely_in_front_hides_what_is_behind(front, behind):
+    """A layer before forty others, whose order among themselves is uncertain, shows as much as it covers."""
+    generator = np.random.default_rng(0)
+    layer = {"scale": 6.0, "opacity": 0.5, "color": (behind,) * 3}
+    layers = [layer | {"mean": (*generator.uniform(-1.0, 1.0, 2), generator.uniform(-6.2, -6.0))} for _ in range(40)]
+    layers.append({"mean": (0.0, 0.0, -5.0), "scale": 40.0, "opacity": 0.9, "color": (front,) * 3})
+    case = Case(scene(*layers, background=BACKGROUNDS[2]), moves(x=0.02, yaw=0.01))
+    ends = ends_of(case)
+    assert_holds(case, ends)
+    # whatever the order, the forty could hide the one
+    assert np.abs(ends - front).max() < 0.13
+
+
+def test_a_colour_inside_a_band_shows_and_covers():
+    """Layers of many colours at one depth: what each adds to the bands that it lies in is part of their picture."""
+    generator = np.random.default_rng(3)
+    layers = [
+        {"mean": (0.0, 0.0, -5.0 - 1e-4 * k), "scale": 8.0, "opacity": 0.2, "color": generator.uniform(0.3, 0.7, 3)}
+        for k in range(40)
+    ]
+    case = Case(scene(*layers, background=BACKGROUNDS[2]), moves(x=0.01, yaw=0.05))
+    ends = ends_of(case)
+    assert_holds(case, ends)
+    assert np.diff(ends, axis=2).max() < 0.4
+
+
+@pytest.mark.parametrize("goal", [0.2, 0.5, 0.8])
+def test_ends_are_on_the_same_side_of_their_goals(goal):
+    """Where only the sides of goals matter, ends hold as well, and tell the same."""
+    for number in range(3):
+        case = stack(number + 7, BACKGROUNDS[number])
+        every, some = ends_of(case), ends_of(case, goal)
+        assert_holds(case, some)
+        for told, known in (
+            (some[:, :, 0] > goal, every[:, :, 0] > goal),
+            (some[:, :, 1] < goal, every[:, :, 1] < goal),
+        ):
+            assert (told == known).mean() > 0.99
+        assert (every[:, :, 1] < goal).any() or (every[:, :, 0] > goal).any()
 
 
 @pytest.mark.parametrize(("near", "far"), [(0.4, 0.0), (0.6, 1.0)])
@@ -199,10 +239,10 @@ def test_what_warms_up_is_what_a_search_calls(monkeypatch):
     pixels = np.ones((tiles.size, frame.side, frame.side), bool)
     # so that no block has few enough uncertain pairs
     monkeypatch.setattr(splat_bounds, "PART_PAIR_LIMIT", 1)
-    monkeypatch.setattr(sub_box_bounds, "unordered_stage", lambda *values: calls.append([*map(numba.typeof, values)]))
+    monkeypatch.setattr(sub_box_bounds, "depth_range_stage", lambda *values: calls.append([*map(numba.typeof, values)]))
     frame.warm_up_sub_boxes()
     warm = len(calls)
-    assert frame.sub_box_ends(frame.box, COUNTS, tiles, pixels, np.ones((pixels.sum(), 6), bool)) is not None
+    assert frame.sub_box_ends(frame.box, COUNTS, tiles, pixels, np.ones((pixels.sum(), 6))) is not None
     assert len(calls) > warm > 0 and all(call == calls[0] for call in calls)
     # a set of one parameter has no sub-boxes
     SplatFrame(case.splats, GSPLAT_1_4_0, FLOAT32, Case(case.splats, moves(x=0.1)).poses).warm_up_sub_boxes()
