@@ -47,8 +47,7 @@ class LocationTuning:
     #: motion of what a pixel shows.
     along: int = 8
     #: Widths (see `LocationSearch.widths`) beyond which cells are cut without bounds, in sets of few parameters and of
-    #: many; and up to which pixels of too many uncertain orders are bounded from ranges of depths: it takes
-    #: long, and excludes little of wider cells.
+    #: many; and up to which ranges of depths bound pixels of too many orders: slow, and little use in wider cells.
     coarse: tuple[float, float] = 4.0, 1.6
     by_depth_ranges: float = 1.6
     #: Rounds of pixels. What a cell takes whatever its pixels are is most of the work, and a first round of more pixels

@@ -24,7 +24,7 @@ _ALL = 255
 
 
 @dataclass(frozen=True)
-class BandTuning:
+class ColorBandTuning:
     """How many bands of colour there are, and where lists end. Neither decides whether a bound holds."""
 
     #: Bands of colour.
@@ -35,9 +35,9 @@ class BandTuning:
     worth: float = 2.0**-8
 
 
-BANDS = BandTuning.bands
-_LEAST = BandTuning.least
-_WORTH = BandTuning.worth
+BANDS = ColorBandTuning.bands
+_LEAST = ColorBandTuning.least
+_WORTH = ColorBandTuning.worth
 
 
 class ColorEnd(NamedTuple):

@@ -176,9 +176,9 @@ def _depth_ranges(count, x, y, inputs, block, work):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _find_some(start, count, q, place, listed, inputs, block, work):
+def _find_some(start, q, place, listed, inputs, block, work):
     """Find what is known of the alphas of the next fragments of pixel q; returns how many are known then."""
-    some = min(BATCH, count - start)
+    some = min(BATCH, listed.length - start)
     place_batch(start, some, signed(1 << q), listed, inputs, block)
     find_alphas(start, some, signed(start), place, listed, inputs, block)
     for b in range(some):
@@ -187,7 +187,7 @@ def _find_some(start, count, q, place, listed, inputs, block, work):
 
 
 @njit(cache=True, error_model="numpy")
-def _find_visible(count, q, place, listed, inputs, block, work):
+def _find_visible(q, place, listed, inputs, block, work):
     """Weights of the fragments at the middle pose, as far as light comes; returns how many are known.
 
     Nothing that is proved depends on them. The background is one more.
@@ -195,9 +195,9 @@ def _find_visible(count, q, place, listed, inputs, block, work):
     values, width = block.fragments.values, block.fragments.width
     ends = exponent_ends(inputs.shape.monomials)
     light, known = 1.0, 0
-    while known < count and light > _SHOWN:
+    while known < listed.length and light > _SHOWN:
         first = known
-        known = _find_some(first, count, q, place, listed, inputs, block, work)
+        known = _find_some(first, q, place, listed, inputs, block, work)
         for k in range(first, known):
             at = k * width
             y1, y2 = values[at + EXPONENT], values[at + EXPONENT + 1]
@@ -212,9 +212,10 @@ def _find_visible(count, q, place, listed, inputs, block, work):
 
 
 @njit(cache=True, error_model="numpy")
-def _bound_end(q, count, known, goal, place, listed, inputs, block, strips, end, work, sums, out):
+def _bound_end(q, known, goal, place, listed, inputs, block, strips, end, work, sums, out):
     """Write one end of pixel q over each sub-box (design.md, B14); returns how many fragments are known then."""
     values, width, parts, levels = block.fragments.values, block.fragments.width, inputs.shape.parts, sums.levels
+    count = listed.length
     charges, thresholds = charges_of(count, inputs, end), thresholds_of(inputs)
     for lane in range(BANDS * parts):
         sums.lit[lane], sums.light[lane], sums.less[lane] = 0.0, 1.0, 0.0
@@ -225,7 +226,7 @@ def _bound_end(q, count, known, goal, place, listed, inputs, block, strips, end,
         if open_ == 0:
             break
         if k == known:
-            known = _find_some(k, count, q, place, listed, inputs, block, work)
+            known = _find_some(k, q, place, listed, inputs, block, work)
         while past < count and work.far[past] < work.near[k]:
             cover(work.by_far[past], open_, charges.dark, parts, work, sums)
             past += 1
@@ -258,7 +259,7 @@ def _bound_pixel(q, count, goals, place, inputs, block, strips, color_ends, work
     for k in range(count):
         block.entries.has_pixels[k] = 1
         block.entries.pixels[k] = signed(1 << q)
-    visible = known = _find_visible(count, q, place, listed, inputs, block, work)
+    visible = known = _find_visible(q, place, listed, inputs, block, work)
     for row in range(6):
         goal = goals[row] if row >= 3 else -goals[row]
         if math.isnan(goal):
@@ -271,7 +272,7 @@ def _bound_pixel(q, count, goals, place, inputs, block, strips, color_ends, work
             color_ends.bright,
         )  # fmt: skip
         set_levels(visible, count, end, work, sums)
-        known = _bound_end(q, count, known, goal, place, listed, inputs, block, strips, end, work, sums, out)
+        known = _bound_end(q, known, goal, place, listed, inputs, block, strips, end, work, sums, out)
 
 
 @njit(cache=True, error_model="numpy")
