@@ -235,9 +235,13 @@ class SubBoxFrame(Protocol):
         """[d] pixels that typical elements move by, over each parameter's range, beside what their block does."""
         ...
 
+    def element_counts(self, box: ParameterBox) -> np.ndarray:
+        """[H, W] scene elements that bounds of each pixel over a cell look at (an estimate)."""
+        ...
+
     def sub_box_ends(
         self, box: ParameterBox, counts: np.ndarray | MotionCells, tiles: np.ndarray, pixels: np.ndarray,
-        goals: np.ndarray | None = None, differences: bool = False,
+        goals: np.ndarray, differences: bool = False,
     ) -> tuple[np.ndarray, np.ndarray] | None:  # fmt: skip
         """Lower and upper bounds [n, 3, k] of ``n`` pixels over ``k`` sub-boxes; None: there are none for this set.
 
@@ -245,9 +249,8 @@ class SubBoxFrame(Protocol):
 
         There are ``counts`` [d] sub-boxes along the axes, powers of two, at least 8 together, numbered like entries of
         an array of this shape; or cells of the image motion. Each is widened by `SUB_BOX_OVERLAP` of the half-widths.
-        ``pixels`` [t, side, side]: the ``n``. ``goals`` [n, 6]: of the lower, then the upper bounds of channels those
-        that are worth more work, where it matters on which side of the goal they are; infinite: whatever they are; NaN:
-        they are not.
+        ``pixels`` [t, side, side]: the ``n``. ``goals`` [n, 6]: values of the lower, then the upper bounds of channels
+        that only have to be known to lie on one side of them; infinite: all of a bound matters; NaN: it is not wanted.
         """
         ...
 

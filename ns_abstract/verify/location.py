@@ -280,7 +280,6 @@ class _Examination:
             return None
         boxes, parts = MotionBoxes(cells, counts, search.frame.camera), cells if search.by_motion else counts
         rounds, order = self._rounds(box, picture, counts)
-        narrow = search.width(box) <= tuning.by_depth_ranges
         while (chosen := rounds.following(*order.towards(boxes.moved[rounds.left]))) is not None:
             self.bounded += 1
             excluding = np.zeros((int(chosen.sum()), rounds.numbers.size), bool)
@@ -289,9 +288,8 @@ class _Examination:
                 if not pixels.any():
                     continue
                 tiles = np.flatnonzero(pixels.any(axis=(1, 2)))
-                telling, goals = (miss == miss.max(axis=-1, keepdims=True))[pixels], None
-                if narrow:
-                    goals = np.where(telling, search.tiled.goals(pixels, kind == DIFFERENCES), np.nan)
+                telling = (miss == miss.max(axis=-1, keepdims=True))[pixels]
+                goals = np.where(telling, search.tiled.goals(pixels, kind == DIFFERENCES), np.nan)
                 ends = frame.sub_box_ends(box, parts, tiles, pixels[tiles], goals, kind == DIFFERENCES)
                 if ends is None:
                     return None
@@ -398,10 +396,11 @@ class _Examination:
         """Rounds of pixels for the sub-boxes [counts] of the cell, and the pixels that they choose from."""
         search, tiled, tuning = self.search, self.search.tiled, self.search.tuning
         moved, needed = float(np.linalg.norm(search.moved(box))), tiled.allowed + 1 - int(self.inherited.sum())
-        parts = bool(counts.prod() > 1)
+        parts, frame = bool(counts.prod() > 1), search.sub_box_frame
         chosen = search.telling.order(
             picture, max(1, round(0.5 * moved)), search.width(box) if parts else moved,
-            tiled.counted & ~self.inherited, round(tuning.surplus * needed), differences=parts,
+            tiled.counted & ~self.inherited, round(tuning.surplus * needed),
+            frame.element_counts(box) if parts and frame is not None else None,
         )  # fmt: skip
         return PixelRounds(tiled, int(np.prod(counts)), self.inherited, tuning.pixel_rounds), chosen
 

@@ -21,12 +21,14 @@ from ns_abstract.verify.photo import TiledPhoto
 
 #: What is bounded of a pixel: its channels, or differences of these.
 CHANNELS, DIFFERENCES = range(2)
-#: Of a typical cell: most pixels that are bounded, and how many times as far apart are those that take more work.
-_MOST_PIXELS, _FEWER = 4096, 3
+#: Of a typical cell: most pixels that are bounded, and most scene elements that these look at.
+_MOST_PIXELS, _MOST_ELEMENTS = 4096, 2_000_000
 #: What bounds lose at most, and as which power of their width.
 _ALL, _POWER = 2.0, 1.5
-#: What the worth of a pixel counts beside the part of a cell that it is likely to exclude.
-_WORTH = 0.25
+#: Where bounds miss the photo by so much more, a pixel may take e times the work.
+_WORTH = 0.5
+#: Scene elements whose work is that of all else that a pixel takes.
+_OTHER_WORK = 1000.0
 
 
 @dataclass(frozen=True)
@@ -37,7 +39,8 @@ class PixelOrder:
         steps: [m, 2] columns and rows that the picture may have moved by.
         missed: [m, n] whether bounds are likely to miss the photo there at each of ``n`` pixels.
         numbers: [n] these pixels.
-        worth: [n] what else comes first: by how much bounds miss, less how loose they are, as these take longer.
+        worth: [n] what else comes first: by how much bounds miss, less how loose they are.
+        work: [n] what bounds of each take, about.
         most: So many pixels at most.
         kinds: [T, side, side] whether `CHANNELS` or `DIFFERENCES` of a pixel tell more.
         misses: By kind, [T, side, side, 6] by how much bounds in the cell's middle are expected to miss the photo: the
@@ -48,6 +51,7 @@ class PixelOrder:
     missed: np.ndarray
     numbers: np.ndarray
     worth: Float64Array
+    work: Float64Array
     most: int
     kinds: np.ndarray
     misses: tuple[Float64Array, ...]
@@ -69,7 +73,7 @@ class PixelOrder:
 
     def _sorted(self, shares: Float64Array) -> tuple[np.ndarray, Float64Array]:
         some = np.flatnonzero(shares > 0.0)
-        order = some[np.argsort(-_score(shares[some], self.worth[some]), kind="stable")][: self.most]
+        order = some[np.argsort(-_score(shares[some], self.worth[some]) / self.work[some], kind="stable")][: self.most]
         return self.numbers[order], shares[order]
 
 
@@ -104,8 +108,9 @@ class TellingPixels:
         self.ends = [[assemble(end, camera) for end in pair] for pair in pairs]
 
     def order(
-        self, tiles: np.ndarray, radius: int, width: float, counted: np.ndarray, most_pixels: int, differences: bool
-    ) -> PixelOrder:
+        self, tiles: np.ndarray, radius: int, width: float, counted: np.ndarray, most_pixels: int,
+        elements: np.ndarray | None,
+    ) -> PixelOrder:  # fmt: skip
         """The pixels to bound of a cell whose middle shows ``tiles``.
 
         Args:
@@ -113,10 +118,11 @@ class TellingPixels:
             width: Pixels by which bounds over it are wide.
             counted: [T, side, side] pixels that may be chosen.
             most_pixels: So many at most.
-            differences: Whether differences may be bounded.
+            elements: [H, W] scene elements that each pixel's bounds look at, where these are over parts of the cell and
+                may be of differences; None: they are not.
         """
         picture = assemble(tiles, self.camera)[..., :3]
-        kinds = range(len(self.typical.losses) if differences else 1)
+        kinds = range(1 if elements is None else len(self.typical.losses))
         shift = best_shift(self.typical.picture.mean(axis=-1), picture.mean(axis=-1))
         scale = (width / self.typical.width) ** _POWER
         losses = [[scale * shifted(loss, *shift) for loss in self.typical.losses[kind]] for kind in kinds]
@@ -132,7 +138,10 @@ class TellingPixels:
         worth = np.take_along_axis(worth, kinds_of[None], axis=0)[0]
         chosen = np.zeros(counted.shape, np.int64)
         chosen[counted] = kinds_of
-        return PixelOrder(steps, missed > 0.0, np.flatnonzero(counted), worth, most_pixels, chosen, misses)
+        work = np.full(len(worth), _OTHER_WORK)
+        if elements is not None:
+            work += in_tiles(elements, self.side)[counted]
+        return PixelOrder(steps, missed > 0.0, np.flatnonzero(counted), worth, work, most_pixels, chosen, misses)
 
     def _moved_misses(self, kind: int, ends: tuple[Float64Array, Float64Array], steps: np.ndarray) -> np.ndarray:
         """[m, T, side, side] by how much bounds ``ends`` miss the photo where the picture moved by ``steps``."""
@@ -161,25 +170,23 @@ def typical_cell(
     """
     camera = frame.camera
     step = math.ceil(math.sqrt(camera.height * camera.width / _MOST_PIXELS))
-    # of blocks whose orders are too many, few pixels are bounded from ranges of depths
-    some, few = (_lattice((camera.height, camera.width), k * step) for k in (1, _FEWER))
-    chosen, worked = in_tiles(some, frame.side), in_tiles(few, frame.side)
-    bounds = _bounds_in_the_middle(frame, cell, parts, chosen, worked)
+    if parts is not None:
+        assert isinstance(frame, SubBoxFrame)
+        step = max(step, math.ceil(math.sqrt(float(frame.element_counts(cell).sum()) / _MOST_ELEMENTS)))
+    some = _lattice((camera.height, camera.width), step)
+    chosen = in_tiles(some, frame.side)
     losses = []
-    for kind, (lower, upper) in enumerate(bounds):
+    for kind, (lower, upper) in enumerate(_bounds_in_the_middle(frame, cell, parts, chosen)):
         sides = _losses(_values(picture, kind), width, lower, upper, chosen, camera)
-        sources = few & np.isfinite(sides[0]).all(axis=-1) & np.isfinite(sides[1]).all(axis=-1)
-        losses.append([filled(side, sources, 2 * _FEWER * step, _ALL) for side in sides])
+        sources = some & np.isfinite(sides[0]).all(axis=-1) & np.isfinite(sides[1]).all(axis=-1)
+        losses.append([filled(side, sources, 2 * step, _ALL) for side in sides])
     return TypicalCell(picture, width, tuple(losses))
 
 
 def _bounds_in_the_middle(
-    frame: Frame, cell: ParameterBox, parts: MotionCells | np.ndarray | None, pixels: np.ndarray, worked: np.ndarray
+    frame: Frame, cell: ParameterBox, parts: MotionCells | np.ndarray | None, pixels: np.ndarray
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """By kind, bounds [n, 3] of the ``n`` ``pixels`` over the middle of a cell, NaN where nothing is known.
-
-    Those ``worked`` at are bounded from ranges of depths.
-    """
+    """By kind, bounds [n, 3] of the ``n`` ``pixels`` over the middle of a cell."""
     tiles = np.flatnonzero(pixels.any(axis=(1, 2)))
     if parts is None:
         whole = frame.bound(cell, tiles, None)
@@ -190,15 +197,11 @@ def _bounds_in_the_middle(
     middle = np.zeros(counts, bool)
     middle[tuple(slice((n - 1) // 2, n // 2 + 1) for n in counts.tolist())] = True
     middle = middle.ravel()
-    goals, bounds = np.repeat(np.where(worked[pixels], np.inf, np.nan)[:, None], 6, axis=1), []
+    goals, bounds = np.full((int(pixels.sum()), 6), np.inf), []
     for kind in (CHANNELS, DIFFERENCES):
         pair = frame.sub_box_ends(cell, parts, tiles, pixels[tiles], goals, kind == DIFFERENCES)
         assert pair is not None
-        lower, upper = pair[0][..., middle].mean(axis=-1), pair[1][..., middle].mean(axis=-1)
-        # what is known of no end would be known with more work
-        vain = (lower <= 0.0) & (upper >= 1.0) | ~(np.isfinite(lower) & np.isfinite(upper))
-        nothing = vain.all(axis=1)[:, None]
-        bounds.append((np.where(nothing, np.nan, lower), np.where(nothing, np.nan, upper)))
+        bounds.append((pair[0][..., middle].mean(axis=-1), pair[1][..., middle].mean(axis=-1)))
     return bounds
 
 
@@ -236,8 +239,8 @@ def _ends(picture: np.ndarray, kind: int, losses: Sequence[Float64Array]) -> tup
 
 
 def _score(shares: Float64Array, worth: Float64Array) -> Float64Array:
-    """Which pixels come first, the largest; see `PixelOrder`."""
-    return shares + _WORTH * worth
+    """Which pixels tell most, the largest; see `PixelOrder`."""
+    return shares * np.exp(worth / _WORTH)
 
 
 def _steps(radius: int) -> range:

@@ -21,11 +21,12 @@ from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.bounds import SceneSums, Stages
 from ns_abstract.methods.splat.constants import Rasteriser
 from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW, DEPTH_HIGH, DEPTH_LOW
+from ns_abstract.methods.splat.enclosing_cells import EnclosingCells, VisibleContext
 from ns_abstract.methods.splat.image_motion import ImageMotion
-from ns_abstract.methods.splat.lists import summed_area, touching
+from ns_abstract.methods.splat.lists import rectangles_by_place, summed_area, touching, visible_again
 from ns_abstract.methods.splat.render import Renderer
 from ns_abstract.methods.splat.stage_data import SubBoxes
-from ns_abstract.methods.splat.sub_box_bounds import SubBoxBounds, difference_ends, part_ends
+from ns_abstract.methods.splat.sub_box_bounds import SubBoxBounds, channel_differences, difference_ends, part_ends
 from ns_abstract.methods.splat.variations import VariedSplats
 from ns_abstract.refine.protocol import COLORS, Bounds, Frame, LinearSets, Score, SharedOrder
 
@@ -50,29 +51,6 @@ class FrameTuning:
 
 
 _TUNING = FrameTuning()
-
-
-@dataclass(frozen=True)
-class VisibleContext:
-    """The Gaussians that a cell may show on the requested pixels, reused for the cells inside it.
-
-    Attributes:
-        visible: [n] scene indices.
-        reach: [n, 4] int32 first and past columns, first and past rows of the pixels on which they may be seen.
-    """
-
-    visible: np.ndarray
-    reach: np.ndarray
-
-    @property
-    def nbytes(self) -> int:
-        """Memory that it holds."""
-        return self.visible.nbytes + self.reach.nbytes
-
-    @property
-    def shown(self) -> np.ndarray:
-        """Numbers [n] of the Gaussians that the cell may show."""
-        return self.visible
 
 
 @dataclass(frozen=True)
@@ -185,6 +163,7 @@ class SplatFrame(Frame):
             self.pose_set = pose_set.sheared(shear)
             self.box = self.pose_set.box
             self._image_motion = ImageMotion(self.pose_set, splats.means, self.renderer)
+        self._enclosing = EnclosingCells(self.box, self.motion, self._context)
 
     def warm_up(self, stage: str | None = None) -> None:
         """Compile the kernels that this frame needs, or those of one of `stages`."""
@@ -286,20 +265,21 @@ class SplatFrame(Frame):
 
     def sub_box_ends(
         self, box: ParameterBox, counts: np.ndarray | MotionCells, tiles: np.ndarray, pixels: np.ndarray,
-        goals: np.ndarray | None = None, differences: bool = False,
+        goals: np.ndarray, differences: bool = False,
     ) -> tuple[np.ndarray, np.ndarray] | None:  # fmt: skip
         """See `ns_abstract.refine.protocol.SubBoxFrame` (design.md, U5, B14, B15)."""
         if box.dimensions < 2:
             return None
         check_cancelled()
         forms = self.pose_set.enclosure(box, self.order)
+        projected = self.bounds.project(self.camera, forms, self.candidates(tiles, self._enclosing.around(box), pixels))
         if not differences:
-            projected = self.bounds.projected_box(self.camera, forms, box)
-            return part_ends(self.bounds.sub_boxes(self.camera, forms, projected, tiles, pixels, counts, goals), pixels)
-        projected, scale = self.bounds.projected_differences(self.camera, forms, box)
-        scaled = None if goals is None else 0.5 + scale * goals
-        parts = self.bounds.sub_boxes(self.camera, forms, projected, tiles, pixels, counts, scaled)
-        return difference_ends(parts, pixels, scale)
+            return part_ends(self.bounds.sub_boxes(self.camera, forms, projected, tiles, pixels, counts, goals))
+        projected, scale = channel_differences(projected)
+        goals = 0.5 + scale * goals
+        return difference_ends(
+            self.bounds.sub_boxes(self.camera, forms, projected, tiles, pixels, counts, goals), scale
+        )
 
     def motion_cells(self, box: ParameterBox, counts: np.ndarray) -> MotionCells | None:
         """See `ns_abstract.refine.protocol.SubBoxFrame` (design.md, B16)."""
@@ -309,6 +289,19 @@ class SplatFrame(Frame):
     def parallax(self, box: ParameterBox) -> np.ndarray:
         """See `ns_abstract.refine.protocol.SubBoxFrame`."""
         return self._image_motion.parallax(box)
+
+    def element_counts(self, box: ParameterBox) -> np.ndarray:
+        """See `ns_abstract.refine.protocol.SubBoxFrame`."""
+        context, size = self._enclosing.around(box), (self.camera.height, self.camera.width)
+        return np.zeros(size, np.int64) if context is None else rectangles_by_place(context.reach, *size)
+
+    def _context(self, box: ParameterBox) -> VisibleContext:
+        """The Gaussians that a cell may show."""
+        projected = self.bounds.project(self.camera, self.pose_set.enclosure(box, self.order))
+        marks = np.zeros(projected.candidates.size, np.uint8)
+        marks[projected.alive] = 1
+        gaussians = projected.gaussians
+        return VisibleContext(*visible_again(marks, projected.candidates, gaussians.box, gaussians.tiles, self.side))
 
     def motion(self, box: ParameterBox) -> np.ndarray:
         """[d] pixels that typical Gaussians move by over each parameter's range (an estimate)."""

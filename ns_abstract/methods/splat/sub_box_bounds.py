@@ -1,29 +1,23 @@
-"""Bounds of a splat scene's pixels over many sub-boxes of one cell (design.md, B12, B14)."""
+"""Bounds of a splat scene's pixels over many sub-boxes of one cell (design.md, B14)."""
 
 from __future__ import annotations
-
-from typing import Any
 
 import numpy as np
 
 from ns_abstract.arithmetic.rounding import CHANNEL_DIFFERENCE_ROUNDING, SUB_BOX_OVERLAP, UP
-from ns_abstract.execution.threads import lane, threads
-from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.execution.threads import threads
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.motion_cells import MotionCells
 from ns_abstract.geometry.poses import PoseForms
-from ns_abstract.geometry.tiles import laid_out, tile_grid
+from ns_abstract.geometry.tiles import tile_grid
 from ns_abstract.methods.splat.bounds import SplatBounds, divided_by
 from ns_abstract.methods.splat.depth_range_pixels import depth_range_stage
-from ns_abstract.methods.splat.lists import TileLists, pixel_sets, summed_area, tile_lists, tile_mask, touching
+from ns_abstract.methods.splat.lists import TileLists, pixel_sets, tile_lists, tile_mask
 from ns_abstract.methods.splat.stage_data import (
-    CellPoses,
     ColorEnds,
     Colors,
-    FormShape,
     PixelInputs,
     ProjectedCell,
-    ProjectedGaussians,
     strips_of,
 )
 from ns_abstract.refine.protocol import CHANNEL_DIFFERENCES, COLORS, FIRST_CHANNELS, SECOND_CHANNELS
@@ -32,73 +26,26 @@ from ns_abstract.refine.protocol import CHANNEL_DIFFERENCES, COLORS, FIRST_CHANN
 class SubBoxBounds(SplatBounds):
     """`SplatBounds` with bounds over sub-boxes; takes the same arguments."""
 
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        self._latest: dict[int, tuple[ParameterBox, ProjectedCell] | None] = {}
-        self._differences: dict[int, tuple[ProjectedCell, float] | None] = {}
-
-    def _projected(
-        self, candidates: np.ndarray, poses: CellPoses, camera: PinholeCamera, shape: FormShape
-    ) -> tuple[ProjectedGaussians, np.ndarray]:
-        # it takes the memory of the last one, of which the differences are
-        self._latest[lane()] = self._differences[lane()] = None
-        return super()._projected(candidates, poses, camera, shape)
-
-    def projected_box(self, camera: PinholeCamera, forms: PoseForms, box: ParameterBox) -> ProjectedCell:
-        """`project` all Gaussians over ``box`` with poses ``forms``, unless the lane's last projection was that."""
-        latest = self._latest.get(lane())
-        if latest is None or latest[0] != box:
-            latest = self._latest[lane()] = box, self.project(camera, forms)
-        return latest[1]
-
-    def projected_differences(
-        self, camera: PinholeCamera, forms: PoseForms, box: ParameterBox
-    ) -> tuple[ProjectedCell, float]:
-        """`channel_differences` of `projected_box`, unless the lane's last were that."""
-        projected = self.projected_box(camera, forms, box)
-        differences = self._differences.get(lane())
-        if differences is None:
-            differences = self._differences[lane()] = channel_differences(projected)
-        return differences
-
     def warm_up(self, camera: PinholeCamera, forms: PoseForms, counts: np.ndarray) -> None:
-        """Compile what `by_depth_ranges` needs; arguments are as of `sub_boxes`."""
+        """Compile what `sub_boxes` needs; arguments are as there."""
         pixels = np.ones((1, self.side, self.side), bool)
-        out, goals = np.empty((*pixels.shape, 6, int(counts.prod()))), np.full((pixels.size, 6), np.inf)
-        self.by_depth_ranges(camera, forms, self.project(camera, forms), np.arange(1), pixels, counts, goals, out)
+        goals = np.full((pixels.size, 6), np.inf)
+        self.sub_boxes(camera, forms, self.project(camera, forms), np.arange(1), pixels, counts, goals)
 
     def sub_boxes(
         self, camera: PinholeCamera, forms: PoseForms, projected: ProjectedCell, wanted: np.ndarray,
-        pixels: np.ndarray, counts: np.ndarray | MotionCells, goals: np.ndarray | None = None,
+        pixels: np.ndarray, counts: np.ndarray | MotionCells, goals: np.ndarray,
     ) -> np.ndarray:  # fmt: skip
-        """Bounds [t, side, side, 6, k] of ``pixels`` of the tiles ``wanted`` over sub-boxes (design.md, B12, B14).
+        """Bounds [n, 6, k] of the ``n`` ``pixels`` of the tiles ``wanted`` over sub-boxes (design.md, B14).
 
-        They are the least of the three channels, then the most. Ends that are no numbers bound nothing; what stands at
-        other pixels means nothing.
+        They are the least of the three channels, then the most. What is not wanted, or no number, bounds nothing.
 
         Args:
             camera, forms, wanted, pixels: As of `cell`.
-            projected: What `project` returns of the cell.
+            projected: What `project` returns of the cell, at least of the Gaussians that may be seen on ``pixels``.
             counts: [d] sub-boxes along the cell's axes, powers of two, at least `PART_LANES` together; or cells of the
                 image motion in their place.
-            goals: [n, 6] see `depth_range_stage`, for pixels whose depth orders are too many; None: none is wanted.
-        """
-        cell = self.cell(camera, forms, wanted, projected, pixels=pixels, parts=counts, keep_parts=True)
-        out = cell.parts
-        assert out is not None
-        if goals is not None and cell.statistics[3]:
-            unknown = (out[pixels][:, :3] == 0.0).all(axis=(1, 2)) & (out[pixels][:, 3:] == 1.0).all(axis=(1, 2))
-            asked = np.where(unknown[:, None], goals, np.nan)
-            self.by_depth_ranges(camera, forms, projected, wanted, pixels, counts, asked, out)
-        return out
-
-    def by_depth_ranges(
-        self, camera: PinholeCamera, forms: PoseForms, projected: ProjectedCell, wanted: np.ndarray,
-        pixels: np.ndarray, counts: np.ndarray | MotionCells, goals: np.ndarray, out: np.ndarray,
-    ) -> None:  # fmt: skip
-        """Write ends of the ``n`` pixels to ``out`` from the ranges of the Gaussians' depths (design.md, B14).
-
-        Arguments are those of `sub_boxes`.
+            goals: [n, 6] see `depth_range_stage`.
         """
         across, down = tile_grid(camera, self.side)
         shape, parts = divided_by(forms.rotation.basis, counts, SUB_BOX_OVERLAP)
@@ -108,22 +55,19 @@ class SubBoxBounds(SplatBounds):
             Colors(colors, background, color_error, 3, np.zeros(shape.monomials + 1)),
             self.rules, self.charges, self._cutoffs(-1.0, 1), shape, parts,
         )  # fmt: skip
-        chosen = np.zeros((across * down, self.side, self.side), bool)
-        chosen[wanted] = pixels
-        # a pixel's middle lies half a pixel behind its number; what is not a number leaves nothing out
-        box, size = gaussians.box[alive], np.repeat([across, down], 2) * self.side
-        reach = np.where(np.isnan(box), [0, np.inf] * 2, np.floor(box + [-0.5, 1.5] * 2)).clip(0, size).astype(np.int32)
-        touched = touching(np.arange(alive.size), reach, summed_area(laid_out(chosen, across)))
-        alive = alive[touched]
         order = alive[np.argsort(gaussians.depth[alive], kind="stable")]
         shown = tile_mask(wanted[pixels.any(axis=(1, 2))], across * down)
         lists = TileLists(wanted, *tile_lists(order, gaussians.tiles, shown, across))
         by_pixel = np.full((*pixels.shape, 6), np.nan)
         by_pixel[pixels] = goals
+        # memory is taken where it is written: for the pixels that are wanted
+        out = np.empty((*pixels.shape, 6, shape.parts))
+        out[pixels] = np.nan
         depth_range_stage(
             lists, pixel_sets(~np.isnan(by_pixel).all(axis=-1), wanted.size, self.side), by_pixel, inputs,
             strips_of(inputs.parts), _color_ends(colors, alive, background), threads(), out,
         )  # fmt: skip
+        return out[pixels]
 
 
 def channel_differences(projected: ProjectedCell) -> tuple[ProjectedCell, float]:
@@ -171,25 +115,25 @@ def _color_ends(colors: np.ndarray, alive: np.ndarray, background: np.ndarray) -
     return ColorEnds(values, behind, opposite, bright)
 
 
-def part_ends(parts: np.ndarray | None, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper bounds [n, 3, k] of the ``n`` chosen ``pixels`` [t, side, side] from `PixelBounds.parts`."""
-    assert parts is not None
-    ends = parts[pixels]
-    lower, upper = ends[:, :COLORS], ends[:, COLORS:]
-    # crossed or not a number: nothing is known
+def part_ends(ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper bounds [n, 3, k] of the colours from what `SubBoxBounds.sub_boxes` returns."""
+    lower, upper = (np.where(np.isnan(end), side, end) for side, end in enumerate((ends[:, :COLORS], ends[:, COLORS:])))
+    # crossed: nothing is known
     sane = lower <= upper
     return np.where(sane, lower, 0.0).clip(0.0, 1.0), np.where(sane, upper, 1.0).clip(0.0, 1.0)
 
 
-def difference_ends(parts: np.ndarray, pixels: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
-    """Bounds [n, 3, k] of `CHANNEL_DIFFERENCES`, from ``parts`` for those of the colours (design.md, B15)."""
-    ends = parts[pixels]
+def difference_ends(ends: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds [n, 3, k] of `CHANNEL_DIFFERENCES`, from ``ends`` for those of the colours (design.md, B15)."""
     lower, upper = ends[:, :COLORS], ends[:, COLORS:]
-    # [0, 1] stands for nothing that is known (design.md, B15)
-    sane = (lower <= upper) & ~((lower == 0.0) & (upper == 1.0)) & (scale > 0.0)
     with np.errstate(all="ignore"):
         lower, upper = (
             (lower - 0.5 - CHANNEL_DIFFERENCE_ROUNDING) / scale,
             (upper - 0.5 + CHANNEL_DIFFERENCE_ROUNDING) / scale,
         )
+    known = scale > 0.0
+    lower = np.where(known & ~np.isnan(lower), lower, -np.inf)
+    upper = np.where(known & ~np.isnan(upper), upper, np.inf)
+    # crossed: nothing is known
+    sane = lower <= upper
     return np.where(sane, lower, -np.inf), np.where(sane, upper, np.inf)
