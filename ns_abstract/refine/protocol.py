@@ -241,11 +241,12 @@ class SubBoxFrame(Protocol):
 
     def sub_box_ends(
         self, box: ParameterBox, counts: np.ndarray | MotionCells, tiles: np.ndarray, pixels: np.ndarray,
-        goals: np.ndarray, differences: bool = False,
+        goals: np.ndarray, differences: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray] | None:  # fmt: skip
         """Lower and upper bounds [n, 3, k] of ``n`` pixels over ``k`` sub-boxes; None: there are none for this set.
 
-        ``differences``: of `CHANNEL_DIFFERENCES` of the pixels before they are clamped to [0, 1], in place of channels.
+        ``differences`` [n]: of which pixels `CHANNEL_DIFFERENCES` are bounded, before they are clamped to [0, 1], in place
+        of channels.
 
         There are ``counts`` [d] sub-boxes along the axes, powers of two, at least 8 together, numbered like entries of
         an array of this shape; or cells of the image motion. Each is widened by `SUB_BOX_OVERLAP` of the half-widths.

@@ -282,19 +282,16 @@ class _Examination:
         rounds, order = self._rounds(box, picture, counts)
         while (chosen := rounds.following(*order.towards(boxes.moved[rounds.left]))) is not None:
             self.bounded += 1
-            excluding = np.zeros((int(chosen.sum()), rounds.numbers.size), bool)
-            for kind, miss in enumerate(order.misses):
-                pixels = chosen & (order.kinds == kind)
-                if not pixels.any():
-                    continue
-                tiles = np.flatnonzero(pixels.any(axis=(1, 2)))
-                telling = (miss == miss.max(axis=-1, keepdims=True))[pixels]
-                goals = np.where(telling, search.tiled.goals(pixels, kind == DIFFERENCES), np.nan)
-                ends = frame.sub_box_ends(box, parts, tiles, pixels[tiles], goals, kind == DIFFERENCES)
-                if ends is None:
-                    return None
-                known = search.tiled.excluding(*ends, pixels, kind == DIFFERENCES)
-                excluding[pixels[chosen]] = boxes.excluded(known, pixels) if search.by_motion else known
+            kinds, tiles = order.kinds[chosen], np.flatnonzero(chosen.any(axis=(1, 2)))
+            misses = np.choose(kinds[:, None], [miss[chosen] for miss in order.misses])
+            telling, differences = misses == misses.max(axis=-1, keepdims=True), kinds == DIFFERENCES
+            goals = np.where(telling, search.tiled.goals(chosen, differences), np.nan)
+            ends = frame.sub_box_ends(box, parts, tiles, chosen[tiles], goals, differences)
+            if ends is None:
+                return None
+            excluding = search.tiled.excluding(*ends, chosen, differences)
+            if search.by_motion:
+                excluding = boxes.excluded(excluding, chosen)
             rounds.take(excluding, chosen)
         self.share = min(1.0, rounds.expected)
         self.divisions = self.cell, counts, rounds

@@ -174,21 +174,28 @@ class TiledPhoto:
         sane = (lower <= upper).all(axis=-1)
         return sane & self.counted[tiles] & ((lower > self.high[tiles]) | (upper < self.low[tiles])).any(axis=-1)
 
-    def goals(self, pixels: np.ndarray, differences: bool = False) -> np.ndarray:
+    def _explaining(self, pixels: np.ndarray, differences: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+        """[n, 3], [n, 3] the least and most that explain the ``n`` ``pixels`` [T, side, side]."""
+        low, high = self.low[pixels], self.high[pixels]
+        if differences is None or not differences.any():
+            return low, high
+        ends = zip((low, high), self.differences, strict=True)
+        low, high = (np.where(differences[:, None], other[pixels], end) for end, other in ends)
+        return low, high
+
+    def goals(self, pixels: np.ndarray, differences: np.ndarray) -> np.ndarray:
         """[n, 6] what lower, then upper bounds of the ``n`` ``pixels`` [T, side, side] exclude beyond (U5, U10)."""
-        low, high = self.differences if differences else (self.low, self.high)
-        return np.concatenate([high[pixels], low[pixels]], axis=-1)
+        return np.concatenate(self._explaining(pixels, differences)[::-1], axis=-1)
 
     def excluding(
-        self, lower: np.ndarray, upper: np.ndarray, pixels: np.ndarray, differences: bool = False
+        self, lower: np.ndarray, upper: np.ndarray, pixels: np.ndarray, differences: np.ndarray | None = None
     ) -> np.ndarray:
         """[n, k] which of the ``n`` ``pixels`` [T, side, side] exclude which of ``k`` sub-boxes (U2, U5, U10).
 
-        Their bounds [n, 3, k], of channels or of `CHANNEL_DIFFERENCES`, lie beyond what explains them; NaN, crossed
-        bounds and pixels that do not count exclude nothing.
+        Their bounds [n, 3, k], of channels or, where ``differences`` [n] says so, of `CHANNEL_DIFFERENCES`, lie beyond
+        what explains them; NaN, crossed bounds and pixels that do not count exclude nothing.
         """
-        ends = self.differences if differences else (self.low, self.high)
-        low, high = (end[pixels][:, :, None] for end in ends)
+        low, high = (end[:, :, None] for end in self._explaining(pixels, differences))
         beyond = (lower <= upper).all(axis=1) & ((lower > high) | (upper < low)).any(axis=1)
         return beyond & self.counted[pixels][:, None]
 

@@ -199,7 +199,7 @@ def _bounds_in_the_middle(
     middle = middle.ravel()
     goals, bounds = np.full((int(pixels.sum()), 6), np.inf), []
     for kind in (CHANNELS, DIFFERENCES):
-        pair = frame.sub_box_ends(cell, parts, tiles, pixels[tiles], goals, kind == DIFFERENCES)
+        pair = frame.sub_box_ends(cell, parts, tiles, pixels[tiles], goals, np.full(len(goals), kind == DIFFERENCES))
         assert pair is not None
         bounds.append((pair[0][..., middle].mean(axis=-1), pair[1][..., middle].mean(axis=-1)))
     return bounds

@@ -265,7 +265,7 @@ class SplatFrame(Frame):
 
     def sub_box_ends(
         self, box: ParameterBox, counts: np.ndarray | MotionCells, tiles: np.ndarray, pixels: np.ndarray,
-        goals: np.ndarray, differences: bool = False,
+        goals: np.ndarray, differences: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray] | None:  # fmt: skip
         """See `ns_abstract.refine.protocol.SubBoxFrame` (design.md, U5, B14, B15)."""
         if box.dimensions < 2:
@@ -273,13 +273,21 @@ class SplatFrame(Frame):
         check_cancelled()
         forms = self.pose_set.enclosure(box, self.order)
         projected = self.bounds.project(self.camera, forms, self.candidates(tiles, self._enclosing.around(box), pixels))
-        if not differences:
-            return part_ends(self.bounds.sub_boxes(self.camera, forms, projected, tiles, pixels, counts, goals))
-        projected, scale = channel_differences(projected)
-        goals = 0.5 + scale * goals
-        return difference_ends(
-            self.bounds.sub_boxes(self.camera, forms, projected, tiles, pixels, counts, goals), scale
-        )
+        ends: list[tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]] = []
+        for chosen in (~differences, differences):
+            if not chosen.any():
+                continue
+            some, scale = pixels.copy(), 1.0
+            some[pixels], wanted = chosen, goals[chosen]
+            if chosen is differences:
+                projected, scale = channel_differences(projected)
+                wanted = 0.5 + scale * wanted
+            bounds = self.bounds.sub_boxes(self.camera, forms, projected, tiles, some, counts, wanted)
+            ends.append((chosen, difference_ends(bounds, scale) if chosen is differences else part_ends(bounds)))
+        lower, upper = (np.empty((len(goals), *ends[0][1][0].shape[1:])) for _ in range(2))
+        for chosen, (low, high) in ends:
+            lower[chosen], upper[chosen] = low, high
+        return lower, upper
 
     def motion_cells(self, box: ParameterBox, counts: np.ndarray) -> MotionCells | None:
         """See `ns_abstract.refine.protocol.SubBoxFrame` (design.md, B16)."""
