@@ -32,7 +32,7 @@ from ns_abstract.verify.location_cover import PoseCover, ShearedBoxes, cover
 from ns_abstract.verify.photo import Brightness, Photo
 
 #: Of the search's rules: results of different ones are not mixed.
-_RULES = 7
+_RULES = 8
 _OPTION, _DATA = "--calibrate", "transforms.json"
 
 

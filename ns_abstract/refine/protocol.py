@@ -245,8 +245,7 @@ class SubBoxFrame(Protocol):
     ) -> tuple[np.ndarray, np.ndarray] | None:  # fmt: skip
         """Lower and upper bounds [n, 3, k] of ``n`` pixels over ``k`` sub-boxes; None: there are none for this set.
 
-        ``differences`` [n]: of which pixels `CHANNEL_DIFFERENCES` are bounded, before they are clamped to [0, 1], in place
-        of channels.
+        ``differences`` [n]: of which pixels `CHANNEL_DIFFERENCES` are bounded, not clamped to [0, 1], not channels.
 
         There are ``counts`` [d] sub-boxes along the axes, powers of two, at least 8 together, numbered like entries of
         an array of this shape; or cells of the image motion. Each is widened by `SUB_BOX_OVERLAP` of the half-widths.

@@ -47,19 +47,18 @@ class LocationTuning:
     #: motion of what a pixel shows.
     along: int = 8
     #: Widths (see `LocationSearch.widths`) beyond which cells are cut without bounds, in sets of few parameters and of
-    #: many; and up to which ranges of depths bound pixels of too many orders: slow, and little use in wider cells.
-    coarse: tuple[float, float] = 4.0, 1.6
-    by_depth_ranges: float = 1.6
+    #: many.
+    coarse: tuple[float, float] = 4.0, 1.8
     #: Rounds of pixels. What a cell takes whatever its pixels are is most of the work, and a first round of more pixels
     #: excludes more at once.
-    pixel_rounds: RoundTuning = field(default_factory=lambda: RoundTuning(first=1.6))
+    pixel_rounds: RoundTuning = field(default_factory=lambda: RoundTuning(first=1.3))
     #: The part of a box of sub-boxes that has to be left for it to become one cell.
     filled: float = 0.5
     #: Grid lines that cells begin and end at, as a power of two of their width.
     aligned: int = 5
     contracted: float = 0.3
     #: Pixels that are bounded to exclude a cell: so many times those that may show anything.
-    surplus: float = 6.0
+    surplus: float = 2.0
     #: Width of the cell whose bounds tell how loose they are, without parts, with sub-boxes and with motion cells.
     reference: tuple[float, float, float] = 2.4, 1.8, 0.9
     #: Pixels that must be likely to be excluded, as a part of those that exclude a cell, for it to be bounded.

@@ -25,10 +25,12 @@ CHANNELS, DIFFERENCES = range(2)
 _MOST_PIXELS, _MOST_ELEMENTS = 4096, 2_000_000
 #: What bounds lose at most, and as which power of their width.
 _ALL, _POWER = 2.0, 1.5
-#: Where bounds miss the photo by so much more, a pixel may take e times the work.
-_WORTH = 0.5
+#: Worth at which a pixel is as likely to exclude poses as not, and by how much e times the odds have more.
+_EVEN, _STEEP = -0.1, 0.2
 #: Scene elements whose work is that of all else that a pixel takes.
-_OTHER_WORK = 1000.0
+_OTHER_WORK = 3000.0
+#: Most scene elements that a cell's pixels look at where there are so many times as many of these.
+_LITTLE_WORK, _MORE = 300_000.0, 5
 
 
 @dataclass(frozen=True)
@@ -68,13 +70,16 @@ class PixelOrder:
     @property
     def everywhere(self) -> tuple[np.ndarray, Float64Array]:
         """The pixels that are likely to exclude all of the cell, and 1 for each."""
-        numbers, shares = self._sorted(self.missed.mean(axis=0))
-        return numbers[shares >= 1.0], shares[shares >= 1.0]
+        shares = self.missed.mean(axis=0)
+        return self._sorted(np.where(shares >= 1.0, shares, 0.0))
 
     def _sorted(self, shares: Float64Array) -> tuple[np.ndarray, Float64Array]:
         some = np.flatnonzero(shares > 0.0)
-        order = some[np.argsort(-_score(shares[some], self.worth[some]) / self.work[some], kind="stable")][: self.most]
-        return self.numbers[order], shares[order]
+        likely = _likely(shares[some], self.worth[some])
+        order = np.argsort(-likely / self.work[some], kind="stable")
+        light = int(np.searchsorted((self.work[some[order]] - _OTHER_WORK).cumsum(), _LITTLE_WORK))
+        order = order[: max(self.most, min(light, _MORE * self.most))]
+        return self.numbers[some[order]], likely[order]
 
 
 @dataclass(frozen=True)
@@ -133,7 +138,7 @@ class TellingPixels:
         loose = [in_tiles((below + above).max(axis=-1), self.side)[counted] for below, above in losses]
         missed = np.stack([part[:, counted] for part in everywhere])
         worth = missed.min(axis=1) - np.stack(loose)
-        kinds_of = _score((missed > 0.0).mean(axis=1), worth).argmax(axis=0)
+        kinds_of = _likely((missed > 0.0).mean(axis=1), worth).argmax(axis=0)
         missed = np.take_along_axis(missed, kinds_of[None, None], axis=0)[0]
         worth = np.take_along_axis(worth, kinds_of[None], axis=0)[0]
         chosen = np.zeros(counted.shape, np.int64)
@@ -238,9 +243,9 @@ def _ends(picture: np.ndarray, kind: int, losses: Sequence[Float64Array]) -> tup
     return least - losses[0], most + losses[1]
 
 
-def _score(shares: Float64Array, worth: Float64Array) -> Float64Array:
-    """Which pixels tell most, the largest; see `PixelOrder`."""
-    return shares * np.exp(worth / _WORTH)
+def _likely(shares: Float64Array, worth: Float64Array) -> Float64Array:
+    """The part of a cell that each pixel is likely to exclude, of the ``shares`` where bounds may miss the photo."""
+    return shares / (1.0 + np.exp((_EVEN - worth) / _STEEP))
 
 
 def _steps(radius: int) -> range:

@@ -16,7 +16,7 @@ from ns_abstract.execution.threads import each
 from ns_abstract.geometry.box import ParameterBox, shared_out
 from ns_abstract.geometry.motion_cells import MotionCells
 from ns_abstract.geometry.poses import PoseBox, translation_only
-from ns_abstract.geometry.tiles import laid_out, tile_grid
+from ns_abstract.geometry.tiles import in_tiles, laid_out, tile_grid
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.bounds import SceneSums, Stages
 from ns_abstract.methods.splat.constants import Rasteriser
@@ -46,6 +46,9 @@ class FrameTuning:
     #: Where typical Gaussians move by more pixels, a cell is bounded over so many parts, not by forms (B12).
     wide: float = 0.35
     parts: int = 32
+    #: More Gaussians over a pixel than that of a cell with parts: ranges of depths tell as much as pairs of uncertain
+    #: order, in less time, and most blocks have too many of these.
+    crowded: int = 1000
     #: A context that is larger than this part of the one around it is not kept beside it.
     worth_keeping: float = 0.8
 
@@ -273,6 +276,7 @@ class SplatFrame(Frame):
         check_cancelled()
         forms = self.pose_set.enclosure(box, self.order)
         projected = self.bounds.project(self.camera, forms, self.candidates(tiles, self._enclosing.around(box), pixels))
+        crowded = in_tiles(self.element_counts(box), self.side)[tiles][pixels] > _TUNING.crowded
         ends: list[tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]] = []
         for chosen in (~differences, differences):
             if not chosen.any():
@@ -282,7 +286,7 @@ class SplatFrame(Frame):
             if chosen is differences:
                 projected, scale = channel_differences(projected)
                 wanted = 0.5 + scale * wanted
-            bounds = self.bounds.sub_boxes(self.camera, forms, projected, tiles, some, counts, wanted)
+            bounds = self.bounds.sub_boxes(self.camera, forms, projected, tiles, some, counts, wanted, crowded[chosen])
             ends.append((chosen, difference_ends(bounds, scale) if chosen is differences else part_ends(bounds)))
         lower, upper = (np.empty((len(goals), *ends[0][1][0].shape[1:])) for _ in range(2))
         for chosen, (low, high) in ends:

@@ -22,23 +22,26 @@ from ns_abstract.methods.splat.stage_data import (
 )
 from ns_abstract.refine.protocol import CHANNEL_DIFFERENCES, COLORS, FIRST_CHANNELS, SECOND_CHANNELS
 
+#: Lower and upper bounds of three channels where nothing is known.
+_NOTHING = np.repeat([0.0, 1.0], COLORS)[:, None]
+
 
 class SubBoxBounds(SplatBounds):
     """`SplatBounds` with bounds over sub-boxes; takes the same arguments."""
 
     def warm_up(self, camera: PinholeCamera, forms: PoseForms, counts: np.ndarray) -> None:
-        """Compile what `sub_boxes` needs; arguments are as there."""
+        """Compile what `by_depth_ranges` needs; arguments are as there."""
         pixels = np.ones((1, self.side, self.side), bool)
         goals = np.full((pixels.size, 6), np.inf)
-        self.sub_boxes(camera, forms, self.project(camera, forms), np.arange(1), pixels, counts, goals)
+        self.by_depth_ranges(camera, forms, self.project(camera, forms), np.arange(1), pixels, counts, goals)
 
     def sub_boxes(
         self, camera: PinholeCamera, forms: PoseForms, projected: ProjectedCell, wanted: np.ndarray,
-        pixels: np.ndarray, counts: np.ndarray | MotionCells, goals: np.ndarray,
+        pixels: np.ndarray, counts: np.ndarray | MotionCells, goals: np.ndarray, crowded: np.ndarray,
     ) -> np.ndarray:  # fmt: skip
-        """Bounds [n, 6, k] of the ``n`` ``pixels`` of the tiles ``wanted`` over sub-boxes (design.md, B14).
+        """Bounds [n, 6, k] of the ``n`` ``pixels`` of the tiles ``wanted`` over sub-boxes (design.md, B12, B14).
 
-        They are the least of the three channels, then the most. What is not wanted, or no number, bounds nothing.
+        They are the least of the three channels, then the most; 0 and 1 where nothing is known, or was wanted.
 
         Args:
             camera, forms, wanted, pixels: As of `cell`.
@@ -46,6 +49,31 @@ class SubBoxBounds(SplatBounds):
             counts: [d] sub-boxes along the cell's axes, powers of two, at least `PART_LANES` together; or cells of the
                 image motion in their place.
             goals: [n, 6] see `depth_range_stage`.
+            crowded: [n] the pixels at which pairs of uncertain order are too many: ranges of depths bound these.
+        """
+        shape, _ = divided_by(forms.rotation.basis, counts, SUB_BOX_OVERLAP)
+        ends, unknown = np.empty((len(goals), 6, shape.parts)), crowded
+        if not crowded.all():
+            unknown, some = crowded.copy(), pixels.copy()
+            some[pixels] = ~crowded
+            cell = self.cell(camera, forms, wanted, projected, pixels=some, parts=counts, keep_parts=True)
+            assert cell.parts is not None
+            ordered = cell.parts[some]
+            unknown[~crowded] = (ordered == _NOTHING).all(axis=(1, 2))
+            ends[~crowded] = ordered
+        if unknown.any():
+            some = pixels.copy()
+            some[pixels] = unknown
+            ends[unknown] = self.by_depth_ranges(camera, forms, projected, wanted, some, counts, goals[unknown])
+        return ends
+
+    def by_depth_ranges(
+        self, camera: PinholeCamera, forms: PoseForms, projected: ProjectedCell, wanted: np.ndarray,
+        pixels: np.ndarray, counts: np.ndarray | MotionCells, goals: np.ndarray,
+    ) -> np.ndarray:  # fmt: skip
+        """Bounds [n, 6, k] of the ``n`` ``pixels`` from the ranges of the Gaussians' depths (design.md, B14).
+
+        Arguments are those of `sub_boxes`.
         """
         across, down = tile_grid(camera, self.side)
         shape, parts = divided_by(forms.rotation.basis, counts, SUB_BOX_OVERLAP)
@@ -62,7 +90,7 @@ class SubBoxBounds(SplatBounds):
         by_pixel[pixels] = goals
         # memory is taken where it is written: for the pixels that are wanted
         out = np.empty((*pixels.shape, 6, shape.parts))
-        out[pixels] = np.nan
+        out[pixels] = _NOTHING
         depth_range_stage(
             lists, pixel_sets(~np.isnan(by_pixel).all(axis=-1), wanted.size, self.side), by_pixel, inputs,
             strips_of(inputs.parts), _color_ends(colors, alive, background), threads(), out,
@@ -117,8 +145,8 @@ def _color_ends(colors: np.ndarray, alive: np.ndarray, background: np.ndarray) -
 
 def part_ends(ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Lower and upper bounds [n, 3, k] of the colours from what `SubBoxBounds.sub_boxes` returns."""
-    lower, upper = (np.where(np.isnan(end), side, end) for side, end in enumerate((ends[:, :COLORS], ends[:, COLORS:])))
-    # crossed: nothing is known
+    lower, upper = ends[:, :COLORS], ends[:, COLORS:]
+    # crossed or not a number: nothing is known
     sane = lower <= upper
     return np.where(sane, lower, 0.0).clip(0.0, 1.0), np.where(sane, upper, 1.0).clip(0.0, 1.0)
 
@@ -126,14 +154,11 @@ def part_ends(ends: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def difference_ends(ends: np.ndarray, scale: float) -> tuple[np.ndarray, np.ndarray]:
     """Bounds [n, 3, k] of `CHANNEL_DIFFERENCES`, from ``ends`` for those of the colours (design.md, B15)."""
     lower, upper = ends[:, :COLORS], ends[:, COLORS:]
+    # [0, 1] stands for nothing that is known (design.md, B15)
+    sane = (lower <= upper) & ~((lower == 0.0) & (upper == 1.0)) & (scale > 0.0)
     with np.errstate(all="ignore"):
         lower, upper = (
             (lower - 0.5 - CHANNEL_DIFFERENCE_ROUNDING) / scale,
             (upper - 0.5 + CHANNEL_DIFFERENCE_ROUNDING) / scale,
         )
-    known = scale > 0.0
-    lower = np.where(known & ~np.isnan(lower), lower, -np.inf)
-    upper = np.where(known & ~np.isnan(upper), upper, np.inf)
-    # crossed: nothing is known
-    sane = lower <= upper
     return np.where(sane, lower, -np.inf), np.where(sane, upper, np.inf)

@@ -195,7 +195,8 @@ class SplatWeightFrame(SplatFrame):
         """See `ns_abstract.refine.protocol.ElementFrame` (design.md, B13)."""
         candidates = self.candidates(tiles, within, pixels)
         bounds = self._bound(box, tiles, within, candidates, True, pixels, SubBoxes(counts, tuple(levels)))
-        return bounds, outward(*part_ends(bounds.parts, pixels))
+        assert bounds.parts is not None
+        return bounds, outward(*part_ends(bounds.parts[pixels]))
 
     def differentiable(self, values: torch.Tensor) -> torch.Tensor:
         """See `ns_abstract.refine.protocol.WeightFrame`, by the reference renderer."""
