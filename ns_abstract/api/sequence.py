@@ -28,7 +28,7 @@ from ns_abstract.report.run import plain
 Range = tuple[float, float]
 _REPORT = "report.json"
 #: Of how one photo's sets follow from another's: results of different rules are not continued.
-_RULES = 3
+_RULES = 2
 
 
 def load_motion(file: Path, sets: Mapping[int, PoseBox], dataset_scale: float | None) -> dict[str, Range]:
