@@ -388,6 +388,14 @@ def test_selections_that_cannot_be_read(text: str) -> None:
     assert perturbation_of({"x": 0.1, "mean": 0.0}, text) == perturbation_of({"x": 0.1})
 
 
+def test_selections_of_the_panel_read_no_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "some.json").write_text("[3, 1]")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=r"select\.indices"):
+        perturbation_of({"mean": 0.1}, '{"indices": "some.json"}')
+    assert perturbation_of({"mean": 0.1}, '{"indices": [3, 1]}').scene[0].select.indices == (1, 3)
+
+
 @pytest.mark.slow
 def test_an_empty_selection_is_told(background: Callable[..., Background]) -> None:
     one = background()
