@@ -257,7 +257,9 @@ def idle_assumptions(state: Collection[str], idle: Mapping[str, str]) -> tuple[A
 def units_assumption(transform: DataparserTransform, assumed: bool) -> Assumption:
     """The units of the data set; ``assumed``: the run does not say them."""
     origin = NO_TRANSFORMS if assumed else TRANSFORMS_NAME
-    return Assumption("units", f"1 of the data set is {transform.scale:.9g}", origin)
+    scale = transform.scale if assumed else transform.stated_scale
+    text = "those of the data set differ by direction" if scale is None else f"1 of the data set is {scale:.9g}"
+    return Assumption("units", text, origin)
 
 
 def places_transforms(run: RunConfig) -> bool:
