@@ -230,7 +230,9 @@ def _read_field(file: Path, settings: dict[str, Any], renderer: dict[str, Any]) 
 def dataset_scale(config: Path) -> float:
     """Normalised units per unit of transforms.json."""
     file = (config if config.is_dir() else config.parent) / "dataparser_transforms.json"
-    return float(read_json(file, "dataparser transform")["scale"]) if file.is_file() else 1.0
+    stated = read_json(file, "dataparser transform") if file.is_file() else {"scale": 1.0, "transform": np.eye(3, 4)}
+    size = (float((np.array(stated["transform"], np.float64)[:, :3] ** 2).sum()) / 3.0) ** 0.5
+    return float(stated["scale"]) * (size if abs(size - 1.0) > 1e-3 else 1.0)
 
 
 def read_poses(path: Path, given: dict[str, Any] | None, frame: int, settings: dict[str, Any], scale: float) -> Any:
