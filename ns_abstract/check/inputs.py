@@ -218,9 +218,8 @@ def _read_field(file: Path, settings: dict[str, Any], renderer: dict[str, Any]) 
         far = float((model.get("collider_params") or {}).get("far_plane", 6.0))
         near, samples = float(settings.get("near_plane") or 0.0), int(renderer["samples"])
         field = CheckedField(tensors, near, far, samples, background)
-    digest = hashlib.sha256()
-    for array in field.arrays:
-        digest.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
+    arrays = (repr(array.shape).encode() + np.ascontiguousarray(array).tobytes() for array in field.arrays)
+    digest = hashlib.sha256(b"".join(arrays))
     codes = ", ".join(f"Encoding(count={n}, least=0.0, most={m})" for n, m in field.counts)
     sampling = f"{near=!r}, {far=!r}, {samples=}, importance=0, {background=!r}"
     digest.update(f"({codes}, Sampling(kind='uniform', {sampling}))".encode())
@@ -273,8 +272,7 @@ def given_set(settings: dict[str, Any], moved: Path | None) -> dict[str, Any] | 
     if radii:
         units: dict[str, Any] = {name: settings.get(name) for name in ("units", "angle_units") if settings.get(name)}
         return units | {n: dict(zip(axes[n], v if len(v) == 3 else list(v) * 3, strict=True)) for n, v in radii.items()}
-    file = moved or settings.get("perturbation_filename")
-    if file is None:
+    if (file := moved or settings.get("perturbation_filename")) is None:
         return None
     root = read_json(Path(file), "perturbation file", "say with --perturbation-filename where it lies now")
     return root["perturbation"] if "camera_path" in root and "perturbation" in root else root
