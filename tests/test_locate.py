@@ -21,9 +21,8 @@ from ns_abstract.cli.locate import main
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import load_camera_path
 from ns_abstract.geometry.tiles import assemble
-from ns_abstract.verify.cell_boxes import divided, inner_cell, meeting, resolved, slabs, sub_box_counts
+from ns_abstract.verify.cell_boxes import between, divided, inner_cell, meeting, resolved, slabs, sub_box_counts
 from ns_abstract.verify.cells import Cell, CellGrid
-from ns_abstract.verify.location import between
 from ns_abstract.verify.location_cover import ShearedBoxes, cover
 from ns_abstract.verify.location_store import LocationStore
 from ns_abstract.verify.neighbouring_pixels import nearby

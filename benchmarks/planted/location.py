@@ -123,7 +123,7 @@ LOCATION = (
     ),
     Fault(
         "location: cuts are rounded inward",
-        _SEARCH, "between", "middle + half * float(most[k]) + room", "middle + half * float(most[k]) - 1e-9", _REACH,
+        _CELLS, "between", "middle + half * float(most[k]) + room", "middle + half * float(most[k]) - 1e-9", _REACH,
     ),
     Fault(
         "location: the last slab is left out",
