@@ -62,6 +62,7 @@ from ns_abstract.cli import check as check_command
 from ns_abstract.demo.writing import write_loop_demo
 from ns_abstract.geometry.camera_path import PinholeCamera as PathCamera
 from ns_abstract.geometry.camera_path import load_camera_path
+from ns_abstract.geometry.transform import DataparserTransform
 from ns_abstract.io.atomic import write_json
 from ns_abstract.methods.nerf.render import NerfRenderer
 from ns_abstract.methods.nerf.scene import NerfScene
@@ -282,6 +283,15 @@ def test_sets_in_units_of_another_data_set_are_refused(copy: Path) -> None:
     file.write_text(json.dumps(document))
     with pytest.raises(nsa.InputError, match="another set of poses"):
         check(copy, claims=1, perturbation=spec)
+
+
+def test_units_of_a_data_set_are_the_packages(tmp_path: Path) -> None:
+    """Bit for bit: sets are compared so."""
+    rng = np.random.default_rng(0)
+    for size in (0.3, 1.0, 1.0 + 1e-7, 7.1):
+        matrix = np.hstack([size * np.linalg.qr(rng.normal(size=(3, 3)))[0], rng.normal(size=(3, 1))])
+        write_json(tmp_path / "dataparser_transforms.json", {"transform": matrix.tolist(), "scale": 0.07})
+        assert inputs.dataset_scale(tmp_path / "config.yml") == DataparserTransform(matrix, 0.07).stated_scale
 
 
 @pytest.mark.slow

@@ -12,6 +12,7 @@ import shutil
 import struct
 import subprocess
 import sys
+import textwrap
 import warnings
 import zipfile
 from collections import OrderedDict
@@ -528,6 +529,19 @@ def _bomb(width: int) -> str:
     return "\n".join(lines) + "\n" + CONFIG.split("\n", 1)[1]
 
 
+def _called(section: str, arguments: str) -> Spoil:
+    """Make the object of a section by a call, its values as its state beside ``arguments``."""
+    start = CONFIG.index(f"{section}: !!python/object:") + len(section) + 2 if section else 0
+    line, rest = CONFIG[start:].split("\n", 1)
+    indent = len(re.match(" *", rest)[0])  # type: ignore[index]
+    end = re.search(rf"^ {{0,{indent - 1}}}[^ ]", rest, re.MULTILINE) if indent else None
+    inside, after = (rest, "") if end is None else (rest[: end.start()], rest[end.start() :])
+    values = textwrap.indent(inside, "  ")
+    made = line.replace("object:", "object/apply:")
+    prefix = " " * indent
+    return _config(f"{CONFIG[:start]}{made}\n{prefix}{arguments}\n{prefix}state:\n{values}{after}")
+
+
 BAD_CONFIGS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
     "missing": (lambda run: run.config.unlink(), ("config.yml", "no such")),
     "folder": (lambda run: _folder(run.config), ("config.yml",)),
@@ -586,6 +600,12 @@ BAD_CONFIGS: dict[str, tuple[Spoil, tuple[str, ...]]] = {
         ),
         ("relative_model_dir",),
     ),
+    "a model with arguments": (
+        _called("model", "kwds: {rasterize_mode: antialiased}"),
+        ("pipeline.model", "SplatfactoModelConfig", "state"),
+    ),
+    "a pipeline with arguments": (_called("pipeline", "args: [1]"), ("pipeline", "VanillaPipelineConfig", "state")),
+    "a run with arguments": (_called("", "kwds: {load_step: 1}"), ("top level", "mapping")),
     "model folder absent": (_edit("- nerfstudio_models", "- weights"), ("weights", "no such folder")),
 }
 
@@ -595,6 +615,19 @@ def test_bad_config(run: Run, case: str) -> None:
     spoil, mentions = BAD_CONFIGS[case]
     spoil(run)
     refused(run.folder if case == "missing" else run.config, *mentions)
+
+
+@pytest.mark.parametrize("section", ["", "pipeline", "model"])
+def test_an_object_of_its_state_alone_is_that_mapping(run: Run, section: str) -> None:
+    before = runs.read_config(run.config)
+    _called(section, "args: []")(run)
+    assert "state:" in run.config.read_text()
+    after = runs.read_config(run.config)
+    assert (after.model, after.method_name, after.model_folder) == (
+        before.model,
+        before.method_name,
+        before.model_folder,
+    )
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import InProcess, Inputs
+from interrupting import check_interrupted, interrupted_at
 from PIL import Image
 
 import ns_abstract as nsa
@@ -20,9 +21,8 @@ from ns_abstract.cli.locate import main
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import load_camera_path
 from ns_abstract.geometry.tiles import assemble
-from ns_abstract.verify.cell_boxes import divided, inner_cell, meeting, resolved, slabs, sub_box_counts
+from ns_abstract.verify.cell_boxes import between, divided, inner_cell, meeting, resolved, slabs, sub_box_counts
 from ns_abstract.verify.cells import Cell, CellGrid
-from ns_abstract.verify.location import between
 from ns_abstract.verify.location_cover import ShearedBoxes, cover
 from ns_abstract.verify.location_store import LocationStore
 from ns_abstract.verify.neighbouring_pixels import nearby
@@ -455,6 +455,29 @@ def test_command_says_none_and_resumes(blobs: Inputs, tmp_path: Path, in_process
     assert total == pytest.approx(0.06)
     code, _, err = in_process(main, options(blobs, tmp_path / "out", image, noise=0.1, resume=True))
     assert code == 2 and "another noise" in err
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        "ns_abstract.api.locating:LocationQuestion.opened",
+        "ns_abstract.api.locating:warm_up_sub_boxes",
+        "ns_abstract.cli.searching:compile_beside",
+        "ns_abstract.api.cell_search:examine_here",
+    ],
+)
+def test_a_locate_command_is_interrupted_before_its_first_cell(
+    place: str, blobs: Inputs, tmp_path: Path, in_process: InProcess, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    image = tmp_path / "photo.png"
+    Image.fromarray(np.random.default_rng(0).integers(0, 256, (32, 32, 3), np.uint8)).save(image)
+    with monkeypatch.context() as patched:
+        interrupted_at(place, patched)
+        check_interrupted(in_process, main, options(blobs, tmp_path / "out", image), tmp_path / "out")
+    report = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert report["answer"] != "possible" and (report["answer"] == "none") == (report["possible_volume"] == 0.0)
+    code, _, err = in_process(main, options(blobs, tmp_path / "out", image, time_budget=60, resume=True))
+    assert code == 0 and "none: no pose of the set made the photo" in err
 
 
 @pytest.mark.parametrize(

@@ -207,6 +207,19 @@ def test_a_camera_leaves_one_segment_for_another() -> None:
     assert following(sets, [report(k, None) for k in range(3)], {}) == {}
 
 
+@pytest.mark.parametrize("fixed", [0.0, 0.05])
+def test_an_offset_that_is_fixed_in_one_segment_is_taken_to_the_next(fixed: float) -> None:
+    cameras = [nsa.Camera(np.eye(4) + 0.3 * k * np.eye(4, k=3), fov=45.0, width=8, height=8) for k in range(3)]
+    offsets = [(fixed, fixed), (-0.1, 0.1)]
+    swept = [Perturbation(translation={"x": ends}, rotation={"yaw": ends}, sweep="segments") for ends in offsets]
+    sets = {k: PoseBox.around(cameras[k], swept[k], cameras[k + 1]) for k in range(2)}
+    left = {"index": 0, "parameters": [{"name": "segment"}], "hull": {"lower": [0.9], "upper": [1.0]}}
+    found = following(sets, [left, {"index": 1, "parameters": [], "hull": None}], {})
+    assert found[0].fixed["x"] == fixed
+    for name, low, high in zip(found[1].box.names, found[1].box.lower, found[1].box.upper, strict=True):
+        assert (low, high) == (0.0, 1.0) if name == "segment" else low < fixed < high and high - low < 1e-12
+
+
 def test_photos_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     def folder(*names: str) -> Path:
         place = tmp_path / str(len(list(tmp_path.iterdir())))

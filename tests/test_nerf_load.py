@@ -79,6 +79,7 @@ def test_damaged_checkpoints(run: Path, edit: Callable[[dict], None], fragments:
         ("enable_temporal_distortion: false", "enable_temporal_distortion: true", "scenes that move"),
         ("enable_collider: true", "enable_collider: false", "enable_collider"),
         ("far_plane: 4.0", "far_plane: -1.0", "far_plane"),
+        ("      far_plane: 4.0\n", "", "far_plane"),
         ("far_plane: 4.0", "far_plane: .nan", "far_plane"),
         ("background_color: white", "background_color: last_sample", "background_color"),
         ("background_color: white", "background_color: White", "random, white, black, red, green, blue"),

@@ -481,6 +481,13 @@ def test_viewer_finds_the_panel_and_works_in_the_background(
     expected = perturbation_of({"x": 0.01, "color": 0.05}, model.abstract._select.value)
     assert load_perturbation(tmp_path / "varied.json") == expected and expected.scene
     assert "ns-abstract-render" in model.abstract._figures.text
+    # whoever reaches the viewer replaces no file, and writes none of another kind
+    for name, wrong in (("varied.json", "exists"), (".profile", "does not end in .json")):
+        model.abstract._file.value = str(tmp_path / name) + "\0"
+        before = (tmp_path / "varied.json").stat().st_mtime_ns
+        model.abstract.send()
+        assert f"{wrong}: give another" in model.abstract._figures.text
+        assert (tmp_path / "varied.json").stat().st_mtime_ns == before and not (tmp_path / ".profile").exists()
     # what cannot be read is said, and nothing is claimed
     model.abstract._select.value = '{"box": '
     assert (draw()["abstract_upper"] == 1).all() and "not valid JSON" in model.abstract._figures.text

@@ -163,6 +163,23 @@ def test_limits_include_themselves() -> None:
     assert below <= 0.0 < there and above <= 0.0
 
 
+@pytest.mark.parametrize("distance", [1e-15, 1e6, 2.0**20, 1e15])
+def test_rays_that_hit_nothing_are_clear_at_any_distance(distance: float) -> None:
+    prop = parse_picture_property({"type": "clear", "measure": "expected", "distance": distance}, Path())
+    model, claim = prop.model(1, 1), prop.bind(None, lambda: np.zeros(0))  # type: ignore[arg-type]
+    values = model.outputs(np.full((1, 1, 1, model.channels), FARTHEST))
+    assert claim.margin(torch.from_numpy(values), torch.zeros(1, 0))[0] > 0.0
+
+
+@pytest.mark.parametrize("scale", [1e300, 1e-300])
+def test_distances_in_units_of_the_data_set_have_limits(scale: float) -> None:
+    root = {"type": "clear", "units": "dataset", "distance": 1e10}
+    assert parse_picture_property(root, Path(), 1e-3)
+    with pytest.raises(nsa.InputError) as caught:
+        parse_picture_property(root, Path(), scale)
+    assert caught.value.field == "distance" and caught.value.fix
+
+
 def test_depths_where_nothing_may_be_drawn() -> None:
     inf = np.inf
     #: accumulation from and to, depth from and to, and what these leave of a depth where nothing is as far as can be

@@ -257,6 +257,9 @@ OTHER_SPLATS = {
     "spherical Gaussians": ({"sg_axis_0": 0.0}, (), "vertex.sg_axis_0"),
     "spherical Gaussians in capitals": ({"SG_sharpness": 0.0}, (), "spherical Gaussians"),
     "time": ({"trbf_center": 0.0}, (), "move in time"),
+    "a fourth scale": ({"scale_3": 0.0}, (), "vertex.scale_3"),
+    "a fifth number of a rotation": ({"rot_4": 0.0}, (), "more columns rot_*"),
+    "a fourth channel": ({"f_dc_3": 0.0}, (), "vertex.f_dc_3"),
     "anchors": ({"f_anchor_feat_0": 0.0}, (), "neural Gaussians"),
     "points": (
         dict.fromkeys(("scale_0", "scale_1", "scale_2", "opacity", "rot_0", "rot_1", "rot_2", "rot_3")),

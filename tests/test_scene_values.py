@@ -29,6 +29,7 @@ from scene_files import (
 )
 
 import ns_abstract as nsa
+from ns_abstract.geometry.transform import DataparserTransform
 from ns_abstract.methods.load import load_any
 from ns_abstract.methods.overrides import Overrides
 from ns_abstract.methods.splat.load import load_scene
@@ -204,6 +205,20 @@ def test_units_of_a_data_set_need_the_run_to_state_them(tmp_path: Path, kind: st
     with pytest.raises(nsa.InputError, match=r"units: found dataset.*dataparser_transforms\.json"):
         nsa.certify(scene, nsa.PoseSet(camera), None, clear, time_budget=1.0)
     assert nsa.PoseSet(camera, translation={"x": 0.01}).of(scene).box.upper == (0.01,)
+
+
+def test_units_of_a_data_set_hold_the_scale_of_its_matrix() -> None:
+    """Nerfstudio multiplies the matrix by what was applied to the poses before, which may scale."""
+    rng, shift = np.random.default_rng(0), np.ones((3, 1))
+    for size in (1e-3, 0.5, 1.0, 40.0):
+        rotation = np.linalg.qr(rng.normal(size=(3, 3)))[0].astype(np.float32).astype(np.float64)
+        frame = DataparserTransform(np.hstack([size * rotation, shift]), 0.25)
+        a, b = (np.vstack([np.hstack([np.eye(3), p[:, None]]), [0, 0, 0, 1]]) for p in rng.normal(size=(2, 3)))
+        moved = np.linalg.norm(frame.pose(a)[:, 3] - frame.pose(b)[:, 3])
+        assert frame.stated_scale == pytest.approx(moved / np.linalg.norm(a[:3, 3] - b[:3, 3]), rel=1e-6)
+        assert size != 1.0 or frame.stated_scale == 0.25
+    for other in (np.diag([1.0, 1.0, 1.01]), 1e200 * np.eye(3), np.eye(3) + np.eye(3, k=1)):
+        assert DataparserTransform(np.hstack([other, shift]), 0.25).stated_scale is None
 
 
 @pytest.mark.parametrize("name", ["a.splat", "a.spz", "a.sog", "a.glb", "a.bin", "ckpt_6_rank0.pt"])

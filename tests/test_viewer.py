@@ -146,6 +146,34 @@ def test_pictures_grow_and_hold(background: Callable[..., Background]) -> None:
 
 
 @pytest.mark.slow
+def test_two_who_look_both_get_their_bounds(background: Callable[..., Background]) -> None:
+    """Each asks again whenever there is news, as browsers do; work on one must not end that on the other."""
+    one, views = background(), [view(x=0.01), view(x=0.02)]
+    found: dict[int, Snapshot | None] = {}
+
+    def look() -> bool:
+        for k, asked in enumerate(views):
+            found[k] = one.best(asked, 1.0)
+        return (
+            all(snapshot is not None and snapshot.final for snapshot in found.values()) and one.status.state == "idle"
+        )
+
+    until(look, "both pictures")
+    for k, asked in enumerate(views):
+        snapshot = found[k]
+        assert snapshot is not None and snapshot.size == (asked.camera.height, asked.camera.width)
+        assert violations(snapshot, asked) == 0
+
+
+@pytest.mark.slow
+def test_who_comes_back_to_a_view_need_not_wait_for_the_one_left(background: Callable[..., Background]) -> None:
+    one, wide = background(), ViewRequest(camera(), perturbation_of({"x": 0.05, "y": 0.05}))
+    one.best(view(), 1.0)
+    one.best(wide, 3600.0)
+    until(lambda: (found := one.best(view(), 1.0)) is not None and found.final, "the view that was left")
+
+
+@pytest.mark.slow
 def test_a_view_is_remembered(background: Callable[..., Background]) -> None:
     one = background()
     first = answer(one, view())
@@ -358,6 +386,14 @@ def test_selections_that_cannot_be_read(text: str) -> None:
         perturbation_of({"mean": 0.1}, text)
     # nobody looks at them where nothing varies
     assert perturbation_of({"x": 0.1, "mean": 0.0}, text) == perturbation_of({"x": 0.1})
+
+
+def test_selections_of_the_panel_read_no_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "some.json").write_text("[3, 1]")
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(InputError, match=r"select\.indices"):
+        perturbation_of({"mean": 0.1}, '{"indices": "some.json"}')
+    assert perturbation_of({"mean": 0.1}, '{"indices": [3, 1]}').scene[0].select.indices == (1, 3)
 
 
 @pytest.mark.slow

@@ -53,6 +53,11 @@ LOCATION = (
         "test_locate_sequence.py::test_a_camera_leaves_one_segment_for_another",
     ),
     Fault(
+        "location: offsets that are fixed in a segment are taken for 0",
+        "api/sequence.py", "following", "(value, value)", "(0.0, 0.0)",
+        "test_locate_sequence.py::test_an_offset_that_is_fixed_in_one_segment_is_taken_to_the_next[0.05]",
+    ),
+    Fault(
         "location: photos in the order of their names alone",
         "io/photos.py", "sequence_photos", "_numbered(after) < _numbered(before)", "False",
         "test_locate_sequence.py::test_photos_come_in_the_order_of_their_numbers",
@@ -118,7 +123,7 @@ LOCATION = (
     ),
     Fault(
         "location: cuts are rounded inward",
-        _SEARCH, "between", "middle + half * float(most[k]) + room", "middle + half * float(most[k]) - 1e-9", _REACH,
+        _CELLS, "between", "middle + half * float(most[k]) + room", "middle + half * float(most[k]) - 1e-9", _REACH,
     ),
     Fault(
         "location: the last slab is left out",

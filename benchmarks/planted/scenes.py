@@ -14,6 +14,16 @@ SCENES = (
         "test_perturbation.py::test_dataset_units_that_no_scene_states_are_refused",
     ),
     Fault(
+        "scenes: units leave out the scale of the data set's matrix",
+        "geometry/transform.py", "DataparserTransform.stated_scale", "self.scale * length", "self.scale",
+        _FILES.replace("files", "values") + "test_units_of_a_data_set_hold_the_scale_of_its_matrix",
+    ),
+    Fault(
+        "scenes: arguments of an object of config.yml are left out",
+        "methods/runs.py", "as_mapping", "not any(part for key, part in inner.items() if key != \"state\")", "True",
+        "test_load.py::test_bad_config[a model with arguments]",
+    ),
+    Fault(
         "scenes: a run without its transform states units",
         "methods/runs.py", "read_dataparser_transform", "DataparserTransform(stated=False)", "DataparserTransform()",
         _FILES.replace("files", "values") + "test_units_of_a_data_set_need_the_run_to_state_them[run]",

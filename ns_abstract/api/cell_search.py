@@ -150,6 +150,9 @@ class CellQuestion(ABC, Generic[P]):
         """Seconds of so many for search and report together that are kept for `after`."""
         return 0.0
 
+    def opened(self, search: CellSearch[P]) -> None:
+        """Tell the store what its last report needs, before a signal can end the search."""
+
     def prepare(self, search: CellSearch[P], request: Request) -> None:
         """What comes before the first cell is examined; a signal ends it at once."""
         search.report("running")
@@ -275,6 +278,7 @@ class CellSearch(Generic[P]):
             self.last.first_command = first_command(self.folder) if request.resume else None
             store = self.open(resume=request.resume)
             stack.callback(store.close)
+            question.opened(self)
             stack.enter_context(store.errors_as_input())
             stack.enter_context(stop.last_words(self.last.interrupted))
             stack.push(self._ended)

@@ -156,7 +156,7 @@ class Job:
                 f"{self.method.content} at this size needs {needed / 2**30:.2g} GiB, "
                 f"{self.memory / 2**30:.2g} GiB may be used",
                 field="--memory-limit",
-                fix="raise it, or raise --downscale-factor",
+                fix="raise it, or ask for smaller pictures",
             )
 
     def leaf_bytes(self, processes: int) -> int:

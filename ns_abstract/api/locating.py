@@ -89,7 +89,7 @@ class LocationQuestion(CellQuestion[LocateProgress]):
     def stored_set(self, number: int) -> Any:
         return self.job.search(number).frame.box
 
-    def prepare(self, search: CellSearch[LocateProgress], request: Request) -> None:
+    def opened(self, search: CellSearch[LocateProgress]) -> None:
         store = cast(LocationStore, search.store)
         store.allowed = self.job.photo.allowed
         uncovered = dict.fromkeys(tally.frame for tally in store.tallies())
@@ -104,7 +104,9 @@ class LocationQuestion(CellQuestion[LocateProgress]):
             return self.job.cover(frame, store.left(frame), end)
 
         store.cover = cover
-        request.on_open(store)
+
+    def prepare(self, search: CellSearch[LocateProgress], request: Request) -> None:
+        request.on_open(search.store)
         first = next(iter(self.sets))
         self.job.job.warm_up(first)
         if (frame := self.job.search(first).sub_box_frame) is not None:

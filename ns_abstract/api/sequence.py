@@ -95,9 +95,11 @@ def following(
         if frame["hull"] is not None:
             names = [entry["name"] for entry in frame["parameters"]]
             ends = zip(frame["hull"]["lower"], frame["hull"]["upper"], strict=True)
-            hulls[frame["index"]] = dict(zip(names, ends, strict=True))
+            # what is fixed in one set may vary in the next
+            still = {name: (value, value) for name, value in sets[frame["index"]].fixed.items()}
+            hulls[frame["index"]] = still | dict(zip(names, ends, strict=True))
     if hulls and _along_path(sets):
-        apart = [[hull.get(name, (0.0, 0.0)) for hull in hulls.values()] for name in (*TRANSLATIONS, *ROTATIONS)]
+        apart = [[hull[name] for hull in hulls.values()] for name in (*TRANSLATIONS, *ROTATIONS)]
         ends = [(min(low for low, _ in ranges), max(high for _, high in ranges)) for ranges in apart]
         joined: dict[str, Range] = dict(zip((*TRANSLATIONS, *ROTATIONS), ends, strict=True))
         hulls = dict.fromkeys(sets, joined)

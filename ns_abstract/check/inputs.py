@@ -218,9 +218,8 @@ def _read_field(file: Path, settings: dict[str, Any], renderer: dict[str, Any]) 
         far = float((model.get("collider_params") or {}).get("far_plane", 6.0))
         near, samples = float(settings.get("near_plane") or 0.0), int(renderer["samples"])
         field = CheckedField(tensors, near, far, samples, background)
-    digest = hashlib.sha256()
-    for array in field.arrays:
-        digest.update(repr(array.shape).encode() + np.ascontiguousarray(array).tobytes())
+    arrays = (repr(array.shape).encode() + np.ascontiguousarray(array).tobytes() for array in field.arrays)
+    digest = hashlib.sha256(b"".join(arrays))
     codes = ", ".join(f"Encoding(count={n}, least=0.0, most={m})" for n, m in field.counts)
     sampling = f"{near=!r}, {far=!r}, {samples=}, importance=0, {background=!r}"
     digest.update(f"({codes}, Sampling(kind='uniform', {sampling}))".encode())
@@ -230,7 +229,9 @@ def _read_field(file: Path, settings: dict[str, Any], renderer: dict[str, Any]) 
 def dataset_scale(config: Path) -> float:
     """Normalised units per unit of transforms.json."""
     file = (config if config.is_dir() else config.parent) / "dataparser_transforms.json"
-    return float(read_json(file, "dataparser transform")["scale"]) if file.is_file() else 1.0
+    stated = read_json(file, "dataparser transform") if file.is_file() else {"scale": 1.0, "transform": np.eye(3, 4)}
+    size = (float((np.array(stated["transform"], np.float64)[:, :3] ** 2).sum()) / 3.0) ** 0.5
+    return float(stated["scale"]) * (size if abs(size - 1.0) > 1e-3 else 1.0)
 
 
 def read_poses(path: Path, given: dict[str, Any] | None, frame: int, settings: dict[str, Any], scale: float) -> Any:
@@ -271,8 +272,7 @@ def given_set(settings: dict[str, Any], moved: Path | None) -> dict[str, Any] | 
     if radii:
         units: dict[str, Any] = {name: settings.get(name) for name in ("units", "angle_units") if settings.get(name)}
         return units | {n: dict(zip(axes[n], v if len(v) == 3 else list(v) * 3, strict=True)) for n, v in radii.items()}
-    file = moved or settings.get("perturbation_filename")
-    if file is None:
+    if (file := moved or settings.get("perturbation_filename")) is None:
         return None
     root = read_json(Path(file), "perturbation file", "say with --perturbation-filename where it lies now")
     return root["perturbation"] if "camera_path" in root and "perturbation" in root else root

@@ -7,6 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from ns_abstract.io.jsonio import InputTuning
+
 
 @dataclass(frozen=True)
 class DataparserTransform:
@@ -23,8 +25,19 @@ class DataparserTransform:
 
     @property
     def stated_scale(self) -> float | None:
-        """Normalised units per unit of the data set; None: the scene does not say."""
-        return self.scale if self.stated else None
+        """Normalised units per unit of the data set; None: the scene does not say, or they differ by direction.
+
+        What was applied to the data set's poses before may have scaled them: that scale is one of the matrix.
+        """
+        rotation = self.matrix[:, :3]
+        with np.errstate(over="ignore", invalid="ignore"):
+            square = float((rotation**2).sum()) / 3.0
+            apart = np.abs(rotation.T @ rotation - square * np.eye(3)).max()
+        if not (self.stated and apart <= InputTuning.rotation * square < np.inf):
+            return None
+        length = square**0.5
+        # a rotation of float32 is one
+        return self.scale if abs(length - 1.0) <= InputTuning.rotation else self.scale * length
 
     def pose(self, camera_to_world: NDArray[np.float64]) -> NDArray[np.float64]:
         """A pose [4, 4] of the data set in the run's frame, [3, 4]."""

@@ -169,13 +169,19 @@ def read_mapping(file: Path, what: str) -> dict[str, Any]:
 
 
 def as_mapping(value: Any) -> dict[str, Any] | None:
-    """The mapping that a YAML value holds, with a Python object's tag removed; None if it holds none."""
-    if isinstance(value, Tagged):
-        inner = value.value
-        if isinstance(inner, dict) and isinstance(inner.get("state"), dict) and "object/" in value.tag:
-            return inner["state"]
+    """The mapping that a YAML value holds, with a Python object's tag removed; None if it holds none.
+
+    An object that is made by a call (``object/apply``, ``object/new``) is its state alone: with other arguments it may
+    hold what nothing here reads.
+    """
+    if not isinstance(value, Tagged):
+        return value if isinstance(value, dict) else None
+    inner = value.value
+    if not isinstance(inner, dict) or "object/" not in value.tag:
         return inner if isinstance(inner, dict) else None
-    return value if isinstance(value, dict) else None
+    state = inner.get("state")
+    alone = isinstance(state, dict) and not any(part for key, part in inner.items() if key != "state")
+    return state if alone else None
 
 
 def find_checkpoint(run: RunConfig, step: int | None = None) -> Path:
@@ -251,7 +257,9 @@ def idle_assumptions(state: Collection[str], idle: Mapping[str, str]) -> tuple[A
 def units_assumption(transform: DataparserTransform, assumed: bool) -> Assumption:
     """The units of the data set; ``assumed``: the run does not say them."""
     origin = NO_TRANSFORMS if assumed else TRANSFORMS_NAME
-    return Assumption("units", f"1 of the data set is {transform.scale:.9g}", origin)
+    scale = transform.scale if assumed else transform.stated_scale
+    text = "those of the data set differ by direction" if scale is None else f"1 of the data set is {scale:.9g}"
+    return Assumption("units", text, origin)
 
 
 def places_transforms(run: RunConfig) -> bool:
@@ -346,7 +354,11 @@ def _is_list(value: Any, length: int) -> bool:
 def _section(parent: dict[str, Any], key: str, field: str, file: Path) -> dict[str, Any]:
     section = as_mapping(parent.get(key))
     if section is None:
-        problem = "missing" if key not in parent else f"found {show(parent[key])}, not a mapping"
+        value = parent.get(key)
+        problem = "missing" if key not in parent else f"found {show(value)}, not a mapping"
+        if isinstance(value, Tagged):
+            name = show(value.tag.rpartition(".")[2])
+            problem = f"found an object {name} with other values than those of a mapping or a state"
         raise InputError(problem, file=file, field=field, fix="give the config.yml of ns-train")
     return section
 

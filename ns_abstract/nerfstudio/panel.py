@@ -258,10 +258,15 @@ class AbstractPanel(torch.nn.Module):
         if view is None:
             return
         folder = self.control.folder if self.control.present else None
-        name = str(self._file.value).strip()
+        name = str(self._file.value).replace("\0", "").strip()
         file = Path(name) if name else _free_name(_outside(folder))
         if folder is not None and _within(file, folder):
             self._figures.show(f"{self._figures.text}\n\nThe run's folder stays as it is: give another **file**.")
+            return
+        # whoever reaches the viewer may write here
+        if file.suffix.lower() != ".json" or os.path.lexists(file):
+            wrong = "exists" if os.path.lexists(file) else "does not end in .json"
+            self._figures.show(f"{self._figures.text}\n\n**{file}** {wrong}: give another **file**.")
             return
         try:
             file.parent.mkdir(parents=True, exist_ok=True)

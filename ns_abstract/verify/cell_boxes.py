@@ -7,8 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from ns_abstract.arithmetic.rounding import SUB_BOX_LINE_ROUNDING, SUB_BOX_LINES
-from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.arithmetic.rounding import CUT_VALUE_ROUNDING, HALF_UP, SUB_BOX_LINE_ROUNDING, SUB_BOX_LINES
+from ns_abstract.geometry.box import Float64Array, ParameterBox
 from ns_abstract.verify.cells import Cell, CellGrid
 
 
@@ -101,3 +101,18 @@ def divided(cell: Cell, left: np.ndarray, filled: float) -> Iterator[tuple[Cell,
     before, behind = np.split(part, [half], axis=axis)
     yield from divided(replace(inner, past=(*inner.past[:axis], line, *inner.past[axis + 1 :])), before, filled)
     yield from divided(replace(inner, first=(*inner.first[:axis], line, *inner.first[axis + 1 :])), behind, filled)
+
+
+def between(box: ParameterBox, least: Float64Array, most: Float64Array) -> ParameterBox:
+    """The part of a box whose scaled parameters may lie in [least, most], rounded outward (U3)."""
+    for k in range(box.dimensions):
+        low, high = box.lower[k], box.upper[k]
+        middle = 0.5 * (low + high)
+        half = max(high - middle, middle - low) * HALF_UP
+        room = CUT_VALUE_ROUNDING * (abs(low) + abs(high))
+        first = low if least[k] <= -1.0 else max(low, middle + half * float(least[k]) - room)
+        last = high if most[k] >= 1.0 else min(high, middle + half * float(most[k]) + room)
+        # a cut at an end leaves that end
+        first, last = min(first, high), max(last, low)
+        box = box.replace(k, first, last)
+    return box

@@ -15,16 +15,24 @@ from functools import cached_property
 
 import numpy as np
 
-from ns_abstract.arithmetic.rounding import CUT_VALUE_ROUNDING, HALF_UP
 from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import Float64Array, ParameterBox, shared_out
 from ns_abstract.geometry.motion_cells import MotionCells
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.refine.protocol import Bounds, Frame, LinearSets, SubBoxFrame
-from ns_abstract.verify.cell_boxes import aligned, divided, inner_cell, meeting, resolved, slabs, sub_box_counts
+from ns_abstract.verify.cell_boxes import (
+    aligned,
+    between,
+    divided,
+    inner_cell,
+    meeting,
+    resolved,
+    slabs,
+    sub_box_counts,
+)
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.motion_boxes import MotionBoxes
-from ns_abstract.verify.photo import Photo
+from ns_abstract.verify.photo import Photo, TiledPhoto
 from ns_abstract.verify.pixel_rounds import BoundedPixels, PixelRounds, RoundTuning
 from ns_abstract.verify.search_results import BlockResult, FinishedCell
 from ns_abstract.verify.telling_pixels import DIFFERENCES, PixelOrder, TellingPixels, typical_cell
@@ -109,18 +117,32 @@ class LocationSearch:
     ) -> None:
         self.frame, self.plain, self.photo, self.contract = frame, plain, photo, contract
         self.tuning = tuning or LocationTuning()
-        self.tiled = photo.tiled(frame.side)
         box = frame.box
         self.grid = CellGrid(box, (1 << UNITS,) * box.dimensions, (1,) * box.dimensions)
-        width = np.array(box.upper) - np.array(box.lower)
-        motion = np.nan_to_num(np.asarray(frame.motion(box), np.float64), nan=0.0, posinf=0.0)
+
+    @cached_property
+    def tiled(self) -> TiledPhoto:
+        """The photo in the tiles of pictures."""
+        return self.photo.tiled(self.frame.side)
+
+    @cached_property
+    def _pace(self) -> Float64Array:
+        """[d] pixels by unit of a parameter that typical scene elements move by."""
+        box = self.frame.box
+        motion = np.nan_to_num(np.asarray(self.frame.motion(box), np.float64), nan=0.0, posinf=0.0)
         # what moves nothing is cut for the bounds' sake now and then
         motion = np.maximum(motion, 1e-3 * max(1.0, float(motion.max(initial=0.0))))
-        self._pace = motion / width
-        self._width_pace = self._pace / self.along(box)
-        if self.by_motion:
-            assert isinstance(frame, SubBoxFrame)
-            self._width_pace = (frame.parallax(box) + self.tuning.motion_share * motion) / width
+        return motion / (np.array(box.upper) - np.array(box.lower))
+
+    @cached_property
+    def _width_pace(self) -> Float64Array:
+        """[d] the same of what widens bounds; see `widths`. It may take seconds for large pictures."""
+        box = self.frame.box
+        if not self.by_motion:
+            return self._pace / self.along(box)
+        assert isinstance(self.frame, SubBoxFrame)
+        width = np.array(box.upper) - np.array(box.lower)
+        return (self.frame.parallax(box) + self.tuning.motion_share * self._pace * width) / width
 
     @property
     def sub_box_frame(self) -> SubBoxFrame | None:
@@ -478,18 +500,3 @@ class _Examination:
             return self._finish()
         self.children = search.grid.cut(self.cell, parts)
         return None
-
-
-def between(box: ParameterBox, least: Float64Array, most: Float64Array) -> ParameterBox:
-    """The part of a box whose scaled parameters may lie in [least, most], rounded outward (U3)."""
-    for k in range(box.dimensions):
-        low, high = box.lower[k], box.upper[k]
-        middle = 0.5 * (low + high)
-        half = max(high - middle, middle - low) * HALF_UP
-        room = CUT_VALUE_ROUNDING * (abs(low) + abs(high))
-        first = low if least[k] <= -1.0 else max(low, middle + half * float(least[k]) - room)
-        last = high if most[k] >= 1.0 else min(high, middle + half * float(most[k]) + room)
-        # a cut at an end leaves that end
-        first, last = min(first, high), max(last, low)
-        box = box.replace(k, first, last)
-    return box

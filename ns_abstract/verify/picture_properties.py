@@ -45,8 +45,9 @@ from ns_abstract.verify.property_reading import parse_partitions
 from ns_abstract.verify.settled_pixels import LimitedMeasure
 
 STATISTICS = ("mean", "least", "greatest")
-#: The depth of a pixel on which nothing is drawn, and the greatest that is told apart, normalised units.
-FARTHEST = 2.0**20
+#: The depth of a pixel on which nothing is drawn, and the greatest that is told apart, normalised units: beyond twice
+#: any distance (`MODERATE`).
+FARTHEST = 2.0**52
 #: What reports say of distances.
 _DISTANCES = "distances: depth of the centres of Gaussians along the optical axis; of a NeRF's samples along their rays"
 #: Preferences: most parts of a cell, and most numbers (parts times pixels) at once.
@@ -390,6 +391,9 @@ def _clear(source: _PropertyObject) -> Leaf:
     scale = unit_length(units, source.dataset_scale, lambda name, problem, fix: fail(f"{prefix}{name}", problem, fix))
     unit = "units of the data set" if scale != 1.0 else "normalised units"
     distance, region = distance_given * scale, source.region()
+    if not MODERATE[0] <= distance <= MODERATE[1]:
+        limits = f"{MODERATE[0]:g} to {MODERATE[1]:g}"
+        raise fail(f"{prefix}distance", f"is {distance:g} normalised units", f"write one of {limits} normalised units")
     if source.choice("measure", ("weight", "expected")) == "expected":
         if "weight" in root:
             raise fail(f"{prefix}weight", "given with the expected depth", "remove it, or measure")

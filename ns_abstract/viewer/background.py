@@ -28,6 +28,11 @@ from ns_abstract.viewer.views import Snapshot, Source, ViewRequest
 _CACHE_BYTES = 256 << 20
 #: A worker that ends sooner than this after its start is not replaced at once.
 _SHORT_LIFE = 5.0
+#: Views that are known to have been asked for before.
+_REMEMBERED = 64
+#: Of several browsers: seconds after which a view that nobody asked for again is nobody's, and patiences of the scene
+#: after which another one's turn comes.
+_HOLD, _TURN = 1.5, 25.0
 
 _Key = tuple[Any, ...]
 
@@ -118,6 +123,9 @@ class Background:
         self._asked = 0.0
         self._answered = True
         self._failures: dict[_Key, str] = {}
+        #: when views were asked for last, the newest last, and since when some of them wait
+        self._seen: OrderedDict[_Key, float] = OrderedDict()
+        self._waiting: dict[_Key, float] = {}
         self._closed = False
 
     # --- what is asked -------------------------------------------------------------------------
@@ -132,6 +140,8 @@ class Background:
             self._source = token, source
             self._wanted, self._answered = None, True
             self._failures.clear()
+            self._seen.clear()
+            self._waiting.clear()
             for worker in self._workers:
                 worker.post(("scene", token, source))
             self._staff()
@@ -148,7 +158,13 @@ class Background:
             key = (self._source[0], *view.key)
             snapshot = self._known(key, view)
             done = snapshot is not None and snapshot.final and snapshot.size >= (view.camera.height, view.camera.width)
-            if not (done or key in self._failures or self._is_wanted(key, view)):
+            before = key in self._seen
+            self._seen[key] = time.monotonic()
+            self._seen.move_to_end(key)
+            while len(self._seen) > _REMEMBERED:
+                self._waiting.pop(self._seen.popitem(last=False)[0], None)
+            known = done or key in self._failures or self._is_wanted(key, view)
+            if not (known or (before and self._waits(key))):
                 self._ask(key, view, seconds, 0 if snapshot is None or not snapshot.final else max(snapshot.size))
             return snapshot
 
@@ -191,6 +207,26 @@ class Background:
             return None
         self._cache.move_to_end(key)
         return snapshot
+
+    def _waits(self, key: _Key) -> bool:
+        """Whether a view that was seen before waits for the one that is worked on, as both are looked at.
+
+        A moving camera shows views that were not seen before. Two browsers ask for theirs in turn, and work on neither
+        would come to an end if each ended the other's.
+        """
+        now = time.monotonic()
+        since = self._waiting.pop(key, now)
+        if self._answered or self._wanted is None or self._source is None or key == self._wanted[1]:
+            return False
+        if self._seen.get(self._wanted[1], 0.0) >= since:
+            since = now
+        if now - since >= _HOLD or now - self._asked >= _TURN * self._source[1].patience:
+            return False
+        self._waiting[key] = since
+        timer = threading.Timer(_HOLD, self._tell)
+        timer.daemon = True
+        timer.start()
+        return True
 
     def _is_wanted(self, key: _Key, view: ViewRequest) -> bool:
         """Whether the newest request answers this one as well."""
@@ -245,6 +281,10 @@ class Background:
                 self._lost(worker)
             else:
                 self._heard(worker, *message)
+        self._tell()
+
+    def _tell(self) -> None:
+        """Tell who looks that there may be something new."""
         try:
             self.changed()
         except Exception as error:

@@ -13,6 +13,7 @@ import numpy as np
 from ns_abstract.arithmetic.rounding import arithmetic as arithmetic_named
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.poses import PoseBox
+from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import parse_json
 from ns_abstract.methods.nerf.frame import NerfFrame
 from ns_abstract.methods.nerf.method import NerfMethod
@@ -55,7 +56,11 @@ def perturbation_of(radii: Mapping[str, float], select: str = "{}") -> Perturbat
 
     value: dict[str, Any] = {"translation": given(TRANSLATIONS), "rotation": given(ROTATIONS)}
     if ranges := given(VARIATIONS):
-        value["scene"] = [{"select": parse_json(select.strip() or "{}", "select"), **ranges}]
+        chosen = parse_json(select.strip() or "{}", "select")
+        if isinstance(chosen, dict) and isinstance(chosen.get("indices"), str):
+            # whoever reaches the viewer would read files here
+            raise InputError("names a file", field="select.indices", fix="write the numbers of the Gaussians")
+        value["scene"] = [{"select": chosen, **ranges}]
     return parse_perturbation(value, field_prefix="")
 
 

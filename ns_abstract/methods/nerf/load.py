@@ -101,7 +101,7 @@ def _encodings(run: runs.RunConfig) -> tuple[tuple[float, float], tuple[int | No
 
 def _far_plane(run: runs.RunConfig) -> float:
     params = runs.as_mapping(run.model.get("collider_params", _PLANES))
-    value = None if params is None else params.get("far_plane", _PLANES["far_plane"])
+    value = None if params is None else params.get("far_plane")
     if not is_number(value) or not 0.0 < value < 1e6:  # pyright: ignore[reportOperatorIssue]
         raise run.refused("collider_params.far_plane", value, "a distance above 0")
     return float(value)  # pyright: ignore[reportArgumentType]

@@ -25,6 +25,7 @@ GROUPS = {
     "scales": ("scale_0", "scale_1", "scale_2"),
     "quats": ("rot_0", "rot_1", "rot_2", "rot_3"),
 }
+_GROUPED = {name for group in GROUPS.values() for name in group}
 #: The column of mip-splatting.
 FILTER = "filter_3D"
 
@@ -152,7 +153,7 @@ def standard_header(declared: PlyDeclaration, path: Path) -> PlyHeader:
         raise InputError("no Gaussians", file=path, field="element vertex", fix=FIX)
     bands = _bands(vertex, path)
     check_memory(2 * 4 * vertex.count * (11 + 3 * bands), path, f"the scene of {vertex.count} Gaussians")
-    used = {*(name for group in GROUPS.values() for name in group), FILTER}
+    used = {*_GROUPED, FILTER}
     unused = [name for name in vertex.types if name not in used and not name.startswith("f_rest_")]
     others = [f"element {element.name}" for element in declared.elements if element is not vertex]
     return PlyHeader(vertex, bands, declared.mode, declared.comment, (*unused, *others))
@@ -216,6 +217,14 @@ def _refuse_other_splats(vertex: PlyElement, path: Path) -> None:
                     field=f"vertex.{column}",
                     fix=fix.replace("{name}", path.name),
                 )
+        further = re.fullmatch(r"(f_dc|scale|rot)_\d+", column)
+        if further is not None and column not in _GROUPED:
+            raise InputError(
+                f"more columns {further[1]}_* than a Gaussian in space has: another rasteriser draws by them",
+                file=path,
+                field=f"vertex.{column}",
+                fix=RENDER_ELSEWHERE,
+            )
     scales = [name for name in GROUPS["scales"] if name in vertex.types]
     if scales == ["scale_0", "scale_1"]:
         raise InputError(TWO_D, file=path, field="vertex.scale_2", fix=RENDER_ELSEWHERE)
