@@ -110,7 +110,7 @@ class Case:
         projected, scale = channel_differences(bounds.project(self.camera, forms))
         found = []
         for parts in self._orders(bounds, forms, projected, counts):
-            ends = difference_ends(parts, np.ones(parts.shape[:3], bool), scale)
+            ends = difference_ends(parts.reshape(-1, *parts.shape[3:]), scale)
             found.append(self._laid_out(np.concatenate(ends, axis=1).reshape(parts.shape)))
         return found
 
@@ -118,10 +118,14 @@ class Case:
         """Ends [T, side, side, 6, parts] by pairs of uncertain order, and by ranges of depths."""
         tiles = np.arange(math.prod(tile_grid(self.camera, bounds.side)))
         pixels = np.ones((tiles.size, bounds.side, bounds.side), bool)
-        ordered = bounds.sub_boxes(self.camera, forms, projected, tiles, pixels, counts)
-        by_ranges, goals = np.full_like(ordered, np.nan), np.full((pixels.sum(), 6), np.inf)
-        bounds.by_depth_ranges(self.camera, forms, projected, tiles, pixels, counts, goals, by_ranges)
-        return [ordered, by_ranges]
+        found = []
+        for crowded, goal in ((False, np.nan), (True, np.inf)):
+            goals = np.full((pixels.size, 6), goal)
+            ends = bounds.sub_boxes(
+                self.camera, forms, projected, tiles, pixels, counts, goals, np.full(pixels.size, crowded)
+            )
+            found.append(ends.reshape(*pixels.shape, 6, -1))
+        return found
 
     def _laid_out(self, ends: np.ndarray) -> np.ndarray:
         """[H, W, 2, 3, parts] from tiles [T, side, side, 6, parts]."""

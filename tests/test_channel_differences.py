@@ -14,6 +14,7 @@ from test_depth_ranges import BACKGROUNDS, COUNTS, stack
 from ns_abstract.arithmetic.rounding import FLOAT32
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.methods.splat import bounds as splat_bounds
+from ns_abstract.methods.splat import frame as splat_frame
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.stage_data import cell_parts
@@ -111,16 +112,15 @@ def test_colours_without_a_finite_bound_bound_nothing():
     projected.colors[projected.alive[0]] = np.nan
     again, scale = channel_differences(projected)
     assert scale == 0.0 and again is projected
-    pixels = np.ones((1, 2, 2), bool)
-    low, high = difference_ends(np.full((1, 2, 2, 6, 8), 0.5), pixels, scale)
+    low, high = difference_ends(np.full((4, 6, 8), 0.5), scale)
     assert (low == -np.inf).all() and (high == np.inf).all()
 
 
 def test_what_is_not_known_stays_unknown():
     """[0, 1] says nothing of a difference, nor do ends that cross or are no numbers."""
-    pixels, parts = np.ones((1, 2, 2), bool), np.zeros((1, 2, 2, 6, 3))
-    parts[..., :3, :], parts[..., 3:, :] = [0.0, 0.6, np.nan], [1.0, 0.4, 1.0]
-    low, high = difference_ends(parts, pixels, 0.5)
+    parts = np.zeros((4, 6, 3))
+    parts[:, :3], parts[:, 3:] = [0.0, 0.6, np.nan], [1.0, 0.4, 1.0]
+    low, high = difference_ends(parts, 0.5)
     assert (low == -np.inf).all() and (high == np.inf).all()
 
 
@@ -131,8 +131,11 @@ def test_a_frame_bounds_differences_of_blocks_of_many_orders(monkeypatch):
     frame = SplatFrame(case.splats, GSPLAT_1_4_0, FLOAT32, case.poses)
     pixels = np.ones((frame.tile_count, frame.side, frame.side), bool)
     known = {}
-    for goals in (None, np.full((pixels.sum(), 6), np.inf)):
-        low, high = frame.sub_box_ends(frame.box, COUNTS, np.arange(frame.tile_count), pixels, goals, True)
+    for goal in (np.nan, np.inf):
+        low, high = frame.sub_box_ends(
+            frame.box, COUNTS, np.arange(frame.tile_count), pixels, np.full((pixels.size, 6), goal),
+            np.ones(pixels.size, bool),
+        )  # fmt: skip
         shape = (*pixels.shape, 3 * COUNTS.prod())
         image = np.stack([assemble(end.reshape(shape), case.camera) for end in (low, high)], axis=2)
         image = image.reshape(*image.shape[:3], 3, -1)
@@ -140,8 +143,25 @@ def test_a_frame_bounds_differences_of_blocks_of_many_orders(monkeypatch):
         for part in range(0, parts.middles.shape[1], 5):
             picture = case.image(case.poses.box.at(parts.middles[:, part])).astype(np.float64)
             assert_differences(picture, image[..., part : part + 1])
-        known[goals is None] = np.isfinite(image).mean()
-    assert known[True] < 0.5 < known[False]
+        known[goal] = np.isfinite(image).mean()
+    assert known[np.nan] < 0.5 < known[np.inf]
+
+
+def test_pixels_of_both_kinds_are_bounded_together(monkeypatch):
+    """Each pixel has the ends that it has where all pixels are of its kind."""
+    # what pairs of uncertain order tell of a pixel depends on the others of its block
+    monkeypatch.setattr(splat_frame, "_TUNING", splat_frame.FrameTuning(crowded=-1))
+    case = stack(1, BACKGROUNDS[2])
+    frame = SplatFrame(case.splats, GSPLAT_1_4_0, FLOAT32, case.poses)
+    tiles = np.arange(frame.tile_count)
+    pixels = np.random.default_rng(0).uniform(size=(tiles.size, frame.side, frame.side)) < 0.3
+    count = int(pixels.sum())
+    goals, mixed = np.full((count, 6), np.inf), np.arange(count) % 3 == 0
+    some, channels, differences = (
+        np.stack(frame.sub_box_ends(frame.box, COUNTS, tiles, pixels, goals, kinds))
+        for kinds in (mixed, np.zeros(count, bool), np.ones(count, bool))
+    )
+    assert np.array_equal(some, np.where(mixed[:, None, None], differences, channels))
 
 
 @pytest.mark.parametrize("brightness", [Brightness(), Brightness((0.5, 2.0), (-0.1, 0.2))])
@@ -173,6 +193,8 @@ def test_differences_exclude_what_channels_leave():
     shape = (16, 3, 2)
     assert not photo.excluding(np.zeros(shape), np.ones(shape), photo.counted).any()
     low = np.broadcast_to(np.array([[0.1, -np.inf], [-np.inf, -np.inf], [-np.inf, -np.inf]]), shape)
-    assert photo.excluding(low, np.full(shape, np.inf), photo.counted, True).tolist() == [[True, False]] * 16
+    assert (
+        photo.excluding(low, np.full(shape, np.inf), photo.counted, np.ones(16, bool)).tolist() == [[True, False]] * 16
+    )
     # as a channel's lower bound it would exclude nothing
     assert not photo.excluding(low, np.full(shape, np.inf), photo.counted).any()

@@ -42,9 +42,8 @@ def ends_of(case: Case, goal: float = math.inf) -> np.ndarray:
     bounds, forms = SubBoxBounds(case.splats, GSPLAT_1_4_0, FLOAT32), case.poses.enclosure(case.poses.box, 1)
     tiles = np.arange(math.prod(tile_grid(case.camera, bounds.side)))
     pixels = np.ones((tiles.size, bounds.side, bounds.side), bool)
-    out = np.full((*pixels.shape, 6, COUNTS.prod()), np.nan)
     projected, goals = bounds.project(case.camera, forms), np.full((pixels.sum(), 6), goal)
-    bounds.by_depth_ranges(case.camera, forms, projected, tiles, pixels, COUNTS, goals, out)
+    out = bounds.by_depth_ranges(case.camera, forms, projected, tiles, pixels, COUNTS, goals)
     ends = assemble(out.reshape(*pixels.shape, -1), case.camera)
     return ends.reshape(*ends.shape[:2], 2, 3, -1)
 
@@ -205,20 +204,6 @@ def test_a_stop_shows_no_more_than_the_background(count):
         assert ends.min() > 0.998 * 0.1 + 0.002 * 0.5 - 1e-3 and ends.max() < 0.998 * 0.9 + 0.002 * 0.5 + 1e-3
 
 
-def test_the_latest_projection_is_kept_until_its_memory_is_taken():
-    """Rounds of one box share a projection; another projection of the lane ends that."""
-    case = stack(0, BACKGROUNDS[0], 8)
-    bounds, box = SubBoxBounds(case.splats, GSPLAT_1_4_0, FLOAT32), case.poses.box
-    forms = case.poses.enclosure(box, 1)
-    first = bounds.projected_box(case.camera, forms, box)
-    assert bounds.projected_box(case.camera, forms, box) is first
-    bounds.cell(case.camera, forms)
-    assert bounds.projected_box(case.camera, forms, box) is not first
-    half = box.split(0, 2)[0]
-    other = bounds.projected_box(case.camera, case.poses.enclosure(half, 1), half)
-    assert other is not bounds.projected_box(case.camera, forms, box)
-
-
 def test_pixels_that_nothing_reaches_show_the_background():
     """No fragment reaches a corner: its bounds are the background, up to their charge."""
     case = Case(
@@ -229,6 +214,11 @@ def test_pixels_that_nothing_reaches_show_the_background():
     background = np.array(BACKGROUNDS[2])[:, None]
     assert (ends[:, :, 0] <= background).all() and (background <= ends[:, :, 1]).all()
     assert np.abs(ends - background).max() < 1e-4
+
+
+def wanted(pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Goals of all ends of the channels of all ``pixels``."""
+    return np.ones((pixels.size, 6)), np.zeros(pixels.size, bool)
 
 
 def test_what_warms_up_is_what_a_search_calls(monkeypatch):
@@ -242,7 +232,7 @@ def test_what_warms_up_is_what_a_search_calls(monkeypatch):
     monkeypatch.setattr(sub_box_bounds, "depth_range_stage", lambda *values: calls.append([*map(numba.typeof, values)]))
     frame.warm_up_sub_boxes()
     warm = len(calls)
-    assert frame.sub_box_ends(frame.box, COUNTS, tiles, pixels, np.ones((pixels.sum(), 6))) is not None
+    assert frame.sub_box_ends(frame.box, COUNTS, tiles, pixels, *wanted(pixels)) is not None
     assert len(calls) > warm > 0 and all(call == calls[0] for call in calls)
     # a set of one parameter has no sub-boxes
     SplatFrame(case.splats, GSPLAT_1_4_0, FLOAT32, Case(case.splats, moves(x=0.1)).poses).warm_up_sub_boxes()

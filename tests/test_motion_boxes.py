@@ -86,7 +86,9 @@ def test_motion_cells_follow_a_turn() -> None:
     assert cells is not None
     widths = []
     for parts in (np.array([2, 2, 4, 4]), cells):
-        ends = frame.sub_box_ends(frame.box, parts, tiles, pixels)
+        ends = frame.sub_box_ends(
+            frame.box, parts, tiles, pixels, np.full((pixels.size, 6), np.inf), np.zeros(pixels.size, bool)
+        )
         assert ends is not None
         widths.append(float((ends[1] - ends[0]).mean()))
     assert widths[1] < 0.8 * widths[0]

@@ -91,9 +91,33 @@ LOCATION = (
         _DIFFERENCES,
     ),
     Fault(
+        "location: pixels of one kind take the bounds of the other",
+        "methods/splat/frame.py", "SplatFrame.sub_box_ends",
+        "difference_ends(bounds, scale) if chosen is differences else part_ends(bounds)", "part_ends(bounds)",
+        "test_channel_differences.py::test_a_frame_bounds_differences_of_blocks_of_many_orders",
+    ),
+    Fault(
+        "location: a cell reaches beyond the one around it",
+        "methods/splat/enclosing_cells.py", "EnclosingCells._enclosing",
+        "first <= box.lower[k] and box.upper[k] <= last", "first <= box.lower[k]",
+        "test_enclosing_cells.py::test_a_cell_lies_within_the_one_around_it",
+    ),
+    Fault(
+        "location: what reaches beyond the set is within it",
+        "methods/splat/enclosing_cells.py", "EnclosingCells._enclosing",
+        "not low <= box.lower[k] <= box.upper[k] <= high", "not low <= box.lower[k] <= high",
+        "test_enclosing_cells.py::test_what_reaches_beyond_the_set_has_none_around_it",
+    ),
+    Fault(
+        "location: a cell around another shows what its middle does",
+        "methods/splat/frame.py", "SplatFrame._context", "self.pose_set.enclosure(box, self.order)",
+        "self.pose_set.enclosure(box.with_ends(box.middle, box.middle), self.order)",
+        "test_enclosing_cells.py::test_pixels_have_the_ends_that_all_gaussians_leave",
+    ),
+    Fault(
         "location: differences are compared with channels",
-        _PHOTO, "TiledPhoto.excluding", "self.differences if differences else (self.low, self.high)",
-        "(self.low, self.high)", "test_channel_differences.py::test_differences_exclude_what_channels_leave",
+        _PHOTO, "TiledPhoto._explaining", "differences is None or not differences.any()", "True",
+        "test_channel_differences.py::test_differences_exclude_what_channels_leave",
     ),
     Fault(
         "location: as many pixels as are allowed cut a cell",

@@ -29,7 +29,7 @@ _ALL, _POWER = 2.0, 1.5
 _EVEN, _STEEP = -0.1, 0.2
 #: Scene elements whose work is that of all else that a pixel takes.
 _OTHER_WORK = 3000.0
-#: Most scene elements that a cell's pixels look at where there are so many times as many of these.
+#: Most scene elements that a cell's pixels look at where there are up to so many times as many pixels.
 _LITTLE_WORK, _MORE = 300_000.0, 5
 
 
@@ -43,7 +43,7 @@ class PixelOrder:
         numbers: [n] these pixels.
         worth: [n] what else comes first: by how much bounds miss, less how loose they are.
         work: [n] what bounds of each take, about.
-        most: So many pixels at most.
+        count: So many pixels at most, or `_MORE` times as many where these look at little.
         kinds: [T, side, side] whether `CHANNELS` or `DIFFERENCES` of a pixel tell more.
         misses: By kind, [T, side, side, 6] by how much bounds in the cell's middle are expected to miss the photo: the
             lower ones of three values, which may lie above what the photo allows, then the upper ones.
@@ -54,7 +54,7 @@ class PixelOrder:
     numbers: np.ndarray
     worth: Float64Array
     work: Float64Array
-    most: int
+    count: int
     kinds: np.ndarray
     misses: tuple[Float64Array, ...]
 
@@ -78,7 +78,7 @@ class PixelOrder:
         likely = _likely(shares[some], self.worth[some])
         order = np.argsort(-likely / self.work[some], kind="stable")
         light = int(np.searchsorted((self.work[some[order]] - _OTHER_WORK).cumsum(), _LITTLE_WORK))
-        order = order[: max(self.most, min(light, _MORE * self.most))]
+        order = order[: max(self.count, min(light, _MORE * self.count))]
         return self.numbers[some[order]], likely[order]
 
 
@@ -113,7 +113,7 @@ class TellingPixels:
         self.ends = [[assemble(end, camera) for end in pair] for pair in pairs]
 
     def order(
-        self, tiles: np.ndarray, radius: int, width: float, counted: np.ndarray, most_pixels: int,
+        self, tiles: np.ndarray, radius: int, width: float, counted: np.ndarray, count: int,
         elements: np.ndarray | None,
     ) -> PixelOrder:  # fmt: skip
         """The pixels to bound of a cell whose middle shows ``tiles``.
@@ -122,7 +122,7 @@ class TellingPixels:
             radius: Pixels that the picture moves by over half of the cell.
             width: Pixels by which bounds over it are wide.
             counted: [T, side, side] pixels that may be chosen.
-            most_pixels: So many at most.
+            count: See `PixelOrder`.
             elements: [H, W] scene elements that each pixel's bounds look at, where these are over parts of the cell and
                 may be of differences; None: they are not.
         """
@@ -146,7 +146,7 @@ class TellingPixels:
         work = np.full(len(worth), _OTHER_WORK)
         if elements is not None:
             work += in_tiles(elements, self.side)[counted]
-        return PixelOrder(steps, missed > 0.0, np.flatnonzero(counted), worth, work, most_pixels, chosen, misses)
+        return PixelOrder(steps, missed > 0.0, np.flatnonzero(counted), worth, work, count, chosen, misses)
 
     def _moved_misses(self, kind: int, ends: tuple[Float64Array, Float64Array], steps: np.ndarray) -> np.ndarray:
         """[m, T, side, side] by how much bounds ``ends`` miss the photo where the picture moved by ``steps``."""
