@@ -62,7 +62,7 @@ def test_differences_tell_where_channels_do_not():
     numbers, shares = order.everywhere
     assert (
         sorted(numbers) == [8 * row + column for row in range(SIDE) for column in range(4, SIDE)]
-        and (shares > 0.9).all()
+        and (shares == 1.0).all()
     )
     assert (order.kinds.reshape(-1)[numbers] == DIFFERENCES).all()
     alone = telling.order(picture[None], 1, 1.0, photo.counted, 100, None)

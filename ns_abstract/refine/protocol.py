@@ -235,6 +235,10 @@ class SubBoxFrame(Protocol):
         """[d] pixels that typical elements move by, over each parameter's range, beside what their block does."""
         ...
 
+    def enclosing(self, box: ParameterBox) -> Any:
+        """What a wider cell around ``box`` shows, as `Frame.bound` takes it; None: nothing is known."""
+        ...
+
     def element_counts(self, box: ParameterBox) -> np.ndarray:
         """[H, W] scene elements that bounds of each pixel over a cell look at (an estimate)."""
         ...

@@ -426,7 +426,9 @@ class _Examination:
         """Bounds of ``tiles``, or of some of their ``pixels`` alone where the frame can leave out the others."""
         check_cancelled()
         self.bounded += 1
-        return self.search.frame.bound_parts([box], tiles, None, linear, pixels)[0]
+        frame = self.search.frame
+        within = frame.enclosing(box) if isinstance(frame, SubBoxFrame) else None
+        return frame.bound_parts([box], tiles, within, linear, pixels)[0]
 
     def _settled(self, known: BoundedPixels) -> bool:
         """Whether every pose of the cell explains the photo: it is finished then."""

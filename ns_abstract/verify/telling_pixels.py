@@ -70,8 +70,8 @@ class PixelOrder:
     @property
     def everywhere(self) -> tuple[np.ndarray, Float64Array]:
         """The pixels that are likely to exclude all of the cell, and 1 for each."""
-        shares = self.missed.mean(axis=0)
-        return self._sorted(np.where(shares >= 1.0, shares, 0.0))
+        numbers, _ = self._sorted(np.where(self.missed.all(axis=0), 1.0, 0.0))
+        return numbers, np.ones(numbers.size)
 
     def _sorted(self, shares: Float64Array) -> tuple[np.ndarray, Float64Array]:
         some = np.flatnonzero(shares > 0.0)

@@ -275,7 +275,7 @@ class SplatFrame(Frame):
             return None
         check_cancelled()
         forms = self.pose_set.enclosure(box, self.order)
-        projected = self.bounds.project(self.camera, forms, self.candidates(tiles, self._enclosing.around(box), pixels))
+        projected = self.bounds.project(self.camera, forms, self.candidates(tiles, self.enclosing(box), pixels))
         crowded = in_tiles(self.element_counts(box), self.side)[tiles][pixels] > _TUNING.crowded
         ends: list[tuple[np.ndarray, tuple[np.ndarray, np.ndarray]]] = []
         for chosen in (~differences, differences):
@@ -302,9 +302,13 @@ class SplatFrame(Frame):
         """See `ns_abstract.refine.protocol.SubBoxFrame`."""
         return self._image_motion.parallax(box)
 
+    def enclosing(self, box: ParameterBox) -> VisibleContext | None:
+        """See `ns_abstract.refine.protocol.SubBoxFrame`."""
+        return self._enclosing.around(box)
+
     def element_counts(self, box: ParameterBox) -> np.ndarray:
         """See `ns_abstract.refine.protocol.SubBoxFrame`."""
-        context, size = self._enclosing.around(box), (self.camera.height, self.camera.width)
+        context, size = self.enclosing(box), (self.camera.height, self.camera.width)
         return np.zeros(size, np.int64) if context is None else rectangles_by_place(context.reach, *size)
 
     def _context(self, box: ParameterBox) -> VisibleContext:
