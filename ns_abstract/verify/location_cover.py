@@ -51,7 +51,7 @@ class ShearedBoxes:
     def __init__(
         self, lower: Float64Array, upper: Float64Array, names: tuple[str, ...], shear: Mapping[str, Mapping[str, float]]
     ) -> None:
-        self.lower, self.upper = lower, upper
+        self.lower, self.upper, self.volumes = lower, upper, np.prod(upper - lower, axis=1)
         self._terms = [
             (names.index(name), [(names.index(other), factor) for other, factor in factors.items()])
             for name, factors in shear.items()
@@ -106,7 +106,8 @@ def cover(
         inner = inner_cell(grid, cell, box.with_ends(lower.min(axis=0), upper.max(axis=0)))
         excluded.extend(slabs(cell, inner))
         count += 1
-        filled = float(np.prod(upper - lower, axis=1).sum())
+        # a slanted box fills less than the box around it
+        filled = float(np.minimum(np.prod(upper - lower, axis=1), boxes.volumes[chosen]).sum())
         taken = float(np.prod(np.array(grid.box_of(inner).upper) - np.array(grid.box_of(inner).lower)))
         if taken <= SPARE * filled or inner.volume == 1:
             finished.append(inner)

@@ -1,4 +1,4 @@
-"""What the cells around a cell show: few of a scene's Gaussians may be seen on the pixels that are wanted (design.md, U8)."""
+"""What the cells around a cell show: few Gaussians may be seen on the pixels that are wanted (design.md, U8)."""
 
 from __future__ import annotations
 
