@@ -9,9 +9,11 @@ from test_depth_ranges import BACKGROUNDS, COUNTS, stack
 
 from ns_abstract.arithmetic.rounding import FLOAT32
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.enclosing_boxes import box_of_motion
 from ns_abstract.methods.splat import enclosing_cells
-from ns_abstract.methods.splat.enclosing_cells import EnclosingCells, VisibleContext
+from ns_abstract.methods.splat.enclosing_cells import EnclosingCells, EnclosingContext
 from ns_abstract.methods.splat.frame import SplatFrame
+from ns_abstract.methods.splat.lists import rectangles_by_place
 
 SET = ParameterBox(("x", "yaw", "z"), ("", "", ""), (-1.0, -0.1, 2.0), (1.0, 0.3, 2.0))
 MOTION = np.array([16.0, 5.0, 0.0])
@@ -20,9 +22,9 @@ MOTION = np.array([16.0, 5.0, 0.0])
 def cells(found: list[ParameterBox]) -> EnclosingCells:
     """Of `SET`; boxes whose context is found are added to a list."""
 
-    def context(box: ParameterBox) -> VisibleContext:
+    def context(box: ParameterBox) -> EnclosingContext:
         found.append(box)
-        return VisibleContext(np.zeros(25, np.int64), np.full((25, 4), len(found), np.int32))
+        return EnclosingContext(np.zeros(25, np.int64), np.full((25, 4), len(found), np.int32), np.zeros((0, 0)))
 
     return EnclosingCells(SET, lambda box: MOTION, context)
 
@@ -38,7 +40,7 @@ def test_a_cell_lies_within_the_one_around_it(seed):
             ends = np.maximum(middle - half, SET.lower), np.minimum(middle + half, SET.upper)
             box = SET.with_ends(*ends)
             assert around.around(box) is not None
-            enclosing = around._enclosing(box)
+            enclosing = box_of_motion(box, SET, MOTION, 2.0)
             assert enclosing is not None and enclosing in found
             assert all(a <= c <= d <= b for a, b, c, d in zip(enclosing.lower, enclosing.upper, *ends, strict=True))
     # narrow cells do not have one each
@@ -51,7 +53,7 @@ def test_what_reaches_beyond_the_set_has_none_around_it():
 
 
 def test_the_latest_are_kept_within_their_memory(monkeypatch):
-    monkeypatch.setattr(enclosing_cells, "_TUNING", enclosing_cells.EnclosingTuning(most=2000))
+    monkeypatch.setattr(enclosing_cells, "_TUNING", enclosing_cells.ContextTuning(most=2000))
     found: list[ParameterBox] = []
     around = cells(found)
     narrow = [SET.replace(0, x, x + 0.001) for x in (-0.9, -0.3, 0.3, 0.9)]
@@ -78,3 +80,13 @@ def test_pixels_have_the_ends_that_all_gaussians_leave(monkeypatch):
             without.setattr(frame, "enclosing", lambda box: None)
             assert np.abs(np.stack(frame.sub_box_ends(*arguments)) - fast).max() < 1e-9
     assert frame.element_counts(box).max() <= case.splats.count
+
+
+def test_rectangles_are_counted_at_every_place():
+    generator = np.random.default_rng(0)
+    rectangles = np.sort(generator.integers(0, 7, (50, 2, 2)), axis=2).reshape(50, 4).astype(np.int32)
+    counts = np.zeros((6, 6), np.int64)
+    for x0, x1, y0, y1 in rectangles:
+        counts[y0:y1, x0:x1] += 1
+    assert np.array_equal(rectangles_by_place(rectangles, 6, 6), counts)
+    assert not rectangles_by_place(rectangles[:0], 6, 6).any()

@@ -17,10 +17,10 @@ from ns_abstract.api.nearby_pictures import KnownBoxes, NearbyPictures, NearbyTu
 from ns_abstract.api.picture_question import PlanePictures
 from ns_abstract.arithmetic.rounding import SUB_BOX_OVERLAP
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.enclosing_boxes import enclosing_box, shared_box
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.methods.splat.stage_data import cell_parts
 from ns_abstract.methods.splat.weights import SplatWeightFrame
-from ns_abstract.verify.enclosing_boxes import enclosing_box, shared_box
 from ns_abstract.verify.picture_measures import CellParts, Measure, PlaneSets
 from ns_abstract.verify.picture_sets import PictureSets
 from ns_abstract.verify.protocol import ComparedCuts, DividedImages, NearImages

@@ -97,15 +97,10 @@ LOCATION = (
         "test_channel_differences.py::test_a_frame_bounds_differences_of_blocks_of_many_orders",
     ),
     Fault(
-        "location: a cell reaches beyond the one around it",
-        "methods/splat/enclosing_cells.py", "EnclosingCells._enclosing",
-        "first <= box.lower[k] and box.upper[k] <= last", "first <= box.lower[k]",
-        "test_enclosing_cells.py::test_a_cell_lies_within_the_one_around_it",
-    ),
-    Fault(
         "location: what reaches beyond the set is within it",
-        "methods/splat/enclosing_cells.py", "EnclosingCells._enclosing",
-        "not low <= box.lower[k] <= box.upper[k] <= high", "not low <= box.lower[k] <= high",
+        "geometry/enclosing_boxes.py", "box_of_motion",
+        "whole.contains(np.array(cell.lower)) and whole.contains(np.array(cell.upper))",
+        "whole.contains(np.array(cell.lower))",
         "test_enclosing_cells.py::test_what_reaches_beyond_the_set_has_none_around_it",
     ),
     Fault(

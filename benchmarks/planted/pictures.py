@@ -12,7 +12,7 @@ _INSIDE = "test_picture_properties.py::test_measures_stay_inside[2]"
 _TREES = "test_picture_properties.py::test_claims_are_trees"
 _DEPTHS = "test_picture_properties.py::test_depths_where_nothing_may_be_drawn"
 _SETTLED, _ENCLOSING, _NEARBY = (
-    "verify/settled_pixels.py", "verify/enclosing_boxes.py", "api/nearby_pictures.py",
+    "verify/settled_pixels.py", "geometry/enclosing_boxes.py", "api/nearby_pictures.py",
 )  # fmt: skip
 _PARTS, _HOLD = "verify/part_proofs.py", "test_part_proofs.py::test_parts_that_are_decided_are_so_everywhere[2]"
 _LEFT = "test_nearby_pictures.py::test_parts_of_a_cell_bound_what_its_sub_boxes_leave_open"

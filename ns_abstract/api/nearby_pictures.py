@@ -15,10 +15,10 @@ import numpy as np
 import torch
 
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.enclosing_boxes import enclosing_box, shared_box
 from ns_abstract.geometry.tiles import assemble, in_tiles
 from ns_abstract.io.errors import InputError
 from ns_abstract.refine.protocol import Bounds, ElementFrame, Frame, SceneSample
-from ns_abstract.verify.enclosing_boxes import enclosing_box, shared_box
 from ns_abstract.verify.picture_measures import SubBoxEnds, shared_counts
 from ns_abstract.verify.picture_sets import PictureSets
 from ns_abstract.verify.protocol import FrameImages, PixelSets

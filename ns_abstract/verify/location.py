@@ -35,7 +35,7 @@ from ns_abstract.verify.motion_boxes import MotionBoxes
 from ns_abstract.verify.photo import Photo, TiledPhoto
 from ns_abstract.verify.pixel_rounds import BoundedPixels, PixelRounds, RoundTuning
 from ns_abstract.verify.search_results import BlockResult, FinishedCell
-from ns_abstract.verify.telling_pixels import DIFFERENCES, PixelOrder, TellingPixels, typical_cell
+from ns_abstract.verify.telling_pixels import PixelOrder, TellingPixels, typical_cell
 
 #: Grid units along each parameter, as a power of two.
 UNITS = 20
@@ -54,8 +54,7 @@ class LocationTuning:
     #: In sets of fewer, sub-boxes along the two parameters that move the picture most: these move it more beside the
     #: motion of what a pixel shows.
     along: int = 8
-    #: Widths (see `LocationSearch.widths`) beyond which cells are cut without bounds, in sets of few parameters and of
-    #: many.
+    #: `LocationSearch.widths` beyond which cells are cut without bounds, in sets of few parameters and of many.
     coarse: tuple[float, float] = 4.0, 1.8
     #: Rounds of pixels. What a cell takes whatever its pixels are is most of the work, and a first round of more pixels
     #: excludes more at once.
@@ -141,8 +140,8 @@ class LocationSearch:
         if not self.by_motion:
             return self._pace / self.along(box)
         assert isinstance(self.frame, SubBoxFrame)
-        width = np.array(box.upper) - np.array(box.lower)
-        return (self.frame.parallax(box) + self.tuning.motion_share * self._pace * width) / width
+        parallax = self.frame.parallax(box) / (np.array(box.upper) - np.array(box.lower))
+        return parallax + self.tuning.motion_share * self._pace
 
     @property
     def sub_box_frame(self) -> SubBoxFrame | None:
@@ -303,17 +302,13 @@ class _Examination:
         rounds, order = self._rounds(box, picture, counts)
         while (chosen := rounds.following(*order.towards(boxes.moved[rounds.left]))) is not None:
             self.bounded += 1
-            kinds, tiles = order.kinds[chosen], np.flatnonzero(chosen.any(axis=(1, 2)))
-            misses = np.choose(kinds[:, None], [miss[chosen] for miss in order.misses])
-            telling, differences = misses == misses.max(axis=-1, keepdims=True), kinds == DIFFERENCES
+            tiles, (telling, differences) = np.flatnonzero(chosen.any(axis=(1, 2))), order.telling(chosen)
             goals = np.where(telling, search.tiled.goals(chosen, differences), np.nan)
             ends = frame.sub_box_ends(box, parts, tiles, chosen[tiles], goals, differences)
             if ends is None:
                 return None
             excluding = search.tiled.excluding(*ends, chosen, differences)
-            if search.by_motion:
-                excluding = boxes.excluded(excluding, chosen)
-            rounds.take(excluding, chosen)
+            rounds.take(boxes.excluded(excluding, chosen) if search.by_motion else excluding, chosen)
         self.share = min(1.0, rounds.expected)
         self.divisions = self.cell, counts, rounds
         left = rounds.left.reshape(counts)

@@ -73,6 +73,15 @@ class PixelOrder:
         numbers, _ = self._sorted(np.where(self.missed.all(axis=0), 1.0, 0.0))
         return numbers, np.ones(numbers.size)
 
+    def telling(self, pixels: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """[n, 6] the bounds of the ``n`` ``pixels`` [T, side, side] that are expected to miss the photo most.
+
+        And [n] whether they are of `DIFFERENCES`.
+        """
+        kinds = self.kinds[pixels]
+        misses = np.choose(kinds[:, None], [miss[pixels] for miss in self.misses])
+        return misses == misses.max(axis=-1, keepdims=True), kinds == DIFFERENCES
+
     def _sorted(self, shares: Float64Array) -> tuple[np.ndarray, Float64Array]:
         some = np.flatnonzero(shares > 0.0)
         likely = _likely(shares[some], self.worth[some])

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from ns_abstract.geometry.box import ParameterBox
+from ns_abstract.geometry.enclosing_boxes import box_of_motion
 
 
 @dataclass(frozen=True)
@@ -36,17 +37,31 @@ class VisibleContext:
 
 
 @dataclass(frozen=True)
-class EnclosingTuning:
-    """Preferences about enclosing cells. None of them decides whether a bound holds."""
+class EnclosingContext(VisibleContext):
+    """The context of an enclosing cell, on all pixels.
 
-    #: Pixels that the picture may move by over one, along each parameter, or so many times what it does over the cell.
+    Attributes:
+        counts: [H, W] how many of the Gaussians may be seen on each pixel.
+    """
+
+    counts: np.ndarray
+
+    @property
+    def nbytes(self) -> int:
+        return super().nbytes + self.counts.nbytes
+
+
+@dataclass(frozen=True)
+class ContextTuning:
+    """Preferences about the contexts of enclosing cells. None of them decides whether a bound holds."""
+
+    #: Pixels that the picture may move by over a cell along each parameter, about, where that is enough.
     motion: float = 2.0
-    times: float = 2.0
     #: Most bytes that are kept.
     most: int = 1 << 27
 
 
-_TUNING = EnclosingTuning()
+_TUNING = ContextTuning()
 
 
 class EnclosingCells:
@@ -62,16 +77,15 @@ class EnclosingCells:
         self,
         box: ParameterBox,
         motion: Callable[[ParameterBox], np.ndarray],
-        context: Callable[[ParameterBox], VisibleContext],
+        context: Callable[[ParameterBox], EnclosingContext],
     ) -> None:
         self._box, self._find_motion, self._context = box, motion, context
-        self._moved: list[float] = []
-        self._kept: dict[ParameterBox, VisibleContext] = {}
+        self._kept: dict[ParameterBox, EnclosingContext] = {}
         self._lock = threading.Lock()
 
-    def around(self, box: ParameterBox) -> VisibleContext | None:
+    def around(self, box: ParameterBox) -> EnclosingContext | None:
         """What a cell around ``box`` may show; None: ``box`` reaches beyond the set."""
-        enclosing = self._enclosing(box)
+        enclosing = box_of_motion(box, self._box, self._motion, _TUNING.motion)
         if enclosing is None:
             return None
         with self._lock:
@@ -83,26 +97,6 @@ class EnclosingCells:
                 del self._kept[next(iter(self._kept))]
         return context
 
-    def _enclosing(self, box: ParameterBox) -> ParameterBox | None:
-        """The narrowest of the cells around ``box`` that are wide enough to be of use for others."""
-        if not self._moved:
-            self._moved = np.nan_to_num(np.asarray(self._find_motion(self._box), np.float64)).tolist()
-        around = self._box
-        for k, (low, high) in enumerate(zip(self._box.lower, self._box.upper, strict=True)):
-            if not low <= box.lower[k] <= box.upper[k] <= high:
-                return None
-            width = high - low
-            if not 0.0 < width < math.inf:
-                continue
-            least = _TUNING.times * (box.upper[k] - box.lower[k]) / width
-            parts = 1 << max(
-                0, math.floor(-math.log2(max(least, _TUNING.motion / max(self._moved[k], _TUNING.motion))))
-            )
-            while parts > 1:
-                step = math.floor((box.lower[k] - low) / width * parts)
-                first, last = low + width * (step / parts), low + width * ((step + 1) / parts)
-                if first <= box.lower[k] and box.upper[k] <= last:
-                    around = around.replace(k, max(first, low), min(last, high))
-                    break
-                parts //= 2
-        return around
+    @cached_property
+    def _motion(self) -> np.ndarray:
+        return np.nan_to_num(np.asarray(self._find_motion(self._box), np.float64))

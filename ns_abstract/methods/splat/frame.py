@@ -21,7 +21,7 @@ from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.bounds import SceneSums, Stages
 from ns_abstract.methods.splat.constants import Rasteriser
 from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW, DEPTH_HIGH, DEPTH_LOW
-from ns_abstract.methods.splat.enclosing_cells import EnclosingCells, VisibleContext
+from ns_abstract.methods.splat.enclosing_cells import EnclosingCells, EnclosingContext, VisibleContext
 from ns_abstract.methods.splat.image_motion import ImageMotion
 from ns_abstract.methods.splat.lists import rectangles_by_place, summed_area, touching, visible_again
 from ns_abstract.methods.splat.render import Renderer
@@ -302,22 +302,23 @@ class SplatFrame(Frame):
         """See `ns_abstract.refine.protocol.SubBoxFrame`."""
         return self._image_motion.parallax(box)
 
-    def enclosing(self, box: ParameterBox) -> VisibleContext | None:
+    def enclosing(self, box: ParameterBox) -> EnclosingContext | None:
         """See `ns_abstract.refine.protocol.SubBoxFrame`."""
         return self._enclosing.around(box)
 
     def element_counts(self, box: ParameterBox) -> np.ndarray:
         """See `ns_abstract.refine.protocol.SubBoxFrame`."""
-        context, size = self.enclosing(box), (self.camera.height, self.camera.width)
-        return np.zeros(size, np.int64) if context is None else rectangles_by_place(context.reach, *size)
+        context = self.enclosing(box)
+        return np.zeros((self.camera.height, self.camera.width), np.int64) if context is None else context.counts
 
-    def _context(self, box: ParameterBox) -> VisibleContext:
+    def _context(self, box: ParameterBox) -> EnclosingContext:
         """The Gaussians that a cell may show."""
         projected = self.bounds.project(self.camera, self.pose_set.enclosure(box, self.order))
         marks = np.zeros(projected.candidates.size, np.uint8)
         marks[projected.alive] = 1
         gaussians = projected.gaussians
-        return VisibleContext(*visible_again(marks, projected.candidates, gaussians.box, gaussians.tiles, self.side))
+        visible, reach = visible_again(marks, projected.candidates, gaussians.box, gaussians.tiles, self.side)
+        return EnclosingContext(visible, reach, rectangles_by_place(reach, self.camera.height, self.camera.width))
 
     def motion(self, box: ParameterBox) -> np.ndarray:
         """[d] pixels that typical Gaussians move by over each parameter's range (an estimate)."""

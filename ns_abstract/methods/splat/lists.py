@@ -87,24 +87,16 @@ def touching(indices, rectangles, table):
     return out[:count]
 
 
-@njit(cache=True, error_model="numpy")
 def rectangles_by_place(rectangles, rows, columns):
-    """[rows, columns] int64 how many of the ``rectangles`` (see `touching`) each place lies in."""
-    table = np.zeros((rows + 1, columns + 1), np.int64)
-    for k in range(len(rectangles)):
-        x0, x1, y0, y1 = rectangles[k, 0], rectangles[k, 1], rectangles[k, 2], rectangles[k, 3]
-        if x0 < x1 and y0 < y1:
-            table[y0, x0] += 1
-            table[y0, x1] -= 1
-            table[y1, x0] -= 1
-            table[y1, x1] += 1
-    for row in range(rows + 1):
-        for column in range(columns):
-            table[row, column + 1] += table[row, column]
-    for row in range(rows):
-        for column in range(columns + 1):
-            table[row + 1, column] += table[row, column]
-    return table[:rows, :columns]
+    """[rows, columns] int64 how many of the ``rectangles`` [n, 4] within these (see `touching`) each place lies in."""
+    x0, x1, y0, y1 = rectangles[(rectangles[:, 0] < rectangles[:, 1]) & (rectangles[:, 2] < rectangles[:, 3])].T
+    wide = columns + 1
+    begun, ended = (
+        np.bincount(a * wide + x0, minlength=(rows + 1) * wide)
+        - np.bincount(a * wide + x1, minlength=(rows + 1) * wide)
+        for a in (y0, y1)
+    )
+    return (begun - ended).reshape(rows + 1, wide).cumsum(axis=0).cumsum(axis=1)[:rows, :columns]
 
 
 @njit(cache=True, error_model="numpy")

@@ -62,6 +62,18 @@ def shared_box(box: ParameterBox, whole: ParameterBox, motion: np.ndarray) -> Pa
     return _useful(aligned, box, whole, motion)
 
 
+def box_of_motion(cell: ParameterBox, whole: ParameterBox, motion: np.ndarray, pixels: float) -> ParameterBox | None:
+    """Return a box of ``whole`` around a cell of it over which the picture moves by about ``pixels`` along a parameter.
+
+    It is wider than the cell as `enclosing_box` is, and ``motion`` as there. None: the cell reaches beyond ``whole``.
+    """
+    if not (whole.contains(np.array(cell.lower)) and whole.contains(np.array(cell.upper))):
+        return None
+    few = [math.floor(math.log2(moved / pixels)) if moved > pixels else 0 for moved in motion.tolist()]
+    widths = zip(_levels(cell, whole), few, strict=True)
+    return _aligned(cell, whole, [max(0, min(level - _TUNING.halvings, least)) for level, least in widths])
+
+
 def _levels(cell: ParameterBox, whole: ParameterBox) -> list[int]:
     """[d] halvings of ``whole`` along each parameter that leave it as wide as the cell or less than twice as wide."""
     widths = zip(cell.lower, cell.upper, whole.lower, whole.upper, strict=True)
