@@ -16,7 +16,7 @@ import pytest
 from ns_abstract.arithmetic.rounding import FLOAT32, REAL, SUB_BOX_OVERLAP
 from ns_abstract.geometry.box import ParameterBox, shared_out
 from ns_abstract.geometry.camera_path import PinholeCamera
-from ns_abstract.geometry.motion_cells import MotionCells
+from ns_abstract.geometry.motion_cells import MotionCells, MotionField
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble, tile_grid
 from ns_abstract.methods.splat.activate import Splats, rotation_matrices
@@ -93,7 +93,7 @@ class Case:
         """Cells of linear maps at random: any map is sound (B16)."""
         generator, shape = np.random.default_rng(box.dimensions), (self.camera.height * self.camera.width, 2)
         pixels = generator.normal(size=(*shape, box.dimensions)) * (generator.uniform(size=(*shape, 1)) < 0.9)
-        return MotionCells.of(pixels, 1, np.array([4, 2]))
+        return MotionField(pixels, 1).cells(np.array([4, 2]))
 
     def check_motion(self, cells: MotionCells, ends: np.ndarray, p: np.ndarray, image: np.ndarray) -> None:
         """Each pixel of the ``image`` at scaled parameters ``p`` [d] lies within the ends over its motion cells."""

@@ -8,7 +8,7 @@ from test_bounds import Case, camera, moves, scene
 
 from ns_abstract.arithmetic.rounding import FLOAT32, SUB_BOX_OVERLAP
 from ns_abstract.geometry.camera_path import PinholeCamera
-from ns_abstract.geometry.motion_cells import MotionCells, square_numbers
+from ns_abstract.geometry.motion_cells import MotionCells, MotionField, square_numbers
 from ns_abstract.methods.splat.constants import GSPLAT_1_4_0
 from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.stage_data import cell_parts
@@ -23,7 +23,7 @@ ACROSS, DOWN = 3, 2
 def cells_of(generator: np.random.Generator, d: int, side: int) -> MotionCells:
     squares = square_numbers(np.array([19]), np.array([11]), 20, side)[0] + 1
     pixels = generator.normal(size=(squares, 2, d)) * (generator.uniform(size=(squares, 1, d)) < 0.7)
-    return MotionCells.of(pixels, side, COUNTS)
+    return MotionField(pixels, side).cells(COUNTS)
 
 
 @pytest.mark.parametrize("side", [1, 8])
@@ -66,7 +66,7 @@ def test_sub_boxes_are_excluded_by_all_motion_cells_of_their_poses(d: int, side:
 def test_motion_of_pixels_that_show_nothing_or_move_along_a_line() -> None:
     """No motion, motion along one direction alone, and large motion: maps into the square, with finite inverses."""
     pixels = np.array([[[0.0, 0.0], [0.0, 0.0]], [[3.0, 1.0], [3.0, 1.0]], [[1e200, 1.0], [0.0, 1e-200]]])
-    cells = MotionCells.of(pixels, 1, COUNTS)
+    cells = MotionField(pixels, 1).cells(COUNTS)
     assert np.isfinite(cells.motion).all()
     assert (np.abs(cells.motion[:, :2]).sum(axis=-1) <= 1.0).all() and (cells.motion[0] == 0.0).all()
 
@@ -82,8 +82,7 @@ def test_motion_cells_follow_a_turn() -> None:
     frame = SplatFrame(case.splats, GSPLAT_1_4_0, FLOAT32, case.poses)
     tiles = np.arange(frame.tile_count)
     pixels = np.ones((tiles.size, frame.side, frame.side), bool)
-    cells = frame.motion_cells(frame.box, np.array([8, 8]))
-    assert cells is not None
+    cells = frame.motion_field(frame.box).cells(np.array([8, 8]))
     widths = []
     for parts in (np.array([2, 2, 4, 4]), cells):
         ends = frame.sub_box_ends(
@@ -99,7 +98,7 @@ def test_a_large_picture_moves_by_squares() -> None:
     wall = scene({"mean": (0.0, 0.0, -5.0), "scale": 30.0, "opacity": 0.9, "color": (0.2, 0.5, 0.7)})
     for size, side, squares in ((16, 1, 16 * 17), (300, 8, 38 * 38)):
         case = Case(wall, moves(x=0.1, yaw=0.02), camera(size, size + 1, float(size)))
-        cells = SplatFrame(wall, GSPLAT_1_4_0, FLOAT32, case.poses).motion_cells(case.poses.box, COUNTS)
-        assert cells is not None and (cells.side, len(cells.motion)) == (side, squares)
+        cells = SplatFrame(wall, GSPLAT_1_4_0, FLOAT32, case.poses).motion_field(case.poses.box).cells(COUNTS)
+        assert (cells.side, len(cells.motion)) == (side, squares)
         # the wall moves as one
         assert np.abs(cells.typical[0]) == pytest.approx([0.1 * size / 5.0, 0.02 * size], rel=0.1)

@@ -124,7 +124,7 @@ def test_losses_of_a_typical_cell():
     case = Case(scene(*layers), moves(x=0.3, yaw=0.05))
     frame = SplatFrame(case.splats, GSPLAT_1_4_0, FLOAT32, case.poses)
     box = case.poses.box
-    cells = frame.motion_cells(box, np.array([4, 2]))
+    cells = frame.motion_field(box).cells(np.array([4, 2]))
     typical = typical_cell(frame, box, cells, 1.0, case.image(box.middle))
     assert len(typical.losses) == 2
     for below, above in typical.losses:
@@ -133,6 +133,3 @@ def test_losses_of_a_typical_cell():
         assert max(below.max(), above.max()) > 0.01
     whole = typical_cell(frame, box, None, 1.0, case.image(box.middle))
     assert len(whole.losses) == 1 and whole.losses[0][0].mean() > typical.losses[0][0].mean()
-    one = Case(case.splats, moves(x=0.3))
-    line = SplatFrame(one.splats, GSPLAT_1_4_0, FLOAT32, one.poses)
-    assert line.motion_cells(one.poses.box, np.array([8, 8])) is None

@@ -37,13 +37,31 @@ class MotionCells:
     side: int
     typical: Float64Array
 
-    @classmethod
-    def of(cls, pixels: Float64Array, side: int, counts: np.ndarray) -> MotionCells:
-        """Those of squares that move by ``pixels`` [squares, 2, d] for each parameter."""
-        size = np.abs(pixels).sum(axis=-1, keepdims=True)
-        rows = MOTION_SCALE * pixels / np.where(size > 0.0, size, 1.0)
+
+@dataclass(frozen=True, eq=False)
+class MotionField:
+    """By how much each square of some pixels of a picture moves over a cell of poses (an estimate).
+
+    Attributes:
+        pixels: [squares, 2, d] columns and rows that a square's content moves by over half of each parameter's range;
+            squares row by row.
+        side: Pixels across a square.
+    """
+
+    pixels: Float64Array
+    side: int
+
+    def cells(self, counts: np.ndarray) -> MotionCells:
+        """Cells of this motion, ``counts`` [2] of them."""
+        size = np.abs(self.pixels).sum(axis=-1, keepdims=True)
+        rows = MOTION_SCALE * self.pixels / np.where(size > 0.0, size, 1.0)
         motion = np.ascontiguousarray(np.concatenate([rows, _inverse(rows)], axis=1))
-        return cls(counts, motion, side, pixels.mean(axis=0))
+        return MotionCells(counts, motion, self.side, self.pixels.mean(axis=0))
+
+    def at(self, scaled: Float64Array, height: int, width: int) -> Float64Array:
+        """[H, W, 2] columns and rows that pixels move by from the cell's middle to its scaled parameters [d]."""
+        squares = (self.pixels @ scaled).reshape(-(-height // self.side), -(-width // self.side), 2)
+        return squares.repeat(self.side, axis=0).repeat(self.side, axis=1)[:height, :width]
 
 
 def square_numbers(columns: np.ndarray, rows: np.ndarray, width: int, side: int) -> np.ndarray:

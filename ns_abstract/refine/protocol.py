@@ -14,7 +14,7 @@ import numpy as np
 
 from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import PinholeCamera
-from ns_abstract.geometry.motion_cells import MotionCells
+from ns_abstract.geometry.motion_cells import MotionCells, MotionField
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.perturbation.variations import Selection
@@ -227,8 +227,8 @@ FIRST_CHANNELS, SECOND_CHANNELS = ([pair[k] for pair in CHANNEL_DIFFERENCES] for
 class SubBoxFrame(Protocol):
     """An optional interface of a `Frame`: bounds over each of many equal parts of a wide cell."""
 
-    def motion_cells(self, box: ParameterBox, counts: np.ndarray) -> MotionCells | None:
-        """`MotionCells`, ``counts`` [2] of them, over a cell of poses; None: there are none for this set."""
+    def motion_field(self, box: ParameterBox) -> MotionField:
+        """By how much the squares of a picture move over a cell of poses (an estimate)."""
         ...
 
     def parallax(self, box: ParameterBox) -> np.ndarray:

@@ -19,7 +19,7 @@ from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import Float64Array, ParameterBox, shared_out
 from ns_abstract.geometry.motion_cells import MotionCells
 from ns_abstract.geometry.tiles import assemble
-from ns_abstract.refine.protocol import Bounds, Frame, LinearSets, SubBoxFrame
+from ns_abstract.refine.protocol import Bounds, Frame, SubBoxFrame
 from ns_abstract.verify.cell_boxes import (
     aligned,
     between,
@@ -32,6 +32,7 @@ from ns_abstract.verify.cell_boxes import (
 )
 from ns_abstract.verify.cells import Cell, CellGrid
 from ns_abstract.verify.motion_boxes import MotionBoxes
+from ns_abstract.verify.moved_pictures import FoundPose, MovedPictures
 from ns_abstract.verify.photo import Photo, TiledPhoto
 from ns_abstract.verify.pixel_rounds import BoundedPixels, PixelRounds, RoundTuning
 from ns_abstract.verify.search_results import BlockResult, FinishedCell
@@ -86,14 +87,6 @@ class LocationTuning:
     #: Pixels that a picture may miss beyond those allowed, as a part of all, where a better pose is looked for nearby.
     hopeful: float = 0.3
     steps: int = 12
-
-
-@dataclass(frozen=True)
-class FoundPose:
-    """A rendered pose."""
-
-    values: tuple[float, ...]
-    outliers: int
 
 
 @dataclass(frozen=True)
@@ -197,7 +190,23 @@ class LocationSearch:
     def motion_cells(self, box: ParameterBox) -> MotionCells | None:
         """Those of a cell, if the frame bounds pixels over them."""
         frame = self.sub_box_frame
-        return None if frame is None else frame.motion_cells(box, np.array(self.tuning.motion_cells))
+        if frame is None or box.dimensions < 2:
+            return None
+        return frame.motion_field(box).cells(np.array(self.tuning.motion_cells))
+
+    @cached_property
+    def moved_pictures(self) -> MovedPictures | None:
+        """Pictures near the middles of cells that the frame bounds over their sub-boxes."""
+        frame = self.sub_box_frame
+        if frame is None:
+            return None
+        return MovedPictures(self.frame, frame.motion_field, self.moved(self.frame.box), self.look)
+
+    def look(self, values: Float64Array) -> tuple[np.ndarray, FoundPose]:
+        """Render the pose at sheared values; returns its tiles, and what it misses of the photo."""
+        pose = self.original(values)
+        picture = self.plain.render(pose)
+        return picture, FoundPose(tuple(pose.tolist()), int(self.tiled.outside(picture).sum()))
 
     @property
     def has_parts(self) -> bool:
@@ -217,7 +226,7 @@ class LocationSearch:
         for report in reports:
             report.run()
         children = [report.heir(part) for report in reports for part in report.children]
-        poses = [report.best for report in reports if report.best is not None]
+        poses = [pose for report in reports for pose in (report.best, report.nearby) if pose is not None]
         return LocationResult(
             leaves=tuple(leaf for report in reports for leaf in report.leaves),
             blocks=tuple((part,) for part in children),
@@ -252,6 +261,8 @@ class _Examination:
     leaves: list[FinishedCell] = field(default_factory=list)
     children: list[Cell] = field(default_factory=list)
     best: FoundPose | None = None
+    #: A pose that was rendered for cells around; it may lie beside this cell.
+    nearby: FoundPose | None = None
     bounded: int = 0
     #: Pixels that were excluded, as a part of those that would have excluded the cell.
     share: float = 1.0
@@ -272,14 +283,14 @@ class _Examination:
             box = search.grid.box_of(self.cell)
             if box.dimensions and search.width(box) > tuning.coarse[search.by_motion]:
                 break
-            picture, number = self._look(box.middle)
             moved = float(np.linalg.norm(search.moved(box))) if search.by_motion else search.width(box)
             if moved > tuning.contracted:
-                some = self._sub_boxes(box, picture)
+                some = self._sub_boxes(box)
                 if some:
                     return None
                 if some is False:
                     break
+            picture, number = self._look(box.middle)
             if not self._whole(box, picture, number) or self.cell.volume > (1.0 - tuning.worth) * before:
                 break
         if not self.done:
@@ -291,7 +302,7 @@ class _Examination:
         """Whether what is left of the cell has a verdict."""
         return bool(self.leaves) and self.leaves[-1].cell == self.cell
 
-    def _sub_boxes(self, box: ParameterBox, picture: np.ndarray) -> bool | None:
+    def _sub_boxes(self, box: ParameterBox) -> bool | None:
         """Exclude sub-boxes of the cell; returns whether some were, or None: the frame has no bounds of sub-boxes."""
         search, tuning = self.search, self.search.tuning
         frame, cells = search.sub_box_frame, search.motion_cells(box)
@@ -299,7 +310,7 @@ class _Examination:
         if frame is None or cells is None or not resolved(box, counts):
             return None
         boxes, parts = MotionBoxes(cells, counts, search.frame.camera), cells if search.by_motion else counts
-        rounds, order = self._rounds(box, picture, counts)
+        rounds, order = self._rounds(box, self._glance(box), counts)
         while (chosen := rounds.following(*order.towards(boxes.moved[rounds.left]))) is not None:
             self.bounded += 1
             tiles, (telling, differences) = np.flatnonzero(chosen.any(axis=(1, 2))), order.telling(chosen)
@@ -348,13 +359,19 @@ class _Examination:
 
     def _look(self, values: Float64Array) -> tuple[np.ndarray, int]:
         """Render the pose at sheared values; returns its tiles, and how many pixels it does not explain."""
-        search = self.search
-        pose = search.original(values)
-        picture = search.plain.render(pose)
-        number = int(search.tiled.outside(picture).sum())
-        if self.best is None or number < self.best.outliers:
-            self.best = FoundPose(tuple(pose.tolist()), number)
-        return picture, number
+        picture, pose = self.search.look(values)
+        if self.best is None or pose.outliers < self.best.outliers:
+            self.best = pose
+        return picture, pose.outliers
+
+    def _glance(self, box: ParameterBox) -> np.ndarray:
+        """About the tiles that the middle of a cell shows."""
+        moved = self.search.moved_pictures
+        found = None if moved is None else moved.near(box)
+        if found is None:
+            return self._look(box.middle)[0]
+        picture, self.nearby = found
+        return picture
 
     @property
     def explained(self) -> bool:
@@ -399,7 +416,9 @@ class _Examination:
                 if self._settled(known):
                     return False
                 if tiled.allowed < number < tuning.hopeful * search.photo.counted.sum():
-                    self._render_best_fit(box, known.linear)
+                    fit = known.best_fit(tuning.steps)
+                    if fit is not None:
+                        self._look(box.at(fit))
             if not self._contracted(box, known):
                 return False
             if last or self.cell.volume <= (1.0 - tuning.worth) * before:
@@ -441,26 +460,6 @@ class _Examination:
             return False
         self._shrink(between(box, least, most))
         return True
-
-    def _render_best_fit(self, box: ParameterBox, linear: LinearSets) -> None:
-        """Render the pose at which the linear bounds' middle explains most (weighted least squares)."""
-        search, counted = self.search, self.search.tiled.counted
-        a = 0.5 * (linear[0].astype(np.float64) + linear[2])[counted].reshape(-1, box.dimensions)
-        b = 0.5 * (linear[1].astype(np.float64) + linear[3])[counted].reshape(-1)
-        low, high = (end[counted].reshape(-1) for end in (search.tiled.low, search.tiled.high))
-        target, room = 0.5 * (low + high) - b, 0.5 * (high - low)
-        good = np.isfinite(a).all(axis=-1) & np.isfinite(target) & (np.abs(a).sum(axis=-1) > 0.0)
-        if not good.any():
-            return
-        a, target, room = a[good], target[good], room[good]
-        p = np.zeros(box.dimensions)
-        for _ in range(search.tuning.steps):
-            miss = np.abs(a @ p - target)
-            weight = 1.0 / np.maximum(miss, room) ** 2
-            p = np.linalg.lstsq(a * np.sqrt(weight)[:, None], target * np.sqrt(weight), rcond=None)[0]
-            if not np.isfinite(p).all():
-                return
-        self._look(box.at(np.clip(p, -1.0, 1.0).astype(np.float64)))
 
     def _finish(self) -> None:
         """End with the cell as it is: possible if a rendered pose explains the photo."""

@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from ns_abstract.verify.cells import Cell, CellGrid
-from ns_abstract.verify.location import FoundPose
 from ns_abstract.verify.location_cover import PoseCover
+from ns_abstract.verify.moved_pictures import FoundPose
 from ns_abstract.verify.search_results import BlockResult, FinishedCell
 from ns_abstract.verify.store import CellBlock, Store
 

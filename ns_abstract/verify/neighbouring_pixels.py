@@ -65,6 +65,25 @@ def best_shift(image: np.ndarray, other: np.ndarray) -> tuple[int, int]:
     return rows, columns
 
 
+def moved(image: np.ndarray, motion: np.ndarray) -> np.ndarray:
+    """An image [H, W, ...] that shows at each pixel what lay ``motion`` [H, W, 2] columns and rows before it.
+
+    Linear between pixels; edges are repeated.
+    """
+    places, weights = [], []
+    for axis, step in ((0, motion[..., 1]), (1, motion[..., 0])):
+        size = image.shape[axis]
+        index = np.arange(size).reshape((-1, 1) if axis == 0 else (1, -1))
+        place = np.clip(index - np.nan_to_num(step), 0.0, size - 1.0)
+        first = np.minimum(place.astype(np.int64), max(0, size - 2))
+        places.append((first, np.minimum(first + 1, size - 1)))
+        weights.append((place - first).reshape(*place.shape, *[1] * (image.ndim - 2)).astype(image.dtype))
+    (top, bottom), (left, right) = places
+    down, across = weights
+    above, below = ((1.0 - across) * image[row, left] + across * image[row, right] for row in (top, bottom))
+    return (1.0 - down) * above + down * below
+
+
 def shifted(image: np.ndarray, rows: int, columns: int) -> np.ndarray:
     """An image [H, W, ...] moved down and to the right, its edges repeated."""
     down, right = (

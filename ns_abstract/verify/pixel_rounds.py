@@ -163,6 +163,28 @@ class BoundedPixels:
         beyond = self.outliers | self.photo.beyond(self.lower, self.upper, self._tiles)
         return self.photo.reach(self.linear, beyond, self._tiles)
 
+    def best_fit(self, steps: int) -> Float64Array | None:
+        """Scaled parameters [d] where the linear bounds' middle explains most, by ``steps`` weighted least squares.
+
+        None: there are none.
+        """
+        counted, d = self.photo.counted, self.linear[0].shape[-1]
+        a = 0.5 * (self.linear[0].astype(np.float64) + self.linear[2])[counted].reshape(-1, d)
+        b = 0.5 * (self.linear[1].astype(np.float64) + self.linear[3])[counted].reshape(-1)
+        low, high = (end[counted].reshape(-1) for end in (self.photo.low, self.photo.high))
+        target, room = 0.5 * (low + high) - b, 0.5 * (high - low)
+        good = np.isfinite(a).all(axis=-1) & np.isfinite(target) & (np.abs(a).sum(axis=-1) > 0.0)
+        if not good.any():
+            return None
+        a, target, room = a[good], target[good], room[good]
+        p = np.zeros(d)
+        for _ in range(steps):
+            weight = 1.0 / np.maximum(np.abs(a @ p - target), room) ** 2
+            p = np.linalg.lstsq(a * np.sqrt(weight)[:, None], target * np.sqrt(weight), rcond=None)[0]
+            if not np.isfinite(p).all():
+                return None
+        return np.clip(p, -1.0, 1.0).astype(np.float64)
+
     @property
     def _tiles(self) -> np.ndarray:
         return np.arange(self.photo.counted.shape[0])

@@ -14,7 +14,7 @@ from ns_abstract.arithmetic.rounding import LINEAR_ROUNDING, LINEAR_UP, Arithmet
 from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.execution.threads import each
 from ns_abstract.geometry.box import ParameterBox, shared_out
-from ns_abstract.geometry.motion_cells import MotionCells
+from ns_abstract.geometry.motion_cells import MotionCells, MotionField
 from ns_abstract.geometry.poses import PoseBox, translation_only
 from ns_abstract.geometry.tiles import in_tiles, laid_out, tile_grid
 from ns_abstract.methods.splat.activate import Splats
@@ -293,10 +293,9 @@ class SplatFrame(Frame):
             lower[chosen], upper[chosen] = low, high
         return lower, upper
 
-    def motion_cells(self, box: ParameterBox, counts: np.ndarray) -> MotionCells | None:
+    def motion_field(self, box: ParameterBox) -> MotionField:
         """See `ns_abstract.refine.protocol.SubBoxFrame` (design.md, B16)."""
-        motion = self._image_motion
-        return None if box.dimensions < 2 else MotionCells.of(motion.of_squares(box), motion.side, counts)
+        return MotionField(self._image_motion.of_squares(box), self._image_motion.side)
 
     def parallax(self, box: ParameterBox) -> np.ndarray:
         """See `ns_abstract.refine.protocol.SubBoxFrame`."""
