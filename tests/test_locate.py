@@ -235,6 +235,29 @@ def test_a_cover_holds_every_pose_of_sheared_boxes(seed: int) -> None:
     assert found.volume < 0.5
 
 
+@pytest.mark.parametrize("shear", [{}, {"yaw": {"x": 0.7, "z": -0.2}}, {"yaw": {"x": 0.5}, "z": {"y": -0.4}}])
+def test_the_volume_of_sheared_boxes_within_a_set(shear: dict[str, dict[str, float]]) -> None:
+    """At most what random poses tell, and little more; exactly that of boxes that are not sheared."""
+    generator = np.random.default_rng(3)
+    box = box_of([-0.1, -0.2, -0.1, -0.05], [0.1, 0.1, 0.2, 0.1])
+    count, many = 30, 20_000
+    lower = generator.uniform(np.array(box.lower) - 0.05, np.array(box.upper), (count, 4))
+    upper = lower + generator.uniform(0.02, 0.2, lower.shape)
+    found = ShearedBoxes(lower, upper, box.names, shear).volume_within(box)
+    sampled, error = 0.0, 0.0
+    for low, high in zip(lower, upper, strict=True):
+        values = generator.uniform(low, high, (many, 4))
+        own = values.copy()
+        for name, factors in shear.items():
+            for other, factor in factors.items():
+                values[:, box.names.index(name)] += factor * own[:, box.names.index(other)]
+        share = float(((values >= box.lower) & (values <= box.upper)).all(axis=1).mean())
+        sampled += float(np.prod(high - low)) * share
+        error += float(np.prod(high - low)) ** 2 * share * (1.0 - share) / many
+    assert sampled - 5.0 * error**0.5 <= found <= (1.15 if shear else 1.0) * sampled + 5.0 * error**0.5
+    assert ShearedBoxes(lower[:0], upper[:0], box.names, shear).volume_within(box) == 0.0
+
+
 def test_a_cover_takes_little_that_is_excluded() -> None:
     """A set of which a part is excluded is not reported as left as a whole."""
     box = box_of([0.0, 0.0, 0.0, 0.0], [1.0, 1.0, 1.0, 1.0])
@@ -277,12 +300,12 @@ def test_what_is_left_is_told_apart_from_the_boxes_around_it(blobs: Inputs, tmp_
         Cell(tuple(middle), tuple(m + half for m in middle)),
         Cell(tuple(m - 2 * half for m in middle), tuple(m - half for m in middle)),
     ]
-    part = location.left_volume(0, left)
+    part = location.possible_volume(0, left)
     assert 0.0 < part < 1e-7
     whole, own = (np.subtract(b.upper, b.lower) for b in (grid.box, location.search(0).plain.box))
     assert part == pytest.approx(2 * (half / grid.units[0]) ** 6 * np.prod(whole / own))
     assert location.cover(0, left, lambda: True).volume > 100.0 * part
-    assert location.left_volume(0, grid.roots()) == 1.0
+    assert location.possible_volume(0, grid.roots()) == 1.0 and location.possible_volume(0, []) == 0.0
 
 
 def test_a_locate_command_ends_with_its_time(
@@ -300,7 +323,7 @@ def test_a_locate_command_ends_with_its_time(
     code, _, _ = in_process(main, options(blobs, tmp_path / "out", image, time_budget=3))
     assert code == 0 and len(ends) == 1 and ends[0] <= 3.0
     report = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert report["left_volume"] <= report["possible_volume"] <= 1.0
+    assert report["possible_volume"] <= report["boxes_volume"] <= 1.0
 
 
 def test_nearby_values() -> None:
@@ -420,8 +443,8 @@ def test_locate_finds_the_pose(blobs: Inputs, tmp_path: Path) -> None:
         kind: sum(np.prod((c.upper - c.lower) / sizes) for c in place.cells if (c.verdict == "excluded") == kind)
         for kind in (True, False)
     }
-    assert volumes[False] == pytest.approx(place.possible_volume)
-    assert place.left_volume <= place.possible_volume
+    assert volumes[False] == pytest.approx(place.boxes_volume)
+    assert 0.0 < place.possible_volume <= place.boxes_volume
     assert sum(volumes.values()) == pytest.approx(1.0)
     for cell in place.cells:
         if cell.verdict == "possible":

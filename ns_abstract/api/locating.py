@@ -127,7 +127,7 @@ class LocationQuestion(CellQuestion[LocateProgress]):
         if state == "running":
             return {}
         rows = {tally.frame: store.leaves(tally.frame) for tally in store.tallies()}
-        left = {frame: self.job.left_volume(frame, store.left(frame)) for frame in rows}
+        left = {frame: self.job.possible_volume(frame, store.left(frame)) for frame in rows}
         sets = {frame: self.job.job.pose_sets[frame] for frame in rows}
         poses = {frame: store.poses(frame) for frame in rows}
         photo = self.job.photo
@@ -185,7 +185,7 @@ class Located(SearchResult):
 
     Attributes:
         possible_volume: Part of the parameter volume that is not excluded, mean over the sets.
-        left_volume: Part of it that the search left; the cells are boxes around that.
+        boxes_volume: Part of it that ``cells`` around this take: cells of the search are slanted, these are boxes.
         hull: Ends [d], [d] of the smallest box around all that is not excluded; None: no pose made the photo.
         best: Parameters ``pose`` of the rendered pose that explains most, and the number of ``outliers``; or None.
         answer: "none" (no pose of the sets made the photo), "possible" (a rendered pose explains it) or "unknown".
@@ -194,7 +194,7 @@ class Located(SearchResult):
     """
 
     possible_volume: float
-    left_volume: float
+    boxes_volume: float
     hull: tuple[np.ndarray, np.ndarray] | None
     best: Mapping[str, Any] | None
     answer: str
@@ -321,7 +321,7 @@ def located(job: Location, rows: Mapping[int, list[Row]], document: Mapping[str,
         job.job.parameters,
         document,
         possible_volume=document["possible_volume"],
-        left_volume=document["left_volume"],
+        boxes_volume=document["boxes_volume"],
         hull=None if hull is None else (np.array(hull["lower"]), np.array(hull["upper"])),
         best=document["best"],
         answer=document["answer"],

@@ -17,6 +17,7 @@ from ns_abstract.api.files import Settings, open_job
 from ns_abstract.api.job import Job, require_sound_platform
 from ns_abstract.api.scenes import Scene
 from ns_abstract.execution.worker_cache import Recipe
+from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.geometry.camera_path import load_camera_path
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.geometry.tiles import assemble
@@ -132,13 +133,12 @@ class Location:
         plain = self.search(number).plain
         return assemble(plain.render(np.asarray(values, np.float64)), plain.camera)[..., :3]
 
-    def left_volume(self, number: int, cells: list[Cell]) -> float:
-        """The part of a set that ``cells`` of its search hold at most; some of them reach beyond the set."""
-        search = self.search(number)
-        # a shear keeps volumes
-        whole, own = (np.subtract(box.upper, box.lower) for box in (search.grid.box, search.plain.box))
-        shares = sum(cell.volume for cell in cells) / search.grid.volume
-        return min(1.0, shares * float(np.prod(whole / own)))
+    def possible_volume(self, number: int, cells: list[Cell]) -> float:
+        """The part of a set that ``cells`` of its search hold, at most."""
+        plain = self.search(number).plain.box
+        whole = float(np.prod(np.subtract(plain.upper, plain.lower)))
+        boxes = list(map(self.search(number).grid.box_of, cells))
+        return min(1.0, self._sheared(number, boxes).volume_within(plain) / whole) if boxes else 0.0
 
     def cover(self, number: int, cells: list[Cell], late: Callable[[], bool] = lambda: False) -> PoseCover:
         """Cells of a set's own parameters that hold all poses in ``cells`` of its search; ``late``: see `cover`."""
@@ -149,13 +149,15 @@ class Location:
             feasible = box if late() else search.frame.feasible(box)
             if feasible is not None:
                 boxes.append(feasible)
-        d = search.frame.box.dimensions
+        return cover(search.plain.box, self._sheared(number, boxes), late=late)
+
+    def _sheared(self, number: int, boxes: list[ParameterBox]) -> ShearedBoxes:
+        frame = self.search(number).frame
         lower, upper = (
-            np.array([getattr(box, end) for box in boxes], np.float64).reshape(len(boxes), d)
+            np.array([getattr(box, end) for box in boxes], np.float64).reshape(len(boxes), frame.box.dimensions)
             for end in ("lower", "upper")
         )
-        sheared = ShearedBoxes(lower, upper, search.frame.box.names, search.frame.pose_set.shear)
-        return cover(search.plain.box, sheared, late=late)
+        return ShearedBoxes(lower, upper, frame.box.names, frame.pose_set.shear)
 
     @property
     def fingerprint(self) -> dict[str, Any]:

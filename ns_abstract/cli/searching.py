@@ -164,11 +164,10 @@ def _search(
         lambda store: f"{store.open_blocks} cells still to be examined from before",
         introduced,
     )  # fmt: skip
-    left = percent(document["left_volume"])
+    left, boxes = (percent(document[name]) for name in ("possible_volume", "boxes_volume"))
     console.print(f"{_ANSWERS[document['answer']]}; {left} of the set left")
-    possible = percent(document["possible_volume"])
-    if possible != left:
-        console.print(f"  cells.sqlite has boxes around it, which take {possible} of the set")
+    if boxes != left:
+        console.print(f"  cells.sqlite has boxes around it, which take {boxes} of the set")
     late = [entry["index"] for entry in document["frames"] if entry["best"] is None and entry["possible_volume"] > 0.0]
     if document["state"] != "done" and late:
         console.print(f"  not examined before the time was over: {frames_listed(late)}")

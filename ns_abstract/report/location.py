@@ -31,7 +31,7 @@ _POSSIBLE, _BEST = (29, 116, 64), (179, 38, 30)
 
 METRICS = {
     "possible_volume": "part of the parameter volume that is not excluded, mean over the frames' sets",
-    "left_volume": "part of it that the search left; the cells are boxes around that",
+    "boxes_volume": "part of it that the cells of cells.sqlite which are not excluded take: boxes around this",
     "hull": "the smallest box around all that is not excluded; null: no pose of the sets made the photo",
     "best": "of all rendered poses the one that explains most, and how many counted pixels it does not explain",
     "answer": "none (proved: no pose of the sets made the photo), possible (a rendered pose explains it), unknown",
@@ -67,7 +67,7 @@ def location_document(
         parameters: Names and units of the table ``parameters``.
         sets: By frame, the poses.
         rows: By frame, the cells.
-        left: By frame, the part of the set that the search left.
+        left: By frame, the part of the set that is not excluded.
         poses: Rendered poses by frame, the best first, with ``values`` and ``outliers``.
         figures: See `ns_abstract.report.certificate.search_figures`.
         state: "done", "budget" or "interrupted".
@@ -92,7 +92,7 @@ def location_document(
             "answer": answer,
             **{
                 name: sum(entry[name] for entry in frames) / max(1, len(frames))
-                for name in ("possible_volume", "left_volume")
+                for name in ("possible_volume", "boxes_volume")
             },
             "hull": hull,
             "best": best,
@@ -111,7 +111,7 @@ def _frame(
     index: int,
     poses: PoseBox,
     rows: Sequence[Row],
-    searched: float,
+    possible: float,
     found: Sequence[Any],
 ) -> dict[str, Any]:
     box = poses.box
@@ -123,7 +123,7 @@ def _frame(
         shares = np.subtract(row["upper"], row["lower"])[columns] / np.subtract(box.upper, box.lower)
         return float(np.prod(shares))
 
-    possible = min(1.0, sum(map(volume, left)))
+    boxes = min(1.0, sum(map(volume, left)))
     hull = None
     if left:
         hull = {
@@ -140,8 +140,8 @@ def _frame(
         "index": index,
         "intrinsics": poses.camera.intrinsics._asdict(),
         "parameters": entries,
-        "possible_volume": possible,
-        "left_volume": min(possible, searched),
+        "possible_volume": min(boxes, possible),
+        "boxes_volume": boxes,
         "hull": hull,
         "best": best,
         "cells": {kind: sum(row["verdict"] == kind for row in rows) for kind in ("excluded", "possible", "unknown")},

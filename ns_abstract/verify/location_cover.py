@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -16,6 +17,8 @@ from ns_abstract.verify.location import UNITS
 
 #: Most cells of a cover that are left, and by how much their volume may exceed that of what they hold.
 MOST, SPARE = 1500, 1.03
+#: Parts along each parameter that turns make up for, where the volume of what lies in a set is summed.
+_PARTS = 4
 
 
 @dataclass(frozen=True)
@@ -56,6 +59,30 @@ class ShearedBoxes:
             (names.index(name), [(names.index(other), factor) for other, factor in factors.items()])
             for name, factors in shear.items()
         ]
+
+    def volume_within(self, box: ParameterBox) -> float:
+        """The volume of the boxes' poses that lie in ``box``, at most: a sum over parts of them."""
+        lower, upper = (np.array(end) for end in (box.lower, box.upper))
+        sheared = [axis for axis, _ in self._terms]
+        plain = [axis for axis in range(len(lower)) if axis not in sheared]
+        shifts = sorted({other for _, terms in self._terms for other, _ in terms})
+        own_lower, own_upper = self.lower.copy(), self.upper.copy()
+        own_lower[:, plain] = np.maximum(own_lower[:, plain], lower[plain])
+        own_upper[:, plain] = np.minimum(own_upper[:, plain], upper[plain])
+        steps, total = (own_upper - own_lower)[:, shifts] / _PARTS, 0.0
+        for part in itertools.product(range(_PARTS), repeat=len(shifts)):
+            least, most = own_lower.copy(), own_upper.copy()
+            least[:, shifts] = own_lower[:, shifts] + steps * part
+            most[:, shifts] = least[:, shifts] + steps
+            lengths = (most - least).clip(0.0)
+            for axis, terms in self._terms:
+                # what the set leaves of the turn, which the parameters in terms go with
+                ends = [(factor * least[:, other], factor * most[:, other]) for other, factor in terms]
+                low, high = (sum(pick(a, b) for a, b in ends) for pick in (np.minimum, np.maximum))
+                inside = np.minimum(most[:, axis], upper[axis] - low) - np.maximum(least[:, axis], lower[axis] - high)
+                lengths[:, axis] = inside.clip(0.0)
+            total += float(lengths.prod(axis=1).sum())
+        return total
 
     def within(self, box: ParameterBox, chosen: np.ndarray) -> tuple[np.ndarray, Float64Array, Float64Array]:
         """Which boxes of ``chosen`` [m] may have poses in ``box``, and ends [m, d] around these, rounded outward."""
