@@ -23,8 +23,10 @@ from ns_abstract.geometry.camera_path import load_camera_path
 from ns_abstract.geometry.tiles import assemble
 from ns_abstract.verify.cell_boxes import between, divided, inner_cell, meeting, resolved, slabs, sub_box_counts
 from ns_abstract.verify.cells import Cell, CellGrid
+from ns_abstract.verify.location import LocationSearch, LocationTuning
 from ns_abstract.verify.location_cover import ShearedBoxes, cover
 from ns_abstract.verify.location_store import LocationStore
+from ns_abstract.verify.moved_pictures import FoundPose
 from ns_abstract.verify.neighbouring_pixels import nearby
 from ns_abstract.verify.photo import Photo, TiledPhoto
 
@@ -380,6 +382,34 @@ def test_known_outliers_exclude_a_cell_without_bounds(blobs: Inputs) -> None:
     # any picture explains this photo
     findings = search.examine([replace(root, outliers=tuple(numbers[:-1]))])
     assert not any(leaf.verdict == "certified" for leaf in findings.leaves)
+
+
+def test_a_pose_beside_a_cell_does_not_make_it_possible(blobs: Inputs, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The picture that pixels are chosen by is of a pose nearby; what that one explains is told, of no cell."""
+    scene, camera = nsa.load_scene(blobs.config), nsa.load_camera_path(blobs.path).cameras[0]
+    poses = nsa.PoseSet(camera, translation={"x": 0.03, "y": 0.03}, rotation={"yaw": 0.02})
+    job = Job(scene, [poses.of(scene)])
+    frame = job.frame(0)
+    levels = taken(assemble(frame.render(frame.box.middle), frame.camera), 0.0, 0, np.random.default_rng(0))
+    photo = Location(job, levels, None, PhotoOptions(0.01, 0.02)).photo
+    # every cell is the finest, and has sub-boxes
+    tuning = LocationTuning(finest=1.0, contracted=0.0)
+    search = LocationSearch(job.frame(0, sheared=True), job.frame(0), photo, tuning=tuning)
+    (root,) = search.grid.roots()
+    beside = search.grid.box.middle
+
+    class Beside:
+        def near(self, box: ParameterBox) -> tuple[np.ndarray, FoundPose]:
+            return search.look(beside)
+
+    monkeypatch.setattr(LocationSearch, "moved_pictures", Beside())
+    verdicts, told = set(), False
+    for cell in search.grid.cut(root, [8, 8, 8]):
+        if not search.grid.box_of(cell).contains(beside):
+            findings = search.examine([cell])
+            verdicts |= {leaf.verdict for leaf in findings.leaves}
+            told |= findings.best is not None and findings.best.outliers <= search.tiled.allowed
+    assert told and verdicts == {"certified", "unknown"}
 
 
 @pytest.mark.parametrize(("shifts", "turns"), [("xy", ()), ("xy", ("yaw",)), ("xyz", ("yaw", "pitch", "roll"))])

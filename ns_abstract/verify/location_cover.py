@@ -18,7 +18,7 @@ from ns_abstract.verify.location import UNITS
 #: Most cells of a cover that are left, and by how much their volume may exceed that of what they hold.
 MOST, SPARE = 1500, 1.03
 #: Parts along each parameter that turns make up for, where the volume of what lies in a set is summed.
-_PARTS = 4
+_PARTS = 8
 
 
 @dataclass(frozen=True)
