@@ -8,10 +8,10 @@ from test_bounds import GSPLAT_1_4_0, Case, moves
 from test_depth_ranges import BACKGROUNDS, COUNTS, stack
 
 from ns_abstract.arithmetic.rounding import FLOAT32
+from ns_abstract.geometry import enclosing_boxes
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.enclosing_boxes import box_of_motion
-from ns_abstract.methods.splat import enclosing_cells
-from ns_abstract.methods.splat.enclosing_cells import EnclosingCells, EnclosingContext
+from ns_abstract.geometry.enclosing_boxes import EnclosingBoxes, box_of_motion
+from ns_abstract.methods.splat.enclosing_cells import EnclosingContext
 from ns_abstract.methods.splat.frame import SplatFrame
 from ns_abstract.methods.splat.lists import rectangles_by_place
 
@@ -19,14 +19,14 @@ SET = ParameterBox(("x", "yaw", "z"), ("", "", ""), (-1.0, -0.1, 2.0), (1.0, 0.3
 MOTION = np.array([16.0, 5.0, 0.0])
 
 
-def cells(found: list[ParameterBox]) -> EnclosingCells:
+def cells(found: list[ParameterBox]) -> EnclosingBoxes[EnclosingContext]:
     """Of `SET`; boxes whose context is found are added to a list."""
 
     def context(box: ParameterBox) -> EnclosingContext:
         found.append(box)
         return EnclosingContext(np.zeros(25, np.int64), np.full((25, 4), len(found), np.int32), np.zeros((0, 0)))
 
-    return EnclosingCells(SET, lambda box: MOTION, context)
+    return EnclosingBoxes(SET, lambda box: MOTION, context)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -53,7 +53,7 @@ def test_what_reaches_beyond_the_set_has_none_around_it():
 
 
 def test_the_latest_are_kept_within_their_memory(monkeypatch):
-    monkeypatch.setattr(enclosing_cells, "_TUNING", enclosing_cells.ContextTuning(most=2000))
+    monkeypatch.setattr(enclosing_boxes, "_TUNING", enclosing_boxes.EnclosingTuning(most=2000))
     found: list[ParameterBox] = []
     around = cells(found)
     narrow = [SET.replace(0, x, x + 0.001) for x in (-0.9, -0.3, 0.3, 0.9)]

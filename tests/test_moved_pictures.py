@@ -57,7 +57,7 @@ def test_one_picture_serves_the_cells_nearby() -> None:
         looks.append(tuple(values.tolist()))
         return frame.render(values), FoundPose(tuple(values.tolist()), len(looks))
 
-    pictures = MovedPictures(frame, frame.motion_field, frame.motion(frame.box), look)
+    pictures = MovedPictures(frame, frame.motion_field, look)
     wide = np.array(frame.box.upper) - frame.box.lower
     errors = []
     for middle in frame.box.sample(60, generator):
@@ -77,6 +77,6 @@ def test_one_picture_serves_the_cells_nearby() -> None:
 def test_a_cell_that_reaches_beyond_the_set_has_none() -> None:
     case = Case(scene({"mean": (0.0, 0.0, -5.0), "scale": 1.0, "opacity": 0.9}), moves(x=0.1, yaw=0.02))
     frame = SplatFrame(case.splats, GSPLAT_1_4_0, FLOAT32, case.poses)
-    pictures = MovedPictures(frame, frame.motion_field, frame.motion(frame.box), lambda _: pytest.fail("a look"))
+    pictures = MovedPictures(frame, frame.motion_field, lambda _: pytest.fail("a look"))
     beyond = ParameterBox(frame.box.names, frame.box.units, frame.box.lower, tuple(2.0 * x for x in frame.box.upper))
     assert pictures.near(beyond) is None

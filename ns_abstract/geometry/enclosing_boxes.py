@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 
@@ -23,6 +26,10 @@ class EnclosingTuning:
     #: grid by, as they are rounded; and parts of a box that it reaches beyond its lines, so that these ends lie inside.
     spare: float = 1e-6
     beyond: float = 1e-9
+    #: Pixels that the picture moves by along each parameter over the boxes of `EnclosingBoxes`, about, where a cell is
+    #: no wider; and most bytes that is kept of them.
+    shared_motion: float = 2.0
+    most: int = 1 << 27
     #: Most halvings of other parameters before a parameter is halved over which the picture hardly moves.
     deepest: int = 64
 
@@ -72,6 +79,54 @@ def box_of_motion(cell: ParameterBox, whole: ParameterBox, motion: np.ndarray, p
     few = [math.floor(math.log2(moved / pixels)) if moved > pixels else 0 for moved in motion.tolist()]
     widths = zip(_levels(cell, whole), few, strict=True)
     return _aligned(cell, whole, [max(0, min(level - _TUNING.halvings, least)) for level, least in widths])
+
+
+class Sized(Protocol):
+    """What takes memory."""
+
+    @property
+    def nbytes(self) -> int: ...
+
+
+_Known = TypeVar("_Known", bound=Sized)
+
+
+class EnclosingBoxes(Generic[_Known]):
+    """What is known of boxes around cells, by which a set is divided evenly; the latest are kept.
+
+    Args:
+        whole: The set.
+        motion: Tells by how many pixels [d] the picture moves over a box.
+        find: Finds what is to be known of a box.
+    """
+
+    def __init__(
+        self,
+        whole: ParameterBox,
+        motion: Callable[[ParameterBox], np.ndarray],
+        find: Callable[[ParameterBox], _Known],
+    ) -> None:
+        self._whole, self._find_motion, self._find = whole, motion, find
+        self._kept: dict[ParameterBox, _Known] = {}
+        self._lock = threading.Lock()
+
+    def around(self, cell: ParameterBox) -> _Known | None:
+        """What is known of a box around a cell; None: the cell reaches beyond the set."""
+        box = box_of_motion(cell, self._whole, self._motion, _TUNING.shared_motion)
+        if box is None:
+            return None
+        with self._lock:
+            known = self._kept.pop(box, None)
+        known = known or self._find(box)
+        with self._lock:
+            self._kept[box] = known
+            while len(self._kept) > 1 and sum(one.nbytes for one in self._kept.values()) > _TUNING.most:
+                del self._kept[next(iter(self._kept))]
+        return known
+
+    @cached_property
+    def _motion(self) -> np.ndarray:
+        return np.nan_to_num(np.asarray(self._find_motion(self._whole), np.float64))
 
 
 def _levels(cell: ParameterBox, whole: ParameterBox) -> list[int]:

@@ -200,7 +200,7 @@ class LocationSearch:
         frame = self.sub_box_frame
         if frame is None:
             return None
-        return MovedPictures(self.frame, frame.motion_field, self.moved(self.frame.box), self.look)
+        return MovedPictures(self.frame, frame.motion_field, self.look)
 
     def look(self, values: Float64Array) -> tuple[np.ndarray, FoundPose]:
         """Render the pose at sheared values; returns its tiles, and what it misses of the photo."""

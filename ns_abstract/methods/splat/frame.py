@@ -14,6 +14,7 @@ from ns_abstract.arithmetic.rounding import LINEAR_ROUNDING, LINEAR_UP, Arithmet
 from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.execution.threads import each
 from ns_abstract.geometry.box import ParameterBox, shared_out
+from ns_abstract.geometry.enclosing_boxes import EnclosingBoxes
 from ns_abstract.geometry.motion_cells import MotionCells, MotionField
 from ns_abstract.geometry.poses import PoseBox, translation_only
 from ns_abstract.geometry.tiles import in_tiles, laid_out, tile_grid
@@ -21,7 +22,7 @@ from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.bounds import SceneSums, Stages
 from ns_abstract.methods.splat.constants import Rasteriser
 from ns_abstract.methods.splat.depths import ACCUMULATION_HIGH, ACCUMULATION_LOW, DEPTH_HIGH, DEPTH_LOW
-from ns_abstract.methods.splat.enclosing_cells import EnclosingCells, EnclosingContext, VisibleContext
+from ns_abstract.methods.splat.enclosing_cells import EnclosingContext, VisibleContext
 from ns_abstract.methods.splat.image_motion import ImageMotion
 from ns_abstract.methods.splat.lists import rectangles_by_place, summed_area, touching, visible_again
 from ns_abstract.methods.splat.render import Renderer
@@ -166,7 +167,7 @@ class SplatFrame(Frame):
             self.pose_set = pose_set.sheared(shear)
             self.box = self.pose_set.box
             self._image_motion = ImageMotion(self.pose_set, splats.means, self.renderer)
-        self._enclosing = EnclosingCells(self.box, self.motion, self._context)
+        self._enclosing = EnclosingBoxes(self.box, self.motion, self._context)
 
     def warm_up(self, stage: str | None = None) -> None:
         """Compile the kernels that this frame needs, or those of one of `stages`."""
