@@ -384,6 +384,18 @@ def test_known_outliers_exclude_a_cell_without_bounds(blobs: Inputs) -> None:
     assert not any(leaf.verdict == "certified" for leaf in findings.leaves)
 
 
+@pytest.mark.parametrize("outliers", [0, 100])
+def test_a_set_of_one_pose_is_searched(outliers: int, blobs: Inputs) -> None:
+    scene, camera = nsa.load_scene(blobs.config), nsa.load_camera_path(blobs.path).cameras[0]
+    poses, generator = nsa.PoseSet(camera), np.random.default_rng(0)
+    frame = Job(scene, [poses.of(scene)]).frame(0)
+    levels = taken(assemble(frame.render(np.zeros(0)), camera), 0.0, outliers, generator)
+    found = nsa.locate(scene, poses, levels, noise=0.01, outliers=0.02, time_budget=60.0)
+    assert found.answer == ("none" if outliers else "possible")
+    assert found.possible_volume == found.boxes_volume == (0.0 if outliers else 1.0)
+    assert found.best is not None and abs(found.best["outliers"] - outliers) <= 5
+
+
 def test_a_pose_beside_a_cell_does_not_make_it_possible(blobs: Inputs, monkeypatch: pytest.MonkeyPatch) -> None:
     """The picture that pixels are chosen by is of a pose nearby; what that one explains is told, of no cell."""
     scene, camera = nsa.load_scene(blobs.config), nsa.load_camera_path(blobs.path).cameras[0]
