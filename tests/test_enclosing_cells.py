@@ -101,6 +101,7 @@ def test_elements_are_counted_in_pictures_of_every_size(size):
     frame = SplatFrame(case.splats, GSPLAT_1_4_0, FLOAT32, case.poses)
     context, counts = frame.enclosing(frame.box), frame.element_counts(frame.box)
     expected = np.zeros((size[1], size[0]), np.int64)
+    assert context is not None
     for x0, x1, y0, y1 in context.reach:
         expected[y0:y1, x0:x1] += 1
     assert np.array_equal(counts, expected) and counts.min() >= 1
