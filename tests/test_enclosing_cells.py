@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from test_bounds import GSPLAT_1_4_0, Case, moves
+from test_bounds import GSPLAT_1_4_0, Case, camera, moves, scene
 from test_depth_ranges import BACKGROUNDS, COUNTS, stack
 
 from ns_abstract.arithmetic.rounding import FLOAT32
@@ -84,9 +84,24 @@ def test_pixels_have_the_ends_that_all_gaussians_leave(monkeypatch):
 
 def test_rectangles_are_counted_at_every_place():
     generator = np.random.default_rng(0)
-    rectangles = np.sort(generator.integers(0, 7, (50, 2, 2)), axis=2).reshape(50, 4).astype(np.int32)
+    # some reach beyond all places, as tiles reach beyond a picture
+    rectangles = np.sort(generator.integers(-2, 14, (50, 2, 2)), axis=2).reshape(50, 4).astype(np.int32)
     counts = np.zeros((6, 6), np.int64)
     for x0, x1, y0, y1 in rectangles:
-        counts[y0:y1, x0:x1] += 1
+        counts[max(0, y0) : max(0, y1), max(0, x0) : max(0, x1)] += 1
     assert np.array_equal(rectangles_by_place(rectangles, 6, 6), counts)
     assert not rectangles_by_place(rectangles[:0], 6, 6).any()
+
+
+@pytest.mark.parametrize("size", [(20, 17), (1, 1), (33, 5)])
+def test_elements_are_counted_in_pictures_of_every_size(size):
+    """Also where tiles reach beyond the picture, and Gaussians beyond both."""
+    blobs = [{"mean": (x, 0.0, -5.0), "scale": scale, "opacity": 0.9} for x, scale in ((0.0, 3.0), (0.5, 0.1))]
+    case = Case(scene(*blobs), moves(x=0.1, yaw=0.02), camera(*size))
+    frame = SplatFrame(case.splats, GSPLAT_1_4_0, FLOAT32, case.poses)
+    context, counts = frame.enclosing(frame.box), frame.element_counts(frame.box)
+    expected = np.zeros((size[1], size[0]), np.int64)
+    assert context is not None
+    for x0, x1, y0, y1 in context.reach:
+        expected[y0:y1, x0:x1] += 1
+    assert np.array_equal(counts, expected) and counts.min() >= 1

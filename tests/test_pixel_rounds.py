@@ -200,3 +200,13 @@ def test_the_last_pixels_of_a_round_tell_how_many_more_help() -> None:
         rounds.take(np.repeat(excluding, 2, axis=1), chosen)
         assert rounds.numbers.tolist() == [4, 4]
         assert (rounds.following(order, shares) is not None) == goes_on
+
+
+@pytest.mark.parametrize("dimensions", [0, 2])
+def test_nothing_fits_better_where_nothing_moves_the_picture(dimensions: int) -> None:
+    """A set of one pose has no parameters, and its linear bounds no slopes."""
+    photo = photo_of(np.zeros((T, SIDE, SIDE, 3)), 0)
+    known, shape = BoundedPixels(photo, dimensions), (T, SIDE, SIDE, 3)
+    flat, ends = np.zeros((*shape, dimensions)), np.full(shape, 0.5)
+    known.add(bounds_of(ends, ends, (flat, ends, flat, ends)), np.arange(T), np.ones((T, SIDE, SIDE), bool))
+    assert known.best_fit(3) is None

@@ -133,3 +133,14 @@ def test_losses_of_a_typical_cell():
         assert max(below.max(), above.max()) > 0.01
     whole = typical_cell(frame, box, None, 1.0, case.image(box.middle))
     assert len(whole.losses) == 1 and whole.losses[0][0].mean() > typical.losses[0][0].mean()
+
+
+def test_cells_that_are_far_too_wide_are_likely_to_exclude_nothing():
+    """And what bounds lose there does not overflow."""
+    levels = np.zeros((SIDE, SIDE, 3), np.uint8)
+    photo = Photo(levels, 0.02, 0.0, np.ones((SIDE, SIDE), bool)).tiled(SIDE)
+    picture, loose = np.full((SIDE, SIDE, 3), 0.6), np.full((SIDE, SIDE, 3), 1.0)
+    telling = TellingPixels(photo, CAMERA, TypicalCell(picture, 1.0, ([loose, loose],)))
+    with np.errstate(over="raise"):
+        order = telling.order(picture[None], 1, 1000.0, photo.counted, 100, None)
+        assert order.everywhere[0].size == 0 and order.towards(np.zeros((1, 2)))[1].sum() < 1e-9

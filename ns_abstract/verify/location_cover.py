@@ -66,9 +66,10 @@ class ShearedBoxes:
         sheared = [axis for axis, _ in self._terms]
         plain = [axis for axis in range(len(lower)) if axis not in sheared]
         shifts = sorted({other for _, terms in self._terms for other, _ in terms})
-        own_lower, own_upper = self.lower.copy(), self.upper.copy()
-        own_lower[:, plain] = np.maximum(own_lower[:, plain], lower[plain])
-        own_upper[:, plain] = np.minimum(own_upper[:, plain], upper[plain])
+        # what of the other parameters goes with turns of the set
+        chosen, *ends = self.within(box, np.arange(len(self.lower)))
+        own_lower, own_upper = self.lower[chosen], self.upper[chosen]
+        own_lower[:, plain], own_upper[:, plain] = (end[:, plain] for end in ends)
         steps, total = (own_upper - own_lower)[:, shifts] / _PARTS, 0.0
         for part in itertools.product(range(_PARTS), repeat=len(shifts)):
             least, most = own_lower.copy(), own_upper.copy()
@@ -76,11 +77,14 @@ class ShearedBoxes:
             most[:, shifts] = least[:, shifts] + steps
             lengths = (most - least).clip(0.0)
             for axis, terms in self._terms:
-                # what the set leaves of the turn, which the parameters in terms go with
-                ends = [(factor * least[:, other], factor * most[:, other]) for other, factor in terms]
-                low, high = (sum(pick(a, b) for a, b in ends) for pick in (np.minimum, np.maximum))
-                inside = np.minimum(most[:, axis], upper[axis] - low) - np.maximum(least[:, axis], lower[axis] - high)
-                lengths[:, axis] = inside.clip(0.0)
+                # at each pose of the part, what the set leaves of the turn, which the parameters in terms go with
+                moved = [(factor * least[:, other], factor * most[:, other]) for other, factor in terms]
+                low, high = (sum(pick(a, b) for a, b in moved) for pick in (np.minimum, np.maximum))
+                first, last = lower[axis] - least[:, axis], upper[axis] - most[:, axis]
+                # the two overlap by most where their middles meet
+                shift = (0.5 * (first + last)).clip(low, high)
+                beyond = np.maximum(first - shift, shift - last).clip(0.0)
+                lengths[:, axis] = np.minimum(lengths[:, axis] - beyond, upper[axis] - lower[axis]).clip(0.0)
             total += float(lengths.prod(axis=1).sum())
         return total
 

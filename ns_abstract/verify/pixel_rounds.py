@@ -169,8 +169,8 @@ class BoundedPixels:
         None: there are none.
         """
         counted, d = self.photo.counted, self.linear[0].shape[-1]
-        a = 0.5 * (self.linear[0].astype(np.float64) + self.linear[2])[counted].reshape(-1, d)
         b = 0.5 * (self.linear[1].astype(np.float64) + self.linear[3])[counted].reshape(-1)
+        a = 0.5 * (self.linear[0].astype(np.float64) + self.linear[2])[counted].reshape(b.size, d)
         low, high = (end[counted].reshape(-1) for end in (self.photo.low, self.photo.high))
         target, room = 0.5 * (low + high) - b, 0.5 * (high - low)
         good = np.isfinite(a).all(axis=-1) & np.isfinite(target) & (np.abs(a).sum(axis=-1) > 0.0)

@@ -27,6 +27,8 @@ _MOST_PIXELS, _MOST_ELEMENTS = 4096, 2_000_000
 _ALL, _POWER = 2.0, 1.5
 #: Worth at which a pixel is as likely to exclude poses as not, and by how much e times the odds have more.
 _EVEN, _STEEP = -0.1, 0.2
+#: A power of e of the odds beyond which they are no smaller.
+_HOPELESS = 100.0
 #: Scene elements whose work is that of all else that a pixel takes.
 _OTHER_WORK = 3000.0
 #: Most scene elements that a cell's pixels look at where there are up to so many times as many pixels.
@@ -254,7 +256,8 @@ def _ends(picture: np.ndarray, kind: int, losses: Sequence[Float64Array]) -> tup
 
 def _likely(shares: Float64Array, worth: Float64Array) -> Float64Array:
     """The part of a cell that each pixel is likely to exclude, of the ``shares`` where bounds may miss the photo."""
-    return shares / (1.0 + np.exp((_EVEN - worth) / _STEEP))
+    # what bounds lose has no end where a cell is far wider than the typical one
+    return shares / (1.0 + np.exp(np.minimum((_EVEN - worth) / _STEEP, _HOPELESS)))
 
 
 def _steps(radius: int) -> range:

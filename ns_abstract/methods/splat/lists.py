@@ -88,8 +88,11 @@ def touching(indices, rectangles, table):
 
 
 def rectangles_by_place(rectangles, rows, columns):
-    """[rows, columns] int64 how many of the ``rectangles`` [n, 4] within these (see `touching`) each place lies in."""
-    x0, x1, y0, y1 = rectangles[(rectangles[:, 0] < rectangles[:, 1]) & (rectangles[:, 2] < rectangles[:, 3])].T
+    """[rows, columns] int64 how many of the ``rectangles`` [n, 4] (see `touching`) each place lies in."""
+    # those of Gaussians end with their tiles, which reach beyond a picture whose sides they do not divide
+    x0, x1, y0, y1 = np.minimum(np.maximum(rectangles, 0), [columns, columns, rows, rows]).T
+    some = (x0 < x1) & (y0 < y1)
+    x0, x1, y0, y1 = x0[some], x1[some], y0[some], y1[some]
     wide = columns + 1
     begun, ended = (
         np.bincount(a * wide + x0, minlength=(rows + 1) * wide)
