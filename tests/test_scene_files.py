@@ -321,6 +321,18 @@ def test_another_class_is_refused_unless_it_is_declared(
     assert "Gaussians alone" in scene.method().content
 
 
+@pytest.mark.parametrize("key", ["rasterize_mode", "background_color", "sh_degree_interval"])
+def test_absent_keys_have_the_defaults_of_their_own_class_alone(plain: Path, key: str) -> None:
+    """A configuration class of somebody else may have another default than Nerfstudio's."""
+    edit(plain, (TAG, "!!python/object:sea.WaterModelConfig"))
+    shows(plain, LATE)
+    (line,) = (line for line in plain.read_text().splitlines() if line.strip().startswith(f"{key}:"))
+    edit(plain, (line + "\n", ""))
+    refused(plain, f"pipeline.model.{key}", "sea.WaterModelConfig")
+    edit(plain, ("!!python/object:sea.WaterModelConfig", TAG))
+    assert load_scene(plain).count
+
+
 MODULES = ("background_model.0.weight", "medium_mlp.bias", "gauss_params.features_medium", "exposure", "lpips_.x")
 
 

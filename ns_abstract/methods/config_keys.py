@@ -6,6 +6,7 @@ Lines are those of Nerfstudio 1.1.5; `docs/keys.md` is made from these tables.
 from __future__ import annotations
 
 from ns_abstract.io.errors import InputError
+from ns_abstract.io.jsonio import show
 from ns_abstract.io.keys import Key, KeyTable, sentence
 from ns_abstract.methods import runs
 
@@ -203,14 +204,39 @@ RUN = KeyTable(
 
 TABLES = (SPLATFACTO, VANILLA_NERF, NERFACTO, RUN)
 
+#: Classes of ``pipeline.model`` whose defaults are known.
+_CONFIGS = frozenset({
+    "nerfstudio.models.splatfacto.SplatfactoModelConfig",
+    "nerfstudio.models.vanilla_nerf.VanillaModelConfig",
+    "nerfstudio.models.nerfacto.NerfactoModelConfig",
+    "ns_abstract.nerfstudio.splat.AbstractSplatfactoModelConfig",
+    "ns_abstract.nerfstudio.nerf.AbstractNerfModelConfig",
+})  # fmt: skip
+
+
+def _check_defaults(run: runs.RunConfig, model: KeyTable) -> None:
+    """Refuse a run of a configuration class with other defaults, where a key is absent that the picture depends on."""
+    name = runs.config_class(run)
+    if not name or name in _CONFIGS:
+        return
+    for key in model.keys:
+        if key.status != "irrelevant" and key.name != "_target" and key.name.partition(".")[0] not in run.model:
+            raise InputError(
+                f"is absent: its value is the default of {show(name)}, which is not known here",
+                file=run.file,
+                field=_MODEL + key.name,
+                fix="write its value",
+            )
+
 
 def check_keys(run: runs.RunConfig, model: KeyTable, refuse_unknown: bool = True) -> tuple[str, ...]:
     """Notes on the keys of a run's config.yml that nothing is known of, and that are not used.
 
     ``model``: the keys of ``pipeline.model``: `SPLATFACTO`, `VANILLA_NERF` or `NERFACTO`. ``refuse_unknown``: whether a
     key of ``pipeline.model`` that is in no table is refused, or named in the notes. Raises InputError where a key of
-    ``pipeline.model`` is unknown, or a key has a value that is refused.
+    ``pipeline.model`` is unknown, a key has a value that is refused, or one is absent whose default is not known.
     """
+    _check_defaults(run, model)
     try:
         names = RUN.unknown(run.root, "", runs.as_mapping)
         inner = model.unknown(run.model, _MODEL, runs.as_mapping)

@@ -275,6 +275,12 @@ def places_transforms(run: RunConfig) -> bool:
     return isinstance(target, Tagged) and target.tag.rpartition(".")[2].removesuffix("Config") in _PLACING_PARSERS
 
 
+def config_class(run: RunConfig) -> str:
+    """Dotted name of the class of ``pipeline.model``, whose defaults absent keys have; "" where it has none."""
+    model = (as_mapping(run.root.get("pipeline")) or {}).get("model")
+    return model.tag.rpartition(":")[2] if isinstance(model, Tagged) else ""
+
+
 def target_class(run: RunConfig) -> str:
     """Dotted name of the model's class that config.yml names; "" where it names none."""
     target = run.model.get("_target")
