@@ -46,25 +46,22 @@ class LocateProgress(SearchProgress):
     """Where a search stands.
 
     Attributes:
-        left: Part of the searched volume that is not excluded.
+        left: Part of the sets that is not excluded, at most.
         outliers: Pixels that the best pose so far does not explain, or None.
         seconds: Time spent.
+        done: Part of what is searched that is excluded; slanted cells reach beyond the sets.
     """
 
     left: float
     outliers: int | None
     seconds: float
-
-    @property
-    def done(self) -> float:
-        """Part of the searched volume that is excluded."""
-        return 1.0 - self.left
+    done: float
 
     @property
     def sentence(self) -> str:
         """What is left, and how well the best pose explains the photo."""
         best = "" if self.outliers is None else f", best pose misses {self.outliers:,} pixels"
-        return f"excluded {percent(self.done)}, left {percent(self.left)}{best}"
+        return f"at most {percent(self.left)} of the set left{best}"
 
 
 class LocationQuestion(CellQuestion[LocateProgress]):
@@ -118,9 +115,16 @@ class LocationQuestion(CellQuestion[LocateProgress]):
     def progress(self, store: Store) -> LocateProgress:
         assert isinstance(store, LocationStore)
         tallies = store.tallies()
-        left = sum(1.0 - tally.certified / tally.units for tally in tallies) / max(1, len(tallies))
+        open_parts = {tally.frame: 1.0 - tally.certified / tally.units for tally in tallies}
+        left = sum(min(1.0, part * self._excess(frame)) for frame, part in open_parts.items()) / max(1, len(tallies))
         best = [pose.outliers for tally in tallies for pose in store.poses(tally.frame)[:1]]
-        return LocateProgress(left, min(best, default=None), store.seconds)
+        done = 1.0 - sum(open_parts.values()) / max(1, len(tallies))
+        return LocateProgress(left, min(best, default=None), store.seconds, done)
+
+    def _excess(self, frame: int) -> float:
+        """Volume of what is searched for a set, as a multiple of the set's."""
+        searched, own = self.sets[frame], self.job.job.pose_sets[frame].box
+        return float(np.prod(np.subtract(searched.upper, searched.lower) / np.subtract(own.upper, own.lower)))
 
     def report(self, search: CellSearch[LocateProgress], state: str) -> dict[str, Any]:
         store = cast(LocationStore, search.store)
