@@ -135,10 +135,10 @@ class Location:
 
     def possible_volume(self, number: int, cells: list[Cell]) -> float:
         """The part of a set that ``cells`` of its search hold, at most."""
-        plain = self.search(number).plain.box
+        search = self.search(number)
+        plain, boxes = search.plain.box, list(map(search.grid.box_of, cells))
         whole = float(np.prod(np.subtract(plain.upper, plain.lower)))
-        boxes = list(map(self.search(number).grid.box_of, cells))
-        return min(1.0, self._sheared(number, boxes).volume_within(plain) / whole) if boxes else 0.0
+        return min(1.0, self._sheared(number, boxes).volume_within(plain) / whole)
 
     def cover(self, number: int, cells: list[Cell], late: Callable[[], bool] = lambda: False) -> PoseCover:
         """Cells of a set's own parameters that hold all poses in ``cells`` of its search; ``late``: see `cover`."""

@@ -81,17 +81,17 @@ def box_of_motion(cell: ParameterBox, whole: ParameterBox, motion: np.ndarray, p
     return _aligned(cell, whole, [max(0, min(level - _TUNING.halvings, least)) for level, least in widths])
 
 
-class Sized(Protocol):
+class InMemory(Protocol):
     """What takes memory."""
 
     @property
     def nbytes(self) -> int: ...
 
 
-_Known = TypeVar("_Known", bound=Sized)
+_Value = TypeVar("_Value", bound=InMemory)
 
 
-class EnclosingBoxes(Generic[_Known]):
+class EnclosingBoxes(Generic[_Value]):
     """What is known of boxes around cells, by which a set is divided evenly; the latest are kept.
 
     Args:
@@ -104,25 +104,25 @@ class EnclosingBoxes(Generic[_Known]):
         self,
         whole: ParameterBox,
         motion: Callable[[ParameterBox], np.ndarray],
-        find: Callable[[ParameterBox], _Known],
+        find: Callable[[ParameterBox], _Value],
     ) -> None:
         self._whole, self._find_motion, self._find = whole, motion, find
-        self._kept: dict[ParameterBox, _Known] = {}
+        self._kept: dict[ParameterBox, _Value] = {}
         self._lock = threading.Lock()
 
-    def around(self, cell: ParameterBox) -> _Known | None:
+    def around(self, cell: ParameterBox) -> _Value | None:
         """What is known of a box around a cell; None: the cell reaches beyond the set."""
         box = box_of_motion(cell, self._whole, self._motion, _TUNING.shared_motion)
         if box is None:
             return None
         with self._lock:
-            known = self._kept.pop(box, None)
-        known = known or self._find(box)
+            value = self._kept.pop(box, None)
+        value = value or self._find(box)
         with self._lock:
-            self._kept[box] = known
+            self._kept[box] = value
             while len(self._kept) > 1 and sum(one.nbytes for one in self._kept.values()) > _TUNING.most:
                 del self._kept[next(iter(self._kept))]
-        return known
+        return value
 
     @cached_property
     def _motion(self) -> np.ndarray:

@@ -284,11 +284,9 @@ def config_class(run: RunConfig) -> str:
 def target_class(run: RunConfig) -> str:
     """Dotted name of the model's class that config.yml names; "" where it names none."""
     target = run.model.get("_target")
-    tagged = (as_mapping(run.root.get("pipeline")) or {}).get("model") if target is None else target
-    if not isinstance(tagged, Tagged):
-        return "" if target is None else show(target)
-    name = tagged.tag.rpartition(":")[2]
-    return name.removesuffix("Config") if target is None else name
+    if target is None:
+        return config_class(run).removesuffix("Config")
+    return target.tag.rpartition(":")[2] if isinstance(target, Tagged) else show(target)
 
 
 def read_dataparser_transform(run: RunConfig) -> tuple[DataparserTransform, tuple[str, ...]]:
@@ -306,13 +304,11 @@ def read_dataparser_transform(run: RunConfig) -> tuple[DataparserTransform, tupl
         raise unusable(data, field="top level", fix="write an object", file=path)
     rows = data.get("transform")
     if not (isinstance(rows, list) and len(rows) == 3 and all(_is_list(row, 4) for row in rows)):
-        fix = "write three rows of four numbers"
-        raise InputError("not a 3x4 matrix", file=path, field="transform", fix=fix)
+        raise InputError("not a 3x4 matrix", file=path, field="transform", fix="write three rows of four numbers")
     for i, row in enumerate(rows):
         for j, value in enumerate(row):
             if not is_number(value):
-                field = f"transform[{i}][{j}]"
-                raise unusable(value, field=field, fix="write a finite number", file=path)
+                raise unusable(value, field=f"transform[{i}][{j}]", fix="write a finite number", file=path)
     matrix = np.array(rows, np.float64)
     with np.errstate(all="ignore"):
         determinant = float(np.linalg.det(matrix[:, :3]))
@@ -471,8 +467,7 @@ class _InertLoader(yaml.SafeLoader):
                     raise _constructor_error("a key is not a scalar", key_node.start_mark)
                 key = self.construct_object(key_node, deep=True)
                 if key in keys:
-                    problem = f"key {show(key)} stands twice in one mapping"
-                    raise _constructor_error(problem, key_node.start_mark)
+                    raise _constructor_error(f"key {show(key)} stands twice in one mapping", key_node.start_mark)
                 keys.add(key)
         return super().construct_mapping(node, deep=deep)
 

@@ -367,10 +367,10 @@ class _Examination:
     def _glance(self, box: ParameterBox) -> np.ndarray:
         """About the tiles that the middle of a cell shows."""
         moved = self.search.moved_pictures
-        found = None if moved is None else moved.near(box)
-        if found is None:
+        nearby = None if moved is None else moved.near(box)
+        if nearby is None:
             return self._look(box.middle)[0]
-        picture, self.nearby = found
+        picture, self.nearby = nearby
         return picture
 
     @property

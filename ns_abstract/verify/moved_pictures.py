@@ -28,7 +28,7 @@ class FoundPose:
 
 
 @dataclass(frozen=True)
-class _Seen:
+class _Drawn:
     """The picture [H, W, c] of the middle of a box, how it moves over the box, and what it misses of the photo."""
 
     box: ParameterBox
@@ -57,20 +57,20 @@ class MovedPictures:
         look: Callable[[Float64Array], tuple[np.ndarray, FoundPose]],
     ) -> None:
         self._frame, self._field, self._look = frame, field, look
-        self._boxes = EnclosingBoxes(frame.box, frame.motion, self._seen)
+        self._boxes = EnclosingBoxes(frame.box, frame.motion, self._draw)
 
     def near(self, box: ParameterBox) -> tuple[np.ndarray, FoundPose] | None:
         """About what the middle of ``box`` shows, in tiles, and the pose that was rendered.
 
         None: ``box`` reaches beyond the set.
         """
-        seen = self._boxes.around(box)
-        if seen is None:
+        drawn = self._boxes.around(box)
+        if drawn is None:
             return None
-        camera, half = self._frame.camera, 0.5 * (np.array(seen.box.upper) - seen.box.lower)
-        motion = seen.motion.at((box.middle - seen.box.middle) / half, camera.height, camera.width)
-        return in_tiles(moved(seen.picture, motion), self._frame.side), seen.pose
+        camera, half = self._frame.camera, 0.5 * (np.array(drawn.box.upper) - drawn.box.lower)
+        motion = drawn.motion.at((box.middle - drawn.box.middle) / half, camera.height, camera.width)
+        return in_tiles(moved(drawn.picture, motion), self._frame.side), drawn.pose
 
-    def _seen(self, box: ParameterBox) -> _Seen:
+    def _draw(self, box: ParameterBox) -> _Drawn:
         tiles, pose = self._look(box.middle)
-        return _Seen(box, assemble(tiles, self._frame.camera), self._field(box), pose)
+        return _Drawn(box, assemble(tiles, self._frame.camera), self._field(box), pose)
