@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -105,6 +106,26 @@ def test_intrinsics_of_a_camera_path(tmp_path: Path) -> None:
     value = {"render_height": 24, "render_width": 32, "cx": 15.5, "camera_path": [entry]}
     camera = load_camera_path(save(tmp_path / "path.json", value)).cameras[0]
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (40, 40, 15.5, 11)
+
+
+def test_a_lens_that_nerfstudio_does_not_read_is_told(tmp_path: Path) -> None:
+    """Nerfstudio draws with fov and the middle (cameras/camera_paths.py:167); agreeing numbers need no note."""
+    focal = 12.0 / math.tan(math.radians(25.0))
+    entry = {"camera_to_world": [*POSE.reshape(-1).tolist(), 0, 0, 0, 1], "fov": 50.0}
+    for root, own, told in (
+        ({}, {}, False),
+        ({}, {"fx": focal, "cx": 16.0}, False),
+        ({}, {"fx": 40.0}, True),
+        ({"cy": 11.0}, {}, True),
+    ):
+        value = {"render_height": 24, "render_width": 32, **root, "camera_path": [entry | own, entry | own]}
+        path = load_camera_path(save(tmp_path / "path.json", value))
+        assert len(path.notes) == told
+        if told:
+            assert path.notes[0].startswith("camera_path[0] and 1 more: drawn with its fx, fy, cx and cy")
+    del entry["fov"]
+    value["camera_path"] = [entry | {"fx": 40.0}]
+    assert not load_camera_path(save(tmp_path / "path.json", value)).notes
 
 
 def test_what_all_frames_have_comes_first(tmp_path: Path) -> None:

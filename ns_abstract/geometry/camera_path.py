@@ -233,7 +233,7 @@ def stated_intrinsics(
 
 
 def _parse(root: dict[str, Any], source: str, downscale_factor: float) -> CameraPath:
-    unknown = PATH.unknown(root)
+    unknown, restated = PATH.unknown(root), []
     height = checked_side(root.get("render_height"), "render_height")
     width = checked_side(root.get("render_width"), "render_width")
     cameras = []
@@ -242,6 +242,8 @@ def _parse(root: dict[str, Any], source: str, downscale_factor: float) -> Camera
         own = {key: entry.get(key, root.get(key)) for key in ("fx", "fy", "cx", "cy")}
         focal = partial(_focal, entry, root, field, height)
         lens = stated_intrinsics(own, focal, height, width, f"{field}.")
+        if entry.get("fov") is not None and not np.allclose(lens, stated_intrinsics({}, focal, height, width), 1e-6):
+            restated.append(field)
         pose = checked_pose(entry.get("camera_to_world"), f"{field}.camera_to_world")
         camera = PinholeCamera(pose, *lens[:4], width=width, height=height)
         cameras.append(camera.rescaled(downscale_factor))
@@ -259,8 +261,16 @@ def _parse(root: dict[str, Any], source: str, downscale_factor: float) -> Camera
         fps=None if fps is None else float(fps),
         is_cycle=bool(is_cycle),
         source=source,
-        notes=sentence(unknown, Path(source).name),
+        notes=sentence(unknown, Path(source).name) + _restated(restated),
     )
+
+
+def _restated(fields: list[str]) -> tuple[str, ...]:
+    """A note of cameras whose fx, fy, cx or cy say another picture than the fov that Nerfstudio draws with."""
+    if not fields:
+        return ()
+    which = fields[0] + (f" and {len(fields) - 1} more" if fields[1:] else "")
+    return (f"{which}: drawn with its fx, fy, cx and cy; Nerfstudio does not read these and draws with its fov",)
 
 
 #: Files of Nerfstudio and of this program that are taken for camera paths, by a key that these lack.
