@@ -14,13 +14,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from ns_abstract.execution import cancellation
+from ns_abstract.execution.cancellation import check_cancelled
 from ns_abstract.geometry.box import ParameterBox
-from ns_abstract.geometry.tiles import assemble
-from ns_abstract.refine import engine, initial
+from ns_abstract.geometry.tiles import assemble, in_tiles
+from ns_abstract.refine import engine, initial, inner
 from ns_abstract.refine.engine import Refinement, RefinementGoal
 from ns_abstract.refine.frame_tiles import pixels_inside
 from ns_abstract.refine.result import FrameResult, TracePoint, mean_pixel_gap
-from ns_abstract.refine.tuning import Tuning
+from ns_abstract.refine.tuning import TUNING, Tuning
 
 SIDE = 4
 FOREVER = 1e9
@@ -426,6 +428,55 @@ def test_a_cover_that_takes_too_long_becomes_one_cell(dimensions: int, monkeypat
     assert result.leaves is not None
     assert {tuple(row) for row in result.leaves.box_lower.tolist()} == {frame.box.lower}
     assert len(result.leaves.tile) == frame.tile_count
+
+
+class Slow(Waves):
+    """A picture takes a second, bounds ``tile_seconds`` for each tile; cancelled work ends before it begins."""
+
+    tile_seconds = 2.0
+    clock = 0.0
+
+    def render(self, values: np.ndarray, tiles: np.ndarray | None = None) -> np.ndarray:
+        self.clock += 1.0
+        return super().render(values, tiles)
+
+    def bound(self, box: ParameterBox, tiles: np.ndarray, *rest: Any) -> Any:
+        check_cancelled()
+        self.clock += self.tile_seconds * len(tiles)
+        return super().bound(box, tiles, *rest)
+
+
+@pytest.mark.parametrize("dimensions", [1, 2, 3])
+@pytest.mark.parametrize("tile_seconds", [2.0, 0.001])
+def test_a_cell_that_takes_too_long_is_bounded_in_some_tiles(
+    dimensions: int, tile_seconds: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    frame = Slow(dimensions, width=9 * SIDE, height=7 * SIDE - 1)
+    frame.tile_seconds = tile_seconds
+    for module in (engine, initial, inner, cancellation):
+        monkeypatch.setattr(module, "time", SimpleNamespace(perf_counter=lambda: frame.clock))
+    result = refine(frame, RefinementGoal(1.0, 50.0), keep_leaves=True)
+    check(frame, result)
+    assert (
+        result.bounded
+        and frame.clock < 50.0 + 4.0 * tile_seconds + TUNING.cover_seconds + 1.0 + TUNING.views * dimensions
+    )
+    known = ~in_tiles((result.lower == 0.0) & (result.upper == 1.0), SIDE).all(axis=(1, 2, 3))
+    assert 8 <= known.sum() < 63 if tile_seconds > 1.0 else known.all()
+    # every tile has a cover, sound where nothing is known, too
+    leaves = result.leaves
+    assert leaves is not None and len(np.unique(leaves.tile, axis=0)) == frame.tile_count
+    if tile_seconds > 1.0:
+        place = {tuple(tile): k for k, tile in enumerate(leaves.tile.tolist())}
+        for tile, is_known in enumerate(known):
+            k = place[tile // frame.across * SIDE, tile % frame.across * SIDE]
+            assert is_known or (not leaves.b_lower[k].any() and (leaves.b_upper[k] == 1.0).all())
+        # what nothing is known of comes first when the work goes on
+        frame.clock = 0.0
+        more = refine(frame, RefinementGoal(1.0, 50.0), earlier=result)
+        check(frame, more)
+        both = ~in_tiles((more.lower == 0.0) & (more.upper == 1.0), SIDE).all(axis=(1, 2, 3))
+        assert both[known].all() and both.sum() >= known.sum() + 8
 
 
 # ---------------------------------------------------------------- reproducible

@@ -265,6 +265,22 @@ FORMS = (
         "test_engine.py::test_a_stricter_goal_asks_for_no_pixel_that_was_left_before",
     ),
     Fault(
+        "tiles that there was no time for show the middle of the set",
+        _ENGINE,
+        "Refinement._cell_in_groups",
+        "lower, upper = self.tiles.filled(np.nan), self.tiles.filled(np.nan)",
+        "lower, upper = self.inner.image.copy(), self.inner.image.copy()",
+        "test_engine.py::test_a_cell_that_takes_too_long_is_bounded_in_some_tiles[2.0-1]",
+    ),
+    Fault(
+        "linear sets of tiles that there was no time for are 0",
+        _LEAVES,
+        "LeafSets.keep_unknown",
+        "np.nan",
+        "0.0",
+        "test_engine.py::test_a_cell_that_takes_too_long_is_bounded_in_some_tiles[2.0-2]",
+    ),
+    Fault(
         "the cover that is kept for others lacks a part",
         _ENGINE,
         "Refinement._cover",

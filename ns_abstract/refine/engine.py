@@ -10,13 +10,13 @@ from __future__ import annotations
 import itertools
 import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
+from contextlib import nullcontext, suppress
 from dataclasses import replace
 
 import numpy as np
 
 from ns_abstract.arithmetic.rounding import MEAN_DOWN
-from ns_abstract.execution.cancellation import WorkCancelledError, cancel_when
+from ns_abstract.execution.cancellation import Deadline, WorkCancelledError, cancel_when
 from ns_abstract.geometry.tiles import in_tiles
 from ns_abstract.refine.box_splitter import BoxSplitter, SubBox
 from ns_abstract.refine.frame_tiles import FrameTiles, LeafCell, context_bytes, usable
@@ -200,6 +200,9 @@ class Refinement:
             for leaf in self.initial:
                 self.leaves.take(*leaf)
             return self._covered([cell for cell, _, _ in self.initial])
+        if self._may_be_late() and (leaf := self._cell_in_groups()) is not None:
+            self.leaves.take(*leaf)
+            return self._covered([leaf[0]])
         partition = InitialPartition(self.tiles, self.splitter, self.inner, self.goal, self.tuning).choose()
         parts = partition.parts
         cells: list[LeafCell] = []
@@ -231,6 +234,43 @@ class Refinement:
             self.initial.extend(bounded_leaves)
         return self._covered(cells)
 
+    def _may_be_late(self) -> bool:
+        """Whether a cell may take longer than there is time for, by what a picture takes."""
+        longest = self.tuning.most_cell_pictures * self.inner.picture_seconds
+        return not self.frame.tilewise and longest > self.goal.seconds and self.tiles.count >= self.tuning.cover_groups
+
+    def _cell_in_groups(self) -> BoundedCell | None:
+        """The whole set as a cell, bounded in one group of tiles after another until the time is over (R6).
+
+        Nothing is known of the tiles that are left. None: the first group says that there is time for all at once.
+        """
+        cell, begin = self._cell(self.splitter.whole), time.perf_counter()
+        left = max(self.start + self.goal.seconds - begin, 0.0)
+        deadline = Deadline(left + self.tuning.cover_seconds, self.stopped)
+        lower, upper = self.tiles.filled(np.nan), self.tiles.filled(np.nan)
+        # first what least is known of
+        known = -(self.leaves.upper - self.leaves.lower)[..., :COLORS].sum(axis=(1, 2, 3))
+        groups = np.array_split(np.argsort(known, kind="stable"), self.tuning.cover_groups)
+        for number, group in enumerate(groups):
+            places = np.sort(group)
+            try:
+                # the first tells how long all take
+                with deadline.enforced() if number else nullcontext():
+                    [bounds] = self.tiles.bound([cell], None, places)
+            except WorkCancelledError:
+                if not number:
+                    raise
+                self.leaf_sets.keep_unknown(cell, bounds.linear, np.concatenate(groups[number:]))
+                break
+            if not number and len(groups) * (time.perf_counter() - begin) < left:
+                return None
+            lower[places], upper[places] = bounds.lower, bounds.upper
+            self.leaf_sets.keep(cell, bounds.linear, places)
+            self._record((number + 1) / len(groups), keep=False)
+        self.cells += 1
+        cell.slopes = bounds.slopes
+        return cell, *usable(lower, upper)
+
     def _covered(self, cells: list[LeafCell]) -> bool:
         """Go on with ``cells`` that cover the set and whose bounds the leaves have; returns True."""
         self.leaves.cover()
@@ -250,7 +290,7 @@ class Refinement:
         else:
             [(lower, upper, bounds)] = self._bound([cell], None, everything)
         self.leaves.take(cell, lower, upper)
-        self.leaf_sets.keep(cell, bounds, everything)
+        self.leaf_sets.keep(cell, bounds.linear, everything)
         return cell, lower, upper
 
     def _refine(self) -> None:
@@ -321,7 +361,7 @@ class Refinement:
                 change.upper.append(high)
                 added += low.nbytes + high.nbytes
         for child, (_, _, bounds) in zip(children, bounded, strict=True):
-            self.leaf_sets.keep(child, bounds, places, cell)
+            self.leaf_sets.keep(child, bounds.linear, places, cell)
             if child.context is not cell.context:
                 added += context_bytes(child.context)
         return added

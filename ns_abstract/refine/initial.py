@@ -92,6 +92,8 @@ class InitialPartition:
         while True:
             part = self.splitter.cut(whole, 0, count)[count // 2]
             probe, affordable = self._probe(part)
+            if affordable <= 1.0:
+                return Partition([whole], part, probe)
             excess = self._beyond(Partition([], part, probe))
             aim = tuning.aim_share * goal.excess(self.inner.mean_gap)
             most = int(min(affordable, tuning.most_initial_cells))

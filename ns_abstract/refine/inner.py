@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import itertools
+import math
+import time
 from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
@@ -23,6 +25,7 @@ class InnerBound:
 
     Attributes:
         lower, upper: [t, side, side, channels] float32.
+        picture_seconds: Least that a picture took to render, the first apart, which may compile kernels; 0: not known.
     """
 
     def __init__(
@@ -31,6 +34,7 @@ class InnerBound:
         self.tiles, self.random, self.scenes, self.tuning = tiles, random, scenes, tuning
         self.lower, self.upper = tiles.filled(np.inf), tiles.filled(-np.inf)
         self.image = tiles.filled(0.0)
+        self.picture_seconds = 0.0
         self._mean_gap: float | None = None
         self._views: list[tuple[np.ndarray, np.ndarray]] = []
 
@@ -48,7 +52,10 @@ class InnerBound:
 
     def render(self, values: np.ndarray, places: np.ndarray | None = None) -> np.ndarray:
         """Render the pose at ``values``, and some other scenes there; returns the picture of the frame's own scene."""
+        begin = time.perf_counter()
         picture = self.tiles.render(self.tiles.frame.render, values, places)
+        if places is None:
+            self.picture_seconds = min(self.picture_seconds or math.inf, time.perf_counter() - begin)
         self._widen(picture, places)
         for render in itertools.islice(self.scenes, self.tuning.scene_samples_by_pose):
             self._widen(self.tiles.render(render, values, places), places)
@@ -57,6 +64,7 @@ class InnerBound:
     def render_middle(self) -> None:
         """Render the pose in the middle of the set, which becomes `image`."""
         self.image = self.render(self.tiles.frame.box.middle)
+        self.picture_seconds = 0.0
 
     def render_scenes(self, over: Callable[[], bool]) -> None:
         """Render other scenes of the set at its middle, until ``over`` says so."""

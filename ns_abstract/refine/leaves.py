@@ -10,7 +10,7 @@ from ns_abstract.geometry.box import ParameterBox
 from ns_abstract.refine.frame_tiles import FrameTiles, LeafCell, context_bytes, usable
 from ns_abstract.refine.goal import RefinementGoal
 from ns_abstract.refine.inner import InnerBound
-from ns_abstract.refine.protocol import COLORS, MOST_PARTS, Bounds, CellContext
+from ns_abstract.refine.protocol import COLORS, MOST_PARTS, Bounds, CellContext, LinearSets
 from ns_abstract.refine.result import Leaves
 from ns_abstract.refine.tuning import TUNING, Tuning
 
@@ -282,11 +282,13 @@ class LeafSets:
         self._sets.clear()
         self.bytes = 0
 
-    def keep(self, cell: LeafCell, bounds: Bounds, places: np.ndarray, parent: LeafCell | None = None) -> None:
-        """Store the linear sets of ``cell`` in the tiles at ``places``, in place of those of its ``parent``."""
-        if not self.tiles.keep_linear or bounds.linear is None:
+    def keep(
+        self, cell: LeafCell, linear: LinearSets | None, places: np.ndarray, parent: LeafCell | None = None
+    ) -> None:
+        """Store the ``linear`` sets of ``cell`` in the tiles at ``places``, in place of those of its ``parent``."""
+        if not self.tiles.keep_linear or linear is None:
             return
-        linear = _usable_linear(bounds.linear)
+        linear = _usable_linear(linear)
         for k, t in enumerate(places.tolist()):
             if parent is not None:
                 gone = self._sets.pop((parent.number, t), None)
@@ -295,6 +297,12 @@ class LeafSets:
             entry = tuple(a[k].copy() for a in linear)
             self._sets[(cell.number, t)] = (cell.box, entry)
             self.bytes += sum(a.nbytes for a in entry)
+
+    def keep_unknown(self, cell: LeafCell, others: LinearSets | None, places: np.ndarray) -> None:
+        """Store sets that say nothing but [0, 1] in the tiles at ``places``, where ``others`` have sets."""
+        if others is not None:
+            a, b, c, d = (np.full((len(places), *part.shape[1:]), np.nan, part.dtype) for part in others)
+            self.keep(cell, (a, b, c, d), places)
 
     def leaves(self) -> Leaves:
         """The linear bounds of all leaves, ordered by box and tile."""
@@ -328,11 +336,11 @@ def linear_bytes(bounds: Bounds) -> int:
     return 0 if bounds.linear is None else sum(a.nbytes for a in bounds.linear)
 
 
-def _usable_linear(linear: tuple[np.ndarray, ...]) -> tuple[np.ndarray, ...]:
+def _usable_linear(linear: LinearSets) -> LinearSets:
     """Linear sets (A_lower, b_lower, A_upper, b_upper) with 0 and 1 where a number is not finite."""
     parts: list[np.ndarray] = []
     for slope, offset, trivial in ((linear[0], linear[1], 0.0), (linear[2], linear[3], 1.0)):
         good = np.isfinite(slope).all(axis=-1) & np.isfinite(offset)
         parts.append(np.where(good[..., None], slope, np.zeros_like(slope)))
         parts.append(np.where(good, offset, np.full_like(offset, trivial)))
-    return tuple(parts)
+    return parts[0], parts[1], parts[2], parts[3]

@@ -24,6 +24,9 @@ class Tuning:
         sampled_tiles: From so many tiles on, some of them tell how many initial cells of one parameter are tried first.
         tiles_a_sample: One of so many.
         initial_time_share: Part of the time budget that the initial partition may take.
+        most_cell_pictures: A cell may take as long as rendering so many pictures.
+        cover_groups: Groups of tiles that are bounded one after another where time may end before all of them are.
+        cover_seconds: They get so many seconds at least, or so many more than the rest of the work.
         most_initial_cells: Most cells of the initial partition.
         round_share: Part of the whole excess that one round of splitting takes on.
         looks: Times in a round that the goal is checked.
@@ -55,6 +58,9 @@ class Tuning:
     sampled_tiles: int = 4096
     tiles_a_sample: int = 8
     initial_time_share: float = 0.7
+    most_cell_pictures: float = 100.0
+    cover_groups: int = 32
+    cover_seconds: float = 2.0
     most_initial_cells: int = 4096
     round_share: float = 0.8
     looks: int = 16

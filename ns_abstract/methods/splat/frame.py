@@ -231,6 +231,9 @@ class SplatFrame(Frame):
         """What was left out for this frame, given what refinement found."""
         varied = self.varied
         total, plan = varied.nearest.count, []
+        unknown = ~in_tiles((lower > 0.0) | (upper < 1.0), self.side).any(axis=(1, 2, 3))
+        if unknown.any():
+            plan.append(f"nothing is known of {unknown.sum():,} of {unknown.size:,} tiles: they are left at [0, 1]")
         if visible is not None and visible < total:
             plan.append(
                 f"{total - visible:,} of {total:,} Gaussians left out: no pose of the set shows them "
