@@ -8,6 +8,7 @@ import importlib.util
 import io
 import itertools
 import json
+import math
 import os
 import re
 import shutil
@@ -17,6 +18,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -33,10 +35,12 @@ from ns_abstract.api import certificate_report
 from ns_abstract.api.cell_search import examine_block
 from ns_abstract.api.certificate_report import PoseRenderer, look_closer
 from ns_abstract.api.certification import Certification, CertifySettings, FramePictures, open_certification
+from ns_abstract.api.certifying import CertificateQuestion
 from ns_abstract.api.files import Settings
 from ns_abstract.cli import certify as certify_command
 from ns_abstract.cli.certify import Certify, certify
 from ns_abstract.demo.writing import write_demo
+from ns_abstract.execution.cancellation import Deadline
 from ns_abstract.execution.engines import Processes, SerialEngine
 from ns_abstract.execution.worker_cache import clear_cache
 from ns_abstract.io.atomic import write_json
@@ -770,6 +774,22 @@ def test_where_it_fails_is_looked_at_closely(planted: Case, finished: Path, monk
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(
+    ("deadline", "left", "least", "most"),
+    # a search that may finish what it began; one that ends with the budget; one that has no time for pictures
+    [
+        (math.inf, -30.0, 4.0, 5.0),
+        (math.inf, 100.0, 104.0, 105.0),
+        (-30.0, -30.0, -26.0, -25.0),
+        (-math.inf, 9.0, -math.inf, -99.0),
+    ],
+)
+def test_last_pictures_end_with_the_time(deadline: float, left: float, least: float, most: float) -> None:
+    search: Any = SimpleNamespace(deadline=Deadline(deadline), whole=Deadline(left), stop=lambda: False)
+    CertificateQuestion.finish(object.__new__(CertificateQuestion), search)
+    assert least <= search.deadline.left <= most
+
+
 def test_pictures_of_a_resumed_command(planted: Case, finished: Path, tmp_path: Path) -> None:
     """They are made again, and are the same; what an interrupted command leaves is none of them."""
     page = (finished / "report.html").read_text()

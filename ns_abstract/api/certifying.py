@@ -46,7 +46,7 @@ from ns_abstract.verify.store import Store, fractions
 if TYPE_CHECKING:
     from typing import Unpack  # pyright: ignore[reportAttributeAccessIssue]  # of Python 3.11
 
-#: Seconds that pictures for the last report may take beyond the budget, where they are made ray by ray.
+#: Seconds that pictures for the last report may take beyond the budget and the search.
 _LAST = 5.0
 
 
@@ -156,7 +156,8 @@ class CertificateQuestion(CellQuestion[CertifyProgress]):
             search.report("running")
 
     def finish(self, search: CellSearch[CertifyProgress]) -> None:
-        search.deadline = search.deadline.extended(_LAST)
+        seconds = min(search.deadline.left, max(search.whole.left, 0.0)) + _LAST
+        search.deadline = Deadline(seconds, search.stop)
 
     def varied_scenes(self) -> tuple[Sequence[VariationKind], Callable[[VariationKind], ProveCell]]:
         return self.job.kinds, self.job.prover
