@@ -33,7 +33,7 @@ from ns_abstract.methods.splat.signed_steps import signed_gradient_step
 from ns_abstract.methods.splat.variations import VariedSplats, vary
 from ns_abstract.perturbation.specification import parse_perturbation
 
-#: Parameter values [d] and a member of the set to a picture [H, W, 3].
+#: Parameter values [d] and a scene sample of the set to a picture [H, W, 3].
 Show = Callable[[Float64Array, Splats], np.ndarray]
 
 _STEPS = 4
@@ -61,23 +61,23 @@ class VariedAttack:
 
 def show_compiled(renderer: Renderer, poses: PoseBox) -> Show:
     """Pictures of the compiled renderer."""
-    return lambda values, member: renderer.image(poses.camera, *poses.world_to_camera(values), member)
+    return lambda values, scene_sample: renderer.image(poses.camera, *poses.world_to_camera(values), scene_sample)
 
 
 def show_reference(reference: Reference, poses: PoseBox) -> Show:
-    """Pictures of the reference renderer, in its own precision: a member's values are rounded to it."""
+    """Pictures of the reference renderer, in its own precision: a scene sample's values are rounded to it."""
 
-    def show(values: Float64Array, member: Splats) -> np.ndarray:
+    def show(values: Float64Array, scene_sample: Splats) -> np.ndarray:
         with torch.no_grad():
-            other = reference.member(*_tensors(member))
+            other = reference.scene_sample(*_tensors(scene_sample))
             return other.image(poses.camera, torch.from_numpy(poses.pose(values))).numpy()
 
     return show
 
 
-def _tensors(member: Splats) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
-    shift = torch.from_numpy(member.color_shift) if member.color_shift.size else None
-    return torch.from_numpy(member.means), torch.from_numpy(member.opacity), shift
+def _tensors(scene_sample: Splats) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
+    shift = torch.from_numpy(scene_sample.color_shift) if scene_sample.color_shift.size else None
+    return torch.from_numpy(scene_sample.means), torch.from_numpy(scene_sample.opacity), shift
 
 
 def attack_varied(
@@ -90,7 +90,7 @@ def attack_varied(
     poses: PoseBox,
     rasteriser: Rasteriser,
     *,
-    members: int = 40,
+    scene_samples: int = 40,
     targets: int = 12,
     seed: int = 0,
 ) -> VariedAttack:
@@ -102,7 +102,7 @@ def attack_varied(
         varied: The scenes.
         shows: Renderers; every picture of every one must lie inside.
         scene, poses, rasteriser: What the reference renderer differentiates.
-        members: Scenes rendered without gradients, each at a pose.
+        scene_samples: Scenes rendered without gradients, each at a pose.
         targets: Pixel channels that gradients push, each along ``4`` signed steps.
         seed: Decides every random choice.
     """
@@ -112,11 +112,11 @@ def attack_varied(
     seen: list[tuple[Float64Array, Splats]] = []
     least_at, most_at = np.zeros(lower.shape, np.int64), np.zeros(lower.shape, np.int64)
 
-    def compare(values: Float64Array, member: Splats, strategy: str) -> None:
+    def compare(values: Float64Array, scene_sample: Splats, strategy: str) -> None:
         number = len(seen)
-        seen.append((values, member))
+        seen.append((values, scene_sample))
         for show in shows:
-            picture = np.asarray(show(values, member), np.float64)
+            picture = np.asarray(show(values, scene_sample), np.float64)
             outside = ~((lower <= picture) & (picture <= upper))
             record.pictures[strategy] = record.pictures.get(strategy, 0) + 1
             record.comparisons += picture.size
@@ -128,25 +128,25 @@ def attack_varied(
             record.least, record.most = np.fmin(record.least, picture), np.fmax(record.most, picture)
 
     corners = box.corners() if box.dimensions else np.empty((0, 0))
-    for k, member in enumerate(itertools.islice(varied.scene_samples(generator), members)):
+    for k, scene_sample in enumerate(itertools.islice(varied.scene_samples(generator), scene_samples)):
         at_corner = k % 3 == 1 and len(corners)
         values = corners[generator.integers(len(corners))] if at_corner else box.sample(1, generator)[0]
-        compare(box.middle if k % 3 == 0 else values, member, "members")
+        compare(box.middle if k % 3 == 0 else values, scene_sample, "scene_samples")
     compare(box.middle, varied.nearest, "nearest")
     slow = Reference(scene, rasteriser)
     for number in range(targets):
         row, column, channel, sign = _target(record, lower, upper, number, generator)
-        values, member = seen[(most_at if sign > 0.0 else least_at)[row, column, channel]]
+        values, scene_sample = seen[(most_at if sign > 0.0 else least_at)[row, column, channel]]
         for step in range(_STEPS):
             # a full step to the ends first, then steps of half the rest
-            values, member = signed_gradient_step(
-                slow, poses, varied, box, values, member,
+            values, scene_sample = signed_gradient_step(
+                slow, poses, varied, box, values, scene_sample,
                 lambda show, values, place=(row, column, channel), sign=sign: (
                     sign * show(torch.tensor([place[:2]]))[0, place[2]]
                 ),
                 2.0 if step == 0 else 0.5,
             )  # fmt: skip
-            compare(values, member, "gradient")
+            compare(values, scene_sample, "gradient")
     return record
 
 
@@ -206,7 +206,7 @@ def check_varied(
     frame: int,
     cells: int = 1,
     *,
-    members: int = 40,
+    scene_samples: int = 40,
     targets: int = 12,
     reference: bool = True,
     seed: int = 0,
@@ -222,7 +222,7 @@ def check_varied(
         spec: A perturbation object with the key "scene".
         frame: Number of the entry of the camera path.
         cells: Equal parts along the first parameter of the poses, if there is any.
-        members, targets: See `attack_varied`; of every cell.
+        scene_samples, targets: See `attack_varied`; of every cell.
         reference: Whether the reference renderer's pictures are compared besides the compiled one's.
         seed: Decides every random choice.
         downscale_factor: Images become this many times smaller.
@@ -253,7 +253,7 @@ def check_varied(
     attacks = [
         attack_varied(
             lower, upper, box, varied, shows, scene, poses, rasteriser,
-            members=members, targets=targets, seed=seed + number,
+            scene_samples=scene_samples, targets=targets, seed=seed + number,
         )
         for number, (box, (lower, upper)) in enumerate(zip(boxes, bounds, strict=True))
     ]  # fmt: skip

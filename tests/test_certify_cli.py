@@ -936,11 +936,11 @@ def test_scene_variations(
         box = pictures.box
         for axis, ends in enumerate(zip(json.loads(lower), json.loads(upper), strict=True)):
             box = box.replace(axis, *ends)
-        for member in itertools.islice(pictures.scene_samples(5), 0, 26, 5):
+        for scene_sample in itertools.islice(pictures.scene_samples(5), 0, 26, 5):
             values = box.sample(1, rng)[0] if box.dimensions else box.middle
-            assert margin(pictures.image(values, member), values) >= proved
-        values, member = member.signed_gradient_step(box, values, loss, 2.0)
-        assert box.contains(values) and margin(pictures.image(values, member), values) >= proved
+            assert margin(pictures.image(values, scene_sample), values) >= proved
+        values, scene_sample = scene_sample.signed_gradient_step(box, values, loss, 2.0)
+        assert box.contains(values) and margin(pictures.image(values, scene_sample), values) >= proved
     for file in (tmp_path / "out" / "counterexamples").glob("*.npz"):
         with np.load(file) as stored:
             assert margin(stored["image"], stored["values"]) <= 0.0
@@ -1002,11 +1002,11 @@ def test_scene_margin(blobs: Inputs, bright: tuple[Path, float, float], tmp_path
         def loss(picture: torch.Tensor, values: torch.Tensor, claim: Any = claim) -> torch.Tensor:
             return -claim.margin(job.model.differentiable(picture[None]), values[None])[0]
 
-        for number, member in enumerate(itertools.islice(pictures.scene_samples(2), 0, 24, 2)):
+        for number, scene_sample in enumerate(itertools.islice(pictures.scene_samples(2), 0, 24, 2)):
             values = pictures.box.sample(1, rng)[0]
             if number % 4 == 0:
-                values, member = member.signed_gradient_step(pictures.box, values, loss, 2.0)
-            outputs = job.model.outputs(pictures.image(values, member)[None])
+                values, scene_sample = scene_sample.signed_gradient_step(pictures.box, values, loss, 2.0)
+            outputs = job.model.outputs(pictures.image(values, scene_sample)[None])
             assert (
                 float(claim.margin(torch.from_numpy(np.asarray(outputs, np.float64)), torch.from_numpy(values)[None]))
                 > 0

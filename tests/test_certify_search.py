@@ -464,8 +464,8 @@ class Shaded(Ramp):
         super().__init__(d)
         self.reach = reach
 
-    def image(self, values: np.ndarray, member: Any = None) -> np.ndarray:
-        return super().image(values) + np.float32(0.0 if member is None else member.shift)
+    def image(self, values: np.ndarray, scene_sample: Any = None) -> np.ndarray:
+        return super().image(values) + np.float32(0.0 if scene_sample is None else scene_sample.shift)
 
     def scene_samples(self, seed: int) -> Iterator[Any]:
         return itertools.repeat(Shade(self, 0.0))

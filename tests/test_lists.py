@@ -14,7 +14,7 @@ from test_bounds import TURN, camera, moves, scene
 
 from ns_abstract.arithmetic.rounding import FLOAT32, REAL
 from ns_abstract.arithmetic.simd.intrinsics import pointer, taken
-from ns_abstract.execution.threads import _pool, each, lane, side_by_side, threads, use_threads
+from ns_abstract.execution.threads import _pool, each, side_by_side, thread_group, threads, use_threads
 from ns_abstract.geometry.poses import PoseBox
 from ns_abstract.methods.splat.activate import Splats
 from ns_abstract.methods.splat.bounds import SplatBounds
@@ -168,13 +168,13 @@ def test_pieces_of_work_share_the_threads(count, lanes, share):
         seen: list[int] = []
         side_by_side(seen.append, threads())
         assert sorted(seen) == list(range(share))
-        return item, lane(), threads(), state.get()
+        return item, thread_group(), threads(), state.get()
 
     found = each(work, range(count))
     assert [item for item, *_ in found] == list(range(count))
     assert {number for _, number, *_ in found} == set(range(lanes))
     assert all(rest == [share, 7] for _, _, *rest in found)
-    assert (lane(), threads()) == (0, 4)
+    assert (thread_group(), threads()) == (0, 4)
 
 
 @pytest.mark.usefixtures("four_threads")

@@ -333,16 +333,16 @@ def test_pieces_that_are_given_up_say_nothing() -> None:
 def test_rays_of_wide_sets_lie_in_their_polynomials() -> None:
     """The Taylor models' own error counts where sets are wide and the degree is 1."""
     pose_set = poses({"rotation": {"yaw": 0.2, "roll": 0.1}, "translation": {"x": 0.1}})
-    pencil = sample_cells.RayBundle(pose_set, pose_set.box, pixels_of(pose_set.camera), 1)
+    bundle = sample_cells.RayBundle(pose_set, pose_set.box, pixels_of(pose_set.camera), 1)
     ray, distance = np.repeat(np.arange(12), 2), np.tile([0.3, 3.9], 12)
-    lines, radius = pencil.points(ray, distance, 0.0 * distance)
+    lines, radius = bundle.points(ray, distance, 0.0 * distance)
     directions = np.array([[(x + 0.5 - 2.0) / 5.0, -(y + 0.5 - 1.5) / 5.0, -1.0] for y in range(3) for x in range(4)])
     worst = np.zeros_like(radius)
     for values in np.random.default_rng(0).uniform(-1.0, 1.0, (300, 3)):
         pose = pose_set.pose(pose_set.box.at(values))
         world = directions @ pose[:, :3].T
         points = pose[:, 3] + distance[:, None] * (world / np.linalg.norm(world, axis=1, keepdims=True))[ray]
-        monomials = np.prod(values**pencil.exponents, axis=1)
+        monomials = np.prod(values**bundle.exponents, axis=1)
         worst = np.maximum(worst, np.abs(points - np.einsum("m,kmc->kc", monomials, lines)))
     assert (worst <= radius).all()
     assert worst.max() > 0.1 * radius.max(), "far too wide"

@@ -96,11 +96,11 @@ def test_extreme_boxes_tell_nothing_wrong() -> None:
 
 def test_ranges_of_points_are_enclosed_and_tight() -> None:
     pose_set = poses(SETS["two"])
-    pencil = RayBundle(pose_set, pose_set.box, pixels_of(pose_set.camera), 4)
+    bundle = RayBundle(pose_set, pose_set.box, pixels_of(pose_set.camera), 4)
     ray, distance = np.repeat(np.arange(12), 3), np.tile([0.3, 1.5, 3.9], 12)
-    lines, radius = pencil.points(ray, distance, 0.0 * distance)
+    lines, radius = bundle.points(ray, distance, 0.0 * distance)
     low, high = np.array([[-0.5, 0.25]]).repeat(36, 0), np.array([[0.0, 1.0]]).repeat(36, 0)
-    bottom, top = pencil.ranges(lines, radius, low, high)
+    bottom, top = bundle.ranges(lines, radius, low, high)
     assert (top - bottom).max() < 0.02
     directions = np.stack([[(x + 0.5 - 2.0) / 5.0, -(y + 0.5 - 1.5) / 5.0, -1.0] for y in range(3) for x in range(4)])
     for values in np.random.default_rng(0).uniform(low[0], high[0], (200, 2)):

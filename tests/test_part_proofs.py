@@ -203,7 +203,7 @@ class Disc:
         self.box, self.lie, self.bounded, self.drawn = interval(2), lie, 0, 0
         self.radii = np.linspace(0.4, 0.9, PIXELS)
 
-    def image(self, values: np.ndarray, member: Any = None) -> np.ndarray:
+    def image(self, values: np.ndarray, scene_sample: Any = None) -> np.ndarray:
         self.drawn += 1
         return (0.5 + self.radii**2 - values @ values).reshape(1, PIXELS, 1).astype(np.float32)
 

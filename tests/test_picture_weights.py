@@ -61,7 +61,7 @@ def slow(
     reference = Reference(scene, GSPLAT_1_4_0, dtype)
     if sample is not None:
         splats = sample.splats
-        reference = reference.member(torch.from_numpy(splats.means), torch.from_numpy(splats.opacity), None)
+        reference = reference.scene_sample(torch.from_numpy(splats.means), torch.from_numpy(splats.opacity), None)
     red = 0.5 + 0.28209479177387814 * scene.sh[:, 0, 0].astype(np.float64)
     left, bright = torch.from_numpy(scene.means[:, 0] <= 0.0), torch.from_numpy(red >= 0.5)
 

@@ -343,17 +343,17 @@ def test_tubes_hold_runs_in_a_scene_whose_place_the_view_tells(tmp_path: Path) -
 
 
 class Lamp(Wall):
-    """A wall by the light that a member of the scene's set tells."""
+    """A wall by the light that a scene sample of the scene's set tells."""
 
-    def image(self, values: np.ndarray, member: Any = None) -> np.ndarray:
-        return super().image(values) * np.float32(1.0 if member is None else member)
+    def image(self, values: np.ndarray, scene_sample: Any = None) -> np.ndarray:
+        return super().image(values) * np.float32(1.0 if scene_sample is None else scene_sample)
 
 
 def test_a_run_sees_the_scene_it_is_given(tmp_path: Path) -> None:
     base = reacher(tmp_path, specification("affine"))
     lit = replace(base, view=Lamp(base.loop))
     start, push = base.loop.state(base.loop.box, np.zeros(base.loop.box.dimensions)), np.zeros((20, 3))
-    stored, dark = (simulate(lit, start, push, member) for member in (None, 0.5))
+    stored, dark = (simulate(lit, start, push, scene_sample) for scene_sample in (None, 0.5))
     assert (stored.states == simulate(base, start, push).states).all()
     for x, u in zip(dark.states, dark.controls, strict=False):
         assert (u == lit.pilot.concrete(lit.view.image(lit.loop.camera.values(x), 0.5))).all()

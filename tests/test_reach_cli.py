@@ -298,17 +298,17 @@ def test_scene_margin(course: Course, tmp_path: Path) -> None:
         elif (of_camera := responses.get(name)) is not None:
             view = ScenePictures(job.job.method.frame(job.job.pose_sets[0]), CameraResponse(of_camera, radius))
             reacher = replace(job.reacher(), view=view)
-            scenes = [(member, None) for member in itertools.islice(view.scene_samples(1), 24)]
+            scenes = [(scene_sample, None) for scene_sample in itertools.islice(view.scene_samples(1), 24)]
         else:
             ends: dict[str, Any] = {name: (-radius, radius)}
             view = ScenePictures(job.job.method.frame(job.job.varied(0, SceneVariation(Selection(), **ends))))
             reacher = replace(job.reacher(), view=view)
-            scenes = [(member, None) for member in itertools.islice(reacher.view.scene_samples(1), 24)]
+            scenes = [(scene_sample, None) for scene_sample in itertools.islice(reacher.view.scene_samples(1), 24)]
         tube = reacher.tube(box)
-        for number, (member, shift) in enumerate(scenes):
+        for number, (scene_sample, shift) in enumerate(scenes):
             start = box.corners()[number % 2] if number % 2 else box.sample(1, rng)[0]
             push = sampled_disturbances(loop, rng, "ends" if number % 3 else "random")
-            run = simulate(reacher, loop.state(box, start), push, member, shift)
+            run = simulate(reacher, loop.state(box, start), push, scene_sample, shift)
             assert run.margin(loop, "safe") > 0.0
             assert first_outside(tube, run) is None
             compared += len(run.states)

@@ -1,4 +1,4 @@
-"""A scene that stands elsewhere as a whole: sets, the network's bounds and members, on pictures with a formula."""
+"""A scene that stands elsewhere as a whole: sets, bounds of a network, scene samples, on pictures with a formula."""
 
 from __future__ import annotations
 
@@ -62,12 +62,12 @@ def test_bounds_hold_for_every_place_of_the_scene(tmp_path: Path, d: int) -> Non
     found = model.bound(images, Query(rows, np.zeros(6)))
     assert found.a.shape == (1, 6, d) and np.isfinite(found.b).all()
     nearest, reached = np.inf, 0.0
-    for member in itertools.islice(scene.scene_samples(2), 300):
+    for scene_sample in itertools.islice(scene.scene_samples(2), 300):
         p = rng.choice([-1.0, 1.0], d) if rng.random() < 0.5 else rng.uniform(-1.0, 1.0, d)
-        outputs = model.outputs(scene.image(box.at(p), member)[None])[0].astype(np.float64)
+        outputs = model.outputs(scene.image(box.at(p), scene_sample)[None])[0].astype(np.float64)
         room = rows @ outputs - (found.a[0] @ p + found.b[0])
         assert (room >= 0.0).all() and (rows @ outputs >= found.lower[0]).all()
-        nearest, reached = min(nearest, float(room.min())), max(reached, float(np.abs(member.offset).max()))
+        nearest, reached = min(nearest, float(room.min())), max(reached, float(np.abs(scene_sample.offset).max()))
     # and are reached, but for what curves
     assert nearest < 0.01 and reached == 0.1
 
@@ -75,13 +75,13 @@ def test_bounds_hold_for_every_place_of_the_scene(tmp_path: Path, d: int) -> Non
 def test_steps_go_uphill_and_stay_in_the_set() -> None:
     wall = Wall(2, 0.1)
     scene: Any = RegisteredImages(wall, wall)  # type: ignore[arg-type]
-    values, member = scene.box.middle, next(scene.scene_samples(0)).nearest
-    assert (member.offset == 0.0).all() and (scene.image(values) == scene.image(values, member)).all()
+    values, scene_sample = scene.box.middle, next(scene.scene_samples(0)).nearest
+    assert (scene_sample.offset == 0.0).all() and (scene.image(values) == scene.image(values, scene_sample)).all()
 
     def score(picture: torch.Tensor, pose: torch.Tensor) -> torch.Tensor:
         return picture.sum()
 
-    moved, other = member.signed_gradient_step(scene.box, values, score, 2.0)
+    moved, other = scene_sample.signed_gradient_step(scene.box, values, score, 2.0)
     assert scene.box.contains(moved) and (np.abs(other.offset) == 0.1).all()
     assert other(moved).sum() > scene.image(values).sum()
     assert float(scene.image(moved, other).sum()) >= max(

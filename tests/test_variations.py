@@ -1,4 +1,4 @@
-"""Scenes of which Gaussians vary: selections, members, and bounds attacked over poses and scenes."""
+"""Scenes of which Gaussians vary: selections, scene samples, and bounds attacked over poses and scenes."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class Case:
 
     def attack(
         self, bounds: SplatBounds | None = None, box: ParameterBox | None = None, candidates=None,
-        arithmetic: Arithmetic = REAL, members: int = 22, targets: int = 6,
+        arithmetic: Arithmetic = REAL, scene_samples: int = 22, targets: int = 6,
     ) -> tuple[VariedAttack, np.ndarray, CellBounds]:  # fmt: skip
         """Bound and attack a box; the attack, the width of the bounds, and the bounds."""
         bounds = bounds or SplatBounds(self.splats, GSPLAT_1_4_0, arithmetic, self.varied)
@@ -85,7 +85,7 @@ class Case:
             shows.append(show_reference(Reference(self.scene, GSPLAT_1_4_0, dtype), self.poses))
         found = attack_varied(
             lower, upper, self.poses.box if box is None else box, self.varied, shows, self.scene, self.poses,
-            GSPLAT_1_4_0, members=members, targets=targets,
+            GSPLAT_1_4_0, scene_samples=scene_samples, targets=targets,
         )  # fmt: skip
         return found, upper - lower, cell
 
@@ -116,7 +116,7 @@ def test_blobs(degree: int, dimensions: int) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("dimensions", [0, 3])
 def test_float32_blobs(dimensions: int) -> None:
-    """Float32 evaluations of members, whose values are rounded to float32, lie inside as well."""
+    """Float32 evaluations of scene samples, whose values are rounded to float32, lie inside as well."""
     scene = replace(blob_scene(24, degree=1), rasterize_mode="antialiased")
     found, _, _ = Case(scene, POSES[dimensions] | {"scene": scene_of(**EVERYTHING)}, height=1.5).attack(
         arithmetic=FLOAT32
@@ -273,7 +273,7 @@ def test_nothing_varies(degree: int, dimensions: int) -> None:
     view = case.poses.world_to_camera(case.poses.box.middle)
     renderer = Renderer(case.splats, GSPLAT_1_4_0)
     assert np.array_equal(
-        renderer.image(case.camera, *view), renderer.image(case.camera, *view, member=case.varied.nearest)
+        renderer.image(case.camera, *view), renderer.image(case.camera, *view, scene_sample=case.varied.nearest)
     )
 
 
@@ -282,9 +282,9 @@ def test_nothing_varies(degree: int, dimensions: int) -> None:
     "ranges, most", [({"color": 0.1}, 1.001), ({"opacity": 0.1}, 1.06), ({"mean": 0.005}, 2.4), (EVERYTHING, 2.4)]
 )
 def test_tightness(ranges: dict, most: float) -> None:
-    """Mean width of the bounds against the width that members show."""
+    """Mean width of the bounds against the width that scene samples show."""
     case = Case(blob_scene(24, degree=0), {"scene": scene_of(**ranges)}, height=1.5)
-    found, width, _ = case.attack(members=40, targets=40)
+    found, width, _ = case.attack(scene_samples=40, targets=40)
     assert found.violations == 0
     ratio = width.mean() / (found.most - found.least).mean()
     assert 1.0 <= ratio < most
@@ -333,7 +333,7 @@ def test_overlapping_ranges() -> None:
     assert np.allclose(varied.mean_high - scene.means, np.array([0.2, 0.2, 0.05])[:, None])
     assert np.allclose(varied.opacity_low, [0.85, 0.85, 0.95]) and np.allclose(varied.opacity_high, [1, 1, 0.95])
     assert varied.counts == {"mean": 3, "opacity": 2, "color": 0}
-    # the member nearest to the stored scene is in the set
+    # the scene sample nearest to the stored scene is in the set
     assert (varied.nearest.means >= varied.mean_low).all() and (varied.nearest.means <= varied.mean_high).all()
     assert np.allclose(varied.nearest.means[0, 0], 0.1)
 
@@ -341,10 +341,10 @@ def test_overlapping_ranges() -> None:
 def test_members_lie_in_the_set() -> None:
     case = Case(blob_scene(24, degree=1), {"scene": scene_of(**EVERYTHING)})
     varied, generator = case.varied, np.random.default_rng(0)
-    for member, _ in zip(varied.scene_samples(generator), range(40), strict=False):
-        assert ((varied.mean_low <= member.means) & (member.means <= varied.mean_high)).all()
-        assert ((varied.opacity_low <= member.opacity) & (member.opacity <= varied.opacity_high)).all()
-        assert ((varied.shift_low <= member.color_shift) & (member.color_shift <= varied.shift_high)).all()
+    for scene_sample, _ in zip(varied.scene_samples(generator), range(40), strict=False):
+        assert ((varied.mean_low <= scene_sample.means) & (scene_sample.means <= varied.mean_high)).all()
+        assert ((varied.opacity_low <= scene_sample.opacity) & (scene_sample.opacity <= varied.opacity_high)).all()
+        assert ((varied.shift_low <= scene_sample.color_shift) & (scene_sample.color_shift <= varied.shift_high)).all()
 
 
 @pytest.mark.parametrize(
@@ -412,7 +412,7 @@ def render(options: list[str], monkeypatch: pytest.MonkeyPatch) -> int:
 @pytest.mark.slow
 @pytest.mark.parametrize("poses", [{}, SHIFT])
 def test_command(poses: dict, make_blobs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Alone and with poses: the command's result contains members of the set, and the report counts them."""
+    """Alone and with poses: the command's result contains scene samples of the set, and the report counts them."""
     entry = {"select": {"box": [[-1, -1, -1], [0, 1, 1]], "indices": "some.json"}, **EVERYTHING}
     inputs: Inputs = make_blobs(spec=poses | {"scene": [entry]})
     write_json(inputs.spec.parent / "some.json", list(range(40)))
@@ -429,7 +429,7 @@ def test_command(poses: dict, make_blobs, tmp_path: Path, monkeypatch: pytest.Mo
     assert 0 < varied.counts["opacity"] < 40 and text in " ".join(report["frames"][0]["plan"])
     shows = [show_compiled(Renderer(splat.splats, splat.rasteriser), pose_set)]
     found = attack_varied(
-        lower, upper, pose_set.box, varied, shows, splat.scene, pose_set, splat.rasteriser, members=30, targets=6
+        lower, upper, pose_set.box, varied, shows, splat.scene, pose_set, splat.rasteriser, scene_samples=30, targets=6
     )
     assert found.violations == 0
 
@@ -453,6 +453,6 @@ def test_fingerprint(make_blobs, tmp_path: Path) -> None:
 
 def test_check(blobs: Inputs) -> None:
     spec = SHIFT | {"scene": [{"select": {"opacity": [0.5, 1]}, "opacity": 0.1}]}
-    found = check_varied(blobs.config, blobs.path, spec, 0, 2, members=6, targets=2, downscale_factor=2)
+    found = check_varied(blobs.config, blobs.path, spec, 0, 2, scene_samples=6, targets=2, downscale_factor=2)
     assert found["violations"] == 0 and found["pictures"] == 2 * 2 * (7 + 2 * 4)
     assert 0.0 < found["mpg_witness"] < found["mpg"] < found["xpg"]

@@ -324,13 +324,13 @@ def varied_view(select: str = SELECT, **radii: float) -> ViewRequest:
 
 
 def outside(snapshot: Snapshot, view: ViewRequest, count: int = 24) -> int:
-    """Values of pictures of members of ``view``'s set outside the bounds."""
+    """Values of pictures of scene samples of ``view``'s set outside the bounds."""
     at = view.camera.rescaled(view.side / max(snapshot.size))
     frame = source().frame(at, view.perturbation)
     rng, found = np.random.default_rng(5), 0
-    for member in itertools.islice(frame.varied.scene_samples(rng), count):
+    for scene_sample in itertools.islice(frame.varied.scene_samples(rng), count):
         values = frame.box.middle if frame.box.dimensions == 0 else frame.box.sample(1, rng)[0]
-        picture = frame.renderer.image(at, *frame.pose_set.world_to_camera(values), member)
+        picture = frame.renderer.image(at, *frame.pose_set.world_to_camera(values), scene_sample)
         found += int(((picture < snapshot.lower) | (picture > snapshot.upper)).sum())
     return found
 

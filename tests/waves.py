@@ -19,10 +19,10 @@ class Waves:
     def __init__(self, size: tuple[int, int], d: int) -> None:
         self.slopes = np.random.default_rng(0).normal(size=(*size, 3, d)) * 0.2
 
-    def members(self, seed: int) -> Iterator[Any]:
+    def scene_samples(self, seed: int) -> Iterator[Any]:
         return iter(())
 
-    def image(self, values: np.ndarray, member: Any = None) -> np.ndarray:
+    def image(self, values: np.ndarray, scene_sample: Any = None) -> np.ndarray:
         return (0.5 + 0.3 * self.slopes @ np.sin(values)).astype(np.float32)
 
     def linear_sets(self, box: ParameterBox) -> tuple[tuple[np.ndarray, ...], np.ndarray, np.ndarray, np.ndarray]:

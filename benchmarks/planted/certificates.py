@@ -428,7 +428,9 @@ CERTIFICATES = (
     ),
     Fault(
         "search: only the stored scene is shown",
-        "verify/scene_pictures.py", "ScenePictures.image", "self.frame.render if member is None else member",
+        "verify/scene_pictures.py",
+        "ScenePictures.image",
+        "self.frame.render if scene_sample is None else scene_sample",
         "self.frame.render", "test_certify_cli.py::test_a_variation_of_the_scene_breaks_what_poses_do_not",
         compiled=True,
     ),

@@ -111,13 +111,13 @@ class FramePictures(ScenePictures):
     def _frame(self, method: Method, poses: PoseBox, sheared: bool) -> Frame:
         return method.frame(poses, sheared)
 
-    def image(self, values: np.ndarray, member: SceneSample | None = None) -> np.ndarray:
+    def image(self, values: np.ndarray, scene_sample: SceneSample | None = None) -> np.ndarray:
         values = np.asarray(values, np.float64)
         key = values.tobytes()
-        image = None if member is not None else self._images.get(key)
+        image = None if scene_sample is not None else self._images.get(key)
         if image is None:
-            image = super().image(values, member)
-            if self.frame.tilewise and member is None:
+            image = super().image(values, scene_sample)
+            if self.frame.tilewise and scene_sample is None:
                 # costly, and neighbouring cells share their ends
                 while len(self._images) >= _IMAGES:
                     self._images.pop(next(iter(self._images)))

@@ -229,7 +229,7 @@ class Job:
 
         refinement = Refinement(
             frame, index, replace(goal, keep_leaves=keep_leaves), seed=self.seed, stopped=over, progress=progress,
-            members=frame.scene_samples(self.seed), tiles=tiles, earlier=earlier,
+            scene_samples=frame.scene_samples(self.seed), tiles=tiles, earlier=earlier,
         )  # fmt: skip
         return replace(refinement.run_part(), problems=platform_problems())
 

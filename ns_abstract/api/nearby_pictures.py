@@ -199,9 +199,9 @@ class NearbyPictures:
         self._pictures, self._weights, self._known, self.box = pictures, weights, box_bounds, pictures.box
         self._draws, self._measures, self._motion = draws, measures, motion
 
-    def image(self, values: np.ndarray, member: SceneSample | None = None) -> np.ndarray:
+    def image(self, values: np.ndarray, scene_sample: SceneSample | None = None) -> np.ndarray:
         """Picture at a pose of the box: pixels that are settled are in the middle of their bounds."""
-        assert member is None
+        assert scene_sample is None
         box_bounds = self._known
         image = 0.5 * (box_bounds.lower + box_bounds.upper)
         if box_bounds.elements is not None:

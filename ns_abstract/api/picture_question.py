@@ -151,10 +151,10 @@ class PlanePictures(FramePictures):
         """Number of channels C."""
         return COLORS + len(self._planes)
 
-    def image(self, values: np.ndarray, member: SceneSample | None = None) -> np.ndarray:
+    def image(self, values: np.ndarray, scene_sample: SceneSample | None = None) -> np.ndarray:
         """Concrete picture [H, W, C] float32; see `ns_abstract.verify.protocol.FrameImages`."""
         values = np.asarray(values, np.float64)
-        base = member.base if isinstance(member, PlaneSample) else member
+        base = scene_sample.base if isinstance(scene_sample, PlaneSample) else scene_sample
         image = np.zeros((*self.wanted.shape, self.channels), np.float32)
         whole = None if self._dark else super().image(values, base)
         if whole is not None:

@@ -119,7 +119,7 @@ CUBIC_SERIES_REST = 1.5e-4
 #: B7: a radius' own recursion, three roundings by layer of numbers that are not negative; 1 to spare.
 LAYER_ROUNDING = 4.0 * UNIT64
 #: B11: sums of what skipping changes, one rounding by fragment. O2: swaps, one by pair; 1 to spare.
-JUMP_ROUNDING, SWAP_ROUNDING = UNIT64, 2.0 * UNIT64
+CROSSING_ROUNDING, SWAP_ROUNDING = UNIT64, 2.0 * UNIT64
 #: B12: by how much of a cell's half-width sub-boxes reach beyond their ends, so that they hold what lies between the
 #: grid's lines however these are rounded; and the most, of that, that the lines' rounding may come to.
 SUB_BOX_OVERLAP, SUB_BOX_LINES = 2.0**-24, 2.0**-26

@@ -21,7 +21,7 @@ def refine(job: PathJob, poses: PoseBox, frame: int, seconds: float, ratio: floa
     """The abstract image of ``poses`` about entry ``frame``; kernels are compiled before the clock starts."""
     view, seed = job.method.frame(poses, sheared=True), job.seed
     view.warm_up()
-    result = Refinement(view, frame, job.goal(ratio, seconds), seed=seed, members=view.scene_samples(seed)).run()
+    result = Refinement(view, frame, job.goal(ratio, seconds), seed=seed, scene_samples=view.scene_samples(seed)).run()
     return replace(result, box=poses.box)
 
 

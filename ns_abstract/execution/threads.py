@@ -25,14 +25,14 @@ class _Setting:
 _setting = _Setting()
 
 
-class _Lane(NamedTuple):
+class _ThreadGroup(NamedTuple):
     """One of several pieces of work that go on side by side: its number, and the threads that it has to itself."""
 
     number: int
     threads: int
 
 
-_lane: ContextVar[_Lane | None] = ContextVar("lane", default=None)
+_group: ContextVar[_ThreadGroup | None] = ContextVar("thread group", default=None)
 
 
 def most_threads() -> int:
@@ -42,15 +42,15 @@ def most_threads() -> int:
     return numba.config.NUMBA_NUM_THREADS  # pyright: ignore[reportPrivateImportUsage, reportAttributeAccessIssue]
 
 
-def lane() -> int:
+def thread_group() -> int:
     """Number of the calling piece of work among those of `each` that go on side by side; 0 outside."""
-    current = _lane.get()
+    current = _group.get()
     return 0 if current is None else current.number
 
 
 def threads() -> int:
     """How many work side by side, of those that the calling piece of work has to itself."""
-    current = _lane.get()
+    current = _group.get()
     if current is not None:
         return current.threads
     most = most_threads()
@@ -88,22 +88,22 @@ def each(work: Callable[[T], R], items: Sequence[T]) -> list[R]:
         Exception: What ``work`` raised of the first item of which it raised anything; the others have ended.
     """
     mine = threads()
-    lanes = min(mine, len(items))
-    if lanes < 2:
+    groups = min(mine, len(items))
+    if groups < 2:
         return [work(item) for item in items]
     results: dict[int, R] = {}
     raised: dict[int, Exception] = {}
     turns = itertools.count()
 
     def run(number: int) -> None:
-        _lane.set(_Lane(number, mine // lanes))
+        _group.set(_ThreadGroup(number, mine // groups))
         while not raised and (turn := next(turns)) < len(items):
             try:
                 results[turn] = work(items[turn])
             except Exception as error:
                 raised[turn] = error
 
-    side_by_side(run, lanes)
+    side_by_side(run, groups)
     if raised:
         raise raised[min(raised)]
     return [results[turn] for turn in range(len(items))]

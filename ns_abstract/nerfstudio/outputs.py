@@ -211,7 +211,7 @@ class AbstractOutputs(_Base):
         if self._problems is None:
             self._problems = check_functions()
         frame = source.frame(view.camera, view.perturbation)
-        result = Refinement(frame, 0, RefinementGoal(seconds=seconds), members=frame.scene_samples(0)).run()
+        result = Refinement(frame, 0, RefinementGoal(seconds=seconds), scene_samples=frame.scene_samples(0)).run()
         return Snapshot.of(result, final=True, guarantee="sampled" if self._problems else source.guarantee)
 
     def _attached(self) -> None:

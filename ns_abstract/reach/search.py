@@ -88,18 +88,18 @@ def simulate(
     reacher: TubeBuilder,
     start: Float64,
     disturbances: Float64,
-    member: SceneSample | None = None,
+    scene_sample: SceneSample | None = None,
     off: Float64 | None = None,
 ) -> SimulatedRun:
     """One run with the real renderer and the deployed network, in float64 but for these.
 
     Args:
         disturbances: [steps, n], added to every next state.
-        member: The scene that is seen throughout; None: the stored one.
+        scene_sample: The scene that is seen throughout; None: the stored one.
         off: Where the scene stands throughout, as `TubeBuilder.seen_from` has it; None: at its place.
     """
     loop = reacher.loop
-    more = () if member is None else (member,)
+    more = () if scene_sample is None else (scene_sample,)
     states, controls = [np.asarray(start, np.float64)], []
     margins = np.full((loop.steps + 1, len(reacher.views)), np.nan)
     with np.errstate(all="ignore"):
@@ -217,7 +217,7 @@ class LoopSearch:
         """Scenes of the set, without end: other Gaussians, or the stored ones elsewhere, corners first."""
         reach = self.reacher.place if self.reacher.place.size else self.reacher.shift
         if not reach.any():
-            yield from ((member, None) for member in self.reacher.view.scene_samples(0))
+            yield from ((scene_sample, None) for scene_sample in self.reacher.view.scene_samples(0))
             return
         for signs in itertools.product((-1.0, 1.0), repeat=int(np.count_nonzero(reach))):
             corner = reach.copy()
@@ -240,10 +240,10 @@ class LoopSearch:
         starts = [box.middle, np.array(box.lower), np.array(box.upper)]
         first = int(generator.integers(_SCENES)) if proved else 0
         scenes = itertools.islice(self._scenes(generator), first, first + 1 if proved else _SCENES)
-        for number, (member, off) in enumerate(scenes):
+        for number, (scene_sample, off) in enumerate(scenes):
             state = self.loop.state(box, starts[number % len(starts)])
             push = sampled_disturbances(self.loop, generator, "ends" if number % 2 else "middle")
-            run = simulate(self.reacher, state, push, member, off)
+            run = simulate(self.reacher, state, push, scene_sample, off)
             outside = first_outside(tube, run) if has_tube else None
             margin = run.margin(self.loop, question)
             if outside is not None or (proved and margin <= 0.0):
@@ -253,10 +253,13 @@ class LoopSearch:
                 )
             if math.isnan(margin):
                 return CellOutcome("unknown", "the states of a run are no finite numbers", width)
-            if margin <= 0.0 and simulate(self.reacher, state, push, member, off).margin(self.loop, question) <= 0.0:
+            if (
+                margin <= 0.0
+                and simulate(self.reacher, state, push, scene_sample, off).margin(self.loop, question) <= 0.0
+            ):
                 arrays = {"states": run.states, "controls": run.controls, "disturbances": run.disturbances}
                 arrays |= {"names": np.array(self.loop.names, str)}
-                varied = {} if member is None else member.arrays
+                varied = {} if scene_sample is None else scene_sample.arrays
                 arrays |= {f"scene_{name}": array for name, array in varied.items()}
                 arrays |= {} if off is None else {"place" if self.reacher.place.size else "shift": off}
                 return CellOutcome("falsified", "a run goes wrong", width, arrays)

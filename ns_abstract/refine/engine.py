@@ -39,7 +39,7 @@ class Refinement:
 
     Args:
         progress: Called with (trace point, covered part of the set) after every initial cell and after every round.
-        members: Where the scene varies too: other scenes of the set, each as a function like the frame's
+        scene_samples: Where the scene varies too: other scenes of the set, each as a function like the frame's
             ``render``. They widen the inner bound; only poses are split.
         tiles: Numbers of the tiles that are looked at, ascending; None: all. Measures are those of its pixels (R6).
         earlier: What was found of the same set before, with bounds: results are no looser, and work goes where it
@@ -62,7 +62,7 @@ class Refinement:
         seed: int = 0,
         stopped: Callable[[], bool] = lambda: False,
         progress: Callable[[TracePoint, float], None] = lambda point, share: None,
-        members: Iterator[Render] | None = None,
+        scene_samples: Iterator[Render] | None = None,
         tiles: np.ndarray | None = None,
         earlier: FrameResult | None = None,
         initial: list[BoundedCell] | None = None,
@@ -71,7 +71,7 @@ class Refinement:
         self.frame, self.index, self.goal, self.tuning = frame, index, goal, tuning
         self.stopped, self.progress = stopped, progress
         self.tiles = FrameTiles(frame, tiles, goal.keep_leaves)
-        scenes = iter(()) if members is None else members
+        scenes = iter(()) if scene_samples is None else scene_samples
         self.inner = InnerBound(self.tiles, np.random.default_rng([seed, index]), scenes, tuning)
         bounds: tuple[np.ndarray, np.ndarray] | None = None
         if earlier is not None:

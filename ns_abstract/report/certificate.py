@@ -127,7 +127,7 @@ class LastReport:
         #: the command that a resumed search goes on with
         self.first_command: list[str] | None = None
         self._document: dict[str, Any] = {}
-        self._page: Callable[[], str] = str
+        self._page: Callable[[], str] = lambda: ""
 
     def write(self, document: dict[str, Any], page: Callable[[], str]) -> None:
         """Write both.

@@ -153,12 +153,12 @@ def _spoilt(margin: float) -> bool:
 
 def sample_key(sample: Sample) -> tuple[bytes, int]:
     """Return a key that is equal for equal pictures; scene samples are distinguished by identity."""
-    pose, member = sample
-    return pose.tobytes(), id(member)
+    pose, scene_sample = sample
+    return pose.tobytes(), id(scene_sample)
 
 
 def drawn(scene: FrameImages, sample: Sample) -> np.ndarray:
     """Return the picture of a sample."""
     check_cancelled()
-    values, member = sample
-    return scene.image(values) if member is None else scene.image(values, member)
+    values, scene_sample = sample
+    return scene.image(values) if scene_sample is None else scene.image(values, scene_sample)

@@ -20,7 +20,7 @@ class FrameImages(Protocol):
 
     box: ParameterBox
 
-    def image(self, values: np.ndarray, member: SceneSample | None = None) -> np.ndarray:
+    def image(self, values: np.ndarray, scene_sample: SceneSample | None = None) -> np.ndarray:
         """Concrete picture [H, W, 3] float32 at parameter values [d], of another scene of the set if one is named."""
         ...
 

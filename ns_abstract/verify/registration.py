@@ -33,9 +33,11 @@ class RegisteredImages:
         #: [3] how far each may be off
         self.reach = np.array(box.upper[-PLACE:])
 
-    def image(self, values: np.ndarray, member: SceneSample | None = None) -> np.ndarray:
-        assert member is None or isinstance(member, RegisteredSample)
-        return self.scene.image(np.concatenate([values, np.zeros(PLACE) if member is None else member.offset]))
+    def image(self, values: np.ndarray, scene_sample: SceneSample | None = None) -> np.ndarray:
+        assert scene_sample is None or isinstance(scene_sample, RegisteredSample)
+        return self.scene.image(
+            np.concatenate([values, np.zeros(PLACE) if scene_sample is None else scene_sample.offset])
+        )
 
     def scene_samples(self, seed: int) -> Iterator[RegisteredSample]:
         """Places of the scene, without end, corners first."""

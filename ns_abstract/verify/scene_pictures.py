@@ -26,9 +26,9 @@ class ScenePictures:
         """The poses that may be looked at."""
         return self.frame.pose_set
 
-    def image(self, values: np.ndarray, member: SceneSample | None = None) -> np.ndarray:
+    def image(self, values: np.ndarray, scene_sample: SceneSample | None = None) -> np.ndarray:
         check_cancelled()
-        render = self.frame.render if member is None else member
+        render = self.frame.render if scene_sample is None else scene_sample
         return assemble(render(np.asarray(values, np.float64)), self.frame.camera)
 
     def scene_samples(self, seed: int) -> Iterator[SceneSample]:

@@ -57,7 +57,7 @@ _WITNESSES = 64
 #: Steps of the descent to a counterexample.
 _STEPS = 6
 #: Scenes of a set tried in a cell without a proof.
-_MEMBERS = 4
+_SCENE_SAMPLES = 4
 #: Why a cell is unknown where a sample's margin decides nothing.
 NO_NUMBER = "the margin of a picture is no finite number"
 #: Most branches on signs of units where a cell cannot be cut, and how many times the margin that samples show its bound
@@ -176,8 +176,8 @@ class Search:
         poses = list(cell.box.sample(1, generator)) if cell.box.dimensions else []
         if not self.varies:
             return [(pose, None) for pose in poses]
-        member = next(itertools.islice(self._members(cell), int(generator.integers(_ATTACKERS)), None))
-        return [(pose, member) for pose in poses or [cell.box.middle]]
+        scene_sample = next(itertools.islice(self._scene_samples(cell), int(generator.integers(_ATTACKERS)), None))
+        return [(pose, scene_sample) for pose in poses or [cell.box.middle]]
 
     def _attack_parts(self, cell: CellSamples) -> list[Sample]:
         """A random pose of one of the parts that are proved, and the middle of every part that is refuted."""
@@ -189,7 +189,7 @@ class Search:
             poses += list(self.grid.box_of(proved[int(generator.integers(len(proved)))]).sample(1, generator))
         return [(pose, None) for pose in poses if pose.tobytes() not in cell.poses]
 
-    def _members(self, cell: CellSamples) -> Iterator[SceneSample]:
+    def _scene_samples(self, cell: CellSamples) -> Iterator[SceneSample]:
         return self.scene.scene_samples(int(_generator(cell.cell).integers(1 << 31)))
 
     def _late(self, cell: CellSamples) -> list[Sample]:
@@ -230,11 +230,11 @@ class Search:
         The nearest is moved to the ends of its ranges along the signs of the margin's gradient, the worst by then half
         as far, and the worst of all tried at the other poses, where it mostly breaks the property, too.
         """
-        members: list[SceneSample] = []
+        scene_samples: list[SceneSample] = []
         for cell in sorted(cells, key=lambda c: c.margins[c.worst]):
             pose = cell.samples[cell.worst][0]
-            tried = [*itertools.islice(self._members(cell), _MEMBERS), *members]
-            margins = self._shown(cell, [(pose, member) for member in tried])
+            tried = [*itertools.islice(self._scene_samples(cell), _SCENE_SAMPLES), *scene_samples]
+            margins = self._shown(cell, [(pose, scene_sample) for scene_sample in tried])
             least = min(range(len(tried)), key=lambda k: margins[k] if math.isfinite(margins[k]) else math.inf)
             best, margin = tried[least], margins[least]
             # colours that are clamped at an end of their range have no slope there
@@ -245,7 +245,7 @@ class Search:
                 (image,) = self._shown(cell, [moved])
                 if image < margin:
                     (pose, best), margin = moved, image
-            members = [best]
+            scene_samples = [best]
             self._shown(cell, [(other, best) for key, other in cell.poses.items() if key != pose.tobytes()])
 
     def _shown(self, cell: CellSamples, samples: list[Sample]) -> list[float]:
@@ -476,7 +476,7 @@ class Search:
 
     def _counterexample(self, cell: Cell, box: ParameterBox, sample: Sample) -> FinishedCell:
         """What a sample in ``box`` says of a cell, rendered and classified once more."""
-        values, member = sample
+        values, scene_sample = sample
         image = drawn(self.scene, sample)
         margins, outputs = self._judged([sample], [image])
         margin = float(margins[0])
@@ -490,7 +490,7 @@ class Search:
             counterexample=tuple(values.tolist()),
             image=image,
             outputs=outputs[0],
-            scene=None if member is None else member.arrays,
+            scene=None if scene_sample is None else scene_sample.arrays,
         )
 
 

@@ -144,7 +144,7 @@ class Background:
             self._waiting.clear()
             for worker in self._workers:
                 worker.post(("scene", token, source))
-            self._staff()
+            self._start_missing_workers()
 
     def best(self, view: ViewRequest, seconds: float) -> Snapshot | None:
         """The best that is known of ``view``; what is missing is asked for.
@@ -235,25 +235,25 @@ class Background:
     def _ask(self, key: _Key, view: ViewRequest, seconds: float, known: int) -> None:
         number = 0 if self._wanted is None else self._wanted[0] + 1
         self._wanted, self._answered, self._asked = (number, key, view, seconds), False, time.monotonic()
-        self._staff()
+        self._start_missing_workers()
         if self._workers:
             self._workers[0].post(("work", number, view, seconds, known))
         assert self._source is not None
-        timer = threading.Timer(self._source[1].patience, self._relieve)
+        timer = threading.Timer(self._source[1].patience, self._replace_stuck_worker)
         timer.daemon = True
         timer.start()
 
     # --- workers -------------------------------------------------------------------------------
 
-    def _staff(self) -> None:
-        """Start what is missing of the workers."""
+    def _start_missing_workers(self) -> None:
+        """Start the workers that are missing: one, and those in reserve."""
         while not self._closed and self._source is not None and len(self._workers) < 1 + self._reserve:
             worker = _Process(self._take)
             worker.post(("scene", *self._source))
             self._workers.append(worker)
 
-    def _relieve(self) -> None:
-        """Hand the newest request to the reserve if the worker is stuck with an older one."""
+    def _replace_stuck_worker(self) -> None:
+        """End the first worker if it is stuck with an older request, and send the newest one to the reserve."""
         with self._lock:
             if self._closed or self._wanted is None or self._source is None or len(self._workers) < 2:
                 return
@@ -263,11 +263,11 @@ class Background:
                 return
             self._workers.pop(0)
             first.end()
-            self._hand_over()
-            self._staff()
+            self._send_request()
+            self._start_missing_workers()
 
-    def _hand_over(self) -> None:
-        """Give the newest request to the first worker."""
+    def _send_request(self) -> None:
+        """Send the newest request to the first worker."""
         if self._workers and self._wanted is not None and not self._answered:
             number, _, view, seconds = self._wanted
             self._workers[0].post(("work", number, view, seconds, 0))
@@ -299,14 +299,14 @@ class Background:
             self._failures[self._wanted[1]] = f"the bounding process ended with code {code} (out of memory?)"
             self._answered = True
         elif was_first:
-            self._hand_over()
+            self._send_request()
         if time.monotonic() - worker.started >= _SHORT_LIFE:
-            self._staff()
+            self._start_missing_workers()
 
     def _heard(self, worker: _Process, kind: str, *content: Any) -> None:
         if kind == "ready":
             worker.scene, self.problems = content
-            self._relieve()
+            self._replace_stuck_worker()
             return
         if kind == "begin":
             worker.busy = content[0]

@@ -99,7 +99,9 @@ class BoundsWorker:
         """Refine one size; False if a newer message waits."""
         assert self.source is not None
         frame = self.source.frame(camera, perturbation)
-        refinement = Refinement(frame, 0, self._goal(seconds), stopped=self._stopped, members=frame.scene_samples(0))
+        refinement = Refinement(
+            frame, 0, self._goal(seconds), stopped=self._stopped, scene_samples=frame.scene_samples(0)
+        )
         refinement.progress = _Teller(self, number, refinement)
         self.refinement, self.about = refinement, about
         with suppress(WorkCancelledError):

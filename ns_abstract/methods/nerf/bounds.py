@@ -71,14 +71,14 @@ class NerfBounds(RayField):
 
         Also [n] whether the box is so narrow that it is one cell to begin with.
         """
-        pencil = RayBundle(request.pose_set, request.box, request.pixels, paths.degree)
-        moves = pencil.displacement(self.distances, self.lengths)
+        bundle = RayBundle(request.pose_set, request.box, request.pixels, paths.degree)
+        moves = bundle.displacement(self.distances, self.lengths)
         division = self.division(moves) if given is None else given
         parts = None if given is None else given.parts
-        if division is None or not pencil.finite:
+        if division is None or not bundle.finite:
             return self._nothing(request, parts), np.zeros(len(moves), bool)
         start = division.first(moves, self.displacement).max(axis=1)
-        work = BundleBounds(paths, pencil, division, start, request.tolerance, request.aim, request.shifts)
+        work = BundleBounds(paths, bundle, division, start, request.tolerance, request.aim, request.shifts)
         work.run()
         n, shifts = len(moves), work.lower.shape[2]
         # [n, shifts, *parts, 3]
@@ -93,15 +93,15 @@ class NerfBounds(RayField):
     def _apart(self, request: RayRequest, given: Division | None, by_part: bool, displacement: float) -> RayBounds:
         """Bounds from cells of every sample, or of the bins that samples lie in."""
         n, samples, box = len(request.pixels), self.distances.size, request.box
-        pencil = RayBundle(request.pose_set, box, request.pixels, self.taylor, self.swept)
-        moves = pencil.displacement(self.distances, self.lengths)
+        bundle = RayBundle(request.pose_set, box, request.pixels, self.taylor, self.swept)
+        moves = bundle.displacement(self.distances, self.lengths)
         division = given
         if division is None:
             d = moves.shape[2]
             division = division_for(
                 moves, displacement, _PARTS, _DEEPER.get(d, _DEEPER_MORE), _FINER.get(d, 0), self.swept
             )
-        if division is None or not pencil.finite:
+        if division is None or not bundle.finite:
             parts = (1,) * box.dimensions if division is None else division.parts[: box.dimensions]
             return self._nothing(request, parts if by_part else None)
         if n > 1 and n * samples * math.prod(division.parts) > _NUMBERS:
@@ -120,15 +120,15 @@ class NerfBounds(RayField):
         edges = None
         if self.paths is not None:
             edges = self._edges(self.paths, RayBundle(request.pose_set, box, request.pixels, self.taylor), division)
-        work = SampleCellBounds(self, pencil, division, moves, request, displacement, edges)
+        work = SampleCellBounds(self, bundle, division, moves, request, displacement, edges)
         return work.run(request.shifts, by_part)
 
-    def _edges(self, paths: SamplePaths, pencil: RayBundle, division: Division) -> tuple[np.ndarray, np.ndarray]:
+    def _edges(self, paths: SamplePaths, bundle: RayBundle, division: Division) -> tuple[np.ndarray, np.ndarray]:
         """Bounds [n parts, .] of the fine samples' edges by parts of the poses (design.md, F14)."""
-        monomials = np.prod(paths.coarse.basis.nodes[:, None, :] ** pencil.exponents, axis=-1)
-        origin, direction = monomials @ pencil.origin, monomials @ pencil.direction
+        monomials = np.prod(paths.coarse.basis.nodes[:, None, :] ** bundle.exponents, axis=-1)
+        origin, direction = monomials @ bundle.origin, monomials @ bundle.direction
         low, high = paths.edges(
-            np.broadcast_to(origin, direction.shape), direction, pencil.rounded, division.parts[:-1]
+            np.broadcast_to(origin, direction.shape), direction, bundle.rounded, division.parts[:-1]
         )
         return low.reshape(-1, low.shape[2]), high.reshape(-1, high.shape[2])
 

@@ -44,12 +44,12 @@ _SWEPT = 8.0
 
 
 class SampleCellBounds:
-    """The bounds of one pencil of rays; see `BoundedRays.rays`."""
+    """The bounds of one bundle of rays; see `BoundedRays.rays`."""
 
     def __init__(
         self,
         owner: RayField,
-        pencil: RayBundle,
+        bundle: RayBundle,
         division: Division,
         moves: np.ndarray,
         request: RayRequest,
@@ -57,7 +57,7 @@ class SampleCellBounds:
         edges: tuple[np.ndarray, np.ndarray] | None = None,
     ) -> None:
         self.edges, alphas = edges, request.most_alpha
-        self.owner, self.pencil, self.division = owner, pencil, division
+        self.owner, self.bundle, self.division = owner, bundle, division
         self.tolerance, self.aim = request.tolerance * (_SWEPT if owner.swept else 1.0), request.aim
         self.basis, self.field = owner.basis, owner.field
         n, samples = moves.shape[:2]
@@ -129,7 +129,7 @@ class SampleCellBounds:
         if level not in self._levels:
             low, high = self.division.boxes(level)
             nodes = 0.5 * (low + high)[:, None] + 0.5 * (high - low)[:, None] * self.basis.nodes
-            monomials = np.prod(nodes[:, :, None, :] ** self.pencil.exponents, axis=-1)
+            monomials = np.prod(nodes[:, :, None, :] ** self.bundle.exponents, axis=-1)
             self._levels[level] = (
                 torch.from_numpy(monomials).to(self.owner.device),
                 self.field.bernstein(self.division.inner(level)),
@@ -275,7 +275,7 @@ class SampleCellBounds:
         """
         check_cancelled()
         halve, lost, tried = (np.zeros(len(items), bool) for _ in range(3))
-        lines, radius = self.pencil.points(
+        lines, radius = self.bundle.points(
             items.ray, self.owner.distances[items.sample], 0.5 * self.owner.lengths[items.sample]
         )
         which, sure = self._occupied(level, items, lines, radius)
@@ -293,7 +293,7 @@ class SampleCellBounds:
         if self.owner.occupancy is None:
             return everything, np.ones(len(items), bool)
         low, high = self.division.boxes(level)
-        ends = self.pencil.ranges(lines, radius, low[items.cell], high[items.cell])
+        ends = self.bundle.ranges(lines, radius, low[items.cell], high[items.cell])
         empty, sure = self.owner.occupancy.look(*ends)
         gone = items.take(empty)
         if len(gone):
@@ -371,8 +371,8 @@ class SampleCellBounds:
             return
         device, field = self.owner.device, self.field
         bernstein = self._level(level)[1]
-        direction = there @ torch.from_numpy(self.pencil.direction[items.ray]).to(device)
-        radius = self.pencil.direction_radius[items.ray] + DIRECTION_ROUNDING
+        direction = there @ torch.from_numpy(self.bundle.direction[items.ray]).to(device)
+        radius = self.bundle.direction_radius[items.ray] + DIRECTION_ROUNDING
         encoded = field.encode(direction, torch.from_numpy(radius).to(device), field.direction)
         color = field.color(pieces, *encoded)
         low, high, error = brightness(color, bernstein)
@@ -385,9 +385,9 @@ class SampleCellBounds:
     def _whiten(self, white: WhiteSamples, level: int, items: RayCells) -> None:
         """Bound the colours of samples ``items`` that are white where they are chosen (Q3)."""
         distance = self.owner.distances[items.sample]
-        lines, radius = self.pencil.points(items.ray, distance, 0.5 * self.owner.lengths[items.sample])
+        lines, radius = self.bundle.points(items.ray, distance, 0.5 * self.owner.lengths[items.sample])
         low, high = self.division.boxes(level)
-        ends = self.pencil.ranges(lines, radius, low[items.cell], high[items.cell])
+        ends = self.bundle.ranges(lines, radius, low[items.cell], high[items.cell])
         least, most = white.between(*ends, distance)
         where = self._rows(level, items)
         self._keep(self.color_low, self.color_high, where, least[:, None], most[:, None])

@@ -193,10 +193,10 @@ class _Level(NamedTuple):
 
 
 class BundleBounds:
-    """The bounds of one pencil of rays, cell after cell, halved where they are too wide.
+    """The bounds of one bundle of rays, cell after cell, halved where they are too wide.
 
     Args:
-        pencil: The rays over a box of poses; not swept.
+        bundle: The rays over a box of poses; not swept.
         division: Cells of the box, and the parts that are kept.
         start: [n] the level of each ray's first cells.
         aim: [n, 3] lower and upper colours; bounds between them are good enough (before the shifts).
@@ -204,12 +204,12 @@ class BundleBounds:
     """
 
     def __init__(
-        self, owner: SamplePaths, pencil: RayBundle, division: Division, start: np.ndarray, tolerance: float,
+        self, owner: SamplePaths, bundle: RayBundle, division: Division, start: np.ndarray, tolerance: float,
         aim: tuple[np.ndarray, np.ndarray] | None, shifts: list[tuple[Range, Range]],
     ) -> None:  # fmt: skip
-        self.owner, self.pencil, self.division, self.tolerance, self.aim = owner, pencil, division, tolerance, aim
+        self.owner, self.bundle, self.division, self.tolerance, self.aim = owner, bundle, division, tolerance, aim
         self.start, self.shifts = start, shifts
-        self._radii = pencil.rounded
+        self._radii = bundle.rounded
         rows = len(start), math.prod(division.parts), max(1, len(shifts)), 3
         #: Bounds [n, parts, shifts, 3].
         self.lower, self.upper = np.zeros(rows), np.ones(rows)
@@ -255,8 +255,8 @@ class BundleBounds:
         d = self.division.dimensions
         low, high = (ends[cells.cell] for ends in self._level(level).boxes)
         places = 0.5 * (low + high)[:, None] + 0.5 * (high - low)[:, None] * field.basis.nodes[:, :d]
-        monomials = np.prod(places[:, :, None, :] ** self.pencil.exponents, axis=-1)
-        return monomials @ self.pencil.origin, monomials @ self.pencil.direction[cells.ray]
+        monomials = np.prod(places[:, :, None, :] ** self.bundle.exponents, axis=-1)
+        return monomials @ self.bundle.origin, monomials @ self.bundle.direction[cells.ray]
 
     def _bound(self, level: int, cells: RayCells) -> NDArray[np.bool_]:
         """Bound cells of one level; [k] whether they are too wide."""

@@ -131,8 +131,8 @@ class PoseStrips:
         self.bounds.displacement = displacement
         while True:
             box = self._strip(counts, [n // 2 for n in counts])
-            pencil = RayBundle(self.geometry, box, pixels, self.bounds.taylor)
-            moves = pencil.displacement(self.bounds.distances, self.bounds.lengths)
+            bundle = RayBundle(self.geometry, box, pixels, self.bounds.taylor)
+            moves = bundle.displacement(self.bounds.distances, self.bounds.lengths)
             line = moves.shape[2] == 1
             most, deeper = (_PARTS_LINE, _DEEPER_LINE) if line else (_PARTS, None)
             division = self.bounds.division(moves, most, deeper)

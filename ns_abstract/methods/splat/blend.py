@@ -1,6 +1,6 @@
 """Blending of a pixel's fragments back to front, as forms and as intervals (design.md, B7-B11, O2-O4).
 
-SIMD lanes are the three channels, and a fourth one of nothing.
+SIMD lanes are the three channels, and a fourth one that is not used.
 """
 
 from __future__ import annotations

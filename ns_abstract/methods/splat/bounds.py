@@ -25,7 +25,7 @@ from ns_abstract.arithmetic.rounding import (
     Charges,
     charges,
 )
-from ns_abstract.execution.threads import lane, threads
+from ns_abstract.execution.threads import thread_group, threads
 from ns_abstract.geometry.camera_path import PinholeCamera
 from ns_abstract.geometry.motion_cells import MotionCells
 from ns_abstract.geometry.poses import PoseForms
@@ -239,8 +239,8 @@ class SplatBounds:
         return self.varied.mean_radius.shape[0] == 0 and self._sums.least_step > TIE_ROUNDING * largest
 
     def _buffer(self, name: str, shape: tuple[int, ...], dtype: type = np.float64) -> np.ndarray:
-        """Uninitialised memory that begins with a cache line and is kept from call to call of the same lane."""
-        size, key = math.prod(shape), (lane(), name)
+        """Uninitialised memory that begins with a cache line and is kept from call to call of the same thread group."""
+        size, key = math.prod(shape), (thread_group(), name)
         buffer = self._buffers.get(key)
         if buffer is None or buffer.size < size:
             room = np.empty(size * np.dtype(dtype).itemsize + 64, np.uint8)
@@ -440,17 +440,17 @@ class SplatBounds:
         if not np.any(position.linear) and float(position.radius.max()) < STILL_POSITION:
             position_error += 2.0 * float(position.radius.max())
             view = (*position.center.tolist(), position_error)
-            cached = self._seen_from.get(lane())
+            cached = self._seen_from.get(thread_group())
             if cached is None or cached[0] != view:
                 # of every Gaussian: cells that only turn the camera share them
                 colors = self._buffer("colors", (splats.count, 6))
                 fixed_colors(scene, position.center, position_error, self.charges, colors)
-                cached = self._seen_from[lane()] = view, colors
+                cached = self._seen_from[thread_group()] = view, colors
             colors = cached[1]
             return colors if n == splats.count else gathered(colors, candidates, alive, self._buffer("some", (n, 6)))
         indices = np.empty((alive.size, 2), np.int64)
         indices[:, 0], indices[:, 1] = alive, candidates[alive]
-        self._seen_from.pop(lane(), None)
+        self._seen_from.pop(thread_group(), None)
         shape = form_shape(position.basis)
         colors = self._buffer("colors", (n, 3 * (shape.monomials + 1)))
         self.stages.moving_colors(

@@ -55,19 +55,20 @@ class BandSums(NamedTuple):
 
     Attributes:
         levels: [bands + 1] colours that the bands lie between, the last of which none is beyond.
-        lit, light, less: [strips, bands, 8] the part of a band that the picture reaches is at most ``lit``, ``light``
-            times that of what follows, and ``less``, which is not positive, times what it is at the band's end.
-        least, most: [strips, 8] light that the fragments so far leave, whatever their order.
-        lost: [strips, 8] most light that a stop leaves.
+        drawn, transmittance, occluded: [strips, bands, 8] A, B and C of B14: the part of a band that the picture
+            reaches is at most ``drawn``, and ``transmittance`` times that of what follows, and ``occluded``, which is
+            not positive, times what it is at the band's end.
+        least_transmittance, most_transmittance: [strips, 8] of the fragments so far, whatever their order.
+        stopped: [strips, 8] most transmittance at a stop.
     """
 
     levels: np.ndarray
-    lit: np.ndarray
-    light: np.ndarray
-    less: np.ndarray
-    least: np.ndarray
-    most: np.ndarray
-    lost: np.ndarray
+    drawn: np.ndarray
+    transmittance: np.ndarray
+    occluded: np.ndarray
+    least_transmittance: np.ndarray
+    most_transmittance: np.ndarray
+    stopped: np.ndarray
 
 
 class EndCharges(NamedTuple):
@@ -89,7 +90,7 @@ class EndCharges(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def charges_of(count, inputs, end):
+def end_charges(count, inputs, end):
     """The `EndCharges` of a pixel of ``count`` fragments."""
     charges = inputs.charges
     # rounding of the program's own sums and products
@@ -105,32 +106,32 @@ def charges_of(count, inputs, end):
 
 
 @njit(cache=True, error_model="numpy")
-def set_levels(known, count, end, work, sums):
-    """Choose levels among the colours of the ``known`` fragments: half by their weights, half by their range."""
-    levels, colors, most, total = sums.levels, work.colors, end.background, work.weights[known]
+def choose_levels(looked_at, count, end, work, sums):
+    """Choose levels among the colours of the first ``looked_at`` fragments, half by weight and half by range."""
+    levels, colors, most, total = sums.levels, work.colors, end.background, work.weights[looked_at]
     for k in range(count):
         most = max(most, end.colors[work.numbers[k]])
-    for k in range(known):
+    for k in range(looked_at):
         total += work.weights[k]
         colors[k] = end.colors[work.numbers[k]]
-    colors[known] = end.background
-    sort_keys(colors, work.order, known + 1)
-    first, last, level, seen = colors[0], colors[0], 0, 0.0
-    span = max(colors[known] - first, _LEAST)
-    for k in range(known + 1):
+    colors[looked_at] = end.background
+    sort_keys(colors, work.order, looked_at + 1)
+    first, last, level, weight = colors[0], colors[0], 0, 0.0
+    span = max(colors[looked_at] - first, _LEAST)
+    for k in range(looked_at + 1):
         # the part of all that is divided up to this colour, without it and with it
-        reached = 0.5 * (colors[k] - first) / span
-        while level < BANDS - 1 and level / (BANDS - 1) < reached + seen:
-            levels[level] = last = min(max(last, first + 2.0 * span * (level / (BANDS - 1) - seen)), colors[k])
+        spread = 0.5 * (colors[k] - first) / span
+        while level < BANDS - 1 and level / (BANDS - 1) < spread + weight:
+            levels[level] = last = min(max(last, first + 2.0 * span * (level / (BANDS - 1) - weight)), colors[k])
             level += 1
-        seen += 0.5 * work.weights[work.order[k]] / total
-        while level < BANDS - 1 and level / (BANDS - 1) <= reached + seen:
+        weight += 0.5 * work.weights[work.order[k]] / total
+        while level < BANDS - 1 and level / (BANDS - 1) <= spread + weight:
             levels[level] = last = colors[k]
             level += 1
     while level < BANDS:
-        levels[level] = colors[known]
+        levels[level] = colors[looked_at]
         level += 1
-    levels[BANDS] = max(most, colors[known])
+    levels[BANDS] = max(most, colors[looked_at])
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
@@ -142,98 +143,102 @@ def share_of(color, band, levels):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def cover(e, open_, dark, parts, work, sums):
-    """Let fragment e cover what comes behind it in the bands that its colour does not reach (design.md, B14).
+def occlude(e, open_, dark, parts, work, sums):
+    """Let fragment e occlude what comes behind it in the bands that its colour does not reach (design.md, B14).
 
-    It is a stop only where all that may come before it leaves no more light than ``dark``.
+    The rasteriser may stop at it only where the transmittance of all that may come before it is at most ``dark``.
     """
-    met, below, share = work.met[e] & open_, work.below[e], work.share[e]
-    while met != 0:
-        strip = lowest_bit(met)
-        met &= met - 1
+    strips, below, share = work.strips[e] & open_, work.below[e], work.share[e]
+    while strips != 0:
+        strip = lowest_bit(strips)
+        strips &= strips - 1
         part = PART_LANES * strip
         low = load8(work.low, 2 * parts * e + part)
-        lost = where(load8(sums.least, part) > dark, 0.0, load8(work.low, 2 * parts * e + parts + part))
-        store(sums.lost, part, maximum(load8(sums.lost, part), lost))
+        stopped = where(
+            load8(sums.least_transmittance, part) > dark, 0.0, load8(work.low, 2 * parts * e + parts + part)
+        )
+        store(sums.stopped, part, maximum(load8(sums.stopped, part), stopped))
         left, first = 1.0 - low, below
-        store(sums.most, part, load8(sums.most, part) * left)
+        store(sums.most_transmittance, part, load8(sums.most_transmittance, part) * left)
         if share > 0.0:
             at = PART_LANES * (strip * BANDS + below)
             covered = (1.0 - share) * low
-            store(sums.less, at, fma(left, load8(sums.less, at), -covered * load8(sums.light, at)))
+            store(sums.occluded, at, fma(left, load8(sums.occluded, at), -covered * load8(sums.transmittance, at)))
             first += 1
         for band in range(first, BANDS):
             at = PART_LANES * (strip * BANDS + band)
-            store(sums.light, at, load8(sums.light, at) * left)
-            store(sums.less, at, load8(sums.less, at) * left)
+            store(sums.transmittance, at, load8(sums.transmittance, at) * left)
+            store(sums.occluded, at, load8(sums.occluded, at) * left)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def show(k, met, values, at, thresholds, charges, inputs, work, sums):
-    """Draw fragment k in the bands that its colour reaches, as much of it as there may be (design.md, B14)."""
+def composite(k, strips, values, at, thresholds, charges, inputs, work, sums):
+    """Composite fragment k over the bands that its colour reaches, with its largest alpha (design.md, B14)."""
     below, share, parts = work.below[k], work.share[k], inputs.shape.parts
-    while met != 0:
-        strip = lowest_bit(met)
-        met &= met - 1
+    while strips != 0:
+        strip = lowest_bit(strips)
+        strips &= strips - 1
         part = PART_LANES * strip
         low, high = part_alphas(values, at, part, inputs, thresholds)
         left = 1.0 - high
         store(work.low, 2 * parts * k + part, low)
-        lost = minimum(charges.stop / maximum(left, charges.stop), charges.grown * load8(sums.most, part))
-        store(work.low, 2 * parts * k + parts + part, lost)
-        store(sums.least, part, load8(sums.least, part) * left)
+        stopped = minimum(
+            charges.stop / maximum(left, charges.stop), charges.grown * load8(sums.most_transmittance, part)
+        )
+        store(work.low, 2 * parts * k + parts + part, stopped)
+        store(sums.least_transmittance, part, load8(sums.least_transmittance, part) * left)
         for band in range(below):
             place = PART_LANES * (strip * BANDS + band)
-            light, less = load8(sums.light, place), load8(sums.less, place)
-            store(sums.lit, place, fma(light + less, high, load8(sums.lit, place)))
-            store(sums.light, place, light * left)
-            store(sums.less, place, less * left)
+            transmittance, occluded = load8(sums.transmittance, place), load8(sums.occluded, place)
+            store(sums.drawn, place, fma(transmittance + occluded, high, load8(sums.drawn, place)))
+            store(sums.transmittance, place, transmittance * left)
+            store(sums.occluded, place, occluded * left)
         if share > 0.0:
             place = PART_LANES * (strip * BANDS + below)
-            light, drawn = load8(sums.light, place), share * high
-            store(sums.lit, place, fma(light, drawn, load8(sums.lit, place)))
-            store(sums.light, place, light * (1.0 - drawn))
+            transmittance, drawn = load8(sums.transmittance, place), share * high
+            store(sums.drawn, place, fma(transmittance, drawn, load8(sums.drawn, place)))
+            store(sums.transmittance, place, transmittance * (1.0 - drawn))
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def close_settled(open_, goal, charges, sums):
-    """Let all of the light be lit where no more of it matters; returns the strips that stay open.
+def retire_decided_strips(open_, goal, charges, sums):
+    """Return the strips of ``open_`` that are not decided; in the others all that is behind counts as drawn.
 
-    That is where little is left, where the ends are below ``goal`` anyhow, or beyond it already.
+    A strip is decided where little can follow, or where its ends are below ``goal`` anyhow, or beyond it already.
     """
     some = open_
     while some != 0:
         strip = lowest_bit(some)
         some &= some - 1
         begin = PART_LANES * strip * BANDS
-        rest = 0.0 * load8(sums.light, begin)
+        rest = 0.0 * load8(sums.transmittance, begin)
         end = rest + sums.levels[0]
         for band in range(BANDS):
             step = sums.levels[band + 1] - sums.levels[band]
-            end = fma(step, load8(sums.lit, begin + PART_LANES * band), end)
-            rest = fma(step, load8(sums.light, begin + PART_LANES * band), rest)
-        most = end + rest + (charges.slack + charges.hidden * load8(sums.lost, PART_LANES * strip))
+            end = fma(step, load8(sums.drawn, begin + PART_LANES * band), end)
+            rest = fma(step, load8(sums.transmittance, begin + PART_LANES * band), rest)
+        most = end + rest + (charges.slack + charges.hidden * load8(sums.stopped, PART_LANES * strip))
         if bits(rest <= _WORTH) | bits(end >= goal) | bits(most <= goal) == _ALL:
             for band in range(BANDS):
                 at = begin + PART_LANES * band
-                store(sums.lit, at, load8(sums.lit, at) + load8(sums.light, at))
+                store(sums.drawn, at, load8(sums.drawn, at) + load8(sums.transmittance, at))
             open_ &= ~(1 << strip)
     return open_
 
 
 @njit(cache=True, error_model="numpy")
-def note_stops(closed, last, past, count, parts, work, sums):
-    """Let each fragment up to ``last`` whose far end is not passed be a stop in the strips ``closed``."""
+def keep_possible_stops(closed, last, past, count, parts, work, sums):
+    """Let the rasteriser stop at each fragment up to ``last`` whose far end is not passed, in the strips ``closed``."""
     if closed == 0:
         return
     for place in range(past, count):
         e = work.by_far[place]
-        met = work.met[e] & closed if e <= last else 0
-        while met != 0:
-            part = PART_LANES * lowest_bit(met)
-            met &= met - 1
-            lost = load8(work.low, 2 * parts * e + parts + part)
-            store(sums.lost, part, maximum(load8(sums.lost, part), lost))
+        strips = work.strips[e] & closed if e <= last else 0
+        while strips != 0:
+            part = PART_LANES * lowest_bit(strips)
+            strips &= strips - 1
+            stopped = load8(work.low, 2 * parts * e + parts + part)
+            store(sums.stopped, part, maximum(load8(sums.stopped, part), stopped))
 
 
 @njit(cache=True, error_model="numpy")
@@ -246,16 +251,16 @@ def write_end(q, open_, charges, place, end, sums, out):
     ends = out[place.y0 % side + q // BLOCK, place.x0 % side + q % BLOCK, end.row]
     for lane in range(ends.size):
         strip = lane // PART_LANES
-        shown = open_ & (1 << strip) != 0
+        sees_background = open_ & (1 << strip) != 0
         value = levels[0]
         for band in range(BANDS):
             at = PART_LANES * (strip * BANDS + band) + lane % PART_LANES
-            lit = sums.lit[at]
-            if shown and end.background >= levels[band + 1]:
-                lit += sums.light[at] + sums.less[at]
-            elif shown:
-                lit += share_of(end.background, band, levels) * sums.light[at]
-            value += (levels[band + 1] - levels[band]) * min(lit, 1.0)
-        value = min(value + sums.lost[lane] * charges.hidden, levels[BANDS])
+            drawn = sums.drawn[at]
+            if sees_background and end.background >= levels[band + 1]:
+                drawn += sums.transmittance[at] + sums.occluded[at]
+            elif sees_background:
+                drawn += share_of(end.background, band, levels) * sums.transmittance[at]
+            value += (levels[band + 1] - levels[band]) * min(drawn, 1.0)
+        value = min(value + sums.stopped[lane] * charges.hidden, levels[BANDS])
         value += charges.slack
         ends[lane] = value if end.row >= 3 else -value

@@ -21,13 +21,13 @@ from ns_abstract.methods.splat.color_bands import (
     BANDS,
     BandSums,
     ColorEnd,
-    charges_of,
-    close_settled,
-    cover,
-    note_stops,
-    set_levels,
+    choose_levels,
+    composite,
+    end_charges,
+    keep_possible_stops,
+    occlude,
+    retire_decided_strips,
     share_of,
-    show,
     write_end,
 )
 from ns_abstract.methods.splat.depth_pairs import block_list, depth_radii
@@ -58,11 +58,11 @@ _ALL = 255
 class DepthRangeTuning:
     """How far fragments are looked at before bands are chosen. It does not decide whether a bound holds."""
 
-    #: Light at the middle pose behind which they are not.
-    shown: float = 2.0**-4
+    #: Transmittance at the middle pose behind which they are not.
+    least_transmittance: float = 2.0**-4
 
 
-_SHOWN = DepthRangeTuning.shown
+_LEAST_TRANSMITTANCE = DepthRangeTuning.least_transmittance
 
 
 class _Work(NamedTuple):
@@ -71,24 +71,24 @@ class _Work(NamedTuple):
     Attributes:
         sets: The set of the block's pixels that each of its Gaussians reaches.
         numbers: The rows of the Gaussians that reach the pixel.
-        found: Whether alpha may reach the threshold.
+        is_drawn: Whether alpha may reach the threshold.
         near, far: Ends of the depth (`_depth_ranges`); ``far`` in its own order, which ``by_far`` tells.
         by_far: The fragments, farthest ends last.
-        met: The sets of strips in which alpha may reach the threshold.
+        strips: The sets of strips in which alpha may reach the threshold.
         below: How many bands the colour is beyond.
         share: Part of the next band that it reaches, or 0.
-        low: [room, 2, parts] least alpha over the sub-boxes, and most light that a stop there leaves.
+        low: [room, 2, parts] least alpha over the sub-boxes, and most transmittance at a stop there.
         colors, weights, keys: Scratch.
         order: Scratch.
     """
 
     sets: np.ndarray
     numbers: np.ndarray
-    found: np.ndarray
+    is_drawn: np.ndarray
     near: np.ndarray
     far: np.ndarray
     by_far: np.ndarray
-    met: np.ndarray
+    strips: np.ndarray
     below: np.ndarray
     share: np.ndarray
     low: np.ndarray
@@ -120,7 +120,7 @@ def _work_of(rooms, low):
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _strips_met(values, at, strips, inputs):
+def _strips_reached(values, at, strips, inputs):
     """The set of strips in which the fragment at ``at`` may reach the threshold (design.md, B4, B12, B14)."""
     axes = part_axes(inputs.shape)
     ends = at + exponent_ends(inputs.shape.monomials)
@@ -131,7 +131,7 @@ def _strips_met(values, at, strips, inputs):
         e2 += strips.half[k] * abs(values[e + 1])
     e1 *= UP
     e2 *= UP
-    met, room = 0, strips.room
+    reached, room = 0, strips.room
     for strip in range(0, room, PART_LANES):
         e = at + EXPONENT
         zero = 0.0 * load8(strips.middles, strip)
@@ -144,8 +144,8 @@ def _strips_met(values, at, strips, inputs):
         near1, near2 = maximum(0.0, abs(y1) - e1), maximum(0.0, abs(y2) - e2)
         nearest = (0.5 * (1.0 - FRAGMENT_ROUNDING)) * fma(near1, near1, near2 * near2)
         beyond = nearest > values[at + exponent_limit(inputs.shape)]
-        met |= (_ALL - bits(beyond)) << strip
-    return met
+        reached |= (_ALL - bits(beyond)) << strip
+    return reached
 
 
 @njit(cache=True, error_model="numpy")
@@ -169,86 +169,91 @@ def _depth_ranges(count, x, y, inputs, block, work):
     sort_keys(near, work.order, count)
     for k in range(count):
         far[k] = work.keys[work.order[k]]
-        work.found[k] = numbers[work.order[k]]
+        # as scratch
+        work.is_drawn[k] = numbers[work.order[k]]
     for k in range(count):
-        numbers[k] = work.found[k]
+        numbers[k] = work.is_drawn[k]
     sort_keys(far, work.by_far, count)
 
 
 @njit(cache=True, error_model="numpy", forceinline=True)
-def _find_some(start, q, place, listed, inputs, block, work):
-    """Find what is known of the alphas of the next fragments of pixel q; returns how many are known then."""
+def _compute_alphas(start, q, place, listed, inputs, block, work):
+    """Compute the alphas of the next fragments of pixel q; returns of how many they are computed then."""
     some = min(BATCH, listed.length - start)
     place_batch(start, some, signed(1 << q), listed, inputs, block)
     find_alphas(start, some, signed(start), place, listed, inputs, block)
     for b in range(some):
-        work.found[start + b] = block.batch.found[b]
+        work.is_drawn[start + b] = block.batch.found[b]
     return start + some
 
 
 @njit(cache=True, error_model="numpy")
-def _find_visible(q, place, listed, inputs, block, work):
-    """Weights of the fragments at the middle pose, as far as light comes; returns how many are known.
+def _compute_visible(q, place, listed, inputs, block, work):
+    """Compute blending weights at the middle pose while the transmittance is high; returns of how many fragments.
 
     Nothing that is proved depends on them. The background is one more.
     """
     values, width = block.fragments.values, block.fragments.width
     ends = exponent_ends(inputs.shape.monomials)
-    light, known = 1.0, 0
-    while known < listed.length and light > _SHOWN:
-        first = known
-        known = _find_some(first, q, place, listed, inputs, block, work)
-        for k in range(first, known):
+    transmittance, computed = 1.0, 0
+    while computed < listed.length and transmittance > _LEAST_TRANSMITTANCE:
+        first = computed
+        computed = _compute_alphas(first, q, place, listed, inputs, block, work)
+        for k in range(first, computed):
             at = k * width
             y1, y2 = values[at + EXPONENT], values[at + EXPONENT + 1]
             alpha = 0.0
-            if work.found[k] != 0:
+            if work.is_drawn[k] != 0:
                 exponent = min(0.5 * (y1 * y1 + y2 * y2), EXPONENT_CUT)
                 alpha = min(values[at + ends + 3] * exp_kernel(-exponent), values[at + ALPHA_HIGH])
-            work.weights[k] = light * alpha
-            light *= 1.0 - alpha
-    work.weights[known] = light
-    return known
+            work.weights[k] = transmittance * alpha
+            transmittance *= 1.0 - alpha
+    work.weights[computed] = transmittance
+    return computed
 
 
 @njit(cache=True, error_model="numpy")
-def _bound_end(q, known, goal, place, listed, inputs, block, strips, end, work, sums, out):
-    """Write one end of pixel q over each sub-box (design.md, B14); returns how many fragments are known then."""
+def _bound_end(q, computed, goal, place, listed, inputs, block, strips, end, work, sums, out):
+    """Write the lower or upper bound that is ``end`` of pixel q over each sub-box (design.md, B14).
+
+    Fragments are composited nearest depth first; each occludes what follows once its farthest depth is passed. Returns
+    of how many fragments alphas are computed then.
+    """
     values, width, parts, levels = block.fragments.values, block.fragments.width, inputs.shape.parts, sums.levels
     count = listed.length
-    charges, thresholds = charges_of(count, inputs, end), thresholds_of(inputs)
+    charges, thresholds = end_charges(count, inputs, end), thresholds_of(inputs)
     for lane in range(BANDS * parts):
-        sums.lit[lane], sums.light[lane], sums.less[lane] = 0.0, 1.0, 0.0
+        sums.drawn[lane], sums.transmittance[lane], sums.occluded[lane] = 0.0, 1.0, 0.0
     for lane in range(parts):
-        sums.least[lane], sums.most[lane], sums.lost[lane] = 1.0, 1.0, 0.0
+        sums.least_transmittance[lane], sums.most_transmittance[lane], sums.stopped[lane] = 1.0, 1.0, 0.0
     open_, past = (1 << (parts // PART_LANES)) - 1, 0
     for k in range(count):
         if open_ == 0:
             break
-        if k == known:
-            known = _find_some(k, q, place, listed, inputs, block, work)
+        if k == computed:
+            computed = _compute_alphas(k, q, place, listed, inputs, block, work)
         while past < count and work.far[past] < work.near[k]:
-            cover(work.by_far[past], open_, charges.dark, parts, work, sums)
+            occlude(work.by_far[past], open_, charges.dark, parts, work, sums)
             past += 1
-        work.met[k] = 0
-        if work.found[k] != 0:
+        work.strips[k] = 0
+        if work.is_drawn[k] != 0:
             color, below = end.colors[listed.numbers[k]], 0
             while below < BANDS and levels[below + 1] <= color:
                 below += 1
             work.below[k], work.share[k] = below, share_of(color, below, levels)
-            work.met[k] = _strips_met(values, k * width, strips, inputs) & open_
-            show(k, work.met[k], values, k * width, thresholds, charges, inputs, work, sums)
+            work.strips[k] = _strips_reached(values, k * width, strips, inputs) & open_
+            composite(k, work.strips[k], values, k * width, thresholds, charges, inputs, work, sums)
         if k % BATCH == BATCH - 1:
-            still = close_settled(open_, goal, charges, sums)
+            still = retire_decided_strips(open_, goal, charges, sums)
             # what may come before these is not known
-            note_stops(open_ & ~still, k, past, count, parts, work, sums)
+            keep_possible_stops(open_ & ~still, k, past, count, parts, work, sums)
             open_ = still
     if open_ != 0:
         while past < count:
-            cover(work.by_far[past], open_, charges.dark, parts, work, sums)
+            occlude(work.by_far[past], open_, charges.dark, parts, work, sums)
             past += 1
     write_end(q, open_, charges, place, end, sums, out)
-    return known
+    return computed
 
 
 @njit(cache=True, error_model="numpy")
@@ -259,7 +264,7 @@ def _bound_pixel(q, count, goals, place, inputs, block, strips, color_ends, work
     for k in range(count):
         block.entries.has_pixels[k] = 1
         block.entries.pixels[k] = signed(1 << q)
-    visible = known = _find_visible(q, place, listed, inputs, block, work)
+    visible = computed = _compute_visible(q, place, listed, inputs, block, work)
     for row in range(6):
         goal = goals[row] if row >= 3 else -goals[row]
         if math.isnan(goal):
@@ -271,8 +276,8 @@ def _bound_pixel(q, count, goals, place, inputs, block, strips, color_ends, work
             row, pointer(color_ends.values[row]), color_ends.background[row], color_ends.opposite[row],
             color_ends.bright,
         )  # fmt: skip
-        set_levels(visible, count, end, work, sums)
-        known = _bound_end(q, known, goal, place, listed, inputs, block, strips, end, work, sums, out)
+        choose_levels(visible, count, end, work, sums)
+        computed = _bound_end(q, computed, goal, place, listed, inputs, block, strips, end, work, sums, out)
 
 
 @njit(cache=True, error_model="numpy")

@@ -202,14 +202,16 @@ class SplatFrame(Frame):
         check_cancelled()
         return self.drawn(values, tiles, None)
 
-    def drawn(self, values: np.ndarray, tiles: np.ndarray | None, member: Splats | None) -> np.ndarray:
+    def drawn(self, values: np.ndarray, tiles: np.ndarray | None, scene_sample: Splats | None) -> np.ndarray:
         """What `render` returns, of another scene of the set if one is given."""
-        return self.precise(values, tiles, member).astype(np.float32)
+        return self.precise(values, tiles, scene_sample).astype(np.float32)
 
-    def precise(self, values: np.ndarray, tiles: np.ndarray | None = None, member: Splats | None = None) -> np.ndarray:
+    def precise(
+        self, values: np.ndarray, tiles: np.ndarray | None = None, scene_sample: Splats | None = None
+    ) -> np.ndarray:
         """What `drawn` rounds: float64."""
         draw = self.renderer.tiles if self.channels == COLORS else self.renderer.layer_tiles
-        return draw(self.camera, *self.pose_set.world_to_camera(values), tiles, member)
+        return draw(self.camera, *self.pose_set.world_to_camera(values), tiles, scene_sample)
 
     def scene_samples(self, seed: int) -> Iterator[SplatSample]:
         """Other scenes of the set, without end; none where nothing varies."""

@@ -1,6 +1,6 @@
 """Blending of a pixel's fragments back to front as intervals, over a cell and over parts of it (design.md, B7, B12).
 
-SIMD lanes are the three channels, and a fourth one of nothing; or eight parts of the cell.
+SIMD lanes are the three channels, and a fourth one that is not used; or eight parts of the cell.
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 GAUSSIANS_ALONE = "of the Gaussians alone"
 #: Bytes that the kernels need by Gaussian and cell, beside the scene itself (record, boxes, colours, buffers).
 _BYTES_BY_GAUSSIAN = 1200
-#: The same of the ranges of a varied scene and of the member that is rendered.
+#: The same of the ranges of a varied scene and of the scene sample that is rendered.
 _BYTES_BY_VARIED = 400
 #: Sets of scenes at hand.
 _KEPT = 8

@@ -126,7 +126,7 @@ class Reference:
         if not rasteriser.background:
             self._background = torch.zeros(3, dtype=dtype)
 
-    def member(self, means: Tensor, opacities: Tensor, color_shift: Tensor | None) -> Reference:
+    def scene_sample(self, means: Tensor, opacities: Tensor, color_shift: Tensor | None) -> Reference:
         """The same scene with other means [N, 3], activated opacities [N] and shifts of activated colours [N, 3].
 
         Gradients of `pixels` flow back to them.

@@ -364,7 +364,7 @@ class Renderer:
         rotation: np.ndarray,
         position: np.ndarray,
         wanted: np.ndarray | None = None,
-        member: Splats | None = None,
+        scene_sample: Splats | None = None,
         pixels: np.ndarray | None = None,
     ) -> np.ndarray:
         """The tiles ``wanted`` (numbers, row-major; all if None) as float64 [t, side, side, 3].
@@ -373,10 +373,10 @@ class Renderer:
             camera: Intrinsics and size; its own pose is not used.
             rotation: [3, 3] world to camera, OpenCV axes.
             position: [3] camera position, world.
-            member: What to show in place of the scene: as many Gaussians, of the same degree.
+            scene_sample: What to show in place of the scene: as many Gaussians, of the same degree.
             pixels: [t, side, side] which of the tiles' pixels to draw, others show the background; all if None.
         """
-        splats = self.splats if member is None else member
+        splats = self.splats if scene_sample is None else scene_sample
         across, down = tile_grid(camera, self.side)
         if wanted is None:
             wanted = np.arange(across * down)
@@ -426,10 +426,10 @@ class Renderer:
         return image
 
     def image(
-        self, camera: PinholeCamera, rotation: np.ndarray, position: np.ndarray, member: Splats | None = None
+        self, camera: PinholeCamera, rotation: np.ndarray, position: np.ndarray, scene_sample: Splats | None = None
     ) -> np.ndarray:
         """The whole image, float64 [H, W, 3] in [0, 1]; see `tiles`."""
-        return assemble(self.tiles(camera, rotation, position, member=member), camera)
+        return assemble(self.tiles(camera, rotation, position, scene_sample=scene_sample), camera)
 
     def layers(
         self, camera: PinholeCamera, rotation: np.ndarray, position: np.ndarray
@@ -451,7 +451,7 @@ class Renderer:
         rotation: np.ndarray,
         position: np.ndarray,
         wanted: np.ndarray | None = None,
-        member: Splats | None = None,
+        scene_sample: Splats | None = None,
     ) -> np.ndarray:
         """`tiles` with two more channels: [t, side, side, 5].
 
@@ -459,7 +459,7 @@ class Renderer:
         """
         across, down = tile_grid(camera, self.side)
         wanted = np.arange(across * down) if wanted is None else np.asarray(wanted, np.int64)
-        splats = self.splats if member is None else member
+        splats = self.splats if scene_sample is None else scene_sample
         lists = self.lists(splats, camera, rotation, position, wanted)
         projected = self._projected
         image = self._blend(camera, lists, projected.record, splats.background)

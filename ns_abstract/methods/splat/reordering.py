@@ -1,6 +1,6 @@
 """Bounds of a pixel whose fragments have an uncertain depth order (design.md, O2-O4).
 
-SIMD lanes are the three channels, and a fourth one of nothing.
+SIMD lanes are the three channels, and a fourth one that is not used.
 """
 
 from __future__ import annotations

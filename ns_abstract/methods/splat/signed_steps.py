@@ -25,7 +25,7 @@ def signed_gradient_step(
     varied: VariedSplats,
     box: ParameterBox,
     values: Float64Array,
-    member: Splats,
+    scene_sample: Splats,
     score: Callable[[DifferentiableRender, torch.Tensor], torch.Tensor],
     size: float,
 ) -> tuple[Float64Array, Splats]:
@@ -33,16 +33,16 @@ def signed_gradient_step(
 
     Args:
         poses, varied, box: The set of poses, the set of scenes, the parameters that the pose may have.
-        values, member: Where the step begins.
+        values, scene_sample: Where the step begins.
         score: What is to grow, of a picture or of pixels and of the pose's parameters.
         size: Length in half-widths of every range; 2 goes from one end to the other. The step ends in the set.
     """
-    shift = torch.from_numpy(member.color_shift.copy()) if member.color_shift.size else None
-    leaves = [torch.from_numpy(np.array(v, np.float64)) for v in (values, member.means, member.opacity)]
+    shift = torch.from_numpy(scene_sample.color_shift.copy()) if scene_sample.color_shift.size else None
+    leaves = [torch.from_numpy(np.array(v, np.float64)) for v in (values, scene_sample.means, scene_sample.opacity)]
     for leaf in (*leaves, shift):
         if leaf is not None:
             leaf.requires_grad_(True)
-    other = reference.member(leaves[1], leaves[2], shift)
+    other = reference.scene_sample(leaves[1], leaves[2], shift)
     pose = differentiable_pose(poses)(leaves[0])
 
     def show(pixels: torch.Tensor | None = None) -> torch.Tensor:
@@ -56,11 +56,11 @@ def signed_gradient_step(
     steps = [0.5 * size * _sign(leaf) for leaf in (*leaves, shift)]
     low, high = np.array(box.lower), np.array(box.upper)
     values = np.clip(values + steps[0] * (high - low), low, high) if values.size else values
-    means = member.means
+    means = scene_sample.means
     if varied.mean_low.size:
         means = means + steps[1] * (varied.mean_high - varied.mean_low)
-    opacity = member.opacity + steps[2] * (varied.opacity_high - varied.opacity_low)
-    moved = member.color_shift
+    opacity = scene_sample.opacity + steps[2] * (varied.opacity_high - varied.opacity_low)
+    moved = scene_sample.color_shift
     if varied.shift_low.size:
         moved = moved + steps[3] * (varied.shift_high - varied.shift_low)
     return values, varied.at(means, opacity, moved)

@@ -25,7 +25,7 @@ from numba import njit
 
 from ns_abstract.arithmetic.elementary import fma
 from ns_abstract.arithmetic.rounding import (
-    JUMP_ROUNDING,
+    CROSSING_ROUNDING,
     LAYER_ROUNDING,
     PART_ROUNDING,
     PLANE_ROUNDINGS,
@@ -48,7 +48,7 @@ from ns_abstract.methods.splat.pixel_block import (
 
 
 @dataclass(frozen=True)
-class JumpTuning:
+class CrossingTuning:
     """Planes that skipped fragments are bounded by. None of them decides whether a bound holds."""
 
     #: Planes whose steepness would divide by less than this part of the threshold are left out.
@@ -57,7 +57,7 @@ class JumpTuning:
 
 #: Parts of a cell, a power of two.
 _PARTS = 8
-_STEEP = JumpTuning.steep
+_STEEP = CrossingTuning.steep
 _RADIUS, _TOP, _THRESHOLD, _SIZE, _SIZES, _WEIGHTS = range(6)
 # from `_restricted_rows` on: centre, then behind the slopes
 _LOW, _HIGH, _ABOVE, _FAR_ABOVE, _FAR_ABOVE_AT_0, _BELOW, _BELOW_AT_0, _FAR_BELOW, _PRODUCTS = range(1, 10)
@@ -139,8 +139,8 @@ def gather_crossings(begin, end, count, since, fragments, crossings, out, shape)
             number -= 1
         most *= 1.0 - values[at + ALPHA_LOW]
         least *= 1.0 - values[at + ALPHA_HIGH]
-    store(out, 0, falls * (UP + JUMP_ROUNDING * count))
-    store(out, 4, rises * (UP + JUMP_ROUNDING * count))
+    store(out, 0, falls * (UP + CROSSING_ROUNDING * count))
+    store(out, 4, rises * (UP + CROSSING_ROUNDING * count))
 
 
 @njit(cache=True, error_model="numpy")

@@ -1,4 +1,4 @@
-"""Scenes of which some Gaussians vary: their ranges, and the members of the set (design.md, S1)."""
+"""Scenes of which some Gaussians vary: their ranges, and the scene samples of the set (design.md, S1)."""
 
 from __future__ import annotations
 
@@ -68,10 +68,12 @@ class VariedSplats:
 
     @property
     def varies(self) -> bool:
-        """Whether there is more than one member."""
+        """Whether there is more than one scene sample."""
         return any(self.counts.values())
 
-    def member(self, mean: Float64Array | float, opacity: Float64Array | float, color: Float64Array | float) -> Splats:
+    def scene_sample(
+        self, mean: Float64Array | float, opacity: Float64Array | float, color: Float64Array | float
+    ) -> Splats:
         """One scene of the set, at positions in [-1, 1] between the ranges' ends, broadcast to [N, 3], [N], [N, 3]."""
         return self.at(
             _between(self.mean_low, self.mean_high, mean) if self.mean_low.size else self.stored.means,
@@ -90,7 +92,7 @@ class VariedSplats:
 
     @cached_property
     def nearest(self) -> Splats:
-        """The member nearest to the stored scene: itself where the ranges contain 0."""
+        """The scene sample nearest to the stored scene: itself where the ranges contain 0."""
         if not self.varies and not self.mean_low.size and not self.shift_low.size:
             return self.stored
         return self.at(self.stored.means, self.stored.opacity, np.zeros_like(self.shift_low))
@@ -107,20 +109,20 @@ class VariedSplats:
         bright = np.where(brightness >= np.median(brightness), 1.0, -1.0)
         zero = np.zeros(3)
         for sign in (1.0, -1.0):
-            yield self.member(zero, sign * bright, sign)
+            yield self.scene_sample(zero, sign * bright, sign)
         for opacity, color in ((1.0, 1.0), (-1.0, -1.0), (1.0, -1.0), (-1.0, 1.0)):
-            yield self.member(zero, opacity, color)
+            yield self.scene_sample(zero, opacity, color)
         if self.mean_low.size:
             for axis, sign in itertools.product(range(3), (1.0, -1.0)):
-                yield self.member(sign * np.eye(3)[axis], 0.0, 0.0)
+                yield self.scene_sample(sign * np.eye(3)[axis], 0.0, 0.0)
             for corner in itertools.product((1.0, -1.0), repeat=3):
-                yield self.member(np.array(corner), corner[0] * bright, corner[0])
+                yield self.scene_sample(np.array(corner), corner[0] * bright, corner[0])
         n = stored.count
         for k in itertools.count():
             values = generator.uniform(-1.0, 1.0, (n, 7))
             if k % 2 == 0:
                 values = np.where(values < 0.0, -1.0, 1.0)
-            yield self.member(values[:, :3], values[:, 3], values[:, 4:])
+            yield self.scene_sample(values[:, :3], values[:, 3], values[:, 4:])
 
 
 def _between(low: Float64Array, high: Float64Array, place: Float64Array | float) -> Float64Array:

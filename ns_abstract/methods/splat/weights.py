@@ -149,10 +149,12 @@ class SplatWeightFrame(SplatFrame):
         self.bounds.white = white
         self._black, self._rasteriser = black, rasteriser
 
-    def precise(self, values: np.ndarray, tiles: np.ndarray | None = None, member: Splats | None = None) -> np.ndarray:
+    def precise(
+        self, values: np.ndarray, tiles: np.ndarray | None = None, scene_sample: Splats | None = None
+    ) -> np.ndarray:
         """What `drawn` rounds: float64 tiles of the weights at parameter values [d]."""
         rotation, position = self.pose_set.world_to_camera(values)
-        scene = self.varied.nearest if member is None else member
+        scene = self.varied.nearest if scene_sample is None else scene_sample
         colors = self.white.at((scene.means - position) @ rotation[2])
         weighted = replace(self._black, means=scene.means, opacity=scene.opacity, sh=colors[:, None])
         return self.renderer.tiles(self.camera, rotation, position, tiles, weighted)
@@ -183,8 +185,8 @@ class SplatWeightFrame(SplatFrame):
             check_cancelled()
             rotation, position = self.pose_set.world_to_camera(values)
             colors = white.at((drawn.means - position) @ rotation[2])
-            member = replace(drawn, sh=colors[:, None])
-            return renderer.tiles(self.camera, rotation, position, tiles, member, pixels).astype(np.float32)
+            scene_sample = replace(drawn, sh=colors[:, None])
+            return renderer.tiles(self.camera, rotation, position, tiles, scene_sample, pixels).astype(np.float32)
 
         return draw
 

@@ -210,7 +210,7 @@ class CompositeBuilder(ElementwiseBuilder):
         stride: Any,
         dilation: Any,
         pads: Any,
-        more: Any,
+        output_padding: Any,
         groups: int,
         exact: bool = False,
     ) -> int:
@@ -226,23 +226,23 @@ class CompositeBuilder(ElementwiseBuilder):
         sizes, taps = [out], 1
         for k in range(2):
             kernel, s, d = weight.shape[2 + k], stride[k], dilation[k]
-            if min(s, d, kernel) < 1 or min(pads) < 0 or min(more) < 0 or max(more) > 1 << 20:
+            if min(s, d, kernel) < 1 or min(pads) < 0 or min(output_padding) < 0 or max(output_padding) > 1 << 20:
                 raise InputError(f"strides {list(stride)}, dilations {list(dilation)}, pads {list(pads)}")
-            sizes.append((shape[1 + k] - 1) * s + (kernel - 1) * d + 1 - pads[k] - pads[2 + k] + more[k])
+            sizes.append((shape[1 + k] - 1) * s + (kernel - 1) * d + 1 - pads[k] - pads[2 + k] + output_padding[k])
             # taps of one place are that many steps of the stride apart
             taps *= -(-kernel // (s // math.gcd(s, d)))
         self._check_size(sizes)
         layer = TransposedConvolution(
             (shape,),
             tuple(sizes),
-            0 if exact else shape[0] // groups * taps + 2,
-            int(np.prod(weight.shape[1:])),
-            as_double(weight),
-            None if bias is None else as_double(bias),
-            tuple(stride),
-            tuple(dilation),
-            tuple(pads[:2]),
-            groups,
+            terms=0 if exact else shape[0] // groups * taps + 2,
+            row_terms=int(np.prod(weight.shape[1:])),
+            weight=as_double(weight),
+            offset=None if bias is None else as_double(bias),
+            stride=tuple(stride),
+            dilation=tuple(dilation),
+            pads=tuple(pads[:2]),
+            groups=groups,
         )
         return self._add(layer, x)
 

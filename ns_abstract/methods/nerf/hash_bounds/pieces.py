@@ -397,19 +397,19 @@ def _keep(out, counts, place, cells, found, shown, line, low, high):
 
 @njit(cache=True, error_model="numpy", nogil=True, **COUNTED)
 def bound_ray(field, rays, ray, cells, deepest, most, goal, limits, shifts, room, counts, out):
-    """Bounds of a ray by part of the box, pieces halved until they are good or as small as allowed (design.md, H8).
+    """Write bounds of a ray over each part of the box, from sub-boxes halved until they are good (design.md, H8).
 
     Args:
         field, rays, ray, limits, room: See `bound_piece`.
-        cells: [d] first pieces by axis.
-        deepest, most: Halvings of these, and pieces in all.
-        goal: [3, 3] bounds between which all is good, and a form's rest that is good wherever it lies.
+        cells: [d] first sub-boxes by axis.
+        deepest, most: Halvings of one of these, and sub-boxes in all.
+        goal: [3, 3] by channel: a sub-box is good with bounds between the first two, or a radius below the third.
         shifts: [s, 2, 2] intervals of hue and saturation that are added to the samples' colours; none: they stay.
         counts: [d] parts by axis.
         out: [s or 1, parts, 2, 3] bounds by shift; overwritten.
 
     Returns:
-        The number of first pieces, of pieces that were bounded, and of those that were kept.
+        The number of first sub-boxes, of those that were bounded, and of those that were not halved.
     """
     d = cells.shape[0]
     first = 1
