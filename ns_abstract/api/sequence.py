@@ -28,7 +28,7 @@ from ns_abstract.report.run import plain
 Range = tuple[float, float]
 _REPORT = "report.json"
 #: Of how one photo's sets follow from another's: results of different rules are not continued.
-_RULES = 2
+_RULES = 3
 
 
 def load_motion(file: Path, sets: Mapping[int, PoseBox], dataset_scale: float | None) -> dict[str, Range]:
@@ -86,7 +86,7 @@ def following(
     """By number, the sets that the next photo may come from: none where nothing is left (U7).
 
     Args:
-        sets: Those of the first photo.
+        sets: Those that photos may come from, as they are given.
         frames: What reports of one photo say of each: ``index``, ``parameters`` and ``hull``.
         motion: As for `grown`.
     """
@@ -151,7 +151,9 @@ class PhotoSequence:
         self.job = job
         _check_sizes(self.images)
         self.sets = {k: job.pose_sets[k] for k in check_frames(self.frames, job.frame_count)}
-        self.ranges = load_motion(self.motion, self.sets, job.method.dataset_scale)
+        # the sets that later photos may come from: a camera on a swept path goes on to its other segments
+        self.reached = dict(enumerate(job.pose_sets)) if _along_path(self.sets) else self.sets
+        self.ranges = load_motion(self.motion, self.reached, job.method.dataset_scale)
         text = json.dumps([_RULES, self.first.fingerprint, self.ranges, sorted(self.sets)], sort_keys=True)
         self.fingerprint = hashlib.sha256(text.encode()).hexdigest()
         self.entries: list[dict[str, Any]] = self._stored() if self.resume else []
@@ -215,7 +217,7 @@ class PhotoSequence:
         """By number, the set of photo ``k``."""
         if k == 0:
             return self.sets
-        return following(self.sets, self.entries[k - 1]["frames"], self.ranges)
+        return following(self.reached, self.entries[k - 1]["frames"], self.ranges)
 
     def _location(self, k: int, poses: tuple[PoseBox, ...]) -> Location:
         image, first = self.images[k], self.first
