@@ -252,6 +252,30 @@ def test_a_camera_leaves_the_segments_that_it_began_in(blobs: Inputs, tmp_path: 
         assert [[frame["index"] for frame in image["frames"]] for image in report["images"]] == [[0], [*range(sets[1])]]
 
 
+@pytest.mark.slow
+def test_sets_of_a_sequence_have_the_numbers_of_their_entries(
+    travelled: tuple[list[str], np.ndarray, Path], blobs: Inputs, tmp_path: Path, in_process: InProcess
+) -> None:
+    options, _, folder = travelled
+    rng, scene = RNG(8), nsa.load_scene(blobs.config)
+    camera = nsa.load_camera_path(blobs.path).cameras[2]
+    frame = scene.method().frame(nsa.PoseSet(camera, translation={"x": 0.03}).of(scene))
+    photos = Path(options[options.index("--image-sequence") + 1])
+    for photo in photos.iterdir():
+        Image.fromarray(taken(assemble(frame.render(np.array([0.01])), camera), 0.004, 5, rng)).save(photo)
+    options[options.index("--frames") + 1 : options.index("--frames") + 2] = ["1", "2"]
+    assert in_process(main, options)[0] == 0
+    report = json.loads((folder / "report.json").read_text())
+    found = [[1, 2], *[[2]] * (len(report["images"]) - 1)]
+    assert len(found) == 5 and report["answer"] == "possible"
+    for image, numbers in zip(report["images"], found, strict=True):
+        one = json.loads((folder / image["folder"] / "report.json").read_text())
+        with sqlite3.connect(folder / image["folder"] / "cells.sqlite") as base:
+            stored = sorted(row[0] for row in base.execute("SELECT DISTINCT frame FROM cells"))
+        assert numbers == stored == [entry["index"] for entry in one["frames"]]
+        assert image["best"]["frame"] == one["best"]["frame"] == 2 and image["frames"] == one["frames"]
+
+
 def test_photos_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     def folder(*names: str) -> Path:
         place = tmp_path / str(len(list(tmp_path.iterdir())))

@@ -197,17 +197,13 @@ class PhotoSequence:
             if not alive:
                 break
             folder = f"{k:05d}_{self.images[k].stem}"
-            numbers, poses = tuple(alive), tuple(alive.values())
-            stamp, location = file_stamp(self.images[k]), self._location(k, poses)
+            stamp, location = file_stamp(self.images[k]), self._location(k, alive)
             if file_stamp(self.images[k]) != stamp:
                 fix = "give a copy that nothing writes to"
                 raise InputError("was replaced meanwhile", file=self.images[k], fix=fix)
-            document = search(location, tuple(range(len(poses))), self.folder / folder)
-            frames = [{**frame, "index": numbers[frame["index"]]} for frame in document["frames"]]
-            reported = ("answer", "possible_volume", "hull", "best", "seconds", "state")
-            self.entries.append(
-                {"image": stamp, "folder": folder, **{name: document[name] for name in reported}} | {"frames": frames}
-            )
+            document = search(location, tuple(alive), self.folder / folder)
+            reported = ("answer", "possible_volume", "hull", "best", "seconds", "state", "frames")
+            self.entries.append({"image": stamp, "folder": folder, **{name: document[name] for name in reported}})
             if document["state"] == "interrupted":
                 break
             self._write("running")
@@ -219,10 +215,12 @@ class PhotoSequence:
             return self.sets
         return following(self.reached, self.entries[k - 1]["frames"], self.ranges)
 
-    def _location(self, k: int, poses: tuple[PoseBox, ...]) -> Location:
+    def _location(self, k: int, alive: Mapping[int, PoseBox]) -> Location:
         image, first = self.images[k], self.first
         levels = read_photo(image)
         mask = None if self.settings.mask is None else read_mask(self.settings.mask, levels.shape[:2])
+        # sets keep their numbers, of the path's entries
+        poses = tuple(alive.get(number, poses) for number, poses in enumerate(self.job.pose_sets))
         job = PathJob(self.job.settings, self.job.scene, self.job.path, poses)
         return Location(job, levels, mask, first.options, image, first.calibration)
 
