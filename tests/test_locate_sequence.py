@@ -424,6 +424,17 @@ def test_a_sequence_that_is_cut_off_is_not_told_as_done(blobs: Inputs, tmp_path:
         return found
 
     assert photos.follow(search)["state"] == "done" and states == ["running"]
+    # one that is begun anew leaves no report of the one before, also where it is killed
+
+    def killed(location: Location, frames: tuple[int, ...], folder: Path) -> dict[str, Any]:
+        raise MemoryError
+
+    again = open_sequence(settings, tmp_path / "photos", tmp_path / "motion.json", tmp_path / "out", (0,), False)
+    with pytest.raises(MemoryError):
+        again.follow(killed)
+    assert not (tmp_path / "out" / "report.json").exists()
+    resumed = open_sequence(settings, tmp_path / "photos", tmp_path / "motion.json", tmp_path / "out", (0,), True)
+    assert not resumed.entries
 
 
 #: What others may make of a sequence's report.

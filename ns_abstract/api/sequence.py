@@ -189,6 +189,9 @@ class PhotoSequence:
             InputError: Another command works in the folder, it holds files of others, or a photo cannot be read.
         """
         with claim(self.folder):
+            if not self.entries:
+                # it would speak of photos whose folders are written anew
+                (self.folder / _REPORT).unlink(missing_ok=True)
             return self._followed(search)
 
     def _followed(self, search: Callable[[Location, tuple[int, ...], Path], dict[str, Any]]) -> dict[str, Any]:
