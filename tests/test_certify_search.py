@@ -711,9 +711,15 @@ def test_another_search_is_not_continued(change: dict[str, Any], tmp_path: Path)
     with pytest.raises(InputError) as caught:
         open_store(tmp_path, resume=True, fingerprint=change)
     assert caught.value.field == "--resume" and caught.value.fix
-    # without --resume it is replaced
+    # without --resume it is replaced, and nothing speaks of it any more
+    reports = [tmp_path / "report.json", tmp_path / "report.html"]
+    for report in reports:
+        report.write_text("{}")
+    open_store(tmp_path, resume=True).close()
+    assert all(report.exists() for report in reports)
     store = open_store(tmp_path, fingerprint=change)
     assert store.tallies() == [] and not store.resumed
+    assert not any(report.exists() for report in reports)
 
 
 def test_damaged_store_and_second_command(tmp_path: Path) -> None:

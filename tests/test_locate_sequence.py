@@ -1,6 +1,7 @@
 """Photos of other brightness, calibrated noise, and sequences of photos: what is excluded never made the photo."""
 
 import json
+import shutil
 import sqlite3
 from collections.abc import Callable
 from fractions import Fraction
@@ -220,6 +221,61 @@ def test_an_offset_that_is_fixed_in_one_segment_is_taken_to_the_next(fixed: floa
         assert (low, high) == (0.0, 1.0) if name == "segment" else low < fixed < high and high - low < 1e-12
 
 
+def test_a_camera_leaves_the_segments_that_it_began_in(blobs: Inputs, tmp_path: Path) -> None:
+    """Frames are those of the first photo: the next one may come from any segment of the path."""
+    (tmp_path / "photos").mkdir()
+    for k in range(2):
+        Image.new("RGB", (32, 32)).save(tmp_path / "photos" / f"{k}.png")
+    (tmp_path / "motion.json").write_text('{"version": 1, "translation": {"x": 0.01}}')
+    found: dict[str, Any] = {
+        "answer": "possible", "possible_volume": 1.0, "hull": None, "best": None, "seconds": 1.0, "state": "done",
+    }  # fmt: skip
+    for sweep, sets in (("segments", [1, 3]), ("keyframes", [1, 1])):
+        spec = {"version": 1, "translation": {"x": 0.02}, "sweep": sweep}
+        (tmp_path / "spec.json").write_text(json.dumps(spec))
+        settings = LocateSettings(Settings(blobs.config, blobs.path, tmp_path / "spec.json"), tmp_path / "photos/0.png")
+        photos = open_sequence(
+            settings, tmp_path / "photos", tmp_path / "motion.json", tmp_path / sweep, frames=(0,), resume=False
+        )
+        box, searched = photos.sets[0].box, []
+
+        def search(
+            location: Location, frames: tuple[int, ...], folder: Path, box=box, searched=searched
+        ) -> dict[str, Any]:
+            searched.append(len(frames))
+            hull = {"lower": box.lower, "upper": box.upper}
+            entry = {"parameters": [{"name": name} for name in box.names], "hull": hull}
+            return found | {"frames": [{"index": k, **entry} for k in frames]}
+
+        report = photos.follow(search)
+        assert searched == sets
+        assert [[frame["index"] for frame in image["frames"]] for image in report["images"]] == [[0], [*range(sets[1])]]
+
+
+@pytest.mark.slow
+def test_sets_of_a_sequence_have_the_numbers_of_their_entries(
+    travelled: tuple[list[str], np.ndarray, Path], blobs: Inputs, tmp_path: Path, in_process: InProcess
+) -> None:
+    options, _, folder = travelled
+    rng, scene = RNG(8), nsa.load_scene(blobs.config)
+    camera = nsa.load_camera_path(blobs.path).cameras[2]
+    frame = scene.method().frame(nsa.PoseSet(camera, translation={"x": 0.03}).of(scene))
+    photos = Path(options[options.index("--image-sequence") + 1])
+    for photo in photos.iterdir():
+        Image.fromarray(taken(assemble(frame.render(np.array([0.01])), camera), 0.004, 5, rng)).save(photo)
+    options[options.index("--frames") + 1 : options.index("--frames") + 2] = ["1", "2"]
+    assert in_process(main, options)[0] == 0
+    report = json.loads((folder / "report.json").read_text())
+    found = [[1, 2], *[[2]] * (len(report["images"]) - 1)]
+    assert len(found) == 5 and report["answer"] == "possible"
+    for image, numbers in zip(report["images"], found, strict=True):
+        one = json.loads((folder / image["folder"] / "report.json").read_text())
+        with sqlite3.connect(folder / image["folder"] / "cells.sqlite") as base:
+            stored = sorted(row[0] for row in base.execute("SELECT DISTINCT frame FROM cells"))
+        assert numbers == stored == [entry["index"] for entry in one["frames"]]
+        assert image["best"]["frame"] == one["best"]["frame"] == 2 and image["frames"] == one["frames"]
+
+
 def test_photos_come_in_the_order_of_their_numbers(tmp_path: Path) -> None:
     def folder(*names: str) -> Path:
         place = tmp_path / str(len(list(tmp_path.iterdir())))
@@ -303,6 +359,8 @@ def test_a_sequence_is_followed_and_resumed(
     cut = {**report, "images": report["images"][:2]}
     (folder / "report.json").write_text(json.dumps(cut))
     stamps = [(folder / entry["folder"] / "report.json").stat().st_mtime_ns for entry in report["images"][:2]]
+    # what a folder after that holds may follow from other results, as of a command that was cut off in its turn
+    shutil.copy(folder / report["images"][0]["folder"] / "cells.sqlite", folder / report["images"][3]["folder"])
     assert in_process(main, [*options, "--resume"])[0] == 0
     again = json.loads((folder / "report.json").read_text())
     assert [(e["answer"], e["hull"]) for e in again["images"]] == [(e["answer"], e["hull"]) for e in report["images"]]
@@ -366,6 +424,17 @@ def test_a_sequence_that_is_cut_off_is_not_told_as_done(blobs: Inputs, tmp_path:
         return found
 
     assert photos.follow(search)["state"] == "done" and states == ["running"]
+    # one that is begun anew leaves no report of the one before, also where it is killed
+
+    def killed(location: Location, frames: tuple[int, ...], folder: Path) -> dict[str, Any]:
+        raise MemoryError
+
+    again = open_sequence(settings, tmp_path / "photos", tmp_path / "motion.json", tmp_path / "out", (0,), False)
+    with pytest.raises(MemoryError):
+        again.follow(killed)
+    assert not (tmp_path / "out" / "report.json").exists()
+    resumed = open_sequence(settings, tmp_path / "photos", tmp_path / "motion.json", tmp_path / "out", (0,), True)
+    assert not resumed.entries
 
 
 #: What others may make of a sequence's report.

@@ -239,6 +239,30 @@ PROPERTIES: dict[str, Callable[[float], dict[str, Any]]] = {
 }
 
 
+@pytest.mark.parametrize("height, width", [(16, 16), (24, 16), (16, 24)])
+def test_depths_stay_inside_whatever_tiles_pictures_have(
+    height: int, width: int, blobs: Inputs, tmp_path: Path
+) -> None:
+    """Pictures that are one tile wide, too, whose tiles are laid out already."""
+    prop = {"type": "clear", "measure": "expected", "distance": 1.0, "preprocess": {"resize": [height, width]}}
+    _, pictures = Case(tmp_path / "case", blobs, prop).pictures
+    box = pictures.box.with_ends(np.array([-0.01]), np.array([0.02]))
+    sets = pictures.linear_sets(box)
+    # colours are not read
+    a_lower, b_lower, a_upper, b_upper, lower, upper = (
+        side[..., 3] if side.ndim == 3 else side[..., 3, 0] for side in (*sets[0], *sets[1:3])
+    )
+    depths = []
+    for p in np.linspace(-1.0, 1.0, 9):
+        values = np.clip(box.middle + p * (np.array(box.upper) - box.middle), box.lower, box.upper)
+        depth = pictures.image(values)[..., 3]
+        assert (lower <= depth).all() and (depth <= upper).all()
+        assert (a_lower * p + b_lower <= depth).all() and (depth <= a_upper * p + b_upper).all()
+        depths.append(depth)
+    seen = np.max(depths, axis=0) < 2.0
+    assert seen.mean() > 0.3 and 0.0 < np.median((upper - lower)[seen]) < 0.5
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", PROPERTIES)
 def test_certificates_hold(kind: str, blobs: Inputs, tmp_path: Path, in_process: InProcess) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from fractions import Fraction
 
 import mpmath
 import numpy as np
@@ -207,6 +208,23 @@ def test_enclosure_of_a_scene_elsewhere(name, names, radius, order):
     pose = differentiable_pose(poses)
     for values in poses.box.sample(5, np.random.default_rng(0)):
         assert np.allclose(pose(torch.from_numpy(values)).numpy(), poses.pose(values), rtol=0.0, atol=1e-13)
+
+
+def test_a_set_that_grew_is_charged_for_where_it_reaches():
+    """The positions of its float64 poses are off by no more than the charge, far beyond the ranges of the file, too."""
+    rng, stated = np.random.default_rng(3), Perturbation(translation={"x": (-0.1, 0.1), "y": (-0.1, 0.1)})
+    poses = PoseBox.around(camera(random_rotation(2)), stated)
+    far = poses.within(ParameterBox(poses.box.names, poses.box.units, (1e6, 1e6), (1e6 + 0.2, 1e6 + 0.2)))
+    matrix = [[Fraction(entry) for entry in row] for row in poses.camera.camera_to_world.tolist()]
+    shares = []
+    for values in far.box.sample(40, rng):
+        shift = [Fraction(value) for value in values.tolist()]
+        for row, entry in zip(matrix, far.pose(values)[:, 3].tolist(), strict=True):
+            off = abs(row[0] * shift[0] + row[1] * shift[1] + row[3] - Fraction(entry))
+            shares.append(off / Fraction(float(far._rounding[1])))
+    assert 1e-3 < max(shares) <= 1
+    outright = Perturbation(translation={"x": (1e6, 1e6 + 0.2), "y": (1e6, 1e6 + 0.2)})
+    assert far._rounding == PoseBox.around(poses.camera, outright)._rounding
 
 
 def test_a_scene_elsewhere_is_seen_as_it_would_be():

@@ -183,6 +183,27 @@ def test_a_film_encloses_what_runs_see(course: Course) -> None:
 
 
 @pytest.mark.slow
+def test_a_film_has_the_camera_of_the_network(course: Course) -> None:
+    """Intrinsics in pixels of the network's picture are those of the film's larger ones."""
+    mount = json.loads(course.loop.read_text())["camera"]
+    (height, width), shown = (8, 8), []
+    focal = 0.5 * height / np.tan(0.5 * np.radians(mount["fov"]))
+    lens = {"fx": focal, "fy": focal, "cx": 0.5 * width, "cy": 0.5 * height}
+    for name, camera in (
+        ("fov.json", mount),
+        ("lens.json", {key: v for key, v in mount.items() if key != "fov"} | lens),
+    ):
+        job = course.changed(name, initial=SMALL, steps=1, camera=camera).job
+        assert job.loop.preprocess.size(job.network.input_shape) == (height, width)
+        reacher = job.reacher()
+        shown.append(list(along(reacher, job.job.method, (64, 64), reacher.tube(job.loop.box, whole=True))))
+    for step, other in zip(*shown, strict=True):
+        assert np.ptp(step.image) > 0.1
+        for one, two in ((step.lower, other.lower), (step.upper, other.upper), (step.image, other.image)):
+            np.testing.assert_allclose(one, two, rtol=0.0, atol=1e-5)
+
+
+@pytest.mark.slow
 def test_interrupted_in_a_film(
     course: Course, tmp_path: Path, in_process: InProcess, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -217,6 +217,14 @@ FORMS = (
         "test_poses.py::test_enclosure_of_a_scene_elsewhere",
     ),
     Fault(
+        "a set that grew is charged for where it was stated",
+        _POSES,
+        "PoseBox._rounding",
+        "map(abs, limits[name])",
+        "map(abs, self.perturbation.translation.get(name, limits[name]))",
+        "test_poses.py::test_a_set_that_grew_is_charged_for_where_it_reaches",
+    ),
+    Fault(
         "slanted box loses its ends",
         _POSES,
         "PoseBox.sheared",

@@ -48,6 +48,11 @@ LOCATION = (
         "test_locate_sequence.py::test_a_camera_leaves_one_segment_for_another",
     ),
     Fault(
+        "location: a camera stays on the segments of the first photo",
+        _SEQUENCE, "PhotoSequence.__post_init__", "_along_path(self.sets)", "False",
+        "test_locate_sequence.py::test_a_camera_leaves_the_segments_that_it_began_in", compiled=True,
+    ),
+    Fault(
         "location: offsets of one segment alone go on",
         "api/sequence.py", "following", "max(high for _, high in ranges)", "ranges[0][1]",
         "test_locate_sequence.py::test_a_camera_leaves_one_segment_for_another",

@@ -27,6 +27,11 @@ PICTURES = (
         "near", "test_pixel_parts.py::test_no_more_pixels_are_asked_for_than_is_said",
     ),
     Fault(
+        "depths: both ends of tiles that lie one below the other are the last one",
+        "geometry/tiles.py", "assemble", "image.copy() if np.may_share_memory(image, tiles) else image", "image",
+        "test_picture_properties.py::test_depths_stay_inside_whatever_tiles_pictures_have[16-16]", compiled=True,
+    ),
+    Fault(
         "weights: what may be nearer is not", _WEIGHTS, "WhiteGaussians.between", "~(low[:, None] >= self.nearer)",
         "high[:, None] < self.nearer", _CROSS,
     ),

@@ -49,7 +49,7 @@ if TYPE_CHECKING:
     from ns_abstract.verify.interop import Form, LibraryVersion
 
 #: Of the search's rules: results of different ones are not mixed.
-_RULES = 9
+_RULES = 10
 #: Numbers that a network's layers may have together in a block's cells.
 _BLOCK_NUMBERS = 1 << 18
 #: Slanted parts of a cell at most, about: narrower cells need more of them in all.

@@ -41,7 +41,7 @@ from ns_abstract.verify.scene_margin import REGISTRATION, CellOutcome, ProveCell
 from ns_abstract.verify.scene_pictures import ScenePictures
 
 #: Of the search's rules: results of different ones are not mixed.
-_RULES = 4
+_RULES = 5
 
 
 class LoopJob:

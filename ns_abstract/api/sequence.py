@@ -28,7 +28,7 @@ from ns_abstract.report.run import plain
 Range = tuple[float, float]
 _REPORT = "report.json"
 #: Of how one photo's sets follow from another's: results of different rules are not continued.
-_RULES = 2
+_RULES = 3
 
 
 def load_motion(file: Path, sets: Mapping[int, PoseBox], dataset_scale: float | None) -> dict[str, Range]:
@@ -86,7 +86,7 @@ def following(
     """By number, the sets that the next photo may come from: none where nothing is left (U7).
 
     Args:
-        sets: Those of the first photo.
+        sets: Those that photos may come from, as they are given.
         frames: What reports of one photo say of each: ``index``, ``parameters`` and ``hull``.
         motion: As for `grown`.
     """
@@ -151,7 +151,9 @@ class PhotoSequence:
         self.job = job
         _check_sizes(self.images)
         self.sets = {k: job.pose_sets[k] for k in check_frames(self.frames, job.frame_count)}
-        self.ranges = load_motion(self.motion, self.sets, job.method.dataset_scale)
+        # the sets that later photos may come from: a camera on a swept path goes on to its other segments
+        self.reached = dict(enumerate(job.pose_sets)) if _along_path(self.sets) else self.sets
+        self.ranges = load_motion(self.motion, self.reached, job.method.dataset_scale)
         text = json.dumps([_RULES, self.first.fingerprint, self.ranges, sorted(self.sets)], sort_keys=True)
         self.fingerprint = hashlib.sha256(text.encode()).hexdigest()
         self.entries: list[dict[str, Any]] = self._stored() if self.resume else []
@@ -187,6 +189,9 @@ class PhotoSequence:
             InputError: Another command works in the folder, it holds files of others, or a photo cannot be read.
         """
         with claim(self.folder):
+            if not self.entries:
+                # it would speak of photos whose folders are written anew
+                (self.folder / _REPORT).unlink(missing_ok=True)
             return self._followed(search)
 
     def _followed(self, search: Callable[[Location, tuple[int, ...], Path], dict[str, Any]]) -> dict[str, Any]:
@@ -195,17 +200,13 @@ class PhotoSequence:
             if not alive:
                 break
             folder = f"{k:05d}_{self.images[k].stem}"
-            numbers, poses = tuple(alive), tuple(alive.values())
-            stamp, location = file_stamp(self.images[k]), self._location(k, poses)
+            stamp, location = file_stamp(self.images[k]), self._location(k, alive)
             if file_stamp(self.images[k]) != stamp:
                 fix = "give a copy that nothing writes to"
                 raise InputError("was replaced meanwhile", file=self.images[k], fix=fix)
-            document = search(location, tuple(range(len(poses))), self.folder / folder)
-            frames = [{**frame, "index": numbers[frame["index"]]} for frame in document["frames"]]
-            reported = ("answer", "possible_volume", "hull", "best", "seconds", "state")
-            self.entries.append(
-                {"image": stamp, "folder": folder, **{name: document[name] for name in reported}} | {"frames": frames}
-            )
+            document = search(location, tuple(alive), self.folder / folder)
+            reported = ("answer", "possible_volume", "hull", "best", "seconds", "state", "frames")
+            self.entries.append({"image": stamp, "folder": folder, **{name: document[name] for name in reported}})
             if document["state"] == "interrupted":
                 break
             self._write("running")
@@ -215,12 +216,14 @@ class PhotoSequence:
         """By number, the set of photo ``k``."""
         if k == 0:
             return self.sets
-        return following(self.sets, self.entries[k - 1]["frames"], self.ranges)
+        return following(self.reached, self.entries[k - 1]["frames"], self.ranges)
 
-    def _location(self, k: int, poses: tuple[PoseBox, ...]) -> Location:
+    def _location(self, k: int, alive: Mapping[int, PoseBox]) -> Location:
         image, first = self.images[k], self.first
         levels = read_photo(image)
         mask = None if self.settings.mask is None else read_mask(self.settings.mask, levels.shape[:2])
+        # sets keep their numbers, of the path's entries
+        poses = tuple(alive.get(number, poses) for number, poses in enumerate(self.job.pose_sets))
         job = PathJob(self.job.settings, self.job.scene, self.job.path, poses)
         return Location(job, levels, mask, first.options, image, first.calibration)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -99,7 +100,8 @@ def locate_photos(options: Locate, stop: SignalStop) -> None:
         with stop.at_once():
             location = open_location(options.settings)
             frames = check_frames(options.frames, location.job.frame_count)
-        _search(options, stop, console, location, frames, options.output_dir, lambda: _tell(console, location))
+        introduce = partial(_tell, console, location)
+        _search(options, stop, console, location, frames, options.output_dir, options.resume, introduce)
         return
     with stop.at_once():
         settings = options.settings
@@ -112,12 +114,16 @@ def locate_photos(options: Locate, stop: SignalStop) -> None:
     untold = [photos.first]
 
     def search(location: Location, frames: tuple[int, ...], folder: Path) -> dict[str, Any]:
+        first = bool(untold)
+
         def introduce() -> None:
             if untold:
                 _tell(console, untold.pop())
             console.print(f"{location.file}")
 
-        return _search(options, stop, console, location, frames, folder, introduce)
+        # later photos' sets follow from what is left of this one: what their folders hold is of other sets
+        resume = options.resume and first and (folder / "cells.sqlite").exists()
+        return _search(options, stop, console, location, frames, folder, resume, introduce)
 
     document = photos.follow(search)
     if document["not_examined"] and document["state"] == "done":
@@ -146,11 +152,10 @@ def _search(
     location: Location,
     frames: tuple[int, ...],
     folder: Path,
+    resume: bool,
     introduce: Callable[[], None],
 ) -> dict[str, Any]:
     """Locate one photo; returns the content of its report.json. ``introduce``: as in `searched`."""
-    # a photo of a sequence that was not begun has no folder yet
-    resume = options.resume and (options.image_sequence is None or (folder / "cells.sqlite").exists())
     question = LocationQuestion(location, frames, stated(options), ("ns-abstract-locate", *sys.argv[1:]))
 
     def introduced() -> None:

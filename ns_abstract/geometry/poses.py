@@ -307,9 +307,10 @@ class PoseBox:
     def _rounding(self) -> tuple[float, float]:
         """Error bounds of a pose evaluated in float64: of an entry of its rotation, and of one of its position."""
         start, displacement = self._base[1], self._base[4]
-        limits = dict(zip(self.box.names, zip(self.box.lower, self.box.upper, strict=True), strict=True))
-        shifts = [*self.perturbation.translation.values(), *(limits[n] for n in SCENE_SHIFTS if n in limits)]
-        farthest = sum(max(map(abs, ends)) for ends in shifts)
+        limits = {name: (value, value) for name, value in self.fixed.items()}
+        limits |= dict(zip(self.box.names, zip(self.box.lower, self.box.upper, strict=True), strict=True))
+        # of the box: a set that was grown reaches farther than it was stated
+        farthest = sum(max(map(abs, limits[name])) for name in (*TRANSLATIONS, *SCENE_SHIFTS) if name in limits)
         shift = POSE_ROUNDING * (1.0 + farthest + np.abs(start).max() + np.abs(displacement).max())
         if self.perturbation.orbit is not None:
             shift += POSE_ROUNDING * (1.0 + 2.0 * np.abs(self.perturbation.orbit.target).max())

@@ -22,9 +22,11 @@ def in_tiles(image: np.ndarray, side: int) -> np.ndarray:
 
 
 def assemble(tiles: np.ndarray, camera: PinholeCamera) -> np.ndarray:
-    """The image [H, W, ...] from all its tiles [T, side, side, ...] in row-major order."""
+    """A new image [H, W, ...] from all its tiles [T, side, side, ...] in row-major order."""
     across, _ = tile_grid(camera, tiles.shape[1])
-    return np.ascontiguousarray(laid_out(tiles, across)[: camera.height, : camera.width])
+    image = np.ascontiguousarray(laid_out(tiles, across)[: camera.height, : camera.width])
+    # tiles that are one below the other are laid out already: their memory is not the image's
+    return image.copy() if np.may_share_memory(image, tiles) else image
 
 
 def laid_out(tiles: np.ndarray, across: int) -> np.ndarray:

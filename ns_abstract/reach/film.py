@@ -81,7 +81,8 @@ def along(reacher: TubeBuilder, method: Method, size: tuple[int, int], tube: Tub
 
     The bounds are those of one cell, as tubes have them.
     """
-    camera = reacher.loop.camera
+    small = reacher.view.pose_set.camera
+    camera = reacher.loop.camera.enlarged(size[0] / small.height, size[1] / small.width)
     poses = camera.poses(size)
     view, begin = ScenePictures(method.frame(poses)), time.perf_counter()
     for step in _some(len(tube.state_sets), _MOST_STEPS):

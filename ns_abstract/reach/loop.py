@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
@@ -95,6 +95,11 @@ class CameraMount:
     offset: Float64
     factors: Float64
     fixed: Mapping[str, float]
+
+    def enlarged(self, down: float, across: float) -> CameraMount:
+        """The same camera for pictures of so many times the rows and columns of the network's."""
+        factors = {"fx": across, "fy": down, "cx": across, "cy": down}
+        return replace(self, lens={name: value * factors[name] for name, value in self.lens.items()})
 
     def poses(self, size: tuple[int, int]) -> PoseBox:
         """All poses that may be looked at, in pictures of ``size`` (height, width)."""

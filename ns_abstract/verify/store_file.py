@@ -160,8 +160,9 @@ class StoreFile:
             remove_parts(images)
         if fresh:
             self._remove_images()
-            for suffix in ("", "-wal", "-shm"):
-                Path(f"{self.file}{suffix}").unlink(missing_ok=True)
+            # a report would speak of another search while this one has none
+            for name in (*(f"{NAME}{suffix}" for suffix in ("", "-wal", "-shm")), report.name, "report.html"):
+                (self.folder / name).unlink(missing_ok=True)
             self._create(fingerprint, parameters)
         elif not stat.S_ISREG(self.file.lstat().st_mode):
             # a link would lead to a file of others
