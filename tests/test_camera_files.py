@@ -92,6 +92,12 @@ def test_a_command_takes_both(tmp_path: Path) -> None:
     config.write_text(ngp)
     with pytest.raises(InputError, match="with Nerfstudio's or COLMAP's data parser"):
         open_job(Settings(config, tmp_path / "transforms.json", spec))
+    # orienting by pca may turn the transform that is stored, and not the poses
+    assert text.count("orientation_method: none") == 1
+    config.write_text(text.replace("orientation_method: none", "orientation_method: pca"))
+    with pytest.raises(InputError, match="another orientation_method than pca"):
+        open_job(Settings(config, tmp_path / "transforms.json", spec))
+    open_job(Settings(config, tmp_path / "cameras.json", spec))
     config.write_text(text)
     # without it nothing says where the data set's cameras stand in the run's frame
     file.unlink()
@@ -133,6 +139,7 @@ BAD: dict[str, tuple[Any, str]] = {
     "distorted frame": (
         transforms(frames=[{"transform_matrix": [*POSE.tolist(), [0, 0, 0, 1]], "p2": -1e-3}]), "frames[0].p2",
     ),
+    "oriented by pca": (transforms(orientation_override="pca"), "orientation_override"),
     "a frame cannot straighten": (
         transforms(k1=0.01, frames=[{"transform_matrix": [*POSE.tolist(), [0, 0, 0, 1]], "k1": 0.0}]), "distorted",
     ),

@@ -78,12 +78,15 @@ def transforms_cameras(
         problem = "is a data set's transforms.json, and the scene is no run whose frame could be told from it"
         fix = (
             "give the config.yml of a run trained on it, beside its dataparser_transforms.json and with Nerfstudio's "
-            "or COLMAP's data parser, or make a camera path"
+            "or COLMAP's data parser and another orientation_method than pca, or make a camera path"
         )
         raise InputError(problem, fix=fix)
     frames = root.get("frames")
     if not isinstance(frames, list) or not frames:
         raise unusable(frames, field="frames", fix="write a list of at least one camera")
+    if root.get("orientation_override") == "pca":
+        problem = "Nerfstudio may turn the transform that it stores of such a run, and not the cameras"
+        raise InputError(problem, field="orientation_override", fix="make a camera path in Nerfstudio's viewer")
     # the run's frame is that of the poses here after what was applied to them is undone
     applied, stated = np.eye(4), root.get("applied_transform")
     if "applied_transform" not in root and (folder / _COLMAP_FOLDER).exists():
