@@ -113,6 +113,25 @@ def test_intrinsics_of_a_camera_path(tmp_path: Path) -> None:
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (40, 40, 15.5, 11)
 
 
+def test_a_lens_that_nerfstudio_does_not_draw_is_noted(tmp_path: Path) -> None:
+    """It reads fov alone (cameras/camera_paths.py:167)."""
+    pose = {"camera_to_world": [*POSE.reshape(-1).tolist(), 0, 0, 0, 1]}
+    value: dict[str, Any] = {"render_height": 24, "render_width": 32, "camera_path": [pose | {"fov": 50.0}]}
+    usual = load_camera_path(save(tmp_path / "path.json", value))
+    assert usual.notes == ()
+    focal = usual.cameras[0].fx
+    same = {"fx": focal, "fy": focal, "cx": 16.0, "cy": 12.0}
+    for lens, noted in ((same, False), ({"fx": 40.0}, True), ({"fy": 1.01 * focal}, True), ({"cx": 16.5}, True)):
+        for entry, path in ((lens, {}), ({"fx": None}, lens)):
+            value["camera_path"] = [pose | {"fov": 50.0} | entry]
+            found = load_camera_path(save(tmp_path / "path.json", value | path))
+            assert [note.partition(":")[0] for note in found.notes] == ["camera_path[0]"] * noted
+            # null states nothing: the path's lens counts
+            assert all(getattr(found.cameras[0], key) == number for key, number in lens.items())
+    # it draws no entry without fov
+    assert load_camera_path(save(tmp_path / "path.json", value | {"camera_path": [pose | same]})).notes == ()
+
+
 def test_what_all_frames_have_comes_first(tmp_path: Path) -> None:
     """Nerfstudio reads a frame's own intrinsics where the file states none for all frames."""
     value = transforms()
