@@ -113,6 +113,26 @@ def test_intrinsics_of_a_camera_path(tmp_path: Path) -> None:
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (40, 40, 15.5, 11)
 
 
+def test_cameras_far_from_the_origin_are_refused(tmp_path: Path) -> None:
+    """Nerfstudio computes poses in float32 (nerfstudio_dataparser.py:236): coordinates of a map leave metres open."""
+    value = transforms()
+    for far, scale, refused in ((0.0, 1.0, False), (5e5, 1e-5, False), (5e5, 0.1, True)):
+        place = POSE[:, 3] + far
+        value["frames"][0]["transform_matrix"] = [*np.column_stack([POSE[:, :3], place]).tolist(), [0, 0, 0, 1]]
+        frame = DataparserTransform(np.column_stack([np.eye(3), np.full(3, -far)]), scale)
+        # as Nerfstudio rounds it
+        rounded = scale * (place.astype(np.float32) - np.float32(far)) - scale * POSE[:, 3]
+        assert (np.abs(rounded).max() > 1e-3) == refused
+        file = save(tmp_path / "transforms.json", value)
+        if refused:
+            with pytest.raises(InputError, match="may move the camera") as error:
+                load_camera_path(file, 1, frame)
+            assert error.value.field == "frames[0].transform_matrix"
+        else:
+            camera = load_camera_path(file, 1, frame).cameras[0]
+            np.testing.assert_allclose(camera.camera_to_world[:, 3], scale * POSE[:, 3], atol=1e-9)
+
+
 def test_a_lens_that_nerfstudio_does_not_draw_is_noted(tmp_path: Path) -> None:
     """It reads fov alone (cameras/camera_paths.py:167)."""
     pose = {"camera_to_world": [*POSE.reshape(-1).tolist(), 0, 0, 0, 1]}

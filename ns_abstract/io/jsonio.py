@@ -40,6 +40,8 @@ class InputTuning:
     segment: float = 2e-6
     #: Relative difference of intrinsics up to which two cameras are one.
     lens: float = 1e-6
+    #: Normalised units by which float32 may move a camera of a data set.
+    placed: float = 1e-3
 
 
 MODERATE = InputTuning.least, InputTuning.largest
