@@ -92,6 +92,19 @@ def test_a_command_takes_both(tmp_path: Path) -> None:
     config.write_text(ngp)
     with pytest.raises(InputError, match="with Nerfstudio's or COLMAP's data parser"):
         open_job(Settings(config, tmp_path / "transforms.json", spec))
+    # a run of COLMAP's own model: the file has to say how it differs, whatever folder lies beside it
+    assert transforms().get("applied_transform") is None
+    (tmp_path / "colmap" / "sparse" / "0").mkdir(parents=True)
+    config.write_text(text.replace("nerfstudio_dataparser.Nerfstudio", "colmap_dataparser.Colmap"))
+    config.write_text(
+        config.read_text().replace("colmap_dataparser.Colmap ''", "colmap_dataparser.ColmapDataParser ''")
+    )
+    with pytest.raises(InputError, match="trained on COLMAP's model") as error:
+        open_job(Settings(config, tmp_path / "transforms.json", spec))
+    assert error.value.field == "applied_transform"
+    applied = save(tmp_path / "applied.json", transforms(applied_transform=np.eye(3, 4).tolist()))
+    center = open_job(Settings(config, applied, spec)).pose_sets[0].camera.camera_to_world[:, 3]
+    np.testing.assert_allclose(center, 0.5 * POSE[:, 3], atol=1e-15)
     # orienting by pca may turn the transform that is stored, and not the poses
     assert text.count("orientation_method: none") == 1
     config.write_text(text.replace("orientation_method: none", "orientation_method: pca"))

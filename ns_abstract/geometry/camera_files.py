@@ -90,6 +90,11 @@ def transforms_cameras(
     if root.get("orientation_override") == "pca":
         problem = "Nerfstudio may turn the transform that it stores of such a run, and not the cameras"
         raise InputError(problem, field="orientation_override", fix="make a camera path in Nerfstudio's viewer")
+    if frame.original and root.get("applied_transform") is None:
+        problem = "missing: the run was trained on COLMAP's model, and nothing says how these poses differ from it"
+        raise InputError(
+            problem, field="applied_transform", fix="give a file of ns-process-data, or make a camera path"
+        )
     # the run's frame is that of the poses here after what was applied to them is undone
     applied, stated = np.eye(4), root.get("applied_transform")
     if "applied_transform" not in root and (folder / _COLMAP_FOLDER).exists():

@@ -262,21 +262,21 @@ def units_assumption(transform: DataparserTransform, assumed: bool) -> Assumptio
     return Assumption("units", text, origin)
 
 
-def places_transforms(run: RunConfig) -> bool:
-    """Return whether the run's frame is told from that of a ``transforms.json``: not by every data parser.
+def placing_parser(run: RunConfig) -> str | None:
+    """The data parser, if the run's frame is told from that of a ``transforms.json``: not by every one.
 
     Instant-NGP's leaves alone what the file says was applied to its poses. Orienting by "pca" may turn the transform
     that is stored, and not the poses (nerfstudio/cameras/camera_utils.py:579).
     """
-    manager = (as_mapping(run.root.get("pipeline")) or {}).get("datamanager")
-    parser = (as_mapping(manager) or {}).get("dataparser")
+    parser = (as_mapping((as_mapping(run.root.get("pipeline")) or {}).get("datamanager")) or {}).get("dataparser")
     options = as_mapping(parser) or {}
     target = options.get("_target", parser)
     if options.get("orientation_method") == "pca":
-        return False
+        return None
     if target is None:
-        return True
-    return isinstance(target, Tagged) and target.tag.rpartition(".")[2].removesuffix("Config") in _PLACING_PARSERS
+        return _PLACING_PARSERS[0]
+    name = target.tag.rpartition(".")[2].removesuffix("Config") if isinstance(target, Tagged) else ""
+    return name if name in _PLACING_PARSERS else None
 
 
 def config_class(run: RunConfig) -> str:
