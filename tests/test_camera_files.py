@@ -93,6 +93,25 @@ def test_a_command_takes_both(tmp_path: Path) -> None:
     config.write_text(ngp)
     with pytest.raises(InputError, match="with Nerfstudio's or COLMAP's data parser"):
         open_job(Settings(config, tmp_path / "transforms.json", spec))
+    # a run of COLMAP's own model: the file has to say how it differs, whatever folder lies beside it
+    assert transforms().get("applied_transform") is None
+    (tmp_path / "colmap" / "sparse" / "0").mkdir(parents=True)
+    config.write_text(text.replace("nerfstudio_dataparser.Nerfstudio", "colmap_dataparser.Colmap"))
+    config.write_text(
+        config.read_text().replace("colmap_dataparser.Colmap ''", "colmap_dataparser.ColmapDataParser ''")
+    )
+    with pytest.raises(InputError, match="trained on COLMAP's model") as error:
+        open_job(Settings(config, tmp_path / "transforms.json", spec))
+    assert error.value.field == "applied_transform"
+    applied = save(tmp_path / "applied.json", transforms(applied_transform=np.eye(3, 4).tolist()))
+    center = open_job(Settings(config, applied, spec)).pose_sets[0].camera.camera_to_world[:, 3]
+    np.testing.assert_allclose(center, 0.5 * POSE[:, 3], atol=1e-15)
+    # orienting by pca may turn the transform that is stored, and not the poses
+    assert text.count("orientation_method: none") == 1
+    config.write_text(text.replace("orientation_method: none", "orientation_method: pca"))
+    with pytest.raises(InputError, match="another orientation_method than pca"):
+        open_job(Settings(config, tmp_path / "transforms.json", spec))
+    open_job(Settings(config, tmp_path / "cameras.json", spec))
     config.write_text(text)
     # without it nothing says where the data set's cameras stand in the run's frame
     file.unlink()
@@ -108,24 +127,43 @@ def test_intrinsics_of_a_camera_path(tmp_path: Path) -> None:
     assert (camera.fx, camera.fy, camera.cx, camera.cy) == (40, 40, 15.5, 11)
 
 
-def test_a_lens_that_nerfstudio_does_not_read_is_told(tmp_path: Path) -> None:
-    """Nerfstudio draws with fov and the middle (cameras/camera_paths.py:167); agreeing numbers need no note."""
-    focal = 12.0 / math.tan(math.radians(25.0))
-    entry = {"camera_to_world": [*POSE.reshape(-1).tolist(), 0, 0, 0, 1], "fov": 50.0}
-    for root, own, told in (
-        ({}, {}, False),
-        ({}, {"fx": focal, "cx": 16.0}, False),
-        ({}, {"fx": 40.0}, True),
-        ({"cy": 11.0}, {}, True),
-    ):
-        value = {"render_height": 24, "render_width": 32, **root, "camera_path": [entry | own, entry | own]}
-        path = load_camera_path(save(tmp_path / "path.json", value))
-        assert len(path.notes) == told
-        if told:
-            assert path.notes[0].startswith("camera_path[0] and 1 more: drawn with its fx, fy, cx and cy")
-    del entry["fov"]
-    value["camera_path"] = [entry | {"fx": 40.0}]
-    assert not load_camera_path(save(tmp_path / "path.json", value)).notes
+def test_cameras_far_from_the_origin_are_refused(tmp_path: Path) -> None:
+    """Nerfstudio computes poses in float32 (nerfstudio_dataparser.py:236): coordinates of a map leave metres open."""
+    value = transforms()
+    for far, scale, refused in ((0.0, 1.0, False), (5e5, 1e-5, False), (5e5, 0.1, True)):
+        place = POSE[:, 3] + far
+        value["frames"][0]["transform_matrix"] = [*np.column_stack([POSE[:, :3], place]).tolist(), [0, 0, 0, 1]]
+        frame = DataparserTransform(np.column_stack([np.eye(3), np.full(3, -far)]), scale)
+        # as Nerfstudio rounds it
+        rounded = scale * (place.astype(np.float32) - np.float32(far)) - scale * POSE[:, 3]
+        assert (np.abs(rounded).max() > 1e-3) == refused
+        file = save(tmp_path / "transforms.json", value)
+        if refused:
+            with pytest.raises(InputError, match="may move the camera") as error:
+                load_camera_path(file, 1, frame)
+            assert error.value.field == "frames[0].transform_matrix"
+        else:
+            camera = load_camera_path(file, 1, frame).cameras[0]
+            np.testing.assert_allclose(camera.camera_to_world[:, 3], scale * POSE[:, 3], atol=1e-9)
+
+
+def test_a_lens_that_nerfstudio_does_not_draw_is_noted(tmp_path: Path) -> None:
+    """It reads fov alone (cameras/camera_paths.py:167)."""
+    pose = {"camera_to_world": [*POSE.reshape(-1).tolist(), 0, 0, 0, 1]}
+    value: dict[str, Any] = {"render_height": 24, "render_width": 32, "camera_path": [pose | {"fov": 50.0}]}
+    usual = load_camera_path(save(tmp_path / "path.json", value))
+    assert usual.notes == ()
+    focal = usual.cameras[0].fx
+    same = {"fx": focal, "fy": focal, "cx": 16.0, "cy": 12.0}
+    for lens, noted in ((same, False), ({"fx": 40.0}, True), ({"fy": 1.01 * focal}, True), ({"cx": 16.5}, True)):
+        for entry, path in ((lens, {}), ({"fx": None}, lens)):
+            value["camera_path"] = [pose | {"fov": 50.0} | entry]
+            found = load_camera_path(save(tmp_path / "path.json", value | path))
+            assert [note.partition(":")[0] for note in found.notes] == ["camera_path[0]"] * noted
+            # null states nothing: the path's lens counts
+            assert all(getattr(found.cameras[0], key) == number for key, number in lens.items())
+    # it draws no entry without fov
+    assert load_camera_path(save(tmp_path / "path.json", value | {"camera_path": [pose | same]})).notes == ()
 
 
 def test_what_all_frames_have_comes_first(tmp_path: Path) -> None:
@@ -154,6 +192,7 @@ BAD: dict[str, tuple[Any, str]] = {
     "distorted frame": (
         transforms(frames=[{"transform_matrix": [*POSE.tolist(), [0, 0, 0, 1]], "p2": -1e-3}]), "frames[0].p2",
     ),
+    "oriented by pca": (transforms(orientation_override="pca"), "orientation_override"),
     "a frame cannot straighten": (
         transforms(k1=0.01, frames=[{"transform_matrix": [*POSE.tolist(), [0, 0, 0, 1]], "k1": 0.0}]), "distorted",
     ),

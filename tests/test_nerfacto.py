@@ -95,7 +95,7 @@ TABLE, PROPOSAL = "_model.field.mlp_base.model.0.hash_table", "_model.proposal_n
         (lambda s: s.pop("_model.field.mlp_head.layers.1.bias"), "mlp_head.layers.1.bias: missing"),
         (lambda s: s.update({"_model.field.mlp_head.layers.1.weight": torch.zeros(16, 9)}), "config.yml says [16, 16]"),
         (lambda s: s.update({"_model.field.mlp_base.model.params": torch.zeros(9)}), "tiny-cuda-nn"),
-        (lambda s: s.update({"_model.field.mlp_pred_normals.layers.0.weight": torch.zeros(9, 9)}), "does not have"),
+        (lambda s: s.update({"_model.field.mlp_transient.layers.0.weight": torch.zeros(9, 9)}), "does not have"),
         (lambda s: s.update({"_model.field.embedding_appearance.embedding.weight": torch.zeros(3, 8)}), "does not"),
         (lambda s: [s.pop(k) for k in list(s) if ".field." in k], "no nerfacto"),
         (lambda s: [s.pop(k) for k in list(s) if "networks.1" in k], "proposal_networks.1.mlp_base.0.hash_table"),
@@ -319,7 +319,7 @@ def loaded(folder: Path, model: Any, edits: dict[str, str]) -> NerfactoScene:
 @pytest.mark.slow
 @needs_nerfstudio
 def test_nerfstudio_shows_the_same_picture_in_float64(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """1,000 rays of a model with Nerfstudio's embedding, and 50 before each other background and spacing."""
+    """1,000 rays of a model with embedding and normals, and 50 before each other background and spacing."""
     declare_missing()
     metric = importlib.import_module("torchmetrics.image.lpip")
     monkeypatch.setattr(metric, "LearnedPerceptualImagePatchSimilarity", lambda **options: torch.nn.Identity())
@@ -334,6 +334,7 @@ def test_nerfstudio_shows_the_same_picture_in_float64(tmp_path: Path, monkeypatc
         nerfacto.NerfactoModelConfig(
             implementation="torch", num_levels=6, max_res=500, log2_hashmap_size=12, average_init_density=0.01,
             num_proposal_samples_per_ray=(64, 32), num_nerf_samples_per_ray=24, proposal_net_args_list=proposals,
+            predict_normals=True,
         )
     )  # fmt: skip
     written = ", ".join(str(one).replace("'", "").replace("False", "false") for one in proposals)
@@ -343,7 +344,7 @@ def test_nerfstudio_shows_the_same_picture_in_float64(tmp_path: Path, monkeypatc
             "num_levels": "6", "max_res": "500", "log2_hashmap_size": "12", "hidden_dim": "64",
             "hidden_dim_color": "64", "num_proposal_samples_per_ray": "[64, 32]", "num_nerf_samples_per_ray": "24",
             "far_plane": "1000.0", "background_color": "last_sample", "use_appearance_embedding": "true",
-            "proposal_net_args_list": f"[{written}]",
+            "proposal_net_args_list": f"[{written}]", "predict_normals": "true",
         },
     ).field  # fmt: skip
     assert field.encoding.resolutions.tolist() == model.field.mlp_base.model[0].scalings.int().tolist()

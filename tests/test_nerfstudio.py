@@ -251,7 +251,9 @@ def test_abstract_outputs_hold(model: Any, nerfstudio: SimpleNamespace, attack: 
 
 
 @pytest.mark.slow
-def test_crop_and_background_reach_the_bounds(model: Any, nerfstudio: SimpleNamespace) -> None:
+def test_crop_and_background_reach_the_bounds(
+    model: Any, nerfstudio: SimpleNamespace, monkeypatch: pytest.MonkeyPatch
+) -> None:
     import torch
     from nerfstudio.data.scene_box import OrientedBox
 
@@ -264,6 +266,13 @@ def test_crop_and_background_reach_the_bounds(model: Any, nerfstudio: SimpleName
     empty = model.get_outputs_for_camera(cameras(nerfstudio), nothing)
     assert (empty["accumulation"] == 0).all() and empty["rgb"].unique().numel() <= 3
     assert (empty["abstract_lower"] <= empty["rgb"]).all() and (empty["rgb"] <= empty["abstract_upper"]).all()
+    # there, Nerfstudio shows the viewer's colour, whatever the run's is (splatfacto.py:551-554)
+    monkeypatch.setattr(model.config, "background_color", "white")
+    monkeypatch.setattr(model, "background_color", torch.tensor([0.25, 0.5, 0.125]))
+    empty = model.get_outputs_for_camera(cameras(nerfstudio), nothing)
+    assert (empty["rgb"] == model.background_color).all()
+    assert (empty["abstract_lower"] <= empty["rgb"]).all() and (empty["rgb"] <= empty["abstract_upper"]).all()
+    monkeypatch.undo()
     source = model.abstract_source()
     assert model.abstract_source() is source
     model.set_crop(None)
@@ -627,6 +636,40 @@ def test_nerf_has_the_chosen_size(nerfstudio: SimpleNamespace) -> None:
     assert any(bool(p.grad.any()) for p in field.parameters() if p.grad is not None)
     # a steeper network has a larger bound, and really is no steeper than the bound says
     assert not nerfstudio.loading.lpips_known(model.lpips)
+
+
+@pytest.mark.parametrize(
+    ("lens", "said"),
+    [({"camera_type": 2}, "perspective"), ({"distortion_params": [0.3, 0.1, 0.0, 0.0, 0.0, 0.0]}, "distorted")],
+)
+def test_other_lenses_of_a_nerf_are_drawn_and_not_bounded(
+    nerfstudio: SimpleNamespace, monkeypatch: pytest.MonkeyPatch, lens: dict[str, Any], said: str
+) -> None:
+    import torch
+    from nerfstudio.data.scene_box import SceneBox
+    from nerfstudio.models.vanilla_nerf import NeRFModel
+
+    config = nerfstudio.nerf.AbstractNerfModelConfig(width=8, depth=3, num_coarse_samples=8, num_importance_samples=8)
+    with nerfstudio.loading.lpips_weights(download=False):
+        model = config.setup(scene_box=SceneBox(torch.tensor([[-1.0] * 3, [1.0] * 3])), num_train_data=1).eval()
+    model.start_evaluation()
+    pose, size = torch.eye(4)[None, :3], (9.0, 9.0, 8.0, 8.0, 16, 16)
+    given = {key: torch.tensor(value) if isinstance(value, list) else value for key, value in lens.items()}
+    other, usual = nerfstudio.Cameras(pose, *size, **given), nerfstudio.Cameras(pose, *size)
+    model.get_outputs_for_camera(usual)
+    assert model.abstract_source() is not None
+    model.get_outputs_for_camera(other)
+    with pytest.raises(InputError, match=said):
+        model.abstract_source()
+    # in a viewer, too
+    monkeypatch.setattr(model.abstract.control, "draw", lambda: None)
+    model.abstract.control._present.set()
+    model._speed = 100.0
+    found = model.get_outputs_for_camera(other)
+    shown, straight = (NeRFModel.get_outputs_for_camera(model, camera)["rgb_fine"] for camera in (other, usual))
+    assert torch.equal(found["rgb_fine"], shown) and not torch.equal(shown, straight)
+    assert (found["abstract_lower"] == 0).all() and (found["abstract_upper"] == 1).all()
+    assert said in model.abstract._figures.text
 
 
 # ---------------------------------------------------------------- nerfstudio's own commands

@@ -20,12 +20,15 @@ from ns_abstract.io.errors import InputError
 from ns_abstract.methods.load import open_scene
 from ns_abstract.methods.overrides import UNSAID, OverrideKeywords, Overrides, assumption_of
 from ns_abstract.methods.program_options import ProgramOptions
-from ns_abstract.methods.runs import NO_TRANSFORMS, places_transforms, read_config
+from ns_abstract.methods.runs import NO_TRANSFORMS, placing_parser, read_config
 from ns_abstract.perturbation.specification import Perturbation
 from ns_abstract.refine.protocol import Method, PreciseFrame
 
 if TYPE_CHECKING:
     from typing import Unpack  # pyright: ignore[reportAttributeAccessIssue]  # of Python 3.11
+
+#: It reads COLMAP's model, and no ``transforms.json``.
+_COLMAP_PARSER = "ColmapDataParser"
 
 
 @dataclass(frozen=True)
@@ -105,7 +108,8 @@ class Scene:
     def data_frame(self) -> DataparserTransform | None:
         """From the frame of a ``transforms.json`` to the run's; None where no run says so."""
         frame = self.run_frame
-        return None if frame is None or not places_transforms(read_config(self.source.file)) else frame
+        parser = None if frame is None else placing_parser(read_config(self.source.file))
+        return None if frame is None or parser is None else replace(frame, original=parser == _COLMAP_PARSER)
 
     @property
     def background(self) -> tuple[float, ...] | None:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ns_abstract.arithmetic.rounding import UNIT32
 from ns_abstract.geometry.transform import DataparserTransform
 from ns_abstract.io.errors import InputError
 from ns_abstract.io.jsonio import InputTuning, is_number, show, unusable
@@ -20,6 +21,8 @@ _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 #: What Nerfstudio takes for applied_transform where a data set states none and has this folder beside it.
 _COLMAP_FOLDER, _COLMAP_APPLIED = "colmap/sparse/0", [[0, 1, 0, 0], [1, 0, 0, 0], [0, 0, -1, 0]]
 _MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")
+#: Of a camera's position, in Nerfstudio.
+_FLOAT32_ROUNDINGS = 12
 _INTRINSICS = ("fl_x", "fl_y", "cx", "cy", "w", "h")
 
 
@@ -78,12 +81,20 @@ def transforms_cameras(
         problem = "is a data set's transforms.json, and the scene is no run whose frame could be told from it"
         fix = (
             "give the config.yml of a run trained on it, beside its dataparser_transforms.json and with Nerfstudio's "
-            "or COLMAP's data parser, or make a camera path"
+            "or COLMAP's data parser and another orientation_method than pca, or make a camera path"
         )
         raise InputError(problem, fix=fix)
     frames = root.get("frames")
     if not isinstance(frames, list) or not frames:
         raise unusable(frames, field="frames", fix="write a list of at least one camera")
+    if root.get("orientation_override") == "pca":
+        problem = "Nerfstudio may turn the transform that it stores of such a run, and not the cameras"
+        raise InputError(problem, field="orientation_override", fix="make a camera path in Nerfstudio's viewer")
+    if frame.original and root.get("applied_transform") is None:
+        problem = "missing: the run was trained on COLMAP's model, and nothing says how these poses differ from it"
+        raise InputError(
+            problem, field="applied_transform", fix="give a file of ns-process-data, or make a camera path"
+        )
     # the run's frame is that of the poses here after what was applied to them is undone
     applied, stated = np.eye(4), root.get("applied_transform")
     if "applied_transform" not in root and (folder / _COLMAP_FOLDER).exists():
@@ -107,10 +118,21 @@ def transforms_cameras(
         numbers["fl_y"] = _number(values.get("fl_y", numbers["fl_x"]), f"{field}.fl_y")
         pose = _matrix(entry.get("transform_matrix"), None, 4, f"{field}.transform_matrix")
         whole = np.vstack([pose[:3], [0.0, 0.0, 0.0, 1.0]])
+        _refuse_far(undone, whole, f"{field}.transform_matrix")
         yield FileCamera(
             field, undone.pose(whole).tolist(), numbers["fl_x"], numbers["fl_y"], numbers["cx"], numbers["cy"],
             values.get("w"), values.get("h"),
         )  # fmt: skip
+
+
+def _refuse_far(frame: DataparserTransform, pose: NDArray[np.float64], field: str) -> None:
+    """Refuse a ``pose`` [4, 4] that lies so far from the run's origin that Nerfstudio's float32 moves the camera."""
+    reach = frame.scale * float((np.abs(frame.matrix) @ np.abs(pose[:, 3])).max())
+    # a rounding of the pose, of each product and sum, of the scale, and as many of a transform that holds another
+    moved = _FLOAT32_ROUNDINGS * UNIT32 * reach
+    if not moved <= InputTuning.placed:
+        problem = f"so far from the run's origin that Nerfstudio, in float32, may move the camera by {moved:.2g} units"
+        raise InputError(problem, field=field, fix="make a camera path in Nerfstudio's viewer")
 
 
 def _refuse_distorted(section: Mapping[str, Any], prefix: str) -> None:

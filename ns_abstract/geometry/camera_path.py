@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -233,17 +233,18 @@ def stated_intrinsics(
 
 
 def _parse(root: dict[str, Any], source: str, downscale_factor: float) -> CameraPath:
-    unknown, restated = PATH.unknown(root), []
+    unknown = PATH.unknown(root)
     height = checked_side(root.get("render_height"), "render_height")
     width = checked_side(root.get("render_width"), "render_width")
     cameras = []
     overrides = []
+    others: list[str] = []
     for field, entry in _entries(root, unknown):
-        own = {key: entry.get(key, root.get(key)) for key in ("fx", "fy", "cx", "cy")}
+        own = {key: root.get(key) if entry.get(key) is None else entry[key] for key in ("fx", "fy", "cx", "cy")}
         focal = partial(_focal, entry, root, field, height)
         lens = stated_intrinsics(own, focal, height, width, f"{field}.")
-        if entry.get("fov") is not None and not np.allclose(lens, stated_intrinsics({}, focal, height, width), 1e-6):
-            restated.append(field)
+        if not np.allclose(lens, _lens_of_fov(entry, lens), rtol=InputTuning.lens, atol=0.0):
+            others.append(field)
         pose = checked_pose(entry.get("camera_to_world"), f"{field}.camera_to_world")
         camera = PinholeCamera(pose, *lens[:4], width=width, height=height)
         cameras.append(camera.rescaled(downscale_factor))
@@ -261,16 +262,25 @@ def _parse(root: dict[str, Any], source: str, downscale_factor: float) -> Camera
         fps=None if fps is None else float(fps),
         is_cycle=bool(is_cycle),
         source=source,
-        notes=sentence(unknown, Path(source).name) + _restated(restated),
+        notes=(*sentence(unknown, Path(source).name), *_other_lenses(others)),
     )
 
 
-def _restated(fields: list[str]) -> tuple[str, ...]:
-    """A note of cameras whose fx, fy, cx or cy say another picture than the fov that Nerfstudio draws with."""
+def _lens_of_fov(entry: Mapping[str, Any], lens: Intrinsics) -> Intrinsics:
+    """What ns-render takes for ``lens``: it reads ``fov`` alone, and stops at an entry without it."""
+    fov = entry.get("fov")
+    if not is_number(fov) or not 0 < fov < 180:
+        return lens
+    focal, (width, height) = focal_length(fov, int(lens.height), "fov"), lens[4:]
+    return Intrinsics(focal, focal, width / 2, height / 2, width, height)
+
+
+def _other_lenses(fields: Sequence[str]) -> tuple[str, ...]:
+    """A note on the entries ``fields``, which ns-render draws by another camera; none without them."""
     if not fields:
         return ()
-    which = fields[0] + (f" and {len(fields) - 1} more" if fields[1:] else "")
-    return (f"{which}: drawn with its fx, fy, cx and cy; Nerfstudio does not read these and draws with its fov",)
+    count = f" and {len(fields) - 1} more" if len(fields) > 1 else ""
+    return (f"{fields[0]}{count}: fx, fy, cx and cy are taken; ns-render takes fov and the middle, another picture",)
 
 
 #: Files of Nerfstudio and of this program that are taken for camera paths, by a key that these lack.

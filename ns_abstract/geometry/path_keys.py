@@ -16,7 +16,7 @@ _TIME = "time of a scene that moves; such runs are refused"
 _EDITOR = "how the viewer makes its path from keyframes; the path itself is in camera_path"
 _EXTRA = Key("perturbation", "used", "the set of poses (ns-abstract)")
 _INTRINSICS = (
-    Key("fx", "used", "focal length in pixels, in place of fov (ns-abstract)"),
+    Key("fx", "used", "focal length in pixels, in place of fov, which ns-render takes (ns-abstract)"),
     Key("fy", "used", "vertical focal length in pixels; without it fx (ns-abstract)"),
     Key("cx", "used", "principal point from the left edge in pixels; without it the middle (ns-abstract)"),
     Key("cy", "used", "principal point from the top edge in pixels; without it the middle (ns-abstract)"),

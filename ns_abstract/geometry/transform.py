@@ -16,12 +16,14 @@ class DataparserTransform:
 
     ``x_normalised = scale * (matrix[:, :3] @ x_dataset + matrix[:, 3])``
     (nerfstudio/data/dataparsers/base_dataparser.py, ``DataparserOutputs``). ``stated``: whether the scene says so; the
-    identity stands for what it does not say.
+    identity stands for what it does not say. ``original``: whether the data set is COLMAP's own, from which a
+    transforms.json differs by what it says was applied.
     """
 
     matrix: NDArray[np.float64] = field(default_factory=lambda: np.eye(3, 4))  # [3, 4]
     scale: float = 1.0
     stated: bool = True
+    original: bool = False
 
     @property
     def stated_scale(self) -> float | None:

@@ -38,6 +38,10 @@ class InputTuning:
     last_row: float = 1e-6
     #: The same for keyframes that a segment connects, which leads from one rotation to another: what float32 leaves.
     segment: float = 2e-6
+    #: Relative difference of intrinsics up to which two cameras are one.
+    lens: float = 1e-6
+    #: Normalised units by which float32 may move a camera of a data set.
+    placed: float = 1e-3
 
 
 MODERATE = InputTuning.least, InputTuning.largest

@@ -262,17 +262,21 @@ def units_assumption(transform: DataparserTransform, assumed: bool) -> Assumptio
     return Assumption("units", text, origin)
 
 
-def places_transforms(run: RunConfig) -> bool:
-    """Return whether the run's frame is told from that of a ``transforms.json``: not by every data parser.
+def placing_parser(run: RunConfig) -> str | None:
+    """The data parser, if the run's frame is told from that of a ``transforms.json``: not by every one.
 
-    Instant-NGP's, for one, leaves alone what the file says was applied to its poses.
+    Instant-NGP's leaves alone what the file says was applied to its poses. Orienting by "pca" may turn the transform
+    that is stored, and not the poses (nerfstudio/cameras/camera_utils.py:579).
     """
-    manager = (as_mapping(run.root.get("pipeline")) or {}).get("datamanager")
-    parser = (as_mapping(manager) or {}).get("dataparser")
-    target = (as_mapping(parser) or {}).get("_target", parser)
+    parser = (as_mapping((as_mapping(run.root.get("pipeline")) or {}).get("datamanager")) or {}).get("dataparser")
+    options = as_mapping(parser) or {}
+    target = options.get("_target", parser)
+    if options.get("orientation_method") == "pca":
+        return None
     if target is None:
-        return True
-    return isinstance(target, Tagged) and target.tag.rpartition(".")[2].removesuffix("Config") in _PLACING_PARSERS
+        return _PLACING_PARSERS[0]
+    name = target.tag.rpartition(".")[2].removesuffix("Config") if isinstance(target, Tagged) else ""
+    return name if name in _PLACING_PARSERS else None
 
 
 def config_class(run: RunConfig) -> str:
@@ -303,7 +307,7 @@ def read_dataparser_transform(run: RunConfig) -> tuple[DataparserTransform, tupl
     if not isinstance(data, dict):
         raise unusable(data, field="top level", fix="write an object", file=path)
     rows = data.get("transform")
-    if not (isinstance(rows, list) and len(rows) == 3 and all(_is_list(row, 4) for row in rows)):
+    if not (isinstance(rows, list) and len(rows) == 3 and all(isinstance(row, list) and len(row) == 4 for row in rows)):
         raise InputError("not a 3x4 matrix", file=path, field="transform", fix="write three rows of four numbers")
     for i, row in enumerate(rows):
         for j, value in enumerate(row):
@@ -347,10 +351,6 @@ def read_model_state(path: Path) -> dict[str, Any]:
     if state and all(key.startswith("module.") for key in state):
         state = {key.removeprefix("module."): value for key, value in state.items()}
     return state
-
-
-def _is_list(value: Any, length: int) -> bool:
-    return isinstance(value, list) and len(value) == length
 
 
 def _section(parent: dict[str, Any], key: str, field: str, file: Path) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import torch
-from nerfstudio.cameras.cameras import Cameras
+from nerfstudio.cameras.cameras import Cameras, CameraType
 from nerfstudio.field_components.encodings import NeRFEncoding
 from nerfstudio.fields.vanilla_nerf_field import NeRFField
 from nerfstudio.models.vanilla_nerf import NeRFModel, VanillaModelConfig
@@ -28,6 +28,7 @@ from ns_abstract.viewer.views import NerfSource
 #: Seconds that a picture may take while the camera moves, and in the end; each picture of a view that stays has so
 #: many times the pixels of the one before.
 _FIRST, _LAST, _GROWTH = 0.2, 3.2, 4.0
+_CROPPED = "the whole field is bounded, a part of it is shown", "switch the crop box off"
 #: Rays by second that are assumed before any was drawn, and fewest rows of a picture.
 _RAYS, _ROWS = 200.0, 6
 
@@ -74,7 +75,8 @@ class AbstractNerfModel(AbstractOutputs, NeRFModel):
         #: what was drawn last: of which view, the outputs, and seconds for the next picture of it
         self._drawn: tuple[Any, dict[str, torch.Tensor], float] | None = None
         self._speed = _RAYS
-        self._cropped = False
+        #: why the picture that was drawn last is not bounded: problem and fix
+        self._unlike: tuple[str, str] | None = None
         c = self.config
         if c.num_direction_frequencies == 0:
             # nerfstudio's own fields
@@ -97,13 +99,13 @@ class AbstractNerfModel(AbstractOutputs, NeRFModel):
         """The fields as they are shown; None where they are not what can be bounded.
 
         Raises:
-            InputError: Only a part is shown.
+            InputError: Only a part is shown, or by another camera.
         """
         c = self.config
         if c.enable_temporal_distortion or not c.enable_collider or c.background_color == "last_sample":
             return None
-        if self._cropped:
-            raise InputError("the whole field is bounded, a part of it is shown", fix="switch the crop box off")
+        if self._unlike is not None:
+            raise InputError(self._unlike[0], fix=self._unlike[1])
         fields = (self.field_coarse, self.field_fine)
         state = tuple((id(p), p._version) for one in fields if one is not None for p in one.parameters())
         background = self._color_behind()
@@ -141,8 +143,9 @@ class AbstractNerfModel(AbstractOutputs, NeRFModel):
 
     def _concrete(self, camera: Any, obb_box: Any) -> dict[str, torch.Tensor]:
         """The model's own outputs; in a viewer without CUDA, small pictures first, so that the camera can move."""
-        self._cropped = obb_box is not None
-        if not self.abstract.control.present or self.device.type == "cuda" or self.training:
+        lens = _other_lens(camera)
+        self._unlike = lens if obb_box is None else _CROPPED
+        if not self.abstract.control.present or self.device.type == "cuda" or self.training or lens is not None:
             return with_depth(super()._concrete(camera, obb_box))
         pinhole = camera_of(camera)
         box = None if obb_box is None else tuple(torch.cat([obb_box.R.flatten(), obb_box.T, obb_box.S]).tolist())
@@ -172,6 +175,15 @@ class AbstractNerfModel(AbstractOutputs, NeRFModel):
             steepness = torch.stack([log_lipschitz(f) for f in fields]).mean()
             losses["smoothness"] = self.config.smoothness_penalty * steepness
         return losses
+
+
+def _other_lens(camera: Cameras) -> tuple[str, str] | None:
+    """Problem and fix where rays are not those of a perspective camera without distortion (cameras.py:622-790)."""
+    if bool((camera.camera_type != CameraType.PERSPECTIVE.value).any()):
+        return "only perspective cameras are bounded", "choose Perspective in the viewer's Render tab"
+    if camera.distortion_params is not None and bool(camera.distortion_params.any()):
+        return "the lens is distorted, and cameras without distortion are bounded", "draw a camera path"
+    return None
 
 
 def with_depth(outputs: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:

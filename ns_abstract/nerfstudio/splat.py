@@ -84,9 +84,13 @@ class AbstractSplatfactoModel(AbstractOutputs, SplatfactoModel):
     def _scene(self) -> tuple[SplatSource, Renderer]:
         """What is shown: the Gaussians inside the crop box, before the background."""
         scene, splats = self._splats()
-        background = self._get_background_color().detach().cpu().numpy().astype(np.float64)
+        # of the whole scene, and where the crop box leaves no Gaussian (splatfacto.py:551-554)
+        background, without = (
+            color.detach().cpu().numpy().astype(np.float64)
+            for color in (self._get_background_color(), self.background_color)
+        )
         box = self.crop_box
-        crop = None if box is None else tuple(np.concatenate([np.ravel(v) for v in (box.R, box.T, box.S)]).tolist())
+        crop = None if box is None else np.hstack([*map(np.ravel, (box.R, box.T, box.S)), without]).tobytes()
         state = (id(splats), background.tobytes(), crop)
         if self._shown is None or self._shown[0] != state:
             if box is not None:
@@ -94,6 +98,7 @@ class AbstractSplatfactoModel(AbstractOutputs, SplatfactoModel):
                 parts = {name: getattr(splats, name)[inside] for name in ("means", "axes", "opacity", "sh")}
                 splats = dataclasses.replace(splats, **parts)
                 scene = cropped(scene, inside)
+                background = background if inside.any() else without
             splats = dataclasses.replace(splats, background=background)
             rules = self._rules
             source = SplatSource(splats, scene, version=rules.version, layers=self.config.abstract.depth)
@@ -111,9 +116,9 @@ class AbstractSplatfactoModel(AbstractOutputs, SplatfactoModel):
             raise RuntimeError("gsplat trains on CUDA only; without it, runs can be viewed, rendered and bounded")
         with uninterrupted():
             view, renderer = camera_of(camera), self._scene()[1]
-            background = self._get_background_color()
             if renderer.splats.count == 0:
-                return self.get_empty_outputs(view.width, view.height, background)
+                return self.get_empty_outputs(view.width, view.height, self.background_color)
+            background = self._get_background_color()
             pose = view.camera_to_world
             layers = renderer.layers(view, pose[:, :3].T * _FLIP[:, None], pose[:, 3])
         rgb, accumulation, depth = (torch.from_numpy(layer.astype(np.float32)) for layer in layers)

@@ -37,6 +37,8 @@ _FIX = "give a run of nerfacto or abstract-nerfacto that was trained with --pipe
 _PAIR = "give the checkpoint that belongs to config.yml"
 _STOCK = "nerfstudio.models.nerfacto.NerfactoModel"
 _MODEL = "pipeline.model."
+#: nerfstudio/fields/nerfacto_field.py: modules of ``predict_normals``.
+_NORMALS = ("field.mlp_pred_normals.", "field.field_head_pred_normals.")
 #: nerfstudio/fields/nerfacto_field.py: harmonics of directions, and geometric features.
 HARMONICS, FEATURES = 16, 15
 _LEVELS_LIMIT, _TABLE_LIMIT, _FEATURES_LIMIT, _RESOLUTION_LIMIT = 64, 30, 64, 2**22
@@ -122,8 +124,8 @@ def load_nerfacto(run: runs.RunConfig, overrides: Overrides | None = None) -> Ne
         else background.astype(np.float64),
     )
     for key in state:
-        # the box that a field without contraction ends at
-        if key.rpartition(".")[2] == "aabb":
+        # the box that a field without contraction ends at, and what draws normals beside the picture
+        if key.rpartition(".")[2] == "aabb" or key.startswith(_NORMALS):
             state.read.add(key)
     state.refuse_unread("nerfacto")
     others = model_state.records(run, state, overrides, _STOCK, transform, bool(notes))
