@@ -203,6 +203,54 @@ def test_a_float32_network_leaves_the_exact_one(tmp_path: Path) -> None:
         assert bool(((low <= y) & (y <= high)).all()) == holds
 
 
+def chain(file: Path, factors: list[float], weight: np.ndarray, side: int = 1) -> Path:
+    """Products with ``factors``, one behind the other, then with ``weight``, and a sum with (0, 0.1)."""
+    weights = {f"w{k}": v * np.eye(3 * side * side) for k, v in enumerate(factors)}
+    nodes = [helper.make_node("Flatten", ["image"], ["f0"])]
+    nodes += [helper.make_node("MatMul", [f"f{k}", f"w{k}"], [f"f{k + 1}"]) for k in range(len(factors))]
+    nodes += [helper.make_node("MatMul", [f"f{len(factors)}", "w"], ["m"]), helper.make_node("Add", ["m", "b"], ["y"])]
+    return write_onnx(file, (3, side, side), nodes, weights | {"w": weight, "b": np.array([0.0, 0.1])}, 2)
+
+
+@pytest.mark.parametrize("factors", [[1e-25, 1e-20, 1e36, 1e9], [1e20, 1e19, 1e-30, 1e-9], [1e-44, 1e38, 1e6]])
+def test_what_float32_cannot_hold_is_not_proved(factors: list[float], tmp_path: Path) -> None:
+    """A product on the way is flushed, or infinite, and runtimes find another class than real numbers."""
+    file, x = chain(tmp_path / "net.onnx", factors, np.eye(3, 2) * [1.0, 0.0]), np.full((1, 3, 1, 1), 0.6)
+    session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
+    y = np.asarray(session.run(None, {"image": x.astype(np.float32)})[0], np.float64)[0]
+    form, row = Affine(x, np.zeros((0, *x.shape)), np.full(x.shape, 1e-6)), np.array([[1.0, -1.0]])
+    exact, (least, _) = (read_network(file, None, unit).outputs(form, row).range() for unit in (0.0, FLOAT))
+    assert exact[0][0, 0] > 0.4 and not least[0, 0] > 0.0
+    assert not y[0] > 0.5999
+
+
+def test_sums_may_begin_with_what_is_added_behind_them(tmp_path: Path) -> None:
+    """Runtimes make one operator of a product and a sum; each of many terms is then lost beside a large one."""
+    file = chain(tmp_path / "net.onnx", [], np.full((3 * 64 * 64, 2), 0.9 / 256.0 * FLOAT), 64)
+    model = onnx.load(str(file))
+    model.graph.initializer[-1].CopyFrom(numpy_helper.from_array(np.ones(2, np.float32), "b"))
+    onnx.save(model, str(file))
+    x = np.ones((1, 3, 64, 64))
+    session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
+    y = np.asarray(session.run(None, {"image": x.astype(np.float32)})[0], np.float64)
+    low, high = read_network(file, None, FLOAT).outputs(Affine(x, np.zeros((0, *x.shape)), np.zeros(x.shape))).range()
+    assert ((low <= y) & (y <= high)).all() and np.abs(y - 1.0 - 43.2 * FLOAT).max() > 30.0 * FLOAT
+
+
+def test_tensors_of_other_dimensions_are_not_added(tmp_path: Path) -> None:
+    """As many channels as symbols would pass for symbols."""
+    nodes = [
+        helper.make_node("Flatten", ["image"], ["f"]),
+        helper.make_node("Gemm", ["f", "w"], ["g"]),
+        helper.make_node("Conv", ["image", "k"], ["c"]),
+        helper.make_node("Add", ["g", "c"], ["y"]),
+    ]
+    weights = {"w": np.eye(12, 2), "k": np.ones((3, 3, 1, 1))}
+    network = read_network(write_onnx(tmp_path / "net.onnx", (3, 2, 2), nodes, weights, 12), None, 0.0)
+    with pytest.raises(ValueError, match="dimensions"):
+        network.outputs(Affine(np.zeros((1, 3, 2, 2)), np.ones((3, 1, 3, 2, 2)), np.zeros((1, 3, 2, 2))))
+
+
 # ---------------------------------------------------------------- certificates
 
 

@@ -14,6 +14,8 @@ import numpy as np
 U, TINY = 2.0**-53, 1e-290
 #: Relative error, in units, of numpy's exponential, sine and cosine; the libraries' own figure is 4 at most.
 FUNCTION = 8.0
+#: What a flushed number of float32 loses at most, and what its sums and products stay below without overflow.
+_FLUSH, _OVERFLOW = 2.0**-126, 2.0**126
 
 Array = Any
 
@@ -168,21 +170,25 @@ class Affine:
             form = (self * slope + 0.5 * (small + large)).wider(0.5 * (large - small) * (1.0 + 4.0 * U))
         return form.boxed(~(np.isfinite(form.r) & np.isfinite(form.c)), bottom, top)
 
-    def mapped(self, f: Any, absolute: Any, bias: Array, terms: int, unit: float = 0.0) -> Affine:
+    def mapped(self, f: Any, absolute: Any, bias: Array, terms: int, unit: float = 0.0, largest: float = 1.0) -> Affine:
         """The form of a linear map ``f`` plus ``bias``; ``absolute`` is the map of the absolute coefficients.
 
         A sum of ``terms`` products, in any order, errs by ``terms`` + 2 roundings of the sum of their sizes: those of
-        float64, and those of ``unit`` where that is how the map is evaluated.
+        float64, and those of ``unit`` where that is how the map is evaluated. Then ``largest`` bounds the coefficients,
+        and numbers may be flushed to zero; the form is unbounded where they may overflow.
         """
         size = absolute(self.size()) + np.abs(bias)
         charge = (terms + 4.0) * (unit + 2.0 * U) + 2.0 * U * (len(self.g) + 16.0)
         r = (absolute(self.r) + charge * size) * (1.0 + 2.0 * U * (terms + 16.0)) + TINY
+        if unit:
+            peak = (terms + 4.0) * (1.0 + largest) * (1.0 + self.size().max() + np.abs(bias).max())
+            r = r + (8.0 * _FLUSH * peak if peak < _OVERFLOW else np.inf)
         return Affine(f(self.c) + bias, f(self.g), r)
 
     def dense(self, weight: Array, bias: Array, unit: float = 0.0) -> Affine:
         """The form of ``weight`` [out, in] times the last axis, plus ``bias``; see `mapped`."""
         size = np.abs(weight).T
-        return self.mapped(lambda a: a @ weight.T, lambda a: a @ size, bias, weight.shape[1], unit)
+        return self.mapped(lambda a: a @ weight.T, lambda a: a @ size, bias, weight.shape[1], unit, size.max())
 
     def bent(self, most: int) -> Affine:
         """The form behind a ReLU, `lifted` where it may bend."""
