@@ -239,6 +239,28 @@ def test_a_capped_alpha_lets_light_through() -> None:
 
 
 @pytest.mark.parametrize("unit", [0.0, FLOAT])
+def test_an_alpha_that_may_be_skipped_may_be_nothing(unit: float) -> None:
+    """A Gaussian whose alpha reaches 1/255 for some poses of a box alone, in front of black."""
+    scene = dataclasses.replace(
+        blob_scene(1, degree=0),
+        means=np.zeros((1, 3), np.float32),
+        log_scales=np.full((1, 3), -1.0, np.float32),
+        opacity_logits=np.full(1, -1.0, np.float32),
+        background=np.zeros(3, np.float32),
+    )
+    ours, theirs = cameras(np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2.0]]), 40.0)
+    pose_set = PoseBox.around(theirs, parse_perturbation({"version": 1, "translation": {"x": 2.0}}))
+    poses, splats, reference = Poses(ours, ("x",)), splats_of(scene), Reference(scene)
+    places = np.linspace(1.13, 1.2, 21)
+    seen = [
+        float(reference.image(theirs, torch.from_numpy(pose_set.pose(np.array([x]))))[16, 16].max()) for x in places
+    ]
+    assert min(seen) == 0.0 < max(seen)
+    form, _, _ = pixel_form(splats, poses, places[None, :1], places[None, -1:], np.arange(1), (16, 16), 0, unit)
+    assert form.range()[0][0] <= 0.0 and form.range()[1][0] > 0.0
+
+
+@pytest.mark.parametrize("unit", [0.0, FLOAT])
 def test_the_background_is_drawn_exactly(unit: float) -> None:
     """A box over which nothing shows, beside one over which a Gaussian does."""
     scene = dataclasses.replace(blob_scene(1, degree=0), background=np.full(3, 0.3, np.float32))

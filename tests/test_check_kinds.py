@@ -49,6 +49,7 @@ from ns_abstract.check.results import StoredCells, read_verdicts, structure
 from ns_abstract.check.splats import (
     FLOAT,
     ActivatedScene,
+    _fragments,
     _kept,
     meeting,
     pictures,
@@ -114,6 +115,47 @@ def test_needles_may_miss_their_tiles_in_float32() -> None:
         kept, level = _kept(found, True)
         assert kept.tolist() == [[True, False, False]] and 1.0 + 2.0**-6 < level[0, 0] < 1.1
         assert _kept(found, False)[1][0, 0] < level[0, 0] and not _kept(found, False)[0][0, 2]
+
+
+@pytest.mark.parametrize("version", ["1.4.0", "1.5.3"])
+def test_a_float32_cap_is_a_float32(version: str) -> None:
+    """0.999 is rounded upwards, by more than float64 sees: behind it a hundred-thousandth less light is left."""
+    scene = dataclasses.replace(blob_scene(1, degree=0), means=np.array([[0.025, -0.025, 0.0]], np.float32))
+    scene = dataclasses.replace(scene, log_scales=-np.ones((1, 3), np.float32))
+    scene = dataclasses.replace(scene, opacity_logits=np.full(1, 12.0, np.float32))
+    cam = CheckedCamera(np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2.0]]), 40.0, 40.0, 16, 16, 32, 32)
+    view, pixel = Poses(cam, ()).view(none := np.zeros((1, 0)), none), (np.array([16]), np.array([16]))
+    splats = splats_of(scene, version)
+    with np.errstate(all="ignore"):
+        seen = projected(splats, cam, view, np.zeros((1, 1), int), FLOAT)
+        low, high = _fragments(splats, cam, seen, np.zeros((1, 1), int), pixel, FLOAT)[0].range()
+    assert low[0, 0] <= 0.999 < float(np.float32(0.999)) <= high[0, 0] < 0.9991
+
+
+def test_covariances_that_may_overflow_are_unknown() -> None:
+    """Seen from so far that it is small in the picture, a Gaussian of 1e16 has a square that float32 holds not."""
+    sizes = np.log([[1e14] * 3, [1e16, 1.0, 1.0]]).astype(np.float32)
+    scene = dataclasses.replace(blob_scene(2, degree=0), means=np.full((2, 3), [0.0, 0.0, -1e9], np.float32))
+    scene = dataclasses.replace(scene, log_scales=sizes, quats=np.eye(4, dtype=np.float32)[[0, 0]])
+    cam = CheckedCamera(np.eye(4)[:3], 1e-5, 1e-5, 8, 8, 16, 16)
+    none = np.zeros((1, 0))
+    with np.errstate(all="ignore"):
+        found = projected(splats_of(scene), cam, Poses(cam, ()).view(none, none), np.arange(2)[None], FLOAT)
+    assert found.kappa[0, 0] < 0.01 and np.isinf(found.kappa[0, 1])
+
+
+@pytest.mark.parametrize("name", ["quaternions of 1e-20", "quaternions of 1e20", "scales of 1e-39"])
+def test_scenes_that_float32_does_not_hold_are_refused(name: str) -> None:
+    """Their squares, or they themselves, are flushed or infinite there, and other Gaussians are drawn."""
+    scene = blob_scene(2, degree=0)
+    stored = [scene.means, scene.log_scales, scene.quats, scene.opacity_logits, scene.sh]
+    assert len(inputs._drawn(stored, Path("f"), {})[0]) == 2
+    size, column = float(name.rsplit(maxsplit=1)[-1]), 2 if name.startswith("q") else 1
+    values = stored[2] * size if column == 2 else np.full((2, 3), np.log(size))
+    changed = [*stored[:column], values.astype(np.float32), *stored[column + 1 :]]
+    for settings in ({}, {"drop_nan_gaussians": True}):
+        with pytest.raises(BadInput, match="not normal"):
+            inputs._drawn(changed, Path("f"), settings)
 
 
 # ---------------------------------------------------------------- networks

@@ -105,10 +105,14 @@ def _drawn(stored: list[Array], file: Path, settings: dict[str, Any]) -> list[Ar
     with np.errstate(over="ignore", invalid="ignore"):
         squares, scales = np.square(quats.astype(np.float64)).sum(axis=1), np.exp(logs.astype(np.float64))
     drawn = np.isfinite(means).all(1) & np.isfinite(quats).all(1) & ~np.isnan(logs).any(1) & (squares > 0.0)
-    whole = (scales <= np.finfo(np.float32).max * (1.0 - 1e-6)).all(1) & ~np.isnan(logits) & np.isfinite(sh).all((1, 2))
-    if (drawn & ~whole).any() and not settings.get("drop_nan_gaussians"):
-        raise BadInput("holds numbers that are not finite", file)
-    return [a[drawn & whole] for a in stored]
+    least, most = 2.0**-126 * (1.0 + 1e-6), 2.0**128 * (1.0 - 1e-6)
+    whole = (scales <= most).all(1) & ~np.isnan(logits) & np.isfinite(sh).all((1, 2))
+    # what float32 flushes to zero, or has no room for, is drawn as something else
+    normal = ((scales >= least) | (logs == -np.inf)).all(1) & (squares >= 2.0**-100) & (squares <= most)
+    kept = drawn & whole
+    if (kept & ~normal).any() or ((drawn & ~whole).any() and not settings.get("drop_nan_gaussians")):
+        raise BadInput("holds numbers that are not finite, or not normal in float32", file)
+    return [a[kept] for a in stored]
 
 
 def _read_run(file: Path, settings: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:

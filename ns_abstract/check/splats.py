@@ -173,7 +173,7 @@ def projected(
     iz = iz.wider(6.0 * unit * iz.size())
     u, v = ((e * iz).wider(4.0 * unit * e.size() * iz.size()) for e in (x, y))
     ends = ((u, cam.fx, cam.cx, cam.width), (v, cam.fy, cam.cy, cam.height))
-    centre = [(e * f + c).wider(4.0 * unit * (f * e.size() + c)) for e, f, c, _ in ends]
+    centre = [(e * f + c).wider(4.0 * unit * (f * e.size() + abs(c))) for e, f, c, _ in ends]
     slopes, roots, axes, sizes = [], [], splats.axes[at], splats.scales[at]
     turned = [
         [
@@ -235,9 +235,9 @@ def _fragments(
         ellipse_kept, level = _kept(p, rules.ellipses)
         surely = surely & ellipse_kept & (least >= LEAST_ALPHA * level)
     alow, ahigh = alpha.range()
-    # the form must say no less than the interval, and stay below the cap
+    # the form must say no less than the interval, and stay below the cap, which is rounded, too
     rough = ~((ahigh - alow) <= 1.5 * (most - least)) | ~(ahigh <= rules.cap) | ~(alow >= 0.0) | ~surely
-    bottom, top = np.where(surely, np.minimum(least, rules.cap), 0.0), np.minimum(most, rules.cap)
+    bottom, top = (np.minimum(e, rules.cap * (1.0 + s * unit)) for e, s in ((least * surely, -1.0), (most, 1.0)))
     gone = np.where(shows, 1.0, 0.0)
     alpha = alpha.boxed(rough, bottom, np.maximum(top, bottom)).of(lambda a: a * gone)
     motion = np.where(shows[None], np.abs(mx.g) + np.abs(my.g), 0.0).max(axis=2, initial=0.0)
@@ -252,10 +252,12 @@ def _rounded(det: Affine, squares: Any, h: list[Array], sizes: Array) -> tuple[l
     square, (hx, hy) = (sizes * sizes).sum(axis=-1) * (1.0 + _LIBRARY), h
     a, c = (e.size() + BLUR for e in squares)
     ends = ((hx, hx, a), (hy, hy, c), (hx, hy, 0.0))
-    ea, ec, eb = (FLOAT * (330.0 * p * q * square + 3.0 * d) for p, q, d in ends)
+    # beyond that products may overflow
+    held = (a * c < 1e30) & (square * (1.0 + hx + hy) ** 2 < 1e30)
+    ea, ec, eb = (np.where(held, FLOAT * (330.0 * p * q * square + 3.0 * d), np.inf) for p, q, d in ends)
     low = np.maximum(det.range()[0], BLUR * BLUR)
     eta = (c * ea + 2.0 * np.sqrt(a * c) * eb + a * ec) / low
-    kappa = np.where(a * c < 1e30, 1.05 * (eta + 48.0 * FLOAT * a * c / low), np.inf)
+    kappa = 1.05 * (eta + 48.0 * FLOAT * a * c / low)
     error = a * ec + c * ea + 2.0 * np.sqrt(a * c) * eb + ea * ec + eb * eb + 8.0 * FLOAT * a * c + _FLUSHED
     return [ea, ec, eb], kappa, error
 
