@@ -296,19 +296,23 @@ def test_tensors_of_other_dimensions_are_not_added(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- certificates
 
 
-def certified(folder: Path, blobs: Inputs, prop: dict[str, Any], **options: Any) -> Path:
-    """What `ns-abstract-certify` finds out about 8 x 8 pictures of the first frame, with x within 0.002."""
+def certified(
+    folder: Path, blobs: Inputs, prop: dict[str, Any], spec: dict[str, Any] | None = None, frames: int = 1, **more: Any
+) -> Path:
+    """What `ns-abstract-certify` finds out about 8 x 8 pictures of first frames, of x within 0.002 or ``spec``."""
     path = json.loads(blobs.path.read_text())
-    small = {"render_width": 8, "render_height": 8, "camera_path": path["camera_path"][:1]}
+    small = {"render_width": 8, "render_height": 8, "camera_path": path["camera_path"][:frames]}
     write_json(folder / "path.json", path | small)
     write_json(folder / "prop.json", prop)
-    options |= {
+    write_json(folder / "spec.json", spec or {"version": 1, "translation": {"x": 0.002}})
+    more |= {
         "load-config": blobs.config, "camera-path-filename": folder / "path.json", "property": folder / "prop.json",
         "output-dir": folder / "out", "time-budget": 300,
     }  # fmt: skip
-    arguments = [str(v) for k, o in options.items() for v in (f"--{k}", o)]
+    more |= {"translation": [0.002, 0, 0]} if spec is None else {"perturbation-filename": folder / "spec.json"}
+    arguments = [str(v) for k, o in more.items() for v in (f"--{k}", *(o if isinstance(o, list) else [o]))]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["certify", *arguments, "--translation", "0.002", "0", "0"])
+        patch.setattr(sys, "argv", ["certify", *arguments])
         with pytest.raises(SystemExit) as ended:
             certify_command.main()
     assert ended.value.code in (0, None)
@@ -382,6 +386,29 @@ def test_units_of_a_data_set_are_the_packages(tmp_path: Path) -> None:
         matrix = np.hstack([size * np.linalg.qr(rng.normal(size=(3, 3)))[0], rng.normal(size=(3, 1))])
         write_json(tmp_path / "dataparser_transforms.json", {"transform": matrix.tolist(), "scale": 0.07})
         assert inputs.dataset_scale(tmp_path / "config.yml") == DataparserTransform(matrix, 0.07).stated_scale
+
+
+@pytest.mark.slow
+def test_frames_may_vary_less_than_others(blobs: Inputs, tmp_path: Path) -> None:
+    """No segment begins at the last entry of an open path; cells have all parameters that vary in any frame."""
+    spec = {"version": 1, "translation": {"x": 0.002}, "sweep": "segments"}
+    prop = {"type": "picture", "statistic": "mean", "max": 1.0}
+    folder = certified(tmp_path, blobs, prop, spec, 2)
+    found = check(folder, claims=4, seconds=120)
+    assert (found.proved, found.refuted, found.structure, found.exit_code) == (4, 0, [], 0)
+    # what is fixed has to be where the set has it, and the table's parameters are the report's
+    file, document = folder / "report.json", json.loads((folder / "report.json").read_text())
+    assert [p["upper"] for p in document["frames"][1]["parameters"]] == [0.002, 0.0]
+    rewrite(folder, "UPDATE cells SET upper = '[0.002, 0.5]', lower = '[-0.002, 0.5]' WHERE frame = 1")
+    assert "overlap, or leave the set" in check(folder, claims=1, seconds=60).structure[0]
+    document = json.loads(file.read_text())
+    document["frames"][1]["parameters"][1] |= {"lower": 0.5, "upper": 0.5}
+    file.write_text(json.dumps(document))
+    with pytest.raises(nsa.InputError, match="another set of poses"):
+        check(folder, claims=1)
+    rewrite(folder, "UPDATE parameters SET name = 'y' WHERE position = 0")
+    with pytest.raises(nsa.InputError, match="cannot be read as the cells"):
+        check(folder, claims=1)
 
 
 @pytest.mark.slow

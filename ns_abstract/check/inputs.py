@@ -238,10 +238,14 @@ def dataset_scale(config: Path) -> float:
     return float(stated["scale"]) * (size if abs(size - 1.0) > 1e-3 else 1.0)
 
 
-def read_poses(path: Path, given: dict[str, Any] | None, frame: int, settings: dict[str, Any], scale: float) -> Any:
-    """The poses of a frame of the camera path, and its box of parameters as [(name, lower, upper)]."""
-    # the perturbation object ``given``, of another file or of options, wins over the path's; ``settings`` are the
-    # options that the result was made with, ``scale`` is that of `dataset_scale`
+def read_poses(
+    path: Path, given: dict[str, Any] | None, frame: int, settings: dict[str, Any], scale: float, names: Any = ()
+) -> tuple[Poses, list[tuple[str, float, float]]]:
+    """The poses of a frame of the camera path, and its parameters' (name, lower, upper): ``names``, then what varies.
+
+    The perturbation object ``given``, of another file or of options, wins over the path's. ``settings`` are the options
+    that the result was made with, ``scale`` is that of `dataset_scale`.
+    """
     root = read_json(path, "camera path", "say with --camera-path-filename where it lies now")
     with reading(path, f"frame {frame} or its set of poses cannot be read"):
         entries, entry = root["camera_path"], root["camera_path"][frame]
@@ -263,10 +267,12 @@ def read_poses(path: Path, given: dict[str, Any] | None, frame: int, settings: d
         following = _pose(entries[(frame + 1) % len(entries)]) if swept else None
     if varied := [name for name in ("scene", "hue", "saturation") if spec.get(name) is not None]:
         raise BadInput(f"the set varies {varied[0]}, which is not checked", path, f"perturbation.{varied[0]}")
-    free = [(name, low, high) for name, (low, high) in ranges.items() if low < high]
+    # cells hold what varies in any frame
+    names = dict.fromkeys([*names, *(name for name, (low, high) in ranges.items() if low < high)])
+    free = [(name, *ranges.get(name, (0.0, 0.0))) for name in names]
     point = {n: a for n, (a, b) in ranges.items() if a == b and (a != 0.0 or n in ("segment", "azimuth"))}
     world = spec.get("frame", "camera") == "world"
-    return Poses(camera, tuple(name for name, _, _ in free), point, world, about, following), free
+    return Poses(camera, tuple(names), point, world, about, following), free
 
 
 def given_set(settings: dict[str, Any], moved: Path | None) -> dict[str, Any] | None:
