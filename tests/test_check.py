@@ -69,7 +69,7 @@ def test_it_shares_no_code_and_stays_small() -> None:
             names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
             for name in names:
                 assert not name.startswith("ns_abstract") or name.startswith("ns_abstract.check."), (file, name)
-    assert 0 < lines[False] <= 1555 and 0 < lines[True] <= 425
+    assert 0 < lines[False] <= 1502 and 0 < lines[True] <= 478
 
 
 # ---------------------------------------------------------------- enclosures
@@ -77,8 +77,9 @@ def test_it_shares_no_code_and_stays_small() -> None:
 OPERATIONS: dict[str, tuple[Callable[[Affine], Affine], Callable[[Any], Any]]] = {
     "square": (lambda f: f.square(), lambda x: x * x),
     "product": (lambda f: f * (f + 1.5), lambda x: x * (x + mpmath.mpf(1.5))),
-    "reciprocal": (lambda f: f.reciprocal(), lambda x: 1 / x),
-    "root": (lambda f: f.root(), mpmath.sqrt),
+    "reciprocal": (lambda f: f.power(-1.0), lambda x: 1 / x),
+    "reciprocal root": (lambda f: f.power(-0.5), lambda x: 1 / mpmath.sqrt(x)),
+    "root": (lambda f: f.power(0.5), mpmath.sqrt),
     "exponential": (lambda f: f.exp(), mpmath.exp),
     "sine": (lambda f: f.sine()[0], mpmath.sin),
     "cosine": (lambda f: f.sine()[1], mpmath.cos),
@@ -109,7 +110,7 @@ def test_forms_contain_exact_values(name: str) -> None:
 
 def test_what_is_not_defined_is_not_bounded() -> None:
     form = Affine(np.array([0.1, -1.0]), np.array([[0.2, 0.1]]), np.array([0.0, 0.0]))
-    assert np.isinf(form.reciprocal().r).all() and np.isinf(form.root().r).all()
+    assert all(np.isinf(form.power(k).r).all() for k in (-1.0, -0.5, 0.5))
 
 
 SPEC = {

@@ -41,7 +41,7 @@ from ns_abstract.check import inputs
 from ns_abstract.check.audit import _together
 from ns_abstract.check.fields import CheckedField
 from ns_abstract.check.forms import Affine, parameters
-from ns_abstract.check.inputs import BadInput, read_poses, read_scene
+from ns_abstract.check.inputs import BadInput, followed, read_poses, read_scene
 from ns_abstract.check.loops import LoopRuns, _lifted
 from ns_abstract.check.networks import read_network
 from ns_abstract.check.poses import CheckedCamera, Poses
@@ -57,7 +57,7 @@ from ns_abstract.check.splats import (
     projected,
     reaches,
 )
-from ns_abstract.check.statements import followed, parsed
+from ns_abstract.check.statements import parsed
 from ns_abstract.cli import certify as certify_command
 from ns_abstract.cli import check as check_command
 from ns_abstract.demo.writing import write_loop_demo
@@ -829,6 +829,8 @@ def test_cells_of_a_loop_are_of_all_its_initial_states(tmp_path: Path) -> None:
     with sqlite3.connect(tmp_path / "cells.sqlite") as base:
         columns = "lower, upper, verdict, margin, seconds, counterexample"
         base.execute(f"CREATE TABLE cells(frame, {columns})")
+        base.execute("CREATE TABLE parameters(position, name, unit)")
+        base.execute("INSERT INTO parameters VALUES (0, 'x', '')")
         base.execute("CREATE TABLE search_state(key, value)")
         base.execute("INSERT INTO cells VALUES (0, '[0.0]', '[1.0]', 'certified', 1.0, 1.0, NULL)")
     loop = {"state": ["x", "y"], "initial": {"y": 0.5, "x": [0, 1]}}
@@ -987,6 +989,34 @@ def test_bands_that_are_not_drawn_are_refused(tmp_path: Path) -> None:
     report = {"settings": {}, "scene": {}, "renderer": {"name": "gsplat"}, "fingerprint": {}}
     with pytest.raises(BadInput, match="degree 4"):
         read_scene(file, report)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"version": 2}, {"frame": "World"}, {"sweep": "segment"}, {"translation": {"X": 1.0}}, {"hue": 0.1},
+        {"scene": [{"select": {}, "mean": 0.1}]}, {"translation": {"x": -1.0}}, {"translation": {"x": [0.2, -0.2]}},
+        {"rotation": {"yaw": -1.0}}, {"orbit": {"target": [0, 0, 0], "axis": [0, 0, 1], "azimuth": -1.0}},
+    ],
+)  # fmt: skip
+def test_sets_of_poses_say_nothing_that_is_passed_over(given: dict[str, Any], blobs: Inputs) -> None:
+    """What is misspelt, or varies something else, would be a set without it."""
+    good = {"version": 1, "$schema": "perturbation.schema.json", "translation": {"x": [-0.2, 0.2]}}
+    assert [name for name, _, _ in read_poses(blobs.path, good, 0, {}, 1.0)[1]] == ["x"]
+    with pytest.raises(BadInput, match="which is not checked"):
+        read_poses(blobs.path, {"version": 1} | given, 0, {}, 1.0)
+
+
+@pytest.mark.parametrize("change", [{"camera_type": "fisheye"}, {"crop": {"crop_scale": [1, 1, 1]}}, {"fov": 200.0}])
+@pytest.mark.parametrize("inside", [False, True])
+def test_pictures_of_other_cameras_are_refused(
+    change: dict[str, Any], inside: bool, blobs: Inputs, tmp_path: Path
+) -> None:
+    path = json.loads(blobs.path.read_text())
+    assert read_poses(blobs.path, {}, 0, {}, 1.0)[1] == []
+    (path["camera_path"][0] if inside or "fov" in change else path).update(change)
+    with pytest.raises(BadInput, match=r"not perspective|cannot be read"):
+        read_poses(write_json(tmp_path / "path.json", path), {}, 0, {}, 1.0)
 
 
 @pytest.mark.parametrize("cycle", [True, False])

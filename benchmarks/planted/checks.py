@@ -89,6 +89,14 @@ CHECKS = (
         f"{_KINDS}::test_frames_may_vary_less_than_others",
     ),
     Fault(
+        "checker: unknown keys of a set of poses are passed over",
+        "check/inputs.py",
+        "read_poses",
+        'followed({k: v for k, v in spec.items() if k != "$schema"}, "perturbation", file=path)',
+        "pass",
+        f"{_KINDS}::test_sets_of_poses_say_nothing_that_is_passed_over[given0]",
+    ),
+    Fault(
         "checker: local functions are the operators that they are called after",
         _NETWORKS,
         "read_network",
@@ -204,7 +212,7 @@ CHECKS = (
     ),
     Fault(
         "checker: unknown keys of a statement are passed over",
-        _STATEMENTS,
+        "check/inputs.py",
         "followed",
         "wrong = sorted(value.keys() - set(_KEYS[key].split() if key in _KEYS else states))",
         "wrong = []",
@@ -212,7 +220,7 @@ CHECKS = (
     ),
     Fault(
         "checker: unknown words are taken for the usual ones",
-        _STATEMENTS,
+        "check/inputs.py",
         "followed",
         'value in _WORDS.get(key, "").split()',
         "value in _WORDS.get(key, value)",
@@ -220,7 +228,7 @@ CHECKS = (
     ),
     Fault(
         "checker: labels are counted from the last one",
-        _STATEMENTS,
+        "check/inputs.py",
         "followed",
         "value >= least",
         "value >= -math.inf",
@@ -228,7 +236,7 @@ CHECKS = (
     ),
     Fault(
         "checker: ranges of a loop may be reversed",
-        _STATEMENTS,
+        "check/inputs.py",
         "followed",
         "ranges and ends != sorted(ends)",
         "False",
@@ -252,7 +260,7 @@ CHECKS = (
     ),
     Fault(
         "checker: a goal may be a half-space",
-        _STATEMENTS,
+        "check/inputs.py",
         "",
         '"box when"',
         '"box when half_space"',

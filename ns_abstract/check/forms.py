@@ -111,19 +111,14 @@ class Affine:
         f = f + 0.5 * (high + low)
         return Affine(np.where(bad, 0.0, f), np.where(bad, 0.0, slope * self.g), np.where(bad, np.inf, r))
 
-    def reciprocal(self) -> Affine:
-        """1 / x; unbounded where the form is not surely above 0."""
-        low, high = self.range()
-        bad = ~(low > 0.0)
-        low, high, c = (np.where(bad, 1.0, v) for v in (low, high, self.c))
-        return self.composed(1.0 / c, -1.0 / (c * c), high**-3.0, low**-3.0 * (1.0 + 16.0 * U), bad)
-
-    def root(self) -> Affine:
-        """The square root; unbounded where the form is not surely above 0."""
-        low = self.range()[0]
-        bad = ~(low > 0.0)
-        low, f = np.where(bad, 1.0, low), np.sqrt(np.where(bad, 1.0, self.c))
-        return self.composed(f, 0.5 / f, -0.125 * low**-1.5 * (1.0 + 32.0 * U), 0.0 * f, bad)
+    def power(self, k: float) -> Affine:
+        """The power -1, -1/2 or 1/2; unbounded where the form is not surely above 0."""
+        ends = np.stack(self.range())
+        bad = ~(ends[0] > 0.0)
+        ends, c = np.where(bad, 1.0, ends), np.where(bad, 1.0, self.c)
+        # the second derivative has one sign, and falls with the argument
+        bends = 0.5 * k * (k - 1.0) * ends ** (k - 2.0) * (1.0 + 32.0 * U)
+        return self.composed(c**k, k * c ** (k - 1.0), bends.min(axis=0), bends.max(axis=0), bad)
 
     def exp(self) -> Affine:
         """The exponential."""

@@ -26,18 +26,11 @@ _PLAIN = {"auto_pad": b"NOTSET", "alpha": 1.0, "beta": 1.0, "transA": 0, "ceil_m
 _Step = Callable[..., Affine]
 
 
-class CheckedLayer(NamedTuple):
-    """A node: the names of its inputs and output, and what it makes of its inputs' forms."""
-
-    inputs: list[str]
-    output: str
-    apply: _Step
-
-
 class CheckedNetwork(NamedTuple):
     """A network of layers, each behind those that it needs."""
 
-    layers: list[CheckedLayer]
+    #: Names of its inputs and its output, and what it makes of its inputs' forms.
+    layers: list[tuple[list[str], str, _Step]]
     #: The names of its input and of the output that counts.
     source: str
     output: str
@@ -52,10 +45,10 @@ class CheckedNetwork(NamedTuple):
 
     def _outputs(self, picture: Affine, rows: Array | None) -> Affine:
         known = {self.source: _lifted(picture)}
-        for layer in self.layers:
+        for inputs, output, step in self.layers:
             # a symbol is new to all that is known
             count = max(len(form.g) for form in known.values())
-            known[layer.output] = layer.apply(*(known[name].padded(count) for name in layer.inputs))
+            known[output] = step(*(known[name].padded(count) for name in inputs))
         form = known[self.output].reshaped(1, known[self.output].c.size)
         form = form if rows is None else form.dense(rows, np.zeros(len(rows)))
         return form.folded(len(picture.g))
@@ -96,18 +89,14 @@ def read_network(file: Path, output: str | None, unit: float) -> CheckedNetwork:
         if wrong or not own or not made.issuperset(inputs) or not inputs or list(node.input[: len(inputs)]) != inputs:
             raise ValueError(f"has {node.op_type} with {wrong or 'inputs or a domain'} that this program does not read")
         step = _layer(node.op_type, options, constants, len(inputs), unit, sums)
-        layers.append(CheckedLayer(inputs, node.output[0], step))
+        layers.append((inputs, node.output[0], step))
         made.add(node.output[0])
     return CheckedNetwork(layers, source, output or names[0], unit)
 
 
-def _layer(
-    kind: str, options: dict[str, Any], constants: list[Array], inputs: int, unit: float, sums: list[tuple[int, float]]
-) -> _Step:
-    """What an operator makes of the forms of its ``inputs``, behind which ``constants`` stand.
-
-    ``sums``: numbers of terms and largest coefficients of the network's sums, to which this one's are added.
-    """
+def _layer(kind: str, options: dict[str, Any], constants: list[Array], inputs: int, unit: float, sums: Any) -> _Step:
+    """What an operator makes of the forms of its ``inputs``, behind which ``constants`` stand."""
+    # ``sums`` are the numbers of terms and the largest coefficients of the network's sums; this one's are added
 
     def added(*parts: Affine) -> Affine:
         if len({part.c.ndim for part in parts}) > 1:
