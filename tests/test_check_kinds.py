@@ -41,7 +41,7 @@ from ns_abstract.check import inputs
 from ns_abstract.check.audit import _together
 from ns_abstract.check.fields import CheckedField
 from ns_abstract.check.forms import Affine, parameters
-from ns_abstract.check.inputs import BadInput, read_poses, read_scene
+from ns_abstract.check.inputs import BadInput, followed, read_poses, read_scene
 from ns_abstract.check.loops import LoopRuns, _lifted
 from ns_abstract.check.networks import read_network
 from ns_abstract.check.poses import CheckedCamera, Poses
@@ -49,6 +49,7 @@ from ns_abstract.check.results import StoredCells, read_verdicts, structure
 from ns_abstract.check.splats import (
     FLOAT,
     ActivatedScene,
+    _fragments,
     _kept,
     meeting,
     pictures,
@@ -56,7 +57,7 @@ from ns_abstract.check.splats import (
     projected,
     reaches,
 )
-from ns_abstract.check.statements import followed, parsed
+from ns_abstract.check.statements import parsed
 from ns_abstract.cli import certify as certify_command
 from ns_abstract.cli import check as check_command
 from ns_abstract.demo.writing import write_loop_demo
@@ -114,6 +115,47 @@ def test_needles_may_miss_their_tiles_in_float32() -> None:
         kept, level = _kept(found, True)
         assert kept.tolist() == [[True, False, False]] and 1.0 + 2.0**-6 < level[0, 0] < 1.1
         assert _kept(found, False)[1][0, 0] < level[0, 0] and not _kept(found, False)[0][0, 2]
+
+
+@pytest.mark.parametrize("version", ["1.4.0", "1.5.3"])
+def test_a_float32_cap_is_a_float32(version: str) -> None:
+    """0.999 is rounded upwards, by more than float64 sees: behind it a hundred-thousandth less light is left."""
+    scene = dataclasses.replace(blob_scene(1, degree=0), means=np.array([[0.025, -0.025, 0.0]], np.float32))
+    scene = dataclasses.replace(scene, log_scales=-np.ones((1, 3), np.float32))
+    scene = dataclasses.replace(scene, opacity_logits=np.full(1, 12.0, np.float32))
+    cam = CheckedCamera(np.array([[1.0, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2.0]]), 40.0, 40.0, 16, 16, 32, 32)
+    view, pixel = Poses(cam, ()).view(none := np.zeros((1, 0)), none), (np.array([16]), np.array([16]))
+    splats = splats_of(scene, version)
+    with np.errstate(all="ignore"):
+        seen = projected(splats, cam, view, np.zeros((1, 1), int), FLOAT)
+        low, high = _fragments(splats, cam, seen, np.zeros((1, 1), int), pixel, FLOAT)[0].range()
+    assert low[0, 0] <= 0.999 < float(np.float32(0.999)) <= high[0, 0] < 0.9991
+
+
+def test_covariances_that_may_overflow_are_unknown() -> None:
+    """Seen from so far that it is small in the picture, a Gaussian of 1e16 has a square that float32 holds not."""
+    sizes = np.log([[1e14] * 3, [1e16, 1.0, 1.0]]).astype(np.float32)
+    scene = dataclasses.replace(blob_scene(2, degree=0), means=np.full((2, 3), [0.0, 0.0, -1e9], np.float32))
+    scene = dataclasses.replace(scene, log_scales=sizes, quats=np.eye(4, dtype=np.float32)[[0, 0]])
+    cam = CheckedCamera(np.eye(4)[:3], 1e-5, 1e-5, 8, 8, 16, 16)
+    none = np.zeros((1, 0))
+    with np.errstate(all="ignore"):
+        found = projected(splats_of(scene), cam, Poses(cam, ()).view(none, none), np.arange(2)[None], FLOAT)
+    assert found.kappa[0, 0] < 0.01 and np.isinf(found.kappa[0, 1])
+
+
+@pytest.mark.parametrize("name", ["quaternions of 1e-20", "quaternions of 1e20", "scales of 1e-39"])
+def test_scenes_that_float32_does_not_hold_are_refused(name: str) -> None:
+    """Their squares, or they themselves, are flushed or infinite there, and other Gaussians are drawn."""
+    scene = blob_scene(2, degree=0)
+    stored = [scene.means, scene.log_scales, scene.quats, scene.opacity_logits, scene.sh]
+    assert len(inputs._drawn(stored, Path("f"), {})[0]) == 2
+    size, column = float(name.rsplit(maxsplit=1)[-1]), 2 if name.startswith("q") else 1
+    values = stored[2] * size if column == 2 else np.full((2, 3), np.log(size))
+    changed = [*stored[:column], values.astype(np.float32), *stored[column + 1 :]]
+    for settings in ({}, {"drop_nan_gaussians": True}):
+        with pytest.raises(BadInput, match="not normal"):
+            inputs._drawn(changed, Path("f"), settings)
 
 
 # ---------------------------------------------------------------- networks
@@ -203,22 +245,74 @@ def test_a_float32_network_leaves_the_exact_one(tmp_path: Path) -> None:
         assert bool(((low <= y) & (y <= high)).all()) == holds
 
 
+def chain(file: Path, factors: list[float], weight: np.ndarray, side: int = 1) -> Path:
+    """Products with ``factors``, one behind the other, then with ``weight``, and a sum with (0, 0.1)."""
+    weights = {f"w{k}": v * np.eye(3 * side * side) for k, v in enumerate(factors)}
+    nodes = [helper.make_node("Flatten", ["image"], ["f0"])]
+    nodes += [helper.make_node("MatMul", [f"f{k}", f"w{k}"], [f"f{k + 1}"]) for k in range(len(factors))]
+    nodes += [helper.make_node("MatMul", [f"f{len(factors)}", "w"], ["m"]), helper.make_node("Add", ["m", "b"], ["y"])]
+    return write_onnx(file, (3, side, side), nodes, weights | {"w": weight, "b": np.array([0.0, 0.1])}, 2)
+
+
+@pytest.mark.parametrize("factors", [[1e-25, 1e-20, 1e36, 1e9], [1e20, 1e19, 1e-30, 1e-9], [1e-44, 1e38, 1e6]])
+def test_what_float32_cannot_hold_is_not_proved(factors: list[float], tmp_path: Path) -> None:
+    """A product on the way is flushed, or infinite, and runtimes find another class than real numbers."""
+    file, x = chain(tmp_path / "net.onnx", factors, np.eye(3, 2) * [1.0, 0.0]), np.full((1, 3, 1, 1), 0.6)
+    session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
+    y = np.asarray(session.run(None, {"image": x.astype(np.float32)})[0], np.float64)[0]
+    form, row = Affine(x, np.zeros((0, *x.shape)), np.full(x.shape, 1e-6)), np.array([[1.0, -1.0]])
+    exact, (least, _) = (read_network(file, None, unit).outputs(form, row).range() for unit in (0.0, FLOAT))
+    assert exact[0][0, 0] > 0.4 and not least[0, 0] > 0.0
+    assert not y[0] > 0.5999
+
+
+def test_sums_may_begin_with_what_is_added_behind_them(tmp_path: Path) -> None:
+    """Runtimes make one operator of a product and a sum; each of many terms is then lost beside a large one."""
+    file = chain(tmp_path / "net.onnx", [], np.full((3 * 64 * 64, 2), 0.9 / 256.0 * FLOAT), 64)
+    model = onnx.load(str(file))
+    model.graph.initializer[-1].CopyFrom(numpy_helper.from_array(np.ones(2, np.float32), "b"))
+    onnx.save(model, str(file))
+    x = np.ones((1, 3, 64, 64))
+    session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
+    y = np.asarray(session.run(None, {"image": x.astype(np.float32)})[0], np.float64)
+    low, high = read_network(file, None, FLOAT).outputs(Affine(x, np.zeros((0, *x.shape)), np.zeros(x.shape))).range()
+    assert ((low <= y) & (y <= high)).all() and np.abs(y - 1.0 - 43.2 * FLOAT).max() > 30.0 * FLOAT
+
+
+def test_tensors_of_other_dimensions_are_not_added(tmp_path: Path) -> None:
+    """As many channels as symbols would pass for symbols."""
+    nodes = [
+        helper.make_node("Flatten", ["image"], ["f"]),
+        helper.make_node("Gemm", ["f", "w"], ["g"]),
+        helper.make_node("Conv", ["image", "k"], ["c"]),
+        helper.make_node("Add", ["g", "c"], ["y"]),
+    ]
+    weights = {"w": np.eye(12, 2), "k": np.ones((3, 3, 1, 1))}
+    network = read_network(write_onnx(tmp_path / "net.onnx", (3, 2, 2), nodes, weights, 12), None, 0.0)
+    with pytest.raises(ValueError, match="dimensions"):
+        network.outputs(Affine(np.zeros((1, 3, 2, 2)), np.ones((3, 1, 3, 2, 2)), np.zeros((1, 3, 2, 2))))
+
+
 # ---------------------------------------------------------------- certificates
 
 
-def certified(folder: Path, blobs: Inputs, prop: dict[str, Any], **options: Any) -> Path:
-    """What `ns-abstract-certify` finds out about 8 x 8 pictures of the first frame, with x within 0.002."""
+def certified(
+    folder: Path, blobs: Inputs, prop: dict[str, Any], spec: dict[str, Any] | None = None, frames: int = 1, **more: Any
+) -> Path:
+    """What `ns-abstract-certify` finds out about 8 x 8 pictures of first frames, of x within 0.002 or ``spec``."""
     path = json.loads(blobs.path.read_text())
-    small = {"render_width": 8, "render_height": 8, "camera_path": path["camera_path"][:1]}
+    small = {"render_width": 8, "render_height": 8, "camera_path": path["camera_path"][:frames]}
     write_json(folder / "path.json", path | small)
     write_json(folder / "prop.json", prop)
-    options |= {
+    write_json(folder / "spec.json", spec or {"version": 1, "translation": {"x": 0.002}})
+    more |= {
         "load-config": blobs.config, "camera-path-filename": folder / "path.json", "property": folder / "prop.json",
         "output-dir": folder / "out", "time-budget": 300,
     }  # fmt: skip
-    arguments = [str(v) for k, o in options.items() for v in (f"--{k}", o)]
+    more |= {"translation": [0.002, 0, 0]} if spec is None else {"perturbation-filename": folder / "spec.json"}
+    arguments = [str(v) for k, o in more.items() for v in (f"--{k}", *(o if isinstance(o, list) else [o]))]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sys, "argv", ["certify", *arguments, "--translation", "0.002", "0", "0"])
+        patch.setattr(sys, "argv", ["certify", *arguments])
         with pytest.raises(SystemExit) as ended:
             certify_command.main()
     assert ended.value.code in (0, None)
@@ -292,6 +386,29 @@ def test_units_of_a_data_set_are_the_packages(tmp_path: Path) -> None:
         matrix = np.hstack([size * np.linalg.qr(rng.normal(size=(3, 3)))[0], rng.normal(size=(3, 1))])
         write_json(tmp_path / "dataparser_transforms.json", {"transform": matrix.tolist(), "scale": 0.07})
         assert inputs.dataset_scale(tmp_path / "config.yml") == DataparserTransform(matrix, 0.07).stated_scale
+
+
+@pytest.mark.slow
+def test_frames_may_vary_less_than_others(blobs: Inputs, tmp_path: Path) -> None:
+    """No segment begins at the last entry of an open path; cells have all parameters that vary in any frame."""
+    spec = {"version": 1, "translation": {"x": 0.002}, "sweep": "segments"}
+    prop = {"type": "picture", "statistic": "mean", "max": 1.0}
+    folder = certified(tmp_path, blobs, prop, spec, 2)
+    found = check(folder, claims=4, seconds=120)
+    assert (found.proved, found.refuted, found.structure, found.exit_code) == (4, 0, [], 0)
+    # what is fixed has to be where the set has it, and the table's parameters are the report's
+    file, document = folder / "report.json", json.loads((folder / "report.json").read_text())
+    assert [p["upper"] for p in document["frames"][1]["parameters"]] == [0.002, 0.0]
+    rewrite(folder, "UPDATE cells SET upper = '[0.002, 0.5]', lower = '[-0.002, 0.5]' WHERE frame = 1")
+    assert "overlap, or leave the set" in check(folder, claims=1, seconds=60).structure[0]
+    document = json.loads(file.read_text())
+    document["frames"][1]["parameters"][1] |= {"lower": 0.5, "upper": 0.5}
+    file.write_text(json.dumps(document))
+    with pytest.raises(nsa.InputError, match="another set of poses"):
+        check(folder, claims=1)
+    rewrite(folder, "UPDATE parameters SET name = 'y' WHERE position = 0")
+    with pytest.raises(nsa.InputError, match="cannot be read as the cells"):
+        check(folder, claims=1)
 
 
 @pytest.mark.slow
@@ -712,6 +829,8 @@ def test_cells_of_a_loop_are_of_all_its_initial_states(tmp_path: Path) -> None:
     with sqlite3.connect(tmp_path / "cells.sqlite") as base:
         columns = "lower, upper, verdict, margin, seconds, counterexample"
         base.execute(f"CREATE TABLE cells(frame, {columns})")
+        base.execute("CREATE TABLE parameters(position, name, unit)")
+        base.execute("INSERT INTO parameters VALUES (0, 'x', '')")
         base.execute("CREATE TABLE search_state(key, value)")
         base.execute("INSERT INTO cells VALUES (0, '[0.0]', '[1.0]', 'certified', 1.0, 1.0, NULL)")
     loop = {"state": ["x", "y"], "initial": {"y": 0.5, "x": [0, 1]}}
@@ -870,6 +989,34 @@ def test_bands_that_are_not_drawn_are_refused(tmp_path: Path) -> None:
     report = {"settings": {}, "scene": {}, "renderer": {"name": "gsplat"}, "fingerprint": {}}
     with pytest.raises(BadInput, match="degree 4"):
         read_scene(file, report)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        {"version": 2}, {"frame": "World"}, {"sweep": "segment"}, {"translation": {"X": 1.0}}, {"hue": 0.1},
+        {"scene": [{"select": {}, "mean": 0.1}]}, {"translation": {"x": -1.0}}, {"translation": {"x": [0.2, -0.2]}},
+        {"rotation": {"yaw": -1.0}}, {"orbit": {"target": [0, 0, 0], "axis": [0, 0, 1], "azimuth": -1.0}},
+    ],
+)  # fmt: skip
+def test_sets_of_poses_say_nothing_that_is_passed_over(given: dict[str, Any], blobs: Inputs) -> None:
+    """What is misspelt, or varies something else, would be a set without it."""
+    good = {"version": 1, "$schema": "perturbation.schema.json", "translation": {"x": [-0.2, 0.2]}}
+    assert [name for name, _, _ in read_poses(blobs.path, good, 0, {}, 1.0)[1]] == ["x"]
+    with pytest.raises(BadInput, match="which is not checked"):
+        read_poses(blobs.path, {"version": 1} | given, 0, {}, 1.0)
+
+
+@pytest.mark.parametrize("change", [{"camera_type": "fisheye"}, {"crop": {"crop_scale": [1, 1, 1]}}, {"fov": 200.0}])
+@pytest.mark.parametrize("inside", [False, True])
+def test_pictures_of_other_cameras_are_refused(
+    change: dict[str, Any], inside: bool, blobs: Inputs, tmp_path: Path
+) -> None:
+    path = json.loads(blobs.path.read_text())
+    assert read_poses(blobs.path, {}, 0, {}, 1.0)[1] == []
+    (path["camera_path"][0] if inside or "fov" in change else path).update(change)
+    with pytest.raises(BadInput, match=r"not perspective|cannot be read"):
+        read_poses(write_json(tmp_path / "path.json", path), {}, 0, {}, 1.0)
 
 
 @pytest.mark.parametrize("cycle", [True, False])

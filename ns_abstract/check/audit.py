@@ -110,7 +110,7 @@ def _opened(folder: Path, report: dict[str, Any], moved: dict[str, Path | None])
         return parts, [s for s in subjects if s.count], set()
     path, perturbation = file("camera_path_filename"), given_set(settings, moved.get("perturbation_filename"))
     for cells in parts:
-        poses, free = read_poses(path, perturbation, cells.index, settings, scale)
+        poses, free = read_poses(path, perturbation, cells.index, settings, scale, cells.names)
         size = (poses.camera.height, poses.camera.width)
         ranges = list(zip(cells.names, cells.lower.tolist(), cells.upper.tolist(), strict=True))
         if ranges != free or (not certificate and cells.arrays["lower"].shape[:2] != size):

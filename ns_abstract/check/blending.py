@@ -70,12 +70,11 @@ def blended(
     light = np.minimum(light, np.take_along_axis(most, begin, 1)[:, 0])[:, None] * (begin < end) * room
     darkest = np.minimum(np.where(at, cl, np.inf).min(axis=1, initial=np.inf), background)
     brightest = np.maximum(np.where(at, ch, -np.inf).max(axis=1, initial=-np.inf), background)
-    with np.errstate(invalid="ignore"):
-        lower = lower - np.where(light > 0.0, light * (brightest - background), 0.0)
-        upper = upper + np.where(light > 0.0, light * (background - darkest), 0.0)
-        # where nothing shows the background is drawn, exactly
-        rest = 0.5 * (upper - lower) * (1.0 + ROOM) + 8.0 * U * (np.abs(form.c) + 1.0) * inside.any(axis=1)[:, None]
-        middle = 0.5 * (lower + upper)
+    lower = lower - np.where(light > 0.0, light * (brightest - background), 0.0)
+    upper = upper + np.where(light > 0.0, light * (background - darkest), 0.0)
+    # where nothing shows the background is drawn, exactly
+    rest = 0.5 * (upper - lower) * (1.0 + ROOM) + 8.0 * U * (np.abs(form.c) + 1.0) * inside.any(axis=1)[:, None]
+    middle = 0.5 * (lower + upper)
     bad = ~np.isfinite(rest)
     form = Affine(form.c + np.where(bad, 0.0, middle), form.g, form.r + np.where(bad, np.inf, rest))
     np.put_along_axis(keep, order, (place[:, :-1] < end + 1) & shows, 1)
@@ -125,8 +124,7 @@ def _reordering_bounds(depths: Any, inside: Array, most: Array, ah: Array, cl: A
         pair = inside[:, :-k] & inside[:, k:] & ~(dhigh[:, :-k] < dlow[:, k:])
         rows = np.flatnonzero(pair.any(axis=1))
         weight = np.where(pair, np.maximum(light[:, :-k], light[:, k:]) * ah[:, :-k] * ah[:, k:], 0.0)[rows, :, None]
-        with np.errstate(invalid="ignore"):
-            down = np.where(weight > 0.0, weight * np.minimum(cl[rows, k:] - ch[rows, :-k], 0.0), 0.0)
-            up = np.where(weight > 0.0, weight * np.maximum(ch[rows, k:] - cl[rows, :-k], 0.0), 0.0)
+        down = np.where(weight > 0.0, weight * np.minimum(cl[rows, k:] - ch[rows, :-k], 0.0), 0.0)
+        up = np.where(weight > 0.0, weight * np.maximum(ch[rows, k:] - cl[rows, :-k], 0.0), 0.0)
         lower[rows], upper[rows] = lower[rows] + down.sum(axis=1), upper[rows] + up.sum(axis=1)
     return lower * (1.0 + ROOM), upper * (1.0 + ROOM)

@@ -48,8 +48,6 @@ class Claims(ABC):
     together = 8
     #: Number of claims that are drawn from.
     count: int
-    #: Whether what is behind the picture is proved of float32, too.
-    in_float32 = True
 
     def __init__(self, cells: StoredCells, scene: Any, report: dict[str, Any]) -> None:
         self.cells, self.scene = cells, scene
@@ -103,7 +101,7 @@ class Claims(ABC):
             end = begin + (deadline - begin) * (_FIRST if unit else 1.0)
             verdict, detail = self._divide(claim, near, unit, end)
             if verdict is not None:
-                return verdict, unit > 0.0 and self.in_float32, detail
+                return verdict, unit > 0.0, detail
         return None, False, {}
 
     def _divide(self, claim: BoxClaim, near: Array, unit: float, deadline: float) -> tuple[bool | None, dict[str, Any]]:
@@ -138,12 +136,10 @@ class Claims(ABC):
 
 def _divided(low: Array, high: Array, motion: Array, full: Array) -> list[tuple[Array, Array]]:
     """Parts of a box: along the side that moves the picture most."""
-    width = high - low
-    relative = width / np.where(full > 0.0, full, 1.0)
-    weight = np.where(np.isfinite(motion), motion, 0.0)
-    weight = np.where(width > 0.0, weight + 1e-3 * (weight.max(initial=0.0) + 1e-30) * relative, -1.0)
+    width, motion = high - low, np.where(np.isfinite(motion), motion, 0.0)
     if not (width > 0.0).any():
         return [(low, high)]
-    axis, count = int(np.argmax(weight)), 4 if len(width) == 1 else 2
+    weight = motion + 1e-3 * (motion.max(initial=0.0) + 1e-30) * width / np.where(full > 0.0, full, 1.0)
+    axis, count = int(np.argmax(np.where(width > 0.0, weight, -1.0))), 4 if len(low) == 1 else 2
     ends, cut = np.linspace(low[axis], high[axis], count + 1), np.arange(len(low)) == axis
     return [(np.where(cut, a, low), np.where(cut, b, high)) for a, b in itertools.pairwise(ends)]

@@ -45,7 +45,7 @@ class CheckedField:
         ray = ((pixel[1] + 0.5 - cam.cx) / cam.fx, -(pixel[0] + 0.5 - cam.cy) / cam.fy, -np.ones(len(pixel[0])))
         along = [total(e * v for e, v in zip(row, ray, strict=True)) for row in view.turn]
         along = [e.wider(8.0 * U * sum(abs(v) for v in ray)) for e in along]
-        inverse = total(e.square() for e in along).root().reciprocal()
+        inverse = total(e.square() for e in along).power(-0.5)
         along = [wide(e * inverse) for e in along]
         edges = np.linspace(0.0, 1.0, self.samples + 1)
         edges = edges * self.far + (1.0 - edges) * self.near

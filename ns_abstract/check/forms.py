@@ -14,6 +14,8 @@ import numpy as np
 U, TINY = 2.0**-53, 1e-290
 #: Relative error, in units, of numpy's exponential, sine and cosine; the libraries' own figure is 4 at most.
 FUNCTION = 8.0
+#: What a flushed number of float32 loses at most, and what its sums and products stay below without overflow.
+_FLUSH, _OVERFLOW = 2.0**-126, 2.0**126
 
 Array = Any
 
@@ -109,19 +111,14 @@ class Affine:
         f = f + 0.5 * (high + low)
         return Affine(np.where(bad, 0.0, f), np.where(bad, 0.0, slope * self.g), np.where(bad, np.inf, r))
 
-    def reciprocal(self) -> Affine:
-        """1 / x; unbounded where the form is not surely above 0."""
-        low, high = self.range()
-        bad = ~(low > 0.0)
-        low, high, c = (np.where(bad, 1.0, v) for v in (low, high, self.c))
-        return self.composed(1.0 / c, -1.0 / (c * c), high**-3.0, low**-3.0 * (1.0 + 16.0 * U), bad)
-
-    def root(self) -> Affine:
-        """The square root; unbounded where the form is not surely above 0."""
-        low = self.range()[0]
-        bad = ~(low > 0.0)
-        low, f = np.where(bad, 1.0, low), np.sqrt(np.where(bad, 1.0, self.c))
-        return self.composed(f, 0.5 / f, -0.125 * low**-1.5 * (1.0 + 32.0 * U), 0.0 * f, bad)
+    def power(self, k: float) -> Affine:
+        """The power -1, -1/2 or 1/2; unbounded where the form is not surely above 0."""
+        ends = np.stack(self.range())
+        bad = ~(ends[0] > 0.0)
+        ends, c = np.where(bad, 1.0, ends), np.where(bad, 1.0, self.c)
+        # the second derivative has one sign, and falls with the argument
+        bends = 0.5 * k * (k - 1.0) * ends ** (k - 2.0) * (1.0 + 32.0 * U)
+        return self.composed(c**k, k * c ** (k - 1.0), bends.min(axis=0), bends.max(axis=0), bad)
 
     def exp(self) -> Affine:
         """The exponential."""
@@ -168,21 +165,25 @@ class Affine:
             form = (self * slope + 0.5 * (small + large)).wider(0.5 * (large - small) * (1.0 + 4.0 * U))
         return form.boxed(~(np.isfinite(form.r) & np.isfinite(form.c)), bottom, top)
 
-    def mapped(self, f: Any, absolute: Any, bias: Array, terms: int, unit: float = 0.0) -> Affine:
+    def mapped(self, f: Any, absolute: Any, bias: Array, terms: int, unit: float = 0.0, largest: float = 1.0) -> Affine:
         """The form of a linear map ``f`` plus ``bias``; ``absolute`` is the map of the absolute coefficients.
 
         A sum of ``terms`` products, in any order, errs by ``terms`` + 2 roundings of the sum of their sizes: those of
-        float64, and those of ``unit`` where that is how the map is evaluated.
+        float64, and those of ``unit`` where that is how the map is evaluated. Then ``largest`` bounds the coefficients,
+        and numbers may be flushed to zero; the form is unbounded where they may overflow.
         """
         size = absolute(self.size()) + np.abs(bias)
         charge = (terms + 4.0) * (unit + 2.0 * U) + 2.0 * U * (len(self.g) + 16.0)
         r = (absolute(self.r) + charge * size) * (1.0 + 2.0 * U * (terms + 16.0)) + TINY
+        if unit:
+            peak = (terms + 4.0) * (1.0 + largest) * (1.0 + self.size().max() + np.abs(bias).max())
+            r = r + (8.0 * _FLUSH * peak if peak < _OVERFLOW else np.inf)
         return Affine(f(self.c) + bias, f(self.g), r)
 
     def dense(self, weight: Array, bias: Array, unit: float = 0.0) -> Affine:
         """The form of ``weight`` [out, in] times the last axis, plus ``bias``; see `mapped`."""
         size = np.abs(weight).T
-        return self.mapped(lambda a: a @ weight.T, lambda a: a @ size, bias, weight.shape[1], unit)
+        return self.mapped(lambda a: a @ weight.T, lambda a: a @ size, bias, weight.shape[1], unit, size.max())
 
     def bent(self, most: int) -> Affine:
         """The form behind a ReLU, `lifted` where it may bend."""

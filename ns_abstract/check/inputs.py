@@ -7,7 +7,7 @@ import json
 import math
 import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,28 @@ _COLORS = {
     "random": (0.1490, 0.1647, 0.2157), "white": (1.0, 1.0, 1.0), "black": (0.0, 0.0, 0.0),
     "red": (1.0, 0.0, 0.0), "green": (0.0, 1.0, 0.0), "blue": (0.0, 0.0, 1.0),
 }  # fmt: skip
+#: Keys of objects, by their kind or the key that holds them, and words that may stand under a key.
+_KEYS = {
+    "picture": "type channel statistic region minus min max", "visible": "type select region weight fraction pixels",
+    "clear": "type distance region weight units measure", "all": "", "any": "", "select": "box",
+    "class": "type label", "preprocess": "resize", "input": "resize mean std layout channels range",
+    "loop": "version initial steps sampling_time dynamics disturbance camera control unsafe goal",
+    "dynamics": "type A B c", "control": "gain goal clip", "unsafe": "box half_space", "goal": "box when",
+    "half_space": "normal at_least", "camera": "camera_to_world fov fx fy cx cy position yaw pitch roll",
+    "perturbation": "version frame units translation angle_units rotation sweep orbit",
+    "translation": "x y z", "rotation": "yaw pitch roll", "orbit": "target axis azimuth",
+    "position": "offset matrix", "yaw": "offset row", "pitch": "offset row", "roll": "offset row",
+}  # fmt: skip
+_WORDS = {
+    "type": "affine classification clear picture visible", "layout": "NCHW", "channels": "RGB BGR", "region": "all",
+    "channel": "luminance r g b", "statistic": "mean least greatest", "measure": "weight", "when": "end any",
+    "units": "normalised dataset", "frame": "camera world", "angle_units": "radians degrees",
+    "sweep": "keyframes segments",
+}  # fmt: skip
+#: Keys of whole numbers from 0 on, and of ranges by their names, whose single numbers are radii but for initial states.
+_WHOLE = ("label", "pixels", "region", "minus", "resize", "steps")
+_RANGES = ("initial", "disturbance", "box", "translation", "rotation")
+FIX = "audit a result of what docs/check.md names"
 #: Bytes of the largest text that is read.
 _TEXT = 256 << 20
 #: The mode that a comment of a .ply file stands for.
@@ -43,6 +65,32 @@ class BadInput(ValueError):
     def __init__(self, problem: str, file: Any = None, field: str | None = None, fix: str | None = None) -> None:
         super().__init__(problem)
         self.problem, self.file, self.field, self.fix = problem, file, field, fix
+
+
+def followed(value: Any, key: str, states: Collection[str] = (), file: Any = "report.json") -> None:
+    """Refuse what would be passed over or taken for something else: other keys, words, and numbers that are none.
+
+    ``key`` is an object's kind, or holds the value; ``states`` are those of a loop, whose names are keys of ranges.
+    """
+    wrong, ranges = [], key in ("clip", "azimuth") or key.startswith("range of ")
+    if isinstance(value, dict):
+        wrong = sorted(value.keys() - set(_KEYS[key].split() if key in _KEYS else states))
+        for name, part in value.items():
+            followed(part, f"range of {key}" if key in _RANGES else name, states, file)
+    elif isinstance(value, list):
+        ends = [v for v in value if isinstance(v, (int, float))]
+        wrong = ends if ranges and ends != sorted(ends) else []
+        for part in value:
+            followed(part, "clip" if ranges else key, states, file)
+    elif isinstance(value, (bool, str)):
+        wrong = [] if value in _WORDS.get(key, "").split() else [value]
+    elif value is not None:
+        least = 0 if key in _WHOLE or (ranges and key not in ("clip", "range of initial")) else -math.inf
+        whole = key not in _WHOLE or isinstance(value, int)
+        known = math.isfinite(value) and value >= least and (key != "version" or value == 1)
+        wrong = [] if whole and known else [value]
+    if wrong:
+        raise BadInput(f"has {', '.join(map(str, wrong))}, which is not checked", file, key, FIX)
 
 
 @contextmanager
@@ -105,10 +153,14 @@ def _drawn(stored: list[Array], file: Path, settings: dict[str, Any]) -> list[Ar
     with np.errstate(over="ignore", invalid="ignore"):
         squares, scales = np.square(quats.astype(np.float64)).sum(axis=1), np.exp(logs.astype(np.float64))
     drawn = np.isfinite(means).all(1) & np.isfinite(quats).all(1) & ~np.isnan(logs).any(1) & (squares > 0.0)
-    whole = (scales <= np.finfo(np.float32).max * (1.0 - 1e-6)).all(1) & ~np.isnan(logits) & np.isfinite(sh).all((1, 2))
-    if (drawn & ~whole).any() and not settings.get("drop_nan_gaussians"):
-        raise BadInput("holds numbers that are not finite", file)
-    return [a[drawn & whole] for a in stored]
+    least, most = 2.0**-126 * (1.0 + 1e-6), 2.0**128 * (1.0 - 1e-6)
+    whole = (scales <= most).all(1) & ~np.isnan(logits) & np.isfinite(sh).all((1, 2))
+    # what float32 flushes to zero, or has no room for, is drawn as something else
+    normal = ((scales >= least) | (logs == -np.inf)).all(1) & (squares >= 2.0**-100) & (squares <= most)
+    kept = drawn & whole
+    if (kept & ~normal).any() or ((drawn & ~whole).any() and not settings.get("drop_nan_gaussians")):
+        raise BadInput("holds numbers that are not finite, or not normal in float32", file)
+    return [a[kept] for a in stored]
 
 
 def _read_run(file: Path, settings: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -130,9 +182,8 @@ def _read_run(file: Path, settings: dict[str, Any]) -> tuple[dict[str, Any], dic
         warnings.simplefilter("ignore")
         with torch.serialization.safe_globals(safe):
             state = torch.load(checkpoint, map_location="cpu", weights_only=True)["pipeline"]
-        state = {key.removeprefix("module."): value for key, value in state.items()}
-        inside = {key[7:]: value for key, value in state.items() if key.startswith("_model.")}
-    return model, {key.removeprefix("module."): value for key, value in inside.items()}
+        found = ((re.fullmatch(r"(?:module\.)?_model\.(?:module\.)?(.*)", key), value) for key, value in state.items())
+        return model, {name[1]: value for name, value in found if name}
 
 
 def same_network(model: Path, stated: dict[str, Any]) -> bool:
@@ -234,14 +285,19 @@ def dataset_scale(config: Path) -> float:
     return float(stated["scale"]) * (size if abs(size - 1.0) > 1e-3 else 1.0)
 
 
-def read_poses(path: Path, given: dict[str, Any] | None, frame: int, settings: dict[str, Any], scale: float) -> Any:
-    """The poses of a frame of the camera path, and its box of parameters as [(name, lower, upper)]."""
+def read_poses(
+    path: Path, given: dict[str, Any] | None, frame: int, settings: dict[str, Any], scale: float, names: Any = ()
+) -> tuple[Poses, list[tuple[str, float, float]]]:
+    """The poses of a frame of the camera path, and (name, lower, upper) of parameters: ``names``, and what varies."""
     # the perturbation object ``given``, of another file or of options, wins over the path's; ``settings`` are the
     # options that the result was made with, ``scale`` is that of `dataset_scale`
     root = read_json(path, "camera path", "say with --camera-path-filename where it lies now")
     with reading(path, f"frame {frame} or its set of poses cannot be read"):
         entries, entry = root["camera_path"], root["camera_path"][frame]
         spec = (entry.get("perturbation") or root.get("perturbation") or {}) if given is None else given
+        followed({k: v for k, v in spec.items() if k != "$schema"}, "perturbation", file=path)
+        if any(at.get("camera_type", "perspective") != "perspective" or at.get("crop") for at in (root, entry)):
+            raise BadInput("has a crop, or a camera that is not perspective", path, "camera_type")
         camera = _camera(root, entry, float(settings.get("downscale_factor") or 1.0))
         cycle = frame + 1 < len(entries) or (root.get("is_cycle") is True and len(entries) > 1)
         swept = spec.get("sweep", "keyframes") == "segments" and cycle
@@ -257,12 +313,12 @@ def read_poses(path: Path, given: dict[str, Any] | None, frame: int, settings: d
             low, high = (-value, value) if isinstance(value, (int, float)) else value
             ranges[name] = (float(factor * low), float(factor * high))
         following = _pose(entries[(frame + 1) % len(entries)]) if swept else None
-    if varied := [name for name in ("scene", "hue", "saturation") if spec.get(name) is not None]:
-        raise BadInput(f"the set varies {varied[0]}, which is not checked", path, f"perturbation.{varied[0]}")
-    free = [(name, low, high) for name, (low, high) in ranges.items() if low < high]
+    # cells hold what varies in any frame
+    names = dict.fromkeys([*names, *(name for name, (low, high) in ranges.items() if low < high)])
+    free = [(name, *ranges.get(name, (0.0, 0.0))) for name in names]
     point = {n: a for n, (a, b) in ranges.items() if a == b and (a != 0.0 or n in ("segment", "azimuth"))}
     world = spec.get("frame", "camera") == "world"
-    return Poses(camera, tuple(name for name, _, _ in free), point, world, about, following), free
+    return Poses(camera, tuple(names), point, world, about, following), free
 
 
 def given_set(settings: dict[str, Any], moved: Path | None) -> dict[str, Any] | None:
@@ -301,4 +357,6 @@ def lens(own: dict[str, Any], fov: Any, width: float, height: float) -> tuple[fl
         own = own | {"fx": height / 2.0 / np.tan(float(fov) * (np.pi / 180.0) / 2.0)}
     default = {"fy": own["fx"], "cx": width / 2.0, "cy": height / 2.0}
     fx, fy, cx, cy = (float(default[n] if own.get(n) is None else own[n]) for n in ("fx", "fy", "cx", "cy"))
+    if not min(fx, fy) > 0.0:
+        raise ValueError("no focal length")
     return fx, fy, cx, cy

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.check.forms import Affine, Array, U, fixed, parameters, product, rotation, total
-from ns_abstract.check.inputs import BadInput, lens
+from ns_abstract.check.inputs import BadInput, followed, lens
 from ns_abstract.check.poses import TURNS, CameraForms, CheckedCamera, Poses
 from ns_abstract.check.results import StoredCells
-from ns_abstract.check.statements import FREE, followed
+from ns_abstract.check.statements import FREE
 from ns_abstract.check.verdicts import SeeingNetwork
 
 #: Keys of a loop that name things.

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch.nn.functional import avg_pool2d, conv2d, pad
 
-from ns_abstract.check.forms import Affine, Array
+from ns_abstract.check.forms import Affine, Array, total
 
 #: Bytes of a file that are read at most, and coefficients of a layer's symbols; part of the largest remainder that a
 #: number has a symbol from.
@@ -26,18 +26,11 @@ _PLAIN = {"auto_pad": b"NOTSET", "alpha": 1.0, "beta": 1.0, "transA": 0, "ceil_m
 _Step = Callable[..., Affine]
 
 
-class CheckedLayer(NamedTuple):
-    """A node: the names of its inputs and output, and what it makes of its inputs' forms."""
-
-    inputs: list[str]
-    output: str
-    apply: _Step
-
-
 class CheckedNetwork(NamedTuple):
     """A network of layers, each behind those that it needs."""
 
-    layers: list[CheckedLayer]
+    #: Names of its inputs and its output, and what it makes of its inputs' forms.
+    layers: list[tuple[list[str], str, _Step]]
     #: The names of its input and of the output that counts.
     source: str
     output: str
@@ -47,14 +40,15 @@ class CheckedNetwork(NamedTuple):
     def outputs(self, picture: Affine, rows: Array | None = None) -> Affine:
         """The outputs as forms [B, n] over pictures [B, ...]; or ``rows`` [m, n] times them, [B, m]."""
         boxes = (picture.of(lambda a, k=k: a[..., k : k + 1, :, :, :]) for k in range(len(picture.c)))
-        return Affine.joined([self._outputs(box, rows) for box in boxes], -2)
+        with np.errstate(all="ignore"):
+            return Affine.joined([self._outputs(box, rows) for box in boxes], -2)
 
     def _outputs(self, picture: Affine, rows: Array | None) -> Affine:
         known = {self.source: _lifted(picture)}
-        for layer in self.layers:
+        for inputs, output, step in self.layers:
             # a symbol is new to all that is known
             count = max(len(form.g) for form in known.values())
-            known[layer.output] = layer.apply(*(known[name].padded(count) for name in layer.inputs))
+            known[output] = step(*(known[name].padded(count) for name in inputs))
         form = known[self.output].reshaped(1, known[self.output].c.size)
         form = form if rows is None else form.dense(rows, np.zeros(len(rows)))
         return form.folded(len(picture.g))
@@ -83,7 +77,7 @@ def read_network(file: Path, output: str | None, unit: float) -> CheckedNetwork:
     names = [o.name for o in graph.output]
     if (output is None and len(names) != 1) or output not in (None, *names):
         raise ValueError("the output is not said")
-    source, layers = next(i.name for i in graph.input if i.name not in read), []
+    source, layers, sums = next(i.name for i in graph.input if i.name not in read), [], [(1, 1.0)]
     made = {source}
     for node in graph.node:
         options = {a.name: onnx.helper.get_attribute_value(a) for a in node.attribute}
@@ -94,20 +88,29 @@ def read_network(file: Path, output: str | None, unit: float) -> CheckedNetwork:
         wrong = [k for k, v in options.items() if given.count(k) > 1 or (k not in _USED and _PLAIN.get(k) != v)]
         if wrong or not own or not made.issuperset(inputs) or not inputs or list(node.input[: len(inputs)]) != inputs:
             raise ValueError(f"has {node.op_type} with {wrong or 'inputs or a domain'} that this program does not read")
-        layers.append(CheckedLayer(inputs, node.output[0], _layer(node.op_type, options, constants, len(inputs), unit)))
+        step = _layer(node.op_type, options, constants, len(inputs), unit, sums)
+        layers.append((inputs, node.output[0], step))
         made.add(node.output[0])
     return CheckedNetwork(layers, source, output or names[0], unit)
 
 
-def _layer(kind: str, options: dict[str, Any], constants: list[Array], inputs: int, unit: float) -> _Step:
+def _layer(kind: str, options: dict[str, Any], constants: list[Array], inputs: int, unit: float, sums: Any) -> _Step:
     """What an operator makes of the forms of its ``inputs``, behind which ``constants`` stand."""
+    # ``sums`` are the numbers of terms and the largest coefficients of the network's sums; this one's are added
+
+    def added(*parts: Affine) -> Affine:
+        if len({part.c.ndim for part in parts}) > 1:
+            raise ValueError("adds tensors of other dimensions")
+        # a program may start a sum with what is added behind it, or fold that into the sums that follow
+        longest, largest = (max(column) for column in zip(*sums, strict=True))
+        shift, terms = constants[0] if constants else np.zeros(1), 3 * (longest + 9)
+        return total(part.mapped(np.array, np.array, shift, terms, unit, largest) for part in parts)
+
     match kind, inputs, [a.ndim for a in constants]:
         case "Relu", 1, []:
             return lambda x: _lifted(x.clamped(0.0, np.inf))
-        case "Add", 2, []:
-            return lambda x, y: (x + y).mapped(np.array, np.array, np.zeros(1), 1, unit)
-        case "Add", 1, [_]:
-            return lambda x: x.mapped(np.array, np.array, constants[0], 1, unit)
+        case ("Add", 2, []) | ("Add", 1, [_]):
+            return added
         case "Conv", 1, [4, *_]:
             weight, *rest = constants
             pads, bias = options.get("pads", [0] * 4), rest[0].reshape(-1, 1, 1) if rest else np.zeros(1)
@@ -119,13 +122,16 @@ def _layer(kind: str, options: dict[str, Any], constants: list[Array], inputs: i
                 return _of_pictures(lambda x: conv2d(pad(x, spare), w, None, stride, 0, dilation, groups))
 
             f, size = convolution(weight), convolution(np.abs(weight))
-            return lambda x: x.mapped(f, size, bias, weight[0].size, unit)
+            sums.append((weight[0].size, np.abs(weight).max()))
+            return lambda x: x.mapped(f, size, bias, weight[0].size, unit, np.abs(weight).max())
         case (("Gemm" | "MatMul"), 1, [2, *_]):
             weight = constants[0] if options.get("transB") else constants[0].T
+            sums.append((weight.shape[1], np.abs(weight).max()))
             return lambda x: x.dense(weight, constants[1] if constants[1:] else np.zeros(1), unit)
         case "AveragePool", 1, [] if not any(options.get("pads", [])) and "dilations" not in options:
             kernel, stride = options["kernel_shape"], options.get("strides", 1)
             f = _of_pictures(lambda x: avg_pool2d(x, kernel, stride))
+            sums.append((math.prod(kernel), 1.0))
             return lambda x: x.mapped(f, f, np.zeros(1), math.prod(kernel), unit)
         case "Flatten", 1, []:
             return lambda x: x.reshaped(1, x.c.size)

@@ -111,6 +111,5 @@ def _axis_angle(turn: Array) -> tuple[Array, float]:
     *vector, w = np.linalg.eigh(k)[1][:, -1]
     vector = np.array(vector) * (1.0 if w >= 0.0 else -1.0)
     length = float(np.linalg.norm(vector))
-    if length == 0.0:
-        return np.array([0.0, 0.0, 1.0]), 0.0
-    return vector / length, 2.0 * float(np.arctan2(length, abs(w)))
+    # without a turn there is no axis, and none is needed
+    return vector / (length or 1.0), 2.0 * float(np.arctan2(length, abs(w)))

@@ -99,6 +99,7 @@ def read_verdicts(folder: Path, report: dict[str, Any]) -> list[StoredCells]:
         # rows that stand for what is still to be examined
         query = "SELECT value FROM search_state WHERE key = 'open_rows'"
         left = set(json.loads((base.execute(query).fetchone() or ["[]"])[0]))
+        stated = [name for (name,) in base.execute("SELECT name FROM parameters ORDER BY position")]
         columns = "rowid, frame, lower, upper, verdict, margin, seconds, counterexample"
         for number, *row in base.execute(f"SELECT {columns} FROM cells LIMIT {_ROWS}"):
             frame, low, high, verdict, margin, _, example = row
@@ -114,7 +115,7 @@ def read_verdicts(folder: Path, report: dict[str, Any]) -> list[StoredCells]:
         for index, entries in sorted(by_frame.items()):
             names, first, last = ([p[key] for p in sets[index]] for key in _BOX)
             boxes = np.array([entry[0] for entry in entries], np.float64)
-            if boxes.shape != (len(entries), 2, len(names)) or not np.isfinite(boxes).all():
+            if boxes.shape != (len(entries), 2, len(names)) or not np.isfinite(boxes).all() or names != stated:
                 raise ValueError
             arrays, verdicts = {"box_lower": boxes[:, 0], "box_upper": boxes[:, 1]}, [entry[1:] for entry in entries]
             cells.append(StoredCells(index, tuple(names), np.array(first), np.array(last), arrays, verdicts))
@@ -200,6 +201,8 @@ def partition(low: Array, high: Array, first: Array, last: Array) -> Fraction | 
     """The part of the box [first, last] that boxes [n, d] fill, exactly; None if they overlap or leave it."""
     if not ((low >= first) & (high <= last) & (low <= high)).all():
         return None
+    # what is fixed in this frame has no volume
+    low, high, first, last = (a[..., first < last] for a in (low, high, first, last))
     order = np.argsort(low[:, 0], kind="stable") if low.shape[1] else np.arange(len(low))
     low, high = low[order], high[order]
     for k in range(len(low)):

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ns_abstract.check.blending import ROOM, blended, picked
-from ns_abstract.check.forms import Affine, Array, U, total
+from ns_abstract.check.forms import Affine, Array, U, product, total
 from ns_abstract.check.poses import CameraForms, CheckedCamera
 
 NEAR, FAR, BLUR, MARGIN, TILE = 0.01, 1e10, 0.3, 0.3, 16
@@ -139,12 +139,11 @@ def _points(splats: ActivatedScene, view: CameraForms, index: Array, unit: float
     """
     means, origin = splats.means[index], view.origin[:, None, :]
     far = np.abs(means) + np.abs(origin) + np.sum([e.size() for e in view.position], axis=0)[:, None, None]
-    coordinates = []
-    for row, move in zip(view.rotation, view.shift, strict=True):
-        parts = [wide(e) * (means - origin)[..., s] for s, e in enumerate(row)]
-        error = np.sum([wide(e).size() * far[..., s] for s, e in enumerate(row)], axis=0)
-        coordinates.append((total(parts) + wide(move)).wider((4.0 * U + 8.0 * unit) * error))
-    return coordinates
+    rotation = [[wide(e) for e in row] for row in view.rotation]
+    points = product(rotation, np.moveaxis(means - origin, -1, 0)[:, None])
+    errors = (np.sum([e.size() * far[..., s] for s, e in enumerate(row)], axis=0) for row in rotation)
+    parts = zip(points, view.shift, errors, strict=True)
+    return [(point + wide(move)).wider((4.0 * U + 8.0 * unit) * error) for (point,), move, error in parts]
 
 
 class ProjectedForms(NamedTuple):
@@ -169,29 +168,24 @@ def projected(
 ) -> ProjectedForms:
     """The Gaussians ``at`` [B, n] for cameras over B boxes."""
     x, y, z = _points(splats, view, at, unit)
-    iz = z.reciprocal()
+    iz = z.power(-1.0)
     iz = iz.wider(6.0 * unit * iz.size())
     u, v = ((e * iz).wider(4.0 * unit * e.size() * iz.size()) for e in (x, y))
     ends = ((u, cam.fx, cam.cx, cam.width), (v, cam.fy, cam.cy, cam.height))
-    centre = [(e * f + c).wider(4.0 * unit * (f * e.size() + c)) for e, f, c, _ in ends]
+    centre = [(e * f + c).wider(4.0 * unit * (f * e.size() + abs(c))) for e, f, c, _ in ends]
     slopes, roots, axes, sizes = [], [], splats.axes[at], splats.scales[at]
-    turned = [
-        [
-            total(wide(view.rotation[r][s]) * axes[..., s, k] for s in range(3)).wider(4.0 * 96.0 * U * sizes[..., k])
-            for r in range(3)
-        ]
-        for k in range(3)
-    ]
+    turned = product([[wide(e) for e in row] for row in view.rotation], np.moveaxis(axes, (-2, -1), (0, 1)))
+    turned = [[e.wider(4.0 * 96.0 * U * sizes[..., k]) for k, e in enumerate(row)] for row in turned]
     for row, (e, f, c, side) in enumerate(ends):
         spare = MARGIN * 0.5 * side / f
         slopes.append(e.clamped(-(c / f + spare), (side - c) / f + spare))
-        roots.append([(iz * f) * (t[row] - slopes[-1] * t[2]) for t in turned])
+        roots.append([(iz * f) * (a - slopes[-1] * b) for a, b in zip(turned[row], turned[2], strict=True)])
     m, n = roots
     pairs = zip(m, n, strict=True)
     mm, nn, mn = total(a.square() for a in m), total(b.square() for b in n), total(a * b for a, b in pairs)
     flat = total((m[a] * n[b] - m[b] * n[a]).square() for a, b in ((0, 1), (0, 2), (1, 2)))
     det = flat + (mm + nn) * BLUR + BLUR * BLUR
-    inverse, errors, kappa = det.reciprocal(), [np.zeros(at.shape)] * 3, np.zeros(at.shape)
+    inverse, errors, kappa = det.power(-1.0), [np.zeros(at.shape)] * 3, np.zeros(at.shape)
     if unit:
         h = [(iz * f).size() * (1.0 + e.size()) for e, f in zip(slopes, (cam.fx, cam.fy), strict=True)]
         errors, kappa, error = _rounded(det, (mm, nn), h, sizes)
@@ -235,11 +229,10 @@ def _fragments(
         ellipse_kept, level = _kept(p, rules.ellipses)
         surely = surely & ellipse_kept & (least >= LEAST_ALPHA * level)
     alow, ahigh = alpha.range()
-    # the form must say no less than the interval, and stay below the cap
+    # the form must say no less than the interval, and stay below the cap, which is rounded, too
     rough = ~((ahigh - alow) <= 1.5 * (most - least)) | ~(ahigh <= rules.cap) | ~(alow >= 0.0) | ~surely
-    bottom, top = np.where(surely, np.minimum(least, rules.cap), 0.0), np.minimum(most, rules.cap)
-    gone = np.where(shows, 1.0, 0.0)
-    alpha = alpha.boxed(rough, bottom, np.maximum(top, bottom)).of(lambda a: a * gone)
+    bottom, top = (np.minimum(e, rules.cap * (1.0 + s * unit)) for e, s in ((least * surely, -1.0), (most, 1.0)))
+    alpha = alpha.boxed(rough, bottom, np.maximum(top, bottom)).of(lambda a: a * shows)
     motion = np.where(shows[None], np.abs(mx.g) + np.abs(my.g), 0.0).max(axis=2, initial=0.0)
     return alpha, shows, motion
 
@@ -252,10 +245,12 @@ def _rounded(det: Affine, squares: Any, h: list[Array], sizes: Array) -> tuple[l
     square, (hx, hy) = (sizes * sizes).sum(axis=-1) * (1.0 + _LIBRARY), h
     a, c = (e.size() + BLUR for e in squares)
     ends = ((hx, hx, a), (hy, hy, c), (hx, hy, 0.0))
-    ea, ec, eb = (FLOAT * (330.0 * p * q * square + 3.0 * d) for p, q, d in ends)
+    # beyond that products may overflow
+    held = (a * c < 1e30) & (square * (1.0 + hx + hy) ** 2 < 1e30)
+    ea, ec, eb = (np.where(held, FLOAT * (330.0 * p * q * square + 3.0 * d), np.inf) for p, q, d in ends)
     low = np.maximum(det.range()[0], BLUR * BLUR)
     eta = (c * ea + 2.0 * np.sqrt(a * c) * eb + a * ec) / low
-    kappa = np.where(a * c < 1e30, 1.05 * (eta + 48.0 * FLOAT * a * c / low), np.inf)
+    kappa = 1.05 * (eta + 48.0 * FLOAT * a * c / low)
     error = a * ec + c * ea + 2.0 * np.sqrt(a * c) * eb + ea * ec + eb * eb + 8.0 * FLOAT * a * c + _FLUSHED
     return [ea, ec, eb], kappa, error
 
@@ -264,29 +259,24 @@ def _factor(flat: Affine, det: Affine, least: float, unit: float) -> Affine:
     """The opacity's factor sqrt(max(0, det before / det after the blur)), not below ``least``."""
     (low, high), (dlow, dhigh) = flat.range(), det.range()
     room, limit = ROOM + 16.0 * unit, 1.0 if not unit else 1e3
-    with np.errstate(all="ignore"):
-        bottom = np.sqrt(np.maximum(low, 0.0) / dhigh) * (1.0 - room)
-        top = np.sqrt(np.maximum(high, 0.0) / np.maximum(dlow, BLUR * BLUR * (1.0 - 1e-3))) * (1.0 + room)
+    bottom = np.sqrt(np.maximum(low, 0.0) / dhigh) * (1.0 - room)
+    top = np.sqrt(np.maximum(high, 0.0) / np.maximum(dlow, BLUR * BLUR * (1.0 - 1e-3))) * (1.0 + room)
     bottom = np.where(np.isfinite(bottom), bottom, 0.0)
     top = np.minimum(np.where(np.isfinite(top), top, limit), limit)
-    root = (flat * det.reciprocal()).root()
+    root = (flat * det.power(-1.0)).power(0.5)
     root = root.wider(16.0 * unit * np.minimum(root.size(), limit))
     return root.within(bottom, np.maximum(top, bottom)).clamped(least, limit + ROOM)
 
 
 def _tiles(cam: CheckedCamera, pixel: Any, centre: Any, squares: Any, unit: float) -> tuple[Array, Array]:
     """Whether gsplat 1.4.0 may, and surely does, list a Gaussian for the pixel's tile."""
-    (al, ah), (bl, bh), (ml, mh) = (e.range() for e in squares)
-    al, bl = np.maximum(al, 0.0), np.maximum(bl, 0.0)
-    dh, dl = np.maximum(np.abs(ah - bl), np.abs(bh - al)), np.maximum(np.maximum(al - bh, bl - ah), 0.0)
-    xl = np.where((ml <= 0.0) & (mh >= 0.0), 0.0, np.minimum(np.abs(ml), np.abs(mh)))
-    xh, room = np.maximum(np.abs(ml), np.abs(mh)), ROOM + 16.0 * unit
+    a, c, b = squares
+    (al, ah), (low, high) = ((a + c) * 0.5 + BLUR).range(), (((a - c) * 0.5).square() + b.square()).range()
     # in float32 the smaller root is of a difference of squares
-    lost = 8.0 * unit * (ah + bh + 2.0 * BLUR) ** 2
-    small = np.maximum(0.25 * dl * dl + xl * xl - lost, 0.01) * (1.0 - room)
-    large = np.maximum(0.25 * dh * dh + xh * xh + lost, 0.01) * (1.0 + room)
-    rl = np.ceil(3.0 * np.sqrt((0.5 * (al + bl) + BLUR + np.sqrt(small)) * (1.0 - room)) * (1.0 - room))
-    rh = np.ceil(3.0 * np.sqrt((0.5 * (ah + bh) + BLUR + np.sqrt(large)) * (1.0 + room)) * (1.0 + room))
+    lost, room = 32.0 * unit * ah * ah, ROOM + 16.0 * unit
+    small, large = np.maximum(low - lost, 0.01), np.maximum(high + lost, 0.01)
+    rl = np.ceil(3.0 * np.sqrt((al + np.sqrt(small * (1.0 - room))) * (1.0 - room)) * (1.0 - room))
+    rh = np.ceil(3.0 * np.sqrt((ah + np.sqrt(large * (1.0 + room))) * (1.0 + room)) * (1.0 + room))
     maybe = certain = True
     for form, place, side in ((centre[0], pixel[1], cam.width), (centre[1], pixel[0], cam.height)):
         low, high = form.range()
@@ -305,8 +295,7 @@ def _kept(p: ProjectedForms, ellipses: bool) -> tuple[Array, Array]:
     The box (1.5.3) and the ellipse (1.6.0) of this level are computed from the floats that alpha is computed from, and
     pixels' centres lie half a pixel from every tile's edge: what rounds there moves the level (docs/dev/checker.md).
     """
-    (_, a), (_, c), _ = (e.range() for e in p.squares)
-    a, c = a + BLUR, c + BLUR
+    a, c = (e.range()[1] + BLUR for e in p.squares[:2])
     # along the image's axes, in pixels: where a Gaussian may reach
     span = p.centre[0].size() + p.centre[1].size() + 8.0 * np.sqrt(a + c)
     kept, room = (p.kappa < 0.03) & (span < 4000.0), 2.0**10
@@ -367,7 +356,7 @@ def _directions(splats: ActivatedScene, view: CameraForms, at: Array, unit: floa
     for k, entry in enumerate(view.position):
         part = -wide(entry) + (means - origin)[..., k]
         parts.append(part.wider(2.0 * U * (np.abs(means) + np.abs(origin))[..., k] + (view.stretch * far)[:, None]))
-    inverse = total(e.square() for e in parts).root().reciprocal()
+    inverse = total(e.square() for e in parts).power(-0.5)
     error = 128.0 * unit * (1.0 + np.abs(means).sum(axis=-1) + far[:, None]) * inverse.size()
     return [e * inverse for e in parts], np.where(np.isfinite(error), error, np.inf if unit else 0.0)
 

@@ -9,54 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ns_abstract.check.forms import Affine, Array, U, total
-from ns_abstract.check.inputs import BadInput
+from ns_abstract.check.inputs import FIX, BadInput, followed
 
-#: Keys of objects, by their kind or the key that holds them, and words that may stand under a key.
-_KEYS = {
-    "picture": "type channel statistic region minus min max", "visible": "type select region weight fraction pixels",
-    "clear": "type distance region weight units measure", "all": "", "any": "", "select": "box",
-    "class": "type label", "preprocess": "resize", "input": "resize mean std layout channels range",
-    "loop": "version initial steps sampling_time dynamics disturbance camera control unsafe goal",
-    "dynamics": "type A B c", "control": "gain goal clip", "unsafe": "box half_space", "goal": "box when",
-    "half_space": "normal at_least", "camera": "camera_to_world fov fx fy cx cy position yaw pitch roll",
-    "position": "offset matrix", "yaw": "offset row", "pitch": "offset row", "roll": "offset row",
-}  # fmt: skip
-_WORDS = {
-    "type": "affine classification clear picture visible", "layout": "NCHW", "channels": "RGB BGR", "region": "all",
-    "channel": "luminance r g b", "statistic": "mean least greatest", "measure": "weight", "when": "end any",
-    "units": "normalised dataset",
-}  # fmt: skip
-#: Keys of whole numbers from 0 on, and of ranges by state.
-_WHOLE, _RANGES = ("label", "pixels", "region", "minus", "resize", "steps"), ("initial", "disturbance", "box")
 #: Keys that are read elsewhere, or say nothing; what to do with others.
 FREE = ("$schema", "output", "partitions", "preprocess")
-_FIX = "audit a result of what docs/check.md names"
 _CHANNELS = {"luminance": (0.2126, 0.7152, 0.0722), "r": (1.0, 0.0, 0.0), "g": (0.0, 1.0, 0.0), "b": (0.0, 0.0, 1.0)}
-
-
-def followed(value: Any, key: str, states: Collection[str] = ()) -> None:
-    """Refuse what would be passed over or taken for something else: other keys, words, and numbers that are none.
-
-    ``key`` is an object's kind, or holds the value; ``states`` are those of a loop, whose names are keys of ranges.
-    """
-    wrong, ranges = [], key == "clip" or key.startswith("range of ")
-    if isinstance(value, dict):
-        wrong = sorted(value.keys() - set(_KEYS[key].split() if key in _KEYS else states))
-        for name, part in value.items():
-            followed(part, f"range of {key}" if key in _RANGES else name, states)
-    elif isinstance(value, list):
-        ends = [v for v in value if isinstance(v, (int, float))]
-        wrong = ends if ranges and ends != sorted(ends) else []
-        for part in value:
-            followed(part, "clip" if ranges else key, states)
-    elif isinstance(value, (bool, str)):
-        wrong = [] if value in _WORDS.get(key, "").split() else [value]
-    elif value is not None:
-        least = 0 if key in _WHOLE or key == "range of disturbance" else -math.inf
-        whole = key not in _WHOLE or isinstance(value, int)
-        wrong = [] if whole and math.isfinite(value) and value >= least else [value]
-    if wrong:
-        raise BadInput(f"has {', '.join(map(str, wrong))}, which is not checked", "report.json", key, _FIX)
 
 
 class CombinedMargins(NamedTuple):
@@ -132,5 +89,5 @@ def _region(box: Any, size: tuple[int, int]) -> Array:
     """Numbers of the pixels in [x0, y0, x1, y1], or all."""
     x0, y0, x1, y1 = (0, 0, size[1], size[0]) if box in (None, "all") else box
     if not (x0 < x1 <= size[1] and y0 < y1 <= size[0]):
-        raise BadInput("has a region outside of the picture", "report.json", "property", _FIX)
+        raise BadInput("has a region outside of the picture", "report.json", "property", FIX)
     return np.arange(size[0] * size[1]).reshape(size)[y0:y1, x0:x1].ravel()

@@ -11,12 +11,12 @@ import numpy as np
 
 from ns_abstract.check.claims import BoxClaim, ClaimMargins, Claims
 from ns_abstract.check.forms import Affine, Array, U
-from ns_abstract.check.inputs import BadInput, same_network
+from ns_abstract.check.inputs import BadInput, followed, same_network
 from ns_abstract.check.networks import read_network
 from ns_abstract.check.poses import CameraForms, CheckedCamera, Poses
 from ns_abstract.check.results import StoredCells
 from ns_abstract.check.splats import FLOAT, ActivatedScene, pictures
-from ns_abstract.check.statements import FREE, followed, parsed
+from ns_abstract.check.statements import FREE, parsed
 
 #: Lower and upper bounds [B] of a margin over boxes [B, d]; the last argument is the unit of the pictures' rounding.
 Bounds = Callable[[Array, Array, float], tuple[Array, Array]]
@@ -31,7 +31,7 @@ class Verdicts(Claims):
         kinds = ("certified",) if report.get("kind") == "loop" else ("certified", "falsified")
         self.rows = [k for k, v in enumerate(cells.verdicts or []) if v[0] in kinds]
         self.count, self.bounds = len(self.rows), bounds
-        self.in_float32 = "sha256" not in report.get("model", {}) or in_float32(report)
+        self.units = self.units if network_unit(report) else (0.0,)
         for verdict, margin, example in ((cells.verdicts or [])[k] for k in self.rows):
             stated = [margin or 0.0, *(cells.lower if verdict == "certified" else example or ())]
             if len(stated) != 1 + len(cells.names) or not all(isinstance(x, (int, float)) for x in stated):
@@ -70,9 +70,9 @@ class Verdicts(Claims):
         return ClaimMargins(np.where(least > 0.0, least, -np.inf), most)
 
 
-def in_float32(report: dict[str, Any]) -> bool:
-    """Whether what is claimed of a network holds of its float32 evaluations."""
-    return report["fingerprint"].get("network_arithmetic") == "float32"
+def network_unit(report: dict[str, Any]) -> float:
+    """The rounding of the network, if there is one: that of float32 unless its arithmetic is real."""
+    return FLOAT if report["fingerprint"].get("network_arithmetic", "float32") == "float32" else 0.0
 
 
 class SeeingNetwork:
@@ -84,7 +84,7 @@ class SeeingNetwork:
             raise BadInput("is not the network of the result (sha256)", model, fix="say with --model where it lies now")
         followed(self.shape, "input")
         try:
-            self.network = read_network(model, about.get("output"), FLOAT if in_float32(report) else 0.0)
+            self.network = read_network(model, about.get("output"), network_unit(report))
         except Exception as error:  # onnx raises whatever a damaged file makes it run into
             raise BadInput(" ".join(str(error).split())[:160] or "cannot be read", model) from None
 
