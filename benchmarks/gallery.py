@@ -381,7 +381,7 @@ ENTRIES = (
     Entry(
         "film", "What the drone may see on its way",
         "Bounds of the picture at some steps of one tube, from the film that the command above writes: the ring comes "
-        "nearer, and what its picture may be varies more.",
+        "nearer, and the bounds widen.",
         _LOOP_COMMAND, "out/loop", film_picture,
     ),
 )  # fmt: skip
