@@ -395,7 +395,7 @@ def listener(stop: StopRequest, on_progress: Callable[[Any], object] | None) -> 
     """
     callback(on_progress)
 
-    def told(progress: Any) -> None:
+    def report(progress: Any) -> None:
         if on_progress is None:
             return
         try:
@@ -404,4 +404,4 @@ def listener(stop: StopRequest, on_progress: Callable[[Any], object] | None) -> 
         except KeyboardInterrupt:
             stop.ask()
 
-    return told
+    return report

@@ -68,7 +68,7 @@ MEMORY = 1 << 30
 AnyQuestion = Question | PictureQuestion
 
 
-def asked(model: Path | None, source: PropertySource) -> AnyQuestion:
+def question_of(model: Path | None, source: PropertySource) -> AnyQuestion:
     """Return the question that a property and its network, if there is one, make.
 
     Raises:
@@ -394,6 +394,6 @@ class CertifySettings:
 
 def open_certification(settings: CertifySettings) -> Certification:
     """Open the files of a command line. Raises InputError where a file or a field cannot be used."""
-    question = asked(settings.model, PropertySource.of(settings.property))
+    question = question_of(settings.model, PropertySource.of(settings.property))
     job = open_job(settings.files, default=Perturbation(), drawn=question.drawn)
     return Certification(job, question, settings.memory, settings.network_arithmetic, settings.picture)

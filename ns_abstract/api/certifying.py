@@ -21,7 +21,7 @@ from ns_abstract.api.cell_search import (
     shares_text,
 )
 from ns_abstract.api.certificate_report import CertificateReport
-from ns_abstract.api.certification import MEMORY, Certification, PropertySource, asked
+from ns_abstract.api.certification import MEMORY, Certification, PropertySource, question_of
 from ns_abstract.api.job import Job
 from ns_abstract.api.poses import PoseSet, pose_sets
 from ns_abstract.api.scenes import Scene, checked_scene
@@ -270,7 +270,7 @@ def certify(
     one_of(picture, ("float", "8-bit"), "picture")
     one_of(network_arithmetic, ("float32", "real"), "network_arithmetic")
     source = plain(property) if isinstance(property, Mapping) else file_path(property, "property")
-    question = asked(None if model is None else file_path(model, "model"), PropertySource.of(source))
+    question = question_of(None if model is None else file_path(model, "model"), PropertySource.of(source))
     drawn = [question.drawn(entry.of(checked_scene(scene))) for entry in pose_sets(poses)]
     memory = network_memory(memory_limit, options.workers)
     job = Job(scene, drawn, arithmetic=options.arithmetic, workers=options.workers)

@@ -102,9 +102,9 @@ def command(program: str, kind: Any, parts: Mapping[str, Any] | None = None, abo
     def read() -> Any:
         import tyro
 
-        from ns_abstract.cli.help import shown
+        from ns_abstract.cli.help import help_page
 
-        text = shown(program, kind, sys.argv[1:], parts or {}, about)
+        text = help_page(program, kind, sys.argv[1:], parts or {}, about)
         if text is not None:
             print(text)
             raise SystemExit(DONE)

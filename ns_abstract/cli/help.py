@@ -198,7 +198,7 @@ def parts_help(program: str, parts: Mapping[str, Any], about: str) -> str:
     return "\n".join([*lines, "", _wrapped(f"{program} NAME --help lists the options of one.", width)])
 
 
-def shown(program: str, kind: Any, words: list[str], parts: Mapping[str, Any], about: str) -> str | None:
+def help_page(program: str, kind: Any, words: list[str], parts: Mapping[str, Any], about: str) -> str | None:
     """The text that ``words`` of a command line ask for, its version or help, or None."""
     if "--version" in words:
         return f"{program} {VERSION}"

@@ -208,7 +208,7 @@ class SceneMargin:
     def entry(self) -> dict[str, Any]:
         """What report.json holds."""
 
-        def told(trial: Trial | None) -> dict[str, Any] | None:
+        def record(trial: Trial | None) -> dict[str, Any] | None:
             return None if trial is None else vars(trial)
 
         # cells that held at once say little
@@ -218,8 +218,8 @@ class SceneMargin:
             "kind": self.kind.name,
             "unit": self.kind.unit,
             "radius": self.radius,
-            "not_certified": told(self.failing),
-            "falsified": told(self.falsified),
+            "not_certified": record(self.failing),
+            "falsified": record(self.falsified),
             "reached": {"radius": self.reached, "part": self.part},
             "state": self.state,
             "cells": self.cells,

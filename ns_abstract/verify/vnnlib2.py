@@ -92,7 +92,9 @@ def parse_query(
         raise InputError("no (vnnlib-version <2.0>) and network", fix="write (vnnlib-version <2.0>) first")
     version = expressions[0][1]
     if not isinstance(version, str) or not _VERSION.fullmatch(version):
-        raise InputError(f"found version {shown(version)}", field="vnnlib-version", fix="give a query of 1.0 or 2.0")
+        raise InputError(
+            f"found version {source_text(version)}", field="vnnlib-version", fix="give a query of 1.0 or 2.0"
+        )
     name, tensors = _network(expressions[1])
     inputs, result = tensors
     if input_shape is not None:
@@ -178,7 +180,7 @@ class _Reader:
             return [head, *(self.condition(part) for part in expression[1:])]
         if head in ("<", ">", "!="):
             fix = "write <= or >=; the closed set holds the open one"
-            raise InputError(f"a comparison with {head}: {shown(expression)}", fix=fix)
+            raise InputError(f"a comparison with {head}: {source_text(expression)}", fix=fix)
         if not isinstance(head, str) or head not in _COMPARISONS or len(expression) != 3:
             raise refused(expression, "use <=, >=, ==, and, or of version 2")
         parts = [self._side(expression, head, operator) for operator in _COMPARISONS[head]]
@@ -193,7 +195,7 @@ class _Reader:
         if all(n is not None for n in numbers) or any(
             n is None and not self._is_element(part) for n, part in zip(numbers, (left, right), strict=True)
         ):
-            problem = f"arithmetic of float32 would round: {shown(expression)}"
+            problem = f"arithmetic of float32 would round: {source_text(expression)}"
             raise InputError(problem, fix="compare an element with an element or a number, or declare real")
         sides = []
         for place, (part, value) in enumerate(zip((left, right), numbers, strict=True)):
@@ -251,15 +253,15 @@ def _outward(value: float, larger: bool) -> str:
     return repr(max(value, single) if larger else min(value, single))
 
 
-def shown(expression: Any) -> str:
+def source_text(expression: Any) -> str:
     """An expression for messages, cut off where it is long."""
-    text = f"({' '.join(map(shown, expression))})" if isinstance(expression, list) else str(expression)
+    text = f"({' '.join(map(source_text, expression))})" if isinstance(expression, list) else str(expression)
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
 def refused(expression: Any, fix: str) -> InputError:
     """The error of an expression."""
-    return InputError(f"not understood: {shown(expression)}", fix=fix)
+    return InputError(f"not understood: {source_text(expression)}", fix=fix)
 
 
 def write_query(d: int, n: int, groups: Sequence[Sequence[int]], k: int, notes: Sequence[str] = ()) -> str:

@@ -94,7 +94,7 @@ def _replaced(path: Path) -> InputError:
     return InputError("was replaced while the command was at work", file=path, fix=fix)
 
 
-def read_onnx(path: Path, asked: ReadRequest | None = None) -> Network:
+def read_onnx(path: Path, request: ReadRequest | None = None) -> Network:
     """The network in an ONNX file, up to the output that is asked for; nothing in it is executed.
 
     Raises:
@@ -102,7 +102,7 @@ def read_onnx(path: Path, asked: ReadRequest | None = None) -> Network:
     """
     model = parse_model(path)
     refuse_lost_epsilons(model.graph, path)
-    return OnnxReader(path, model.graph, operator_set(model, path), RULES, asked or ReadRequest()).network()
+    return OnnxReader(path, model.graph, operator_set(model, path), RULES, request or ReadRequest()).network()
 
 
 def _instead(path: Path) -> str:

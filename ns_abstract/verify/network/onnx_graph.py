@@ -147,7 +147,7 @@ class OnnxReader:
     """Turns the nodes of one ONNX graph into layers."""
 
     def __init__(
-        self, path: Path, graph: onnx.GraphProto, opset: int, rules: dict[str, Rule], asked: ReadRequest
+        self, path: Path, graph: onnx.GraphProto, opset: int, rules: dict[str, Rule], request: ReadRequest
     ) -> None:
         self.path, self.graph, self.opset, self.rules = path, graph, opset, rules
         self.stored = StoredTensors(path)
@@ -166,8 +166,8 @@ class OnnxReader:
         self.batch = 1
         #: whether the input is uint8
         self.whole_numbers = False
-        self.input_name, image = self._input(asked)
-        self.output = self._chosen(asked.output)
+        self.input_name, image = self._input(request)
+        self.output = self._chosen(request.output)
         self.builder = CompositeBuilder(path, image.item)
         self.values: dict[str, TensorValue] = {self.input_name: image}
         #: whether a value is above a number: what the exporter makes of softplus
@@ -181,7 +181,7 @@ class OnnxReader:
         name = node.name or (node.output[0] if node.output else "")
         return InputError(problem, file=self.path, field=f"node {name} ({node.op_type})", fix=fix)
 
-    def _input(self, asked: ReadRequest) -> tuple[str, TensorValue]:
+    def _input(self, request: ReadRequest) -> tuple[str, TensorValue]:
         inputs = [value for value in self.graph.input if value.name not in self.constants]
         if len(inputs) != 1:
             raise InputError(f"has {len(inputs)} inputs", file=self.path, field="graph.input", fix="one image expected")
@@ -189,19 +189,19 @@ class OnnxReader:
         field = f"input {value.name}"
         kind = value.type.tensor_type
         if kind.elem_type == onnx.TensorProto.UINT8:
-            self._check_levels(value.name, field, asked)
+            self._check_levels(value.name, field, request)
             self.whole_numbers = True
         elif kind.elem_type not in (onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE):
             raise InputError("is not a float32 tensor", file=self.path, field=field, fix="export with a float input")
         # some exporters write -1 for what is free
         sizes = [max(0, d.dim_value) if d.HasField("dim_value") else 0 for d in kind.shape.dim]
-        if len(sizes) == 4 and asked.picture is not None:
-            places = (1, 2) if asked.last else (2, 3)
-            for place, size in zip(places, asked.picture, strict=True):
+        if len(sizes) == 4 and request.picture is not None:
+            places = (1, 2) if request.last else (2, 3)
+            for place, size in zip(places, request.picture, strict=True):
                 side = kind.shape.dim[place]
                 if not side.HasField("dim_value") or side.dim_value < 0:
                     sizes[place] = size
-        if asked.vector and len(sizes) == 1 and sizes[0] > 0:
+        if request.vector and len(sizes) == 1 and sizes[0] > 0:
             return value.name, TensorValue(0, tuple(sizes))
         if len(sizes) == 4 and sizes[0] > 1:
             self.batch, sizes[0] = sizes[0], 1
@@ -218,9 +218,9 @@ class OnnxReader:
             )
         return value.name, TensorValue(0, (1, *sizes[1:]))
 
-    def _check_levels(self, name: str, field: str, asked: ReadRequest) -> None:
+    def _check_levels(self, name: str, field: str, request: ReadRequest) -> None:
         """Refuse a uint8 input that is computed with before it is made a float, or that is given no whole numbers."""
-        if not asked.whole_numbers:
+        if not request.whole_numbers:
             fix = 'for pictures: write "range": [0, 255] alone in preprocess; else export with a float input'
             raise InputError("is a uint8 tensor", file=self.path, field=field, fix=fix)
         integers = {name}
@@ -262,7 +262,7 @@ class OnnxReader:
             raise InputError(f"output {name!r} holds minus infinity", file=self.path, field="graph.output")
         return self.builder.network(self.values[name].index, name, self.whole_numbers, self.stored.files)
 
-    def _chosen(self, asked: str | None) -> str:
+    def _chosen(self, name: str | None) -> str:
         """The name of the output that is read: the one asked for, or the only one of scores.
 
         Outputs are never joined: a label would count through all of them. Masks and indices are no scores.
@@ -275,11 +275,11 @@ class OnnxReader:
             ]
             if kind.elem_type not in (0, onnx.TensorProto.FLOAT, onnx.TensorProto.DOUBLE, onnx.TensorProto.FLOAT16):
                 beside.append(value.name)
-        if asked is not None:
-            if asked not in shapes:
+        if name is not None:
+            if name not in shapes:
                 fix = f"write {_named(shapes)}"
-                raise InputError(f"has no output {show(asked)}", file=self.path, field="output", fix=fix)
-            return asked
+                raise InputError(f"has no output {show(name)}", file=self.path, field="output", fix=fix)
+            return name
         scores = [name for name in shapes if name not in beside] or list(shapes)
         if len(scores) == 1:
             return scores[0]
