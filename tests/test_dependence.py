@@ -51,7 +51,8 @@ def test_rows_in_float32_are_charged(tmp_path: Path) -> None:
     network = maps(tmp_path)
     rows = np.random.default_rng(2).normal(size=(6, network.output_size))
     fine, coarse = (bounds_of(network, rows, None, kind) for kind in (False, True))
-    assert (coarse < fine - 1e-7 * np.abs(fine)).all()
+    # some hundred roundings of float32; what float32 really loses is a hundredth of that
+    assert (coarse < fine - 1e-5 * np.abs(fine)).all()
     assert (coarse > fine - 1e-2 * np.abs(fine)).all()
     x = torch.from_numpy(np.random.default_rng(1).uniform(size=(1, 2, 9, 9)))
     assert (coarse < rows @ network(x)[0].numpy()).all()
