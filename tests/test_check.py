@@ -34,7 +34,7 @@ from ns_abstract.check.inputs import BadInput, read_poses
 from ns_abstract.check.pictures import ClaimedBounds, Picture
 from ns_abstract.check.poses import CheckedCamera, Poses
 from ns_abstract.check.results import partition, read_cells
-from ns_abstract.check.splats import FLOAT, ActivatedScene, activated, meeting, pixels, reaches
+from ns_abstract.check.splats import FLOAT, ActivatedScene, activated, gaussians_at, pixel_extents, pixels
 from ns_abstract.cli import check as check_command
 from ns_abstract.geometry.camera_path import PinholeCamera as PathCamera
 from ns_abstract.geometry.poses import PoseBox
@@ -137,7 +137,7 @@ def candidates(
     splats: ActivatedScene, poses: Poses, low: np.ndarray, high: np.ndarray, pixel: tuple[int, int]
 ) -> np.ndarray:
     view = poses.view(low[None], high[None])
-    return meeting(reaches(splats, poses.camera, view, 0.0)[0], *pixel)
+    return gaussians_at(pixel_extents(splats, poses.camera, view, 0.0)[0], *pixel)
 
 
 def pixel_form(
@@ -153,7 +153,7 @@ def pixel_form(
     """One channel of a pixel over boxes [B, d]."""
     at, place = np.broadcast_to(index, (len(low), len(index))), tuple(np.full(len(low), v) for v in pixel)
     form, kept, motion = pixels(splats, poses.camera, poses.view(low, high), at, place, unit)  # pyright: ignore[reportArgumentType]
-    return form.of(lambda a: a[..., channel]), kept, motion
+    return form.apply(lambda a: a[..., channel]), kept, motion
 
 
 def opaque(scene: SplatScene) -> SplatScene:
@@ -590,14 +590,14 @@ def test_frames_of_which_nothing_is_claimed_are_named(copy: Path, in_process: In
 
 
 def test_seconds_of_a_claim_are_those_of_settled_ones(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def outcomes(*arguments: object) -> Iterator[ClaimOutcome]:
+    def settled(*arguments: object) -> Iterator[ClaimOutcome]:
         time.sleep(0.1)
         yield ClaimOutcome(True, True, True, {})
         for _ in range(5):
             yield ClaimOutcome(None, False, False, {})
 
-    monkeypatch.setattr(checking, "opened", lambda folder, moved: ([], [], []))
-    monkeypatch.setattr(checking, "outcomes", outcomes)
+    monkeypatch.setattr(checking, "open_result", lambda folder, moved: ([], [], []))
+    monkeypatch.setattr(checking, "settle_claims", settled)
     audit = check(tmp_path, claims=6)
     assert (audit.claims, audit.unsettled) == (6, 5) and audit.median_seconds >= 0.1
 

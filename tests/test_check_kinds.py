@@ -38,26 +38,26 @@ from test_check import splats_of
 import ns_abstract as nsa
 from ns_abstract.api.checking import check
 from ns_abstract.check import inputs
-from ns_abstract.check.audit import _together
+from ns_abstract.check.audit import _overall
 from ns_abstract.check.fields import CheckedField
 from ns_abstract.check.forms import Affine, parameters
-from ns_abstract.check.inputs import BadInput, followed, read_poses, read_scene
-from ns_abstract.check.loops import LoopRuns, _lifted
+from ns_abstract.check.inputs import BadInput, check_keys, read_poses, read_scene
+from ns_abstract.check.loops import LoopRuns, _with_symbols
 from ns_abstract.check.networks import read_network
 from ns_abstract.check.poses import CheckedCamera, Poses
-from ns_abstract.check.results import StoredCells, read_verdicts, structure
+from ns_abstract.check.results import StoredCells, read_verdicts, structural_faults
 from ns_abstract.check.splats import (
     FLOAT,
     ActivatedScene,
     _fragments,
-    _kept,
-    meeting,
+    _surely_in_tile,
+    gaussians_at,
     pictures,
+    pixel_extents,
     pixels,
     projected,
-    reaches,
 )
-from ns_abstract.check.statements import parsed
+from ns_abstract.check.statements import parse_statement
 from ns_abstract.cli import certify as certify_command
 from ns_abstract.cli import check as check_command
 from ns_abstract.demo.writing import write_loop_demo
@@ -95,8 +95,8 @@ def test_float32_pictures_are_enclosed_and_need_their_charges(mode: str, version
         if unit:
             assert form.r.max() < 5e-3
     # pictures are those of their pixels
-    ends = reaches(splats, cam, seen, 0.0)[0]
-    one, _, _ = pixels(splats, cam, seen, meeting(ends, 7, 9)[None], (np.array([7]), np.array([9])))
+    ends = pixel_extents(splats, cam, seen, 0.0)[0]
+    one, _, _ = pixels(splats, cam, seen, gaussians_at(ends, 7, 9)[None], (np.array([7]), np.array([9])))
     assert np.abs(one.clamped(0.0, 1.0).c[0] - form.c[7, 9]).max() < 1e-12
 
 
@@ -112,9 +112,9 @@ def test_needles_may_miss_their_tiles_in_float32() -> None:
     none = np.zeros((1, 0))
     with np.errstate(all="ignore"):
         found = projected(splats_of(scene, "1.6.0"), cam, Poses(cam, ()).view(none, none), np.arange(3)[None], FLOAT)
-        kept, level = _kept(found, True)
+        kept, level = _surely_in_tile(found, True)
         assert kept.tolist() == [[True, False, False]] and 1.0 + 2.0**-6 < level[0, 0] < 1.1
-        assert _kept(found, False)[1][0, 0] < level[0, 0] and not _kept(found, False)[0][0, 2]
+        assert _surely_in_tile(found, False)[1][0, 0] < level[0, 0] and not _surely_in_tile(found, False)[0][0, 2]
 
 
 @pytest.mark.parametrize("version", ["1.4.0", "1.5.3"])
@@ -528,23 +528,21 @@ def test_headlines_are_those_of_the_cells() -> None:
     frame = {"index": 0, "cells": {}, "coverage": {"certified": 1.0, "falsified": 0.0, "unknown": 0.0}}
     parts = [StoredCells(0, ("x",), low, high, {}, [("certified", 1.0, None)])]
     report = {"frames": [frame], "verdict": "certified", "coverage": frame["coverage"]}
-    assert _together(report, parts) == []
-    assert _together(report | {"verdict": "falsified"}, parts) == [
-        "the verdict is certified, the report says falsified"
-    ]
-    assert _together(report | {"coverage": {"certified": 0.5}}, parts) == [
+    assert _overall(report, parts) == []
+    assert _overall(report | {"verdict": "falsified"}, parts) == ["the verdict is certified, the report says falsified"]
+    assert _overall(report | {"coverage": {"certified": 0.5}}, parts) == [
         "the report says 0.5 of all sets are certified, its frames do not"
     ]
-    assert _together(report, parts, {0, 1}) == ["the verdict is unknown, the report says certified"]
+    assert _overall(report, parts, {0, 1}) == ["the verdict is unknown, the report says certified"]
     twice = report | {"frames": [frame, frame | {"index": 1}], "verdict": "unknown"}
-    assert _together(twice, parts) == ["frame 1: no cells"]
+    assert _overall(twice, parts) == ["frame 1: no cells"]
     # a question of a loop that is answered for all of its cells
     loop = {"kind": "loop", "questions": dict.fromkeys(("safe", "reaches"), frame["coverage"]), "verdict": "safe"}
-    assert _together(loop, parts) == ["frame 1: no cells"]
+    assert _overall(loop, parts) == ["frame 1: no cells"]
     both = [*parts, dataclasses.replace(parts[0], index=1)]
-    assert _together(loop | {"verdict": "reaches"}, both) == []
+    assert _overall(loop | {"verdict": "reaches"}, both) == []
     broken = [parts[0], dataclasses.replace(parts[0], index=1, verdicts=[("falsified", None, [0.0])])]
-    assert _together(loop | {"verdict": "falsified"}, broken) == []
+    assert _overall(loop | {"verdict": "falsified"}, broken) == []
 
 
 @pytest.mark.slow
@@ -569,14 +567,16 @@ def test_parts_and_margins_of_a_report_are_those_of_the_cells() -> None:
         "coverage": {"certified": 0.5, "falsified": 0.0, "unknown": 0.5},
         "least_margin": 0.125,
     }
-    assert structure(cells, {"frames": [frame]}) == []
+    assert structural_faults(cells, {"frames": [frame]}) == []
     parts = frame | {"coverage": {"certified": 0.5, "falsified": 0.0, "unknown": 0.0}}
-    assert structure(cells, {"frames": [parts]}) == ["unknown cells are 0.5 of the set, the report says 0"]
-    assert structure(cells, {"frames": [frame | {"least_margin": 0.25}]}) == ["the least margin is 0.125, not 0.25"]
+    assert structural_faults(cells, {"frames": [parts]}) == ["unknown cells are 0.5 of the set, the report says 0"]
+    assert structural_faults(cells, {"frames": [frame | {"least_margin": 0.25}]}) == [
+        "the least margin is 0.125, not 0.25"
+    ]
     none = frame | {"cells": counts | {"open": 0}}
-    assert structure(cells, {"frames": [none]}) == ["the report counts 0 cells to be examined, the table 1"]
+    assert structural_faults(cells, {"frames": [none]}) == ["the report counts 0 cells to be examined, the table 1"]
     twice = [frame | {"coverage": {"certified": 1.0}}, frame]
-    assert structure(cells, {"frames": twice}) == ["the report has more than one entry of it"]
+    assert structural_faults(cells, {"frames": twice}) == ["the report has more than one entry of it"]
 
 
 @pytest.mark.slow
@@ -617,7 +617,7 @@ def statement(blobs: Inputs, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_statements_say_nothing_that_is_passed_over() -> None:
     dark = {"type": "picture", "max": 0.5}
-    assert parsed({"all": [dark], "preprocess": {"resize": [4, 4]}}, (4, 4), 1.0)
+    assert parse_statement({"all": [dark], "preprocess": {"resize": [4, 4]}}, (4, 4), 1.0)
     for root in (
         {"any": [dark], "type": "picture", "min": 0.9},
         {"any": [dark], "all": [dark]},
@@ -635,11 +635,11 @@ def test_statements_say_nothing_that_is_passed_over() -> None:
         {"type": "visible", "select": {"box": [[0, 0, 0], [1, 1, 1]], "list": "some.npy"}},
     ):
         with pytest.raises(BadInput, match="which is not checked"):
-            parsed(root, (4, 4), 1.0)
+            parse_statement(root, (4, 4), 1.0)
     with pytest.raises(BadInput, match="outside of the picture"):
-        parsed(dark | {"region": [2, 2, 5, 4]}, (4, 4), 1.0)
+        parse_statement(dark | {"region": [2, 2, 5, 4]}, (4, 4), 1.0)
     many = {"type": "visible", "select": {"box": [[0, 0, 0], [1, 1, 1]]}, "pixels": 12, "fraction": 0.1}
-    assert parsed(many, (4, 4), 1.0).rank == 12
+    assert parse_statement(many, (4, 4), 1.0).rank == 12
 
 
 def changed(document: Any, place: tuple[Any, ...], value: Any) -> Any:
@@ -673,16 +673,16 @@ PASSED_OVER = {
 def test_nothing_of_a_property_or_loop_is_passed_over(kind: str) -> None:
     for value in PASSED_OVER[kind]:
         with pytest.raises(BadInput, match="which is not checked"):
-            followed(value, kind, ("along", "across"))
-    followed({"type": "classification", "label": 3}, "class")
-    followed({"resize": [8, 8], "mean": [0.5, 0.4, 0.3], "channels": "BGR", "range": [1, 0]}, "input")
+            check_keys(value, kind, ("along", "across"))
+    check_keys({"type": "classification", "label": 3}, "class")
+    check_keys({"resize": [8, 8], "mean": [0.5, 0.4, 0.3], "channels": "BGR", "range": [1, 0]}, "input")
     loop = {
         "initial": {"along": -1.0, "across": [-0.2, 0.1]}, "disturbance": {"along": [-0.2, -0.1], "across": 0.1},
         "control": {"clip": [[-1, 1], [-2, 2]], "gain": [[1, -1]], "goal": [1, -1]},
         "unsafe": [{"half_space": {"normal": [1, -1], "at_least": -0.5}}, {"box": {"along": [None, -1]}}],
         "goal": {"box": {"across": [0.1, None]}, "when": "any"},
     }  # fmt: skip
-    followed(loop, "loop", ("along", "across"))
+    check_keys(loop, "loop", ("along", "across"))
 
 
 def test_loops_that_say_two_things_are_not_followed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -693,7 +693,7 @@ def test_loops_that_say_two_things_are_not_followed(tmp_path: Path, monkeypatch:
         "unsafe": [{"half_space": {"normal": [1, 0], "at_least": 5}}], "goal": {"box": {"x": [0, 9]}},
     }  # fmt: skip
     seeing = type("", (), {"shape": {"resize": [8, 8]}})
-    monkeypatch.setattr(sys.modules[LoopRuns.__module__], "SeeingNetwork", lambda *_: seeing)
+    monkeypatch.setattr(sys.modules[LoopRuns.__module__], "NetworkOnPictures", lambda *_: seeing)
     cells = StoredCells(1, ("x",), np.zeros(1), np.ones(1), {})
     assert LoopRuns(cells, None, {"loop": loop}, tmp_path).seen == [0, 1]
     half = {"half_space": {"normal": [1, 0], "at_least": 0.1}}
@@ -754,7 +754,7 @@ def test_measures_are_those_of_another_program(leaf: dict[str, Any], half: float
     splats, poses = splats_of(scene), Poses(CheckedCamera(*values), ("x",))
     box = np.full((1, 1), half)
     form = lambda paint: pictures(splats.painted(paint), poses.camera, poses.view(-box, box), 0.0)  # noqa: E731
-    least, most = (float(e[0]) for e in parsed(leaf, (16, 16), 1.0).margin(form))
+    least, most = (float(e[0]) for e in parse_statement(leaf, (16, 16), 1.0).margin(form))
     assert np.isfinite(least) and most - least < (0.3 if half else 1e-9)
     prop = parse_picture_property(leaf, tmp_path)
     white = {"sh": np.full((scene.count, 1, 3), 0.5 / 0.28209479177387814, np.float32), "sh_degree": 0}
@@ -848,10 +848,10 @@ def test_cells_of_a_loop_are_of_all_its_initial_states(tmp_path: Path) -> None:
 def test_errors_of_states_become_symbols() -> None:
     errors = np.array([[0.3, 0.1], [0.0, 0.2]])
     x = [Affine(np.array([1.0, 2.0]), np.array([[0.5, 0.25]]), r) for r in errors]
-    for e, found in zip(x, _lifted(x), strict=True):
+    for e, found in zip(x, _with_symbols(x), strict=True):
         assert not found.r.any() and np.abs(np.array(e.range()) - found.range()).max() < 1e-12
     # what two states share is none of these errors
-    difference = _lifted(x)[0] - _lifted(x)[1]
+    difference = _with_symbols(x)[0] - _with_symbols(x)[1]
     assert (difference.width >= errors.sum(axis=0)).all()
 
 
@@ -897,7 +897,7 @@ def test_neurons_that_bend_are_enclosed(most: int) -> None:
     rng = np.random.default_rng(0)
     form = Affine(rng.normal(size=(1, 2, 5)), 0.3 * rng.normal(size=(2, 1, 2, 5)), 0.1 * rng.random((1, 2, 5)))
     weight, bias = rng.normal(size=(6, 5)), rng.normal(size=6)
-    found = form.lifted(5).dense(weight, bias).bent(most).dense(weight.T, bias[:5]).folded(2)
+    found = form.with_symbols(5).dense(weight, bias).relu(most).dense(weight.T, bias[:5]).keep_symbols(2)
     for _ in range(200):
         s, e = rng.uniform(-1.0, 1.0, 2), rng.choice([-1.0, 1.0], form.c.shape)
         x = form.c + s[0] * form.g[0] + s[1] * form.g[1] + e * form.r
@@ -1040,4 +1040,4 @@ def test_stated_intrinsics_are_those_of_the_picture(tmp_path: Path, down: float)
     ours = load_camera_path(path, down).cameras[0].intrinsics
     checked = inputs._camera(root, entry, down)
     assert (checked.fx, checked.fy, checked.cx, checked.cy, checked.width, checked.height) == ours
-    assert inputs.lens({}, 90.0, 32, 24)[:2] == pytest.approx((12.0, 12.0))
+    assert inputs.intrinsics({}, 90.0, 32, 24)[:2] == pytest.approx((12.0, 12.0))

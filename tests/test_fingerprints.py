@@ -20,7 +20,7 @@ from ns_abstract.api.certification import CertifySettings, open_certification
 from ns_abstract.api.files import Settings
 from ns_abstract.api.reaching import open_loop
 from ns_abstract.check.inputs import BadInput
-from ns_abstract.check.verdicts import SeeingNetwork
+from ns_abstract.check.verdicts import NetworkOnPictures
 from ns_abstract.demo.writing import write_loop_demo
 from ns_abstract.io.atomic import write_json
 from ns_abstract.io.stamps import file_stamp
@@ -175,15 +175,15 @@ def test_checks_know_constants_beside_the_network(tmp_path: Path) -> None:
     sums = {data.name: file_stamp(data)["sha256"]}
     report = {"model": stamp | {"data": sums}, "fingerprint": {}}
     scene: Any = None
-    SeeingNetwork(scene, report, net, {})
+    NetworkOnPictures(scene, report, net, {})
     with pytest.raises(BadInput, match="is not the network of the result"):
-        SeeingNetwork(scene, report | {"model": stamp}, net, {})
+        NetworkOnPictures(scene, report | {"model": stamp}, net, {})
     nudge(data)
     with pytest.raises(BadInput, match="is not the network of the result"):
-        SeeingNetwork(scene, report, net, {})
+        NetworkOnPictures(scene, report, net, {})
     data.unlink()
     with pytest.raises(BadInput, match="lacks a file"):
-        SeeingNetwork(scene, report, net, {})
+        NetworkOnPictures(scene, report, net, {})
 
 
 def test_distances_of_properties_are_those_of_one_data_set(make_blobs: Any, tmp_path: Path) -> None:

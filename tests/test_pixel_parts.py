@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from ns_abstract.check.statements import Measured, parsed
+from ns_abstract.check.statements import Measured, parse_statement
 from ns_abstract.verify.photo import Photo
 from ns_abstract.verify.picture_measures import Region
 from ns_abstract.verify.picture_properties import Leaf
@@ -37,6 +37,6 @@ def test_no_more_pixels_are_asked_for_than_is_said() -> None:
     root = {"type": "visible", "select": {"box": [[0, 0, 0], [1, 1, 1]]}, "weight": 0.5}
     for part, number in ((0.07, 7), (0.55, 55), (1.0, 100), (0.001, 1), (0.0701, 8)):
         leaf = Leaf("", "depth", "rank", Region(), pixels=part)
-        audited = parsed({**root, "fraction": part}, (10, 10), 1.0)
+        audited = parse_statement({**root, "fraction": part}, (10, 10), 1.0)
         assert isinstance(audited, Measured)
         assert leaf.measure(10, 10).rank == audited.rank == number

@@ -19,7 +19,7 @@ CHECKS = (
     Fault(
         "checker: functions are taken to be straight",
         _FORMS,
-        "Affine.composed",
+        "Affine.taylor",
         "np.maximum(high, 0.0) * (w * w)",
         "0.0 * w",
         "test_check.py::test_forms_contain_exact_values[exponential]",
@@ -67,7 +67,7 @@ CHECKS = (
     Fault(
         "checker: no covariance overflows",
         _SPLATS,
-        "_rounded",
+        "_float32_charges",
         "square * (1.0 + hx + hy) ** 2 < 1e30",
         "True",
         f"{_KINDS}::test_covariances_that_may_overflow_are_unknown",
@@ -92,7 +92,7 @@ CHECKS = (
         "checker: unknown keys of a set of poses are passed over",
         "check/inputs.py",
         "read_poses",
-        'followed({k: v for k, v in spec.items() if k != "$schema"}, "perturbation", file=path)',
+        'check_keys({k: v for k, v in spec.items() if k != "$schema"}, "perturbation", file=path)',
         "pass",
         f"{_KINDS}::test_sets_of_poses_say_nothing_that_is_passed_over[given0]",
     ),
@@ -123,7 +123,7 @@ CHECKS = (
     Fault(
         "checker: frames that the report leaves out do not count",
         _AUDIT,
-        "_together",
+        "_overall",
         "len(frames or entries)",
         "len(entries)",
         f"{_KINDS}::test_headlines_are_those_of_the_cells",
@@ -131,7 +131,7 @@ CHECKS = (
     Fault(
         "checker: the property's file may say something else",
         _AUDIT,
-        "_opened",
+        "_open_parts",
         "read_json(stated, key) != report[key]",
         "False",
         f"{_KINDS}::test_another_class_is_refuted",
@@ -140,7 +140,7 @@ CHECKS = (
     Fault(
         "checker: units may be those of another data set",
         _AUDIT,
-        "_opened",
+        "_open_parts",
         'scale == report["scene"]["units"]["dataset_scale"]',
         "True",
         f"{_KINDS}::test_sets_in_units_of_another_data_set_are_refused",
@@ -165,7 +165,7 @@ CHECKS = (
     Fault(
         "checker: figures may be others than those of the bounds",
         _RESULTS,
-        "structure",
+        "structural_faults",
         "abs(gap - (entry[name] or 0.0)) <= 1e-6 + 1e-5 * gap",
         "abs(gap) >= 0.0",
         "test_check.py::test_figures_that_are_not_the_bounds_are_refuted",
@@ -173,7 +173,7 @@ CHECKS = (
     Fault(
         "checker: a report may name another set of poses",
         _RESULTS,
-        "structure",
+        "structural_faults",
         'ranges == [[p[key] for key in _BOX] for p in entry["parameters"]]',
         "ranges == ranges",
         "test_check.py::test_figures_that_are_not_the_bounds_are_refuted",
@@ -181,7 +181,7 @@ CHECKS = (
     Fault(
         "checker: a frame may have a second entry",
         _RESULTS,
-        "structure",
+        "structural_faults",
         "entries[1:]",
         "None",
         f"{_KINDS}::test_parts_and_margins_of_a_report_are_those_of_the_cells",
@@ -189,7 +189,7 @@ CHECKS = (
     Fault(
         "checker: a report may say of unknown cells what it likes",
         _RESULTS,
-        "_tallies",
+        "_tally_faults",
         "abs(share - entry[kind]) <= 1e-9",
         'abs(share - entry[kind]) <= 1e-9 + (kind == "unknown")',
         f"{_KINDS}::test_parts_and_margins_of_a_report_are_those_of_the_cells",
@@ -197,7 +197,7 @@ CHECKS = (
     Fault(
         "checker: what stands beside the parts of a statement is passed over",
         _STATEMENTS,
-        "parsed",
+        "parse_statement",
         "k not in beside and not (k == kind and k in picks)",
         "k not in beside and kind not in picks",
         f"{_KINDS}::test_statements_say_nothing_that_is_passed_over",
@@ -205,15 +205,15 @@ CHECKS = (
     Fault(
         "checker: parts of a statement have pictures of their own",
         _STATEMENTS,
-        "parsed",
-        "parsed(part, size, scale, ())",
-        "parsed(part, size, scale)",
+        "parse_statement",
+        "parse_statement(part, size, scale, ())",
+        "parse_statement(part, size, scale)",
         f"{_KINDS}::test_statements_say_nothing_that_is_passed_over",
     ),
     Fault(
         "checker: unknown keys of a statement are passed over",
         "check/inputs.py",
-        "followed",
+        "check_keys",
         "wrong = sorted(value.keys() - set(_KEYS[key].split() if key in _KEYS else states))",
         "wrong = []",
         f"{_KINDS}::test_nothing_of_a_property_or_loop_is_passed_over[loop]",
@@ -221,7 +221,7 @@ CHECKS = (
     Fault(
         "checker: unknown words are taken for the usual ones",
         "check/inputs.py",
-        "followed",
+        "check_keys",
         'value in _WORDS.get(key, "").split()',
         "value in _WORDS.get(key, value)",
         f"{_KINDS}::test_nothing_of_a_property_or_loop_is_passed_over[input]",
@@ -229,7 +229,7 @@ CHECKS = (
     Fault(
         "checker: labels are counted from the last one",
         "check/inputs.py",
-        "followed",
+        "check_keys",
         "value >= least",
         "value >= -math.inf",
         f"{_KINDS}::test_nothing_of_a_property_or_loop_is_passed_over[class]",
@@ -237,7 +237,7 @@ CHECKS = (
     Fault(
         "checker: ranges of a loop may be reversed",
         "check/inputs.py",
-        "followed",
+        "check_keys",
         "ranges and ends != sorted(ends)",
         "False",
         f"{_KINDS}::test_nothing_of_a_property_or_loop_is_passed_over[loop]",
@@ -293,7 +293,7 @@ CHECKS = (
     Fault(
         "checker: least margins are believed",
         _RESULTS,
-        "_tallies",
+        "_tally_faults",
         'entry["least_margin"] == least',
         "True",
         f"{_KINDS}::test_parts_and_margins_of_a_report_are_those_of_the_cells",
@@ -301,7 +301,7 @@ CHECKS = (
     Fault(
         "checker: rendered pictures may lie outside of the bounds",
         _RESULTS,
-        "structure",
+        "structural_faults",
         '(a["witness_upper"] <= a["upper"])',
         '(a["upper"] <= a["upper"])',
         "test_check.py::test_figures_that_are_not_the_bounds_are_refuted",
@@ -349,7 +349,7 @@ CHECKS = (
     Fault(
         "checker: a network's sums are exact",
         _FORMS,
-        "Affine.mapped",
+        "Affine.linear",
         "(terms + 4.0) * (unit + 2.0 * U)",
         "(terms + 4.0) * 2.0 * U",
         "test_check_kinds.py::test_a_float32_network_leaves_the_exact_one",
@@ -357,7 +357,7 @@ CHECKS = (
     Fault(
         "checker: no number of a float32 network is flushed",
         _FORMS,
-        "Affine.mapped",
+        "Affine.linear",
         "8.0 * _FLUSH * peak",
         "0.0",
         f"{_KINDS}::test_what_float32_cannot_hold_is_not_proved[factors0]",
@@ -365,7 +365,7 @@ CHECKS = (
     Fault(
         "checker: no number of a float32 network overflows",
         _FORMS,
-        "Affine.mapped",
+        "Affine.linear",
         "peak < _OVERFLOW",
         "True",
         f"{_KINDS}::test_what_float32_cannot_hold_is_not_proved[factors1]",
@@ -397,7 +397,7 @@ CHECKS = (
     Fault(
         "checker: remainders without a symbol are forgotten",
         _FORMS,
-        "Affine.lifted",
+        "Affine.with_symbols",
         "np.where(g.any(axis=0), 0.0, self.r)",
         "0.0 * self.r",
         "test_check_kinds.py::test_neurons_that_bend_are_enclosed[0]",
@@ -405,7 +405,7 @@ CHECKS = (
     Fault(
         "checker: symbols that are folded are forgotten",
         _FORMS,
-        "Affine.folded",
+        "Affine.keep_symbols",
         "self.r + np.abs(self.g[count:]).sum(axis=0)",
         "self.r",
         "test_check_kinds.py::test_neurons_that_bend_are_enclosed[6]",
@@ -437,7 +437,7 @@ CHECKS = (
     Fault(
         "checker: errors of states are forgotten",
         _FORMS,
-        "Affine.lifted",
+        "Affine.with_symbols",
         "np.concatenate([self.g, g])",
         "np.concatenate([self.g, 0.0 * g])",
         "test_check_kinds.py::test_errors_of_states_become_symbols",
@@ -453,7 +453,7 @@ CHECKS = (
     Fault(
         "checker: no needle misses a tile",
         _SPLATS,
-        "_kept",
+        "_surely_in_tile",
         "kept, room = (p.kappa < 0.03) & (span < 4000.0), 2.0**10",
         "kept, room = (p.kappa < 0.03), 2.0**10",
         "test_check_kinds.py::test_needles_may_miss_their_tiles_in_float32",
@@ -493,7 +493,7 @@ CHECKS = (
     Fault(
         "checker: Gaussians reach half as far",
         _SPLATS,
-        "_pixel_ends",
+        "_extents",
         "np.where(wild, longest, reach * np.sqrt(variance) * (1.0 + 1e-9))",
         "np.where(wild, longest, 0.5 * reach * np.sqrt(variance))",
         _PIXELS,
@@ -501,7 +501,7 @@ CHECKS = (
     Fault(
         "checker: the report's verdict of all sets is believed",
         _AUDIT,
-        "_together",
+        "_overall",
         'report["verdict"] != verdict',
         "False",
         "test_check_kinds.py::test_headlines_are_those_of_the_cells",
@@ -509,7 +509,7 @@ CHECKS = (
     Fault(
         "checker: frames without cells may say anything",
         _AUDIT,
-        "_together",
+        "_overall",
         "k not in kinds",
         "False",
         "test_check_kinds.py::test_headlines_are_those_of_the_cells",

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from ns_abstract.check.audit import ClaimOutcome, opened, outcomes
+from ns_abstract.check.audit import ClaimOutcome, open_result, settle_claims
 from ns_abstract.check.inputs import BadInput
 from ns_abstract.io.arguments import callback, file_path, positive, whole
 from ns_abstract.io.atomic import write_json
@@ -122,10 +122,10 @@ def check(
     folder, begin = file_path(output_dir, "output_dir"), time.monotonic()
     finished, spent = [], []
     try:
-        wrong, subjects, silent = opened(folder, files)
+        wrong, subjects, silent = open_result(folder, files)
         audit = Audit(structure=wrong, unclaimed=silent)
         start = time.monotonic()
-        for outcome in outcomes(subjects, 0 if wrong else claims, begin + seconds - start, seed):
+        for outcome in settle_claims(subjects, 0 if wrong else claims, begin + seconds - start, seed):
             finished.append(outcome)
             spent.append(time.monotonic() - start)
             if on_progress is not None:

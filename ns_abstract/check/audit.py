@@ -1,4 +1,4 @@
-"""Claims of a result, drawn at random and proved, refuted or left open; see docs/check.md."""
+"""Draws claims of a result at random and settles each: proved, refuted or not settled in time (docs/check.md)."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ns_abstract.check.claims import Claims
-from ns_abstract.check.inputs import BadInput, dataset_scale, given_set, read_json, read_poses, read_scene, reading
+from ns_abstract.check.inputs import BadInput, dataset_scale, read_json, read_poses, read_scene, reading, stated_set
 from ns_abstract.check.loops import LoopRuns
 from ns_abstract.check.pictures import Picture
-from ns_abstract.check.results import StoredCells, entries_of, read_cells, read_report, read_verdicts, structure
+from ns_abstract.check.results import StoredCells, entries_of, read_cells, read_report, read_verdicts, structural_faults
 from ns_abstract.check.splats import RULES
-from ns_abstract.check.verdicts import Verdicts, of_class, of_statement
+from ns_abstract.check.verdicts import Verdicts, class_margin, statement_margin
 
 
 class ClaimOutcome(NamedTuple):
-    """What came of a claim."""
+    """The outcome of one claim."""
 
     #: True: proved; False: refuted; None: open when its time was over.
     verdict: bool | None
@@ -31,24 +31,24 @@ class ClaimOutcome(NamedTuple):
     found: dict[str, Any]
 
 
-def opened(folder: Path, moved: dict[str, Path | None]) -> tuple[list[str], list[Claims], list[int]]:
-    """What is wrong (cells that tile no set, pixels without bounds, figures that do not fit), and a result's claims.
+def open_result(folder: Path, moved: dict[str, Path | None]) -> tuple[list[str], list[Claims], list[int]]:
+    """Return the faults of a result's files as sentences, its kinds of claims, and the frames without claims.
 
-    The third are frames of which nothing is claimed: they are missing, or no cells cover them. ``moved`` says by the
-    name of a setting where a file lies that has been moved since. Raises BadInput where a file cannot be used.
+    A frame has no claims where it is missing or its cells do not cover the set. ``moved``: where input files lie now,
+    by setting. Raises BadInput where a file cannot be used.
     """
     report, name = read_report(folder), folder / "report.json"
     with reading(name, "is not the report of a result", "make the result again"):
-        parts, subjects, frames = _opened(folder, report, moved)
-        wrong = [f"frame {c.index}: {text}" for c in parts for text in structure(c, report)]
-        wrong += [] if not parts or parts[0].verdicts is None else _together(report, parts, frames)
+        parts, subjects, frames = _open_parts(folder, report, moved)
+        wrong = [f"frame {c.index}: {text}" for c in parts for text in structural_faults(c, report)]
+        wrong += [] if not parts or parts[0].verdicts is None else _overall(report, parts, frames)
         if not subjects and not wrong:
             raise BadInput("claims nothing: no cell has a result or verdict", name, fix="finish it: --resume")
     return wrong, subjects, sorted(frames.difference(c.index for c in parts))
 
 
-def _together(report: dict[str, Any], parts: list[StoredCells], frames: Collection[int] | None = None) -> list[str]:
-    """What the report says of all ``frames`` asked for or questions, or of those without cells, and no cell does."""
+def _overall(report: dict[str, Any], parts: list[StoredCells], frames: Collection[int] | None = None) -> list[str]:
+    """Return contradictions of the report's overall verdict and coverage to its cells and the ``frames`` asked for."""
     entries, kinds = entries_of(report), {c.index: {v[0] for v in c.verdicts or ()} for c in parts}
     wrong = [f"frame {k}: no cells" for k, e in entries.items() if k not in kinds and e["certified"] + e["falsified"]]
     for kind, said in (report.get("coverage") or {}).items():
@@ -66,8 +66,8 @@ def _together(report: dict[str, Any], parts: list[StoredCells], frames: Collecti
     return wrong
 
 
-def outcomes(subjects: list[Claims], claims: int, seconds: float, seed: int) -> Iterator[ClaimOutcome]:
-    """Draws claims while there is time, every second one uniformly, and settles each; the others hunt for faults."""
+def settle_claims(subjects: list[Claims], claims: int, seconds: float, seed: int) -> Iterator[ClaimOutcome]:
+    """Draw claims while there is time, every second one uniformly, else to hunt for faults; yield their outcomes."""
     end, rng = time.monotonic() + seconds, np.random.default_rng(seed)
     sizes = np.array([s.count for s in subjects], np.float64)
     for number in (number for number in range(claims) if time.monotonic() < end):
@@ -75,11 +75,12 @@ def outcomes(subjects: list[Claims], claims: int, seconds: float, seed: int) -> 
         claim, share = subject.draw(rng, hunted=number % 2 == 1), 4.0 * (end - start) / (claims - number)
         with reading("report.json", "says what this program cannot follow", "make the result again"):
             settled = subject.settle(claim, min(start + share, end))
-        refutation = {"frame": subject.cells.index, **subject.place(claim), **settled[2]} if settled[0] is False else {}
+        refutation = {"frame": subject.cells.index, **subject.label(claim), **settled[2]} if settled[0] is False else {}
         yield ClaimOutcome(*settled[:2], number % 2 == 0, refutation)
 
 
-def _opened(folder: Path, report: dict[str, Any], moved: dict[str, Path | None]) -> tuple[Any, ...]:
+def _open_parts(folder: Path, report: dict[str, Any], moved: dict[str, Path | None]) -> tuple[Any, ...]:
+    """Return the cells by frame or question, the claims about them, and the numbers of all frames asked for."""
     settings, renderer, name = report["settings"], report["renderer"], folder / "report.json"
     if not (renderer["name"] == "gsplat" and renderer["version"] in RULES) and renderer["name"] != "nerf-uniform":
         problem = f"found {renderer['name']} {renderer.get('version')}, and this program checks gsplat and nerf-uniform"
@@ -98,7 +99,7 @@ def _opened(folder: Path, report: dict[str, Any], moved: dict[str, Path | None])
     # in units of another data set nothing is claimed
     scale = scale if scale == report["scene"]["units"]["dataset_scale"] else float("nan")
     certificate, subjects = (folder / "cells.sqlite").exists(), []
-    parts = read_verdicts(folder, report) if certificate else _frames(folder, report)
+    parts = read_verdicts(folder, report) if certificate else _covered_frames(folder, report)
     for key in {"property", "loop"} & report.keys():
         stated = Path(moved.get(key) or settings.get(key) or folder)
         # a file that is gone says nothing, unless it is given
@@ -108,7 +109,7 @@ def _opened(folder: Path, report: dict[str, Any], moved: dict[str, Path | None])
         model = moved.get("model") or file("loop").parent / report["loop"]["network"]
         subjects = [Verdicts(c, scene, report, LoopRuns(c, scene, report, model).bounds) for c in parts]
         return parts, [s for s in subjects if s.count], set()
-    path, perturbation = file("camera_path_filename"), given_set(settings, moved.get("perturbation_filename"))
+    path, perturbation = file("camera_path_filename"), stated_set(settings, moved.get("perturbation_filename"))
     for cells in parts:
         poses, free = read_poses(path, perturbation, cells.index, settings, scale, cells.names)
         size = (poses.camera.height, poses.camera.width)
@@ -119,15 +120,15 @@ def _opened(folder: Path, report: dict[str, Any], moved: dict[str, Path | None])
         if not certificate:
             subjects.append(Picture(cells, scene, poses, report))
         elif "sha256" in report.get("model", {}):
-            subjects.append(Verdicts(cells, scene, report, of_class(scene, poses, report, file("model"))))
+            subjects.append(Verdicts(cells, scene, report, class_margin(scene, poses, report, file("model"))))
         else:
-            subjects.append(Verdicts(cells, scene, report, of_statement(scene, poses, report, scale)))
+            subjects.append(Verdicts(cells, scene, report, statement_margin(scene, poses, report, scale)))
     asked = settings["frames"] if settings.get("frames") else range(len(read_json(path, "camera path")["camera_path"]))
     return parts, [s for s in subjects if s.count], {*asked, *(f["index"] for f in report["frames"])}
 
 
-def _frames(folder: Path, report: dict[str, Any]) -> list[StoredCells]:
-    """The frames whose cells cover the set; of others nothing is claimed."""
+def _covered_frames(folder: Path, report: dict[str, Any]) -> list[StoredCells]:
+    """Return the stored frames whose cells cover their whole set; nothing is claimed of the others."""
     parts = []
     for entry in report["frames"]:
         npz, trace = (entry.get("files") or {}).get("npz"), entry.get("trace") or [{}]

@@ -1,4 +1,4 @@
-"""Blending of fragments from the front to the back, in forms."""
+"""Alpha compositing of the fragments of a pixel, in first-order forms over boxes of poses."""
 
 from __future__ import annotations
 
@@ -16,26 +16,30 @@ ROOM = 1e-12
 LONGEST = 96
 
 
-def picked(part: Any, row: Array, index: Array) -> Any:
-    """Elements ``index`` of the rows [W, 1] of forms and arrays [..., B, n], and of those in lists and tuples."""
+def gathered(part: Any, row: Array, index: Array) -> Any:
+    """Return the elements at rows [W, 1] and columns ``index`` [W, m] of arrays or forms [..., B, n], or of a list."""
     if isinstance(part, Affine):
-        return part.of(lambda a: a[..., row, index])
+        return part.apply(lambda a: a[..., row, index])
     if isinstance(part, np.ndarray):
         return part[row, index]
-    parts = [picked(e, row, index) for e in part]
+    parts = [gathered(e, row, index) for e in part]
     return type(part)(*parts) if isinstance(part, tuple) else parts
 
 
 def blended(
     alpha: Affine, color: Affine, depth: Affine, shows: Array, background: Array, unit: float
 ) -> tuple[Affine, Array]:
-    """The blended colours [B, 3] before the clamp, and which of the fragments [B, n] matter; colours are [3, B, n]."""
+    """Return the composited colours [B, 3] before the clamp, and which fragments [B, n] may contribute.
+
+    Depth orders and early stops that are open within a box are enclosed with every outcome. Alphas, depths and
+    ``shows`` (may pass the alpha threshold) are [B, n], colours [3, B, n]; ``unit`` is the roundoff of compositing.
+    """
     # those that do not show stand behind all others
     order = np.argsort(np.where(shows, depth.c, np.inf), axis=1, kind="stable")
     order, keep = order[:, : shows.sum(axis=1).max()], np.zeros(shows.shape, bool)
     count, n = order.shape
-    alpha, color, depth, shows = picked([alpha, color, depth, shows], np.arange(count)[:, None], order)
-    color = color.of(lambda a: np.moveaxis(a, -3, -1))
+    alpha, color, depth, shows = gathered([alpha, color, depth, shows], np.arange(count)[:, None], order)
+    color = color.apply(lambda a: np.moveaxis(a, -3, -1))
     al, ah = (np.clip(a, 0.0, 1.0) for a in alpha.range())
     cl, ch = color.range()
     # a slope that all share changes no order
@@ -82,10 +86,10 @@ def blended(
 
 
 def from_the_back(alpha: Affine, color: Affine, inside: Array, background: Array, unit: float) -> Affine:
-    """The colours [B, 3] of fragments that are blended in the order of their centres.
+    """Return the colours [B, 3] of fragments composited back to front, in the order of their middle depths.
 
-    S' = S + alpha (C - S): errors of S are met by 1 - alpha, those of C by alpha. In float32 a fragment's light errs by
-    2 units for each in front of it, sums by one for each.
+    S' = S + alpha (C - S): an error of S is scaled by 1 - alpha, one of C by alpha. In float32 a fragment's
+    transmittance errs by 2 units for each fragment in front of it, and each sum by one unit.
     """
     count = len(inside)
     size = np.maximum(color.size().max(axis=(1, 2), initial=0.0), np.abs(background).max(initial=1.0))[:, None]
@@ -107,11 +111,11 @@ def from_the_back(alpha: Affine, color: Affine, inside: Array, background: Array
 
 
 def _reordering_bounds(depths: Any, inside: Array, most: Array, ah: Array, cl: Array, ch: Array) -> tuple[Array, Array]:
-    """What other orders than that of the centres may change: [B, 3] least and largest.
+    """Return the least and the largest change [B, 3] of the colour by depth orders other than that of the middles.
 
-    Sorting by exchanges of neighbours exchanges each inverted pair once; an exchange changes the colour by the
-    transmittance in front times both alphas times the difference of colours. What is surely in front of both is in
-    front of them throughout.
+    Sorting by exchanges of neighbours exchanges each inverted pair once. An exchange changes the colour by the
+    transmittance in front, times both alphas, times the difference of colours. A fragment that is surely in front of
+    both stays in front of them throughout.
     """
     (count, n), (dlow, dhigh, front, back) = inside.shape, depths
     begin = np.stack([np.searchsorted(f, low) for f, low in zip(front, dlow, strict=True)])

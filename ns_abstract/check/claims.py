@@ -1,4 +1,4 @@
-"""Claims about cells: each is settled by dividing its cell until all parts are proved or a pose refutes it."""
+"""A claim about a cell is settled by division: until every part is proved, or a pose refutes it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _FIRST = 0.5
 
 
 class BoxClaim(NamedTuple):
-    """What is claimed of a cell; of pictures, for a channel of a pixel, with a pose [1, d] that may refute it."""
+    """A claim about a cell, or about one channel of one of its pixels; ``pose`` [1, d] may refute it."""
 
     cell: int
     row: int = 0
@@ -30,7 +30,7 @@ class BoxClaim(NamedTuple):
 
 
 class ClaimMargins(NamedTuple):
-    """By how much a claim holds over B boxes of parameters; negative: by how much it does not."""
+    """Bounds of a claim's margin over B boxes of parameters; the claim fails where the margin is negative."""
 
     #: Lower and upper bounds [B] over all poses.
     least: Array
@@ -42,7 +42,7 @@ class ClaimMargins(NamedTuple):
 
 
 class Claims(ABC):
-    """Claims of one kind about the cells of a frame, or of a question about a loop."""
+    """All claims of one kind about the cells of a frame, or of a question about a loop."""
 
     #: Boxes that are looked at together.
     together = 8
@@ -56,47 +56,47 @@ class Claims(ABC):
         self.units = (FLOAT, 0.0) if splats else (0.0,)
 
     @abstractmethod
-    def one(self, rng: Any) -> BoxClaim:
-        """A claim, uniformly."""
+    def draw_uniform(self, rng: Any) -> BoxClaim:
+        """Return a claim drawn uniformly."""
 
     @abstractmethod
-    def interest(self, claim: BoxClaim) -> float:
-        """The larger, the more likely to fail."""
+    def suspicion(self, claim: BoxClaim) -> float:
+        """Return a score by which claims are hunted: the larger, the more likely the claim is false."""
 
-    def place(self, claim: BoxClaim) -> dict[str, Any]:
-        """What names it in check.json."""
+    def label(self, claim: BoxClaim) -> dict[str, Any]:
+        """Return what identifies the claim in check.json."""
         return {"cell": claim.cell, "parameters": list(self.cells.names)}
 
     @abstractmethod
     def margins(self, claim: BoxClaim, low: Array, high: Array, near: Array, unit: float) -> ClaimMargins:
-        """Over boxes [B, d]; ``near`` are the numbers of what is to be looked at."""
+        """Return bounds of the margin over boxes [B, d]; only the Gaussians numbered in ``near`` are looked at."""
 
     @abstractmethod
-    def detail(self, claim: BoxClaim, point: Array) -> dict[str, Any]:
-        """What is wrong at the pose [1, d]."""
+    def refutation(self, claim: BoxClaim, point: Array) -> dict[str, Any]:
+        """Return what check.json says of the pose ``point`` [1, d], at which the claim is false."""
 
-    def near(self, claim: BoxClaim, low: Array, high: Array, unit: float) -> Array:
-        """Numbers of what has to be looked at over the box [1, d]."""
+    def candidates(self, claim: BoxClaim, low: Array, high: Array, unit: float) -> Array:
+        """Return the numbers of the Gaussians that may matter to the claim over the box [1, d]."""
         return np.zeros(0, np.int64)
 
-    def floor(self, claim: BoxClaim) -> float:
-        """The margin that is claimed of every pose."""
+    def claimed_margin(self, claim: BoxClaim) -> float:
+        """Return the lower bound of the margin that the result claims for every pose of the cell."""
         return 0.0
 
     def draw(self, rng: Any, hunted: bool) -> BoxClaim:
-        """A claim that is uniform, or the most telling of eight."""
-        return max([self.one(rng) for _ in range(8 if hunted else 1)], key=self.interest)
+        """Return a uniform claim, or with ``hunted`` the one of eight that `suspicion` ranks highest."""
+        return max([self.draw_uniform(rng) for _ in range(8 if hunted else 1)], key=self.suspicion)
 
     def box(self, claim: BoxClaim) -> tuple[Array, Array]:
-        """The claim's cell."""
+        """Return the lower and upper ends [d] of the claim's cell."""
         return self.cells.arrays["box_lower"][claim.cell], self.cells.arrays["box_upper"][claim.cell]
 
     def settle(self, claim: BoxClaim, deadline: float) -> tuple[bool | None, bool, dict[str, Any]]:
-        """True: proved; False: refuted, with the pose; None: open when the time was over; and whether of float32."""
+        """Return True (proved), False (refuted) or None (open), if of all float32 evaluations, and the refutation."""
         begin, (low, high) = time.monotonic(), self.box(claim)
-        near, pose = self.near(claim, low[None], high[None], self.units[0]), claim.pose
+        near, pose = self.candidates(claim, low[None], high[None], self.units[0]), claim.pose
         if pose is not None and self.margins(claim, pose, pose, near, 0.0).most[0] < 0.0:
-            return False, False, self.detail(claim, pose)
+            return False, False, self.refutation(claim, pose)
         for unit in self.units:
             end = begin + (deadline - begin) * (_FIRST if unit else 1.0)
             verdict, detail = self._divide(claim, near, unit, end)
@@ -117,12 +117,12 @@ class Claims(ABC):
             bounds, middle = self.margins(claim, first, last, near, unit), 0.5 * (first + last)
             open_ = np.flatnonzero(~(bounds.least >= 0.0))
             some = open_[: 1 + self.together // 8]
-            some = [0] if fresh and not len(some) and self.floor(claim) > 0.0 else some
+            some = [0] if fresh and not len(some) and self.claimed_margin(claim) > 0.0 else some
             if len(some):
                 at = self.margins(claim, middle[some], middle[some], near, unit)
-                wrong = np.flatnonzero(at.most < self.floor(claim) * (1.0 - 1e-9))
+                wrong = np.flatnonzero(at.most < self.claimed_margin(claim) * (1.0 - 1e-9))
                 if len(wrong):
-                    return False, self.detail(claim, middle[some][wrong[:1]])
+                    return False, self.refutation(claim, middle[some][wrong[:1]])
                 if len(open_) and not (at.least >= 0.0).all():
                     # smaller boxes about this point are not proved either
                     return None, {}
@@ -135,7 +135,7 @@ class Claims(ABC):
 
 
 def _divided(low: Array, high: Array, motion: Array, full: Array) -> list[tuple[Array, Array]]:
-    """Parts of a box: along the side that moves the picture most."""
+    """Return the parts of a box, cut along the parameter that moves the picture most."""
     width, motion = high - low, np.where(np.isfinite(motion), motion, 0.0)
     if not (width > 0.0).any():
         return [(low, high)]

@@ -1,4 +1,4 @@
-"""Enclosures of pixels of a vanilla NeRF's fine field at the middles of equal bins, in real numbers."""
+"""Encloses pixels of a vanilla NeRF's fine field, sampled at the middles of equal bins, in real numbers."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _LIBRARY, _SOFTPLUS_CUT, SYMBOLS = 1e-12, 2.1e-9, 256
 
 
 class CheckedField:
-    """A field's layers, and where rays are sampled."""
+    """A NeRF's fine field: its layers, the ends and number of samples of its rays, and the background."""
 
     def __init__(
         self, tensors: dict[str, Array], near: float, far: float, samples: int, background: tuple[float, ...]
@@ -41,7 +41,7 @@ class CheckedField:
         self.counts = tuple(((w - 3) // 6, m) for w, m in zip(widths, (8.0, 4.0), strict=True))
 
     def pixels(self, cam: CheckedCamera, view: CameraForms, pixel: tuple[Array, Array]) -> Affine:
-        """Colours [B, 3] before the clamp of one pixel over each of B boxes."""
+        """Return a pixel's colours [B, 3] before the clamp over B boxes of poses; ``pixel``: rows [B], columns [B]."""
         ray = ((pixel[1] + 0.5 - cam.cx) / cam.fx, -(pixel[0] + 0.5 - cam.cy) / cam.fy, -np.ones(len(pixel[0])))
         along = [total(e * v for e, v in zip(row, ray, strict=True)) for row in view.turn]
         along = [e.wider(8.0 * U * sum(abs(v) for v in ray)) for e in along]
@@ -57,39 +57,40 @@ class CheckedField:
             return self._ray(places, along, lengths)
 
     def _ray(self, places: list[Affine], along: list[Affine], lengths: Array) -> Affine:
+        """Return colours [B, 3] from samples at ``places`` [B, S], directions ``along``, and bin lengths [S]."""
         d = len(places[0].g)
         position, direction = (_encoded(e, *n) for e, n in zip((places, along), self.counts, strict=True))
-        x = code = position.lifted(SYMBOLS)
+        x = code = position.with_symbols(SYMBOLS)
         for k, (weight, bias) in enumerate(self.base):
             if k and weight.shape[1] != x.c.shape[-1]:
                 x = Affine.joined([code.padded(len(x.g)), x], -1)
-            x = x.dense(weight, bias).bent(SYMBOLS)
-        raw = x.dense(*self.density[0]).folded(d).of(lambda a: a[..., 0])
+            x = x.dense(weight, bias).relu(SYMBOLS)
+        raw = x.dense(*self.density[0]).keep_symbols(d).apply(lambda a: a[..., 0])
         low, high = raw.range()
         f, slope = np.logaddexp(0.0, raw.c), 1.0 / (1.0 + np.exp(-raw.c))
         # half the second derivative is at most 1/8, and half the exponential of its argument
         bend = np.minimum(0.5 * np.exp(np.minimum(high, 0.0)) * (1.0 + _LIBRARY), 0.125)
         # torch's softplus is its argument from 20 on
-        density = raw.composed(f, slope, 0.0 * f, bend).wider(np.where(high > 19.0, _SOFTPLUS_CUT, 0.0))
+        density = raw.taylor(f, slope, 0.0 * f, bend).wider(np.where(high > 19.0, _SOFTPLUS_CUT, 0.0))
         ends = [np.logaddexp(0.0, e) * (1.0 + s * 1e-9) for e, s in ((low, -1.0), (high, 1.0))]
-        thin = (density.within(*ends) * -lengths).exp()
+        thin = (density.narrowed(*ends) * -lengths).exp()
         thick, thinned = (np.exp(-e * lengths) for e in ends)
-        thin = thin.within(thinned * (1.0 - _LIBRARY), thick * (1.0 + _LIBRARY))
-        direction = direction.of(lambda a: np.broadcast_to(a, (*a.shape[:-2], *x.c.shape[-2:-1], a.shape[-1])))
+        thin = thin.narrowed(thinned * (1.0 - _LIBRARY), thick * (1.0 + _LIBRARY))
+        direction = direction.apply(lambda a: np.broadcast_to(a, (*a.shape[:-2], *x.c.shape[-2:-1], a.shape[-1])))
         x = Affine.joined([direction.padded(len(x.g)), x], -1)
         for weight, bias in self.head:
-            x = x.dense(weight, bias).bent(SYMBOLS)
-        raw = x.dense(*self.color[0]).folded(d)
+            x = x.dense(weight, bias).relu(SYMBOLS)
+        raw = x.dense(*self.color[0]).keep_symbols(d)
         f = 1.0 / (1.0 + np.exp(-raw.c))
-        color = raw.composed(f, f * (1.0 - f), -0.0482 + 0.0 * f, 0.0482 + 0.0 * f)
+        color = raw.taylor(f, f * (1.0 - f), -0.0482 + 0.0 * f, 0.0482 + 0.0 * f)
         ends = zip(raw.range(), (-_LIBRARY, _LIBRARY), strict=True)
-        color = color.within(*(1.0 / (1.0 + np.exp(-e)) * (1.0 + room) for e, room in ends))
+        color = color.narrowed(*(1.0 / (1.0 + np.exp(-e)) * (1.0 + room) for e, room in ends))
         alpha = -thin + 1.0
         return from_the_back(alpha, color, np.ones(alpha.c.shape, bool), np.array(self.background), 0.0)
 
 
 def _encoded(x: list[Affine], count: int, most: float) -> Affine:
-    """Sines and cosines of three coordinates [B, S], coordinate outside and frequency inside, and the coordinates."""
+    """Return Nerfstudio's encoding of coordinates [B, S]: sines, cosines (by coordinate and frequency), coordinates."""
     # the float32 powers that nerfstudio computes
     frequencies = (2.0 ** torch.linspace(0.0, most, count)).double().tolist()
     angles = [wide(e) * (2.0 * np.pi * f) for e in x for f in frequencies]

@@ -1,4 +1,4 @@
-"""First-order forms with a remainder, in float64: the checker's own arithmetic.
+"""First-order affine forms with a remainder, in float64: the checker's own arithmetic.
 
 A form encloses a function of ``s`` in [-1, 1]^d: ``c + g . s`` with an error of at most ``r``. Every operation adds its
 own rounding to ``r``: an operation in float64 errs by at most ``U`` times the size of its result.
@@ -21,7 +21,7 @@ Array = Any
 
 
 class Affine:
-    """Arrays ``c`` [...], ``g`` [d, ...] and ``r`` [...] of equal trailing shape; several functions side by side."""
+    """Forms of many functions side by side: centres ``c`` [...], slopes ``g`` [d, ...] and radii ``r`` [...]."""
 
     __slots__ = ("c", "g", "r")
 
@@ -30,31 +30,31 @@ class Affine:
 
     @classmethod
     def constant(cls, c: Array, like: Affine, r: Array = 0.0) -> Affine:
-        """``c`` within ``r``, of the shape of ``like``."""
+        """Return the form of a constant ``c`` with error at most ``r``, in the shape of ``like``."""
         shape = like.c.shape
         return cls(np.broadcast_to(np.float64(c), shape), np.zeros_like(like.g), np.broadcast_to(np.float64(r), shape))
 
     @property
     def slope(self) -> Array:
-        """Sum of the sizes of the linear coefficients."""
+        """Sum of the absolute slopes."""
         return np.abs(self.g).sum(axis=0)
 
     @property
     def width(self) -> Array:
-        """Largest distance of the function from its centre."""
+        """Upper bound of the distance between the function and its centre."""
         return (self.slope + self.r) * (1.0 + (16.0 + 2.0 * len(self.g)) * U)
 
     def range(self) -> tuple[Array, Array]:
-        """Lower and upper bounds."""
+        """Return a lower and an upper bound of the function."""
         w = self.width + 2.0 * U * np.abs(self.c)
         return self.c - w, self.c + w
 
     def size(self) -> Array:
-        """The largest absolute value."""
+        """Return an upper bound of the function's absolute value."""
         return np.abs(self.c) + self.width
 
     def wider(self, r: Array) -> Affine:
-        """The form with an error that is larger by ``r``."""
+        """Return the form with a radius that is larger by ``r``."""
         return Affine(self.c, self.g, (self.r + r) * (1.0 + 2.0 * U))
 
     def __neg__(self) -> Affine:
@@ -90,17 +90,17 @@ class Affine:
     __radd__, __rmul__ = __add__, __mul__
 
     def square(self) -> Affine:
-        """The form of the square."""
+        """Return the form of the square."""
         a = self.slope
         p, half = np.abs(self.c) + a, 0.5 * a * a
         # (g . s)^2 lies in [0, a^2]
         r = half + self.r * (2.0 * p + self.r) + 32.0 * U * p * p
         return Affine(self.c * self.c + half, 2.0 * self.c * self.g, r * (1.0 + 32.0 * U) + TINY)
 
-    def composed(self, f: Array, slope: Array, low: Array, high: Array, bad: Array = False) -> Affine:
-        """The form of a function with value ``f`` and slope at the centre, half its second derivative in [low, high].
+    def taylor(self, f: Array, slope: Array, low: Array, high: Array, bad: Array = False) -> Affine:
+        """Return the form of f(self) by Taylor's formula of second order.
 
-        The remainder of Taylor's formula is ``t^2`` times half the second derivative, ``t^2`` in [0, width^2]. The
+        ``f`` and ``slope`` are value and derivative at the centre; half the second derivative lies in [low, high]. The
         form is unbounded where ``bad``.
         """
         w = self.width
@@ -112,47 +112,47 @@ class Affine:
         return Affine(np.where(bad, 0.0, f), np.where(bad, 0.0, slope * self.g), np.where(bad, np.inf, r))
 
     def power(self, k: float) -> Affine:
-        """The power -1, -1/2 or 1/2; unbounded where the form is not surely above 0."""
+        """Return the form of the power ``k``, -1, -1/2 or 1/2; unbounded where the base may be 0 or negative."""
         ends = np.stack(self.range())
         bad = ~(ends[0] > 0.0)
         ends, c = np.where(bad, 1.0, ends), np.where(bad, 1.0, self.c)
         # the second derivative has one sign, and falls with the argument
         bends = 0.5 * k * (k - 1.0) * ends ** (k - 2.0) * (1.0 + 32.0 * U)
-        return self.composed(c**k, k * c ** (k - 1.0), bends.min(axis=0), bends.max(axis=0), bad)
+        return self.taylor(c**k, k * c ** (k - 1.0), bends.min(axis=0), bends.max(axis=0), bad)
 
     def exp(self) -> Affine:
-        """The exponential."""
+        """Return the form of the exponential."""
         high = self.range()[1]
         f = np.exp(np.minimum(self.c, 700.0))
         top = 0.5 * np.exp(np.minimum(high, 700.0)) * (1.0 + 16.0 * FUNCTION * U)
-        return self.composed(f, f, 0.0 * f, top, ~(high <= 690.0))
+        return self.taylor(f, f, 0.0 * f, top, ~(high <= 690.0))
 
     def sine(self) -> tuple[Affine, Affine]:
-        """Sine and cosine."""
+        """Return the forms of sine and cosine."""
         s, c = np.sin(self.c), np.cos(self.c)
         half, room = 0.5 * (1.0 + 8.0 * U), 0.5 * self.width + 1e-15
         # the second derivative moves by no more than the angle
         a, b = (
-            self.composed(f, slope, np.maximum(-0.5 * f - room, -half), np.minimum(-0.5 * f + room, half))
+            self.taylor(f, slope, np.maximum(-0.5 * f - room, -half), np.minimum(-0.5 * f + room, half))
             for f, slope in ((s, c), (c, -s))
         )
         return a, b
 
-    def boxed(self, where: Array, low: Array, high: Array) -> Affine:
-        """The form, but the interval [low, high] ``where`` that is asked for."""
+    def replaced(self, where: Array, low: Array, high: Array) -> Affine:
+        """Return the form, replaced by the interval [low, high] where ``where`` is true."""
         middle = 0.5 * (low + high)
         radius = np.maximum(high - middle, middle - low) * (1.0 + 4.0 * U) + TINY
         return Affine(np.where(where, middle, self.c), np.where(where, 0.0, self.g), np.where(where, radius, self.r))
 
-    def within(self, low: Array, high: Array) -> Affine:
-        """The form, but the interval [low, high], which holds as well, where the form says less."""
-        return self.boxed(~(2.0 * self.width <= 1.5 * (high - low)), low, high)
+    def narrowed(self, low: Array, high: Array) -> Affine:
+        """Return the form, or the interval [low, high], which also holds, where that is clearly narrower."""
+        return self.replaced(~(2.0 * self.width <= 1.5 * (high - low)), low, high)
 
     def clamped(self, low: float | Array, high: float | Array) -> Affine:
-        """The form of the value limited to [low, high]: the chord's slope, and what is left of it.
+        """Return the form of min(max(self, low), high), with the slope of the chord.
 
-        Value less ``slope`` times argument is linear between the argument's ends and the limits inside of them, so
-        that it is least and largest at one of these.
+        The value less ``slope`` times the argument is piecewise linear, so it is extreme at the argument's ends or at
+        the limits between them.
         """
         least, most = self.range()
         bottom, top = np.clip(least, low, high), np.clip(most, low, high)
@@ -163,14 +163,14 @@ class Affine:
             rounding = 4.0 * U * (np.abs(least) + np.abs(most) + np.abs(bottom) + np.abs(top))
             small, large = rest.min(axis=0) - rounding, rest.max(axis=0) + rounding
             form = (self * slope + 0.5 * (small + large)).wider(0.5 * (large - small) * (1.0 + 4.0 * U))
-        return form.boxed(~(np.isfinite(form.r) & np.isfinite(form.c)), bottom, top)
+        return form.replaced(~(np.isfinite(form.r) & np.isfinite(form.c)), bottom, top)
 
-    def mapped(self, f: Any, absolute: Any, bias: Array, terms: int, unit: float = 0.0, largest: float = 1.0) -> Affine:
-        """The form of a linear map ``f`` plus ``bias``; ``absolute`` is the map of the absolute coefficients.
+    def linear(self, f: Any, absolute: Any, bias: Array, terms: int, unit: float = 0.0, largest: float = 1.0) -> Affine:
+        """Return the form of a linear map ``f`` plus ``bias``; ``absolute`` is the map of the absolute coefficients.
 
-        A sum of ``terms`` products, in any order, errs by ``terms`` + 2 roundings of the sum of their sizes: those of
-        float64, and those of ``unit`` where that is how the map is evaluated. Then ``largest`` bounds the coefficients,
-        and numbers may be flushed to zero; the form is unbounded where they may overflow.
+        A sum of ``terms`` products, in any order, errs by ``terms`` + 2 roundings of the sum of their sizes. ``unit``
+        is the roundoff of the program that evaluates the map (0: exact). With it, ``largest`` bounds the coefficients:
+        numbers may be flushed to zero, and the form is unbounded where they may overflow.
         """
         size = absolute(self.size()) + np.abs(bias)
         charge = (terms + 4.0) * (unit + 2.0 * U) + 2.0 * U * (len(self.g) + 16.0)
@@ -181,19 +181,19 @@ class Affine:
         return Affine(f(self.c) + bias, f(self.g), r)
 
     def dense(self, weight: Array, bias: Array, unit: float = 0.0) -> Affine:
-        """The form of ``weight`` [out, in] times the last axis, plus ``bias``; see `mapped`."""
+        """Return the form of ``weight`` [out, in] times the last axis, plus ``bias``; see `linear`."""
         size = np.abs(weight).T
-        return self.mapped(lambda a: a @ weight.T, lambda a: a @ size, bias, weight.shape[1], unit, size.max())
+        return self.linear(lambda a: a @ weight.T, lambda a: a @ size, bias, weight.shape[1], unit, size.max())
 
-    def bent(self, most: int) -> Affine:
-        """The form behind a ReLU, `lifted` where it may bend."""
+    def relu(self, most: int) -> Affine:
+        """Return the form of a ReLU; unstable neurons get symbols of their own (`with_symbols`)."""
         low, high = self.range()
-        return self.clamped(0.0, np.inf).lifted(most, where=(low < 0.0) & (high > 0.0))
+        return self.clamped(0.0, np.inf).with_symbols(most, where=(low < 0.0) & (high > 0.0))
 
-    def lifted(self, most: int, part: float = 0.0, where: Array = True) -> Affine:
-        """The form whose ``most`` largest remainders along the last axis have symbols of their own, behind the others.
+    def with_symbols(self, most: int, part: float = 0.0, where: Array = True) -> Affine:
+        """Return the form with new symbols, behind the others, for the ``most`` largest radii along the last axis.
 
-        What is computed from it later keeps track of them. Those below ``part`` of the largest stay remainders.
+        Operations that follow keep these errors correlated. Radii below ``part`` of the largest one stay radii.
         """
         own = np.where(where, self.r, 0.0)
         own = np.where(own > part * own.max(axis=-1, keepdims=True), own, 0.0)
@@ -203,30 +203,30 @@ class Affine:
         return Affine(self.c, np.concatenate([self.g, g]), np.where(g.any(axis=0), 0.0, self.r))
 
     def padded(self, count: int) -> Affine:
-        """The form with ``count`` symbols."""
+        """Return the form with ``count`` symbols, the new ones with slope 0."""
         return Affine(self.c, np.concatenate([self.g, np.zeros((count - len(self.g), *self.c.shape))]), self.r)
 
-    def folded(self, count: int) -> Affine:
-        """The form with its first ``count`` symbols, what the others do in the remainder."""
+    def keep_symbols(self, count: int) -> Affine:
+        """Return the form with its first ``count`` symbols; the slopes of the others are added to the radius."""
         r = self.r + np.abs(self.g[count:]).sum(axis=0)
         return Affine(self.c, self.g[:count], r * (1.0 + 2.0 * U * (len(self.g) + 8.0)))
 
     @staticmethod
     def joined(forms: Any, axis: int, join: Any = np.concatenate) -> Affine:
-        """Forms one behind the other along an axis that is counted from the last one; or stacked along a new one."""
+        """Return forms concatenated, or stacked, along an axis that is counted from the last one."""
         return Affine(*(join([getattr(f, name) for f in forms], axis=axis) for name in ("c", "g", "r")))
 
-    def of(self, pick: Any) -> Affine:
-        """The form of what ``pick`` makes of its arrays, whose axes it must count from the last one."""
+    def apply(self, pick: Any) -> Affine:
+        """Return the form with ``pick`` applied to its three arrays; it must count axes from the last one."""
         return Affine(pick(self.c), pick(self.g), pick(self.r))
 
     def reshaped(self, *shape: int) -> Affine:
-        """The form with another shape of the same size."""
-        return self.of(lambda a: a.reshape(*a.shape[: a.ndim - self.c.ndim], *shape))
+        """Return the form in another shape of the same size."""
+        return self.apply(lambda a: a.reshape(*a.shape[: a.ndim - self.c.ndim], *shape))
 
 
 def parameters(middle: Array, half: Array) -> list[Affine]:
-    """The d parameters over the boxes ``middle`` +- ``half`` [B, d], as forms [B]; a constant if there is none."""
+    """Return forms [B] of the d parameters over boxes ``middle`` +- ``half`` [B, d]; one constant form if d is 0."""
     d = middle.shape[1]
     g = np.eye(d)[:, :, None] * half.T[:, None]
     room = 4.0 * U * (np.abs(middle) + half)
@@ -235,12 +235,12 @@ def parameters(middle: Array, half: Array) -> list[Affine]:
 
 
 def product(a: list[list[Affine]], b: list[list[Affine]]) -> list[list[Affine]]:
-    """Matrix product of forms."""
+    """Return the product of two matrices of forms."""
     return [[total(row[k] * b[k][j] for k in range(len(b))) for j in range(len(b[0]))] for row in a]
 
 
 def total(items: Any) -> Affine:
-    """Sum of forms."""
+    """Return the sum of forms."""
     first, *rest = items
     for item in rest:
         first = first + item
@@ -248,7 +248,7 @@ def total(items: Any) -> Affine:
 
 
 def rotation(axis: Array, angle: Affine, error: float = 0.0) -> list[list[Affine]]:
-    """Right-handed rotation about the unit vector ``axis``: I + sin K + (1 - cos) K^2, entries within ``error``."""
+    """Return Rodrigues' rotation matrix about a unit vector, I + sin K + (1 - cos) K^2, entries within ``error``."""
     x, y, z = (float(v) for v in axis)
     k = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     kk, (s, c), one = k @ k, angle.sine(), np.eye(3)
@@ -257,5 +257,5 @@ def rotation(axis: Array, angle: Affine, error: float = 0.0) -> list[list[Affine
 
 
 def fixed(matrix: Array, like: Affine, r: float = 0.0) -> list[list[Affine]]:
-    """A matrix of numbers as forms."""
+    """Return a constant matrix as forms with radius ``r``."""
     return [[Affine.constant(v, like, r) for v in row] for row in np.atleast_2d(matrix)]

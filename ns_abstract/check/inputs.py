@@ -1,4 +1,4 @@
-"""The checker's own reading of run folders, .ply files, camera paths and perturbation files; nothing in them is run."""
+"""The checker's own reader of run folders, .ply files, camera paths and perturbation files; it runs nothing in them."""
 
 from __future__ import annotations
 
@@ -60,28 +60,28 @@ _CONVERT += "--load-config scene.ply; the digest says whether these are the resu
 
 
 class BadInput(ValueError):
-    """A file or a field of it cannot be used: ``file``, ``field``, what is wrong, and ``fix``."""
+    """Raised where a ``file`` or a ``field`` of it cannot be used; it says the ``problem`` and perhaps the ``fix``."""
 
     def __init__(self, problem: str, file: Any = None, field: str | None = None, fix: str | None = None) -> None:
         super().__init__(problem)
         self.problem, self.file, self.field, self.fix = problem, file, field, fix
 
 
-def followed(value: Any, key: str, states: Collection[str] = (), file: Any = "report.json") -> None:
-    """Refuse what would be passed over or taken for something else: other keys, words, and numbers that are none.
+def check_keys(value: Any, key: str, states: Collection[str] = (), file: Any = "report.json") -> None:
+    """Raise BadInput where an object has keys, words or numbers that this program would pass over or misread.
 
-    ``key`` is an object's kind, or holds the value; ``states`` are those of a loop, whose names are keys of ranges.
+    ``key`` is the object's kind, or the key that holds ``value``; ``states`` of a loop are keys of ranges.
     """
     wrong, ranges = [], key in ("clip", "azimuth") or key.startswith("range of ")
     if isinstance(value, dict):
         wrong = sorted(value.keys() - set(_KEYS[key].split() if key in _KEYS else states))
         for name, part in value.items():
-            followed(part, f"range of {key}" if key in _RANGES else name, states, file)
+            check_keys(part, f"range of {key}" if key in _RANGES else name, states, file)
     elif isinstance(value, list):
         ends = [v for v in value if isinstance(v, (int, float))]
         wrong = ends if ranges and ends != sorted(ends) else []
         for part in value:
-            followed(part, "clip" if ranges else key, states, file)
+            check_keys(part, "clip" if ranges else key, states, file)
     elif isinstance(value, (bool, str)):
         wrong = [] if value in _WORDS.get(key, "").split() else [value]
     elif value is not None:
@@ -95,7 +95,7 @@ def followed(value: Any, key: str, states: Collection[str] = (), file: Any = "re
 
 @contextmanager
 def reading(file: Any, problem: str, fix: str | None = None) -> Iterator[None]:
-    """Makes a `BadInput` of whatever a damaged file makes a library run into."""
+    """Turn exceptions inside the block, as libraries raise for damaged files, into a `BadInput` that names the file."""
     try:
         yield
     except BadInput:
@@ -105,7 +105,7 @@ def reading(file: Any, problem: str, fix: str | None = None) -> Iterator[None]:
 
 
 def read_json(file: Path, what: str, fix: str | None = None) -> dict[str, Any]:
-    """A JSON object."""
+    """Return the JSON object of a file."""
     with reading(file, f"this {what} cannot be read", fix):
         if not file.is_file():
             raise BadInput(f"no such {what}", file, fix=fix)
@@ -117,7 +117,7 @@ def read_json(file: Path, what: str, fix: str | None = None) -> dict[str, Any]:
 
 
 def read_scene(file: Path, report: dict[str, Any]) -> ActivatedScene | CheckedField:
-    """The scene that a result is about, from config.yml, its folder or .ply: what its digest says, or nothing."""
+    """Return the scene in config.yml, its folder or a .ply; raise BadInput unless its digest is the result's."""
     settings, about, renderer = report["settings"], report["scene"], report["renderer"]
     file, folder = file / "config.yml" if file.is_dir() else file, file.is_dir()
     if not file.is_file():
@@ -148,7 +148,7 @@ def read_scene(file: Path, report: dict[str, Any]) -> ActivatedScene | CheckedFi
 
 
 def _drawn(stored: list[Array], file: Path, settings: dict[str, Any]) -> list[Array]:
-    """The Gaussians that gsplat draws: those of finite means and quaternions, and of scales that are numbers."""
+    """Return the arrays of the Gaussians that gsplat draws; raise BadInput for numbers that float32 holds otherwise."""
     means, logs, quats, logits, sh = stored
     with np.errstate(over="ignore", invalid="ignore"):
         squares, scales = np.square(quats.astype(np.float64)).sum(axis=1), np.exp(logs.astype(np.float64))
@@ -164,7 +164,7 @@ def _drawn(stored: list[Array], file: Path, settings: dict[str, Any]) -> list[Ar
 
 
 def _read_run(file: Path, settings: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
-    """A run's model configuration and its tensors by their names in the model."""
+    """Return a run's model configuration, and the model's tensors by name."""
     with reading(file, "cannot be read as a run's configuration", _CONVERT):
         # makes texts, lists and mappings of whatever Python objects are written down
         root = yaml.BaseLoader(file.read_text(encoding="utf-8")).get_single_data()
@@ -187,7 +187,7 @@ def _read_run(file: Path, settings: dict[str, Any]) -> tuple[dict[str, Any], dic
 
 
 def same_network(model: Path, stated: dict[str, Any]) -> bool:
-    """Whether a network, and the files beside it that hold its constants, are those of the stated digests."""
+    """Return whether a network and its files of external data have the stated digests."""
     import onnx
 
     if not model.is_file() or sha256(model) != stated["sha256"]:
@@ -201,7 +201,7 @@ def same_network(model: Path, stated: dict[str, Any]) -> bool:
 
 
 def sha256(file: Path) -> str:
-    """The digest of a file's content."""
+    """Return the SHA-256 digest of a file."""
     content = hashlib.sha256()
     with file.open("rb") as stream:
         while block := stream.read(1 << 24):
@@ -258,7 +258,7 @@ def _read_ply(file: Path, settings: dict[str, Any]) -> tuple[Any, ...]:
 
 
 def _read_field(file: Path, settings: dict[str, Any], renderer: dict[str, Any]) -> tuple[CheckedField, Any]:
-    """The fine field of vanilla-nerf on equal bins, and the digest of what is drawn."""
+    """Return a vanilla NeRF's fine field sampled at equal bins, and the digest of field, rays and background."""
     if settings.get("occupancy_grid"):
         raise BadInput("is declared empty by a grid, which this program does not read", file, "occupancy_grid")
     model, state = _read_run(file, settings)
@@ -278,7 +278,7 @@ def _read_field(file: Path, settings: dict[str, Any], renderer: dict[str, Any]) 
 
 
 def dataset_scale(config: Path) -> float:
-    """Normalised units per unit of transforms.json."""
+    """Return normalised units per unit of transforms.json."""
     file = (config if config.is_dir() else config.parent) / "dataparser_transforms.json"
     stated = read_json(file, "dataparser transform") if file.is_file() else {"scale": 1.0, "transform": np.eye(3, 4)}
     size = (float((np.array(stated["transform"], np.float64)[:, :3] ** 2).sum()) / 3.0) ** 0.5
@@ -288,14 +288,14 @@ def dataset_scale(config: Path) -> float:
 def read_poses(
     path: Path, given: dict[str, Any] | None, frame: int, settings: dict[str, Any], scale: float, names: Any = ()
 ) -> tuple[Poses, list[tuple[str, float, float]]]:
-    """The poses of a frame of the camera path, and (name, lower, upper) of parameters: ``names``, and what varies."""
+    """Return a frame's poses, and (name, lower, upper) of the parameters in ``names`` and of all that vary."""
     # the perturbation object ``given``, of another file or of options, wins over the path's; ``settings`` are the
     # options that the result was made with, ``scale`` is that of `dataset_scale`
     root = read_json(path, "camera path", "say with --camera-path-filename where it lies now")
     with reading(path, f"frame {frame} or its set of poses cannot be read"):
         entries, entry = root["camera_path"], root["camera_path"][frame]
         spec = (entry.get("perturbation") or root.get("perturbation") or {}) if given is None else given
-        followed({k: v for k, v in spec.items() if k != "$schema"}, "perturbation", file=path)
+        check_keys({k: v for k, v in spec.items() if k != "$schema"}, "perturbation", file=path)
         if any(at.get("camera_type", "perspective") != "perspective" or at.get("crop") for at in (root, entry)):
             raise BadInput("has a crop, or a camera that is not perspective", path, "camera_type")
         camera = _camera(root, entry, float(settings.get("downscale_factor") or 1.0))
@@ -321,8 +321,8 @@ def read_poses(
     return Poses(camera, tuple(names), point, world, about, following), free
 
 
-def given_set(settings: dict[str, Any], moved: Path | None) -> dict[str, Any] | None:
-    """The perturbation object that the options name; None: the path's own."""
+def stated_set(settings: dict[str, Any], moved: Path | None) -> dict[str, Any] | None:
+    """Return the perturbation object that the options name; None: that in the camera path counts."""
     axes = {"translation": SHIFTS, "rotation": tuple(TURNS)}
     radii = {name: settings[name] for name in axes if settings.get(name) is not None}
     if radii:
@@ -342,7 +342,7 @@ def _camera(root: dict[str, Any], entry: dict[str, Any], down: float) -> Checked
     width, height = int(root["render_width"]), int(root["render_height"])
     own = {key: root.get(key) if entry.get(key) is None else entry[key] for key in ("fx", "fy", "cx", "cy")}
     fov = entry["fov"] if "fov" in entry else root.get("default_fov")
-    fx, fy, cx, cy = lens(own, fov, width, height)
+    fx, fy, cx, cy = intrinsics(own, fov, width, height)
     if down != 1.0:
         # nerfstudio holds the factor and the centre in float32
         scale = np.float32(1.0 / down)
@@ -351,8 +351,8 @@ def _camera(root: dict[str, Any], entry: dict[str, Any], down: float) -> Checked
     return CheckedCamera(_pose(entry), fx, fy, cx, cy, width, height)
 
 
-def lens(own: dict[str, Any], fov: Any, width: float, height: float) -> tuple[float, float, float, float]:
-    """fx, fy, cx and cy in pixels: those of ``own`` that are stated, else by the vertical angle and the middle."""
+def intrinsics(own: dict[str, Any], fov: Any, width: float, height: float) -> tuple[float, float, float, float]:
+    """Return fx, fy, cx and cy in pixels: as ``own`` states them, else from the vertical angle of view, centred."""
     if own.get("fx") is None:
         own = own | {"fx": height / 2.0 / np.tan(float(fov) * (np.pi / 180.0) / 2.0)}
     default = {"fy": own["fx"], "cx": width / 2.0, "cy": height / 2.0}

@@ -1,4 +1,4 @@
-"""Claims of loops: no run from a cell comes to harm, and all reach the goal."""
+"""Claims about loops: no run from a cell becomes unsafe, and every run reaches the goal."""
 
 from __future__ import annotations
 
@@ -8,30 +8,30 @@ from typing import Any
 import numpy as np
 
 from ns_abstract.check.forms import Affine, Array, U, fixed, parameters, product, rotation, total
-from ns_abstract.check.inputs import BadInput, followed, lens
+from ns_abstract.check.inputs import BadInput, check_keys, intrinsics
 from ns_abstract.check.poses import TURNS, CameraForms, CheckedCamera, Poses
 from ns_abstract.check.results import StoredCells
 from ns_abstract.check.statements import FREE
-from ns_abstract.check.verdicts import SeeingNetwork
+from ns_abstract.check.verdicts import NetworkOnPictures
 
 #: Keys of a loop that name things.
 _NAMES = ("network", "state", "units")
 
 
 class LoopRuns:
-    """The runs of a loop from the cells of a question: no run comes to harm, and (question 1) all reach the goal."""
+    """Encloses all runs of a loop from boxes of initial states; question 0: none is unsafe, 1: all reach the goal."""
 
     def __init__(self, cells: StoredCells, scene: Any, report: dict[str, Any], model: Path) -> None:
         self.loop, self.cells = report["loop"], cells
-        loop, self.seeing = self.loop, SeeingNetwork(scene, report, model, report["loop"])
-        followed({k: v for k, v in loop.items() if k not in (*FREE, *_NAMES)}, "loop", loop["state"])
+        loop, self.seeing = self.loop, NetworkOnPictures(scene, report, model, report["loop"])
+        check_keys({k: v for k, v in loop.items() if k not in (*FREE, *_NAMES)}, "loop", loop["state"])
         pose = np.array(loop["camera"]["camera_to_world"], np.float64)[:3]
         # nothing is reached without a goal
         unclear = (cells.index and "box" not in loop["goal"]) or pose[:, 3].any()
         if unclear or any(len(area) != 1 for area in loop.get("unsafe") or []):
             raise BadInput("has an area or a camera that this program does not follow", "report.json", "loop")
         height, width = self.seeing.shape["resize"]
-        stated = lens(loop["camera"], loop["camera"].get("fov", 45.0), width, height)
+        stated = intrinsics(loop["camera"], loop["camera"].get("fov", 45.0), width, height)
         self.camera = CheckedCamera(pose, *stated, int(width), int(height))
         self.steps, self.names = int(loop["steps"]), list(loop["state"])
         self.position = {"offset": [0.0] * 3} | loop["camera"]["position"]
@@ -53,9 +53,10 @@ class LoopRuns:
         return CameraForms(turn, place, self.camera.pose)
 
     def _outputs(self, x: list[Affine], unit: float) -> list[Affine]:
-        """The network's outputs in the symbols of the state.
+        """Return the network's outputs over all pictures at the states ``x``, as forms in the same symbols as ``x``.
 
-        They are bounded by forms in the states that the camera sees, over their box; these, scaled, are the symbols.
+        Pictures and outputs are bounded over the box of the states that move the camera, with these states as symbols;
+        then each is replaced by its form.
         """
         low, high = (np.stack([e.range()[k] for e in x], axis=-1) for k in (0, 1))
         middle = 0.5 * (low + high)
@@ -68,7 +69,7 @@ class LoopRuns:
         return [total([form, *(s * y.g[k, :, j] for k, s in enumerate(scaled))]) for j, form in enumerate(forms)]
 
     def _next(self, x: list[Affine], unit: float) -> list[Affine]:
-        law, control, x = self.loop["dynamics"], self.loop.get("control") or {}, _lifted(x)
+        law, control, x = self.loop["dynamics"], self.loop.get("control") or {}, _with_symbols(x)
         u = self._outputs(x, unit)
         u = [a + -float(b) for a, b in zip(u, control.get("goal") or [0.0] * len(u), strict=True)]
         if control.get("gain"):
@@ -85,7 +86,7 @@ class LoopRuns:
         return states
 
     def bounds(self, low: Array, high: Array, unit: float) -> tuple[Array, Array]:
-        """Of how far all runs from boxes stay from going wrong; runs are not refuted."""
+        """Return bounds [B] of the least margin over all runs from the boxes; the upper bound is infinite."""
         x, goal, margins, inside = self._state(low, high), self.loop.get("goal"), [], []
         for step in range(self.steps + 1):
             x = self._next(x, unit) if step else x
@@ -105,14 +106,14 @@ def _affine(row: Any, x: list[Affine], constant: float) -> Affine:
     return total(e * float(v) for v, e in zip(row, x, strict=True)) + float(constant)
 
 
-def _lifted(x: list[Affine]) -> list[Affine]:
-    """The same with a symbol for every error, so that what an error does to later states is followed."""
-    whole = Affine.joined(x, -1, np.stack).lifted(len(x))
-    return [whole.of(lambda a, k=k: a[..., k]) for k in range(len(x))]
+def _with_symbols(x: list[Affine]) -> list[Affine]:
+    """Return the states with a symbol for each error, so that later states follow it."""
+    whole = Affine.joined(x, -1, np.stack).with_symbols(len(x))
+    return [whole.apply(lambda a, k=k: a[..., k]) for k in range(len(x))]
 
 
 def _outside(area: dict[str, Any], x: list[Affine], names: list[str], inner: bool = False) -> Array:
-    """How far states surely are outside of a closed set, or, negated, how far inside of an open box if ``inner``."""
+    """Return a lower bound of states' distance outside of a closed area; ``inner``: negative, inside of an open box."""
     if "half_space" in area:
         return -(_affine(area["half_space"]["normal"], x, -float(area["half_space"]["at_least"])).range()[1])
     gaps = []

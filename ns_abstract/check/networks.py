@@ -1,6 +1,6 @@
-"""Bounds of a network's outputs over sets of pictures, which are forms: in real numbers and every float32 evaluation.
+"""Bounds of a network's outputs over pictures given as forms, in real numbers and for every float32 evaluation.
 
-Every remainder of the picture, and every ReLU that may bend, has a symbol of its own that goes through all layers.
+The forms' radii, and unstable ReLU neurons, get symbols of their own, which go through all layers.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _Step = Callable[..., Affine]
 
 
 class CheckedNetwork(NamedTuple):
-    """A network of layers, each behind those that it needs."""
+    """A network as a list of layers, each behind the layers that it takes inputs from."""
 
     #: Names of its inputs and its output, and what it makes of its inputs' forms.
     layers: list[tuple[list[str], str, _Step]]
@@ -38,33 +38,33 @@ class CheckedNetwork(NamedTuple):
     unit: float
 
     def outputs(self, picture: Affine, rows: Array | None = None) -> Affine:
-        """The outputs as forms [B, n] over pictures [B, ...]; or ``rows`` [m, n] times them, [B, m]."""
-        boxes = (picture.of(lambda a, k=k: a[..., k : k + 1, :, :, :]) for k in range(len(picture.c)))
+        """Return the outputs [B, n] over pictures [B, ...], or ``rows`` [m, n] times the outputs, [B, m]."""
+        boxes = (picture.apply(lambda a, k=k: a[..., k : k + 1, :, :, :]) for k in range(len(picture.c)))
         with np.errstate(all="ignore"):
             return Affine.joined([self._outputs(box, rows) for box in boxes], -2)
 
     def _outputs(self, picture: Affine, rows: Array | None) -> Affine:
-        known = {self.source: _lifted(picture)}
+        known = {self.source: _with_symbols(picture)}
         for inputs, output, step in self.layers:
             # a symbol is new to all that is known
             count = max(len(form.g) for form in known.values())
             known[output] = step(*(known[name].padded(count) for name in inputs))
         form = known[self.output].reshaped(1, known[self.output].c.size)
         form = form if rows is None else form.dense(rows, np.zeros(len(rows)))
-        return form.folded(len(picture.g))
+        return form.keep_symbols(len(picture.g))
 
 
-def _lifted(form: Affine) -> Affine:
-    """A tensor of one picture with symbols for its numbers."""
+def _with_symbols(form: Affine) -> Affine:
+    """Return the tensor of one picture with symbols in place of its largest radii."""
     flat = form.reshaped(1, form.c.size)
-    return flat.lifted(_MOST_COEFFICIENTS // form.c.size, _PART).reshaped(*form.c.shape)
+    return flat.with_symbols(_MOST_COEFFICIENTS // form.c.size, _PART).reshaped(*form.c.shape)
 
 
 def read_network(file: Path, output: str | None, unit: float) -> CheckedNetwork:
-    """A network of convolutions, products, average pooling, ReLU and sums from an .onnx file.
+    """Return the network in an .onnx file of convolutions, products, average pooling, ReLU and sums.
 
-    ``output`` names the output that counts; None: the only one. ``unit`` is that of `CheckedNetwork`. Raises ValueError
-    where it cannot be read, or holds another operator.
+    ``output`` names the output that counts; None: the only one. ``unit`` is the unit roundoff of the network's
+    evaluation. Raises ValueError where the file cannot be read or holds another operator.
     """
     import onnx
 
@@ -95,7 +95,7 @@ def read_network(file: Path, output: str | None, unit: float) -> CheckedNetwork:
 
 
 def _layer(kind: str, options: dict[str, Any], constants: list[Array], inputs: int, unit: float, sums: Any) -> _Step:
-    """What an operator makes of the forms of its ``inputs``, behind which ``constants`` stand."""
+    """Return the function from the forms of an operator's inputs to its output's; ``constants`` are stored inputs."""
     # ``sums`` are the numbers of terms and the largest coefficients of the network's sums; this one's are added
 
     def added(*parts: Affine) -> Affine:
@@ -104,11 +104,11 @@ def _layer(kind: str, options: dict[str, Any], constants: list[Array], inputs: i
         # a program may start a sum with what is added behind it, or fold that into the sums that follow
         longest, largest = (max(column) for column in zip(*sums, strict=True))
         shift, terms = constants[0] if constants else np.zeros(1), 3 * (longest + 9)
-        return total(part.mapped(np.array, np.array, shift, terms, unit, largest) for part in parts)
+        return total(part.linear(np.array, np.array, shift, terms, unit, largest) for part in parts)
 
     match kind, inputs, [a.ndim for a in constants]:
         case "Relu", 1, []:
-            return lambda x: _lifted(x.clamped(0.0, np.inf))
+            return lambda x: _with_symbols(x.clamped(0.0, np.inf))
         case ("Add", 2, []) | ("Add", 1, [_]):
             return added
         case "Conv", 1, [4, *_]:
@@ -123,7 +123,7 @@ def _layer(kind: str, options: dict[str, Any], constants: list[Array], inputs: i
 
             f, size = convolution(weight), convolution(np.abs(weight))
             sums.append((weight[0].size, np.abs(weight).max()))
-            return lambda x: x.mapped(f, size, bias, weight[0].size, unit, np.abs(weight).max())
+            return lambda x: x.linear(f, size, bias, weight[0].size, unit, np.abs(weight).max())
         case (("Gemm" | "MatMul"), 1, [2, *_]):
             weight = constants[0] if options.get("transB") else constants[0].T
             sums.append((weight.shape[1], np.abs(weight).max()))
@@ -132,14 +132,14 @@ def _layer(kind: str, options: dict[str, Any], constants: list[Array], inputs: i
             kernel, stride = options["kernel_shape"], options.get("strides", 1)
             f = _of_pictures(lambda x: avg_pool2d(x, kernel, stride))
             sums.append((math.prod(kernel), 1.0))
-            return lambda x: x.mapped(f, f, np.zeros(1), math.prod(kernel), unit)
+            return lambda x: x.linear(f, f, np.zeros(1), math.prod(kernel), unit)
         case "Flatten", 1, []:
             return lambda x: x.reshaped(1, x.c.size)
     raise ValueError(f"has an operator {kind} that this program does not read")
 
 
 def _of_pictures(f: Callable[[torch.Tensor], torch.Tensor]) -> Callable[[Array], Array]:
-    """A map of tensors [N, C, H, W] as one of arrays [..., C, H, W]."""
+    """Return a map of tensors [N, C, H, W] as a map of arrays [..., C, H, W]."""
 
     def mapped(a: Array) -> Array:
         lead, rest = a.shape[:-3], a.shape[-3:]

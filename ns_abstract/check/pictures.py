@@ -1,4 +1,4 @@
-"""Claims of a picture's bounds: one channel of one pixel over one cell."""
+"""Claims about bounds of pictures: one channel of one pixel over one cell."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from ns_abstract.check.claims import BoxClaim, ClaimMargins, Claims
 from ns_abstract.check.forms import Affine, Array, U
 from ns_abstract.check.poses import Poses
 from ns_abstract.check.results import StoredCells
-from ns_abstract.check.splats import ActivatedScene, meeting, pictures, pixels, reaches
+from ns_abstract.check.splats import ActivatedScene, gaussians_at, pictures, pixel_extents, pixels
 
 
 class ClaimedBounds(NamedTuple):
-    """What is claimed over a cell's box [low, high]: two constants of the frame, two planes (slope [d], height)."""
+    """The claimed bounds of a pixel over the cell [low, high]: two constants, and two planes (slope [d], height)."""
 
     flat: tuple[float, float]
     planes: tuple[tuple[Array, float], tuple[Array, float]]
@@ -22,10 +22,7 @@ class ClaimedBounds(NamedTuple):
     high: Array
 
     def excess(self, low: Array, high: Array, form: Affine) -> tuple[Array, Array]:
-        """By how much pictures lie beyond the bounds, at least and at most over boxes [B, d]: [4, B], lower ones first.
-
-        Pictures are the ``form`` clamped to [0, 1].
-        """
+        """Return bounds [4, B] of how far the ``form``, clamped to [0, 1], exceeds each claimed bound over boxes."""
         middle, span = 0.5 * (low + high), np.where(self.high > self.low, 0.5 * (self.high - self.low), 1.0)
         half, excesses = np.maximum(high - middle, middle - low), []
         for sign, flat, (slope, height) in zip((1.0, -1.0), self.flat, self.planes, strict=True):
@@ -45,7 +42,7 @@ class ClaimedBounds(NamedTuple):
 
 
 class Picture(Claims):
-    """The claims of a frame's cells; ``poses`` are the frame's."""
+    """The claims about the bounds of a frame's pictures over each cell; ``poses`` are the frame's."""
 
     def __init__(self, cells: StoredCells, scene: Any, poses: Poses, report: dict[str, Any]) -> None:
         super().__init__(cells, scene, report)
@@ -53,7 +50,7 @@ class Picture(Claims):
         self.splats = isinstance(scene, ActivatedScene)
         self.together = 64 if self.splats else 4
 
-    def one(self, rng: Any) -> BoxClaim:
+    def draw_uniform(self, rng: Any) -> BoxClaim:
         a = self.cells.arrays
         while True:
             cell = int(rng.integers(self.count))
@@ -62,13 +59,13 @@ class Picture(Claims):
             if row < a["lower"].shape[0] and column < a["lower"].shape[1]:
                 return BoxClaim(cell, row, column, int(rng.integers(3)))
 
-    def interest(self, claim: BoxClaim) -> float:
-        """Narrow and moving."""
+    def suspicion(self, claim: BoxClaim) -> float:
+        """Return the slope of the claimed lower plane over the claim's width: steep and narrow claims come first."""
         (_, b), (slope, c) = self.bounds(claim).planes
         return float((np.abs(slope).sum() + 1e-4) / max(c - b, 1e-7)) if np.any(slope) else 0.0
 
     def draw(self, rng: Any, hunted: bool) -> BoxClaim:
-        """A claim that is uniform, or one that a pose of its cell seems to break, or the most telling of eight."""
+        """Return a uniform claim; with ``hunted`` one that a rendered pose of its cell breaks, if there is one."""
         claim = super().draw(rng, hunted)
         if not hunted or not self.splats:
             return claim
@@ -88,21 +85,22 @@ class Picture(Claims):
         broken = BoxClaim(k, int(rows[row]), int(columns[column]), int(channel), point)
         return broken if room.min() < -1e-9 else claim
 
-    def place(self, claim: BoxClaim) -> dict[str, Any]:
-        return super().place(claim) | {"pixel": [claim.row, claim.column], "channel": claim.channel}
+    def label(self, claim: BoxClaim) -> dict[str, Any]:
+        return super().label(claim) | {"pixel": [claim.row, claim.column], "channel": claim.channel}
 
     def bounds(self, claim: BoxClaim) -> ClaimedBounds:
-        """What is claimed."""
+        """Return the bounds that the frame file claims."""
         a, k, sides = self.cells.arrays, claim.cell, ("lower", "upper")
         at = (k, claim.row - int(a["tile"][k, 0]), claim.column - int(a["tile"][k, 1]), claim.channel)
         least, most = (float(a[s][claim[1:4]]) for s in sides)
         lower, upper = ((a[f"A_{s}"][at].astype(np.float64), float(a[f"b_{s}"][at])) for s in sides)
         return ClaimedBounds((least, most), (lower, upper), *self.box(claim))
 
-    def near(self, claim: BoxClaim, low: Array, high: Array, unit: float) -> Array:
+    def candidates(self, claim: BoxClaim, low: Array, high: Array, unit: float) -> Array:
         if not self.splats:
-            return super().near(claim, low, high, unit)
-        return meeting(reaches(self.scene, self.poses.camera, self.poses.view(low, high), unit)[0], *claim[1:3])
+            return super().candidates(claim, low, high, unit)
+        extents = pixel_extents(self.scene, self.poses.camera, self.poses.view(low, high), unit)
+        return gaussians_at(extents[0], *claim[1:3])
 
     def margins(self, claim: BoxClaim, low: Array, high: Array, near: Array, unit: float) -> ClaimMargins:
         none = np.zeros(len(low))
@@ -122,11 +120,11 @@ class Picture(Claims):
             form, counted, motion = pixels(self.scene, camera, view, at, pixel, unit)
         else:
             form = self.scene.pixels(camera, view, pixel)
-        return form.of(lambda a: a[..., claim.channel]), counted, motion
+        return form.apply(lambda a: a[..., claim.channel]), counted, motion
 
-    def detail(self, claim: BoxClaim, point: Array) -> dict[str, Any]:
-        """The pose, the picture's value, its error, and by how much which bound is left."""
-        form = self._forms(claim, point, point, self.near(claim, point, point, 0.0), 0.0)[0]
+    def refutation(self, claim: BoxClaim, point: Array) -> dict[str, Any]:
+        """Return the pose, the pixel's value there with its error, and which bound it exceeds by how much."""
+        form = self._forms(claim, point, point, self.candidates(claim, point, point, 0.0), 0.0)[0]
         excess = self.bounds(claim).excess(point, point, form)[0][:, 0]
         value, side = float(np.clip(form.c[0], 0.0, 1.0)), ("lower", "upper")[int(np.argmax(excess)) // 2]
         about = {"value": value, "error": float(form.width[0]), "bound": side, "excess": float(excess.max())}

@@ -1,4 +1,4 @@
-"""Camera poses of a frame over boxes of parameters, as forms."""
+"""Cameras of a frame over boxes of parameters, as forms."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _BASE = 256.0 * U
 
 @dataclass(frozen=True)
 class CheckedCamera:
-    """A pinhole camera: [3, 4] camera-to-world, OpenGL axes; focal lengths, centre and size in pixels."""
+    """A pinhole camera: camera-to-world [3, 4] (OpenGL axes), and focal lengths, principal point and size in pixels."""
 
     pose: Array
     fx: float
@@ -28,7 +28,7 @@ class CheckedCamera:
 
 @dataclass(frozen=True)
 class Poses:
-    """The poses of a frame, by the rules of the perturbation file."""
+    """The set of a frame's poses, as the perturbation file defines it."""
 
     #: The keyframe's camera.
     camera: CheckedCamera
@@ -44,18 +44,18 @@ class Poses:
     following: Array | None = None
 
     def given(self, low: Array, high: Array) -> dict[str, Affine]:
-        """The parameters by name over the boxes [B, d]."""
+        """Return the form of each parameter, by name, over boxes [B, d]; the name "" is the constant 0."""
         middle = 0.5 * (low + high)
         free = parameters(middle, np.maximum(high - middle, middle - low) * (1.0 + 4.0 * U))
         coordinates = {"": Affine.constant(0.0, free[0])} | dict(zip(self.names, free, strict=False))
         return coordinates | {name: Affine.constant(v, free[0]) for name, v in self.values.items()}
 
     def view(self, low: Array, high: Array) -> CameraForms:
-        """The cameras over the boxes [B, d]."""
+        """Return the cameras over boxes [B, d]."""
         return CameraForms(*self.posed(self.given(low, high)), self.camera.pose)
 
     def posed(self, p: dict[str, Affine]) -> tuple[list[list[Affine]], list[Affine]]:
-        """Camera-to-world rotation and position at the parameters."""
+        """Return the camera-to-world rotation [3][3] and the camera's position at the parameters."""
         zero, pose = p[""], self.camera.pose
         if self.following is None:
             turn, place = fixed(pose[:, :3], zero), [Affine.constant(v, zero) for v in pose[:, 3]]
@@ -81,7 +81,7 @@ class Poses:
 
 
 class CameraForms:
-    """Where cameras stand over boxes of parameters, all forms [B].
+    """Cameras over boxes of parameters, all forms [B].
 
     x_camera = ``rotation`` (x_world - ``origin``) + ``shift``, OpenCV axes; ``origin`` [B, 3] are numbers.
     """
@@ -104,7 +104,7 @@ def _nearest_rotation(matrix: Array) -> Array:
 
 
 def _axis_angle(turn: Array) -> tuple[Array, float]:
-    """Axis and angle of a rotation, by way of its quaternion: the eigenvector of a symmetric matrix."""
+    """Return the axis and angle of a rotation, from its quaternion: an eigenvector of a symmetric matrix."""
     a, t = turn, np.trace(turn)
     rest = np.array([a[2, 1] - a[1, 2], a[0, 2] - a[2, 0], a[1, 0] - a[0, 1]])
     k = np.block([[a + a.T - t * np.eye(3), rest[:, None]], [rest[None], np.full((1, 1), t)]])

@@ -1,4 +1,4 @@
-"""Reading of a result's folder, and what can be checked of its structure alone: exactly, without a picture."""
+"""Reads the folder of a result, and checks its structure exactly, without rendering."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _WHERE = "give the output folder of ns-abstract-render, ns-abstract-certify or n
 
 @dataclass(frozen=True)
 class StoredCells:
-    """Cells of a frame, or of a question about a loop; arrays as docs/results.md describes them."""
+    """The cells of a frame, or of a question about a loop; arrays as docs/results.md describes them."""
 
     #: Number of the frame or question.
     index: int
@@ -45,7 +45,7 @@ class StoredCells:
 
 
 def read_report(folder: Path) -> dict[str, Any]:
-    """The report of a finished result."""
+    """Return report.json of a result, of the version and kinds that can be checked."""
     if not folder.is_dir():
         raise BadInput("no such folder", folder, fix=_WHERE)
     report = read_json(file := folder / "report.json", "report", _WHERE)
@@ -60,7 +60,7 @@ def read_report(folder: Path) -> dict[str, Any]:
 
 
 def read_cells(folder: Path, name: str, index: int, digest: object) -> StoredCells:
-    """A frame file, checked before anything in it is unpacked."""
+    """Return the cells of a frame file, whose digest, sizes and types are checked before arrays are unpacked."""
     with reading(file := folder / name, "cannot be read as a frame file", _AGAIN):
         if sha256(file) != digest:
             raise BadInput("is not the file that the report names (sha256)", file, fix=_AGAIN)
@@ -86,7 +86,7 @@ def read_cells(folder: Path, name: str, index: int, digest: object) -> StoredCel
 
 
 def read_verdicts(folder: Path, report: dict[str, Any]) -> list[StoredCells]:
-    """The cells of a certificate or a loop: by frame, or by question (0 safe, 1 reaches)."""
+    """Return the cells of a certificate by frame, or those of a loop by question (0 safe, 1 reaches)."""
     file, rows, total, loop, cells = folder / "cells.sqlite", 0, 0, report.get("kind") == "loop", []
     by_frame: dict[int, list[Any]] = {}
     with reading(file, "cannot be read as the cells of this result", _AGAIN):
@@ -123,18 +123,18 @@ def read_verdicts(folder: Path, report: dict[str, Any]) -> list[StoredCells]:
 
 
 def _initial(loop: dict[str, Any]) -> list[list[Any]]:
-    """Name, least and greatest value of each component of a loop's initial states that varies."""
+    """Return [name, lower, upper] of each component that varies over a loop's initial states."""
     ends = {name: np.ravel(loop["initial"][name]).tolist() for name in loop["state"]}
     return [[name, *values] for name, values in ends.items() if values[0] < values[-1]]
 
 
-def structure(cells: StoredCells, report: dict[str, Any]) -> list[str]:
-    """What is wrong with a frame's cells: they must be a partition of the set, every pixel bounded, counts right."""
+def structural_faults(cells: StoredCells, report: dict[str, Any]) -> list[str]:
+    """Return the faults of a frame's cells: they must be a partition of the set, all pixels bounded, counts right."""
     entries = [f for f in report.get("frames", ()) if f["index"] == cells.index]
     # what an entry says that nobody looks at would stand unchecked
     wrong = ["the report has more than one entry of it"] if entries[1:] else []
     if cells.verdicts is not None:
-        return wrong + _tallies(cells, report)
+        return wrong + _tally_faults(cells, report)
     a, entry = cells.arrays, entries[0]
     (height, width, _), side = a["lower"].shape, a["b_lower"].shape[1]
     places = {(r, c) for r in range(0, height, side) for c in range(0, width, side)}
@@ -167,14 +167,14 @@ def structure(cells: StoredCells, report: dict[str, Any]) -> list[str]:
 
 
 def entries_of(report: dict[str, Any]) -> dict[int, dict[str, Any]]:
-    """Counts of cells and parts of the set that the report says of each question or frame."""
+    """Return the report's counts and volume fractions of cells, by number of the question or frame."""
     if report.get("kind") == "loop":
         return {k: report["questions"][n] for k, n in enumerate(("safe", "reaches")) if n in report["questions"]}
     return {f["index"]: f | f["coverage"] for f in report["frames"]}
 
 
-def _tallies(cells: StoredCells, report: dict[str, Any]) -> list[str]:
-    """Verdicts of a frame or question against the report, whose parts are sums of disjoint cells' volumes."""
+def _tally_faults(cells: StoredCells, report: dict[str, Any]) -> list[str]:
+    """Return where the report's counts and fractions of a frame or question differ from its cells' verdicts."""
     loop, entry = report.get("kind") == "loop", entries_of(report)[cells.index]
     wrong, verdicts = [], np.array([v[0] for v in cells.verdicts or []])
     low, high, whole = cells.arrays["box_lower"], cells.arrays["box_upper"], (cells.lower, cells.upper)
@@ -198,7 +198,7 @@ def _tallies(cells: StoredCells, report: dict[str, Any]) -> list[str]:
 
 
 def partition(low: Array, high: Array, first: Array, last: Array) -> Fraction | None:
-    """The part of the box [first, last] that boxes [n, d] fill, exactly; None if they overlap or leave it."""
+    """Return the fraction of the box [first, last] that boxes [n, d] fill, exact; None if they overlap or leave it."""
     if not ((low >= first) & (high <= last) & (low <= high)).all():
         return None
     # what is fixed in this frame has no volume

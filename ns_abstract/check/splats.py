@@ -1,8 +1,8 @@
-"""Enclosures of pixels of Splatfacto's picture over boxes of camera poses, by gsplat's rules.
+"""Encloses pixels of Splatfacto's picture over boxes of camera poses, by gsplat's rules.
 
-The picture is blended from the back by forms in the pose. What depends on decisions that are open within a box
-(threshold, tile, depth order, stop) is enclosed with both outcomes. With ``unit`` 0 that is the picture in real
-numbers; with ``FLOAT`` every float32 evaluation of gsplat's formulas lies within it, too (docs/dev/checker.md).
+The picture is composited back to front by forms in the pose. Decisions that are open within a box (alpha threshold,
+tile, depth order, early stop) are enclosed with both outcomes. With ``unit`` 0 the picture in real numbers is enclosed;
+with ``unit`` `FLOAT` every float32 evaluation of gsplat's formulas, too (docs/dev/checker.md).
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ns_abstract.check.blending import ROOM, blended, picked
+from ns_abstract.check.blending import ROOM, blended, gathered
 from ns_abstract.check.forms import Affine, Array, U, product, total
 from ns_abstract.check.poses import CameraForms, CheckedCamera
 
@@ -26,13 +26,13 @@ TOGETHER, _LIBRARY, _FLUSHED = 20_000, 1e-9, 1e-30
 
 
 class VersionRules(NamedTuple):
-    """What differs between gsplat's versions."""
+    """The rules in which gsplat's versions differ."""
 
     #: Alpha's cap, and the least compensation.
     cap: float
     least_factor: float
     #: Whether tiles cut. Else they hold every pixel with an alpha above the threshold, in real numbers; in float32
-    #: `_kept`.
+    #: `_surely_in_tile`.
     tiles: bool
     #: Whether tiles are of ellipses.
     ellipses: bool
@@ -47,7 +47,7 @@ RULES = {
 
 @dataclass(frozen=True)
 class ActivatedScene:
-    """A scene's activated Gaussians: float64 arrays and how far they may be from the real numbers."""
+    """A scene's activated Gaussians in float64, with bounds of their errors."""
 
     #: [N, 3], exact.
     means: Array
@@ -66,9 +66,9 @@ class ActivatedScene:
     paint: Any = None
 
     def painted(self, paint: Any) -> ActivatedScene:
-        """The scene whose picture is weights: Gaussians that count are white, all others and the background black.
+        """Return the scene with selected Gaussians white, and all others and the background black.
 
-        Those in a box [2, 3] count, or those nearer than a distance; None: the scene itself.
+        ``paint``: a box [2, 3] that selects by mean, a distance that selects by depth, or None: the scene itself.
         """
         if isinstance(paint, np.ndarray):
             paint = ((self.means >= paint[0]) & (self.means <= paint[1])).all(axis=1) * 1.0
@@ -78,7 +78,7 @@ class ActivatedScene:
 def activated(
     stored: list[Array], sigmoid: bool, degree: int, antialiased: bool, background: Array, version: str
 ) -> ActivatedScene:
-    """The scene of stored float32 parameters: means, logarithms of scales, quaternions, logits and coefficients."""
+    """Return the scene of stored float32 parameters: means, log scales, quaternions, opacity logits and colours."""
     means, logs, q, logits, sh = (v.astype(np.float64) for v in stored)
     scales = np.exp(logs)
     w, *v = (q / np.sqrt((q * q).sum(axis=1, keepdims=True))).T
@@ -92,18 +92,15 @@ def activated(
     )  # fmt: skip
 
 
-def reaches(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit: float) -> Array:
-    """Ends [B, N, 4] in pixels (left, right, top, bottom) of where each Gaussian may show for some pose of each box.
-
-    A Gaussian that shows nowhere has crossed ends.
-    """
+def pixel_extents(splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit: float) -> Array:
+    """Return boxes [B, N, 4] in pixels (left, right, top, bottom) about each Gaussian's visible pixels, some empty."""
     parts, count = np.array_split(np.arange(len(splats.means)), 1 + len(splats.means) // TOGETHER), len(view.origin)
     with np.errstate(all="ignore"):
         some = (projected(splats, cam, view, np.broadcast_to(at, (count, len(at))), unit, False) for at in parts)
-        return np.concatenate([_pixel_ends(p, unit) for p in some], axis=1)
+        return np.concatenate([_extents(p, unit) for p in some], axis=1)
 
 
-def _pixel_ends(p: ProjectedForms, unit: float) -> Array:
+def _extents(p: ProjectedForms, unit: float) -> Array:
     zl, zh = p.depth.range()
     wild = ~(p.kappa < 0.125)
     # alpha is the threshold where the exponent is the logarithm, and dx^2 is at most twice that times the variance
@@ -121,22 +118,19 @@ def _pixel_ends(p: ProjectedForms, unit: float) -> Array:
     return np.stack([np.where(hidden, np.inf, ends[0]), *ends[1:]], axis=-1)
 
 
-def meeting(ends: Array, row: int, column: int) -> Array:
-    """Numbers of the Gaussians whose `reaches` hold the pixel's centre."""
+def gaussians_at(ends: Array, row: int, column: int) -> Array:
+    """Return the numbers of the Gaussians whose `pixel_extents` [N, 4] hold the pixel's centre."""
     x, y = column + 0.5, row + 0.5
     return np.flatnonzero((ends[:, 0] <= x) & (ends[:, 1] >= x) & (ends[:, 2] <= y) & (ends[:, 3] >= y))
 
 
 def wide(form: Affine) -> Affine:
-    """Forms [B] as forms [B, 1]."""
-    return form.of(lambda a: a[..., None])
+    """Return forms [B] as forms [B, 1]."""
+    return form.apply(lambda a: a[..., None])
 
 
 def _points(splats: ActivatedScene, view: CameraForms, index: Array, unit: float) -> list[Affine]:
-    """Camera coordinates [B, n] of the means.
-
-    In float32 the pose is rounded, R C and R mu are sums of three: less than 8 units of |R| (|mu| + |C|).
-    """
+    """Return the means in camera coordinates [B, n]; float32 errors are below 8 units of |R| (|mu| + |C|)."""
     means, origin = splats.means[index], view.origin[:, None, :]
     far = np.abs(means) + np.abs(origin) + np.sum([e.size() for e in view.position], axis=0)[:, None, None]
     rotation = [[wide(e) for e in row] for row in view.rotation]
@@ -147,7 +141,7 @@ def _points(splats: ActivatedScene, view: CameraForms, index: Array, unit: float
 
 
 class ProjectedForms(NamedTuple):
-    """Gaussians on the image plane, forms [B, n]: all that does not depend on the pixel."""
+    """Gaussians projected to the image plane, forms [B, n]: everything that does not depend on the pixel."""
 
     centre: list[Affine]
     #: The three columns of the covariance's root.
@@ -166,7 +160,7 @@ class ProjectedForms(NamedTuple):
 def projected(
     splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, at: Array, unit: float, colored: bool = True
 ) -> ProjectedForms:
-    """The Gaussians ``at`` [B, n] for cameras over B boxes."""
+    """Return the Gaussians numbered ``at`` [B, n], projected by cameras over B boxes."""
     x, y, z = _points(splats, view, at, unit)
     iz = z.power(-1.0)
     iz = iz.wider(6.0 * unit * iz.size())
@@ -188,11 +182,11 @@ def projected(
     inverse, errors, kappa = det.power(-1.0), [np.zeros(at.shape)] * 3, np.zeros(at.shape)
     if unit:
         h = [(iz * f).size() * (1.0 + e.size()) for e, f in zip(slopes, (cam.fx, cam.fy), strict=True)]
-        errors, kappa, error = _rounded(det, (mm, nn), h, sizes)
+        errors, kappa, error = _float32_charges(det, (mm, nn), h, sizes)
         flat, det = flat.wider(error), det.wider(error)
     opacity = Affine.constant(splats.opacity[at], z, 32.0 * U * splats.opacity[at])
     if splats.antialiased:
-        opacity = opacity * _factor(flat, det, splats.rules.least_factor, unit)
+        opacity = opacity * _compensation(flat, det, splats.rules.least_factor, unit)
     color = _colors(splats, view, at, z, unit) if colored else None
     return ProjectedForms(centre, roots, [mm, nn, mn], inverse, opacity, z, errors, kappa, color)
 
@@ -200,7 +194,7 @@ def projected(
 def _fragments(
     splats: ActivatedScene, cam: CheckedCamera, p: ProjectedForms, index: Array, pixel: tuple[Array, Array], unit: float
 ) -> tuple[Affine, Array, Array]:
-    """Alphas [B, n], which may show at all, and by how many pixels the parameters move them [d, B]."""
+    """Return alphas [B, n] at a pixel, which may pass the threshold, and the centres' motion [d, B] in pixels."""
     rules, (mx, my), (m, n), opacity, z = splats.rules, p.centre, p.axes, p.opacity, p.depth
     dx, dy = (e + -(place[:, None] + 0.5) for e, place in ((mx, pixel[1]), (my, pixel[0])))
     near = total((n[k] * dx - m[k] * dy).square() for k in range(3))
@@ -223,24 +217,24 @@ def _fragments(
     surely = (least >= LEAST_ALPHA * (1.0 + room)) & (zl >= NEAR * (1.0 + ROOM)) & (zh <= FAR)
     if rules.tiles:
         squares = [e.wider(error) for e, error in zip(p.squares, p.errors, strict=True)]
-        maybe, certain = _tiles(cam, pixel, (mx, my), squares, unit)
+        maybe, certain = _tile_overlap(cam, pixel, (mx, my), squares, unit)
         shows, surely = shows & maybe, surely & certain & ~wild
     elif unit:
-        ellipse_kept, level = _kept(p, rules.ellipses)
+        ellipse_kept, level = _surely_in_tile(p, rules.ellipses)
         surely = surely & ellipse_kept & (least >= LEAST_ALPHA * level)
     alow, ahigh = alpha.range()
     # the form must say no less than the interval, and stay below the cap, which is rounded, too
     rough = ~((ahigh - alow) <= 1.5 * (most - least)) | ~(ahigh <= rules.cap) | ~(alow >= 0.0) | ~surely
     bottom, top = (np.minimum(e, rules.cap * (1.0 + s * unit)) for e, s in ((least * surely, -1.0), (most, 1.0)))
-    alpha = alpha.boxed(rough, bottom, np.maximum(top, bottom)).of(lambda a: a * shows)
+    alpha = alpha.replaced(rough, bottom, np.maximum(top, bottom)).apply(lambda a: a * shows)
     motion = np.where(shows[None], np.abs(mx.g) + np.abs(my.g), 0.0).max(axis=2, initial=0.0)
     return alpha, shows, motion
 
 
-def _rounded(det: Affine, squares: Any, h: list[Array], sizes: Array) -> tuple[list[Array], Array, Array]:
-    """Errors in float32 of the covariance's entries (xx, yy, xy), of the exponent (relative) and of determinants.
+def _float32_charges(det: Affine, squares: Any, h: list[Array], sizes: Array) -> tuple[list[Array], Array, Array]:
+    """Return float32 errors of the covariance (xx, yy, xy), of the exponent (relative), and of determinants.
 
-    Where kappa is not below 1/8 nothing is known of the exponent; docs/dev/checker.md derives the charges.
+    Nothing is known of the exponent where its error (kappa) is 1/8 or more; docs/dev/checker.md derives the charges.
     """
     square, (hx, hy) = (sizes * sizes).sum(axis=-1) * (1.0 + _LIBRARY), h
     a, c = (e.size() + BLUR for e in squares)
@@ -255,8 +249,8 @@ def _rounded(det: Affine, squares: Any, h: list[Array], sizes: Array) -> tuple[l
     return [ea, ec, eb], kappa, error
 
 
-def _factor(flat: Affine, det: Affine, least: float, unit: float) -> Affine:
-    """The opacity's factor sqrt(max(0, det before / det after the blur)), not below ``least``."""
+def _compensation(flat: Affine, det: Affine, least: float, unit: float) -> Affine:
+    """Return gsplat's antialiasing factor of the opacity, sqrt(max(0, det / blurred det)), at least ``least``."""
     (low, high), (dlow, dhigh) = flat.range(), det.range()
     room, limit = ROOM + 16.0 * unit, 1.0 if not unit else 1e3
     bottom = np.sqrt(np.maximum(low, 0.0) / dhigh) * (1.0 - room)
@@ -265,11 +259,11 @@ def _factor(flat: Affine, det: Affine, least: float, unit: float) -> Affine:
     top = np.minimum(np.where(np.isfinite(top), top, limit), limit)
     root = (flat * det.power(-1.0)).power(0.5)
     root = root.wider(16.0 * unit * np.minimum(root.size(), limit))
-    return root.within(bottom, np.maximum(top, bottom)).clamped(least, limit + ROOM)
+    return root.narrowed(bottom, np.maximum(top, bottom)).clamped(least, limit + ROOM)
 
 
-def _tiles(cam: CheckedCamera, pixel: Any, centre: Any, squares: Any, unit: float) -> tuple[Array, Array]:
-    """Whether gsplat 1.4.0 may, and surely does, list a Gaussian for the pixel's tile."""
+def _tile_overlap(cam: CheckedCamera, pixel: Any, centre: Any, squares: Any, unit: float) -> tuple[Array, Array]:
+    """Return whether gsplat 1.4.0 may, and whether it surely does, list a Gaussian for the pixel's tile."""
     a, c, b = squares
     (al, ah), (low, high) = ((a + c) * 0.5 + BLUR).range(), (((a - c) * 0.5).square() + b.square()).range()
     # in float32 the smaller root is of a difference of squares
@@ -289,11 +283,11 @@ def _tiles(cam: CheckedCamera, pixel: Any, centre: Any, squares: Any, unit: floa
     return maybe, certain
 
 
-def _kept(p: ProjectedForms, ellipses: bool) -> tuple[Array, Array]:
-    """Where float32 tiles from 1.5 on lose no pixel whose alpha is above the threshold by a factor, and the factor.
+def _surely_in_tile(p: ProjectedForms, ellipses: bool) -> tuple[Array, Array]:
+    """Return where float32 tiles from gsplat 1.5 on list all pixels of alphas above the threshold times a factor.
 
-    The box (1.5.3) and the ellipse (1.6.0) of this level are computed from the floats that alpha is computed from, and
-    pixels' centres lie half a pixel from every tile's edge: what rounds there moves the level (docs/dev/checker.md).
+    Box (1.5.3) and ellipse (1.6.0) come from the floats that alpha comes from, and pixel centres lie half a pixel from
+    every tile edge: rounding moves the level, by the factor that is returned (docs/dev/checker.md).
     """
     a, c = (e.range()[1] + BLUR for e in p.squares[:2])
     # along the image's axes, in pixels: where a Gaussian may reach
@@ -308,13 +302,13 @@ def _kept(p: ProjectedForms, ellipses: bool) -> tuple[Array, Array]:
 
 
 def _colors(splats: ActivatedScene, view: CameraForms, at: Array, depth: Affine, unit: float) -> Affine:
-    """Colours [3, B, n]."""
+    """Return the Gaussians' colours [3, B, n] seen from the cameras."""
     sh = np.moveaxis(splats.sh[at], (-2, -1), (0, 1))
-    flat = depth.of(lambda a: np.repeat(a[..., None, :, :], 3, axis=-3))
+    flat = depth.apply(lambda a: np.repeat(a[..., None, :, :], 3, axis=-3))
     if isinstance(splats.paint, float):
         # a depth that is not a number may be any
         low, high = flat.range()
-        return flat.boxed(np.array(True), (high < splats.paint) * 1.0, ~(low >= splats.paint) * 1.0)
+        return flat.replaced(np.array(True), (high < splats.paint) * 1.0, ~(low >= splats.paint) * 1.0)
     if splats.paint is not None:
         return Affine.constant(splats.paint[at], flat)
     if splats.sigmoid:
@@ -341,15 +335,15 @@ def _colors(splats: ActivatedScene, view: CameraForms, at: Array, depth: Affine,
                 z * (xx - yy) * 1.445305721320277, x * (xx - yy * 3.0) * -0.5900435899266435,
             ]  # fmt: skip
         # slopes of bands are below 8, and 16 roundings of sums of terms below 8 together
-        bands = [e.wider(8.0 * error + 128.0 * unit).of(lambda a: a[..., None, :, :]) for e in bands]
+        bands = [e.wider(8.0 * error + 128.0 * unit).apply(lambda a: a[..., None, :, :]) for e in bands]
         color = total([color, *(band * row for band, row in zip(bands, sh[1:], strict=False))])
     return color.clamped(0.0, np.inf)
 
 
 def _directions(splats: ActivatedScene, view: CameraForms, at: Array, unit: float) -> tuple[list[Affine], Array]:
-    """Unit vectors from the camera to the means, world axes, and how far those in float32 may be from them.
+    """Return unit vectors from the camera to the means (world axes), and bounds of their float32 errors.
 
-    Version 1.6.0 takes -R^T t with the view matrix, which differs where a keyframe's rotation is not orthonormal.
+    Version 1.6.0 takes -R^T t of the view matrix as the camera; that differs where a keyframe is not orthonormal.
     """
     far = np.abs(view.origin).sum(axis=1) + sum(e.width for e in view.position)
     means, origin, parts = splats.means[at], view.origin[:, None, :], []
@@ -365,11 +359,10 @@ def pixels(
     splats: ActivatedScene, cam: CheckedCamera, view: CameraForms | ProjectedForms, index: Array,
     pixel: tuple[Array, Array], unit: float = 0.0,
 ) -> tuple[Affine, Array, Array]:  # fmt: skip
-    """Colours [B, 3] before the clamp of one pixel over each of B boxes; which Gaussians matter [B, n]; their motion.
+    """Return one pixel's colours [B, 3] before the clamp over B boxes, which Gaussians contribute, and their motion.
 
-    The motion [d, B], in pixels, is what each parameter moves a Gaussian by at most, about. The pixels are at rows [B]
-    and columns [B]. Of the Gaussians ``index`` [B, n], which may show (`reaches`), negative ones stand for none. The
-    ``view`` are cameras over B boxes, or what `projected` makes of them.
+    The motion [d, B], in pixels, is each parameter's largest, approximately. ``view``: cameras, or what `projected`
+    returns of them. ``index`` [B, n] numbers the Gaussians that may be visible (`pixel_extents`), negative ones none.
     """
     with np.errstate(all="ignore"):
         if not isinstance(view, ProjectedForms):
@@ -381,13 +374,13 @@ def pixels(
 def pictures(
     splats: ActivatedScene, cam: CheckedCamera, view: CameraForms, unit: float, numbers: Array | None = None
 ) -> Affine:
-    """Colours [B, P, 3] of pixels over B boxes of poses: those with the ``numbers`` [P] in the picture, or all."""
+    """Return colours [B, P, 3] of pixels over B boxes of poses: the pixels ``numbers`` [P] of the picture, or all."""
     at: Array = np.arange(cam.height * cam.width) if numbers is None else numbers
     count, lists = len(view.origin), []
-    for ends in reaches(splats, cam, view, unit):
+    for ends in pixel_extents(splats, cam, view, unit):
         inside = (ends[:, 0] <= cam.width) & (ends[:, 1] >= 0.0) & (ends[:, 2] <= cam.height) & (ends[:, 3] >= 0.0)
         some = np.flatnonzero(inside)
-        lists += [some[meeting(ends[some], *divmod(p, cam.width))] for p in at]
+        lists += [some[gaussians_at(ends[some], *divmod(p, cam.width))] for p in at]
     every = np.unique(np.concatenate(lists))
     with np.errstate(all="ignore"):
         whole = projected(splats, cam, view, np.broadcast_to(every, (count, len(every))), unit)
@@ -399,6 +392,6 @@ def pictures(
         for place, gaussians in zip(index, chosen, strict=True):
             place[: len(gaussians)] = np.searchsorted(every, gaussians)
         box, place = np.divmod(np.arange(start, start + len(chosen)), len(at))
-        part = picked(whole, box[:, None], index)
+        part = gathered(whole, box[:, None], index)
         parts.append(pixels(splats, cam, part, index, np.divmod(at[place], cam.width), unit)[0].clamped(0.0, 1.0))
     return Affine.joined(parts, -2).reshaped(count, len(at), 3)

@@ -1,4 +1,4 @@
-"""Statements about the picture itself: ``visible``, ``clear``, ``picture``, and ``all`` and ``any`` of them."""
+"""Properties of the picture itself: ``visible``, ``clear``, ``picture``, and ``all`` and ``any`` of them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ns_abstract.check.forms import Affine, Array, U, total
-from ns_abstract.check.inputs import FIX, BadInput, followed
+from ns_abstract.check.inputs import FIX, BadInput, check_keys
 
 #: Keys that are read elsewhere, or say nothing; what to do with others.
 FREE = ("$schema", "output", "partitions", "preprocess")
@@ -17,22 +17,22 @@ _CHANNELS = {"luminance": (0.2126, 0.7152, 0.0722), "r": (1.0, 0.0, 0.0), "g": (
 
 
 class CombinedMargins(NamedTuple):
-    """All or any of some statements hold: the least or the largest of their margins counts."""
+    """A conjunction or disjunction of properties: its margin is the least or the largest of theirs (``pick``)."""
 
     pick: Any
     parts: list[Any]
 
     def margin(self, picture: Callable[[Any], Affine]) -> tuple[Array, Array]:
-        """Lower and upper bounds [B] of the margin over B boxes; ``picture`` gives forms [B, H W, 3] of a plane."""
+        """Return bounds [B] of the margin over B boxes; ``picture`` returns a plane's picture as forms [B, H W, 3]."""
         lower, upper = zip(*(part.margin(picture) for part in self.parts), strict=True)
         return self.pick(lower, axis=0), self.pick(upper, axis=0)
 
 
 class Measured(NamedTuple):
-    """A number of a plane lies between ``low`` and ``high``.
+    """The property that a number measured in a plane lies between ``low`` and ``high``.
 
-    The plane is ``paint``: colours (None), the weights of Gaussians in a box ([2, 3]) or nearer than a distance. Its
-    channels are weighted. What is measured of a second region of numbered pixels is subtracted.
+    The plane (``paint``) holds colours (None), weights of the Gaussians in a box [2, 3], or of those nearer than a
+    distance. A pixel's value is the sum of its channels times ``channels``. The second region's measure is subtracted.
     """
 
     paint: Any
@@ -44,12 +44,12 @@ class Measured(NamedTuple):
     high: float
 
     def margin(self, picture: Callable[[Any], Affine]) -> tuple[Array, Array]:
-        """Lower and upper bounds [B] of the margin; see `CombinedMargins`."""
+        """Return bounds [B] of the margin; see `CombinedMargins.margin`."""
         plane = picture(self.paint)
-        single = total(plane.of(lambda a, k=k: a[..., k]) * w for k, w in enumerate(self.channels))
-        parts = [single.of(lambda a, k=k: a[..., k]) for k in self.regions]
+        single = total(plane.apply(lambda a, k=k: a[..., k]) * w for k, w in enumerate(self.channels))
+        parts = [single.apply(lambda a, k=k: a[..., k]) for k in self.regions]
         if self.rank == 0:
-            means = [p.of(lambda a: a.mean(axis=-1)).wider(2.0 * U * p.size().sum(axis=-1)) for p in parts]
+            means = [p.apply(lambda a: a.mean(axis=-1)).wider(2.0 * U * p.size().sum(axis=-1)) for p in parts]
             least, most = (means[0] - means[1] if parts[1:] else means[0]).range()
         else:
             ends = [[np.sort(e, axis=-1)[:, 0 if self.rank < 0 else -self.rank] for e in p.range()] for p in parts]
@@ -62,13 +62,13 @@ class Measured(NamedTuple):
         return np.where(np.isnan(lower), -np.inf, lower), np.where(np.isnan(upper), np.inf, upper)
 
 
-def parsed(root: dict[str, Any], size: tuple[int, int], scale: float, beside: Collection[str] = FREE) -> Any:
-    """The statement of a property (of a part, without keys ``beside``); height and width; `dataset_scale`."""
+def parse_statement(root: dict[str, Any], size: tuple[int, int], scale: float, beside: Collection[str] = FREE) -> Any:
+    """Return the property of a JSON object for pictures of ``size`` (height, width); keys ``beside`` are for others."""
     kind, picks = "all" if "all" in root else "any" if "any" in root else root["type"], {"all": np.min, "any": np.max}
-    followed({k: v for k, v in root.items() if k not in beside and not (k == kind and k in picks)}, str(kind))
-    followed(root.get("preprocess") or {}, "preprocess")
+    check_keys({k: v for k, v in root.items() if k not in beside and not (k == kind and k in picks)}, str(kind))
+    check_keys(root.get("preprocess") or {}, "preprocess")
     if kind in picks:
-        return CombinedMargins(picks[kind], [parsed(part, size, scale, ()) for part in root[kind]])
+        return CombinedMargins(picks[kind], [parse_statement(part, size, scale, ()) for part in root[kind]])
     weight, first = float(root.get("weight", 0.5)), _region(root.get("region"), size)
     below, above = (lambda v: float(np.nextafter(v, -np.inf))), (lambda v: float(np.nextafter(v, np.inf)))
     if kind == "visible":
@@ -86,7 +86,7 @@ def parsed(root: dict[str, Any], size: tuple[int, int], scale: float, beside: Co
 
 
 def _region(box: Any, size: tuple[int, int]) -> Array:
-    """Numbers of the pixels in [x0, y0, x1, y1], or all."""
+    """Return the numbers of the pixels in the region [x0, y0, x1, y1], or of all."""
     x0, y0, x1, y1 = (0, 0, size[1], size[0]) if box in (None, "all") else box
     if not (x0 < x1 <= size[1] and y0 < y1 <= size[0]):
         raise BadInput("has a region outside of the picture", "report.json", "property", FIX)

@@ -1,4 +1,4 @@
-"""Claims of certificates: what holds of every picture of a cell."""
+"""Claims of certificates: a property holds at every pose of a cell, or fails at one."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ import numpy as np
 
 from ns_abstract.check.claims import BoxClaim, ClaimMargins, Claims
 from ns_abstract.check.forms import Affine, Array, U
-from ns_abstract.check.inputs import BadInput, followed, same_network
+from ns_abstract.check.inputs import BadInput, check_keys, same_network
 from ns_abstract.check.networks import read_network
 from ns_abstract.check.poses import CameraForms, CheckedCamera, Poses
 from ns_abstract.check.results import StoredCells
 from ns_abstract.check.splats import FLOAT, ActivatedScene, pictures
-from ns_abstract.check.statements import FREE, parsed
+from ns_abstract.check.statements import FREE, parse_statement
 
 #: Lower and upper bounds [B] of a margin over boxes [B, d]; the last argument is the unit of the pictures' rounding.
 Bounds = Callable[[Array, Array, float], tuple[Array, Array]]
 
 
 class Verdicts(Claims):
-    """Cells with verdicts: of all their poses a margin is positive, or of one pose it is not."""
+    """The claims of cells: certified, the margin is positive at all poses; falsified, it is not at one pose."""
 
     def __init__(self, cells: StoredCells, scene: Any, report: dict[str, Any], bounds: Bounds) -> None:
         super().__init__(cells, scene, report)
@@ -39,31 +39,31 @@ class Verdicts(Claims):
         if not isinstance(scene, ActivatedScene) or (report.get("picture") or "float") != "float":
             raise BadInput("is of a NeRF or of 8-bit pictures, whose cells are not checked", "report.json", "renderer")
 
-    def one(self, rng: Any) -> BoxClaim:
+    def draw_uniform(self, rng: Any) -> BoxClaim:
         return BoxClaim(self.rows[int(rng.integers(self.count))])
 
-    def interest(self, claim: BoxClaim) -> float:
-        """Margins that are small."""
-        return -self.floor(claim)
+    def suspicion(self, claim: BoxClaim) -> float:
+        """Return the negative of the claimed margin: small margins come first."""
+        return -self.claimed_margin(claim)
 
-    def floor(self, claim: BoxClaim) -> float:
+    def claimed_margin(self, claim: BoxClaim) -> float:
         return max(0.0, (self.cells.verdicts or [])[claim.cell][1] or 0.0)
 
     def settle(self, claim: BoxClaim, deadline: float) -> tuple[bool | None, bool, dict[str, Any]]:
-        """As `Claims.settle`; where a pose is claimed to fail it is looked at alone."""
+        """Settle as `Claims.settle`; of a falsified cell the counterexample alone is looked at."""
         verdict, _, example = (self.cells.verdicts or [])[claim.cell]
         if verdict != "falsified":
             return super().settle(claim, deadline)
         point, (low, high) = np.array(example, np.float64)[None], self.box(claim)
         least, most = self.bounds(point, point, 0.0)
         if not ((point >= low).all() and (point <= high).all()) or least[0] > 0.0:
-            return False, False, self.detail(claim, point)
+            return False, False, self.refutation(claim, point)
         return (True if most[0] <= 0.0 else None), False, {}
 
-    def detail(self, claim: BoxClaim, point: Array) -> dict[str, Any]:
-        """The pose, the margin there at most, and by how much that is below what is claimed."""
+    def refutation(self, claim: BoxClaim, point: Array) -> dict[str, Any]:
+        """Return the pose, an upper bound of its margin, and how far that is below the claimed margin."""
         most = float(self.bounds(point, point, 0.0)[1][0])
-        return {"pose": point[0].tolist(), "margin": most, "excess": max(self.floor(claim) - most, 0.0)}
+        return {"pose": point[0].tolist(), "margin": most, "excess": max(self.claimed_margin(claim) - most, 0.0)}
 
     def margins(self, claim: BoxClaim, low: Array, high: Array, near: Array, unit: float) -> ClaimMargins:
         least, most = self.bounds(low, high, unit)
@@ -71,29 +71,29 @@ class Verdicts(Claims):
 
 
 def network_unit(report: dict[str, Any]) -> float:
-    """The rounding of the network, if there is one: that of float32 unless its arithmetic is real."""
+    """Return the unit roundoff of the network's evaluation: that of float32 unless the result's arithmetic is real."""
     return FLOAT if report["fingerprint"].get("network_arithmetic", "float32") == "float32" else 0.0
 
 
-class SeeingNetwork:
-    """A network that sees pictures of the scene, by the ``preprocess`` of a property or loop."""
+class NetworkOnPictures:
+    """A network whose input is the scene's picture, after the ``preprocess`` of a property or loop."""
 
     def __init__(self, scene: ActivatedScene, report: dict[str, Any], model: Path, about: dict[str, Any]) -> None:
         self.scene, self.shape = scene, about.get("preprocess") or {}
         if not same_network(model, report["model"]):
             raise BadInput("is not the network of the result (sha256)", model, fix="say with --model where it lies now")
-        followed(self.shape, "input")
+        check_keys(self.shape, "input")
         try:
             self.network = read_network(model, about.get("output"), network_unit(report))
         except Exception as error:  # onnx raises whatever a damaged file makes it run into
             raise BadInput(" ".join(str(error).split())[:160] or "cannot be read", model) from None
 
     def outputs(self, camera: CheckedCamera, view: CameraForms, unit: float, rows: Array | None = None) -> Affine:
-        """The outputs over B boxes of poses, as `CheckedNetwork.outputs`."""
+        """Return the outputs over B boxes of poses; ``rows`` as in `CheckedNetwork.outputs`."""
         image = pictures(self.scene, camera, view, unit).reshaped(len(view.origin), camera.height, camera.width, 3)
-        image = image.of(lambda a: np.moveaxis(a, -1, -3))
+        image = image.apply(lambda a: np.moveaxis(a, -1, -3))
         if self.shape.get("channels", "RGB") == "BGR":
-            image = image.of(lambda a: a[..., ::-1, :, :])
+            image = image.apply(lambda a: a[..., ::-1, :, :])
         low, high = self.shape.get("range") or (0.0, 1.0)
         mean, std = (np.reshape(self.shape.get(k) or [d] * 3, (3, 1, 1)) for k, d in (("mean", 0.0), ("std", 1.0)))
         size = (abs(low) + abs(high) + np.abs(mean)) / np.abs(std)
@@ -101,13 +101,13 @@ class SeeingNetwork:
         return self.network.outputs(image, rows)
 
 
-def of_class(scene: Any, poses: Poses, report: dict[str, Any], model: Path) -> Bounds:
-    """Bounds of a class' output less the largest other one."""
+def class_margin(scene: Any, poses: Poses, report: dict[str, Any], model: Path) -> Bounds:
+    """Return bounds of the label's output less the largest other output."""
     about = report["property"]
     if about.get("type") != "classification":
         raise BadInput(f"{about.get('type')!r} is a property that this program does not check", model, "type")
-    followed({k: v for k, v in about.items() if k not in FREE}, "class")
-    seeing, label = SeeingNetwork(scene, report, model, about), int(about["label"])
+    check_keys({k: v for k, v in about.items() if k not in FREE}, "class")
+    seeing, label = NetworkOnPictures(scene, report, model, about), int(about["label"])
     camera, unit_rows = resized(poses.camera, seeing.shape), np.eye(int(report["model"]["output"][-1]))
     rivals = np.delete(unit_rows[label] - unit_rows, label, axis=0)
 
@@ -118,10 +118,10 @@ def of_class(scene: Any, poses: Poses, report: dict[str, Any], model: Path) -> B
     return bounds
 
 
-def of_statement(scene: Any, poses: Poses, report: dict[str, Any], scale: float) -> Bounds:
-    """Bounds of the margin of a statement about the picture itself."""
+def statement_margin(scene: Any, poses: Poses, report: dict[str, Any], scale: float) -> Bounds:
+    """Return bounds of the margin of a property of the picture itself."""
     camera = resized(poses.camera, report["property"].get("preprocess") or {})
-    statement = parsed(report["property"], (camera.height, camera.width), scale)
+    statement = parse_statement(report["property"], (camera.height, camera.width), scale)
 
     def bounds(low: Array, high: Array, unit: float) -> tuple[Array, Array]:
         view = poses.view(low, high)
@@ -131,7 +131,7 @@ def of_statement(scene: Any, poses: Poses, report: dict[str, Any], scale: float)
 
 
 def resized(camera: CheckedCamera, shape: dict[str, Any]) -> CheckedCamera:
-    """The camera at the size that ``preprocess`` names."""
+    """Return the camera for pictures of the size that ``preprocess`` states."""
     height, width = shape.get("resize") or (camera.height, camera.width)
     down, across = height / camera.height, width / camera.width
     return dataclasses.replace(
