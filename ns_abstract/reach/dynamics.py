@@ -29,26 +29,26 @@ MOST = MAX_DIMENSIONS
 
 
 class Floats:
-    """Numbers as they are; works on any type with + and * (float64, exact fractions where no angle occurs)."""
+    """Arithmetic on plain numbers of any type with + and *: float64, or exact fractions where no angle occurs."""
 
     @staticmethod
     def cos_sin(angle: Any) -> tuple[Any, Any]:
-        """Cosine and sine."""
+        """Return cosine and sine of an angle in radians."""
         return np.cos(angle), np.sin(angle)
 
     @staticmethod
     def signed_square(value: Any) -> Any:
-        """``v |v|``."""
+        """Return ``v |v|``."""
         return value * abs(value)
 
     @staticmethod
     def scaled(value: Any, factor: float) -> Any:
-        """``factor * value``."""
+        """Return ``factor * value``."""
         return value * factor
 
 
 class Forms(Floats):
-    """Enclosures by affine forms (A1-A3)."""
+    """Arithmetic on affine forms, which enclose quantities (A1-A3)."""
 
     @staticmethod
     def cos_sin(angle: FormArray) -> tuple[FormArray, FormArray]:
@@ -65,7 +65,7 @@ class Forms(Floats):
 
 
 class TermSizes(Floats):
-    """Upper bounds of the sizes of terms; sums never cancel."""
+    """Arithmetic on upper bounds of the sizes of terms; no sum cancels."""
 
     @staticmethod
     def cos_sin(angle: Any) -> tuple[Any, Any]:
@@ -82,9 +82,9 @@ Law = Callable[[Sequence[Any], Sequence[Any], type[Floats]], list[Any]]
 
 
 class StepEnclosure(NamedTuple):
-    """``f(x, u) = center + slopes (xi, eta) + e`` with ``|e| <= radius``, and a float64 evaluation of it, too.
+    """Encloses the exact step and its float64 evaluation: ``f(x, u) = center + slopes (xi, eta) + e``, |e| <= radius.
 
-    ``xi`` and ``eta`` count x and u from the middles of their boxes in half-widths, so they are in [-1, 1].
+    ``xi`` and ``eta`` in [-1, 1] are the positions of x and u in their boxes, from the middle, in half-widths.
 
     Attributes:
         center: [n].
@@ -101,14 +101,14 @@ class StepEnclosure(NamedTuple):
 
 
 def middle_half(lower: Float64, upper: Float64) -> tuple[Float64, Float64]:
-    """Middles and half-widths of intervals, so that ``middle - half <= lower`` and ``upper <= middle + half``."""
+    """Return middles and half-widths of intervals, with ``middle - half <= lower`` and ``upper <= middle + half``."""
     middle = 0.5 * (lower + upper)
     return middle, np.maximum(upper - middle, middle - lower) * HALF_UP
 
 
 @dataclass(frozen=True)
 class Dynamics:
-    """A law of motion."""
+    """A law of motion in discrete time, ``x' = f(x, u)``."""
 
     name: str
     states: int
@@ -117,13 +117,13 @@ class Dynamics:
     about: str
 
     def step(self, x: Float64, u: Float64) -> Float64:
-        """[n] the next state, in float64, from a state [n] and a control [m]."""
+        """Return the next state [n], evaluated in float64, from a state [n] and a control [m]."""
         return np.array(self.law(list(map(np.float64, x)), list(map(np.float64, u)), Floats), np.float64)
 
     def enclose(self, lower: Float64, upper: Float64) -> StepEnclosure:
-        """Enclosure over the box [n + m] of states and controls, of the exact law and of `step` (L1).
+        """Return an enclosure of the exact law and of `step` over a box [n + m] of states and controls (L1).
 
-        What leaves the range of float64 gets a radius that is not finite.
+        Components that may leave the range of float64 get a radius that is not finite.
         """
         n, m = self.states, self.controls
         middle, half = middle_half(lower, upper)
@@ -144,7 +144,7 @@ class Dynamics:
 
 
 def affine(a: Float64, b: Float64, c: Float64) -> Dynamics:
-    """``x' = A x + B u + c`` with A [n, n], B [n, m], c [n]."""
+    """Return the law ``x' = A x + B u + c`` with A [n, n], B [n, m], c [n]."""
 
     def law(x: Sequence[Any], u: Sequence[Any], kind: type[Floats]) -> list[Any]:
         next_state = []
@@ -260,7 +260,7 @@ KEYS = {
 
 
 def matrix(value: Any, name: str, rows: int, columns: int | None) -> Float64:
-    """A [rows, columns] matrix of moderate numbers, or InputError; ``columns`` None: the first row's."""
+    """Return a [rows, columns] matrix of moderate numbers from JSON; ``columns`` None: as the first row. InputError."""
     if columns is None and isinstance(value, list) and value and isinstance(value[0], list):
         columns = len(value[0])
     good = isinstance(value, list) and len(value) == rows and columns is not None
@@ -274,28 +274,28 @@ def matrix(value: Any, name: str, rows: int, columns: int | None) -> Float64:
 
 
 def numbers(value: Any, name: str, count: int) -> Float64:
-    """[count] moderate numbers, or InputError."""
+    """Return [count] moderate numbers from JSON; InputError where it holds anything else."""
     if not (isinstance(value, list) and len(value) == count and all(is_moderate(v) for v in value)):
         raise fail(name, f"found {show(value)}", f"write {count} numbers, each {FIX_MODERATE}")
     return np.array(value, np.float64)
 
 
 def number(value: Any, name: str, *, positive: bool = False) -> float:
-    """One moderate number, or InputError."""
+    """Return one moderate number from JSON; InputError where it is anything else."""
     if not is_moderate(value) or (positive and not value > 0):
         raise fail(name, f"found {show(value)}", f"write a {'positive ' if positive else ''}number, {FIX_MODERATE}")
     return float(value)
 
 
 def named_file(value: Any, name: str, folder: Path) -> Path:
-    """The .onnx file beside LOOP.json that a field names, or InputError."""
+    """Return the .onnx file beside LOOP.json that a field names; InputError where there is none."""
     if not isinstance(value, str) or not value:
         raise fail(name, f"found {show(value)}", "name an .onnx file beside this one")
     return file_beside(folder, value, name)
 
 
 def parse_dynamics(value: Any, states: int, dt: float, folder: Path) -> Dynamics | LearnedDynamics:
-    """The object under the key ``dynamics``; ``dt`` is the sampling time in seconds."""
+    """Return the law of motion under the key ``dynamics`` of LOOP.json; ``dt`` is the sampling time in seconds."""
     kinds = ", ".join(KEYS)
     if not isinstance(value, Mapping):
         raise fail("dynamics", f"found {show(value)}", f"write an object with a type: {kinds}")

@@ -29,10 +29,10 @@ SHOWN = ("lower", "upper", "gap", "image")
 
 @dataclass(frozen=True)
 class Film:
-    """Abstract images along a tube.
+    """The abstract images along a tube.
 
     Attributes:
-        about: For report.json: cell, verdict, size of pictures; of every step gaps and the box of camera parameters.
+        about: For report.json: the cell, its verdict, picture size; by step the gaps and the box of camera parameters.
     """
 
     about: dict[str, Any]
@@ -40,11 +40,11 @@ class Film:
 
     @property
     def largest(self) -> float:
-        """The largest gap, where all scales end."""
+        """The largest gap over all steps, which is the end of every gap scale."""
         return max(self.about["largest_gap"], default=0.0)
 
     def encoded(self) -> tuple[str, bytes]:
-        """The ending of the file's name and its content; see `ns_abstract.report.export.encoded`."""
+        """Return the file's suffix and its content (mp4 or gif); see `ns_abstract.report.export.encoded`."""
 
         def frames() -> Iterator[np.ndarray]:
             for result in self.steps:
@@ -55,7 +55,7 @@ class Film:
         return encoded(frames(), _FPS)
 
     def strips(self) -> list[tuple[int, bytes]]:
-        """Some steps and PNGs of their pictures, one below the other."""
+        """Return the numbers of a few steps and a PNG of each step's pictures below each other."""
         strips = []
         for k in _some(len(self.steps), _MOST_SHOWN):
             result = self.steps[k]
@@ -66,12 +66,12 @@ class Film:
 
 
 def _some(count: int, most_steps: int) -> list[int]:
-    """At most ``most_steps`` of the first ``count`` numbers, with both ends."""
+    """Return at most ``most_steps`` of the numbers 0 .. ``count`` - 1, evenly spread, with both ends."""
     return np.unique(np.linspace(0, count - 1, min(count, most_steps)).round().astype(int)).tolist() if count else []
 
 
 def film_size(size: tuple[int, int]) -> tuple[int, int]:
-    """Height and width of the film's pictures for a network of pictures of ``size``: a whole multiple."""
+    """Return height and width of the film's pictures: a whole multiple of the network's ``size``."""
     times = -(-_LEAST_SIDE // max(size))
     return size[0] * max(1, times), size[1] * max(1, times)
 
@@ -79,7 +79,7 @@ def film_size(size: tuple[int, int]) -> tuple[int, int]:
 def along(reacher: TubeBuilder, method: Method, size: tuple[int, int], tube: Tube) -> Iterator[FrameResult]:
     """Yield, step by step, bounds of all pictures that the camera may take, and the picture at the middle pose.
 
-    The bounds are those of one cell, as tubes have them.
+    Each step is bounded as one cell, as it is for the tube.
     """
     small = reacher.view.pose_set.camera
     camera = reacher.loop.camera.enlarged(size[0] / small.height, size[1] / small.width)
@@ -100,7 +100,7 @@ def along(reacher: TubeBuilder, method: Method, size: tuple[int, int], tube: Tub
 
 
 def made(steps: Sequence[FrameResult], lower: Sequence[float], upper: Sequence[float], verdict: str) -> Film:
-    """The film of a cell [m] from its steps."""
+    """Return the film of a cell [m] from the bounds of its steps."""
     figures = [metrics(result) for result in steps]
     about = {
         "lower": list(lower),

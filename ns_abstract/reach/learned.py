@@ -51,14 +51,14 @@ class LearnedDynamics:
         require_unchanged(self.network)
 
     def step(self, x: Float64, u: Float64) -> Float64:
-        """[n] the next state as onnxruntime computes it, from a state [n] and a control [m]."""
+        """Return the next state [n] as onnxruntime computes it, from a state [n] and a control [m]."""
         with np.errstate(over="ignore"):
             return self._run(np.concatenate([x, u])[None]).astype(np.float64)
 
     def bound(
         self, center: Float64, generators: Float64, radius: Float64, lower: Float64, upper: Float64
     ) -> OutputBounds | None:
-        """Lower bounds of the next state, and behind them of its negative, over one linear set (L6).
+        """Return lower bounds of the next state and of its negative over one linear set (L6).
 
         They hold for every float32 evaluation, and for the exact function, of all states and controls
         ``center + generators s + e`` with s in [-1, 1]^q and |e| <= radius that lie between ``lower`` and ``upper``.

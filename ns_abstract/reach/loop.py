@@ -38,24 +38,24 @@ KEYS = (
 
 @dataclass(frozen=True)
 class HalfSpace:
-    """``normal . x - offset`` with normal [n], a function of the state that is above 0 on one side of a plane."""
+    """The affine function ``normal . x - offset`` of the state x [n], which is positive on one side of a plane."""
 
     normal: tuple[float, ...]
     offset: float
 
     def exact(self, x: Sequence[float]) -> Fraction:
-        """The value at a state of float64 numbers, without rounding."""
+        """Return the exact value at a state of float64 numbers."""
         terms = (Fraction(a) * Fraction(v) for a, v in zip(self.normal, x, strict=True) if a)
         return sum(terms, start=Fraction(0)) - Fraction(self.offset)
 
 
 @dataclass(frozen=True)
 class Goal:
-    """The goal: the open box that the state has to be in, or the property that its picture has to have.
+    """The goal: an open box of states, or a property of the picture.
 
     Attributes:
-        faces: All above 0 inside; none where a property is asked for.
-        when: "end", after the last step; "any", after at least one.
+        faces: Functions that are all positive inside the box; empty where a property is the goal.
+        when: "end", after the last step; "any", after at least one step.
         view: The property, or None.
     """
 
@@ -64,7 +64,7 @@ class Goal:
     view: PictureProperty | None = None
 
     def steps(self, last: int) -> range:
-        """The steps at which the goal counts."""
+        """Return the steps, of 0 to ``last``, at which the goal counts."""
         return range(last if self.when == "end" else 0, last + 1)
 
 
@@ -80,12 +80,12 @@ class CameraMount:
 
     Attributes:
         rotation: [3, 3] camera to world (OpenGL axes: x right, y up, z back) where all angles are 0.
-        fov: Vertical, degrees.
-        lens: Those of ``fx``, ``fy``, ``cx``, ``cy`` that the file states, pixels of the network's picture.
-        names: Parameters that move: of x, y, z (world axes, normalised units) and yaw, pitch, roll (radians, about the
-            camera's own axes, in this order).
+        fov: Vertical angle of view, degrees.
+        lens: The stated ones of ``fx``, ``fy``, ``cx``, ``cy``, in pixels of the network's picture.
+        names: Pose parameters that move, of x, y, z (world axes, normalised units) and yaw, pitch, roll (radians,
+            about the camera's own axes, in this order).
         offset: [d] their values at state 0.
-        factors: [d, n].
+        factors: [d, n] their derivatives by the state.
     """
 
     rotation: Float64
@@ -97,12 +97,12 @@ class CameraMount:
     fixed: Mapping[str, float]
 
     def enlarged(self, down: float, across: float) -> CameraMount:
-        """The same camera for pictures of so many times the rows and columns of the network's."""
+        """Return the same camera for pictures with ``down`` times the rows and ``across`` times the columns."""
         factors = {"fx": across, "fy": down, "cx": across, "cy": down}
         return replace(self, lens={name: value * factors[name] for name, value in self.lens.items()})
 
     def poses(self, size: tuple[int, int]) -> PoseBox:
-        """All poses that may be looked at, in pictures of ``size`` (height, width)."""
+        """Return the set of all poses for which pictures may be bounded, with pictures of ``size`` (height, width)."""
         ranges = {name: (-FARTHEST, FARTHEST) if name in TRANSLATIONS else (-_TURN, _TURN) for name in self.names}
         ranges |= {name: (value, value) for name, value in self.fixed.items()}
         height, width = size
@@ -115,7 +115,7 @@ class CameraMount:
 
     @property
     def place(self) -> tuple[Float64, Float64]:
-        """[3, n] and [3]: the camera's position is ``matrix x + offset`` (world axes, normalised units)."""
+        """Matrix [3, n] and offset [3] of the camera's position ``matrix x + offset`` (world axes, normalised)."""
         matrix, offset = np.zeros((3, self.factors.shape[1])), np.zeros(3)
         for axis, name in enumerate(TRANSLATIONS):
             if name in self.names:
@@ -126,18 +126,18 @@ class CameraMount:
         return matrix, offset
 
     def values(self, x: Float64) -> Float64:
-        """[d] parameters of the pose at a state [n], in float64."""
+        """Return the pose parameters [d] at a state [n], in float64."""
         return self.offset + self.factors @ x
 
 
 @dataclass(frozen=True)
 class Control:
-    """``u = clip(K (y - goal))`` of the network's outputs y.
+    """The control law ``u = clip(K (y - goal))`` of the network's outputs y.
 
     Attributes:
         gain: [m, o] K.
         goal: [o].
-        lower, upper: [m], infinite where nothing is clipped.
+        lower, upper: [m] limits, infinite where nothing is clipped.
     """
 
     gain: Float64
@@ -146,7 +146,7 @@ class Control:
     upper: Float64
 
     def of(self, outputs: Float64) -> Float64:
-        """[m] the control for outputs [o], in float64."""
+        """Return the control [m] for outputs [o], in float64."""
         return np.clip(self.gain @ (outputs - self.goal), self.lower, self.upper)
 
 
@@ -159,8 +159,8 @@ class Loop:
         lower, upper: [n] initial box.
         dt: Sampling time, seconds.
         disturbance: [2, n] least and most of what is added to every next state.
-        control: What comes behind it; None until the network's outputs are known.
-        unsafe: Closed sets, each given by faces: outside where any of them is above 0.
+        control: The control law; None until the number of the network's outputs is known.
+        unsafe: Closed sets, each given by functions: a state is outside where any of them is positive.
         required: Properties of the picture: a state is unsafe where its picture lacks one of them.
     """
 
@@ -183,20 +183,20 @@ class Loop:
 
     @property
     def views(self) -> dict[str, PictureProperty]:
-        """All properties of the picture by the key that states them, the goal's last."""
+        """All properties of the picture, by the key of LOOP.json that states them; the goal's is the last."""
         keys = [f"unsafe[{k}]" for k, entry in enumerate(self.value.get("unsafe", [])) if is_of_picture(entry)]
         named = dict(zip(keys, self.required, strict=True))
         return named if self.goal is None or self.goal.view is None else {**named, "goal": self.goal.view}
 
     @property
     def loading(self) -> dict[str, Any]:
-        """Keywords of `load_network`."""
+        """Keyword arguments for `load_network`."""
         # pictures of loops are the renderer's floats
         return {**self.preprocess.loading(self.value.get("output")), "whole_numbers": False}
 
     @property
     def box(self) -> ParameterBox:
-        """The initial states that differ, as the box that cells are cut from."""
+        """The box of the initial states that vary; cells are cut from it."""
         free = [k for k in range(len(self.names)) if self.lower[k] < self.upper[k]]
         return ParameterBox(
             tuple(self.names[k] for k in free),
@@ -206,14 +206,14 @@ class Loop:
         )
 
     def initial(self, box: ParameterBox) -> tuple[Float64, Float64]:
-        """[n], [n] ends of all states for a part of the initial box."""
+        """Return lower and upper ends [n] of all states for a cell of the initial box."""
         lower, upper = self.lower.copy(), self.upper.copy()
         for name, low, high in zip(box.names, box.lower, box.upper, strict=True):
             lower[self.names.index(name)], upper[self.names.index(name)] = low, high
         return lower, upper
 
     def state(self, box: ParameterBox, values: Sequence[float] | Float64) -> Float64:
-        """[n] the state at parameter values [m] of a part of the initial box."""
+        """Return the state [n] at parameter values [m] in a cell of the initial box."""
         x = self.lower.copy()
         for name, value in zip(box.names, values, strict=True):
             x[self.names.index(name)] = value
@@ -221,7 +221,7 @@ class Loop:
 
 
 def load_loop(path: str | Path) -> Loop:
-    """Read LOOP.json; the files that it names are looked for beside it."""
+    """Return the loop in LOOP.json; the files that it names lie beside it. InputError."""
     path = Path(path)
     value = load_json(path, "loop file")
     try:
@@ -231,7 +231,7 @@ def load_loop(path: str | Path) -> Loop:
 
 
 def parse_loop(value: Any, folder: Path, dataset_scale: float | None = 1.0) -> Loop:
-    """Check the content of LOOP.json.
+    """Return the loop of LOOP.json's content, checked. InputError.
 
     Args:
         dataset_scale: Normalised units per unit of the data set, for distances in pictures; None: not known.
@@ -293,7 +293,7 @@ def _names(value: Any) -> tuple[str, ...]:
 
 
 def _ranges(value: Any, field: str, names: tuple[str, ...], *, every: bool = False) -> tuple[Float64, Float64]:
-    """Ends [n] of an interval by state; a number r is [-r, r], or r itself where ``every`` state has to be given."""
+    """Return ends [2][n] of intervals by state; a number r stands for [-r, r], or with ``every`` for r itself."""
     if not isinstance(value, Mapping):
         raise fail(field, f"found {show(value)}", "write an object with a range by state")
     known(value, names, f"{field}.", fail)
@@ -376,7 +376,7 @@ def _control(value: Any, controls: int) -> Control:
 
 
 def _box_faces(value: Any, field: str, names: tuple[str, ...], *, inside: bool) -> tuple[HalfSpace, ...]:
-    """Faces of a box; above 0 inside, or each above 0 on its own outside."""
+    """Return the functions of a box's sides: all positive ``inside``, or else each positive beyond its own side."""
     if not isinstance(value, Mapping) or not value:
         raise fail(field, f"found {show(value)}", "write an object with [low, high] by state, null for no end")
     known(value, names, f"{field}.", fail)
@@ -411,7 +411,7 @@ def _unsafe(value: Any, field: str, names: tuple[str, ...]) -> tuple[HalfSpace, 
 
 
 def _view(value: Mapping[str, Any], field: str, folder: Path, dataset_scale: float | None) -> PictureProperty:
-    """The property of the picture under a key."""
+    """Return the property of the picture under the key ``field``."""
     try:
         if "partitions" in value:
             raise fail("partitions", "is for certificates", "remove it")
@@ -421,7 +421,7 @@ def _view(value: Mapping[str, Any], field: str, folder: Path, dataset_scale: flo
 
 
 def within_field(error: InputError, field: str) -> InputError:
-    """The error of a key of a property, with the key that states the property before it."""
+    """Return an error of a property's key with the key ``field`` of the property in front of it."""
     return InputError(error.problem, file=error.file, field=f"{field}.{error.field}", fix=error.fix)
 
 

@@ -34,10 +34,10 @@ def loop_page(
     outside: SceneDrawing | None = None,
     strips: Sequence[tuple[int, bytes]] = (),
 ) -> str:
-    """The page: HTML, self-contained; every text of the ``document`` is escaped.
+    """Return the page of a loop: HTML, self-contained, every text of the ``document`` escaped.
 
     Args:
-        outside: Draws the scene behind the tubes; None: it has no elements with a place of their own.
+        outside: Draws the scene behind the tubes; None: the scene has no elements with a position.
         strips: Steps of the film and their PNGs.
     """
     name = str(document["scene"].get("name", "scene"))
@@ -70,7 +70,7 @@ def loop_page(
 
 
 def runs_text(question: str, simulated: Mapping[str, Any]) -> str:
-    """How many simulated runs did what a question asks, in words."""
+    """Return a sentence on how many simulated runs did what a question asks."""
     runs = simulated["runs"]
     if not runs:
         return "no run was simulated"
@@ -84,9 +84,9 @@ def _pictures(
     loop: Loop,
     outside: SceneDrawing | None,
 ) -> list[tuple[str, str, str, Markup]]:
-    """Titles, legends, texts on the scene and plots: from above and from the side.
+    """Return title, legend, text on the scene, and plot, of the views from above and from the side.
 
-    Where the camera only turns, the one plot is in the plane of two states.
+    A camera that only turns has one plot, in the plane of two states.
     """
     last = max(rows, default=None)
     cells = [] if last is None else rows[last]
@@ -153,7 +153,7 @@ def _seen(
 
 
 def _widths(document: Mapping[str, Any]) -> list[tuple[Mapping[str, Any], Markup]]:
-    """Tubes that are shown, and plots of their widths by step."""
+    """Return the tubes that the page shows, each with a plot of its width by step."""
     figures = []
     for tube in document["tubes"]:
         curves = [("kept", "dependence kept", tube["width"])]

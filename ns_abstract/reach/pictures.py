@@ -1,4 +1,4 @@
-"""Pictures along a loop that properties are read off (docs/dev/design.md, L7)."""
+"""Bounds and renders of the pictures along a loop, for properties of the picture (docs/dev/design.md, L7)."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ Float64 = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class PropertyView:
-    """The pictures that a property is read off (L7), with the further planes that it reads behind the colours."""
+    """The pictures that a property is evaluated on (L7): colours, then the further channels that it needs."""
 
     prop: PictureProperty
     pictures: ScenePictures
     model: MeasureModel
 
     def margin(self, values: Float64) -> float:
-        """The margin of the rendered picture at pose parameters [d]; NaN where the picture is not finite."""
+        """Return the margin of the picture rendered at pose parameters [d]; NaN where it is not finite."""
         image = self.pictures.image(values)
         if not np.isfinite(image).all():
             return math.nan
@@ -35,7 +35,7 @@ class PropertyView:
         return float(claim.margin(outputs, torch.from_numpy(np.asarray(values, np.float64)[None]))[0])
 
     def bound(self, box: ParameterBox) -> tuple[float, Float64]:
-        """Lower bound of the margin over a box of poses, and slopes [d]; minus infinity where nothing is known."""
+        """Return a lower bound of the margin over a box of poses, and its slopes [d]; -infinity if none is known."""
         linear, lower, upper, slopes = self.pictures.linear_sets(box)
         steep = np.abs(np.asarray(slopes, np.float64))
         if not sane(linear, lower, upper):

@@ -1,4 +1,4 @@
-"""Plots of a loop: cells, tubes, runs and sets in planes of camera positions."""
+"""Plots of a loop: cells, tubes, runs and sets, projected to planes of camera positions."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ _MOST_CELLS = 4000
 
 @dataclass(frozen=True)
 class Marks:
-    """The boxes and lines of a plot in the plane's coordinates, each with its class of the style sheet."""
+    """The boxes and lines of a plot in the plane's coordinates, each with its CSS class."""
 
     boxes: list[tuple[str, Float64, Float64]]
     lines: list[tuple[str, Float64]]
 
     @property
     def ends(self) -> tuple[Float64, Float64] | None:
-        """[2], [2] ends of a box around everything; None: there is nothing."""
+        """Return the ends [2], [2] of a box around everything; None where there is nothing."""
         points = [p for _, low, high in self.boxes for p in (low, high)] + [p for _, line in self.lines for p in line]
         return (np.min(points, axis=0), np.max(points, axis=0)) if points else None
 
@@ -40,11 +40,11 @@ def plane_marks(
     offset: Float64,
     axes: tuple[int, int] | None = None,
 ) -> Marks:
-    """Cells, tubes and runs of a report in a plane.
+    """Return the cells, tubes and runs of a report, projected to a plane.
 
     Args:
-        matrix, offset: [2, n], [2]: states to the plane.
-        axes: The world's axes that the plane has, for tubes of camera positions; None: others.
+        matrix, offset: [2, n], [2] of the map from states to the plane.
+        axes: The two world axes of the plane, for tubes of camera positions; None: the plane has others.
     """
     names = [p["name"] for p in document["parameters"]]
     boxes = []
@@ -79,14 +79,14 @@ def plane_marks(
 def region(
     half_spaces: Sequence[HalfSpace], loop: Loop, axes: tuple[int, int], window: PlotWindow, sign: float
 ) -> list[tuple[float, float]]:
-    """The polygon, in the camera's coordinates of a plane, of the states in a window that lie within all half-spaces.
+    """Return the polygon of the states in a window that lie within all half-spaces, in camera coordinates of a plane.
 
-    Empty where the set does not depend on the two coordinates alone: a half-space of other states cannot be drawn.
-    Those of the axis that is looked along are left out.
+    It is empty where the set does not depend on the two coordinates alone, as it cannot be drawn then. Half-spaces
+    along the viewing axis are left out.
 
     Args:
-        axes: The plane's axes of the world.
-        sign: 1: within where all half-spaces hold; -1: where all of their complements do.
+        axes: The plane's two world axes.
+        sign: 1: within the half-spaces; -1: within their complements.
     """
     matrix, offset = loop.camera.place
     states_of_axis = [np.flatnonzero(row) for row in matrix]
@@ -111,7 +111,7 @@ def region(
 
 
 def _clipped(corners: list[tuple[float, float]], a: float, b: float, level: float) -> list[tuple[float, float]]:
-    """The part of a convex polygon where ``a x + b y >= level``."""
+    """Return the part of a convex polygon where ``a x + b y >= level``."""
     corners_inside = []
     for (x, y), (u, v) in zip(corners, [*corners[1:], *corners[:1]], strict=True):
         here, there = a * x + b * y - level, a * u + b * v - level
@@ -125,7 +125,7 @@ def _clipped(corners: list[tuple[float, float]], a: float, b: float, level: floa
 
 @dataclass(frozen=True)
 class LoopPlot:
-    """A plot of a loop in the plane of two world axes, to the right and up; the scene above ``clip`` is left out."""
+    """A plot of a loop in the plane of two world axes, to the right and up; the scene above ``clip`` is not drawn."""
 
     title: str
     axes: tuple[int, int]
@@ -137,7 +137,7 @@ class LoopPlot:
 def views(
     document: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], loop: Loop, outside: SceneDrawing | None, width: int
 ) -> list[LoopPlot]:
-    """Plots from above and from the side, ``width`` pixels wide; none where the camera's position does not move."""
+    """Return plots from above and from the side, ``width`` pixels wide; none where the camera does not move."""
     matrix, offset = loop.camera.place
     if not matrix.any():
         return []

@@ -1,7 +1,7 @@
-"""The search for proofs and counterexamples over a box of initial states (docs/dev/design.md, L5).
+"""Searches for proofs and counterexamples over a box of initial states (docs/dev/design.md, L5).
 
-Two questions, each with its own cells: do all runs stay out of the unsafe sets ("safe"), and do they reach the goal as
-well ("reaches")? What becomes of a cell depends on the cell alone.
+Two questions have cells of their own: do all runs stay out of the unsafe sets ("safe"), and do they also reach the
+goal ("reaches")? The outcome of a cell depends on the cell alone.
 """
 
 from __future__ import annotations
@@ -49,12 +49,12 @@ _SHRINK = {_FEW: 1.0, _MANY: 0.5}
 
 @dataclass(frozen=True, eq=False)
 class SimulatedRun:
-    """A simulated run.
+    """A simulated run of the loop.
 
     Attributes:
         states: [steps + 1, n] float64.
         controls: [steps, m].
-        disturbances: [steps, n] what was added.
+        disturbances: [steps, n] that were added to the next states.
         views: [steps + 1, properties] margins of the pictures at these states; see `Loop.views`.
     """
 
@@ -64,7 +64,7 @@ class SimulatedRun:
     views: Float64
 
     def margin(self, loop: Loop, question: Question) -> float:
-        """How far the run is from going wrong (L7): not above 0 where it does. Its sign is exact; NaN: no number."""
+        """Return the run's margin (L7): not positive where it fails. Its sign is exact; NaN where it is no number."""
         if not np.isfinite(self.states).all():
             return math.nan
         states = self.states.tolist()
@@ -91,12 +91,12 @@ def simulate(
     scene_sample: SceneSample | None = None,
     off: Float64 | None = None,
 ) -> SimulatedRun:
-    """One run with the real renderer and the deployed network, in float64 but for these.
+    """Return one run with the real renderer and the deployed network; everything else is float64.
 
     Args:
         disturbances: [steps, n], added to every next state.
-        scene_sample: The scene that is seen throughout; None: the stored one.
-        off: Where the scene stands throughout, as `TubeBuilder.seen_from` has it; None: at its place.
+        scene_sample: The scene that is rendered throughout; None: the stored one.
+        off: The scene's offset throughout, as in `TubeBuilder.seen_from`; None: it is in its place.
     """
     loop = reacher.loop
     more = () if scene_sample is None else (scene_sample,)
@@ -132,7 +132,7 @@ def _is_nan(value: Any) -> bool:
 def sampled_disturbances(
     loop: Loop, generator: np.random.Generator, kind: Literal["middle", "ends", "random"]
 ) -> Float64:
-    """[steps, n] disturbances inside their box: its middle, one corner of it throughout, or anything in it."""
+    """Return disturbances [steps, n] in their box: the middle, one corner throughout, or random values."""
     low, high = loop.disturbance
     shape = loop.steps, len(low)
     if kind == "middle":
@@ -153,7 +153,7 @@ class LoopBlockResult(BlockResult):
 
 @dataclass
 class _CellRuns:
-    """Simulated runs from one cell, with their margins."""
+    """Simulated runs that start in one cell, with their margins."""
 
     cell: Cell
     box: ParameterBox
@@ -175,7 +175,7 @@ class _CellRuns:
 
 
 class LoopSearch:
-    """Examines cells of the initial box."""
+    """Proves or refutes a question for cells of the initial box."""
 
     def __init__(self, reacher: TubeBuilder) -> None:
         self.reacher, self.loop = reacher, reacher.loop
@@ -183,7 +183,7 @@ class LoopSearch:
         self._runs: OrderedDict[bytes, SimulatedRun] = OrderedDict()
 
     def tube(self, box: ParameterBox) -> Tube | str:
-        """The tube of a cell, kept for a while; or why there is none."""
+        """Return the tube of a cell, from a small cache, or the reason why there is none."""
         if box not in self._tubes:
             while len(self._tubes) >= _KEPT:
                 self._tubes.popitem(last=False)
@@ -196,7 +196,7 @@ class LoopSearch:
         return self._tubes[box]
 
     def proved(self, tube: Tube, question: Question) -> float:
-        """Lower bound of the margin of all runs in a tube; minus infinity where nothing is known (L5)."""
+        """Return a lower bound of the margin of all runs in a tube; minus infinity where none is known (L5)."""
         if (
             tube.reason
             or len(tube.state_sets) != self.loop.steps + 1
@@ -214,7 +214,7 @@ class LoopSearch:
         return clearance if math.isfinite(clearance) or clearance == math.inf else -math.inf
 
     def _scenes(self, generator: np.random.Generator) -> Iterator[tuple[SceneSample | None, Float64 | None]]:
-        """Scenes of the set, without end: other Gaussians, or the stored ones elsewhere, corners first."""
+        """Yield scenes of the set without end: scene samples, or offsets of the stored scene, corners first."""
         reach = self.reacher.place if self.reacher.place.size else self.reacher.shift
         if not reach.any():
             yield from ((scene_sample, None) for scene_sample in self.reacher.view.scene_samples(0))
@@ -227,7 +227,7 @@ class LoopSearch:
             yield None, generator.uniform(-1.0, 1.0, len(reach)) * reach
 
     def prove_cell(self, question: Question, box: ParameterBox) -> CellOutcome:
-        """A cell as it is, for all scenes of the view: its tube, and runs in some of them (V13).
+        """Return the outcome of an undivided cell for all scenes of the set: its tube, and runs in some scenes (V13).
 
         Raises:
             ContradictionError: A run leaves its tube: the program has a fault.
@@ -270,11 +270,11 @@ class LoopSearch:
         return CellOutcome("unknown", reason or "the margin's bound is not above 0", slopes)
 
     def examine(self, number: int, grid: CellGrid, block: Sequence[Cell]) -> LoopBlockResult:
-        """Examine cells for the question of this number.
+        """Return the outcomes of cells for a question.
 
         Raises:
             ContradictionError: A run leaves its tube: the program has a fault.
-            WorkCancelledError: There is no time for it (`ns_abstract.execution.cancellation`).
+            WorkCancelledError: The deadline is over (`ns_abstract.execution.cancellation`).
         """
         question = QUESTIONS[number]
         begin = time.perf_counter()
@@ -317,7 +317,7 @@ class LoopSearch:
         )
 
     def _one(self, question: Question, grid: CellGrid, cell: Cell) -> tuple[_CellRuns, float | None, str, Float64, int]:
-        """Runs, proven margin or None, why there is none, what a cut along each parameter may gain, parts to cut."""
+        """Return a cell's runs, proved margin or None, the reason, gains [m] of cuts by parameter, and parts to make."""
         box = grid.box_of(cell)
         cell_runs, generator = _CellRuns(cell, box), np.random.default_rng([*cell.first, *cell.past])
         self._run(question, cell_runs, box.middle, sampled_disturbances(self.loop, generator, "middle"))
@@ -366,7 +366,7 @@ class LoopSearch:
         return cell_runs.margins[-1]
 
     def _descend(self, question: Question, cell_runs: _CellRuns, generator: np.random.Generator, steps: int) -> None:
-        """Without gradients: from the worst start so far, random directions, kept where the margin falls."""
+        """Search for a lower margin by random steps from the worst start, each kept where the margin falls."""
         box = cell_runs.box
         if not box.dimensions or cell_runs.broken:
             return
@@ -381,7 +381,7 @@ class LoopSearch:
                 step *= 0.5
 
     def _rank(self, cell_runs: _CellRuns, bound: float | None, share: float) -> float:
-        """How many times the bound misses the margin that runs show; the nearest to a proof come first."""
+        """Return how many times the bound misses the least margin of the runs; cells nearest to a proof come first."""
         if cell_runs.broken:
             return _RANK_BROKEN - math.log2(share)
         margin = cell_runs.margins[cell_runs.worst]
@@ -392,7 +392,7 @@ class LoopSearch:
     def _counterexample(
         self, question: Question, cell_runs: _CellRuns, seconds: float
     ) -> tuple[FinishedCell, SimulatedRun]:
-        """The worst run, simulated once more."""
+        """Return the falsified cell and its worst run, simulated once more."""
         start, old = cell_runs.starts[cell_runs.worst], cell_runs.runs[cell_runs.worst]
         run = simulate(self.reacher, self.loop.state(cell_runs.box, start), old.disturbances)
         margin = run.margin(self.loop, question)
@@ -407,7 +407,7 @@ class LoopSearch:
 
 
 def first_outside(tube: Tube, run: SimulatedRun) -> str | None:
-    """The first state or control of a run that is not in a tube, in words; None where all are (no tolerance)."""
+    """Return a sentence on a run's first state or control outside of a tube (no tolerance); None if all are inside."""
     for step, entry in enumerate(tube.state_sets):
         if not entry.finite:
             return None

@@ -43,13 +43,13 @@ _MOST_GENERATORS = 64
 
 @dataclass(frozen=True)
 class AffineSet:
-    """A zonotope and a box: all ``center + generators s + e`` with s in [-1, 1]^q and |e| <= radius (L2).
+    """A zonotope plus a box: all ``center + generators s + e`` with s in [-1, 1]^q and |e| <= radius (L2).
 
     Attributes:
         center: [n].
-        generators: [n, q]; quantities of one step share ``s``; the first are the initial state's.
+        generators: [n, q]; sets of one step share ``s``; the first columns are those of the initial state.
         radius: [n].
-        first: How many generators are the initial state's.
+        first: Number of the initial state's generators.
     """
 
     center: Float64
@@ -59,26 +59,26 @@ class AffineSet:
 
     @classmethod
     def box(cls, lower: Float64, upper: Float64) -> AffineSet:
-        """A box [n], one generator for every side that has a width."""
+        """Return a box [n] as a set, with one generator for every side of positive width."""
         middle, half = middle_half(lower, upper)
         wide = np.flatnonzero(half > 0.0)
         return cls(middle, np.diag(half)[:, wide], np.zeros(len(middle)), len(wide))
 
     @property
     def finite(self) -> bool:
-        """Whether anything is known."""
+        """Whether all numbers of the set are finite."""
         return bool(all(np.isfinite(part).all() for part in (self.center, self.generators, self.radius)))
 
     @property
     def size(self) -> Float64:
-        """[n] upper bounds of absolute values."""
+        """Upper bounds [n] of absolute values."""
         spread = np.abs(self.generators).sum(axis=1) + self.radius
         return (np.abs(self.center) + spread) * (
             1.0 + 2.0 * gamma(self.generators.shape[1] + SPREAD_ROUNDINGS)
         ) + UNDERFLOW64
 
     def hull(self) -> tuple[Float64, Float64]:
-        """[n], [n] the smallest box around it, rounded outward; a width of 0 stays one."""
+        """Return ends [n], [n] of the smallest box around the set, rounded outward; a width of 0 stays 0."""
         spread = np.abs(self.generators).sum(axis=1) + self.radius
         spread = spread * (1.0 + 2.0 * gamma(self.generators.shape[1] + SPREAD_ROUNDINGS))
         still = spread == 0.0
@@ -87,7 +87,10 @@ class AffineSet:
         return np.where(still, self.center, low), np.where(still, self.center, high)
 
     def mapped(self, matrix: Float64, offset: Float64, radius: Float64 | float = 0.0) -> AffineSet:
-        """``matrix x + offset + e`` with |e| <= radius, in the same ``s``; entries may be `SET_ROUNDINGS` units off."""
+        """Return the image ``matrix x + offset + e``, |e| <= radius, in the same ``s``.
+
+        Entries of ``matrix`` and ``offset`` may err by `SET_ROUNDINGS` units.
+        """
         n, q = self.generators.shape
         share = 2.0 * gamma(n + SET_ROUNDINGS)
         with np.errstate(all="ignore"):
@@ -100,15 +103,15 @@ class AffineSet:
         return AffineSet(*image, spread, self.first)
 
     def beside(self, other: AffineSet) -> AffineSet:
-        """Both one after the other; ``other`` is in the same ``s``."""
+        """Return the product of two sets in the same ``s``: the components of the other one follow this one's."""
         names = "center", "generators", "radius"
         parts = [np.concatenate([getattr(entry, name) for entry in (self, other)]) for name in names]
         return AffineSet(parts[0], parts[1], parts[2], self.first)
 
     def promoted(self) -> AffineSet:
-        """The same with a generator of its own for every side of the remainder, so that it is followed as well.
+        """Return the same set with a generator in place of every radius, so that later steps follow it.
 
-        Where there are too many generators the smallest become part of the remainder first: a box around their sum.
+        If that makes too many generators, the smallest are enclosed in a box first.
         """
         generators, radius = self.generators, self.radius
         n = len(radius)
@@ -126,14 +129,14 @@ class AffineSet:
         )
 
     def least(self, face: HalfSpace) -> float:
-        """Lower bound of a face's value; minus infinity where nothing is known."""
+        """Return a lower bound of an affine function over the set; minus infinity where none is known."""
         image = self.mapped(np.array(face.normal)[None], np.array([-face.offset]))
         low = float(image.hull()[0][0])
         return low if np.isfinite(low) else -np.inf
 
 
 def _scaled(values: AffineSet, middle: Float64, half: Float64) -> AffineSet:
-    """``(values - middle) / half``: positions in [-1, 1] in boxes; 0 where a box has no width."""
+    """Return ``(values - middle) / half``, positions in [-1, 1] in boxes; 0 where a box has no width."""
     with np.errstate(all="ignore"):
         usable = half > NARROWEST
         inverse = np.where(usable, 1.0 / half, 0.0)
@@ -147,7 +150,7 @@ def _scaled(values: AffineSet, middle: Float64, half: Float64) -> AffineSet:
 
 @dataclass(frozen=True)
 class AffineBounds:
-    """``y = slopes q + center + e``, |e| <= radius, and ``lower <= y <= upper`` [m], at places q in [-1, 1]^d."""
+    """Bounds of y [m] at q in [-1, 1]^d: ``y = slopes q + center + e``, |e| <= radius, and ``lower <= y <= upper``."""
 
     slopes: Float64
     center: Float64
@@ -157,9 +160,9 @@ class AffineBounds:
 
 
 def clipped(raw: AffineBounds, lower: Float64, upper: Float64) -> AffineBounds:
-    """``clip(z, lower, upper)`` for z given by ``raw`` (L3).
+    """Return bounds of ``clip(z, lower, upper)`` for z bounded by ``raw`` (L3).
 
-    ``clip(z) - lambda z`` is largest and smallest at the ends of z's range or where the clip begins, for any lambda.
+    For any lambda, ``clip(z) - lambda z`` is extreme at the ends of z's range or where the clip begins.
     """
     low, high = np.clip(raw.lower, lower, upper), np.clip(raw.upper, lower, upper)
     inside = (raw.lower >= lower) & (raw.upper <= upper)
@@ -190,7 +193,7 @@ def clipped(raw: AffineBounds, lower: Float64, upper: Float64) -> AffineBounds:
 
 
 class ControlBounds:
-    """Bounds the controls that the network gives for a set of pictures."""
+    """Bounds the controls over a set of pictures, through the network and the control law."""
 
     def __init__(self, model: NetworkModel, control: Control) -> None:
         self.model, self.control = model, control
@@ -200,11 +203,11 @@ class ControlBounds:
         self._query = Query(rows, zero)
 
     def concrete(self, image: np.ndarray) -> Float64:
-        """[m] the control for a picture, as the deployed network computes it."""
+        """Return the control [m] for a picture, as the deployed network computes it."""
         return self.control.of(self.model.outputs(image[None])[0].astype(np.float64))
 
     def bound(self, linear: Sequence[np.ndarray], lower: np.ndarray, upper: np.ndarray) -> AffineBounds | None:
-        """The controls for a set of pictures, and float64 evaluations of K (y - goal); None: nothing is known (L3)."""
+        """Return bounds of the controls over a set of pictures, with float64 errors; None: none is known (L3)."""
         control = self.control
         m, o = control.gain.shape
         images = self.model.input_sets(tuple(part[None] for part in linear), lower[None], upper[None])
@@ -220,14 +223,15 @@ class ControlBounds:
 
 
 def between(bounds: OutputBounds, count: int, shift: Float64, room: Float64) -> AffineBounds | None:
-    """Return the affine set between planes: the first ``count`` rows and their negatives, of one cell (L3).
+    """Return affine bounds of quantities [count] of one cell from planes below them and below their negatives (L3).
 
     Args:
-        shift: [count] what is taken off.
-        room: [count] how far values may be off beside that.
+        bounds: Lower planes; the first ``count`` rows are of the quantities, the next of their negatives.
+        shift: [count] is subtracted.
+        room: [count] further errors.
 
     Returns:
-        None where a bound is not finite: what is not known to be finite need not be a number either.
+        None where a bound is not finite: the quantity may not be a number either.
     """
     least = bounds.lower[0]
     if not np.isfinite(least).all():
@@ -260,19 +264,19 @@ def between(bounds: OutputBounds, count: int, shift: Float64, room: Float64) -> 
 
 
 def clearance(state: AffineSet, unsafe: Sequence[Sequence[HalfSpace]]) -> float:
-    """Lower bound, over unsafe sets, of the distance to them along the best face (L4)."""
+    """Return a lower bound, over the unsafe sets, of the distance to the set along its best face (L4)."""
     return min((max(state.least(face) for face in faces) for faces in unsafe), default=np.inf)
 
 
 @dataclass(frozen=True)
 class Tube:
-    """States of all runs from a cell, step by step.
+    """The sets of states of all runs from a cell, step by step.
 
     Attributes:
-        state_sets: By step, from 0; as many as were found before the end or a reason to stop.
-        controls: [steps, 2, m] least and most control of every step.
-        slopes: [m] how much pictures moved by initial parameter, summed over the steps: what a cut may gain.
-        views: [sets, properties] lower bounds of the margins of `Loop.views` (L7); minus infinity: nothing is known.
+        state_sets: By step, from 0, up to the last step or the one where the tube ends for ``reason``.
+        controls: [steps, 2, m] least and largest control.
+        slopes: [m] motion of the pictures by initial parameter, summed over the steps: the gain of a cut.
+        views: [sets, properties] lower bounds of the margins of `Loop.views` (L7); minus infinity: none is known.
     """
 
     state_sets: tuple[AffineSet, ...]
@@ -282,24 +286,23 @@ class Tube:
     reason: str = ""
 
     def safe(self, loop: Loop) -> float:
-        """Lower bound, over all steps, of the distance to unsafe sets along the best face (L4), and of margins."""
+        """Return a lower bound over all steps of the distance to unsafe sets (L4) and of required margins."""
         clearances = [clearance(step, loop.unsafe) for step in self.state_sets]
         return float(min([*clearances, *self.views[:, : len(loop.required)].ravel()], default=np.inf))
 
     def inside(self, step: int, faces: Sequence[HalfSpace]) -> float:
-        """Lower bound of how deep all states of a step lie inside a box."""
+        """Return a lower bound of how deep all states of a step lie inside a box."""
         return min(self.state_sets[step].least(face) for face in faces)
 
 
 @dataclass
 class TubeBuilder:
-    """Tubes of a loop.
+    """Computes tubes of a loop.
 
     Attributes:
-        registration: How far the scene may stand from its place along every world axis, all of a run through; needs a
-            camera that moves along all of them. Otherwise the view's set may tell where the scene stands
-            (`PoseBox.registered`).
-        views: What the properties of `Loop.views` are read off, in their order.
+        registration: Largest offset of the scene along every world axis, constant over a run. The camera must move
+            along all of them. Otherwise the pose set may tell the scene's offset (`PoseBox.registered`).
+        views: The pictures of the properties of `Loop.views`, in their order.
     """
 
     loop: Loop
@@ -316,23 +319,23 @@ class TubeBuilder:
 
     @property
     def shift(self) -> Float64:
-        """[d] how far pose parameters may be off, as seen from the scene."""
+        """Largest error [d] of pose parameters relative to the scene."""
         return np.array([self.registration if name in TRANSLATIONS else 0.0 for name in self.loop.camera.names])
 
     @property
     def place(self) -> Float64:
-        """[3] how far the scene may stand from its place, where the view's set tells; else [0]."""
+        """Largest offset [3] of the scene, where the pose set has parameters for it; else empty."""
         return self._limits[1][len(self.loop.camera.names) :]
 
     def seen_from(self, x: Float64, off: Float64 | None = None) -> Float64:
-        """Parameters of the view at a state [n], in a scene that is ``off`` by as much as `place` or `shift` say."""
+        """Return the pose set's parameters at a state [n], the scene being ``off`` (see `place` and `shift`)."""
         values = self.loop.camera.values(x)
         if self.place.size:
             return np.concatenate([values, np.zeros(self.place.size) if off is None else off])
         return values if off is None else values + off
 
     def tube(self, cell: ParameterBox, *, whole: bool = False) -> Tube:
-        """The tube of a cell of the initial box; unless ``whole`` it ends where an unsafe set cannot be ruled out."""
+        """Return the tube of a cell; unless ``whole`` it ends where an unsafe set cannot be excluded."""
         lower, upper = self.loop.initial(cell)
         state = AffineSet.box(lower, upper)
         # which generators are which parameters of the cell
@@ -372,7 +375,7 @@ class TubeBuilder:
         return Tube(tuple(sets), np.array(controls), slopes, np.reshape(views, (len(views), len(self.views))), reason)
 
     def poses(self, state: AffineSet) -> AffineSet:
-        """Parameters [d] of the camera's poses at the states of a set, and their float64 evaluations."""
+        """Return the set of pose parameters [d] at the states of a set, float64 evaluations included."""
         loop, camera = self.loop, self.loop.camera
         rounding = 2.0 * gamma(len(loop.names) + SET_ROUNDINGS)
         size = np.abs(camera.factors) @ state.size + np.abs(camera.offset) + self.shift
@@ -380,7 +383,7 @@ class TubeBuilder:
         return state.mapped(camera.factors, camera.offset, self.shift + rounding * size)
 
     def places(self, state: AffineSet) -> tuple[Float64, Float64]:
-        """[3], [3] ends of a box of the camera's positions at the states of a set (world axes, normalised units)."""
+        """Return ends [3], [3] of a box of camera positions at the states of a set (world axes, normalised units)."""
         low, high = self.poses(state).hull()
         ends = [
             (low[names.index(axis)], high[names.index(axis)])
@@ -391,9 +394,9 @@ class TubeBuilder:
         return np.array(ends)[:, 0], np.array(ends)[:, 1]
 
     def _pose_box(self, state: AffineSet) -> tuple[ParameterBox, AffineSet] | None:
-        """The smallest box around the view's parameters at the states of a set, and their positions [-1, 1]^d in it.
+        """Return the smallest box around the pose parameters at the states of a set, and the positions in it.
 
-        None where the camera may leave the range of poses.
+        None: the camera may leave the range of poses.
         """
         pose = self.poses(state)
         low, high = pose.hull()
@@ -406,7 +409,7 @@ class TubeBuilder:
         return self.view.pose_set.box.with_ends(low, high), _scaled(pose, *middle_half(low, high))
 
     def _view_margins(self, state: AffineSet, step: int) -> tuple[Float64, Float64]:
-        """[properties] lower bounds of their margins at a step (L7), and how much the pictures move by generator."""
+        """Return lower bounds [properties] of margins at a step (L7), and the motion of the pictures by generator."""
         margins, moved = np.full(len(self.views), -np.inf), np.zeros(state.generators.shape[1])
         poses, goal = self._pose_box(state), self.loop.goal
         for k, view in enumerate(self.views):
@@ -418,7 +421,7 @@ class TubeBuilder:
         return margins, moved
 
     def _advanced(self, state: AffineSet) -> tuple[AffineSet, Float64, Float64] | str:
-        """One step (L4): the next set, least and most controls [2, m], and how much the picture moves by generator."""
+        """Return the set one step later (L4), its controls' ends [2, m], and the motion of the picture by generator."""
         poses = self._pose_box(state)
         if poses is None:
             return "the camera may leave the range of poses"
@@ -443,7 +446,7 @@ class TubeBuilder:
         return follow if isinstance(follow, str) else (follow, np.stack(ends), moved)
 
     def _driven(self, both: AffineSet, ends: Float64) -> AffineSet | str:
-        """The next states, of states and controls in a set and between ``ends`` [2, n + m] (L4, L6)."""
+        """Return the next states of states and controls in a set and between ``ends`` [2, n + m] (L4, L6)."""
         loop, law = self.loop, self.loop.dynamics
         push, wide = middle_half(*loop.disturbance)
         most = np.abs(loop.disturbance).max(axis=0)
