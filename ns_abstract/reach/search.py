@@ -317,7 +317,7 @@ class LoopSearch:
         )
 
     def _one(self, question: Question, grid: CellGrid, cell: Cell) -> tuple[_CellRuns, float | None, str, Float64, int]:
-        """Return a cell's runs, proved margin or None, the reason, gains [m] of cuts by parameter, and parts to make."""
+        """Return a cell's runs, proved margin or None, the reason, gains [m] of cuts by parameter, number of parts."""
         box = grid.box_of(cell)
         cell_runs, generator = _CellRuns(cell, box), np.random.default_rng([*cell.first, *cell.past])
         self._run(question, cell_runs, box.middle, sampled_disturbances(self.loop, generator, "middle"))

@@ -58,7 +58,7 @@ class CellCamera:
 
 
 def corner_rays(camera: PinholeCamera, pose: Float64) -> Float64:
-    """[4, 3] unit vectors through the corners of the picture, in order around it, for a pose [3, 4]."""
+    """Return unit vectors [4, 3] through the picture's corners, in order around it, world axes, for a pose [3, 4]."""
     left, right = ((x - camera.cx) / camera.fx for x in (0.0, float(camera.width)))
     top, bottom = ((camera.cy - y) / camera.fy for y in (0.0, float(camera.height)))
     rays = np.array([(left, top, -1.0), (right, top, -1.0), (right, bottom, -1.0), (left, bottom, -1.0)])
@@ -69,10 +69,10 @@ def corner_rays(camera: PinholeCamera, pose: Float64) -> Float64:
 def cell_cameras(
     pose_sets: Mapping[int, PoseBox], rows: Mapping[int, Sequence[Mapping[str, Any]]], names: Sequence[str]
 ) -> tuple[list[CellCamera], int]:
-    """Cameras at the middles of cells, the widest cells first.
+    """Return the cameras at the middles of the widest cells, at most `MOST`, and the number of cells left out.
 
-    ``rows``: by frame, cells: lower, upper, verdict. ``names``: of all parameters, in the order of the cells' ends.
-    Returns at most `MOST` cameras, some of every verdict, and the number of cells that are left out.
+    Some of every verdict are returned. ``rows``: by frame, cells with lower, upper, verdict. ``names``: all parameters,
+    in the order of the cells' ends.
     """
     keys = [(frame, k) for frame, frame_rows in rows.items() for k in range(len(frame_rows))]
     width = np.concatenate(
@@ -94,7 +94,7 @@ def cell_cameras(
 
 
 def _shares(box: Any, rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -> Float64:
-    """Return [n] the shares of the set's volume that cells take."""
+    """Return the fraction [n] of the set's volume that each cell fills."""
     sides = np.ones((len(rows), 0))
     if rows and box.names:
         columns = [list(names).index(name) for name in box.names]
@@ -104,7 +104,7 @@ def _shares(box: Any, rows: Sequence[Mapping[str, Any]], names: Sequence[str]) -
 
 
 def standing(pose_sets: Mapping[int, PoseBox]) -> tuple[Float64, Float64]:
-    """[3], [3] ends of a box around where cameras of the sets stand: of poses that vary one parameter each."""
+    """Return ends [3], [3] of a box around the sets' camera positions: of poses that vary one parameter each."""
     axes = sum(poses.box.dimensions for poses in pose_sets.values())
     steps = min(_STEPS, max(2, _POSES // max(1, axes)))
     places = []
@@ -120,9 +120,9 @@ def standing(pose_sets: Mapping[int, PoseBox]) -> tuple[Float64, Float64]:
 
 
 def looked_at(pose_sets: Mapping[int, PoseBox], outside: SceneDrawing | None) -> Float64:
-    """[n, 3] points in front of the cameras in the middles of the sets, behind which half of what they see lies.
+    """Return points [n, 3] in front of the cameras in the middles of the sets, at the median depth of what they see.
 
-    Cameras that see none of the opaque elements have none.
+    Cameras that see no opaque element have none.
     """
     points: list[Float64] = []
     opaque = np.zeros((0, 3)) if outside is None else outside.opaque_places
@@ -139,7 +139,7 @@ def looked_at(pose_sets: Mapping[int, PoseBox], outside: SceneDrawing | None) ->
 
 
 def upward(pose_sets: Mapping[int, PoseBox]) -> int:
-    """The axis that sets turn about most nearly, so that an orbit is seen in its plane; 2 where none turns."""
+    """Return the world axis of an orbit, nearly, so that it is drawn in its plane; 2 if no set has an orbit."""
     for poses in pose_sets.values():
         if (orbit := poses.perturbation.orbit) is not None:
             return int(np.argmax(np.abs(orbit.axis)))
@@ -147,7 +147,7 @@ def upward(pose_sets: Mapping[int, PoseBox]) -> int:
 
 
 def cameras_entry(cameras: Sequence[CellCamera], left_out: int) -> dict[str, Any]:
-    """The key ``cameras`` of report.json."""
+    """Return the content of the key ``cameras`` of report.json."""
 
     def rounded(values: Float64) -> list[float]:
         return [float(f"{v:.6g}") for v in values]
@@ -194,7 +194,7 @@ class CameraDrawings:
     sights: Float64 = field(default_factory=lambda: np.zeros((0, 3)))
 
     def views(self, width: int) -> list[CameraPlot]:
-        """What there is to see from above and from the side, in pictures so many pixels wide."""
+        """Return the drawings from above and from the side, in pictures ``width`` pixels wide."""
         low, high = self.ends
         span = float((high - low).max())
         room = _LENGTH * max(span, _LEAST)
@@ -218,7 +218,7 @@ class CameraDrawings:
         return plots
 
     def plots(self, numbers: Mapping[tuple[int, int], int]) -> list[tuple[Markup, str, str]]:
-        """From above and from the side: the plot, its title, and what of the scene it shows."""
+        """Return plot, title, and caption on the scene, of the views from above and from the side."""
         drawings = []
         for view in self.views(PICTURE_WIDTH):
             x, y = plane_axes(view.window)
@@ -234,7 +234,7 @@ class CameraDrawings:
         return drawings
 
     def html(self, numbers: Mapping[tuple[int, int], int]) -> Markup:
-        """The page's part; cells with numbers, by frame and position, can be chosen."""
+        """Return the page's section; cells with ``numbers``, by frame and position, can be clicked."""
         if not self.cells:
             return Markup()
         where = " · ".join(
@@ -245,7 +245,7 @@ class CameraDrawings:
 
 
 def _hull(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
-    """Corners of the convex hull (Andrew's chain)."""
+    """Return the corners of the convex hull of points (Andrew's monotone chain)."""
     rising = sorted(set(points))
     if len(rising) < 3:
         return rising

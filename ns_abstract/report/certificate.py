@@ -1,4 +1,4 @@
-"""``report.json`` of ``ns-abstract-certify``, and the figures in it."""
+"""Content of ``report.json`` of ``ns-abstract-certify``."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ METRICS = {
 
 
 def coverage(frames: Sequence[Mapping[str, Any]]) -> dict[str, float]:
-    """Mean over the frames' sets: certified, falsified, unknown (with what was not examined), not_examined."""
+    """Return mean fractions of the frames' sets: certified, falsified, unknown (unexamined too), not_examined."""
     names = ("certified", "falsified", "unknown", "not_examined")
     return {name: sum(entry["coverage"][name] for entry in frames) / max(1, len(frames)) for name in names}
 
 
 def verdict(frames: Sequence[Mapping[str, Any]]) -> str:
-    """Of all sets together: falsified if any pose breaks the property, certified if all is proved, else unknown."""
+    """Return the verdict on all sets together: falsified if any pose is, certified if all cells are, else unknown."""
     if any(entry["cells"]["falsified"] for entry in frames):
         return "falsified"
     # the parts are quotients of whole numbers: nothing open is exactly 0
@@ -56,7 +56,7 @@ def verdict(frames: Sequence[Mapping[str, Any]]) -> str:
 
 
 def search_figures(store: Any) -> dict[str, Any]:
-    """What report.json says of the work of a search: over time, in all, why cells are unknown, and the cells' seal."""
+    """Return report.json's figures of a search: progress over time, totals, reasons for unknown, the cells' seal."""
     return {
         "trace": store.points,
         "seconds": store.seconds,
@@ -76,17 +76,17 @@ def certificate_document(
     scene_margin: Mapping[str, Any],
     cameras: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Content of report.json.
+    """Return the content of report.json.
 
     Args:
         run: The command's run.
-        claim: What is claimed, and of what: keys of report.json.
-        frames: One mapping by frame: index, parameters, coverage, cells, sampled, partition, least_margin,
+        claim: The property and the network: keys of report.json.
+        frames: By frame, a mapping of index, parameters, coverage, cells, sampled, partition, least_margin,
             counterexamples.
         figures: See `search_figures`.
         state: "running", "done", "budget" or "interrupted".
-        scene_margin: Largest variations of the scene for which what is certified holds.
-        cameras: Where cameras of cells stand.
+        scene_margin: Largest variations of the scene for which certified cells stay certified.
+        cameras: Positions of the cells' cameras.
     """
     covered = coverage(frames)
     poses = sum(entry["sampled"]["poses"] for entry in frames)
@@ -120,7 +120,7 @@ def certificate_document(
 
 
 class LastReport:
-    """What a search has reported last, so that a command which is ended where it is can say so."""
+    """Keeps the latest report of a search, so that a command that is killed can mark it as interrupted."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -130,7 +130,7 @@ class LastReport:
         self._page: Callable[[], str] = lambda: ""
 
     def write(self, document: dict[str, Any], page: Callable[[], str]) -> None:
-        """Write both.
+        """Write report.json and report.html.
 
         ``document``: content of report.json; its keys ``state`` and ``first_command`` are set here. Raises InputError
         where the folder cannot be written.
@@ -141,7 +141,7 @@ class LastReport:
         write_certificate(self._folder, document, page())
 
     def interrupted(self) -> None:
-        """Say of it that the search was interrupted; nothing else is looked at.
+        """Write the latest report again with the state "interrupted"; nothing else is computed.
 
         Raises:
             InputError: The folder cannot be written.

@@ -30,10 +30,10 @@ _FINE, _MOST_MARKS, _MOST_MATRICES = 160, 400, 4
 
 @dataclass(frozen=True)
 class CertificateDetails:
-    """Details that were computed when a search ended: regions of failure, poses with pictures.
+    """Details that are computed when a search ends: regions of failure, and poses with pictures.
 
-    ``pictures`` show of the first regions a counterexample, and the nearest pose that was seen to be right. ``why``
-    says why there are no more, as the end of a sentence; empty if there were not to be more.
+    ``pictures`` show a counterexample of each of the first regions beside the nearest certified pose. ``why`` ends a
+    sentence on why there are no more; empty if none were left out.
     """
 
     regions: Sequence[FailureRegion] = ()
@@ -50,11 +50,11 @@ def certificate_page(
     cameras: CameraDrawings | None = None,
     closer: CertificateDetails | None = None,
 ) -> str:
-    """The page of a certificate: HTML, self-contained; every text of the document is escaped.
+    """Return the page of a certificate: HTML, self-contained, every text of the document escaped.
 
     ``cells`` are by frame rows lower, upper, verdict in the order of ``document``'s parameters; ``pictures`` have
     ``title``, ``text`` and ``png``; ``seen`` are ``text`` and ``png`` of a pose in a cell, by frame and position of the
-    cell in it; ``closer`` are regions and poses that were looked at more closely.
+    cell in it; ``closer`` are the details of the end of the search.
     """
     name, units = str(document["scene"].get("name", "scene")), ShownUnits.of(document["scene"])
     numbers, closer = _numbered(document, cells), closer or CertificateDetails()
@@ -107,7 +107,7 @@ def certificate_page(
 def _numbered(
     document: Mapping[str, Any], cells: Mapping[int, Sequence[Mapping[str, Any]]]
 ) -> dict[tuple[int, int], int]:
-    """Numbers of the cells that can be chosen, by frame and position; none where there are too many."""
+    """Return numbers of the cells that can be clicked, by frame and position; empty where there are too many."""
     numbers: dict[tuple[int, int], int] = {}
     for entry in document["frames"][:_MOST_ROWS]:
         for position in range(len(cells.get(entry["index"], ()))):
@@ -121,7 +121,7 @@ def _cell_data(
     numbers: Mapping[tuple[int, int], int],
     seen: Mapping[tuple[int, int], Mapping[str, Any]],
 ) -> Markup:
-    """What the script needs to tell about a cell, as JSON that ends no tag."""
+    """Return the page script's data on cells, as JSON that ends no HTML tag."""
     pictures: list[tuple[str, str]] = []
     rows = []
     for frame, position in numbers:
@@ -139,7 +139,7 @@ def _cell_data(
 
 
 def _merged(rows: Sequence[Mapping[str, Any]], axis: int) -> list[tuple[float, float, str]]:
-    """Neighbouring cells of one verdict along one parameter as one span."""
+    """Return spans (from, to, verdict) along one parameter, with neighbouring cells of one verdict merged."""
     spans: list[tuple[float, float, str]] = []
     for row in rows:
         low, high, kind = row["lower"][axis], row["upper"][axis], row["verdict"]
@@ -155,7 +155,7 @@ _Span = tuple[float, float, str, "int | None"]
 
 
 def _spans(rows: Sequence[Mapping[str, Any]], axis: int, frame: int, numbers: Mapping[Any, int]) -> list[_Span]:
-    """The cells along one parameter, one by one if they have numbers."""
+    """Return the cells along one parameter as spans, unmerged if they have numbers."""
     if numbers:
         return [
             (row["lower"][axis], row["upper"][axis], row["verdict"], numbers[frame, k]) for k, row in enumerate(rows)
@@ -172,10 +172,9 @@ def verdict_drawings(
     cells: Mapping[int, Sequence[Mapping[str, Any]]],
     numbers: Mapping[tuple[int, int], int],
 ) -> tuple[list[tuple[Markup, Mapping[str, Any], str]], list[tuple[Markup, str]]]:
-    """Where: rings of one azimuth, strips of one other parameter, maps of two; and of more, bars of all frames.
+    """Return drawings of verdicts over sets: of single frames with their notes, of several frames with captions.
 
-    Returns:
-        Drawings of frames with the frames and notes, and drawings of several frames with captions.
+    One azimuth is a ring, another single parameter a strip, two parameters a map; sets of more have bars.
     """
     if way := along_path(frames):
         return [], [(_path(way, cells, numbers), "the whole path, from keyframe to keyframe")]
@@ -197,7 +196,7 @@ def verdict_drawings(
 
 
 def along_path(frames: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
-    """All frames if each is a way from one keyframe to the next, or the last keyframe, and nothing else varies."""
+    """Return all frames if each is a segment of the path, or its last keyframe, and nothing else varies; else none."""
     for position, entry in enumerate(frames):
         names = [entry["parameters"][k]["name"] for k in free_parameters(entry["parameters"])]
         if names != ["segment"] and (names or position < len(frames) - 1):
@@ -208,10 +207,10 @@ def along_path(frames: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
 def path_spans(
     entry: Mapping[str, Any], rows: Sequence[Mapping[str, Any]], last: float
 ) -> list[tuple[float, float, str, float | None]]:
-    """Cells of a frame of a path: from and to where, verdict, and where the counterexample is.
+    """Return the cells of a path's frame as (from, to, verdict, position of the counterexample or None).
 
     Args:
-        last: How wide a keyframe by itself is drawn.
+        last: Width at which a single keyframe is drawn.
     """
     free = free_parameters(entry["parameters"])
     spans = []
@@ -228,13 +227,13 @@ LAST = 0.015
 
 
 def _broken(rows: Sequence[Mapping[str, Any]]) -> list[Sequence[float]]:
-    """Counterexamples, each once; some of many, evenly spread."""
+    """Return distinct counterexamples; of many, an evenly spread selection."""
     counterexamples = list({tuple(e): e for row in rows if (e := row.get("counterexample")) is not None}.values())
     return counterexamples[:: max(1, -(-len(counterexamples) // _MOST_MARKS))]
 
 
 def _ring(spans: Sequence[_Span], parameter: Mapping[str, Any], broken: Sequence[float]) -> Markup:
-    """Azimuth 0 to the right, counter-clockwise."""
+    """Return the ring of an orbit's verdicts: azimuth 0 is at the right, counter-clockwise."""
     middle, inner, outer = 170.0, 92.0, 138.0
     marks = []
     for low, high, kind, number_of in spans:
@@ -275,7 +274,7 @@ def _strip(spans: Sequence[_Span], parameter: Mapping[str, Any], broken: Sequenc
 
 
 def _along(spans: Sequence[_Span], axis: PlotAxis, broken: Sequence[float], offset: float = 0.0) -> list[str]:
-    """Cells side by side, counterexamples below them."""
+    """Return SVG of cells side by side along an axis, with counterexamples below them."""
     marks = [
         f'<rect class="{kind}"{_chosen(n)} x="{axis(offset + a):.2f}" y="8" '
         f'width="{max(0.3, axis(offset + b) - axis(offset + a)):.2f}" height="32"/>'
@@ -289,7 +288,7 @@ def _path(
     cells: Mapping[int, Sequence[Mapping[str, Any]]],
     numbers: Mapping[tuple[int, int], int],
 ) -> Markup:
-    """All ways from keyframe to keyframe, one after another."""
+    """Return one strip of the verdicts along all segments of a path, in order."""
     ways = sum(bool(free_parameters(entry["parameters"])) for entry in frames)
     last = LAST * ways
     axis = PlotAxis(0.0, ways + (last if ways < len(frames) else 0.0), 20, 1000, log=False)
@@ -340,10 +339,9 @@ def _plane(
 def _matrices(
     frames: Sequence[Mapping[str, Any]], cells: Mapping[int, Sequence[Mapping[str, Any]]]
 ) -> tuple[list[tuple[Markup, Mapping[str, Any]]], int]:
-    """Maps of all pairs of parameters, for sets of more than two; those that are certified least if there are many.
+    """Return maps of all pairs of parameters with their frames, and the number of frames left out.
 
-    Returns:
-        The maps with their frames, and the number of frames that are left out.
+    Sets of more than two parameters have such maps; of many frames, those with the least certified fractions.
     """
     several = [entry for entry in frames if cells.get(entry["index"]) and len(free_parameters(entry["parameters"])) > 2]
     chosen = sorted(several, key=lambda entry: entry["coverage"]["certified"])[:_MOST_MATRICES]
@@ -365,7 +363,7 @@ def _bars(
     numbers: Mapping[tuple[int, int], int],
     cells: Mapping[int, Sequence[Mapping[str, Any]]],
 ) -> Markup:
-    """One stacked bar by frame; a part stands for its cell of the least margin."""
+    """Return one stacked bar of verdicts by frame; each part links to its cell of the least margin."""
     step, width = 14, 600
     marks = []
     for row, entry in enumerate(entries):
@@ -384,13 +382,13 @@ def _bars(
 
 
 def _least(rows: Sequence[Mapping[str, Any]], kind: str) -> int | None:
-    """The cell of a verdict whose margin is the least; one without a margin if all are."""
+    """Return the position of the cell of a verdict with the least margin; cells without a margin come last."""
     of_verdict = [k for k, row in enumerate(rows) if row["verdict"] == kind]
     return min(of_verdict, key=lambda k: math.inf if (m := rows[k].get("margin")) is None else m, default=None)
 
 
 def _time(trace: Sequence[Mapping[str, float]]) -> Markup:
-    """Parts of the set by verdict over time; empty where there is one moment alone."""
+    """Return a plot of the set's fractions by verdict over time; empty where the trace has one moment."""
     stride = max(1, math.ceil(len(trace) / _MOST_POINTS))
     points = [p for k, p in enumerate(trace) if k % stride == 0 or k == len(trace) - 1]
     if len(points) < 2:

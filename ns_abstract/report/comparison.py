@@ -1,4 +1,4 @@
-"""The report on differences of two scenes: files of frames, report.json, report.html."""
+"""Writes the result of a comparison of two scenes: files of frames, report.json, report.html."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ METRICS = {
 
 
 def difference_figures(result: FrameResult) -> dict[str, float]:
-    """Largest and mean values over pixels and channels of the bound and of what was rendered."""
+    """Return largest and mean values, over pixels and channels, of the bound and of rendered differences."""
     return {
         "largest_upper": float(result.upper.max()),
         "largest_lower": float(result.witness_upper.max()),
@@ -51,7 +51,7 @@ def difference_figures(result: FrameResult) -> dict[str, float]:
 
 
 def verdict(result: FrameResult, tolerance: float, guarantee: str) -> str:
-    """Whether no picture differs by more than the tolerance: "certified", "falsified" or "unknown".
+    """Return whether pictures differ by at most the tolerance: "certified", "falsified" or "unknown".
 
     "falsified" needs a stored pose whose rendered pictures differ by more, "certified" a guarantee.
     """
@@ -63,7 +63,7 @@ def verdict(result: FrameResult, tolerance: float, guarantee: str) -> str:
 
 
 def overall(verdicts: Sequence[str], complete: bool) -> str:
-    """The verdict on all frames: one that is falsified decides; certified are all together."""
+    """Return the verdict on all frames: "falsified" if any frame is; "certified" if all are."""
     if "falsified" in verdicts:
         return "falsified"
     return "certified" if complete and verdicts and set(verdicts) == {"certified"} else "unknown"
@@ -72,8 +72,8 @@ def overall(verdicts: Sequence[str], complete: bool) -> str:
 class ComparisonReport(Report):
     """Writes a comparison's results as they come; see `Report`.
 
-    ``output_dir``: made if it is absent. ``tolerance``: difference of which is asked whether any picture exceeds it, or
-    None. Raises InputError where the folder cannot be written, or holds other results that were to be kept.
+    ``output_dir``: made if it is absent. ``tolerance``: largest allowed difference; None: no verdict. Raises InputError
+    where the folder cannot be written, or holds other results that were to be kept.
     """
 
     def __init__(
@@ -96,7 +96,7 @@ class ComparisonReport(Report):
         return result.bounded and figures["largest_upper"] <= max(target * largest, largest + LEAST_ROOM)
 
     def _stored_status(self, stored: StoredFrame) -> str:
-        """Status under the present question, whatever was asked before."""
+        """Return a stored frame's status under the present tolerance, whatever the earlier one was."""
         if not stored.result.bounded:
             return "missing"
         return "done" if self._reached(stored.result) else "partial"
@@ -135,7 +135,7 @@ class ComparisonReport(Report):
         save_figure(self.folder / frame_name(result.index, "png"), figure, 120)
 
     def _panels(self, result: FrameResult) -> list[tuple[str, np.ndarray, bool]]:
-        """Titles, pictures [H, W, 3] or greatest differences over the channels [H, W], and whether it is the latter."""
+        """Return title, picture [H, W, 3] or greatest difference over channels [H, W], and whether it is the latter."""
         assert result.largest is not None
         first, second = self.pictures(result.index, result.largest.pose)
         difference = np.abs(first.astype(np.float64) - second)
@@ -166,7 +166,7 @@ class ComparisonReport(Report):
 def difference_figure(
     result: FrameResult, panels: Sequence[tuple[str, np.ndarray, bool]], about: str, tolerance: float | None
 ) -> Figure:
-    """The picture of one frame: both scenes at the worst pose, their difference, and the maps, of one colour scale."""
+    """Return a frame's figure: both scenes at the worst pose, their difference, and the maps, on one colour scale."""
     top = float(result.upper.max()) or 1.0
     figures = difference_figures(result)
     text = (
@@ -188,10 +188,10 @@ _TITLES = {
 
 
 def comparison_page(document: Mapping[str, Any], pictures: Mapping[int, Mapping[str, bytes]]) -> str:
-    """The page: HTML, self-contained; every text of the document is escaped.
+    """Return the page of a comparison: HTML, self-contained, every text of the document escaped.
 
     Args:
-        pictures: For the frames shown, by number: PNGs by title.
+        pictures: By number of the frames shown, PNGs by title.
     """
     frames, scene = document["frames"], document["scene"]
     other = Path(str(scene["other"].get("source", ""))).name
@@ -221,6 +221,6 @@ def comparison_page(document: Mapping[str, Any], pictures: Mapping[int, Mapping[
 
 
 def _pose(entry: Mapping[str, Any]) -> str:
-    """The worst pose of a frame in words."""
+    """Return the worst pose of a frame in words."""
     pairs = zip(entry["parameters"], entry["worst"]["pose"], strict=True)
     return ", ".join(f"{p['name']} {number(value, 6)} {p['unit']}".strip() for p, value in pairs) or "the only one"

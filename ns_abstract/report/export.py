@@ -1,4 +1,4 @@
-"""Abstract images of a whole path in one archive, as plain pictures, or as a video."""
+"""Exports the abstract images of a whole path: as one archive, as plain pictures, or as a video."""
 
 from __future__ import annotations
 
@@ -37,13 +37,13 @@ _FIX_RESULTS = "give the folder that ns-abstract-render wrote"
 
 
 class Results:
-    """The frames that a command left in a folder.
+    """The frames that a command wrote to a folder.
 
     Raises:
-        InputError: There are no frames in it, one is damaged or not the one that was written, or their sizes differ.
+        InputError: There are no frames, one is damaged or is not the one that was written, or their sizes differ.
 
     Attributes:
-        checked: Whether report.json is there and says of all of them that they are as they were written.
+        checked: Whether report.json is there and its digests are those of all frames.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -95,12 +95,12 @@ class Results:
             self.parameters.append(sides(result.box))
 
     def __iter__(self) -> Iterator[FrameResult]:
-        """The frames in order, each read when it is its turn."""
+        """Yield the frames in order, each read when it is needed."""
         return (load_frame(file, leaves=False).result for file in self.files.values())
 
 
 def picture(result: FrameResult, name: str, largest: float) -> np.ndarray:
-    """[H, W, 3] uint8 of one of `PICTURES`; bounds are rounded outward, gaps are on a scale up to ``largest``."""
+    """Return one of `PICTURES` as [H, W, 3] uint8: bounds rounded outward, gaps on a scale up to ``largest``."""
     if name == "lower":
         return np.floor(result.lower.astype(np.float64) * 255.0).astype(np.uint8)
     if name == "upper":
@@ -113,9 +113,9 @@ def picture(result: FrameResult, name: str, largest: float) -> np.ndarray:
 
 
 def write_archive(results: Results, file: Path) -> None:
-    """One npz: ``frames`` [K], the arrays of frame files as [K, H, W, 3] float32, and ``about`` (JSON text).
+    """Write one npz: ``frames`` [K], the arrays of frame files as [K, H, W, 3] float32, and ``about`` (JSON text).
 
-    Reads with ``np.load(file, allow_pickle=False)``.
+    Read it with ``np.load(file, allow_pickle=False)``.
     """
     shape = (len(results.files), *results.size, 3)
     about = {
@@ -142,7 +142,7 @@ def write_archive(results: Results, file: Path) -> None:
 
 
 def write_pictures(results: Results, folder: Path, names: Sequence[str]) -> list[Path]:
-    """One PNG for every frame and name, ``lower_00000.png``: whole pixels, no labels."""
+    """Write one PNG for every frame and name, such as ``lower_00000.png``, in whole pixels without labels."""
     from PIL import Image
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -157,9 +157,9 @@ def write_pictures(results: Results, folder: Path, names: Sequence[str]) -> list
 
 
 def panels(result: FrameResult, names: Sequence[str], largest: float, text: str) -> np.ndarray:
-    """[h, w, 3] uint8: the pictures ``names`` side by side, each under its label, and ``text`` below.
+    """Return the pictures ``names`` side by side, [h, w, 3] uint8, each under its label, with ``text`` below.
 
-    Small pictures are shown with several screen pixels for each of theirs.
+    Small pictures are enlarged by a whole factor.
     """
     from PIL import Image, ImageDraw
 
@@ -177,7 +177,7 @@ def panels(result: FrameResult, names: Sequence[str], largest: float, text: str)
 
 
 def _figures(results: Results, result: FrameResult, names: Sequence[str]) -> str:
-    """The text below a frame's panels."""
+    """Return the text below a frame's panels."""
     if not result.bounded:
         return f"frame {result.index}   no bound but [0, 1]"
     figures = metrics(result)
@@ -208,12 +208,12 @@ def write_video(results: Results, file: Path, names: Sequence[str], fps: float, 
 
 
 def has_video() -> bool:
-    """Whether PyAV is installed, which encodes videos."""
+    """Return whether PyAV is installed, which encodes videos."""
     return importlib.util.find_spec("av") is not None
 
 
 def encode_mp4(stream: BinaryIO, frames: Iterable[np.ndarray], fps: float) -> None:
-    """Write ``frames`` [h, w, 3] uint8, all of one size, as an H.264 video; odd sides get a black line more."""
+    """Write ``frames`` [h, w, 3] uint8, all of one size, as an H.264 video; odd sides are padded by a black line."""
     import av
 
     with av.open(stream, "w", format="mp4") as container:
@@ -231,7 +231,7 @@ def encode_mp4(stream: BinaryIO, frames: Iterable[np.ndarray], fps: float) -> No
 
 
 def encode_gif(stream: BinaryIO, frames: Iterable[np.ndarray], fps: float) -> None:
-    """Write ``frames`` [h, w, 3] uint8 as an animation without end, in 256 colours each."""
+    """Write ``frames`` [h, w, 3] uint8 as a GIF that repeats, with 256 colours for each frame."""
     from PIL import Image
 
     first, *others = (Image.fromarray(frame) for frame in frames)
@@ -239,7 +239,7 @@ def encode_gif(stream: BinaryIO, frames: Iterable[np.ndarray], fps: float) -> No
 
 
 def encoded(frames: Iterable[np.ndarray], fps: float) -> tuple[str, bytes]:
-    """A film: the ending of its name and its content, mp4, or gif where PyAV is missing."""
+    """Return the file suffix and content of a film: mp4, or gif where PyAV is missing."""
     buffer = io.BytesIO()
     if has_video():
         encode_mp4(buffer, frames, fps)

@@ -1,4 +1,4 @@
-"""The figures of a frame, and how they are written for people."""
+"""The figures of a frame, and their texts."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ _RUNS = 8
 
 
 def metrics(result: FrameResult) -> dict[str, float | None]:
-    """The figures of one frame.
+    """Return the figures of one frame.
 
     ``mpg``, ``xpg``: mean and maximum over the pixels of the length over RGB of upper - lower (the paper's metrics);
-    ``mpg_witness``, ``xpg_witness``: the same of what was rendered; ``ratio``: mpg / mpg_witness, None where that is no
-    finite number.
+    ``mpg_witness``, ``xpg_witness``: the same of the rendered extremes; ``ratio``: mpg / mpg_witness, None where that
+    is not finite.
     """
     mpg = mean_pixel_gap(result.lower, result.upper)
     witness = mean_pixel_gap(result.witness_lower, result.witness_upper)
@@ -35,10 +35,10 @@ def metrics(result: FrameResult) -> dict[str, float | None]:
 
 
 def layer_metrics(result: FrameResult) -> dict[str, dict[str, float | None]]:
-    """The figures of a frame's further outputs, by name; None where a number is not finite.
+    """Return the figures of a frame's further outputs, by name; None where a number is not finite.
 
-    ``mean_gap``: mean over the pixels of upper - lower, in the output's unit; ``mean_gap_witness``: the same of what
-    was rendered; ``ratio``: of the two.
+    ``mean_gap``: mean over the pixels of upper - lower, in the output's unit; ``mean_gap_witness``: the same of the
+    rendered extremes; ``ratio``: the first over the second.
     """
     metrics_by_name: dict[str, dict[str, float | None]] = {}
     for name, layer in result.layers.items():
@@ -50,7 +50,7 @@ def layer_metrics(result: FrameResult) -> dict[str, dict[str, float | None]]:
 
 
 def seconds_to(trace: Sequence[TracePoint], marks: Sequence[float] = MARKS) -> dict[float, float | None]:
-    """Seconds of work after which MPG was at most each of ``marks`` times the witness MPG; None: never."""
+    """Return the seconds of work until MPG was at most each of ``marks`` times the witness MPG; None: never."""
     seconds: dict[float, float | None] = {}
     for mark in marks:
         times = (p.seconds for p in trace if p.covered == 1.0 and p.mpg <= mark * p.mpg_witness)
@@ -59,7 +59,7 @@ def seconds_to(trace: Sequence[TracePoint], marks: Sequence[float] = MARKS) -> d
 
 
 def number(value: float | None, digits: int = 4) -> str:
-    """A figure for people: ``digits`` significant ones, a dash for None."""
+    """Return a number as text with ``digits`` significant digits; a dash for None."""
     if value is None:
         return "–"
     text = f"{value:.{digits}g}"
@@ -70,7 +70,7 @@ def number(value: float | None, digits: int = 4) -> str:
 
 
 def percent(part: float | None) -> str:
-    """Format a fraction for people; 100 % and 0 % are shown only where exact."""
+    """Return a fraction as text in per cent; "100 %" and "0 %" are returned only where exact."""
     if part is None:
         return "–"
     text = f"{100.0 * part:.2f}"
@@ -82,7 +82,7 @@ def percent(part: float | None) -> str:
 
 
 def unit_of_axis(unit: str) -> str:
-    """A unit, short enough for an axis."""
+    """Return a unit's text, shortened for an axis."""
     return "units" if unit == "normalised units" else unit
 
 
@@ -93,12 +93,12 @@ _RING = 1.0
 
 
 def is_ring(parameter: Mapping[str, Any]) -> bool:
-    """Whether a parameter is drawn as a ring."""
+    """Return whether a parameter is a full turn, which is drawn as a ring."""
     return parameter["name"] == "azimuth" and parameter["upper"] - parameter["lower"] >= _RING
 
 
 class _OtherUnit(NamedTuple):
-    """A unit beside that of files, what values are multiplied by, and whether it is the one that was requested."""
+    """A unit beside that of files, the factor to it, and whether it is the one that was requested."""
 
     unit: str
     factor: float
@@ -107,7 +107,7 @@ class _OtherUnit(NamedTuple):
 
 @dataclass(frozen=True)
 class ShownUnits:
-    """Units that a set of poses was stated in: people read ranges in these, with the other unit beside them.
+    """The units in which a pose set was stated: texts have these, and the files' units beside them.
 
     ``translation``: "normalised" or "dataset"; ``angle``: "radians" or "degrees"; ``dataset_scale``: normalised units
     per unit of the data set.
@@ -119,16 +119,16 @@ class ShownUnits:
 
     @classmethod
     def of(cls, scene: Mapping[str, Any]) -> ShownUnits:
-        """Those that a report's ``scene`` names, or the normalised frame's."""
+        """Return the units that a report's ``scene`` names, or those of the normalised frame."""
         return cls(**scene.get("units", {}))
 
     def axis(self, unit: str) -> tuple[str, float]:
-        """The unit that values in ``unit`` are drawn in, and what they are multiplied by."""
+        """Return the unit in which values in ``unit`` are drawn, and the factor to it."""
         other = self._other(unit)
         return (other.unit, other.factor) if other is not None and other.is_requested else (unit, 1.0)
 
     def _other(self, unit: str) -> _OtherUnit | None:
-        """The second unit of values in ``unit``, where there is one to tell of."""
+        """Return the second unit for values in ``unit``, or None."""
         if unit == "rad":
             return _OtherUnit("degrees", math.degrees(1.0), self.angle == "degrees")
         if unit == "normalised units" and (self.translation == "dataset" or self.dataset_scale != 1.0):
@@ -136,13 +136,13 @@ class ShownUnits:
         return None
 
     def value(self, name: str, unit: str, value: float) -> str:
-        """A parameter's value for people: as it is stored, behind it in the unit that was asked for."""
+        """Return a parameter's value as text: as it is stored, then in the requested unit."""
         shown_unit, factor = self.axis(unit)
         beside = "" if factor == 1.0 else f" ({number(value * factor, 6)} {shown_unit})"
         return f"{name} = {value!r}{beside}"
 
     def drawn(self, entry: Mapping[str, Any], rows: Sequence[Row]) -> tuple[dict[str, Any], list[Row]]:
-        """A frame's entry of report.json and its cells as they are drawn: in the units that were asked for.
+        """Return a frame's entry of report.json and its cells, converted to the requested units.
 
         A full turn stays in radians: it is drawn as a ring.
         """
@@ -165,7 +165,7 @@ class ShownUnits:
         ]
 
     def interval(self, name: str, unit: str, low: float, high: float) -> str:
-        """One side of a box for people, in the unit that was requested and in the other one."""
+        """Return one side of a box as text, in the requested unit and in the files' unit."""
         text, other = interval(name, unit, low, high), self._other(unit)
         if other is None:
             return text
@@ -175,13 +175,13 @@ class ShownUnits:
 
 
 def interval(name: str, unit: str, low: float, high: float) -> str:
-    """One side of a box for people, a symmetric one as a radius."""
+    """Return one side of a box as text; a symmetric one as a radius."""
     size = f"± {number(high)}" if low == -high else f"∈ [{number(low, 6)}, {number(high, 6)}]"
     return f"{name} {size} {unit}".strip()
 
 
 def listed(numbers: Sequence[int]) -> str:
-    """Ascending ``numbers`` in words, runs of them by their ends, and how many where there are many runs."""
+    """Return ascending ``numbers`` as text, runs by their ends; of many runs, how many there are."""
     runs: list[list[int]] = []
     for number in numbers:
         if runs and number == runs[-1][1] + 1:
@@ -193,15 +193,15 @@ def listed(numbers: Sequence[int]) -> str:
 
 
 def frames_listed(indices: Sequence[int]) -> str:
-    """Ascending ``indices`` of frames in words, as "frame 3" or "frames 0 to 4, 7"."""
+    """Return ascending ``indices`` of frames as text, such as "frame 3" or "frames 0 to 4, 7"."""
     return f"frame{'' if len(indices) == 1 else 's'} {listed(indices)}"
 
 
 def short_guarantee(guarantee: str, bounded: str | None) -> str:
-    """The name of a guarantee with what of the scene it holds, as "float32-sound, of the Gaussians alone".
+    """Return a guarantee's name and the bounded part of the scene, as "float32-sound, of the Gaussians alone".
 
     Args:
         guarantee: "float32-sound", "real-sound" or "sampled".
-        bounded: What of the scene is bounded, such as "of the Gaussians alone"; None: all of it.
+        bounded: The bounded part of the scene, such as "of the Gaussians alone"; None: all of it.
     """
     return guarantee if bounded is None or guarantee == "sampled" else f"{guarantee}, {bounded}"

@@ -1,4 +1,4 @@
-"""Frame files: written whole or not at all, and read back with suspicion."""
+"""Frame files: each is written whole or not at all, and checked completely when it is read."""
 
 from __future__ import annotations
 
@@ -54,27 +54,26 @@ _RECORD_LIMIT, _TABLE_LIMIT = 64 << 20, 1 << 20
 
 
 def frame_name(index: int, suffix: str) -> str:
-    """File name of one frame: ``frame_00000.npz``."""
+    """Return the file name of one frame: ``frame_00000.npz``."""
     return f"frame_{index:05d}.{suffix}"
 
 
 def layer_name(index: int, name: str) -> str:
-    """File name of a frame's picture of a further output: ``frame_00000_depth.png``."""
+    """Return the file name of a frame's picture of a further output: ``frame_00000_depth.png``."""
     return f"frame_{index:05d}_{name}.png"
 
 
 def frame_index(path: Path) -> int | None:
-    """The frame number in the name of a frame file, or None for any other name."""
+    """Return the frame number in the name of a frame file, or None for any other name."""
     match = _NAME.fullmatch(path.name)
     return int(match[1]) if match else None
 
 
 def check_frame(result: FrameResult) -> None:
-    """Refuse a result that no sound refinement can have.
+    """Raise ValueError for a result that no sound refinement can have.
 
-    Raises:
-        ValueError: Shapes or types disagree, a number is not finite, a value leaves [0, 1], bounds
-            cross, or a rendered image lies outside the bounds.
+    That is: shapes or types disagree, a number is not finite, a value leaves [0, 1], bounds cross, or a rendered image
+    lies outside the bounds.
     """
 
     def fail(problem: str) -> ValueError:
@@ -292,7 +291,7 @@ def load_frame(
 
 
 def _check_declared(archive: Archive, size: tuple[int, int] | None, leaves: bool, path: Path) -> None:
-    """Refuse arrays that no frame has, or that there is no memory for, before they are unpacked."""
+    """Refuse arrays that no frame has, or that do not fit into memory, before they are unpacked."""
     (shape, kind) = archive.declared["lower"]
     if len(shape) != 3 or shape[2] != 3 or kind != np.float32:
         raise InputError(f"lower is {kind} {list(shape)[:4]}, not float32 [H, W, 3]")

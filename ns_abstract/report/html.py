@@ -1,4 +1,4 @@
-"""Pages from templates: one file that needs nothing from the net, and every text that a template is given escaped."""
+"""Pages from templates: one file that loads nothing from the network, with every text of a template escaped."""
 
 from __future__ import annotations
 
@@ -28,23 +28,23 @@ SEARCH_STATES = {
 
 
 def uri(data: bytes) -> str:
-    """A PNG as an address that needs no file."""
+    """Return a PNG as a data URI."""
     return "data:image/png;base64," + base64.b64encode(data).decode()
 
 
 def counted(number_of: int, noun: str) -> str:
-    """A number of things in words."""
+    """Return a number with its noun, singular or plural."""
     return f"{number_of:,} {noun}{'' if number_of == 1 else 's'}"
 
 
 def set_of(entry: Mapping[str, Any], units: ShownUnits) -> str:
-    """The sides of a frame's set that vary, in words."""
+    """Return the ranges of a frame's parameters that vary, as text."""
     sides = [units.interval(p["name"], p["unit"], p["lower"], p["upper"]) for p in entry["parameters"]]
     return " · ".join(sides)
 
 
 def plain_text(value: Any) -> str:
-    """A value of report.json for people."""
+    """Return a value of report.json as text."""
     if value is None:
         return "–"
     if isinstance(value, bool):
@@ -57,7 +57,7 @@ def plain_text(value: Any) -> str:
 
 
 def _in_order(value: Any) -> Any:
-    """A value of a template; of a text, characters that are not seen or turn others round stand as their numbers."""
+    """Return a template's value; characters that are invisible or turn text around become their numbers."""
     if not isinstance(value, str) or isinstance(value, Markup) or value.isprintable():
         return value
     return "".join(ascii(c)[1:-1] if unicodedata.category(c) in _UNSEEN and c not in "\n\t" else c for c in value)
@@ -91,7 +91,7 @@ def _templates() -> Environment:
 
 
 def fill(template: str, **values: Any) -> Markup:
-    """A template of the folder `templates` with values in its places; what is not `Markup` is escaped."""
+    """Return a template of the folder `templates` with values filled in; every value but `Markup` is escaped."""
     return Markup(_templates().get_template(template).render(values))
 
 
@@ -101,9 +101,9 @@ def _text(name: str) -> str:
 
 
 def whole_page(template: str, styles: Sequence[str] = (), scripts: Sequence[str] = (), **values: Any) -> str:
-    """A page that extends base.html, with its style sheets and scripts and no way to load anything.
+    """Return a page that extends base.html, with its style sheets and scripts, which cannot load anything.
 
-    The only code that the browser runs in it is ``scripts``, which the page's policy names by their hash.
+    The browser runs only ``scripts``, which the page's policy lists by their hashes.
     """
     script = "".join(_text(name) for name in scripts)
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()

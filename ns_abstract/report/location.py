@@ -1,4 +1,4 @@
-"""The report on where a photo was taken: report.json, report.html."""
+"""The report of ``ns-abstract-locate``, where a photo was taken: report.json, report.html."""
 
 from __future__ import annotations
 
@@ -59,15 +59,15 @@ def location_document(
     *,
     state: str,
 ) -> dict[str, Any]:
-    """Content of report.json.
+    """Return the content of report.json.
 
     Args:
         run: The command's run.
-        photo: The photo and what a picture may miss of it: keys of report.json.
+        photo: The photo, and how far a render may differ from it: keys of report.json.
         parameters: Names and units of the table ``parameters``.
         sets: By frame, the poses.
         rows: By frame, the cells.
-        left: By frame, the part of the set that is not excluded.
+        left: By frame, the fraction of the set that is not excluded.
         poses: Rendered poses by frame, the best first, with ``values`` and ``outliers``.
         figures: See `ns_abstract.report.certificate.search_figures`.
         state: "done", "budget" or "interrupted".
@@ -151,7 +151,7 @@ def _frame(
 def location_pictures(
     levels: NDArray[np.uint8], picture: NDArray[np.floating] | None, missed: NDArray[np.bool_] | None
 ) -> dict[str, bytes]:
-    """PNGs of the photo, the render that explains most, their difference and the pixels it does not explain."""
+    """Return PNGs of the photo, the best render, their difference, and the pixels that the render does not explain."""
     images = {"photo": levels}
     if picture is not None and missed is not None:
         gap = np.abs(picture.astype(np.float64) - levels / 255.0).max(axis=-1)
@@ -168,7 +168,7 @@ def location_page(
     pictures: Mapping[str, bytes],
     elements: SceneElements | None,
 ) -> str:
-    """The page of a report; all texts of the document are escaped."""
+    """Return the page of a report, every text of the document escaped."""
     kind, heading = _HEADINGS[document["answer"]]
     left = {frame: [_colored(row) for row in cells if row["verdict"] != "excluded"] for frame, cells in rows.items()}
     names = [p["name"] for p in document["frames"][0]["parameters"]] if document["frames"] else []
@@ -191,14 +191,14 @@ def location_page(
 
 
 def _colored(row: Row) -> dict[str, Any]:
-    """A row with the verdict that has its colour in drawings of cameras."""
+    """Return a cell with the verdict whose colour it has in drawings of cameras."""
     return {**row, "verdict": "certified" if row["verdict"] == "possible" else "unknown"}
 
 
 def pair_svg(entry: Mapping[str, Any], rows: Sequence[Row]) -> Markup | None:
-    """Maps of what is left over every pair of parameters: of the set below the diagonal, of the hull above it.
+    """Return maps of the possible cells over all pairs of parameters: in the set below, in their hull above the diagonal.
 
-    A place is coloured where some value of the other parameters is left there.
+    A place is coloured if some value of the other parameters is possible there.
     """
     parameters = entry["parameters"]
     free = [k for k, p in enumerate(parameters) if p["lower"] < p["upper"]]
@@ -236,7 +236,7 @@ def pair_svg(entry: Mapping[str, Any], rows: Sequence[Row]) -> Markup | None:
 def _touched(
     ends: NDArray[np.float64], possible: NDArray[np.bool_], window: NDArray[np.float64], best: Any
 ) -> NDArray[np.uint8]:
-    """[bins, bins, 3] places of two parameters that boxes [n, 2, 2] touch; upward is more of the second one."""
+    """Return a picture [bins, bins, 3] of the bins of two parameters that boxes [n, 2, 2] touch; the second is up."""
     low, width = window[0], np.maximum(window[1] - window[0], np.finfo(np.float64).tiny)
     first = np.clip(np.floor((ends[:, 0] - low) / width * _BINS), 0, _BINS - 1).astype(int)
     last = np.clip(np.ceil((ends[:, 1] - low) / width * _BINS), 1, _BINS).astype(int)

@@ -1,4 +1,4 @@
-"""How results look in a notebook."""
+"""HTML of results for notebooks."""
 
 from __future__ import annotations
 
@@ -29,14 +29,14 @@ def _block(lines: Sequence[str]) -> str:
 
 
 def frame_html(frame: FrameResult, lines: Sequence[str]) -> str:
-    """The four pictures of an abstract image, and lines of text below."""
+    """Return the four pictures of an abstract image with lines of text below."""
     pictures = previews(frame, _SIDE)
     panels = "".join(_panel(title, pictures[name]) for name, title in _TITLES.items() if name in pictures)
     return f"<div>{panels}{_block(lines)}</div>"
 
 
 def verdicts_html(shares: Mapping[str, float], lines: Sequence[str]) -> str:
-    """The parts of a set with each verdict in a bar, and lines of text below."""
+    """Return a bar of a set's fractions by verdict with lines of text below."""
     bar = "".join(
         f'<span title="{kind}" style="display:inline-block;height:14px;width:{100.0 * share:.4f}%;'
         f'background:{_COLORS[kind]}"></span>'

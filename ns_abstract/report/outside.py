@@ -1,4 +1,4 @@
-"""Drawings of a scene from above and from the side, as one small picture, with plots over them."""
+"""Drawings of a scene from above and from the side, as one small picture, as the ground of plots."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ ABOVE = PLANS[2]
 
 @dataclass(frozen=True)
 class PlotWindow:
-    """The window of a plot: the part of a plane that is shown, at one scale, ``size`` pixels wide and high.
+    """The window of a plot: a rectangle of a plane, drawn at one scale, ``size`` pixels wide and high.
 
     ``axes`` are the world's axes to the right and up, ``low`` and ``high`` [2] the ends along them, normalised units.
     """
@@ -53,7 +53,7 @@ class PlotWindow:
 
 
 class SceneDrawing:
-    """Draws a scene from outside."""
+    """Draws a scene's opaque elements from outside."""
 
     def __init__(self, elements: SceneElements) -> None:
         self.elements = elements
@@ -63,7 +63,7 @@ class SceneDrawing:
 
     @staticmethod
     def sight(axes: tuple[int, int]) -> tuple[int, float]:
-        """The axis that is looked along, and the sign of the side from which."""
+        """Return the viewing axis of a plane, and the sign of the side that the viewer is on."""
         third = 3 - sum(axes)
         return third, float(np.cross(np.eye(3)[axes[0]], np.eye(3)[axes[1]])[third])
 
@@ -77,16 +77,16 @@ class SceneDrawing:
         return self.elements.places[self._opaque]
 
     def _drawn(self, axes: tuple[int, int], nearest: float) -> NDArray[np.intp]:
-        """Numbers of the opaque elements that are not nearer to who looks than ``nearest``, the farthest first."""
+        """Return numbers of the opaque elements beyond ``nearest`` from the viewer, the farthest first."""
         third, sign = self.sight(axes)
         depth = sign * self.elements.places[:, third]
         visible = np.flatnonzero(self._opaque & (depth <= nearest))
         return visible[np.argsort(depth[visible], kind="stable")]
 
     def window(self, axes: tuple[int, int], low: Float64, high: Float64, nearest: float, width: int) -> PlotWindow:
-        """A window about the box ``low`` [2] to ``high`` [2], normalised units, that shows some of the scene about it.
+        """Return a window around the box ``low`` [2] to ``high`` [2], normalised units, with some of the scene.
 
-        ``axes`` are the world's axes to the right and up; ``nearest`` as `picture` has it; ``width`` of the picture in
+        ``axes`` are the world's axes to the right and up; ``nearest`` as in `picture`; ``width`` of the picture in
         pixels.
         """
         return self._window(axes, tuple(low.tolist()), tuple(high.tolist()), nearest, width)
@@ -107,7 +107,7 @@ class SceneDrawing:
         return framed(axes, low, high, width)
 
     def picture(self, window: PlotWindow, nearest: float = np.inf) -> bytes:
-        """PNG of the elements in a window but for those in front, beyond ``nearest`` towards who looks."""
+        """Return a PNG of the elements in a window, without those that are nearer to the viewer than ``nearest``."""
         return self._picture(window, nearest)
 
     def _drawn_picture(self, window: PlotWindow, nearest: float) -> bytes:
@@ -146,7 +146,7 @@ class SceneDrawing:
 
 
 def framed(axes: tuple[int, int], low: Float64, high: Float64, width: int) -> PlotWindow:
-    """A window of one scale around the box, with a margin, neither flat nor tall."""
+    """Return a window around the box with a margin, at one scale for both axes, neither flat nor tall."""
     margin = 0.06 * max(float((high - low).max()), 1e-6)
     low, high = low - margin, high + margin
     across, up = high - low
@@ -158,7 +158,7 @@ def framed(axes: tuple[int, int], low: Float64, high: Float64, width: int) -> Pl
 
 
 def sideways(low: Float64, high: Float64, up: int = 2) -> tuple[int, int]:
-    """The axes to the right and up from the side: along the longer side of a box that is not ``up``."""
+    """Return the axes to the right and up of the view from the side: the box's longer horizontal side, and ``up``."""
     first, second = sorted(PLANS[up])
     return (first, up) if high[first] - low[first] >= high[second] - low[second] else (second, up)
 
@@ -166,12 +166,12 @@ def sideways(low: Float64, high: Float64, up: int = 2) -> tuple[int, int]:
 def about(
     outside: SceneDrawing | None, axes: tuple[int, int], low: Float64, high: Float64, nearest: float, width: int
 ) -> PlotWindow:
-    """`SceneDrawing.window`; `framed` where there is nothing to draw of the scene."""
+    """Return `SceneDrawing.window`, or `framed` where there is no scene to draw."""
     return framed(axes, low, high, width) if outside is None else outside.window(axes, low, high, nearest, width)
 
 
 def plane_axes(window: PlotWindow) -> tuple[PlotAxis, PlotAxis]:
-    """From the plane's coordinates to those of `draw_plane`."""
+    """Return the axes from the plane's coordinates to those of `draw_plane`."""
     (left, _, above, _), (width, height) = _ROOM, window.size
     return (
         PlotAxis(window.low[0], window.high[0], left, left + width, log=False),
@@ -180,9 +180,9 @@ def plane_axes(window: PlotWindow) -> tuple[PlotAxis, PlotAxis]:
 
 
 def draw_plane(outside: SceneDrawing | None, window: PlotWindow, nearest: float, marks: str, title: str) -> Markup:
-    """SVG of a window: the scene, if ``outside`` draws one, and ``marks`` over it, in the coordinates of `plane_axes`.
+    """Return the SVG of a window: the scene, if ``outside`` draws one, and ``marks`` in `plane_axes` over it.
 
-    ``nearest`` as `SceneDrawing.picture` has it.
+    ``nearest`` as in `SceneDrawing.picture`.
     """
     (left, right, above, below), (width, height) = _ROOM, window.size
     if outside is not None:
@@ -196,7 +196,7 @@ def draw_plane(outside: SceneDrawing | None, window: PlotWindow, nearest: float,
 
 
 def behind(outside: SceneDrawing | None, nearest: float, alone: str) -> str:
-    """Return a caption of what a plot shows of the scene; ``alone``: the caption without a scene."""
+    """Return a plot's caption on the scene that it shows, or the caption ``alone`` if it shows none."""
     if outside is None:
         return f"The scene has no elements with a place of their own (a NeRF's field has none): {alone}."
     text = "Behind them the opaque Gaussians of the scene, as ellipses of one standard deviation"
@@ -204,7 +204,7 @@ def behind(outside: SceneDrawing | None, nearest: float, alone: str) -> str:
 
 
 def _ellipses(size: tuple[int, int], corners: Float64, fill: NDArray[np.uint8]) -> bytes:
-    """PNG of polygons [n, c, 2] in colours [n, 4], one over the other."""
+    """Return a PNG of polygons [n, c, 2] in colours [n, 4], drawn in order."""
     from PIL import Image, ImageDraw
 
     whole = Image.new("RGB", (_FINE * size[0], _FINE * size[1]), tuple(int(v) for v in _PAPER))

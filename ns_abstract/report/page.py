@@ -1,4 +1,4 @@
-"""``report.html``: the report for people, in one file that needs nothing from the net."""
+"""``report.html`` of abstract images: one file that loads nothing from the network."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _STATS = (
 
 
 def shown_frames(frames: Sequence[Mapping[str, Any]], most: int) -> list[Mapping[str, Any]]:
-    """The frames whose pictures the page shows: all, or the ``most`` with the greatest MPG, in order."""
+    """Return the frames whose pictures the page shows: all, or the ``most`` with the greatest MPG, in order."""
     if len(frames) <= most:
         return list(frames)
     widest = sorted(frames, key=lambda entry: -entry["mpg"])[:most]
@@ -42,11 +42,11 @@ def shown_frames(frames: Sequence[Mapping[str, Any]], most: int) -> list[Mapping
 def render_page(
     document: Mapping[str, Any], pictures: Mapping[int, Mapping[str, bytes]], plays: Mapping[int, str] | None = None
 ) -> str:
-    """The page of a report: HTML, self-contained; every text of the document is escaped.
+    """Return the page of a report: HTML, self-contained, every text of the document escaped.
 
-    ``document`` is the content of report.json (`ns_abstract.report.record.Report.document`). Of the frames shown, by
-    number, ``pictures`` are PNGs lower, upper, gap, witness and image, and ``plays`` what
-    `ns_abstract.report.play.play_data` gives.
+    ``document`` is the content of report.json (`ns_abstract.report.record.Report.document`). By number of the frames
+    shown, ``pictures`` are PNGs lower, upper, gap, witness and image, and ``plays`` what
+    `ns_abstract.report.play.play_data` returns.
     """
     name, frames = str(document["scene"].get("name", "scene")), document["frames"]
     sampled = document["guarantee"] == "sampled"
@@ -92,7 +92,7 @@ def render_page(
 
 
 def _verdict(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Kind and title of the verdict, how many frames have bounds, and further sentences."""
+    """Return the headline of the page: kind and title, the number of frames with bounds, and further sentences."""
     frame_count, missing = len(document["frames_asked"]), len(document["missing"])
     bounded = frame_count - missing
     sampled = document["guarantee"] == "sampled"
@@ -134,7 +134,7 @@ def _verdict(document: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _captions(entry: Mapping[str, Any], sampled: bool) -> Sequence[tuple[str, str, str]]:
-    """Keys, labels and texts of a frame's pictures."""
+    """Return keys, labels and captions of a frame's pictures."""
     captions = (
         ("lower", "lower image", "least values of the samples") if sampled else
         ("lower", "lower bound", "no image of the set is darker"),
@@ -154,20 +154,20 @@ def _captions(entry: Mapping[str, Any], sampled: bool) -> Sequence[tuple[str, st
 
 
 def _thinned(trace: Sequence[Mapping[str, float]]) -> list[Mapping[str, float]]:
-    """Points after the first moment, some of many, the last one always."""
+    """Return points of a trace after the first moment, thinned where there are many; the last one is kept."""
     stride = max(1, math.ceil(len(trace) / _CURVE_POINTS))
     points = [point for k, point in enumerate(trace) if k % stride == 0 or k == len(trace) - 1]
     return [point for point in points if point["seconds"] > 0.0]
 
 
 def _seen(trace: Sequence[Mapping[str, float]]) -> list[Mapping[str, float]]:
-    """Points from the first whole cover on, before which nothing is known; all of them where there is none."""
+    """Return the points of a trace from the first cover of the whole set on; all points where there is none."""
     covered = [point for point in trace if point.get("covered", 1.0) >= 1.0 and point["mpg_witness"] > 0.0]
     return covered or list(trace)
 
 
 def _curve(entry: Mapping[str, Any]) -> Markup | None:
-    """Error against run time, both axes logarithmic; zero has no place on them and is left out."""
+    """Return the plot of a frame's error against run time, both axes logarithmic; zeros are left out."""
     points = _thinned(_seen(entry["trace"]))
     outer = [(point["seconds"], point["mpg"]) for point in points if point["mpg"] > 0.0]
     inner = [(point["seconds"], point["mpg_witness"]) for point in points if point["mpg_witness"] > 0.0]
@@ -192,7 +192,7 @@ def _curve(entry: Mapping[str, Any]) -> Markup | None:
 
 
 def _path_curve(frames: Sequence[Mapping[str, Any]]) -> Markup | None:
-    """Error against run time of the whole path: every frame on its own clock, and their mean."""
+    """Return the plot of all frames' errors against the run time of each, with their mean."""
     traces = [thinned for entry in frames if len(thinned := _thinned(entry["trace"])) > 1]
     if len(traces) < 2:
         return None
@@ -240,7 +240,7 @@ def _reached(frames: Sequence[Mapping[str, Any]], mark: str) -> str:
 
 
 def _overview(frames: Sequence[Mapping[str, Any]]) -> Markup | None:
-    """MPG along the path; nothing for a single frame."""
+    """Return the plot of MPG along the path; None for a single frame."""
     frames = [entry for entry in frames if entry["status"] != "missing"]
     if len(frames) < 2:
         return None

@@ -45,12 +45,12 @@ _DIM, _MAP = 0.35, "viridis"
 
 
 def to_bytes(image: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """[H, W, 3] in [0, 1] as uint8, as Nerfstudio's viewer shows it (render_state_machine.py:279)."""
+    """Return an image [H, W, 3] in [0, 1] as uint8, as Nerfstudio's viewer does (render_state_machine.py:279)."""
     return (np.clip(image, 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
 def _wrapped(items: list[str], width: int) -> list[str]:
-    """Lines of at most ``width`` characters, broken between items only (a longer item is cut)."""
+    """Return lines of at most ``width`` characters, broken between items only; a longer item is cut."""
     lines: list[str] = []
     for item in items:
         item = item if len(item) <= width else f"{item[: width - 1]}…"
@@ -67,7 +67,7 @@ def _box_items(box: ParameterBox, units: ShownUnits) -> list[str]:
 
 
 class _Sheet(NamedTuple):
-    """Sizes of a picture of four panels, in its own pixels; ``dpi``: pixels by inch."""
+    """Sizes in pixels of a figure with four panels; ``dpi``: pixels by inch."""
 
     dpi: float
     panel: tuple[int, int]
@@ -76,7 +76,7 @@ class _Sheet(NamedTuple):
 
     @classmethod
     def of(cls, height: int, width: int) -> _Sheet:
-        """For images of ``height`` x ``width`` pixels."""
+        """Return the sizes for images of ``height`` x ``width`` pixels."""
         panel_w = int(_PANEL_PIXELS_MAX if width > _PANEL_PIXELS_MAX else width * max(1, round(_PANEL_PIXELS / width)))
         panel_h = max(1, round(panel_w * height / width))
         if panel_h > 1.5 * panel_w:
@@ -91,21 +91,21 @@ class _Sheet(NamedTuple):
         return sheet._replace(width=total, characters=max(40, int(total / dpi / (_TEXT_POINTS * 0.0087))))
 
     def px(self, length: float) -> int:
-        """Inches in pixels."""
+        """Return a length in inches as pixels."""
         return round(length * self.dpi)
 
     @property
     def bar(self) -> int:
-        """What the colour bar takes."""
+        """Width of the colour bar with its labels."""
         return self.px(_GUTTER / 2 + _BAR + _BAR_TEXT)
 
 
 def frame_figure(
     result: FrameResult, *, guarantee: str = "", about: str = "", units: ShownUnits | None = None
 ) -> Figure:
-    """The picture of one frame: lower | upper | gap heat map with colour bar | one render.
+    """Return the figure of one frame: lower bound, upper bound, gap with its colour bar, one render.
 
-    Panels show whole pixels, several screen pixels each for small images. ``guarantee``: shown in the title; see
+    Small images are enlarged by a whole factor. ``guarantee``: shown in the title; see
     `ns_abstract.report.figures.short_guarantee`. ``about``: more for the title, such as the scene's name.
     """
     from matplotlib.figure import Figure
@@ -150,7 +150,7 @@ def _metric_items(result: FrameResult) -> list[str]:
 
 
 def _draw_panels(figure: Figure, result: FrameResult, sheet: _Sheet, total_h: int, write: Callable[..., None]) -> None:
-    """Draw the four images with labels, and the gap's colour bar, at the foot of a picture ``total_h`` pixels high."""
+    """Draw the four images with labels and the colour bar of the gap at the foot of a figure of ``total_h`` pixels."""
     px, (panel_w, panel_h) = sheet.px, sheet.panel
     length = gap(result.lower, result.upper)
     top = float(length.max())
@@ -178,10 +178,10 @@ def _draw_panels(figure: Figure, result: FrameResult, sheet: _Sheet, total_h: in
 
 
 def layer_figure(result: FrameResult, name: str) -> Figure:
-    """The picture of one further output: lower | upper | gap | one render, of one colour scale but for the gap.
+    """Return the figure of one further output: lower bound, upper bound, gap, one render; the gap has its own scale.
 
     Args:
-        name: Of `ns_abstract.refine.result.EXTRA_OUTPUTS`; its colour scale ends where what is known ends.
+        name: Of `ns_abstract.refine.result.EXTRA_OUTPUTS`; the colour scale ends at the largest finite value.
     """
     layer = result.layers[name]
     finite = layer.upper[np.isfinite(layer.upper)]
@@ -201,10 +201,10 @@ def layer_figure(result: FrameResult, name: str) -> Figure:
 def panels_figure(
     panels: Sequence[tuple[str, NDArray[Any], str | None, float]], title: str, bars: Iterable[int]
 ) -> Figure:
-    """Pictures side by side below a title.
+    """Return a figure of pictures side by side below a title.
 
     Args:
-        panels: Label, picture, and the colours of its scale and where that ends; no colours: it has its own.
+        panels: Label, picture, colour map and end of its scale; without a colour map the picture has colours.
         bars: Numbers of the panels that have a colour bar.
     """
     from matplotlib.figure import Figure
@@ -232,7 +232,7 @@ def save_figure(path: str | os.PathLike[str], figure: Figure, dpi: int | None = 
 
 
 def bare_axes(axes: Axes) -> None:
-    """Take the ticks from a picture's axes and make their frame thin."""
+    """Remove the ticks of a picture's axes and make their frame thin."""
     axes.set_xticks([])
     axes.set_yticks([])
     for spine in axes.spines.values():
@@ -241,7 +241,7 @@ def bare_axes(axes: Axes) -> None:
 
 
 def _color_bar(figure: Figure, mapped: Any, side: Axes, inches: float) -> None:
-    """A colour bar with as many ticks as fit into ``inches``."""
+    """Draw a colour bar with as many ticks as fit into ``inches``."""
     from matplotlib.ticker import MaxNLocator, ScalarFormatter
 
     bar = figure.colorbar(mapped, cax=side)
@@ -261,7 +261,7 @@ def save_picture(path: str | os.PathLike[str], result: FrameResult, **labels: An
 
 
 def heat(length: NDArray[np.floating], top: float, colors: str = GAP_COLORS) -> NDArray[np.uint8]:
-    """[H, W] gaps as [H, W, 3] uint8 ``colors`` of the scale from 0 to ``top``."""
+    """Return gaps [H, W] as colours [H, W, 3] uint8 of the scale from 0 to ``top``."""
     from matplotlib import colormaps
 
     scaled = np.asarray(length, np.float64) / (top if top > 0.0 else 1.0)
@@ -269,7 +269,7 @@ def heat(length: NDArray[np.floating], top: float, colors: str = GAP_COLORS) -> 
 
 
 def color_stops(count: int = 9) -> list[str]:
-    """``count`` evenly spaced hex colours of the gap scale."""
+    """Return ``count`` evenly spaced colours of the gap scale as hex codes."""
     from matplotlib import colormaps
     from matplotlib.colors import to_hex
 
@@ -277,19 +277,19 @@ def color_stops(count: int = 9) -> list[str]:
 
 
 def color_table() -> str:
-    """The 256 colours of the gap scale as hexadecimal digits, six by colour."""
+    """Return the 256 colours of the gap scale as hexadecimal digits, six for each colour."""
     return heat(np.arange(256)[None] / 255.0, 1.0).tobytes().hex()
 
 
 def png(image: Image) -> bytes:
-    """The file of a picture."""
+    """Return an image as PNG bytes."""
     buffer = io.BytesIO()
     image.save(buffer, "png")
     return buffer.getvalue()
 
 
 def preview(image: NDArray[np.uint8], side: int) -> bytes:
-    """PNG of ``image`` [H, W, 3], made smaller (area average) where a side exceeds ``side`` pixels."""
+    """Return a PNG of ``image`` [H, W, 3], reduced by area average where a side exceeds ``side`` pixels."""
     from PIL import Image
 
     picture = Image.fromarray(image)
@@ -299,9 +299,9 @@ def preview(image: NDArray[np.uint8], side: int) -> bytes:
 
 
 def previews(result: FrameResult, side: int) -> Mapping[str, bytes]:
-    """PNGs of a frame for the page: lower, upper, gap, gap of renders (same scale), render, and further outputs.
+    """Return PNGs of a frame for the page: lower, upper, gap, gap of renders (same scale), render, further outputs.
 
-    The latter are named ``depth_lower`` and so on, and share the scale of the largest value that is known.
+    Further outputs are named ``depth_lower`` and so on; their scale ends at the largest finite value.
     """
     top = max_pixel_gap(result.lower, result.upper)
     images = {
@@ -324,12 +324,12 @@ def previews(result: FrameResult, side: int) -> Mapping[str, bytes]:
 
 
 def planes_picture(image: np.ndarray, wanted: np.ndarray, depth: int | None) -> np.ndarray:
-    """Return a picture [h, w, 3] of bytes: the colours with what is not read darkened, then the planes side by side.
+    """Return a picture [h, w, 3] uint8: colours with unread pixels darkened, then further channels side by side.
 
     Args:
-        image: [H, W, C] colours, then planes in [0, 1]; one of them may be depths.
+        image: [H, W, C] colours, then channels in [0, 1]; one of them may be depths.
         wanted: [H, W] the pixels that are read.
-        depth: Channel of the depths, or None.
+        depth: Number of the channel of depths, or None.
     """
     colors = np.clip(image[..., :3], 0.0, 1.0)
     images = [to_bytes(np.where(wanted[..., None], colors, _DIM * colors))]

@@ -1,11 +1,10 @@
 """Compressed data with which a page shows a frame's bounds at any pose of its set, rounded outward.
 
 On a leaf's box every pixel lies between two functions that are linear in the parameters
-(`ns_abstract.refine.result.Leaves`). Their coefficients become whole multiples of one step; what that rounding may move
-a pixel by is added to the offsets, so that what the page shows still holds. Finished bounds are whole multiples of a
-step, too.
+(`ns_abstract.refine.result.Leaves`). Their coefficients become whole multiples of one step; the error of that rounding
+is added to the offsets, so that the shown bounds hold. Final bounds are whole multiples of a step, too.
 
-Numbers stand as differences from a guess, modulo 2^16 (2^8 for screens' pictures), which leaves small ones:
+Numbers are stored as differences from a prediction, modulo 2^16 (2^8 for images), which are small:
 
 * ``lower``, ``image``: from the pixel to the left; ``upper`` and ``witness_lower``: from ``lower``; ``witness_upper``:
   from ``upper``; ``view_images``: from the view before;
@@ -44,9 +43,9 @@ _SAMPLED, _SURE = 8, 0.85
 
 
 def play_data(result: FrameResult, most: int) -> str | None:
-    """A frame for the page: a zlib stream of a JSON line and arrays, in base64.
+    """Return a frame's data for the page: a zlib stream of a JSON line and arrays, in base64.
 
-    With the leaves' linear sets, as finely as they fit; else without them; None where nothing fits.
+    It holds the leaves' linear sets at the finest step that fits, else no leaves; None where nothing fits.
     """
     # one pose has nothing to move
     moves = result.leaves is not None and result.leaves.tile.shape[0] and result.box.dimensions
@@ -67,13 +66,13 @@ def play_data(result: FrameResult, most: int) -> str | None:
 
 
 def play_moves(text: str) -> bool:
-    """Whether a frame for the page has bounds at single poses."""
+    """Return whether a frame's data have bounds at single poses."""
     head = zlib.decompressobj().decompress(base64.b64decode(text), 65536).split(b"\n", 1)[0]
     return json.loads(head)["cell_steps"] is not None
 
 
 def _guess(leaves: Leaves, steps: int) -> float:
-    """Characters that leaves will take at least, from some of their tiles: trying all is slow."""
+    """Return a lower estimate of the characters that leaves take, from a sample of tiles: trying all is slow."""
     numbers = leaves.tile[:, 0].astype(np.int64) * 65536 + leaves.tile[:, 1]
     some = np.flatnonzero(np.isin(numbers, np.unique(numbers)[::_SAMPLED]))
     part = Leaves(**{name: getattr(leaves, name)[some] for name in Leaves.__dataclass_fields__})
@@ -100,7 +99,7 @@ def _packed(result: FrameResult, head: dict[str, Any], arrays: dict[str, NDArray
 
 
 def _planes(array: NDArray[Any]) -> bytes:
-    """Little-endian bytes of an array, the first byte of every number first: alike bytes stand together."""
+    """Return an array as little-endian bytes, the first bytes of all numbers first: similar bytes are neighbours."""
     flat = np.ascontiguousarray(array).astype(array.dtype.newbyteorder("<"), copy=False).reshape(-1)
     return flat.view(np.uint8).reshape(flat.size, array.itemsize).T.tobytes()
 
@@ -122,7 +121,7 @@ def _base(result: FrameResult, steps: int) -> dict[str, NDArray[Any]]:
 
 
 def _across(array: NDArray[Any], axis: int) -> NDArray[Any]:
-    """Every number less the one before it along an axis."""
+    """Return the difference of every number from the one before it along an axis."""
     return np.diff(array, axis=axis, prepend=np.zeros_like(np.take(array, [0], axis)))
 
 
@@ -135,7 +134,7 @@ def _views(result: FrameResult) -> dict[str, NDArray[Any]]:
 
 
 def _linear(leaves: Leaves, steps: int) -> dict[str, NDArray[Any]]:
-    """Leaves by tile and box, as whole coefficients rounded outward, as differences."""
+    """Return the leaves' linear sets by tile and box, as differences of whole coefficients, rounded outward."""
     order = np.lexsort((*leaves.box_lower.T[::-1], leaves.tile[:, 1], leaves.tile[:, 0]))
     low_slope, low = _whole(leaves.A_lower[order], leaves.b_lower[order], steps, -1.0)
     top_slope, top = _whole(leaves.A_upper[order], leaves.b_upper[order], steps, 1.0)
@@ -162,7 +161,7 @@ def _linear(leaves: Leaves, steps: int) -> dict[str, NDArray[Any]]:
 def _whole(
     slopes: NDArray[np.float32], offsets: NDArray[np.float32], steps: int, way: float
 ) -> tuple[NDArray[np.int16], NDArray[np.int16]]:
-    """Slopes [L, d, 3, s, s] and offsets [L, 3, s, s] in steps, rounded downward (``way`` -1) or upward (1)."""
+    """Return slopes [L, d, 3, s, s] and offsets [L, 3, s, s] in steps, rounded down (``way`` -1) or up (``way`` 1)."""
     axes = (0, *range(4, slopes.ndim), 3, 1, 2)
     a = np.ascontiguousarray(slopes.astype(np.float64).transpose(axes))
     b = np.ascontiguousarray(offsets.astype(np.float64).transpose(0, 3, 1, 2))

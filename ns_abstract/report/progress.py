@@ -1,4 +1,4 @@
-"""One display of progress for all commands and for notebooks."""
+"""The display of progress for all commands and for notebooks."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ _EVERY = 15.0
 
 
 def plain_console() -> Any:
-    """A console on stderr that prints texts as they are, without characters that a terminal acts upon.
+    """Return a console on stderr that prints texts literally, without terminal control characters.
 
-    Where nobody reads any more it raises BrokenPipeError, as files do; rich ends the process with code 1.
+    Where the reader of a pipe is gone it raises BrokenPipeError, as files do; rich would exit with code 1.
     """
     from rich.console import Console
 
@@ -39,28 +39,28 @@ class WorkProgress(Protocol):
 
     @property
     def done(self) -> float:
-        """Part of the work that is done, from 0 to 1."""
+        """Fraction of the work that is done, from 0 to 1."""
         ...
 
     @property
     def sentence(self) -> str:
-        """What is known so far."""
+        """The result so far, as a sentence."""
         ...
 
     @property
     def elapsed(self) -> float:
-        """Seconds that this command has worked."""
+        """Seconds of work so far."""
         ...
 
     @property
     def total_budget(self) -> float:
-        """Seconds that it may take."""
+        """Seconds that the work may take."""
         ...
 
 
 @dataclass(frozen=True)
 class ShownProgress:
-    """What a display shows, as `WorkProgress` has it."""
+    """A `WorkProgress` of plain values."""
 
     done: float
     sentence: str
@@ -69,7 +69,7 @@ class ShownProgress:
 
 
 def time_text(point: WorkProgress, first: WorkProgress) -> str:
-    """Seconds used of the budget, and what is left if the work goes on as since ``first``; never above the budget."""
+    """Return the seconds used, and those left at the pace since ``first``, at most the budget's, as text."""
     rest = max(0.0, point.total_budget - point.elapsed)
     gained = point.done - first.done
     rate = (1.0 - point.done) * (point.elapsed - first.elapsed) / gained if gained > 0.0 else math.inf
@@ -83,10 +83,10 @@ def time_text(point: WorkProgress, first: WorkProgress) -> str:
 
 
 class ProgressBar:
-    """A live line on progress, as ``on_progress`` of `ns_abstract.bound`, `certify` and `reach`.
+    """A live line of progress, to be passed as ``on_progress`` to `ns_abstract.bound`, `certify` and `reach`.
 
-    A line that is redrawn on a terminal and in a notebook; elsewhere a line every 15 seconds. Use it in a ``with``
-    block, which ends the line.
+    The line is redrawn on a terminal and in a notebook; elsewhere a new line is printed every 15 seconds. Use it in a
+    ``with`` block, which ends the line.
 
     Args:
         console: A console of rich; None: one on stderr.
@@ -107,7 +107,7 @@ class ProgressBar:
         self.close()
 
     def close(self) -> None:
-        """End the line; what comes next begins a new one."""
+        """End the line; later calls begin a new one."""
         if self._bar is not None:
             self._bar.stop()
         self._first = self._bar = self._cell = None

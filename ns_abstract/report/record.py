@@ -1,4 +1,4 @@
-"""``report.json``, and everything else that is written while frames are finished."""
+"""Writes ``report.json`` and all other files of a result while frames are finished."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ _LIMITS = {
 
 
 def frame_digests(document: Any) -> dict[str, str]:
-    """SHA-256 of the frame files by name, as report.json has them; what is damaged is left out."""
+    """Return the SHA-256 digests of the frame files by name from a report.json; malformed entries are left out."""
     digests = document.get("sha256") if isinstance(document, dict) else None
     return {str(k): v for k, v in digests.items() if isinstance(v, str)} if isinstance(digests, dict) else {}
 
@@ -85,17 +85,17 @@ def explanations(document: Any) -> dict[int, tuple[str, ...]]:
 
 
 def failed_self_check(problem: str) -> str:
-    """The condition on the guarantee that a problem of a platform's arithmetic makes."""
+    """Return the condition on the guarantee after a failed self-check of a platform's arithmetic."""
     return f"The platform's arithmetic failed the self-check, so nothing is guaranteed: {problem}"
 
 
 @dataclass(frozen=True, kw_only=True)
 class RunRecord(CommandRun):
-    """A command's run over ``frames``, numbers of the camera path's entries that were asked for.
+    """A command's run over ``frames``, the requested numbers of the camera path's entries.
 
-    Of its ``settings``, ``target_ratio`` decides when a frame is done, and with a true ``save_cells`` stored frames
-    without leaf cells are computed again. ``size`` is height and width of the pictures; None: any that stored frames
-    have. ``intrinsics`` has by frame the pictures' `Intrinsics`.
+    Of its ``settings``, ``target_ratio`` decides when a frame is done; with a true ``save_cells``, stored frames
+    without leaf cells are computed again. ``size`` is height and width of the pictures; None: those of the stored
+    frames. ``intrinsics`` are the pictures' `Intrinsics` by frame.
     """
 
     frames: tuple[int, ...]
@@ -106,16 +106,16 @@ class RunRecord(CommandRun):
 class Report:
     """Writes a command's results as they come: ``frame_*.npz``, ``frame_*.png``, report.json, report.html.
 
-    Every file is whole at all times; a frame stands in report.json only after its file is on disk.
+    Every file is whole at all times; a frame is in report.json only after its file is on disk.
 
     Args:
         output_dir: Made if it is absent.
-        keep_stored: Continue in the folder: frames stored with the same fingerprint are kept, asked for or not.
+        keep_stored: Continue in the folder: stored frames with the same fingerprint are kept, requested or not.
             Truncated, damaged or foreign frame files are not used; see ``ignored``.
 
     Attributes:
-        kept: Numbers of the frames taken over from an earlier run.
-        ignored: Stored frames that were not, with the reason, one sentence each.
+        kept: Numbers of the frames kept from an earlier run.
+        ignored: A sentence on each stored frame that was not kept, with the reason.
 
     Raises:
         InputError: The folder cannot be written, or its report, which is to be kept, has another fingerprint.
@@ -148,7 +148,7 @@ class Report:
         self._publish(page=True)
 
     def _describe(self, run: RunRecord) -> None:
-        """Take ``run`` for what report.json and the files of frames say from now on."""
+        """Let report.json and the files of frames describe ``run`` from now on."""
         self.run = run
         self._about = plain(
             {
@@ -161,7 +161,7 @@ class Report:
         )
 
     def _without_guarantee(self, problems: Sequence[str]) -> None:
-        """Say of the whole report that a process whose self-check failed bounded some of it."""
+        """Withdraw the guarantee of the whole report, as a process with a failed self-check bounded part of it."""
         limits = tuple(dict.fromkeys([*self.run.limits, *map(failed_self_check, problems)]))
         self._describe(replace(self.run, guarantee="sampled", limits=limits))
 
@@ -229,7 +229,7 @@ class Report:
                 self.kept.append(index)
 
     def _stored_status(self, stored: StoredFrame) -> str:
-        """Status under the present target: a stricter one re-opens frames that were done."""
+        """Return a stored frame's status under the present target: a stricter one makes done frames partial."""
         if not stored.result.bounded:
             return "missing"
         before, now = stored.about.get("target_ratio"), self.run.settings.get("target_ratio")
@@ -238,7 +238,7 @@ class Report:
         return "done" if self._reached(stored.result) else "partial"
 
     def _reached(self, result: FrameResult) -> bool:
-        """Whether a frame is as tight as was asked for."""
+        """Return whether a frame reaches the target ratio."""
         target = self.run.settings.get("target_ratio")
         figures = metrics(result)
         if target is None or figures["mpg"] == 0.0 or not result.box.dimensions:
@@ -247,16 +247,16 @@ class Report:
 
     @property
     def pending(self) -> list[int]:
-        """Frames asked for that are not done, in the order of the command."""
+        """Requested frames that are not done, in the order of the command."""
         return [k for k in self.run.frames if self._entries.get(k, {}).get("status") != "done"]
 
     @property
     def missing(self) -> list[int]:
-        """Frames asked for of which no bound but [0, 1] is known."""
+        """Requested frames without any bound but [0, 1]."""
         return [k for k in self.run.frames if self._entries.get(k, {}).get("status", "missing") == "missing"]
 
     def explain(self, index: int, lines: Sequence[str]) -> None:
-        """Say in words why the bounds of a frame that was added are loose.
+        """Write sentences on why the bounds of an added frame are loose.
 
         Raises:
             InputError: A file cannot be written.
@@ -302,9 +302,9 @@ class Report:
         return self._entries[index]
 
     def stored(self, index: int) -> FrameResult | None:
-        """A frame as this command or, if it is resumed, an earlier one has stored it, without leaves.
+        """Return a frame as this command, or a resumed earlier one, has stored it, without leaves.
 
-        None: there is none, or others have changed its file since, which is then replaced.
+        None: it is not stored, or its file has been changed since; it is then replaced.
         """
         path = self.folder / frame_name(index, "npz")
         if index in self._entries and path.exists() and file_stamp(path)["sha256"] == self._digests.get(path.name):
@@ -312,7 +312,7 @@ class Report:
         return None
 
     def draw(self, index: int) -> None:
-        """Draw the PNG of a frame that was added, unless it is drawn. Raises InputError where it cannot be written."""
+        """Draw the PNG of an added frame, unless it exists. Raises InputError where it cannot be written."""
         try:
             if index in self._undrawn:
                 self._draw(load_frame(self.folder / frame_name(index, "npz"), leaves=False).result)
@@ -333,7 +333,7 @@ class Report:
             save_figure(self.folder / layer_name(result.index, layer), layer_figure(result, layer), 120)
 
     def _small(self, result: FrameResult) -> Mapping[str, bytes]:
-        """PNGs of a frame for the page."""
+        """Return PNGs of a frame for the page."""
         return previews(result, PREVIEW_PIXELS)
 
     def finish(self, outcome: Outcome) -> dict[str, Any]:
@@ -351,7 +351,7 @@ class Report:
         return self.document()
 
     def interrupted(self) -> None:
-        """Say that the work was ended where it was; nothing is drawn."""
+        """Mark the report as interrupted, without drawing anything."""
         self._state = "interrupted"
         self._publish(page=True)
 
@@ -377,7 +377,7 @@ class Report:
         )
 
     def document(self) -> dict[str, Any]:
-        """The content of report.json (contract, version 1)."""
+        """Return the content of report.json (contract, version 1)."""
         run = self.run
         name = str(run.renderer.get("name", ""))
         beside = {"intrinsics": run.intrinsics, "explanation": self._explained}

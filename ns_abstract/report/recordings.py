@@ -29,7 +29,7 @@ _FLIP = np.diag([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True)
 class RecordedScene:
-    """The Gaussians of a scene, for drawing.
+    """The Gaussians of a scene, to be drawn.
 
     Attributes:
         means: [N, 3], normalised frame.
@@ -44,7 +44,7 @@ class RecordedScene:
     opacities: NDArray[np.float64]
 
     def drawn(self) -> RecordedScene:
-        """At most `_GAUSSIANS` of them."""
+        """Return the Gaussians to draw, at most `_GAUSSIANS`."""
         size = self.opacities * np.square(self.axes).sum(axis=(1, 2))
         best = np.sort(np.argsort(-size, kind="stable")[:_GAUSSIANS])
         return RecordedScene(self.means[best], self.axes[best], self.colors[best], self.opacities[best])
@@ -133,13 +133,13 @@ def write_viser(
 
 
 def _recorder(server: Any) -> Any:
-    """The recorder of either version of viser: 1.x has a public one, 0.2.7 one with an underscore."""
+    """Return the recorder of either version of viser: public in 1.x, with an underscore in 0.2.7."""
     return server.get_scene_serializer() if hasattr(server, "get_scene_serializer") else server._start_scene_recording()
 
 
 @contextmanager
 def _server(viser: Any) -> Iterator[Any]:
-    """A server of this machine alone, which viser needs for a recording."""
+    """Yield a viser server that listens on this machine alone; viser needs one for a recording."""
     server = viser.ViserServer(host="127.0.0.1", port=0, verbose=False)
     try:
         yield server

@@ -1,4 +1,4 @@
-"""Closer looks on a certificate's page: regions where a property fails, and a slider of poses along a set."""
+"""Sections of a certificate's page: regions where a property fails, and a slider of poses along a set."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ class PoseImage:
 
 
 def touching(lower: Float64, upper: Float64) -> NDArray[np.int64]:
-    """[n] numbers of regions: closed boxes [n, d] to [n, d] with a point in common, and so on, are of one."""
+    """Return the region number [n] of closed boxes [n, d]; boxes that share a point belong to one region."""
     count = len(lower)
     region_numbers = np.full(count, -1, np.int64)
     left = np.arange(count)
@@ -120,7 +120,7 @@ def _ranges(parameters: Sequence[Mapping[str, Any]]) -> Float64:
 
 
 def distances(poses: Float64, pose: Sequence[float], parameters: Sequence[Mapping[str, Any]]) -> Float64:
-    """[n] distances of poses [n, d] from a pose, every parameter in units of its range; those without one are equal."""
+    """Return distances [n] of poses [n, d] from a pose, each varying parameter in units of its range."""
     range_of = _ranges(parameters)
     free = range_of > 0.0
     return np.linalg.norm((poses - np.asarray(pose, np.float64))[:, free] / range_of[free], axis=1)
@@ -133,7 +133,7 @@ def nearest(
     parameters: Sequence[Mapping[str, Any]],
     count: int = 1,
 ) -> list[tuple[int, list[float]]]:
-    """The cells of a verdict that are nearest to a pose [n], and the nearest pose of each; the nearest first.
+    """Return the position of, and the nearest pose in, the ``count`` cells of a verdict that are nearest to a pose [n].
 
     Distances are in units of the ranges of ``parameters``, which have names and ends.
     """
@@ -153,7 +153,7 @@ def regions_html(
     why: str,
     units: ShownUnits | None = None,
 ) -> Markup:
-    """The page's part about regions; ``pictures`` are of the first ones, ``why`` there are no more of them."""
+    """Return the page's section on regions; ``pictures`` are of the first ones, ``why`` says why there are no more."""
     if not regions:
         return Markup()
     blocks = []
@@ -180,7 +180,7 @@ def regions_html(
 
 
 def _pose(one: PoseImage, other: PoseImage, sides: Sequence[Mapping[str, Any]]) -> str:
-    """The parameters that vary, and which are those of the other picture."""
+    """Return a pose's varying parameters as text, and which of them equal the other picture's."""
     return ", ".join(
         f"{p['name']} = {number(v, 5)}" + (" (same)" if other is not one and other.values[k] == v else "")
         for k, (p, v) in enumerate(zip(sides, one.values, strict=True))
@@ -202,10 +202,10 @@ def _value(value: float) -> str:
 
 @dataclass(frozen=True)
 class WalkPose:
-    """A pose, ``values`` [n] of all parameters, that the slider shows.
+    """A pose that the slider shows, ``values`` [n] of all parameters.
 
-    ``verdict`` is that of the cell that it lies in; "unknown" where there is none. ``proven`` is the proved lower bound
-    of the margin, where it is certified.
+    ``verdict`` is that of the cell that holds it, "unknown" where none does. ``proven`` is the proved lower bound of
+    the margin, where the cell is certified.
     """
 
     frame: int
@@ -216,7 +216,7 @@ class WalkPose:
 
 
 def direction(parameters: Sequence[Mapping[str, Any]]) -> int | None:
-    """Position of the parameter to walk along: the way along a path, around an orbit, else the first that varies."""
+    """Return the number of the parameter that the slider follows: segment, else azimuth, else the first that varies."""
     free = [k for k, p in enumerate(parameters) if p["lower"] < p["upper"]]
     named = {parameters[k]["name"]: k for k in reversed(free)}
     return next((named[name] for name in ("segment", "azimuth") if name in named), free[0] if free else None)
@@ -228,11 +228,11 @@ def stops(
     units: ShownUnits | None = None,
     most: int = MOST_STOPS,
 ) -> list[WalkPose]:
-    """Poses along every frame's set in turn, evenly spread, the other parameters in the middle.
+    """Return poses along each frame's set in turn, evenly spaced, the other parameters in the middle.
 
     Args:
         entries: Frames of report.json: index and parameters (name, unit, lower, upper).
-        most: Most poses; of more frames some, evenly spread.
+        most: Largest number of poses; of more frames an evenly spaced selection is taken.
     """
     if len(entries) > most:
         entries = [entries[k * (len(entries) - 1) // (most - 1)] for k in range(most)]
@@ -278,7 +278,7 @@ def _stop(
 
 
 def cell_ends(rows: Sequence[Mapping[str, Any]]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lower and upper ends [n, d] of cells."""
+    """Return lower and upper ends [n, d] of cells."""
     lower, upper = (np.array([row[key] for row in rows], np.float64) for key in ("lower", "upper"))
     return lower, upper
 
@@ -288,9 +288,9 @@ def cell_at(
     values: Sequence[float],
     ends: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
 ) -> Mapping[str, Any] | None:
-    """The cell that holds a pose; where several meet a certified one, which holds for its ends, too.
+    """Return the cell that holds a pose; where several meet, a certified one, which includes its boundary.
 
-    ``ends``: those of the rows (`cell_ends`), where there are several poses to look for.
+    ``ends``: those of the rows (`cell_ends`), to be passed where several poses are looked up.
     """
     if not rows:
         return None
@@ -301,11 +301,11 @@ def cell_at(
 
 
 def coarse_first(count: int) -> list[int]:
-    """0 to ``count`` - 1 in an order whose every beginning is spread over the whole."""
+    """Return 0 to ``count`` - 1 in an order of which every beginning is spread evenly."""
     bits = max(1, (count - 1).bit_length())
     return sorted(range(count), key=lambda k: int(f"{k:0{bits}b}"[::-1], 2))
 
 
 def walk_html(poses: Sequence[tuple[WalkPose, PoseImage]]) -> Markup:
-    """The page's part: all pictures; `walk.js` shows one at a time, as the slider stands."""
+    """Return the page's section with all pictures; `walk.js` shows the one at the slider."""
     return fill("walk.html", stops=poses) if len(poses) > 1 else Markup()

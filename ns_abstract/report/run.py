@@ -1,4 +1,4 @@
-"""What every report.json says of its run: what was bounded, under which guarantee, by what."""
+"""The common content of every report.json: the bounded scene, the guarantee, and the program versions."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def guarantee_text(guarantee: str, renderer: str = "gsplat", bounded: str | None
 
 
 def plain(value: Any) -> Any:
-    """``value`` as strict JSON: tuples and arrays as lists, paths as text, no NaN or infinity (null).
+    """Return ``value`` as strict JSON: tuples and arrays as lists, paths as text, NaN and infinity as null.
 
     Raises:
         TypeError: A value has no JSON form.
@@ -70,9 +70,9 @@ def plain(value: Any) -> Any:
 def sides(
     box: ParameterBox, parameters: Sequence[tuple[str, str]] | None = None, fixed: Mapping[str, float] | None = None
 ) -> list[dict[str, Any]]:
-    """Name, unit, lower and upper end of every parameter of a box, as report.json has them.
+    """Return name, unit, lower and upper end of every parameter of a box, as report.json has them.
 
-    ``parameters``: names and units of those that are told; None: the box's own. One that the box lacks has its value in
+    ``parameters``: names and units to list; None: the box's own. A parameter that the box lacks has its value in
     ``fixed``, or 0.
     """
     ends = dict(zip(box.names, zip(box.lower, box.upper, strict=True), strict=True))
@@ -83,7 +83,7 @@ def sides(
 
 @cache
 def versions() -> dict[str, str | None]:
-    """Versions of what computed the bounds; None where a package has no metadata."""
+    """Return versions of the programs that computed the bounds; None where a package has no metadata."""
     packages: dict[str, str | None] = {"python": platform.python_version(), "machine": platform.machine()}
     packages["ns-abstract"] = PACKAGE
     for name in ("numpy", "numba"):
@@ -95,7 +95,7 @@ def versions() -> dict[str, str | None]:
 
 
 def now() -> str:
-    """UTC time as ISO 8601."""
+    """Return the UTC time as ISO 8601."""
     return time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime())
 
 
@@ -129,7 +129,7 @@ class CommandRun:
 
     @classmethod
     def of(cls, job: Any, settings: Mapping[str, Any], command: tuple[str, ...], **more: Any) -> CommandRun:
-        """That of a command that searches the sets of a job; ``more`` replaces what the job says."""
+        """Return the run of a command that searches the sets of a job; ``more`` replaces the job's values."""
         told = {
             "guarantee": job.method.guarantee,
             "renderer": {name: job.method.program[name] for name in ("name", "version")},
@@ -140,7 +140,7 @@ class CommandRun:
         return cls(settings=settings, command=command, **(told | more))
 
     def head(self) -> dict[str, Any]:
-        """The first keys of report.json: format, guarantee, renderer, scene, assumptions."""
+        """Return the first keys of report.json: format, guarantee, renderer, scene, assumptions."""
         name = str(self.renderer.get("name", ""))
         return {
             "version": VERSION,
@@ -152,7 +152,7 @@ class CommandRun:
         }
 
     def tail(self, state: str, metrics: Mapping[str, str]) -> dict[str, Any]:
-        """The last keys of report.json; ``state``: "running", "done", "budget" or "interrupted"."""
+        """Return the last keys of report.json; ``state``: "running", "done", "budget" or "interrupted"."""
         return {
             "plan": self.plan,
             "state": state,
@@ -167,7 +167,7 @@ class CommandRun:
 
 
 def _leaves_of(value: Any, path: str = "") -> dict[str, Any]:
-    """Dotted paths and values of a JSON tree."""
+    """Return the leaves of a JSON tree by their dotted paths."""
     if isinstance(value, dict) and (value or not path):
         leaves: dict[str, Any] = {}
         for key, item in value.items():
@@ -177,7 +177,7 @@ def _leaves_of(value: Any, path: str = "") -> dict[str, Any]:
 
 
 def differences(old: Mapping[str, Any], new: Mapping[str, Any]) -> list[str]:
-    """Dotted paths where two JSON trees differ."""
+    """Return the dotted paths at which two JSON trees differ."""
     first, second = _leaves_of(plain(old)), _leaves_of(plain(new))
     absent = object()
     return [key for key in {**first, **second} if first.get(key, absent) != second.get(key, absent)]

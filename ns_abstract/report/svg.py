@@ -1,4 +1,4 @@
-"""Plots as SVG: axes, curves and legends in the classes of the pages' style sheet."""
+"""Plots as SVG: axes, curves and legends, styled by CSS classes of the pages' style sheet."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from ns_abstract.report.figures import number
 
 
 def draw_svg(width: float, height: float, title: str, marks: str, *, kind: str = "") -> Markup:
-    """An SVG of ``marks``, which are SVG themselves; the title is escaped."""
+    """Return an SVG of ``marks``, which are SVG elements; the title is escaped."""
     named = f' class="{kind}"' if kind else ""
     size = f'viewBox="0 0 {width} {height}" width="{width}" height="{height}"'
     return Markup(f'<svg{named} role="img" {size}><title>{escape(title)}</title>{marks}</svg>')
 
 
 def through(points: Iterable[tuple[float, float]]) -> str:
-    """The way of a path through points in SVG units."""
+    """Return the SVG path data of a polyline."""
     return "M" + "L".join(f"{a:.1f},{b:.1f}" for a, b in points)
 
 
 class PlotAxis:
-    """One axis of a plot: data to SVG units, and where its ticks stand."""
+    """One axis of a plot: maps data to SVG units, and places ticks."""
 
     def __init__(self, low: float, high: float, start: float, end: float, *, log: bool) -> None:
         self.log, self.start, self.end = log, start, end
@@ -61,7 +61,7 @@ class PlotAxis:
 def draw_plot(
     x: PlotAxis | None, y: PlotAxis, labels: tuple[str, str], marks: str, *, size: tuple[int, int], title: str,
 ) -> Markup:  # fmt: skip
-    """An SVG with axes, ``marks`` above them; without ``x`` the marks bring their own labels."""
+    """Return an SVG with axes below ``marks``; without ``x`` the marks bring their own labels."""
     width, height = size
     start, end = (x.start, x.end) if x else (52, width - 12)
     parts = []
@@ -81,7 +81,7 @@ def draw_plot(
 
 
 def draw_line(points: list[tuple[float, float]], kind: str, dots: bool, *, joined: bool = True) -> str:
-    """A curve through points in SVG units, of a class of the style sheet; ``dots`` marks them."""
+    """Return a polyline in SVG units with a CSS class ``kind``; ``dots`` marks its points."""
     path = ""
     if points and joined:
         path = f'<path class="{kind}" d="{through(points)}"/>'
@@ -91,7 +91,7 @@ def draw_line(points: list[tuple[float, float]], kind: str, dots: bool, *, joine
 
 
 def draw_legend(entries: Sequence[tuple[str, str]], right: float) -> str:
-    """Labels of (class, text) from the right end on."""
+    """Return labels, given as (CSS class, text), aligned to the right end."""
     parts, x = [], right
     for kind, label in reversed(entries):
         parts.append(f'<text class="{kind}" x="{x:.1f}" y="12" text-anchor="end">{label}</text>')
@@ -100,7 +100,7 @@ def draw_legend(entries: Sequence[tuple[str, str]], right: float) -> str:
 
 
 def stairs(points: Sequence[tuple[float, float]], end: float) -> list[tuple[float, float]]:
-    """What is known between the points: a bound holds until a better one is there."""
+    """Return the step function that keeps each value until the next point, up to ``end``."""
     corners: list[tuple[float, float]] = []
     stops = [*(start for start, _ in points[1:]), end]
     for (start, value), stop in zip(points, stops, strict=False):

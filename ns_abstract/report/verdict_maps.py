@@ -1,4 +1,4 @@
-"""Maps of verdicts over pairs of parameters: certified and falsified shares, exactly from the cells' boxes."""
+"""Maps of verdicts over pairs of parameters: certified and falsified fractions, exact from the cells' boxes."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ _WIDTH, _GAP, LEFT, _BELOW, _TOP, _PANEL = 760, 10, 62, 34, 8, 190
 
 @dataclass(frozen=True)
 class PairMaps:
-    """Certified and falsified shares of a set's volume by bin; no share exceeds the true one.
+    """Certified and falsified fractions of a set's volume by bin; none exceeds the true one.
 
-    Those of two parameters, by pair (i, j), i < j, of their positions, are [bins, bins] parts of the volume over the
-    other parameters, place of i first; ``along_certified`` and ``along_falsified`` [d, bins] are the same for one.
+    Those of a pair (i, j), i < j, of parameters are [bins, bins], the bin of i first: fractions of the volume over the
+    other parameters. ``along_certified`` and ``along_falsified`` [d, bins] are those of single parameters.
     """
 
     certified: Mapping[tuple[int, int], Float64]
@@ -46,14 +46,14 @@ class PairMaps:
 
 
 def bin_ends(low: float, high: float, bins: int) -> Float64:
-    """[bins + 1] ends of equal places of an interval; the first and the last are its own."""
+    """Return ends [bins + 1] of equal bins of an interval, whose own ends are the first and the last."""
     ends = low + (high - low) * (np.arange(bins + 1) / bins)
     ends[-1] = high
     return ends
 
 
 def overlaps(lower: Float64, upper: Float64, ends: Float64) -> Float64:
-    """[n, bins] part of every place that intervals [n] to [n] take."""
+    """Return the fraction [n, bins] of every bin that intervals [n] to [n] cover."""
     shared = np.minimum(upper[:, None], ends[1:]) - np.maximum(lower[:, None], ends[:-1])
     return np.maximum(shared, 0.0) / (ends[1:] - ends[:-1])
 
@@ -67,11 +67,11 @@ def pair_maps(
     complete: bool,
     bins: int = BINS,
 ) -> PairMaps:
-    """What part of every place of two parameters, and of one, is certified and falsified (docs/dev/design.md, V16).
+    """Return certified and falsified fractions of every bin of two parameters, and of one (docs/dev/design.md, V16).
 
-    ``lower`` and ``upper`` [n, d] are ends of cells that do not overlap, ``verdicts`` [n] "certified", "falsified" or
-    anything else; ``ends`` [d], [d] are those of the set, each with a width. Parts are rounded downward, but exactly 1
-    where the cells of one verdict are all of a place.
+    ``lower`` and ``upper`` [n, d] are ends of disjoint cells, ``verdicts`` [n] "certified", "falsified" or anything
+    else; ``ends`` [d], [d] are those of the set, each of positive width. Fractions are rounded down, but are exactly 1
+    where cells of one verdict fill the bin.
     """
     count, d = lower.shape
     low, high = ends
@@ -97,7 +97,7 @@ def pair_maps(
 
 
 def _downward(parts: Float64, kind: int, slack: float, complete: bool) -> Float64:
-    """The parts of one verdict, no larger than the truth; ``parts`` [3, ...] by verdict."""
+    """Return lower bounds of one verdict's fractions; ``parts`` [3, ...] are computed fractions by verdict."""
     # no term is negative: a sum is 0 only where nothing of that verdict is
     others = np.delete(parts, kind, axis=0).sum(axis=0)
     whole = (others == 0.0) & complete
@@ -105,7 +105,7 @@ def _downward(parts: Float64, kind: int, slack: float, complete: bool) -> Float6
 
 
 def shades(parts: Float64, color: tuple[int, int, int]) -> NDArray[np.uint8]:
-    """[..., 3] colours of parts: nothing, hardly any, nearly all and all of it can be told apart."""
+    """Return colours [..., 3] of fractions, in which 0, nearly 0, nearly 1 and 1 can be told apart."""
     strength = np.where(parts >= 1.0, 1.0, _LEAST + (_MOST - _LEAST) * parts)
     strength = np.where(parts > 0.0, strength, 0.0)[..., None]
     mixed = (1.0 - strength) * np.array(NONE, np.float64) + strength * np.array(color, np.float64)
@@ -113,9 +113,9 @@ def shades(parts: Float64, color: tuple[int, int, int]) -> NDArray[np.uint8]:
 
 
 def matrix_rows(maps: PairMaps, d: int) -> list[list[NDArray[np.uint8]]]:
-    """[d][d] pictures, the first parameter's column at the left and its row at the top; upward is more.
+    """Return pictures [d][d], the first parameter's column at the left and its row at the top; larger values are up.
 
-    Below the diagonal what is certified, above it what is falsified, on it both along one parameter.
+    Certified fractions are below the diagonal, falsified ones above it; on it are both, along one parameter.
     """
 
     def picture(row: int, column: int) -> NDArray[np.uint8]:
@@ -131,7 +131,7 @@ def matrix_rows(maps: PairMaps, d: int) -> list[list[NDArray[np.uint8]]]:
 
 
 def _profile(certified: Float64, falsified: Float64) -> NDArray[np.uint8]:
-    """Columns of green from below and red from above, grey between."""
+    """Return a picture of columns, green from below and red from above, grey between."""
     bins = len(certified)
     level = (np.arange(bins)[::-1, None] + 0.5) / bins
     image = np.full((bins, bins, 3), OPEN, np.uint8)
@@ -141,14 +141,14 @@ def _profile(certified: Float64, falsified: Float64) -> NDArray[np.uint8]:
 
 
 def pixels(image: NDArray[np.uint8]) -> bytes:
-    """PNG of pixels as they are."""
+    """Return an image as PNG without scaling."""
     from PIL import Image
 
     return png(Image.fromarray(image))
 
 
 def mixed(maps: PairMaps) -> NDArray[np.uint8]:
-    """[bins, bins, 3] picture over two parameters: the verdicts' colours, by their parts; upward is more."""
+    """Return a picture [bins, bins, 3] over two parameters of the verdicts' colours, mixed by fractions."""
     good, bad = maps.certified[0, 1], maps.falsified[0, 1]
     parts = np.stack([good, bad, np.maximum(1.0 - good - bad, 0.0)], axis=-1)
     colors = parts @ np.array([GOOD, BAD, OPEN], np.float64)
@@ -156,12 +156,12 @@ def mixed(maps: PairMaps) -> NDArray[np.uint8]:
 
 
 def free_parameters(parameters: Sequence[Mapping[str, Any]]) -> list[int]:
-    """Positions of the parameters that vary."""
+    """Return the numbers of the parameters that vary."""
     return [k for k, p in enumerate(parameters) if p["lower"] < p["upper"]]
 
 
 def maps_of(rows: Sequence[Mapping[str, Any]], entry: Mapping[str, Any], bins: int = BINS) -> PairMaps:
-    """The maps of a frame of report.json from its cells, over the parameters that vary."""
+    """Return the maps of a frame of report.json over its varying parameters, from its cells."""
     parameters = entry["parameters"]
     free = free_parameters(parameters)
     lower, upper = (np.array([row[key] for row in rows], np.float64)[:, free] for key in ("lower", "upper"))
@@ -172,7 +172,7 @@ def maps_of(rows: Sequence[Mapping[str, Any]], entry: Mapping[str, Any], bins: i
 
 
 def matrix_svg(maps: PairMaps, parameters: Sequence[Mapping[str, Any]]) -> Markup:
-    """All pairs of parameters as one plot, for those that vary (their names, units and ends)."""
+    """Return the maps of all pairs of ``parameters`` (their names, units and ends) as one plot."""
     pictures = {
         (i, j): (picture, "along" if i == j else "certified" if i > j else "falsified")
         for i, row in enumerate(matrix_rows(maps, len(parameters)))
@@ -202,10 +202,10 @@ def pairs_svg(
     pictures: Mapping[tuple[int, int], tuple[NDArray[np.uint8], str]],
     labels: Callable[[int, float, float, int, float], list[str]],
 ) -> Markup:
-    """A square of maps by pairs of parameters.
+    """Return a square of maps by pairs of parameters as SVG.
 
-    ``pictures``: by row and column, a map and what it shows. ``labels``: SVG of a parameter: takes its number, where
-    its map on the diagonal begins, the side of a map, and where the square ends below.
+    ``pictures``: by row and column, a map and its title. ``labels``: returns SVG of a parameter's labels; it takes the
+    parameter's number, the start of its map on the diagonal, the side of a map, and the lower end of the square.
     """
     d = len(parameters)
     panel = min(_PANEL, (_WIDTH - LEFT - (d - 1) * _GAP) // d)

@@ -1,4 +1,4 @@
-"""Verdicts as pictures to keep, drawn as the page has them: ``verdicts_00000.svg`` by frame, ``cameras.svg``."""
+"""Verdicts as SVG files, drawn as on the page: ``verdicts_00000.svg`` by frame, ``cameras.svg``."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _size(plot: str) -> tuple[float, float]:
 
 
 def standalone(plots: Sequence[Markup], text: str, covered: Mapping[str, float]) -> str:
-    """An SVG file of plots below each other, with a title and the verdicts' colours and parts."""
+    """Return an SVG file of plots below each other, with a title and a legend of the verdicts' fractions."""
     sizes = [_size(plot) for plot in plots]
     width = max(480.0, *(w for w, _ in sizes))
     marks, y = [], float(_TITLE)
@@ -61,7 +61,7 @@ def standalone(plots: Sequence[Markup], text: str, covered: Mapping[str, float])
 
 
 def _frame(entry: Mapping[str, Any], rows: CellRows) -> str | None:
-    """The verdicts over a frame's set; None of a single pose."""
+    """Return the drawing of the verdicts over a frame's set; None for a single pose."""
     free = free_parameters(entry["parameters"])
     if not free or not rows:
         return None
@@ -75,7 +75,7 @@ def _frame(entry: Mapping[str, Any], rows: CellRows) -> str | None:
 
 
 def clear_pictures(folder: Path) -> None:
-    """Remove the pictures of an earlier command: they would not show what report.json says."""
+    """Remove the pictures of an earlier command: they would contradict report.json."""
     for file in list(folder.iterdir()):
         if _NAMES.fullmatch(file.name) and stat.S_ISREG(file.lstat().st_mode):
             file.unlink(missing_ok=True)
@@ -84,7 +84,7 @@ def clear_pictures(folder: Path) -> None:
 def write_pictures(
     folder: Path, document: Mapping[str, Any], rows: Mapping[int, CellRows], cameras: CameraDrawings | None
 ) -> list[str]:
-    """Write the pictures of a certificate, each whole or not at all; returns their names.
+    """Write the pictures of a certificate, each whole or not at all, and return their names.
 
     Raises:
         InputError: The folder cannot be written.
