@@ -1,4 +1,4 @@
-"""What compiling costs at first use, by kernel."""
+"""Measures what each kernel costs to compile at first use."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _NAMED = 3
 
 @dataclass
 class _Running:
-    """A function that is being compiled: its clocks when it began, and processor seconds ``inner`` compiled for it."""
+    """A function while it compiles: its clocks at the start, and processor seconds of ``inner`` functions."""
 
     name: str
     wall: float
@@ -34,7 +34,7 @@ class _Running:
 
 @dataclass
 class _Recorder:
-    """Rows of the kernels that numba compiles while it is registered (numba's events "compile" and "llvm_lock")."""
+    """Records the kernels that numba compiles while registered for numba's events "compile" and "llvm_lock"."""
 
     stage: str = ""
     rows: list[dict[str, Any]] = field(default_factory=list)
@@ -44,13 +44,13 @@ class _Recorder:
     _locked: list[float] = field(default_factory=list)
 
     def start(self, event: Any) -> None:
-        """A function's turn begins."""
+        """Record that a function begins to compile."""
         function = event.data["dispatcher"].py_func
         name = f"{function.__module__.removeprefix('ns_abstract.')}.{function.__name__}"
         self._running.append(_Running(name, time.perf_counter(), time.process_time()))
 
     def end(self, event: Any) -> None:
-        """It is compiled; a kernel's row is done with it."""
+        """Record that it is compiled; a kernel gets its row then."""
         last = self._running.pop()
         seconds = time.process_time() - last.processor
         self._own[last.name] = self._own.get(last.name, 0.0) + seconds - last.inner
@@ -70,11 +70,11 @@ class _Recorder:
         self._own, self._llvm = {}, 0.0
 
     def lock(self, _: Any) -> None:
-        """LLVM's lock is taken, once more where it is held."""
+        """Record that LLVM's lock is taken; it may be nested."""
         self._locked.append(time.perf_counter())
 
     def unlock(self, _: Any) -> None:
-        """It is given back."""
+        """Record that it is released."""
         since = self._locked.pop()
         if not self._locked:
             self._llvm += time.perf_counter() - since
@@ -82,7 +82,7 @@ class _Recorder:
 
 @contextmanager
 def recording() -> Iterator[_Recorder]:
-    """What is compiled inside becomes rows."""
+    """Yield a recorder of what is compiled inside the block."""
     from numba.core import event
 
     recorder = _Recorder()
@@ -101,7 +101,7 @@ def recording() -> Iterator[_Recorder]:
 
 
 def _measured(recipe: Recipe[Any], poses: PoseBox) -> list[dict[str, Any]]:
-    """The rows of one process, which has no kernel."""
+    """Return the rows of one process without cached kernels."""
     view = load(recipe).method.frame(poses)
     with recording() as recorded:
         for stage in (*view.stages, None):
@@ -112,7 +112,7 @@ def _measured(recipe: Recipe[Any], poses: PoseBox) -> list[dict[str, Any]]:
 
 @contextmanager
 def _without_kernels() -> Iterator[None]:
-    """Processes that start inside find no kernel, and keep none."""
+    """Let processes that start inside the block find no cached kernel, and store none."""
     from ns_abstract.arithmetic.kernel_cache import SESSION, VARIABLE
 
     before = dict(os.environ)
@@ -127,10 +127,10 @@ def _without_kernels() -> Iterator[None]:
 
 
 def compile_times(job: PathJob, name: str, frame: int) -> list[dict[str, Any]]:
-    """Seconds that each kernel of a frame takes to compile in one new process, stage by stage, and all together.
+    """Return a row for each kernel of a frame, compiled in one new process, and rows for stages and the sum.
 
-    ``name``: of the set of poses; see `sets.SETS`. Returns by kernel: its stage, how many functions it is linked from,
-    seconds by the clock, of the processor, and inside LLVM, and what took most of it.
+    ``name``: of the set of poses; see `sets.SETS`. A row has the stage, the number of linked functions, seconds by the
+    clock, of the processor, and inside LLVM, and the function that took most.
     """
     with _without_kernels(), ProcessPoolExecutor(1, mp_context=get_context("spawn")) as pool:
         rows = pool.submit(_measured, job.recipe, pose_set(job, name, frame)).result()

@@ -1,4 +1,4 @@
-"""A network in the loop: certified fraction against time, tubes against the hull of many runs, and attacks on tubes."""
+"""Benchmarks of loops: certified fraction against time, tubes against the hull of many runs, attacks on tubes."""
 
 from __future__ import annotations
 
@@ -42,8 +42,8 @@ SETS: dict[str, dict[str, Any]] = {
 class LoopTables(NamedTuple):
     """Rows of a benchmark, of its ``search`` and of its ``steps``.
 
-    ``search`` is one row: certified fraction by time, the part of random runs that go well, states compared with tubes.
-    ``steps`` is a row by step: mean widths of a certified cell's tubes, and of the hull of runs from it.
+    ``search`` is one row: certified fraction by time, the fraction of random runs that succeed, states compared with
+    tubes. ``steps`` is a row by step: mean widths of a certified cell's tubes, and of the hull of runs from it.
     """
 
     search: list[dict[str, Any]]
@@ -60,10 +60,10 @@ def measure(
     seed: int = 0,
     said: Callable[[str], object] = lambda text: None,
 ) -> LoopTables:
-    """Search a loop, then attack its certified cells and compare one of them with simulated runs.
+    """Return the tables of a loop: it is searched, certified cells are attacked, one is compared with simulated runs.
 
-    ``runs``: random runs from the whole initial box, each compared with the tube of its cell; and as many from one
-    cell. ``marks``: seconds at which the certified fraction is told.
+    ``runs``: number of random runs from the whole initial box, each compared with the tube of its cell, and of runs
+    from one cell. ``marks``: seconds at which the certified fraction is recorded.
     """
     points: list[ReachProgress] = []
     said(f"searching for {seconds:g} s")
@@ -90,7 +90,7 @@ def measure(
 def _at_marks(
     marks: Sequence[float], told: Sequence[tuple[float, float]], seconds: float, last: float
 ) -> dict[str, float]:
-    """The fraction at each of ``marks``, by what was ``told`` (seconds, fraction); after all ``seconds`` the last."""
+    """Return the fraction at each of ``marks`` seconds, by ``told`` pairs (seconds, fraction); ``last`` at the end."""
     return {
         f"at {mark:g} s": last if seconds <= mark else next((f for t, f in reversed(told) if t <= mark), 0.0)
         for mark in marks
@@ -104,7 +104,7 @@ def _box(job: LoopJob, cell: ReachCell) -> ParameterBox:
 def _runs(
     job: LoopJob, box: ParameterBox, count: int, rng: np.random.Generator
 ) -> Iterator[tuple[np.ndarray, SimulatedRun]]:
-    """Random starts and their runs, with disturbances at an end throughout and anywhere by turns."""
+    """Yield random starts and their runs, by turns with disturbances at an end throughout and anywhere."""
     reacher = job.search.reacher
     for number, start in enumerate(box.sample(count, rng)):
         push = sampled_disturbances(job.loop, rng, "ends" if number % 2 else "random")
@@ -114,7 +114,7 @@ def _runs(
 def _attack(
     job: LoopJob, found: ReachResult, cells: Sequence[ReachCell], count: int, rng: np.random.Generator
 ) -> dict[str, Any]:
-    """Random runs: how many go well, and whether all stay inside the tube of their cell."""
+    """Return how many random runs succeed, and how many states leave the tube of their cell."""
     question = QUESTIONS[job.questions[-1]]
     low, high = np.stack([cell.lower for cell in cells]), np.stack([cell.upper for cell in cells])
     by_cell: dict[int, list[SimulatedRun]] = {}
@@ -143,7 +143,7 @@ def _attack(
 
 
 def _by_step(job: LoopJob, box: ParameterBox, count: int, rng: np.random.Generator) -> tuple[list[dict[str, Any]], int]:
-    """Widths by step of tubes that keep more or less, against the hull of runs; and runs that leave a tube."""
+    """Return widths by step of tubes by kept dependence and of the hull of runs, and how many runs leave a tube."""
     tubes: dict[str, Tube] = {name: job.reacher(mode).tube(box, whole=True) for mode, name in _MODES.items()}
     corners = [
         simulate(job.search.reacher, job.loop.state(box, c), sampled_disturbances(job.loop, rng, "ends"))

@@ -1,4 +1,4 @@
-"""Our figures in the shape of the paper's Tables 2 and 6, beside the paper's own."""
+"""Our figures in the form of the paper's Tables 2 and 6, and the paper's own."""
 
 from __future__ import annotations
 
@@ -51,14 +51,14 @@ def _completed(values: tuple[Any, ...]) -> dict[str, Any]:
 
 
 def table_of(poses: PoseBox) -> int:
-    """The table that a set belongs to: 6 where the scene varies, else 2."""
+    """Return the number of the paper's table for a set: 6 where the scene varies, else 2."""
     perturbation = poses.perturbation
     varies = perturbation.scene or perturbation.hue is not None or perturbation.saturation is not None
     return 6 if varies else 2
 
 
 def _range(poses: PoseBox) -> str:
-    """The widths of the set's ranges, as the paper gives them."""
+    """Return the widths of the set's ranges as text, in the paper's form."""
     box, perturbation = poses.box, poses.perturbation
     widths = {f"{high - low:g} {unit}" for low, high, unit in zip(box.lower, box.upper, box.units, strict=True)}
     for entry in perturbation.scene:
@@ -69,7 +69,7 @@ def _range(poses: PoseBox) -> str:
 
 
 def ours(job: PathJob, name: str, poses: PoseBox, result: FrameResult) -> dict[str, Any]:
-    """One row of ours: ranges are whole widths, "empirical" is what was really rendered."""
+    """Return one row of our figures: ranges are whole widths, "empirical" is of rendered pictures."""
     last = result.trace[-1]
     method = "GS" if isinstance(job.method, SplatMethod) else "NeRF"
     return _completed(

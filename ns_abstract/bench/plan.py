@@ -1,4 +1,4 @@
-"""Measure what the omissions of a plan save: each is reverted, and the bounds are compared."""
+"""Measures what each omission of a plan saves: it is reverted, and time and bounds are compared."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _LONG = 1e6
 
 
 class _EveryGaussian(SplatFrame):
-    """Looks at every Gaussian in every cell, whatever the cell around it shows."""
+    """A frame that considers every Gaussian in every cell, not only those visible in the enclosing cell."""
 
     def candidates(
         self, tiles: np.ndarray, within: VisibleContext | None, pixels: np.ndarray | None
@@ -30,7 +30,7 @@ class _EveryGaussian(SplatFrame):
 
 
 def _refined(frame: SplatFrame, index: int, cells: int, seed: int) -> tuple[FrameResult, float]:
-    """The result of a given number of cells, and its processor seconds."""
+    """Return the result after a number of cells, and its processor seconds."""
     frame.warm_up()
     started = time.process_time()
     result = Refinement(frame, index, RefinementGoal(1.0, _LONG, cells), seed=seed).run()
@@ -38,12 +38,12 @@ def _refined(frame: SplatFrame, index: int, cells: int, seed: int) -> tuple[Fram
 
 
 def cost_of_omissions(job: PathJob, name: str, frame: int, cells: int, scale: float = 1.0) -> list[dict[str, Any]]:
-    """One row for the bounds as planned, and one for each omission of the plan that is taken back.
+    """Return a row for the bounds as planned, and one for each omission of the plan that is reverted.
 
     All are refined to the same number of ``cells``.
 
     Returns:
-        Processor seconds, gaps, and by how much any bound of any pixel is tighter or looser than the plan's.
+        Processor seconds, gaps, and the largest change of any pixel's bound against the plan's, tighter and looser.
     """
     poses, splat = pose_set(job, name, frame, scale), splat_of(job)
 

@@ -1,4 +1,4 @@
-"""Measure the cost and tightness of random rays of a NeRF, and attack the bounds."""
+"""Measures cost and tightness of random rays of a NeRF, and attacks the bounds."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from ns_abstract.verify.attack.soundness import nerf_renderer
 
 
 class RaySample(NerfFrame):
-    """Some rays of a frame, as a picture of one row."""
+    """A sample of a frame's rays, as a picture of one row."""
 
     def __init__(self, method: NerfMethod, poses: PoseBox, count: int, seed: int) -> None:
         super().__init__(method.scene, method.sampling, poses, method.device)
@@ -36,7 +36,7 @@ class RaySample(NerfFrame):
 
 
 def measure(job: PathJob, name: str, frame: int, scale: float, **options: Any) -> dict[str, object]:
-    """One row: seconds by ray to a ratio, and attacks by random poses, corners and gradient ascent.
+    """Return a row: seconds by ray to a ratio, and attacks by random poses, corners and gradient ascent.
 
     Args:
         job, name, frame, scale: The scene, and the set of poses (`pose_set`).

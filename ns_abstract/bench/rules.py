@@ -1,7 +1,7 @@
-"""Our bounds against those of the paper's rules, on the same Gaussians, pixels and cells.
+"""Compares our bounds with the paper's rules, on the same Gaussians, pixels and cells.
 
-The cost of the paper's depth-order rule grows with the square of the number of Gaussians, so each pixel gets
-a scene of its own: the Gaussians that give it most of its light.
+The cost of the paper's depth-order rule grows with the square of the number of Gaussians, so each pixel gets a scene of
+its own: the Gaussians with the largest weights there.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ PAPER_RULES: dict[str, dict[str, object]] = {
 
 
 def weights_at(splats: Splats, camera: PinholeCamera, rotation: Float64Array, position: Float64Array, u: Float64Array):
-    """[N] share of the light at the point ``u`` [2] that each Gaussian takes, by Algorithm 1."""
+    """Return each Gaussian's compositing weight [N] at the point ``u`` [2], by Algorithm 1."""
     x, y, z = ((splats.means - position) @ rotation.T).T
     visible = np.flatnonzero((z >= PAPER.near) & (z <= PAPER.far))
     x, y, z = x[visible], y[visible], z[visible]
@@ -65,21 +65,21 @@ def weights_at(splats: Splats, camera: PinholeCamera, rotation: Float64Array, po
 
 
 def _pixel_camera(camera: PinholeCamera, column: int, row: int) -> PinholeCamera:
-    """A camera of one pixel, whose centre is that of ``camera``'s pixel (column, row)."""
+    """Return a camera of one pixel, whose centre is that of ``camera``'s pixel (column, row)."""
     return replace(camera, cx=camera.cx - column, cy=camera.cy - row, width=1, height=1)
 
 
 def _own(
     splats: Splats, camera: PinholeCamera, poses: PoseBox, cell: ParameterBox
 ) -> tuple[Float64Array, Float64Array]:
-    """[3] lower and upper ends of the only pixel, by the compiled stages."""
+    """Return our lower and upper bounds [3] of the only pixel, by the compiled stages."""
     bounds = SplatBounds(splats, PAPER, REAL)
     cell_bounds = bounds.cell(camera, poses.enclosure(cell, 2 if cell.dimensions == 1 else 1))
     return cell_bounds.lower[0, 0, 0], cell_bounds.upper[0, 0, 0]
 
 
 def _all_rules(poses: PoseBox, cell: ParameterBox) -> dict[str, _Rule]:
-    """Ours and the paper's rules, by name, for a cell of a set."""
+    """Return our rules and the paper's, by name, for a cell of a set."""
     forms = poses.enclosure(cell, 1)
 
     def by_paper(options: dict[str, object]) -> _Rule:
@@ -95,7 +95,7 @@ def _all_rules(poses: PoseBox, cell: ParameterBox) -> dict[str, _Rule]:
 
 
 def _scene_of_pixel(splats: Splats, weights: Float64Array, most: int) -> Splats | None:
-    """At most ``most`` Gaussians of the largest weights [N]; None where they take less than half of the light."""
+    """Return the ``most`` Gaussians of the largest weights [N]; None where these sum to less than half."""
     chosen = np.sort(np.argsort(-weights, kind="stable")[:most])
     chosen = chosen[weights[chosen] >= _FAINT]
     if weights[chosen].sum() < 0.5:
@@ -109,11 +109,11 @@ def _scene_of_pixel(splats: Splats, weights: Float64Array, most: int) -> Splats 
 def compare(
     job: PathJob, name: str, frame: int, parts: int, pixels: int, most: int, seed: int = 0
 ) -> list[dict[str, object]]:
-    """Mean gaps of all rules over sampled pixels, for the middle one of ``parts`` equal cells of a set by axis.
+    """Return mean gaps of all rules over sampled pixels, for the middle one of ``parts`` equal cells by axis.
 
-    ``pixels`` are drawn from those where Gaussians take at least half of the light; a pixel's scene has at most
-    ``most`` Gaussians, those with the largest weights at the cell's middle. Returns one row for each rule: gap (length
-    over RGB) relative to that of renders within the cell, its largest value over the pixels, and milliseconds by pixel.
+    ``pixels`` are drawn from those where Gaussians have at least half of the weight; a pixel's scene has at most
+    ``most`` Gaussians, those with the largest weights at the cell's middle. A row has the gap (length over RGB)
+    relative to that of renders within the cell, its largest value over the pixels, and milliseconds by pixel.
     """
     splats = activate(splat_of(job).scene, PAPER)
     poses = pose_set(job, name, frame)

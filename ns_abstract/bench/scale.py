@@ -1,4 +1,4 @@
-"""How cost and memory grow with the number of Gaussians and of pixels."""
+"""Measures how cost and memory grow with the number of Gaussians and of pixels."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ PART = 1.0 / 32.0
 
 
 def resampled(scene: SplatScene, count: int, seed: int = 0) -> SplatScene:
-    """``scene`` with ``count`` Gaussians: several smaller ones drawn from each, or larger ones from a part of them.
+    """Return ``scene`` with ``count`` Gaussians: several smaller ones drawn from each, or a sample of them enlarged.
 
-    What they cover together stays: standard deviations change by the square root of the numbers' ratio.
+    The covered area stays: standard deviations change by the square root of the numbers' ratio.
     """
     random = np.random.default_rng(seed)
     if count <= scene.count:
@@ -61,7 +61,7 @@ def _row(
     config: Path, path: Path | None, frame: int, name: str, count: int, width: int, repeats: int, seconds: float,
     gibibytes: float, version: str | None, overrides: Overrides | None,
 ) -> dict[str, Any]:  # fmt: skip
-    """One row; to be run in a process of its own, whose peak memory is told."""
+    """Return one row; call it in a process of its own, whose peak memory it reports."""
     (job,) = open_jobs((config,), path, 1.0, overrides=overrides)
     (job,) = open_jobs((config,), path, job.path.cameras[frame].width / width, overrides=overrides)
     job.memory_limit = gibibytes
@@ -99,7 +99,7 @@ def curve(
     repeats: int, seconds: float, gibibytes: float, version: str | None = None,
     overrides: Overrides | None = None,
 ) -> Iterator[dict[str, Any]]:  # fmt: skip
-    """Rows for every number of Gaussians and width; the last one, the largest, is refined for ``seconds``.
+    """Yield rows for every number of Gaussians and width; the last one, the largest, is refined for ``seconds``.
 
     A pair is a Gaussian and a pixel of a tile that gsplat lists it for.
     """
@@ -115,7 +115,7 @@ def curve(
 
 
 def measure(functions: Sequence[Callable[[], object]], repeats: int) -> np.ndarray:
-    """Seconds [repeats, k] of ``functions``, called in turn so that all see the same machine."""
+    """Return seconds [repeats, k] of ``functions``, called in turn so that all meet the same speed of the machine."""
     for function in functions:
         function()
     seconds = np.empty((repeats, len(functions)))
@@ -128,7 +128,7 @@ def measure(functions: Sequence[Callable[[], object]], repeats: int) -> np.ndarr
 
 
 def small_cell(poses: PoseBox, part: float) -> ParameterBox:
-    """The middle ``part`` of a set's range in every parameter."""
+    """Return the middle ``part`` of a set's range in every parameter."""
     cell = poses.box
     for axis in range(cell.dimensions):
         middle, half = float(cell.middle[axis]), 0.5 * part * (cell.upper[axis] - cell.lower[axis])
@@ -137,11 +137,11 @@ def small_cell(poses: PoseBox, part: float) -> ParameterBox:
 
 
 def cell_cost(job: PathJob, name: str, frame: int, repeats: int) -> dict[str, object]:
-    """Times of the render, of a cell of a first cover and of a cell inside a bounded one, and their ratios.
+    """Return times of a render, of an initial cell, and of a cell inside a bounded one, and their ratios.
 
-    The first leaves out what a run to the usual goal leaves out of its cover, the second nothing, as in refinement.
-    Returns milliseconds (medians), and medians of the ratios to the render: each of ``repeats`` times the three follow
-    one another, so that they see the machine at the same speed.
+    The initial cell is bounded with the omissions of a run to the usual target, the other one without, as in
+    refinement. Times are medians in milliseconds; ratios to the render are medians of ``repeats`` triples that were
+    timed one after another, so that they meet the machine at the same speed.
     """
     poses = pose_set(job, name, frame)
     splat = splat_of(job)

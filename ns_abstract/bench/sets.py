@@ -1,4 +1,4 @@
-"""Named scenes and sets of poses that the benchmarks run on."""
+"""Named scenes and sets of poses for the benchmarks."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ def open_jobs(
     program: ProgramOptions | None = None,
     overrides: Overrides | None = None,
 ) -> list[PathJob]:
-    """The runs, or the demo scene where none is named.
+    """Return the jobs of the runs, or of the demo scene where none is named.
 
-    Without ``arithmetic`` it is the strongest that the method has; ``program`` draws the scenes, ``overrides`` stand in
-    place of what the files say. Without ``camera_path`` each run's own ``camera_path.json``, in the folder that holds
-    the method's folder, is used. Raises InputError where a file cannot be used.
+    Without ``arithmetic`` it is the strongest of the method; ``program`` are options of the renderer, ``overrides``
+    replace values of the files. Without ``camera_path`` each run's own ``camera_path.json`` is used, from the folder
+    that holds the method's folder. Raises InputError where a file cannot be used.
     """
     if not load_config:
         from ns_abstract.demo.writing import write_demo
@@ -74,14 +74,14 @@ def open_jobs(
 
 
 def splat_of(job: PathJob) -> SplatMethod:
-    """The method of a splat scene. Raises InputError where the run is of another method."""
+    """Return the method of a splat scene. Raises InputError where the run is of another method."""
     if not isinstance(job.method, SplatMethod):
         raise InputError("not a splat scene", file=job.settings.load_config, fix="give a run of splatfacto")
     return job.method
 
 
 def pose_set(job: PathJob, name: str, frame: int, scale: float = 1.0) -> PoseBox:
-    """The set ``name`` around entry ``frame`` of the job's path; ``scale`` multiplies every range.
+    """Return the set ``name`` around entry ``frame`` of the job's path; ``scale`` multiplies every range.
 
     Raises:
         InputError: There is no such set, or not for this method.

@@ -1,8 +1,8 @@
 """Stiff cases: tiny scenes at the limits of what can be loaded, each bounded and then attacked.
 
-Every scene is what a run could hold (finite parameters, scales and quaternion lengths that are normal
-float32), and every set what a perturbation file could say. A case passes if no image of three renderers
-leaves its abstract image and nothing that was computed is NaN or infinite.
+Every scene could be in a run (finite parameters; scales and quaternion lengths that are normal float32), and every set
+in a perturbation file. A case passes if no image of three renderers leaves its abstract image and every computed number
+is finite.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ ARITHMETICS = ("float32", "real")
 
 @dataclass(frozen=True)
 class Outcome:
-    """A case that was bounded and attacked."""
+    """The outcome of a case that was bounded and attacked."""
 
     row: dict[str, Any]
     worst: tuple[Violation, ...]
@@ -46,9 +46,9 @@ class Outcome:
 
 
 class WatchedFrame(SplatFrame):
-    """A `SplatFrame` that counts what should not be: NaN, infinities, and lower bounds above upper ones.
+    """A `SplatFrame` that counts faulty numbers: NaN, infinities, and lower bounds above upper ones.
 
-    Refinement turns such bounds into [0, 1], which is sound but hides them.
+    Refinement replaces such bounds by [0, 1], which is sound but hides them.
 
     Attributes:
         not_finite: Bounds, slopes and pixels that were returned and are NaN or infinite.
@@ -104,12 +104,12 @@ def run_case(
     seed: int = 0,
     frame: Callable[..., WatchedFrame] = WatchedFrame,
 ) -> Outcome:
-    """Refine one case for a fixed number of cells, then attack it through all renderers.
+    """Return the outcome of one case, refined for a fixed number of cells, then attacked through all renderers.
 
-    The compiled renderer and the float64 reference attack both arithmetics, the reference in float32 attacks "float32".
+    The compiled renderer and the float64 reference attack both arithmetics, the float32 reference attacks "float32".
     The work ends after ``cells`` unless the bounds are as tight as the witnesses; ``seconds`` limit the refinement and
-    each attack, and reaching that makes the outcome depend on the machine. ``poses`` are images by the compiled
-    renderer, ``reference_poses`` by each reference. ``frame``: what bounds and renders, called like `SplatFrame`.
+    each attack, and reaching that makes the outcome depend on the machine. ``poses`` are rendered by the compiled
+    renderer, ``reference_poses`` by each reference. ``frame``: bounds and renders, called like `SplatFrame`.
     """
     began = time.perf_counter()
     pose_set = case.pose_set()
@@ -158,7 +158,7 @@ def run_case(
 
 
 def compare(rows: Sequence[dict[str, Any]]) -> list[dict[str, Any]]:
-    """What float32 costs against real arithmetic in gap and time, for every case that was run in both."""
+    """Return what float32 costs against real arithmetic in gap and time, for every case that ran in both."""
     by_case = {(row["case"], row["arithmetic"]): row for row in rows}
     pairs = [(row, by_case[name, "real"]) for (name, kind), row in by_case.items() if (name, "real") in by_case]
     return [

@@ -1,4 +1,4 @@
-"""Writes rows of figures as a table on the terminal, CSV and Markdown."""
+"""Writes rows of figures as a table on the terminal, as CSV and as Markdown."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ns_abstract.refine.result import FrameResult
 
 
 def text(value: Any) -> str:
-    """A figure with four digits, a count with separators, a dash for nothing."""
+    """Return a figure with four digits, a count with separators, a dash for None."""
     if value is None:
         return "-"
     if isinstance(value, float):
@@ -21,7 +21,7 @@ def text(value: Any) -> str:
 
 
 def markdown(rows: Sequence[dict[str, Any]]) -> str:
-    """A Markdown table of rows with equal keys."""
+    """Return a Markdown table of rows with equal keys."""
     names = list(rows[0])
     lines = ["| " + " | ".join(names) + " |", "|" + "---|" * len(names)]
     lines += ["| " + " | ".join(text(row[name]) for name in names) + " |" for row in rows]
@@ -29,7 +29,7 @@ def markdown(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def write(rows: Sequence[dict[str, Any]], folder: Path, name: str, title: str) -> None:
-    """``NAME.csv`` and ``NAME.md`` in ``folder``."""
+    """Write ``NAME.csv`` and ``NAME.md`` to ``folder``."""
     folder.mkdir(parents=True, exist_ok=True)
     with open(folder / f"{name}.csv", "w", newline="") as stream:
         writer = csv.DictWriter(stream, list(rows[0]))
@@ -40,7 +40,7 @@ def write(rows: Sequence[dict[str, Any]], folder: Path, name: str, title: str) -
 
 @dataclass
 class Table:
-    """A table that grows: every row is on the terminal and in the files once it is there.
+    """A table that grows: every row is printed and written to the files at once.
 
     Attributes:
         folder, name, title: See `write`.
@@ -60,7 +60,7 @@ class Table:
 
 
 def save_curves(path: Path, results: Mapping[str, FrameResult]) -> None:
-    """Left: ratio - 1 against seconds, log-log. Right: outer (solid) and witness (dashed) MPG."""
+    """Plot ratio - 1 against seconds (log-log) at the left; bounds' (solid) and witness (dashed) MPG at the right."""
     figure, left, right = _two_panels()
     for label, result in results.items():
         points = [p for p in result.trace if p.mpg_witness > 0.0 and p.seconds > 0.0]

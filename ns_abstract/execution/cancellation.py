@@ -1,4 +1,4 @@
-"""Cancellation: long work checks whether it was cancelled, and worker processes end with their parent."""
+"""Cancellation: long work checks whether it is cancelled, and worker processes end with their parent."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ _cancelled: ContextVar[Callable[[], bool]] = ContextVar("cancelled", default=_ne
 
 
 class Deadline:
-    """When work has to end: at a time, or as soon as who asked for it says so. Calling it tells whether that is now.
+    """The end of some work: a time, or an earlier request to stop. Calling it returns whether the work has to end now.
 
     Args:
-        seconds: From now on; infinite: at no time.
-        request: Asked whether to end early, a signal's `ns_abstract.execution.stopping.StopRequest` for example.
+        seconds: From now on; infinite: there is no time limit.
+        request: Returns whether to stop early, such as `ns_abstract.execution.stopping.StopRequest` after a signal.
     """
 
     def __init__(self, seconds: float = math.inf, request: Callable[[], bool] = _never) -> None:
@@ -40,7 +40,7 @@ class Deadline:
 
     @property
     def late(self) -> bool:
-        """Whether the time is over."""
+        """Return whether the time is over."""
         return time.perf_counter() >= self.end
 
     @property
@@ -49,15 +49,15 @@ class Deadline:
         return self.end - time.perf_counter()
 
     def within(self, seconds: float) -> Deadline:
-        """The same request, at most so many seconds from now on."""
+        """Return a deadline with the same request, and at most ``seconds`` from now on."""
         return Deadline(min(seconds, self.left), self.request)
 
     def before(self, seconds: float) -> Deadline:
-        """The same request, so many seconds earlier."""
+        """Return a deadline with the same request, ``seconds`` earlier."""
         return Deadline(self.left - seconds, self.request)
 
     def extended(self, seconds: float) -> Deadline:
-        """The same request, so many seconds later."""
+        """Return a deadline with the same request, ``seconds`` later."""
         return Deadline(self.left + seconds, self.request)
 
     @contextmanager
@@ -89,7 +89,7 @@ def check_cancelled() -> None:
 
 
 def end_with_parent() -> None:
-    """End this process when the one that started it has ended, whatever it is doing."""
+    """Let this process end as soon as its parent process has ended, whatever it is doing."""
     parent = multiprocessing.parent_process()
     if parent is None:
         return

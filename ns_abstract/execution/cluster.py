@@ -1,4 +1,4 @@
-"""A Dask cluster as an engine, and the connection to it."""
+"""A Dask cluster as an engine, and its connection."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _TRIM = "MALLOC_TRIM_THRESHOLD_"
 
 
 class Cluster:
-    """A Dask cluster, a client of `connected`. Its workers must see the input files under the same paths."""
+    """Runs tasks on a Dask cluster through a client of `connected`; workers need input files under the same paths."""
 
     shares = False
     starting = False
@@ -54,7 +54,7 @@ class Cluster:
         return self._threads
 
     def _now(self) -> int:
-        """Threads that answer."""
+        """Return the number of threads of the workers that are connected now."""
         if self.client.status != "running":
             return 0
         try:
@@ -63,7 +63,7 @@ class Cluster:
             return 0
 
     def machine(self) -> Machine:
-        """The one with most processes, and with most threads."""
+        """Return the largest numbers of processes and of threads on one machine."""
         processes: Counter[str | None] = Counter()
         tasks: Counter[str | None] = Counter()
         for address, threads in self.client.nthreads().items():
@@ -120,7 +120,7 @@ class Cluster:
         return results
 
     def _fetch(self, future: Any, results: list[tuple[int, Any]]) -> bool:
-        """Append a result; False if it does not come, because the worker that held it is gone: it is made anew."""
+        """Append a finished result and return True; submit the task again and return False if its worker is gone."""
         # the built-in one from Python 3.11 on
         from distributed import TimeoutError as LateError
 
@@ -135,7 +135,7 @@ class Cluster:
         return True
 
     def _again(self) -> None:
-        """Hand everything in once more, as its tasks went with the connection; InputError if the scheduler is gone."""
+        """Submit all open tasks again after a lost connection. InputError if the scheduler is gone."""
         end = time.monotonic() + _GONE
         while self.client.status == "connecting" and time.monotonic() < end:
             time.sleep(0.1)
@@ -149,7 +149,7 @@ class Cluster:
             self._submit(key)
 
     def _look(self) -> None:
-        """Refuse to wait on where the scheduler, or every worker, has been gone for a while."""
+        """Raise InputError if the scheduler, or every worker, has been gone for a while."""
         if self._now():
             self._lost_since = None
             return
@@ -177,10 +177,10 @@ class Cluster:
 
 @dataclass(frozen=True)
 class Tls:
-    """Files (PEM) with which a client and a scheduler know each other, as Dask's own options have them.
+    """PEM files with which a client and a scheduler authenticate each other, as in Dask's own options.
 
     Attributes:
-        ca_file: Who signs the others' certificates.
+        ca_file: The certificate authority that signed both certificates.
     """
 
     ca_file: Path
@@ -189,10 +189,10 @@ class Tls:
 
     @classmethod
     def of(cls, ca_file: Path | None, cert: Path | None, key: Path | None, address: str | None) -> Tls | None:
-        """What options say; None if none is given.
+        """Return the files that options name; None if they name none.
 
         Raises:
-            InputError: Some are missing, a file cannot be read, or there is no scheduler to talk to.
+            InputError: Some are missing, a file cannot be read, or no scheduler address is given.
         """
         options = {"--tls-ca-file": ca_file, "--tls-cert": cert, "--tls-key": key}
         if not any(options.values()):
@@ -209,7 +209,7 @@ class Tls:
 
 
 def _check_pem(ca_file: Path, cert: Path, key: Path) -> None:
-    """Refuse a file that is no PEM file, and a key that is another one's or needs a password."""
+    """Raise InputError for a file that is not PEM, and for a key of another certificate or with a password."""
 
     def password() -> str:
         raise ValueError("the key needs a password")
@@ -232,10 +232,10 @@ def _check_pem(ca_file: Path, cert: Path, key: Path) -> None:
 
 
 def _within(seconds: float, make: Callable[[], Any]) -> Any:
-    """What ``make`` returns, if it does so in time: Dask waits for ever where a port takes connections in silence.
+    """Return the result of ``make`` if it comes in time: Dask waits for ever on a port that accepts and stays silent.
 
     Raises:
-        OSError: It does not, or what answers is no scheduler.
+        OSError: It does not come in time, or the other end is no scheduler.
         ValueError, TypeError: As ``make``.
     """
     results: list[Any] = []
@@ -262,10 +262,10 @@ def _within(seconds: float, make: Callable[[], Any]) -> Any:
 
 @contextmanager
 def connected(address: str | None, workers: int = 1, tls: Tls | None = None) -> Iterator[Any]:
-    """A Dask client of the scheduler at ``address``, or of a cluster on this machine if None.
+    """Yield a Dask client of the scheduler at ``address``, or of a new cluster on this machine if None.
 
-    That cluster has ``workers`` processes of one thread, and listens on the loopback interface alone. ``tls`` encrypts
-    the connection to ``address``, and both ends prove who they are.
+    The new cluster has ``workers`` processes of one thread and listens on the loopback interface alone. ``tls``
+    encrypts the connection to ``address`` and authenticates both ends.
     """
     try:
         from dask import config

@@ -1,4 +1,4 @@
-"""Where work is done, as users say it; importing this is quick, as ``--help`` must be."""
+"""Command-line options on where work runs; importing this module is quick, as ``--help`` must be."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class EngineOptions:
-    """Where the work is done."""
+    """Where the work runs."""
 
     engine: Literal["local", "dask"] = "local"
     """dask: spread the work over a Dask cluster (needs the extra "cluster")."""
@@ -34,23 +34,23 @@ class EngineOptions:
 
     @property
     def processes(self) -> int:
-        """Processes on this machine."""
+        """Number of worker processes on this machine."""
         return len(os.sched_getaffinity(0)) if self.workers is None else self.workers
 
     @property
     def ray_processes(self) -> int:
-        """Processes that bound the rays of a NeRF; the workers of a cluster have one each."""
+        """Number of processes that bound the rays of a NeRF; each worker of a cluster has one."""
         return 1 if self.engine == "dask" and self.workers is None else self.processes
 
     def check(self) -> None:
-        """Raise InputError where options make no sense together."""
+        """Raise InputError where options contradict each other."""
         if self.processes < 1:
             raise InputError(f"found {self.workers}", field="--workers", fix="give a number of at least 1")
         if self.engine == "local" and self.scheduler_address is not None:
             raise InputError("given without --engine dask", field="--scheduler-address", fix="add --engine dask")
 
     def started(self, processes: int) -> AbstractContextManager[Engine]:
-        """The engine, closed at the end of the block; ``processes`` work on this machine."""
+        """Return the engine as a context manager that closes it; ``processes`` workers run on this machine."""
         from ns_abstract.execution.cluster import Tls
         from ns_abstract.execution.starting import started
 

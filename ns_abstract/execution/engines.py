@@ -1,6 +1,6 @@
-"""Engines that run tasks: the interface, this process, and processes of this machine (a Dask cluster: `cluster`).
+"""Engines that run tasks: their interface, and those in this process and in processes of this machine.
 
-An engine hands back each task's result exactly once, in any order, whatever workers die on the way.
+An engine returns each task's result exactly once, in any order, even if workers die; `cluster` has another engine.
 """
 
 from __future__ import annotations
@@ -31,45 +31,45 @@ Task = tuple[Callable[..., Any], tuple[Any, ...]]
 
 
 class Machine(NamedTuple):
-    """Processes and threads of an engine on one machine."""
+    """Numbers of an engine's processes and threads on one machine."""
 
     processes: int
     threads: int
 
 
 class Engine(Protocol):
-    """The interface of an engine: it accepts tasks and returns their results."""
+    """Runs tasks and returns their results."""
 
     @property
     def capacity(self) -> int:
-        """Tasks that can usefully be handed in at a time."""
+        """Number of open tasks that keep the engine busy."""
         ...
 
     @property
     def threads(self) -> int:
-        """Tasks that are worked on at a time."""
+        """Number of tasks that run at a time."""
         ...
 
     @property
     def shares(self) -> bool:
-        """Whether tasks see the objects of this process."""
+        """Whether tasks use the objects of this process, without a copy."""
         ...
 
     @property
     def starting(self) -> bool:
-        """Whether workers are still on their way to a first result, which takes them seconds."""
+        """Whether workers still load what they need for their first result, which takes seconds."""
         ...
 
     def machine(self) -> Machine:
-        """The machine with most to do."""
+        """Return the numbers for the machine with most threads."""
         ...
 
     def submit(self, key: int, function: Callable[..., Any], *arguments: Any) -> None:
-        """Hand in a task under a number that no other unfinished task has."""
+        """Submit a task under a number that no other open task has."""
         ...
 
     def collect(self, seconds: float) -> list[tuple[int, Any]]:
-        """Keys and results that have come, after waiting up to ``seconds`` for one.
+        """Return numbers and results of finished tasks, after waiting up to ``seconds`` for one.
 
         Raises:
             Exception: What a task raised.
@@ -78,12 +78,12 @@ class Engine(Protocol):
         ...
 
     def close(self) -> None:
-        """Give up what is not finished and end the workers."""
+        """Drop open tasks and end the workers."""
         ...
 
 
 class SerialEngine:
-    """This process; `collect` does one task."""
+    """Runs tasks in this process; `collect` runs one."""
 
     capacity = 1
     threads = 1
@@ -115,7 +115,7 @@ class _WorkerProcess(NamedTuple):
 
 
 class Processes:
-    """Fresh processes of this machine, one thread each; one that dies is replaced and its task begun again."""
+    """Runs tasks in new processes of this machine, one thread each; a dead one is replaced, its task restarted."""
 
     shares = False
 
@@ -131,21 +131,21 @@ class Processes:
 
     @property
     def threads(self) -> int:
-        """One by process."""
+        """One for each process."""
         return self.capacity
 
     def machine(self) -> Machine:
-        """This one."""
+        """Return the numbers of this machine."""
         return Machine(self.capacity, self.capacity)
 
     @property
     def pids(self) -> list[int]:
-        """Process numbers of the workers that were started."""
+        """Process numbers of the started workers."""
         return [w.process.pid for w in (*self._idle, *(worker for worker, _, _ in self._busy.values()))]
 
     @property
     def unfinished(self) -> int:
-        """Tasks that `collect` has not given back."""
+        """Number of tasks that `collect` has not returned."""
         return len(self._busy) + len(self._waiting)
 
     def _start(self) -> _WorkerProcess:
@@ -167,7 +167,7 @@ class Processes:
         self._feed()
 
     def abandon(self) -> None:
-        """Ask running tasks to end early; `collect` gives `WorkCancelledError` as the result of those that do."""
+        """Cancel running tasks; `collect` returns `WorkCancelledError` as their results."""
         self._waiting.clear()
         for worker, _, _ in self._busy.values():
             if worker.process.is_alive():
@@ -233,7 +233,7 @@ class Processes:
 
 
 def unguarded_script() -> Path | None:
-    """The script that fresh processes import once more, if its work would begin again there."""
+    """Return the main script if new processes, which import it again, would run its work again; else None."""
     name = getattr(sys.modules.get("__main__"), "__file__", None)
     try:
         # how the guard is spelled does not matter
@@ -252,7 +252,7 @@ def needs_guard(script: Path) -> InputError:
 
 
 def _serve(connection: Connection) -> None:
-    """Run a worker: receive tasks, send (good, result or exception), until the connection ends."""
+    """Run a worker: receive tasks, send (success, result or exception), until the connection ends."""
     end_with_parent()
     cancel_requested = threading.Event()
 

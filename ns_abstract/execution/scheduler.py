@@ -1,4 +1,4 @@
-"""The scheduler: keeps an engine busy with tasks of any kind."""
+"""Keeps an engine busy with tasks of any kind."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ PATIENCE = 0.5
 
 
 class Task(NamedTuple):
-    """Work for an engine: a function and its arguments, under a name that no other task has."""
+    """A task for an engine: a function and its arguments, under a unique name."""
 
     name: Hashable
     function: Callable[..., Any]
@@ -24,12 +24,12 @@ def work(
 ) -> Iterator[list[tuple[Any, Any]]]:
     """Yield names and results as they arrive, each once, in any order.
 
-    Ends when nothing is under way after an offer, or when ``stop`` says so; what is not finished is then given up, and
-    the engine is closed.
+    Ends when no task is open after an offer, or when ``stop`` returns True; open tasks are then dropped, and the engine
+    is closed.
 
     Args:
-        offer: The next tasks, at most so many; asked whenever there is room.
-        stop: Asked at least every `PATIENCE` seconds while others work, and after every task in this process.
+        offer: Returns the next tasks, at most so many; called whenever there is capacity.
+        stop: Called at least every `PATIENCE` seconds while others work, and after every task in this process.
     """
     flying: dict[int, Hashable] = {}
     number = 0

@@ -1,4 +1,4 @@
-"""Starts the engine that options ask for."""
+"""Starts the engine that options name."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ EngineName = Literal["local", "dask"]
 
 @contextmanager
 def started(name: EngineName, address: str | None, workers: int, tls: Tls | None = None) -> Iterator[Engine]:
-    """An engine, closed at the end of the block: `connected` for "dask", else processes, or this one for one worker."""
+    """Yield an engine and close it: a cluster for "dask", else processes, or this process for one worker."""
     with ExitStack() as stack:
         if name == "dask":
             engine: Engine = Cluster(stack.enter_context(connected(address, workers, tls)))

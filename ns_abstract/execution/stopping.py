@@ -1,4 +1,4 @@
-"""Requests to stop, made by a signal or by the caller."""
+"""Requests to stop, by a signal or by the caller."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def is_interruption(error: BaseException) -> bool:
 
 
 class StopRequest:
-    """A request to stop that is checked between pieces of work; a second signal stops at once."""
+    """A request to stop that work checks between its parts; a second signal stops at once."""
 
     def __init__(self) -> None:
         self.signal: int | None = None
@@ -29,12 +29,12 @@ class StopRequest:
         return self._asked
 
     def ask(self) -> None:
-        """Ask for it."""
+        """Request to stop."""
         self._asked = True
 
     @contextmanager
     def at_once(self) -> Iterator[None]:
-        """Inside the block there is nothing to save: a signal, also one before, raises KeyboardInterrupt."""
+        """Let a signal inside the block, and one before it, raise KeyboardInterrupt: there is nothing to save."""
         self._raising += 1
         try:
             if self.signal is not None:
@@ -49,7 +49,7 @@ class StopRequest:
 
     @contextmanager
     def last_words(self, write: Callable[[], object]) -> Iterator[None]:
-        """Inside the block, ``write`` says what is there if the process ends in a library call, on any thread."""
+        """Call ``write`` if a second signal ends the process inside the block, on any thread."""
         before, self._last = self._last, write
         try:
             yield
@@ -57,11 +57,11 @@ class StopRequest:
             self._last = before
 
     def say_last_words(self) -> None:
-        """Called by who ends the process."""
+        """Call the function of `last_words`; for whoever ends the process."""
         self._last()
 
     def handle(self, number: int, frame: FrameType | None) -> None:
-        """Handle a signal: take it as a request, or end the work where it is."""
+        """Handle a signal: record the request, or end the work at once."""
         again, self.signal = self.signal is not None, number
         self._asked = True
         if again or self._raising:
@@ -69,7 +69,7 @@ class StopRequest:
 
     @contextmanager
     def handling(self, *numbers: int) -> Iterator[None]:
-        """Handle the signals inside the block."""
+        """Install `handle` for the signals inside the block."""
         before = {number: signal.signal(number, self.handle) for number in numbers}
         try:
             yield
@@ -82,7 +82,7 @@ class StopRequest:
 def interruptible() -> Iterator[StopRequest]:
     """Yield a request that Ctrl-C sets, where Python's own handler would raise KeyboardInterrupt.
 
-    In other threads, and programs that handle the signal themselves, signals are left alone.
+    In other threads, and in programs that handle the signal themselves, signals are left alone.
     """
     stop = StopRequest()
     main = threading.current_thread() is threading.main_thread()

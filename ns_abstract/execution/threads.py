@@ -1,4 +1,4 @@
-"""Threads of this process that work on one cell or picture; compiled kernels release the interpreter's lock."""
+"""Threads of this process that share the work on one cell or picture; compiled kernels release the GIL."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ R = TypeVar("R")
 
 @dataclass
 class _Setting:
-    """How many threads were asked for; None: as many as there may be."""
+    """The requested number of threads; None: as many as there are."""
 
     count: int | None = None
 
@@ -26,7 +26,7 @@ _setting = _Setting()
 
 
 class _ThreadGroup(NamedTuple):
-    """One of several pieces of work that go on side by side: its number, and the threads that it has to itself."""
+    """One of several calls that run side by side: its number, and the threads that it owns."""
 
     number: int
     threads: int
@@ -36,20 +36,20 @@ _group: ContextVar[_ThreadGroup | None] = ContextVar("thread group", default=Non
 
 
 def most_threads() -> int:
-    """Of this machine, as numba sees it: the cores, or fewer by the variable NUMBA_NUM_THREADS."""
+    """Return the largest number of threads: the cores, or fewer by the variable NUMBA_NUM_THREADS."""
     import numba
 
     return numba.config.NUMBA_NUM_THREADS  # pyright: ignore[reportPrivateImportUsage, reportAttributeAccessIssue]
 
 
 def thread_group() -> int:
-    """Number of the calling piece of work among those of `each` that go on side by side; 0 outside."""
+    """Return the number of the calling group among those of `each`; 0 outside of one."""
     current = _group.get()
     return 0 if current is None else current.number
 
 
 def threads() -> int:
-    """How many work side by side, of those that the calling piece of work has to itself."""
+    """Return the number of threads that the calling group may use side by side."""
     current = _group.get()
     if current is not None:
         return current.threads
@@ -58,13 +58,13 @@ def threads() -> int:
 
 
 def use_threads(count: int) -> None:
-    """Let ``count`` threads work side by side from now on, at most NUMBA_NUM_THREADS and at least one."""
+    """Set the number of threads from now on, at least one and at most NUMBA_NUM_THREADS."""
     _setting.count = count
 
 
 @lru_cache(maxsize=1)
 def _pool(process: int) -> ThreadPoolExecutor:
-    """Those of one process: a fork has none."""
+    """Return the thread pool of a process; a fork has none of its own."""
     return ThreadPoolExecutor(max(1, most_threads() - 1), "kernels")
 
 
@@ -82,10 +82,10 @@ def side_by_side(work: Callable[[int], object], count: int) -> None:
 
 
 def each(work: Callable[[T], R], items: Sequence[T]) -> list[R]:
-    """``work`` of every item, several side by side, each with its share of the threads.
+    """Return ``work`` of every item, computed side by side in groups that share the threads.
 
     Raises:
-        Exception: What ``work`` raised of the first item of which it raised anything; the others have ended.
+        Exception: What ``work`` raised for the first item for which it raised; all others have ended.
     """
     mine = threads()
     groups = min(mine, len(items))

@@ -20,7 +20,7 @@ class Fingerprinted(Protocol):
 
     @property
     def fingerprint(self) -> Mapping[str, Any]:
-        """What tells its content from any other."""
+        """A mapping that differs wherever the content does."""
         ...
 
 
@@ -29,19 +29,19 @@ F = TypeVar("F", bound=Fingerprinted)
 
 
 def built(make: Callable[..., F], parts: Sequence[Callable[[], Any]], *arguments: Any, **options: Any) -> F:
-    """``make`` of what ``parts`` open and of the other arguments: a recipe's way to open an object again."""
+    """Return ``make`` of what ``parts`` return and of the other arguments: how a recipe opens an object again."""
     return make(*(part() for part in parts), *arguments, **options)
 
 
 class LatestValue(Generic[T]):
-    """A cache of one value: the latest, until another key is requested."""
+    """A cache of one value, kept until another key is requested."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._held: tuple[object, T] | None = None
 
     def get(self, key: object, make: Callable[[], T]) -> T:
-        """The thing of ``key``, made if it is not at hand; what was there before is given up first."""
+        """Return the value of ``key``, made if it is not cached; the cached value is dropped first."""
         with self._lock:
             if self._held is None or self._held[0] != key:
                 self._held = None
@@ -49,14 +49,14 @@ class LatestValue(Generic[T]):
             return self._held[1]
 
     def clear(self) -> None:
-        """Give up what is kept."""
+        """Drop the cached value."""
         with self._lock:
             self._held = None
 
 
 @dataclass(frozen=True)
 class Recipe(Generic[F]):
-    """A recipe that can be pickled, with which another process opens the same object; errors name ``file``."""
+    """A recipe, which can be pickled, to open the same object in another process; errors name ``file``."""
 
     open: Callable[[], F]
     fingerprint: Mapping[str, Any]
@@ -64,7 +64,7 @@ class Recipe(Generic[F]):
 
     @cached_property
     def key(self) -> bytes:
-        """Equal for equal recipes."""
+        """Bytes that are equal for equal recipes."""
         return hashlib.sha256(pickle.dumps((self.open, self.fingerprint))).digest()
 
 
@@ -75,7 +75,7 @@ def load(recipe: Recipe[F]) -> F:
     """Return the object of the recipe, loaded once in this process.
 
     Raises:
-        InputError: This process runs another version than the one that asks, or reads other files under the same names.
+        InputError: This process runs another version than the caller's, or reads other files under the same names.
     """
 
     def make() -> F:

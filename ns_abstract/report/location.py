@@ -196,7 +196,7 @@ def _colored(row: Row) -> dict[str, Any]:
 
 
 def pair_svg(entry: Mapping[str, Any], rows: Sequence[Row]) -> Markup | None:
-    """Return maps of the possible cells over all pairs of parameters: in the set below, in their hull above the diagonal.
+    """Return maps of the possible cells over all pairs of parameters, in the set (below the diagonal) and their hull.
 
     A place is coloured if some value of the other parameters is possible there.
     """
