@@ -124,14 +124,14 @@ class Power(ScalarFunction):
 
 
 def _unknown(lower: Tensor, upper: Tensor, where: Tensor) -> tuple[Tensor, Tensor]:
-    """Return NaN where the function has no bound; the cell is then given up."""
+    """Return bounds with NaN ``where`` the function has no bound; the cell is then given up."""
     nan = torch.full_like(lower, math.nan)
     return torch.where(where, nan, lower), torch.where(where, nan, upper)
 
 
 @dataclass(frozen=True, eq=False)
 class _Floored(ScalarFunction):
-    """A function of inputs that are known to be at least ``floor``."""
+    """A function whose inputs are at least ``floor``."""
 
     floor: float = -math.inf
 
@@ -140,7 +140,7 @@ class _Floored(ScalarFunction):
 
 
 class _Positive(_Floored):
-    """A function of inputs above 0."""
+    """A function whose inputs are above 0."""
 
     def _cuts(self, lower: Tensor, upper: Tensor) -> _SampledFunction:
         # a number below may be flushed to zero, whose root, power or logarithm is far from its own
@@ -149,7 +149,7 @@ class _Positive(_Floored):
 
 @dataclass(frozen=True, eq=False)
 class Reciprocal(_Floored):
-    """``1 / z``; known where an interval holds no 0."""
+    """``1 / z``; bounded only over intervals without 0."""
 
     # two operations that keep all digits, however small the slope is
     slope_scale = 0.0

@@ -34,15 +34,15 @@ ROWS_AT_ONCE = 24 << 20
 
 @dataclass
 class CoefficientBatch:
-    """Coefficients that are being propagated backwards.
+    """Coefficient rows during a backward pass.
 
     Attributes:
-        waiting: By node.
-        cell, number: [R] of every row, and positions in the result.
-        total: [R, 2] what rows gathered so far, at least and at most.
-        passage: What they take.
-        chosen: Lines of rows' own, and a place for what rows are on the way.
-        trace: A place for what rows are on the way.
+        waiting: Coefficients that have arrived at a node and are not yet propagated through it, by node.
+        cell, number: [R] each row's cell, and its position in the result.
+        total: [R, 2] constants below and above that the rows have gathered so far.
+        passage: Relaxations of the nodes.
+        chosen: Slopes chosen for each row, and memory for the coefficients on the way.
+        trace: Memory for the coefficients on the way.
     """
 
     waiting: dict[int, Coefficients]
@@ -65,10 +65,10 @@ class CoefficientBatch:
 
 
 class BackwardPass:
-    """Propagates coefficients backwards over the relaxations of the nodes, which it does not change.
+    """Propagates coefficients backwards through the relaxations of the nodes, which it does not change.
 
-    ``memory``: bytes to stay within, roughly. ``deep``: the network's rows are rationed (N13); then those that are kept
-    may end on the way, too.
+    ``memory``: approximate limit in bytes. ``deep``: refined neurons of this network are rationed (N13); rows that are
+    stored for reuse may then stop early, too.
     """
 
     def __init__(self, intermediate: IntermediateBounds, memory: int, deep: bool) -> None:
@@ -84,10 +84,10 @@ class BackwardPass:
         trace: BackwardTrace | None = None,
         cut: int = 0,
     ) -> BackwardBounds:
-        """Bounds of rows on node ``index``, relative to the reference.
+        """Return bounds of coefficient rows on node ``index``, relative to the reference.
 
-        Those of which ``enough`` is known may stop before the image; ``trace`` takes in what rows are on the way.
-        All of them end on the nodes up to ``cut`` (N18).
+        Rows for which ``enough`` holds may stop before the image; ``trace`` records coefficients on the way. All rows
+        end at nodes up to ``cut`` (N18).
         """
         bounds = BackwardBounds.unknown(len(cell), self.intermediate.d)
         relaxations = next(
@@ -109,7 +109,7 @@ class BackwardPass:
         enough: StoppingCriterion | None,
         cut: int = 0,
     ) -> None:
-        """Pass a batch from node ``at`` on to the image, or to the nodes up to ``cut``."""
+        """Propagate a batch from node ``at`` to the image, or to the nodes up to ``cut``."""
         while at > cut:
             if at not in batch.waiting:
                 at -= 1
@@ -168,7 +168,7 @@ class BackwardPass:
         self._bound_rows(batch, bounds)
 
     def _inputs_of(self, start: int, at: int, batch: CoefficientBatch, here: Coefficients) -> list[Coefficients]:
-        """Coefficients of the inputs of node ``at`` in place of its own ``here``; constants go to ``batch.total``."""
+        """Return coefficients on the inputs of node ``at`` for those ``here`` on its output; adds to ``total``."""
         layer = self.network.nodes[at - 1].layer
         if isinstance(layer, Activation):
             lines, which = batch.passage.lines[at], batch.cell
@@ -191,13 +191,13 @@ class BackwardPass:
         return layer.backward(here)
 
     def _depends(self, start: int, at: int) -> bool:
-        """Whether what rows that start at node ``start`` gather at another one depends on the cell's ranges (N15)."""
+        """Return whether the constants of rows from node ``start`` at node ``at`` depend on the cell's ranges (N15)."""
         layer = self.network.nodes[at - 1].layer
         charged = isinstance(layer, LinearLayer) and at != start and at not in self.intermediate.folded
         return charged or isinstance(layer, Activation)
 
     def _bound_rows(self, batch: CoefficientBatch, bounds: BackwardBounds, cut: bool = False) -> None:
-        """Bounds of a batch whose rows rest on one node with a known form, or where they are cut on several (N18)."""
+        """Concretise a batch on the node of known form that it has arrived at; with ``cut`` on several nodes (N18)."""
         count, total = len(batch.cell), batch.total
         plane, box = np.zeros((count, 2, self.intermediate.d + 1)), np.zeros((count, 2))
         lost = self.intermediate.flush[batch.cell]

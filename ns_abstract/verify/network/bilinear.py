@@ -1,4 +1,4 @@
-"""Products of two values that both depend on the image: McCormick's planes (docs/dev/design.md, N9)."""
+"""Products of two values that both depend on the image, relaxed by McCormick planes (docs/dev/design.md, N9)."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _MOVES = 2.0**-7
 
 @dataclass(frozen=True)
 class ProductPlanes:
-    """``low <= x y - first x - second y <= high``; all [m, *shape] float64, slopes are float32 numbers."""
+    """Planes ``low <= x y - first x - second y <= high``; all [m, *shape] float64, slopes are float32 numbers."""
 
     first: Tensor
     second: Tensor
@@ -29,7 +29,7 @@ class ProductPlanes:
 
 @dataclass(frozen=True, eq=False)
 class Product:
-    """``x y`` number by number; ``shape`` is one item of both factors and of the result."""
+    """The elementwise product ``x y``; ``shape`` is one item of each factor and of the result."""
 
     shape: Shape
     mixes: ClassVar[bool] = True
@@ -38,11 +38,11 @@ class Product:
         return inputs[0] * inputs[1]
 
     def unstable(self, x: NodeInterval, y: NodeInterval) -> Tensor:
-        """Where better bounds of the factors would give a better plane."""
+        """Return where tighter bounds of the factors would tighten the planes."""
         return (x.upper - x.lower > _MOVES * x.size) & (y.upper - y.lower > _MOVES * y.size)
 
     def relaxation_gap(self, x: NodeInterval, y: NodeInterval) -> Tensor:
-        """How far the planes are apart, as a part of what the product moves along them."""
+        """Return the distance of the planes as a fraction of the product's motion along them."""
         plane = self.plane(x, y)
         moves = plane.first.abs() * (x.upper - x.lower) + plane.second.abs() * (y.upper - y.lower)
         moves = moves.clamp(min=2.0**-1000)
@@ -50,7 +50,7 @@ class Product:
         return (plane.high - plane.low - OWN_FUNCTION * (x.size * y.size)).clamp(min=0.0) / moves
 
     def plane(self, x: NodeInterval, y: NodeInterval) -> ProductPlanes:
-        """The planes half way between McCormick's: any slopes do, as ``x y - a x - b y`` is extreme at corners."""
+        """Return the mean of McCormick's planes; any slopes do, as ``x y - a x - b y`` is extreme at corners."""
         first = (0.5 * (y.lower + y.upper)).float().double()
         second = (0.5 * (x.lower + x.upper)).float().double()
         corners = torch.stack([u * v - first * u - second * v for u in (x.lower, x.upper) for v in (y.lower, y.upper)])

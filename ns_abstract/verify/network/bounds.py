@@ -43,17 +43,17 @@ def bound_outputs(
     slope_steps: int = 0,
     intermediate_steps: int = 0,
 ) -> OutputBounds:
-    """Lower bounds of ``rows @ network(x) + offset`` over every image set.
+    """Return lower bounds of ``rows @ network(x) + offset`` over every image set.
 
     Args:
         network: The network.
         images: m cells in d parameters.
         rows: [k, output_size] array or scipy sparse matrix.
         offset: [k], or [m, k] by image set.
-        memory: Bytes to stay within, roughly.
-        arithmetic: Whether the bounds hold for every float32 evaluation and the exact network, or for that alone.
-        slope_steps: Steps towards the best slopes and tangents, for every row of its own (N14); each takes as long as
-            two passes of the rows.
+        memory: Approximate limit in bytes.
+        arithmetic: "float32": bounds hold for the exact network and every float32 evaluation; "real": for the former.
+        slope_steps: Optimisation steps of slopes and tangents, for every row (N14); a step takes as long as two
+            backward passes.
         intermediate_steps: The same for intermediate bounds, but in deep networks.
     """
     offset = np.asarray(offset, np.float64)
@@ -76,15 +76,13 @@ def bound_outputs(
 
 
 class NetworkBounds:
-    """Bounds of one network over several cells: builds the passes and runs them over all nodes.
+    """Bounds one network over several cells: propagates forms forwards, and refines neurons where that pays.
 
-    ``asked``: [k, output_size] rows of which bounds will be asked, or None; ``coarse``: see `IntermediateBounds`.
-
-    Forms of the nodes are propagated in order; neurons that pay for it are refined before what reads them.
+    ``asked``: [k, output_size] rows that will be bounded, or None; ``coarse``: see `IntermediateBounds`.
 
     Attributes:
-        intermediate: What is known of the nodes.
-        last: The form of the last one.
+        intermediate: Forms and relaxations of the nodes.
+        last: The form of the last node.
         output_rows: Bounds rows of the outputs.
     """
 
@@ -119,11 +117,11 @@ class NetworkBounds:
         self.output_rows = OutputRows(intermediate, backward, RowAscent(intermediate, backward, slope_steps))
 
     def outputs(self, rows: Any, offset: Float64) -> OutputBounds:
-        """Bounds of ``rows @ y + offset`` in every cell."""
+        """Return bounds of ``rows @ y + offset`` in every cell."""
         return self.output_rows.bound(self.last, rows, offset)
 
     def _propagate(self) -> NodeForm:
-        """Pass forms through the nodes in order, with better bounds where they pay; returns that of the last one."""
+        """Propagate forms through the nodes in order, refining neurons where that pays, and return the last form."""
         forms: list[NodeForm | None] = [self.intermediate.image_form()]
         self.intermediate.forms = forms
         if self._schedule.planned:
@@ -160,7 +158,7 @@ class NetworkBounds:
         return end
 
     def _learn(self, index: int, cut: bool) -> None:
-        """Tell the schedule how wide bounds of node ``index`` are; ``cut``: those of numbers that are not cut off."""
+        """Pass the widths of node ``index`` to the cost model; ``cut``: only those of numbers that are not clipped."""
         form = self.intermediate.forms[index]
         assert form is not None
         r = form.r
@@ -170,7 +168,7 @@ class NetworkBounds:
         self._schedule.learns(index, float(r.mean()), float(form.reference.abs().mean()))
 
     def _leave(self, index: int) -> None:
-        """Node ``index`` has been read; rows of later ones may end there (N18)."""
+        """Record that every reader of node ``index`` has read it; later rows may end there (N18)."""
         form = self.intermediate.forms[index]
         if index in self._schedule.rests and index not in self.intermediate.stops:
             assert form is not None

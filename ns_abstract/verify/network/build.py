@@ -1,4 +1,4 @@
-"""Build layers from checked weights and attributes, for every file format (design.md, N7)."""
+"""Builds layers from checked weights and attributes, for every file format (docs/dev/design.md, N7)."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ _TAPS = 32
 
 
 class NetworkBuilder:
-    """Collects the nodes of one network; every method adds layers and returns the index of the last.
+    """Collects the nodes of one network; every method adds layers and returns the number of the last node.
 
-    Errors say what is wrong; the reader of the file adds the file and the node.
+    Errors state the problem; the file's reader adds file and node.
     """
 
     def __init__(self, path: Path, input_shape: Shape) -> None:
@@ -52,20 +52,20 @@ class NetworkBuilder:
         self.spent = 0.0
 
     def shape(self, index: int) -> Shape:
-        """One item of node ``index``."""
+        """Return the shape of one item of node ``index``."""
         return self.nodes[index - 1].layer.shape if index else self.input_shape
 
     def name(self, index: int, name: str, op: str) -> None:
-        """Call the last layers, up to ``index``, as the file does."""
+        """Give the file's name and operator to the unnamed layers up to node ``index``."""
         for k in range(index, 0, -1):
             if self.nodes[k - 1].name:
                 break
             self.nodes[k - 1] = replace(self.nodes[k - 1], name=name, op=op)
 
     def network(self, output: int, name: str = "", whole_numbers: bool = False, data: Sequence[Path] = ()) -> Network:
-        """The network whose output is node ``output``, called ``name``, without nodes that it does not need.
+        """Return the network whose output is node ``output``, called ``name``, without unneeded nodes.
 
-        ``data`` names the files beside the model that hold constants.
+        ``data`` are the files beside the model that hold constants.
         """
         needed = {output}
         for k in range(output, 0, -1):
@@ -93,7 +93,7 @@ class NetworkBuilder:
             raise InputError(f"an item of {item(shape)} numbers", fix=f"between 1 and {_LARGEST:,} are supported")
 
     def reserve(self, count: float) -> None:
-        """Refuse what would take too much memory before any of it is taken."""
+        """Raise InputError for an array of ``count`` numbers that would take too much memory, before it is made."""
         self.spent += count
         if self.spent > _LARGEST_TOTAL:
             raise InputError(
@@ -118,7 +118,7 @@ class NetworkBuilder:
     # ------------------------------------------------------------ windows
 
     def check_window(self, x: int, kernel: Any, stride: Any, dilation: Any, pads: Any) -> tuple[int, int]:
-        """Rows and columns of the result of a window operator."""
+        """Return the rows and columns of a window operator's result. InputError."""
         sizes = []
         for axis, name in enumerate(("rows", "columns")):
             n, k, s, d = self.shape(x)[1 + axis], kernel[axis], stride[axis], dilation[axis]
@@ -145,7 +145,7 @@ class NetworkBuilder:
         groups: int,
         exact: bool = False,
     ) -> int:
-        """A convolution with weights [Cout, Cin / groups, kh, kw]."""
+        """Add a convolution with weights [Cout, Cin / groups, kh, kw]."""
         channels = self.shape(x)[0]
         if groups < 1 or channels != groups * weight.shape[1] or weight.shape[0] % groups:
             raise InputError(f"weights {item(weight.shape)} with group = {groups} on {channels} channels")
@@ -170,7 +170,7 @@ class NetworkBuilder:
         return self._add(layer, x)
 
     def average_pool(self, x: int, kernel: Any, stride: Any, pads: Any, count_pads: bool) -> int:
-        """Means of windows; pads count as numbers or not."""
+        """Add average pooling; with ``count_pads`` the padding counts as numbers."""
         channels = self.shape(x)[0]
         self.check_window(x, kernel, stride, _ONE, pads)
         count = kernel[0] * kernel[1]
@@ -186,7 +186,7 @@ class NetworkBuilder:
         return self.scale(index, 1.0 / inside.numpy(), None)
 
     def max_pool(self, x: int, kernel: Any, stride: Any, dilation: Any, pads: Any) -> int:
-        """Maxima of windows (N12)."""
+        """Add max pooling (N12)."""
         channels, *_ = self.shape(x)
         size = self.check_window(x, kernel, stride, dilation, pads)
         if kernel[0] * kernel[1] > _TAPS and min(kernel) > 1:
@@ -208,7 +208,7 @@ class NetworkBuilder:
     # ------------------------------------------------------------ other linear layers
 
     def matrix(self, x: int, weight: np.ndarray, bias: np.ndarray | None) -> int:
-        """A fully connected layer with weights [out, in]."""
+        """Add a fully connected layer with weights [out, in]."""
         shape = self.shape(x)
         if weight.shape[1] != shape[-1]:
             raise InputError(f"weights {item(weight.shape)} (out x in) on an item {item(shape)}", fix="flatten before")
@@ -228,7 +228,7 @@ class NetworkBuilder:
         return self._add(layer, x)
 
     def scale(self, x: int, factor: np.ndarray, offset: np.ndarray | None, parts: float = 0.0) -> int:
-        """``factor * x + offset`` with constants that are spread over a batch of items; ``parts``: see `ScaleLayer`."""
+        """Add ``factor * x + offset`` with constants that broadcast to a batch; ``parts``: see `ScaleLayer`."""
         shape = self.shape(x)
         self.reserve(2.0 * float(np.prod(shape)))
         spread = []
@@ -244,14 +244,14 @@ class NetworkBuilder:
         return self._add(ScaleLayer((shape,), shape, 3 + self._fused(x), 1, spread[0], spread[1], parts), x)
 
     def _fused(self, *inputs: int) -> int:
-        """Roundings of sums that a program may start with what is added behind them (N2)."""
+        """Return the roundings of the inputs' sums, which a program may fuse with this one (N2)."""
         layers = [self.nodes[k - 1].layer for k in inputs if k]
         return max((layer.terms for layer in layers if isinstance(layer, LinearLayer)), default=0)
 
     def batch_norm(
         self, x: int, scale: np.ndarray, shift: np.ndarray, mean: np.ndarray, variance: np.ndarray, epsilon: float
     ) -> int:
-        """Batch normalisation with stored statistics."""
+        """Add batch normalisation with stored statistics."""
         shape = self.shape(x)
         parts = [np.asarray(v, np.float64) for v in (scale, shift, mean, variance)]
         if any(v.shape != shape[:1] for v in parts):
@@ -270,33 +270,33 @@ class NetworkBuilder:
         return self.scale(index, np.ones(()), shift)
 
     def sum(self, inputs: tuple[int, ...], signs: tuple[int, ...], exact: bool = False) -> int:
-        """Sum or difference of equal shapes."""
+        """Add a sum or difference of equal shapes."""
         shapes = tuple(self.shape(k) for k in inputs)
         if len(set(shapes)) != 1:
             raise InputError(f"shapes {[item(s) for s in shapes]} differ", fix="spreading is not supported")
         return self._add(Sum(shapes, shapes[0], 0 if exact else len(inputs) + self._fused(*inputs), 1, signs), *inputs)
 
     def reshape(self, x: int, shape: Sequence[int]) -> int:
-        """The same numbers in another shape."""
+        """Add a change of shape."""
         if tuple(shape) == self.shape(x):
             return x
         return self._add(LinearLayer((self.shape(x),), tuple(shape)), x)
 
     def gather(self, x: int, index: np.ndarray, fill: float = 0.0) -> int:
-        """The item's numbers at flat positions ``index``, in its shape; -1 stands for ``fill``."""
+        """Add a selection of the item's numbers at flat positions ``index``, in its shape; -1 stands for ``fill``."""
         flat = torch.from_numpy(np.ascontiguousarray(index).reshape(-1).astype(np.int64))
         repeated = int(np.bincount(flat[flat >= 0].numpy(), minlength=1).max())
         return self._add(Gather((self.shape(x),), index.shape, 0, repeated, flat, fill), x)
 
     def transpose(self, x: int, order: Sequence[int]) -> int:
-        """Axes of the item in another order."""
+        """Add a permutation of the item's axes."""
         shape = self.shape(x)
         if list(order) == list(range(len(shape))):
             return x
         return self.gather(x, np.arange(int(np.prod(shape))).reshape(shape).transpose(order))
 
     def slice(self, x: int, chosen: Sequence[slice]) -> int:
-        """Part of the item."""
+        """Add a slice of the item."""
         shape = self.shape(x)
         index = np.arange(int(np.prod(shape))).reshape(shape)[tuple(chosen)]
         if index.size == 0:
@@ -305,7 +305,7 @@ class NetworkBuilder:
         return x if same else self.gather(x, index)
 
     def pad(self, x: int, before: Sequence[int], after: Sequence[int], mode: str, value: float) -> int:
-        """Numbers around the item."""
+        """Add padding around the item."""
         shape = self.shape(x)
         if mode not in ("constant", "reflect", "edge", "wrap"):
             raise InputError(f"attribute mode = {mode} is not supported", fix="use constant, reflect, edge or wrap")
@@ -331,7 +331,7 @@ class NetworkBuilder:
         return self.gather(x, np.pad(index, widths, mode=mode))  # type: ignore[call-overload]
 
     def concat(self, sources: Sequence[int], axis: int) -> int:
-        """Items one after another along ``axis`` of the item: a sum of items with zeros around them."""
+        """Add a concatenation along ``axis`` of the item, as a sum of items with zeros around them."""
         shapes = [self.shape(k) for k in sources]
         if any(
             len(s) != len(shapes[0]) or s[:axis] + s[axis + 1 :] != shapes[0][:axis] + shapes[0][axis + 1 :]
@@ -354,7 +354,7 @@ class NetworkBuilder:
     # ------------------------------------------------------------ activations
 
     def leaky_relu(self, x: int, alpha: float) -> int:
-        """``max(z, alpha z)``."""
+        """Add ``max(z, alpha z)``."""
         if not 0.0 <= alpha <= 1.0:
             raise InputError(f"attribute alpha = {alpha} is not supported", fix="between 0 and 1 expected")
         return self._add(LeakyRelu(self.shape(x), alpha), x)

@@ -1,4 +1,4 @@
-"""Where a cell takes references, slopes and coefficients from: by default from itself (docs/dev/design.md, N15)."""
+"""Where a cell takes references, slopes and coefficients from: from itself, or from another cell (design.md, N15)."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from ns_abstract.verify.network.stopping import BackwardTrace
 
 
 class CoefficientSource:
-    """Bounds every cell by itself; subclasses store coefficients for other cells or reuse stored ones.
+    """Lets every cell use its own coefficients; subclasses store coefficients, or reuse stored ones.
 
-    ``intermediate`` is what is known of the cells, before anything but `about` is asked.
+    ``intermediate``: the cells' intermediate bounds, set before any method but `about` is called.
     """
 
     intermediate: IntermediateBounds
@@ -25,23 +25,23 @@ class CoefficientSource:
     most_rows = 1 << 30
 
     def about(self, middle: Float64) -> Float64:
-        """[m, n] pictures that all is relative to, for the sets' middles: any will do."""
+        """Return the reference pictures [m, n], given the sets' middles; any pictures are sound."""
         return middle
 
     def reference(self, k: int, passed_on: Callable[[], Tensor]) -> Tensor:
-        """[m, *shape] what is relative to at node ``k``: that of its inputs passed on with float64's rounding."""
+        """Return the reference [m, *shape] of node ``k``; ``passed_on`` computes it from its inputs' references."""
         return passed_on()
 
     def rounding_form(self, form: NodeForm) -> NodeForm:
-        """The form, or one of more cells, by which rounding is charged: sizes are all that is read of it."""
+        """Return the form whose magnitudes rounding is charged by: the cell's own, or one that holds for more cells."""
         return form
 
     def winner(self, k: int, winner: Tensor) -> Tensor:
-        """[m, C, 1, W] numbers of windows that are followed from below at node ``k``: any will do."""
+        """Return the inputs [m, C, 1, W] that lower planes of pooling windows at node ``k`` follow; any are sound."""
         return winner
 
     def slopes(self, k: int) -> tuple[np.ndarray, np.ndarray] | None:
-        """Slopes [1, *shape] of rows of another cell on node ``k``, not negative and negative ones."""
+        """Return another cell's slopes [1, *shape] at node ``k``, for coefficients >= 0 and < 0, or None."""
         return None
 
     def reuse_bounds(
@@ -51,8 +51,8 @@ class CoefficientSource:
         return form, unstable, apart
 
     def trace(self, count: int) -> BackwardTrace | None:
-        """A place for so many rows that are to be kept (N15)."""
+        """Return memory for the coefficients of ``count`` rows that are to be stored, or None (N15)."""
         return None
 
     def keep(self, index: int, where: Int64, sign: Float64, trace: BackwardTrace) -> None:
-        """Take notice of rows of ``sign`` times single numbers of node ``index``."""
+        """Store the coefficients of rows ``sign`` times single neurons of node ``index``."""

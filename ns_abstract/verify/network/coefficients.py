@@ -27,7 +27,7 @@ Floats = NDArray[np.floating[Any]]
 
 
 def grid(shape: tuple[int, ...]) -> tuple[int, int, int]:
-    """Return (channels, rows, columns) of an item: a vector is one row of one channel."""
+    """Return (channels, rows, columns) of an item; a vector is one row of one channel."""
     if len(shape) == 3:
         return shape[0], shape[1], shape[2]
     return 1, 1, int(np.prod(shape, dtype=np.int64))
@@ -50,20 +50,20 @@ class Coefficients:
 
     @staticmethod
     def whole(value: Floats) -> Coefficients:
-        """Rows that cover their map [R, C, H, W]."""
+        """Return rows whose window is the whole map [R, C, H, W]."""
         zero = np.zeros(value.shape[0], np.int64)
         return Coefficients(np.ascontiguousarray(value), zero, zero)
 
     def replaced(self, value: Floats) -> Coefficients:
-        """Other coefficients [R, C, h, w] on the same windows."""
+        """Return other coefficients [R, C, h, w] on the same windows."""
         return Coefficients(value, self.y, self.x)
 
     def covers(self, shape: tuple[int, ...]) -> bool:
-        """Whether the rows are those of the whole map of ``shape``."""
+        """Return whether every window is the whole map of ``shape``."""
         return self.value.shape[1:] == grid(shape) and not (self.y.any() or self.x.any())
 
     def scale(self, factor: Floats) -> None:
-        """Multiply by ``factor`` [C, H, W], of the rows' type, in place."""
+        """Multiply in place by ``factor`` [C, H, W], which has the rows' type."""
         _scale(self.value, self.y, self.x, factor)
 
 
@@ -106,7 +106,7 @@ def full(coefficients: Coefficients, shape: tuple[int, ...], force: bool = False
 
 
 def unflatten(coefficients: Coefficients, shape: tuple[int, ...], before: tuple[int, ...]) -> Coefficients:
-    """Rows on an item of ``before`` for rows on the same numbers seen as ``shape``."""
+    """Return the rows on an item of shape ``before`` for rows on the same numbers reshaped to ``shape``."""
     if grid(shape) == grid(before):
         return coefficients
     whole = full(coefficients, shape, force=True)
@@ -115,7 +115,7 @@ def unflatten(coefficients: Coefficients, shape: tuple[int, ...], before: tuple[
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _place(value, y, x, target):
-    """Copy windows to where they lie in ``target`` [R, C, H, W]."""
+    """Copy windows to their places in ``target`` [R, C, H, W]."""
     count, channels, h, w = value.shape
     H, W = target.shape[2:]
     for r in range(count):
@@ -128,7 +128,7 @@ def _place(value, y, x, target):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def add_gathered(value, y, x, height, width, index, target):
-    """Add windows of a map [C, height, width] to ``target`` [R, M], where ``index`` [C height width] says (-1: not)."""
+    """Add windows of a map [C, height, width] to ``target`` [R, M] at places ``index`` [C height width] (-1: none)."""
     count, channels, h, w = value.shape
     for r in range(count):
         first, past = max(0, -x[r]), min(w, width - x[r])
@@ -143,14 +143,14 @@ def add_gathered(value, y, x, height, width, index, target):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def interleave(parts, s, t, top, left, whole):
-    """Put the ``s t`` parts of a transposed stride together, and cut off what lies outside of ``whole``.
+    """Interleave the ``s t`` phases of a transposed convolution with stride (s, t), and crop the map to ``whole``.
 
     Args:
-        parts: [R, s t C, h', w'], part by part; row ``s i + a`` and column ``t j + b`` of the map that they make is
-            number i, j of part ``t a + b``.
+        parts: [R, s t C, h', w'], phase by phase; row ``s i + a`` and column ``t j + b`` of the map is element i, j of
+            phase ``t a + b``.
         s, t: The stride.
-        top, left: The row and the column of that map that ``whole`` begins with.
-        whole: [R, C, h, w]; zero where it is past the map.
+        top, left: The row and the column of the map at which ``whole`` begins.
+        whole: [R, C, h, w] output; zero beyond the map.
     """
     count, channels, h, w = whole.shape
     high, wide = parts.shape[2:]
@@ -189,7 +189,7 @@ def _scale(value, y, x, factor):
 
 @njit(cache=True, error_model="numpy", nogil=True, inline="always")
 def _through_activation(coefficient, at, line, here, plane):
-    """Return a coefficient on the activation's input, and what it adds to the lower and upper bound."""
+    """Return the coefficient on an activation's input, and the constants that it adds below and above."""
     a = coefficient[at]
     # all lines are read and one kept: signs are as good as random, and so several numbers go side by side
     s0, l0, m0 = line[here], line[here + plane], line[here + 2 * plane]
@@ -202,7 +202,7 @@ def _through_activation(coefficient, at, line, here, plane):
 
 @njit(cache=True, error_model="numpy", nogil=True, inline="always")
 def _through_run(coefficient, at, line, here, plane, count):
-    """Pass ``count`` numbers that lie together; returns what they add below and above."""
+    """Propagate ``count`` adjacent coefficients through an activation; return the constants added below and above."""
     l0, l1, l2, l3 = 0.0, 0.0, 0.0, 0.0
     m0, m1, m2, m3 = 0.0, 0.0, 0.0, 0.0
     for j in range(0, count - 3, 4):
@@ -224,13 +224,13 @@ def _through_run(coefficient, at, line, here, plane, count):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def pass_activation(value, y, x, cell, lines, total):
-    """Rows [R, C, h, w] on an activation's output become rows on its input, in place (N4).
+    """Propagate rows [R, C, h, w] on an activation's output to its input, in place (N4).
 
     Args:
-        value, y, x, cell: Rows and which cell each belongs to [R].
-        lines: [6, m, C, H, W] of the rows' type: slope, lower and upper offset for coefficients that are not negative;
-            slope, upper and lower offset for negative ones.
-        total: [R, 2] gathers what the rows are at least and at most.
+        value, y, x, cell: Rows, and each row's cell [R].
+        lines: [6, m, C, H, W] of the rows' type: slope, lower and upper offset for coefficients >= 0; slope, upper and
+            lower offset for negative ones.
+        total: [R, 2] constants below and above, to which offsets are added.
     """
     count, channels, h, w = value.shape
     m, (H, W) = lines.shape[1], lines.shape[3:]
@@ -267,14 +267,14 @@ def pass_activation(value, y, x, cell, lines, total):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def pass_maximum(value, y, x, cell, winner, which, slopes, offsets, steps, stride, total, target):
-    """Rows [R, C, h, w] on maxima of windows become rows ``target`` on the numbers of the windows (N12).
+    """Propagate rows [R, C, h, w] on maxima of windows to ``target``, rows on the windows' inputs (N12).
 
     Args:
-        value, y, x, cell: Rows and which cell each belongs to [R].
+        value, y, x, cell: Rows, and each row's cell [R].
         winner, which, slopes, offsets: See `ns_abstract.verify.network.relaxations.MaxPoolPlanes`.
-        steps: [K, 2] rows and columns of a window's numbers, from its first.
+        steps: [K, 2] rows and columns of a window's inputs, from its first.
         stride: Rows and columns from one window to the next.
-        total: [R, 2] gathers what the rows are at least and at most.
+        total: [R, 2] constants below and above, to which offsets are added.
         target: [R, C, h', w'], zero.
     """
     count, channels, h, w = value.shape
@@ -313,7 +313,7 @@ def pass_maximum(value, y, x, cell, winner, which, slopes, offsets, steps, strid
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def charge(value, y, x, cell, noise, total):
-    """Charge rows on a linear layer's output with its rounding and their own, ``noise`` [m, C, H, W] (N2)."""
+    """Charge rows on a linear layer's output with its rounding error ``noise`` [m, C, H, W] and their own (N2)."""
     count, channels, h, w = value.shape
     H, W = noise.shape[2:]
     coefficient, shake = pointer(value), pointer(noise)
@@ -340,12 +340,12 @@ def charge(value, y, x, cell, noise, total):
 
 
 class NodeColumns(NamedTuple):
-    """Planes and intervals of a node's values, laid out for `concretize` (design.md, N5).
+    """Planes and intervals of a node's values, laid out for `concretize` (docs/dev/design.md, N5).
 
     Attributes:
-        values: [m K C H W + 8]: for each cell the middles of the planes' slopes and offsets [d + 1] and of the
-            intervals, half of what offsets and intervals are apart, sizes of all that is added up, and half of what
-            slopes are apart [d] unless no planes are; the numbers behind the end are there to be read.
+        values: [m K C H W + 8]. By cell: middles of the planes' slopes and offsets [d + 1] and of the intervals, half
+            the distance of offsets and of intervals, magnitudes of all terms, and half the distance of slopes [d] if
+            the planes differ in them. The last 8 numbers are padding for vector loads.
         count: K.
         height, width: H, W.
     """
@@ -357,7 +357,7 @@ class NodeColumns(NamedTuple):
 
 
 def columns_of(slopes: Float64, offsets: Float64, lower: Float64, upper: Float64) -> NodeColumns:
-    """The `NodeColumns` of planes (slopes [m, 2, C, H, W, d], offsets [m, 2, C, H, W]) and intervals [m, C, H, W]."""
+    """Return the columns of planes (slopes [m, 2, C, H, W, d], offsets [m, 2, C, H, W]) and intervals [m, C, H, W]."""
     m, d, shape = slopes.shape[0], slopes.shape[-1], offsets.shape[2:]
     apart = slopes[:, 1] - slopes[:, 0]
     tilted = bool(apart.any())
@@ -375,7 +375,7 @@ def columns_of(slopes: Float64, offsets: Float64, lower: Float64, upper: Float64
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def _add_run(tape, n, column, here, step, columns, signed, sums):
-    """Add ``n`` coefficients [tape] times their columns to ``sums`` [columns, 8]; the first ``signed`` with signs."""
+    """Add ``n`` coefficients [tape] times columns to ``sums`` [columns, 8]; the first ``signed`` with their signs."""
     last = n - n % 8
     for k in range(columns):
         at = here + k * step
@@ -395,14 +395,14 @@ def _add_run(tape, n, column, here, step, columns, signed, sums):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def concretize(value, y, x, cell, intermediate, total, plane, box):
-    """Bounds of rows on a node of which planes and intervals are known (N5).
+    """Concretise rows on a node with known planes and intervals (N5).
 
     Args:
-        value, y, x, cell: Rows.
+        value, y, x, cell: Rows, and each row's cell [R].
         intermediate: `NodeColumns` of the node.
-        total: [R, 2] what the rows gathered on their way.
-        plane: [R, 2, d + 1] becomes slopes and offset of planes below and above.
-        box: [R, 2] becomes a lower and an upper bound from the intervals alone.
+        total: [R, 2] constants that the rows gathered.
+        plane: [R, 2, d + 1] output: slopes and offset of planes below and above.
+        box: [R, 2] output: a lower and an upper bound from the intervals alone.
     """
     count, channels, h, w = value.shape
     H, W, columns, d = intermediate.height, intermediate.width, intermediate.count, plane.shape[2] - 1

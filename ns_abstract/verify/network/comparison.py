@@ -1,4 +1,4 @@
-"""Compare a network as it was read with the runtime that executes its file."""
+"""Compares a network as it was read with the runtime that executes its file."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ _BOUNDED, _UNITS = 32, 1 << 16
 
 
 def levels(image: np.ndarray) -> np.ndarray:
-    """The nearest whole numbers from 0 to 255, of the same type."""
+    """Return the nearest whole numbers from 0 to 255, of the same type."""
     return np.clip(np.rint(image), 0.0, 255.0)
 
 
 def compare(network: Network, run: Evaluate, images: Iterable[np.ndarray], *, usual: bool = True) -> None:
-    """Raise InputError if the network as read and its file's runtime give different outputs for ``images`` [1, ...].
+    """Raise InputError if the network as read and its file's runtime have different outputs for ``images`` [1, ...].
 
-    ``usual``: whether these are inputs for which the outputs must be finite.
+    ``usual``: whether outputs for these inputs must be finite.
     """
     path = network.source
     for image in images:
@@ -85,7 +85,7 @@ def compare(network: Network, run: Evaluate, images: Iterable[np.ndarray], *, us
 
 
 def _rounded(network: Network, image: np.ndarray) -> np.ndarray:
-    """How far each output of the network as it is read is off in float32, at images beside this one."""
+    """Return an estimate of each output's float32 error, from images near this one."""
     generator, off = np.random.default_rng(0), []
     for k in range(_EVALUATIONS):
         moved = image * (1.0 + _MOVED * generator.uniform(-1.0, 1.0, image.shape) * (k > 0))
@@ -98,7 +98,7 @@ def _rounded(network: Network, image: np.ndarray) -> np.ndarray:
 def _within(network: Network, image: np.ndarray, expected: np.ndarray) -> bool:
     """Return whether the runtime's outputs lie within the network's bounds, which charge float32 rounding.
 
-    Sums of computed constants may cancel, and then two programs differ by much.
+    Sums of computed constants may cancel, so that two programs differ by much.
     """
     units = sum(int(np.prod(node.layer.shape)) for node in network.nodes)
     if expected.size > _BOUNDED or units > _UNITS:
@@ -114,7 +114,7 @@ def _within(network: Network, image: np.ndarray, expected: np.ndarray) -> bool:
 
 
 def probes(network: Network) -> tuple[Iterator[np.ndarray], Iterator[np.ndarray]]:
-    """Yield test inputs: usual ones, corners, large and tiny ones, and ones that switch activation phases."""
+    """Return usual test inputs, and unusual ones: corners, large and tiny numbers, and switched activation phases."""
     return _usual(network), _strange(network)
 
 
@@ -150,7 +150,7 @@ def _strange(network: Network) -> Iterator[np.ndarray]:
 
 
 class _VisitedPhases:
-    """Records which activation phases the test inputs have visited."""
+    """Records the activation phases that test inputs have visited."""
 
     def __init__(self, network: Network) -> None:
         self.network = network
@@ -158,7 +158,7 @@ class _VisitedPhases:
         self.seen: dict[tuple[int, float], tuple[Tensor, Tensor]] = {}
 
     def _inputs(self, image: Tensor) -> Iterator[tuple[tuple[int, float], Tensor]]:
-        """What enters each activation, less each of its kinks."""
+        """Yield the input of each activation less each of its kinks, with the activation and the kink."""
         values: list[Tensor] = [image]
         for k, node in enumerate(self.network.nodes, 1):
             inputs = [values[index] for index in node.inputs]
@@ -170,7 +170,7 @@ class _VisitedPhases:
                         yield (k, kink), inputs[0] - kink
 
     def visit(self, image: Tensor) -> bool:
-        """Note the sides at an image; whether a unit is on one for the first time."""
+        """Record the phases at an image, and return whether any neuron is in one for the first time."""
         new = False
         with torch.no_grad():
             for key, z in self._inputs(image):
@@ -181,7 +181,7 @@ class _VisitedPhases:
         return new
 
     def gradient(self, image: Tensor) -> Tensor | None:
-        """How the image changes towards the sides that units have not been on; None if all have been on both."""
+        """Return the image's gradient towards phases that were not visited; None if all were."""
         image = image.clone().requires_grad_(True)
         wanted: list[Tensor] = []
         for key, z in self._inputs(image):

@@ -1,7 +1,7 @@
-"""Activations that stand inside composites: parts of a softmax, and curves with constants of the file.
+"""Activations inside composites: parts of a softmax, and functions with constants of the file.
 
-A file's 0.70710677 is not ``1 / sqrt(2)``. In exact arithmetic the difference may decide a verdict, so that the
-curves here take the file's numbers (docs/dev/design.md, N24).
+A file's 0.70710677 is not ``1 / sqrt(2)``. In exact arithmetic the difference may decide a verdict, so these functions
+take the file's numbers (docs/dev/design.md, N24).
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ class GatedClip(HardSwish):
 
 @dataclass(frozen=True, eq=False)
 class SwitchedSoftplus(Softplus):
-    """``log(1 + exp(z))`` up to ``limit``, and above it a straight line that is ``excess`` off z, relatively."""
+    """``log(1 + exp(z))`` up to ``limit``, and above it a straight line within a relative ``excess`` of z."""
 
     limit: float = math.inf
     excess: float = 0.0
@@ -75,9 +75,9 @@ class SwitchedSoftplus(Softplus):
 
 @dataclass(frozen=True, eq=False)
 class Quantised(Clip):
-    """``step * min(max(round(z / step), low), high)``, enclosed by the clipped z and half a step (N25).
+    """``step * min(max(round(z / step), low), high)``, enclosed by the clipped z plus or minus half a step (N25).
 
-    `function` is the clipped z from ``least = step * low`` to ``most = step * high``, whose gradient a call has.
+    `function` is z clipped to ``least = step * low`` and ``most = step * high``; a call has its gradient.
     """
 
     step: float = 1.0
@@ -99,7 +99,7 @@ CAP = 30.0
 
 
 class SoftmaxReciprocal(Reciprocal):
-    """The reciprocal in a softmax: of a sum of capped exponentials (N11)."""
+    """The reciprocal of a softmax's sum of capped exponentials (N11)."""
 
     def missing(self, lower: Tensor, upper: Tensor) -> Tensor | float:
         # the share and this are both less than exp(-CAP) and its roundings there; sums keep half their size
@@ -108,7 +108,7 @@ class SoftmaxReciprocal(Reciprocal):
 
 @dataclass(frozen=True, eq=False)
 class CappedExp(Exp):
-    """``min(exp(z), exp(cap))``: of terms of a softmax, whose sums are as good as infinite past that (N11).
+    """``min(exp(z), exp(cap))``, a term of a softmax; beyond the cap its sum is practically infinite (N11).
 
     Attributes:
         count: Terms of a sum.

@@ -1,4 +1,4 @@
-"""Build operators that consist of several basic layers (docs/dev/design.md, N11, N19)."""
+"""Builds operators that consist of several basic layers (docs/dev/design.md, N11, N19)."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class CompositeBuilder(ElementwiseBuilder):
         terms: int | None = None,
         kind: Callable[..., SparseMatrix] = SparseMatrix,
     ) -> int:
-        """A sparse matrix; positions of equal shape, weights broadcast."""
+        """Add a sparse matrix with entries ``weight`` from positions ``source`` to ``to``; weights broadcast."""
         to, source = to.reshape(-1).astype(np.int64), source.reshape(-1).astype(np.int64)
         weight = np.broadcast_to(np.asarray(weight, np.float64), to.shape)
         forwards = int(np.bincount(to, minlength=1).max())
@@ -63,13 +63,13 @@ class CompositeBuilder(ElementwiseBuilder):
         return self._add(layer, x)
 
     def positions(self, x: int, copies: int = 1) -> np.ndarray:
-        """Flat positions in the item."""
+        """Return the item's flat positions, ``copies`` times."""
         size = int(np.prod(self.shape(x)))
         self.reserve(3.0 * size * copies)
         return np.arange(size).reshape(self.shape(x))
 
     def reduce(self, x: int, axes: Sequence[int], mean: bool, keep: bool) -> int:
-        """Sum or mean over axes of the item."""
+        """Add a sum or mean over axes of the item."""
         shape = self.shape(x)
         if not axes:
             return x
@@ -90,7 +90,7 @@ class CompositeBuilder(ElementwiseBuilder):
         return index if keep else self.reshape(index, final or (1,))
 
     def _variance(self, squares: int, x: int, kept_shape: Shape, group: np.ndarray, count: int) -> int:
-        """Means of ``squares`` of the centred numbers of ``x`` over groups [size]: one pass is charged (N11)."""
+        """Add means of ``squares`` of the centred ``x`` over groups [size], charged for variances of one pass (N11)."""
         size = int(np.prod(self.shape(x)))
         layer = Variance(
             (self.shape(squares), self.shape(x)),
@@ -104,7 +104,7 @@ class CompositeBuilder(ElementwiseBuilder):
         return self._add(layer, squares, x)
 
     def _centred(self, squares: int) -> int:
-        """The node whose numbers less a mean of them are squared in node ``squares``; -1: none."""
+        """Return the node x if node ``squares`` holds squares of x less a mean of x; else -1."""
         node = self._node(squares)
         while node is not None and type(node.layer) is LinearLayer:
             node = self._node(node.inputs[0])
@@ -122,13 +122,13 @@ class CompositeBuilder(ElementwiseBuilder):
         return -1
 
     def _moved(self, index: int) -> int:
-        """The node whose numbers node ``index`` holds in another shape or order, or repeated."""
+        """Return the node of which node ``index`` is a reshaped, permuted or repeated copy."""
         while index and (type(self._node(index).layer) is LinearLayer or isinstance(self._node(index).layer, Gather)):
             index = self._node(index).inputs[0]
         return index
 
     def local_response(self, x: int, size: int, alpha: float, beta: float, bias: float) -> int:
-        """``x / (bias + alpha / size * sum of squares)^beta``, the sum over windows of ``size`` channels (N11)."""
+        """Add ``x / (bias + alpha / size * sum of squares)^beta``; sums are over ``size`` channels (N11)."""
         shape = self.shape(x)
         channels, before = shape[0], (size - 1) // 2
         place = self.positions(x, min(size, channels))
@@ -145,7 +145,7 @@ class CompositeBuilder(ElementwiseBuilder):
         return self.product(x, self.power(sums, -beta))
 
     def greatest(self, x: int, axes: Sequence[int], keep: bool, most: bool = True) -> int:
-        """Maximum or minimum over axes of the item."""
+        """Add a maximum, or with ``most`` False a minimum, over axes of the item."""
         shape = self.shape(x)
         rest = [k for k in range(len(shape)) if k not in axes]
         reduced_shape = tuple(shape[k] for k in rest)
@@ -156,7 +156,7 @@ class CompositeBuilder(ElementwiseBuilder):
         return self.reshape(index, final or (1,))
 
     def part(self, x: int, chosen: Sequence[slice]) -> int:
-        """Part of the item; channels of a map are chosen by a convolution, which keeps windows small."""
+        """Add a slice of the item; channels are selected by a convolution, which keeps windows of rows small."""
         shape = self.shape(x)
         channels: Any = np.arange(shape[0])[chosen[0]]
         whole = len(shape) == 3 and all(
@@ -170,13 +170,13 @@ class CompositeBuilder(ElementwiseBuilder):
         return self.convolution(x, place, None, _ONES, _ONES, (0, 0, 0, 0), 1, exact=True)
 
     def shift(self, x: int, offset: Any) -> int:
-        """``x + offset`` with a constant, or nothing at all."""
+        """Add ``x + offset`` with a constant, unless the offset is zero."""
         return x if offset is None else self.scale(x, np.ones(()), np.asarray(offset, np.float64))
 
     # ------------------------------------------------------------ sizes of maps
 
     def rounded_up(self, x: int, kernel: Any, stride: Any, dilation: Any, pads: Any) -> tuple[int, int]:
-        """Rows and columns behind the pads that windows take in if their number is rounded up."""
+        """Return the rows and columns behind the pads that windows cover if their number is rounded up (ceil_mode)."""
         self.check_window(x, kernel, stride, dilation, pads)
         more = []
         for k, size in enumerate(self.shape(x)[1:]):
@@ -189,7 +189,7 @@ class CompositeBuilder(ElementwiseBuilder):
         return more[0], more[1]
 
     def average_windows(self, x: int, kernel: Any, stride: Any, pads: Any, more: Any, count_pads: bool) -> int:
-        """Means of windows that may reach past the pads; numbers there never count."""
+        """Add average pooling whose windows may reach past the pads by ``more``; numbers there never count."""
         if not any(more):
             return self.average_pool(x, kernel, stride, pads, count_pads)
         longer = (*pads[:2], pads[2] + more[0], pads[3] + more[1])
@@ -214,7 +214,7 @@ class CompositeBuilder(ElementwiseBuilder):
         groups: int,
         exact: bool = False,
     ) -> int:
-        """A transposed convolution with weights [Cin, Cout / groups, kh, kw] and pads top, left, bottom, right."""
+        """Add a transposed convolution with weights [Cin, Cout / groups, kh, kw] and pads top, left, bottom, right."""
         shape = self.shape(x)
         if len(shape) != 3 or weight.ndim != 4:
             raise InputError(f"weights {item(weight.shape)} on {item(shape)}", fix="only two dimensions are read")
@@ -247,7 +247,7 @@ class CompositeBuilder(ElementwiseBuilder):
         return self._add(layer, x)
 
     def resize(self, x: int, axes: Sequence[ResizeAxis]) -> int:
-        """Rows and columns mapped by matrices [out, in] each; whole factors of nearest ones by repetition."""
+        """Add a resizing of rows and columns by matrices [out, in]; whole factors of "nearest" are repetitions."""
         shape = self.shape(x)
         if len(shape) != 3:
             raise InputError(f"input {item(shape)}", fix="only maps of rows and columns are resized")
@@ -279,7 +279,7 @@ class CompositeBuilder(ElementwiseBuilder):
     # ------------------------------------------------------------ normalisation and attention
 
     def normalise(self, x: int, axes: Sequence[int], epsilon: float) -> int:
-        """``(x - mean) / sqrt(variance + epsilon)`` over axes of the item (N11)."""
+        """Add ``(x - mean) / sqrt(variance + epsilon)`` over axes of the item (N11)."""
         if not epsilon > LEAST_DIVISOR:
             raise InputError(f"attribute epsilon = {epsilon} is not supported", fix="give at least 1e-30")
         shape = self.shape(x)
@@ -305,9 +305,9 @@ class CompositeBuilder(ElementwiseBuilder):
         return self.product(centred, self.spread(inverse, shape))
 
     def softmax(self, x: int, axis: int, logarithm: bool = False, dropped: np.ndarray | None = None) -> int:
-        """``1 / sum_j exp(x_j - x_i)`` along an axis of the item, or its logarithm (N11).
+        """Add ``1 / sum_j exp(x_j - x_i)`` along an axis of the item, or its logarithm (N11).
 
-        ``dropped``: which numbers of the item a mask takes out; not all of any row.
+        ``dropped``: the item's numbers that a mask removes; not all of any row.
         """
         shape = self.shape(x)
         count = shape[axis]
@@ -333,12 +333,12 @@ class CompositeBuilder(ElementwiseBuilder):
         return shares if dropped is None else self._selected(shares, ~dropped)
 
     def _selected(self, x: int, mask: np.ndarray) -> int:
-        """The item with zeros where ``mask`` [shape] is 0; nothing is rounded."""
+        """Add the item with zeros where ``mask`` [shape] is 0; nothing is rounded."""
         self.reserve(float(mask.size))
         return self._add(ScaleLayer((mask.shape,), mask.shape, 0, 1, as_double(mask), None), x)
 
     def matmul(self, a: int, b: int) -> int:
-        """A product of matrices that both depend on the image, with leading axes alike."""
+        """Add a product of matrices that both depend on the image, with equal leading axes."""
         one, two = self.shape(a), self.shape(b)
         if len(one) < 2 or len(two) < 2 or one[-1] != two[-2] or one[:-2] != two[:-2]:
             raise InputError(f"matrices {item(one)} and {item(two)}", fix="leading sizes must agree")
@@ -354,6 +354,6 @@ class CompositeBuilder(ElementwiseBuilder):
         return self.reduce(index, [len(shape) - 1], False, False)
 
     def matrix_from_left(self, weight: np.ndarray, x: int) -> int:
-        """``weight x`` along the last axis but one."""
+        """Add ``weight x`` along the last axis but one."""
         order = [*range(len(self.shape(x)) - 2), len(self.shape(x)) - 1, len(self.shape(x)) - 2]
         return self.transpose(self.matrix(self.transpose(x, order), weight, None), order)

@@ -1,8 +1,8 @@
-"""Enclosures of constants that programs compute from stored ones: exact values, and every float32 order.
+"""Enclosures of constants that programs compute from stored ones: exact values, and every float32 evaluation.
 
 A folded constant is not the one number that one library returns (docs/dev/design.md, N23). Every result is enclosed
-twice: ``real`` holds the exact value, ``evaluated`` what any evaluation in the constant's own type may give, with sums
-in any order, fused multiply-add and flushed subnormals. Where both are one number, the constant is exact.
+twice: ``real`` holds the exact value, ``evaluated`` the results of every evaluation in the constant's own type, with
+sums in any order, fused multiply-add and flushed subnormals. Where both are one number, the constant is exact.
 """
 
 from __future__ import annotations
@@ -47,24 +47,24 @@ class EnclosedConstant(NamedTuple):
 
     @property
     def value(self) -> np.ndarray:
-        """A number within ``real``."""
+        """A number within ``real``, by element."""
         low, high = self.real
         return np.where(low == high, low, 0.5 * (low + high))
 
     @property
     def doubts(self) -> Interval64:
-        """How far ``real`` and ``evaluated`` may be from `value`; a sixteenth more for products with what is off."""
+        """Distances of ``real`` and ``evaluated`` from `value`, a sixteenth larger for inexact factors."""
         value = self.value
         far = [np.maximum(high - value, value - low) * DOUBTS_UP for low, high in (self.real, self.evaluated)]
         return far[0], far[1]
 
     @property
     def exact(self) -> bool:
-        """Whether every evaluation gives the same numbers."""
+        """Whether every evaluation returns the same numbers."""
         return all(np.array_equal(self.real[0], end) for end in (self.real[1], *self.evaluated))
 
     def inverse(self) -> EnclosedConstant:
-        """``1 / c``, without what a division in its type rounds."""
+        """Return ``1 / c`` without the rounding of a division."""
         if any(bool((low * high <= 0.0).any()) for low, high in (self.real, self.evaluated)):
             raise InputError("divides by what may be zero", fix="check the constant")
         ends = [
@@ -74,19 +74,19 @@ class EnclosedConstant(NamedTuple):
         return EnclosedConstant(self.kind, ends[0], ends[1])
 
     def turned(self) -> EnclosedConstant:
-        """A matrix with rows and columns exchanged."""
+        """Return the transposed matrix."""
         real, evaluated = ((low.T, high.T) for low, high in (self.real, self.evaluated))
         return EnclosedConstant(self.kind, real, evaluated)
 
     def times(self, factor: np.ndarray | float) -> EnclosedConstant:
-        """The constant multiplied by exact numbers."""
+        """Return the constant multiplied by exact numbers."""
         ends = [_product(pair, (np.asarray(factor), np.asarray(factor))) for pair in (self.real, self.evaluated)]
         wide = [_widened(e, OWN_CONSTANT * np.maximum(np.abs(e[0]), np.abs(e[1]))) for e in ends]
         return EnclosedConstant(self.kind, wide[0], wide[1])
 
 
 def scaled_integers(number: np.ndarray, scale: EnclosedConstant) -> np.ndarray | EnclosedConstant:
-    """Integers times floats, rounded once."""
+    """Return integers times floats, rounded once."""
     whole = number.astype(np.float64)
     ends = [
         _elementary("Mul", [(whole, whole), part], rounds)
@@ -168,7 +168,7 @@ def fold_enclosed(
 def _computed(
     name: str, given: list[Interval64], put: Callable[[np.ndarray], np.ndarray], rounds: FloatFormat
 ) -> Interval64:
-    """Ends of one result; ``put`` applies the operator to what takes the place of its first input."""
+    """Return the ends of one result; ``put`` applies the operator to a replacement of its first input."""
     unit, tiny, _ = rounds
     low, high = given[0]
     if name == "Neg":
@@ -221,7 +221,7 @@ def _product(a: Interval64, b: Interval64) -> Interval64:
 
 
 def _elementary(name: str, operands: Sequence[Interval64], rounds: FloatFormat) -> Interval64:
-    """Operations that are rounded once; results that the type can hold are exact."""
+    """Return enclosures of operations that are rounded once; results that the type represents are exact."""
     unit, tiny, _ = rounds
     if name == "Reciprocal":
         name, operands = "Div", [(np.ones(()), np.ones(())), operands[0]]
@@ -258,12 +258,12 @@ def _elementary(name: str, operands: Sequence[Interval64], rounds: FloatFormat) 
 
 
 def _held(unit: float) -> int:
-    """Binary digits that a type holds."""
+    """Return the number of significant binary digits of a type."""
     return 53 if unit == OWN_CONSTANT else round(-math.log2(unit))
 
 
 def _digits(value: np.ndarray) -> np.ndarray:
-    """Binary digits of numbers, from the first to the last that is not zero."""
+    """Return the number of binary digits of numbers from the first to the last that is not zero."""
     mantissa = np.abs(np.ldexp(np.frexp(value)[0], 53)).astype(np.int64)
     last = (mantissa & -mantissa).astype(np.float64)
     return np.where(mantissa == 0, 0, 53 - np.log2(np.where(last > 0.0, last, 1.0))).astype(np.int64)
@@ -295,7 +295,7 @@ def _power(operands: Sequence[Interval64], rounds: FloatFormat) -> Interval64:
 def _reduced(
     name: str, operand: Interval64, put: Callable[[np.ndarray], np.ndarray], rounds: FloatFormat
 ) -> Interval64:
-    """Sums in any order; small multiples of one number are summed without rounding."""
+    """Return enclosures of sums in any order; small multiples of one number are summed exactly."""
     unit, tiny, largest = rounds
     still, size = np.array_equal(*operand), _size(operand)
     count = max(1.0, float(operand[0].size))
@@ -329,7 +329,7 @@ def _reduced(
 
 
 def _matmul(first: Interval64, second: Interval64, rounds: FloatFormat) -> Interval64:
-    """Products of matrices by their middles and radii."""
+    """Return enclosures of matrix products, from middles and radii."""
     unit, tiny, largest = rounds
     (a, r), (b, q) = ((0.5 * (low + high), 0.5 * (high - low)) for low, high in (first, second))
     count = float(a.shape[-1])
@@ -352,13 +352,13 @@ def _matmul(first: Interval64, second: Interval64, rounds: FloatFormat) -> Inter
 
 
 def _check_bounded(size: np.ndarray, largest: float) -> None:
-    """Refuse partial results that may overflow."""
+    """Raise InputError where partial results may overflow."""
     if not bool((size < largest).all()):
         raise InputError("computes numbers that may overflow", fix="check its constants")
 
 
 def _plain(value: np.ndarray, tiny: float) -> bool:
-    """Whether products and sums of the numbers stay far from the smallest that the type holds."""
+    """Return whether products and sums of the numbers stay far above the smallest normal number of the type."""
     used = np.abs(value[value != 0.0])
     return tiny == 0.0 or not used.size or float(used.min()) >= math.sqrt(tiny) * 4.0
 
@@ -366,7 +366,7 @@ def _plain(value: np.ndarray, tiny: float) -> bool:
 def _cast(
     node: onnx.NodeProto, values: Sequence[np.ndarray | EnclosedConstant | None]
 ) -> np.ndarray | EnclosedConstant:
-    """A constant in another type."""
+    """Return a constant in another type."""
     operand = values[0]
     if node.op_type == "CastLike":
         other = values[1]
@@ -402,7 +402,7 @@ def _cast(
 
 
 def _grain(value: np.ndarray) -> float:
-    """The largest power of two of which all numbers are multiples."""
+    """Return the largest power of two of which all numbers are multiples."""
     used = value[value != 0.0]
     if not used.size:
         return 1.0

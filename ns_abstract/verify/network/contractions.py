@@ -18,7 +18,7 @@ Operand = tuple[int | np.ndarray, Shape]
 
 
 def einsum(b: CompositeBuilder, equation: str, operands: Sequence[Operand]) -> tuple[int, Shape]:
-    """The node of an equation of one or two operands, and its shape; InputError if it is not read, or does not fit."""
+    """Add an einsum equation of one or two operands; return its node and shape. InputError if it is unsupported."""
     equation = equation.replace(" ", "")
     left, arrow, out = equation.partition("->")
     names = left.split(",")
@@ -58,7 +58,7 @@ def _axes_of(
     inner: list[str],
     sizes: dict[str, int],
 ) -> int | np.ndarray:
-    """An operand as matrices [lead, own, inner]; what no one else names is summed up."""
+    """Return an operand as matrices [lead, own, inner]; axes that only this operand has are summed."""
     value, whole = operand
     alone = [k for k, v in enumerate(name) if v not in (*lead, *own, *inner)]
     rest = [v for v in name if v in (*lead, *own, *inner)]
@@ -74,7 +74,7 @@ def _axes_of(
 
 
 def _matrices(b: CompositeBuilder, one: int | np.ndarray, two: int | np.ndarray) -> int:
-    """``one two^T`` of matrices [N, R, K] and [N, C, K], as [N, R, C]."""
+    """Add ``one two^T`` of matrices [N, R, K] and [N, C, K], as [N, R, C]."""
     if isinstance(one, int) and isinstance(two, int):
         return b.matmul(one, b.transpose(two, (0, 2, 1)))
     if not isinstance(one, int):
@@ -89,10 +89,10 @@ def _matrices(b: CompositeBuilder, one: int | np.ndarray, two: int | np.ndarray)
 
 
 def matmul(b: CompositeBuilder, one: Operand, two: Operand) -> tuple[int, Shape]:
-    """The product of matrices, one of which at least depends on the image, and its shape.
+    """Add a product of matrices, at least one of which depends on the image; return its node and shape.
 
     Raises:
-        InputError: They do not fit, or a constant is more than one matrix.
+        InputError: The shapes do not fit, or a constant is more than one matrix.
     """
     (left, first), (right, second) = one, two
     if isinstance(left, int) and isinstance(right, int):
@@ -116,7 +116,7 @@ def matmul(b: CompositeBuilder, one: Operand, two: Operand) -> tuple[int, Shape]
 
 
 def _matrix(constant: Any) -> Any:
-    """A constant as a matrix [.., ..] float64."""
+    """Return a constant as a float64 matrix."""
     matrix = np.asarray(constant, np.float64)
     if matrix.ndim < 2 or math.prod(matrix.shape[:-2]) != 1:
         raise InputError(f"weights {item(matrix.shape)}", fix="a matrix expected")
@@ -124,7 +124,7 @@ def _matrix(constant: Any) -> Any:
 
 
 def concatenated(b: CompositeBuilder, parts: Sequence[Operand], axis: int) -> tuple[int, Shape]:
-    """Return the concatenation of nodes and constants along an axis, and its shape.
+    """Add a concatenation of nodes and constants along an axis; return its node and shape.
 
     Raises:
         InputError: They do not fit, or a constant is not finite.

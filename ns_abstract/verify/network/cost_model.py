@@ -1,4 +1,7 @@
-"""The cost model of backward passes and of refined neurons (docs/dev/design.md, N13, N17, N18)."""
+"""The cost model of backward passes and refined neurons (docs/dev/design.md, N13, N17, N18).
+
+A pass from a neuron may stop at the image, or earlier at a node with known bounds, which is cheaper and looser.
+"""
 
 from __future__ import annotations
 
@@ -64,14 +67,14 @@ Part = TypeVar("Part")
 
 
 class BackwardRoute(NamedTuple):
-    """The route of a neuron's backward pass: where it stops and what it costs.
+    """The route of a neuron's backward pass: where it stops, and its cost.
 
     Attributes:
-        cut: It passes through the nodes behind this one and ends on those up to it; 0: it ends on the image.
-        price: Products it takes.
-        rests: By node that it is on then: what its coefficients are together, about.
-        passed: The same of nodes before an activation or a product that it passes through.
-        maxima: The same of maxima that it passes through.
+        cut: The pass ends at nodes up to this one; 0: it ends at the image.
+        price: Multiplications.
+        rests: By node where it ends: the sum of its coefficients' magnitudes, estimated.
+        passed: The same for nodes in front of an activation or a product that it passes through.
+        maxima: The same for maxima that it passes through.
     """
 
     cut: int
@@ -81,7 +84,7 @@ class BackwardRoute(NamedTuple):
     maxima: tuple[tuple[int, float], ...]
 
     def spread(self, intermediate: list[float], size: float) -> float:
-        """About how wide its bounds are where earlier nodes' are as wide as ``intermediate``, of numbers ``size``."""
+        """Return its estimated width, if earlier nodes' are ``intermediate`` wide, of numbers about ``size``."""
         total = 0.0
         for at, sum_ in self.rests:
             total += sum_ * intermediate[at]
@@ -94,13 +97,13 @@ class BackwardRoute(NamedTuple):
 
 
 class RefinementPlan(NamedTuple):
-    """Which neurons of a network are refined in a cell (N18).
+    """A plan of which neurons of a network are refined in a cell (N18).
 
     Attributes:
-        ways: By node: how rows for all of its numbers go back.
-        products, rate: What they take together, and what a product costs in logarithms of widths.
-        widest: How wide bounds of a node are foreseen to be at most.
-        step: Which of the plans compared it is.
+        ways: By node: the route of rows for all of its numbers.
+        products, rate: Multiplications in all, and the price of one in logarithms of widths.
+        widest: Largest predicted width of a node's bounds.
+        step: Its number among the compared plans.
     """
 
     ways: dict[int, BackwardRoute]
@@ -118,18 +121,18 @@ class CostModel:
         self._ways: dict[int, list[BackwardRoute]] = {}
 
     def row(self, index: int) -> float:
-        """Products that a row of one number of node ``index`` takes to the image."""
+        """Return the multiplications of a backward pass from one number of node ``index`` to the image."""
         return self.ways(index)[-1].price
 
     def ways(self, index: int) -> list[BackwardRoute]:
-        """How a row of one number of node ``index`` may go back, the shortest way first; the last is to the image."""
+        """Return the routes of a pass from one number of node ``index``, the shortest first, the image's last."""
         if index not in self._ways:
             self._ways[index] = self._passed(index)
         return self._ways[index]
 
     @cached_property
     def _ends(self) -> set[int]:
-        """Nodes that rows may be cut at: those that rows are for, and maxima."""
+        """Nodes at which passes may end early: those that are refined, and maxima."""
         ends = set()
         for k, node in enumerate(self.network.nodes, 1):
             if isinstance(node.layer, MaxPool):
@@ -140,7 +143,7 @@ class CostModel:
 
     @cached_property
     def rests(self) -> set[int]:
-        """Nodes that rows of any node may rest on, but for the image."""
+        """Nodes other than the image at which a pass from any node may end."""
         last = [0] * (len(self.network.nodes) + 1)
         for k, node in enumerate(self.network.nodes, 1):
             for source in node.inputs:
@@ -151,7 +154,7 @@ class CostModel:
         return rests
 
     def _passed(self, index: int) -> list[BackwardRoute]:
-        """The same, window by window."""
+        """Return `ways`, computed by following the pass's windows node by node."""
         # rows and columns of a window, channels in use, and the coefficients' squares together
         windows, total, ways = {index: (1, 1, 1.0, 1.0)}, 0.0, []
         passed: list[tuple[int, float]] = []
@@ -224,14 +227,14 @@ class CostModel:
         passed: list[tuple[int, float]],
         maxima: list[tuple[int, float]],
     ) -> BackwardRoute:
-        """Rows that have got to ``windows``, and are bounded there."""
+        """Return the route of a pass that has reached ``windows`` and is concretised there."""
         bounded = sum(grid(self.network.shape(at))[0] * h * w for at, (h, w, _, _) in windows.items())
         sums = {at: _together(h * w * used, squares) for at, (h, w, used, squares) in windows.items()}
         return BackwardRoute(cut, total + _PASSING * bounded, tuple(sums.items()), tuple(passed), tuple(maxima))
 
     @cached_property
     def _sizes(self) -> list[tuple[float, float]]:
-        """By node: sums of the sizes and of the squares of what one number of it takes of others, on average."""
+        """By node: mean sums over one number's weights, of magnitudes and of squares."""
         sizes = [(1.0, 1.0)]
         for node in self.network.nodes:
             layer = node.layer
@@ -256,7 +259,7 @@ class CostModel:
 
     @cached_property
     def bounded(self) -> dict[int, float]:
-        """By node before an activation or a product: how many of its numbers rows are for, about."""
+        """By node in front of an activation or a product: estimated count of its numbers that are refined."""
         costs: dict[int, float] = {}
         for node in self.network.nodes:
             if isinstance(node.layer, (Activation, Product)):
@@ -276,14 +279,14 @@ class CostModel:
         bounded: dict[int, float] | None = None,
         near: int | None = None,
     ) -> RefinementPlan:
-        """The cheapest ways of rows that keep all bounds close enough, or else as close as they can be kept.
+        """Return the cheapest routes that keep all bounds tight enough, or else as tight as the budget allows.
 
         Args:
-            allowed: Products that they may take together.
-            intermediate: How wide bounds of the first nodes are.
-            size: What numbers of nodes are about.
-            bounded: `CostModel.bounded`, as far as it is known better.
-            near: `RefinementPlan.step` of a plan that was made before; only plans like it are compared.
+            allowed: Multiplications that the passes may take together.
+            intermediate: Widths of the bounds of the first nodes.
+            size: Typical magnitude of nodes' numbers.
+            bounded: Better counts than `CostModel.bounded`, where known.
+            near: `RefinementPlan.step` of an earlier plan; only similar plans are compared.
         """
         best, bounded = None, bounded or self.bounded
         first, past = (0, _STEPS) if near is None else (max(0, near - _LIKE), min(_STEPS, near + _LIKE + 1))
@@ -297,7 +300,7 @@ class CostModel:
         return best
 
     def _plan(self, step: int, intermediate: list[float], size: float, bounded: dict[int, float]) -> RefinementPlan:
-        """The plan in which every node takes the way that is best for what a product costs."""
+        """Return the plan in which every node takes the best route at one price of a multiplication."""
         spread, ways, total, widest = list(intermediate), {}, 0.0, 0.0
         rate = _DEAREST / self.total * 2.0 ** (-0.5 * step)
         for k in range(len(intermediate), len(self.network.nodes) + 1):
@@ -322,7 +325,7 @@ class CostModel:
 
     @cached_property
     def nodes(self) -> list[tuple[int, float]]:
-        """Nodes before an activation or a product, and the products that rows for all of their numbers take."""
+        """Nodes in front of an activation or a product, and the multiplications of passes from all of their numbers."""
         nodes = []
         for node in self.network.nodes:
             if isinstance(node.layer, (Activation, Product)) and self.network.depth[node.inputs[0]] > 1:
@@ -332,32 +335,32 @@ class CostModel:
 
     @cached_property
     def total(self) -> float:
-        """Products that rows for every number before an activation or a product take."""
+        """Multiplications of passes from every number in front of an activation or a product."""
         return sum(products for _, products in self.nodes)
 
     @property
     def deep(self) -> bool:
-        """Whether rows are rationed (N13)."""
+        """Whether passes are rationed, as all of them would cost too much (N13)."""
         return self.total > _DEEP
 
     @property
     def planned(self) -> bool:
-        """Whether rows for all numbers cost so much that each is passed back as far as it pays (N18)."""
+        """Whether passes cost so much that each goes back only as far as it pays (N18)."""
         return self.total > max(_DEEP, _OVER * ALLOWED_PRODUCTS)
 
 
 def log_or_least(value: float) -> float:
-    """Its logarithm; of nothing a very small number's."""
+    """Return the logarithm of a number; of zero, that of a very small number."""
     return float(np.log(max(value, 2.0**-1000)))
 
 
 def _together(count: float, squares: float) -> float:
-    """Sizes of so many normally distributed numbers, of whose squares the sum is known, together."""
+    """Return the expected sum of magnitudes of ``count`` normally distributed numbers with a known sum of squares."""
     return float(np.sqrt(2.0 / np.pi * count * squares))
 
 
 def cost_model_of(network: Network) -> CostModel:
-    """The costs of a network, worked out once."""
+    """Return the cost model of a network, made once."""
     costs = network.__dict__.get("_costs")
     if costs is None:
         costs = network.__dict__["_costs"] = CostModel(network)
@@ -365,7 +368,7 @@ def cost_model_of(network: Network) -> CostModel:
 
 
 def on_threads(work: Callable[[Share], Part], parts: Iterable[Share], threads: int) -> Iterator[Part]:
-    """Return ``work`` of every part, in order, computed by several threads."""
+    """Yield ``work`` of every part, in order, computed by several threads."""
     if threads < 2:
         yield from map(work, parts)
         return

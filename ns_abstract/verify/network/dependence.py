@@ -13,7 +13,7 @@ from ns_abstract.verify.network.max_pooling import MaxPool
 
 
 def dependence(network: Network, rows: Float64) -> dict[int, Tensor]:
-    """Return by node [*shape] bool whether ``rows`` [k, output_size] depend on a number; plays no part in soundness."""
+    """Return by node [*shape] bool whether ``rows`` [k, output_size] depend on a number; for heuristics only."""
     generator = np.random.default_rng(0)
     last, dependent = len(network.nodes), {}
     reached: dict[int, np.ndarray] = {last: (rows != 0.0).any(0)}
@@ -38,10 +38,10 @@ def dependence(network: Network, rows: Float64) -> dict[int, Tensor]:
 
 
 def input_shares(network: Network, lower: Float64, upper: Float64) -> Float64:
-    """Return [n] the part of each input in the motion of the neurons before activations; plays no part in soundness.
+    """Return the share [n] of each input in the motion of neurons in front of activations; for heuristics only.
 
-    Each input alone goes from one end of the box ``lower`` to ``upper`` [n] to the other, with the others in the
-    middle. The parts of a node sum to one; the result is the nodes' mean.
+    Each input alone goes from one end of the box ``lower`` to ``upper`` [n] to the other, the others being in the
+    middle. A node's shares sum to one; the result is the mean over the nodes.
     """
     middle, total, nodes = 0.5 * (lower + upper), np.zeros(len(lower)), 0
     varies = np.flatnonzero(upper > lower)
@@ -58,7 +58,7 @@ def input_shares(network: Network, lower: Float64, upper: Float64) -> Float64:
 
 
 def _motions(network: Network, pair: Tensor) -> list[float]:
-    """By nonlinear node: how far its inputs are apart, together, for a pair of images [2, n]."""
+    """Return by nonlinear node the sum of its inputs' differences between two images [2, n]."""
     values: list[Tensor | None] = [pair.reshape(2, *network.input_shape)]
     motions = []
     for _, node, inputs in network.walk(values):

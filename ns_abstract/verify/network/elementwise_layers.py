@@ -1,4 +1,4 @@
-"""Layers that act on each number alone, recognised and built from what a file writes out."""
+"""Builds layers that act on each number alone, and recognises those that a file spells out."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _NEAR_ZERO = 2.0**16
 
 
 class ElementwiseBuilder(NetworkBuilder):
-    """Builds functions of one number, and sums and products of values that depend on the image."""
+    """Builds functions of one number, and sums and products of two values that depend on the image."""
 
     # ------------------------------------------------------------ what is known of nodes
 
@@ -48,7 +48,7 @@ class ElementwiseBuilder(NetworkBuilder):
         return self.nodes[index - 1] if index else None
 
     def _affine(self, index: int) -> tuple[int, float, float]:
-        """(root, factor, offset): node ``index`` is ``factor * root + offset`` with plain numbers."""
+        """Return (root, factor, offset) if node ``index`` is ``factor * root + offset`` with single numbers."""
         factor, offset = 1.0, 0.0
         # constants that are known within bounds alone are no plain numbers
         while index and type(self._node(index).layer) is ScaleLayer:
@@ -62,7 +62,7 @@ class ElementwiseBuilder(NetworkBuilder):
         return index, factor, offset
 
     def floor(self, index: int, depth: int = 12) -> float:
-        """A number that node ``index`` never is below, by what computes it, rounding included."""
+        """Return a lower bound of node ``index`` that follows from its operators, rounding included."""
         if not index or not depth:
             return -math.inf
         node = self._node(index)
@@ -102,17 +102,17 @@ class ElementwiseBuilder(NetworkBuilder):
 
     @staticmethod
     def _rounded(value: float, positive: bool, terms: int) -> float:
-        """A sum of numbers that are not negative keeps its size, but for ``terms`` roundings and folding."""
+        """Return a lower bound of a computed sum of non-negative numbers, after ``terms`` roundings and folding."""
         return value * (1.0 - gamma(terms + FOLDING)) if positive and value >= 0.0 else -math.inf
 
     # ------------------------------------------------------------ functions of one number
 
     def curve(self, x: int, make: Callable[..., ScalarFunction], **settings: Any) -> int:
-        """A layer of `ns_abstract.verify.network.activations`."""
+        """Add a layer of `ns_abstract.verify.network.activations`."""
         return self._add(make(self.shape(x), **settings), x)
 
     def doubt(self, index: int, weight: ConstantIntervals | None, offset: ConstantIntervals | None) -> int:
-        """The last layer again, whose constants are known within bounds alone (N23)."""
+        """Replace the last layer by one whose constants are intervals (N23)."""
         if weight is None and offset is None:
             return index
         node = self.nodes[index - 1]
@@ -121,7 +121,7 @@ class ElementwiseBuilder(NetworkBuilder):
         return index
 
     def clip(self, x: int, least: float, most: float) -> int:
-        """``min(max(x, least), most)``, with infinite limits, too."""
+        """Add ``min(max(x, least), most)``; limits may be infinite."""
         if not least <= most:
             raise InputError(f"clips to [{least}, {most}]", fix="the limits must not cross")
         if least >= OVERFLOW or most <= -OVERFLOW:
@@ -143,7 +143,7 @@ class ElementwiseBuilder(NetworkBuilder):
         return self.curve(x, activations.Clip, least=bounds[0], most=bounds[1])
 
     def prelu(self, x: int, slope: np.ndarray) -> int:
-        """``max(x, 0) + slope min(x, 0)`` as ``slope x + (1 - slope) relu(x)``."""
+        """Add ``max(x, 0) + slope min(x, 0)`` as ``slope x + (1 - slope) relu(x)``."""
         slope = np.asarray(slope, np.float64)
         if slope.size == 1 and 0.0 <= float(slope.reshape(-1)[0]) <= 1.0:
             return self.leaky_relu(x, float(slope.reshape(-1)[0]))
@@ -151,7 +151,7 @@ class ElementwiseBuilder(NetworkBuilder):
         return self.sum((straight, self.scale(self.leaky_relu(x, 0.0), 1.0 - slope, None)), (1, 1))
 
     def power(self, x: int, exponent: float) -> int:
-        """``x^exponent``; but for whole exponents from 2 on, only where ``x`` is surely above 0, or not 0 for -1."""
+        """Add ``x^exponent``; unless it is a whole number from 2 on, ``x`` must be positive (not 0 for -1)."""
         if exponent == 1.0:
             return x
         if exponent == int(exponent) and 2.0 <= exponent <= 8.0:
@@ -170,23 +170,23 @@ class ElementwiseBuilder(NetworkBuilder):
         return floor if floor > LEAST_DIVISOR else -math.inf
 
     def reciprocal(self, x: int) -> int:
-        """``1 / x``; 1 / sqrt is one function."""
+        """Add ``1 / x``; 1 / sqrt becomes one function."""
         node = self._node(x)
         if node is not None and isinstance(node.layer, activations.Root) and not node.layer.inverse:
             return self.curve(node.inputs[0], activations.Root, floor=node.layer.floor, inverse=True)
         return self.curve(x, activations.Reciprocal, floor=self._above(x))
 
     def softsign(self, x: int) -> int:
-        """``x / (1 + |x|)``."""
+        """Add ``x / (1 + |x|)``."""
         size = self.scale(self.curve(x, activations.Abs), np.ones(()), np.ones(()))
         return self.product(x, self.reciprocal(size))
 
     def logarithm(self, x: int) -> int:
-        """The natural logarithm."""
+        """Add the natural logarithm."""
         return self.curve(x, activations.Log, floor=self._above(x))
 
     def switched_softplus(self, compared: int, limit: float, straight: int, curved: int) -> int:
-        """``straight`` where ``compared`` is above the limit, else the softplus ``curved``; 0 if it is none."""
+        """Add ``straight`` where ``compared`` is above the limit, else the softplus ``curved``; 0 if it is none."""
         (root, s, o), (behind, t, p) = self._affine(straight), self._affine(curved)
         node = self._node(behind)
         if node is None or type(node.layer) is not activations.Softplus or limit < 16.0 or o != 0.0 or p != 0.0:
@@ -202,7 +202,7 @@ class ElementwiseBuilder(NetworkBuilder):
     # ------------------------------------------------------------ two values that depend on the image
 
     def spread(self, x: int, shape: Shape) -> int:
-        """The item repeated along axes of length 1, as arrays are."""
+        """Add the item broadcast along axes of length 1."""
         before = self.shape(x)
         if before == tuple(shape):
             return x
@@ -217,7 +217,7 @@ class ElementwiseBuilder(NetworkBuilder):
         return self.gather(x, index)
 
     def common(self, *inputs: int) -> tuple[int, ...]:
-        """The inputs, spread to one shape."""
+        """Return the inputs broadcast to one shape."""
         try:
             shape = np.broadcast_shapes(*[(1, *self.shape(k)) for k in inputs])
         except ValueError:
@@ -227,7 +227,7 @@ class ElementwiseBuilder(NetworkBuilder):
         return tuple(self.spread(k, shape[1:]) for k in inputs)
 
     def product(self, a: int, b: int) -> int:
-        """``a b``; a value times a known function of it is one function (N10)."""
+        """Add ``a b``; a value times a known function of itself becomes one function (N10)."""
         gated = self._gated(a, b) or self._gated(b, a)
         if gated:
             return gated
@@ -241,7 +241,7 @@ class ElementwiseBuilder(NetworkBuilder):
         return x if factor == 1.0 else self.scale(x, np.asarray(factor), None)
 
     def _gated(self, value: int, gate: int) -> int:
-        """``value gate`` as one curve; 0 if it is none that is known."""
+        """Add ``value gate`` as one activation; 0 if it is no known one."""
         root, s, o = self._affine(value)
         inner, factor, shift = self._affine(gate)
         node = self._node(inner)
@@ -273,7 +273,7 @@ class ElementwiseBuilder(NetworkBuilder):
         return 0
 
     def extreme(self, inputs: Sequence[int], most: bool) -> int:
-        """Greatest or least of several values."""
+        """Add the maximum or minimum of several values."""
         parts = list(self.common(*inputs))
         while len(parts) > 1:
             pairs = [self._either(a, b, most) for a, b in zip(parts[::2], parts[1::2], strict=False)]

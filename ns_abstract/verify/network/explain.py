@@ -1,4 +1,4 @@
-"""Describe a network's layers, the memory of a cell, and its time, which is measured on cells of a made-up picture."""
+"""Describes a network's layers, the memory of a cell, and its time, measured on cells of a synthetic picture."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ class MeasurementTuning:
     """How the time of a cell is measured.
 
     Attributes:
-        motions: By how much the values of a picture move in the cells, at most; values are in [0, 1].
-        rest: What a picture is known to be, beside the motion, as a part of it: about as in cells of splats.
+        motions: Largest motion of a picture's values in the measured cells; values are in [0, 1].
+        rest: Uncertainty of a picture beside the motion, as a fraction of it; as in cells of splats.
         seconds: Time for all of them.
-        brief: Seconds up to which a cell is bounded again: the first time loads kernels.
-        rows: Outputs that are bounded at most.
+        brief: Cells up to this many seconds are bounded again, as the first time loads kernels.
+        rows: Largest number of bounded outputs.
     """
 
     motions: tuple[float, ...] = (0.001, 0.01, 0.1)
@@ -64,7 +64,7 @@ def multiplications(network: Network, index: int) -> float:
 
 
 def cell_bytes(network: Network, dimensions: int) -> float:
-    """Return the bytes that one cell in so many parameters takes, about."""
+    """Return the estimated bytes of one cell in ``dimensions`` parameters."""
     sizes = [float(np.prod(network.shape(k))) for k in range(len(network.nodes) + 1)]
     return sum(sizes) * 8 * (3 * dimensions + _NUMBERS) + (_MANY_ROWS if cost_model_of(network).deep else _FEW_ROWS)
 
@@ -72,9 +72,9 @@ def cell_bytes(network: Network, dimensions: int) -> float:
 def check_cell(
     network: Network, dimensions: int, allowed: float, remedy: str = "a larger --memory-limit, fewer --workers"
 ) -> None:
-    """Raise InputError if one cell of the network takes more than ``allowed`` bytes, about.
+    """Raise InputError if one cell of the network is estimated to take more than ``allowed`` bytes.
 
-    ``remedy`` is what may be given instead of a smaller network.
+    ``remedy`` names alternatives to a smaller network.
     """
     needed = cell_bytes(network, dimensions)
     if needed > allowed:
@@ -87,7 +87,7 @@ def check_cell(
 
 
 def moving_picture(shape: tuple[int, ...], dimensions: int, motion: float) -> ImageSets:
-    """One cell of a smooth picture of ``shape`` that moves along smooth directions, values by ``motion`` at most."""
+    """Return one cell of a smooth picture of ``shape`` whose values move smoothly by at most ``motion``."""
     channels, height, width = grid(shape)
     channel, y, x = np.meshgrid(
         np.arange(channels), np.linspace(0.0, 1.0, height), np.linspace(0.0, 1.0, width), indexing="ij"
@@ -101,9 +101,9 @@ def moving_picture(shape: tuple[int, ...], dimensions: int, motion: float) -> Im
 
 
 def measured(network: Network, dimensions: int, seconds: float = _TUNING.seconds) -> Iterator[str]:
-    """Yield lines of text: what cells of a moving picture took, and how wide the bounds of the outputs are there.
+    """Yield lines of text on the time of cells of a moving picture, and the widths of the outputs' bounds there.
 
-    After ``seconds`` the cell that is worked on is given up, and wider ones are not begun.
+    After ``seconds`` the running cell is dropped and no wider one is begun.
     """
     count = min(network.output_size, 1 + _TUNING.rows)
     rows = np.eye(count, network.output_size)

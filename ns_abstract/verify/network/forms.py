@@ -23,7 +23,7 @@ class NodeInterval(NamedTuple):
 
     @property
     def spread(self) -> Tensor:
-        """What they are above and below zero, together."""
+        """The sum of both bounds' magnitudes."""
         return self.upper.clamp(min=0.0) - self.lower.clamp(max=0.0)
 
 
@@ -32,10 +32,10 @@ class NodeForm:
     """The affine form ``z = reference + c + a p + e``, |e| <= r, of a node's values in every cell (N1).
 
     Attributes:
-        reference: [m, *shape]: the node's exact values are near it; all that follows is relative to it.
+        reference: [m, *shape] near the node's exact values; everything else is relative to it.
         c, r: [m, *shape].
         a: [m, d, *shape].
-        lower, upper: [m, *shape]; what ``z - reference`` is at least and at most.
+        lower, upper: [m, *shape] bounds of ``z - reference``.
         active: [m, *shape]; False where z is exactly zero.
     """
 
@@ -49,19 +49,19 @@ class NodeForm:
 
     @property
     def width(self) -> Tensor:
-        """How far z may be from the reference."""
+        """The largest distance of z from the reference."""
         return torch.maximum(self.lower.abs(), self.upper.abs())
 
     @property
     def interval(self) -> NodeInterval:
-        """What z is at least and at most."""
+        """Lower and upper bounds of z."""
         room = OWN_FEW * self.reference.abs()
         low = self.reference + self.lower - room - OWN_FEW * self.lower.abs()
         return NodeInterval(low, self.reference + self.upper + room + OWN_FEW * self.upper.abs())
 
     @staticmethod
     def ranged(reference: Tensor, c: Tensor, a: Tensor, r: Tensor, active: Tensor | None = None) -> NodeForm:
-        """With the range of the form itself."""
+        """Return the form whose bounds are the range of its polynomial and radius."""
         radius = (a.abs().sum(1) + r) * UP + c.abs() * OWN_FEW
         active = torch.ones_like(c, dtype=torch.bool) if active is None else active
         return NodeForm(reference, c, a, r, c - radius, c + radius, active)

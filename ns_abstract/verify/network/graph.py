@@ -45,7 +45,7 @@ _SIGMOIDAL = "sigmoid and tanh are taken to be evaluated within 2^-20 of the exa
 
 @dataclass(frozen=True, eq=False)
 class Node:
-    """One layer of a network, with name and operator in the file, and the nodes that it reads; 0 is the image."""
+    """One layer of a network, with its name and operator in the file, and the numbers of its inputs; 0 is the image."""
 
     name: str
     op: str
@@ -60,9 +60,9 @@ class Network:
         source: The file.
         input_shape: One item, without the batch.
         nodes: In an order in which every node's inputs come before it; node k is ``nodes[k - 1]``.
-        output_shape: One item of the last node, as the file says it.
+        output_shape: One item of the last node, as in the file.
         output: The output's name in the file.
-        whole_numbers: Whether it takes whole numbers from 0 to 255 alone.
+        whole_numbers: Whether it only takes whole numbers from 0 to 255.
         data: Files beside ``source`` that hold some of its constants.
 
     Attributes:
@@ -96,21 +96,21 @@ class Network:
 
     @property
     def input_size(self) -> int:
-        """Numbers of one image."""
+        """Count of numbers of one image."""
         return int(np.prod(self.input_shape))
 
     @property
     def output_size(self) -> int:
-        """Numbers of one output."""
+        """Count of numbers of one output."""
         return int(np.prod(self.output_shape))
 
     @property
     def neuron_count(self) -> int:
-        """Numbers of all nodes together, with the image."""
+        """Count of numbers of all nodes together, with the image."""
         return sum(int(np.prod(self.shape(k))) for k in range(len(self.nodes) + 1))
 
     def guarantee(self, arithmetic: NetworkArithmetic = "float32") -> tuple[str, ...]:
-        """What certificates about this network cover, and what they do not."""
+        """Return sentences on what certificates about this network cover, and what they do not."""
         if arithmetic == "real":
             return _REAL
         sigmoidal = any(isinstance(node.layer, (Sigmoid, Tanh)) for node in self.nodes)
@@ -118,12 +118,12 @@ class Network:
         return (*GUARANTEE, *[_SIGMOIDAL] * sigmoidal, *[_ELEMENTARY] * elementary)
 
     def shape(self, index: int) -> Shape:
-        """One item of node ``index``."""
+        """Return the shape of one item of node ``index``."""
         return self.nodes[index - 1].layer.shape if index else self.input_shape
 
     @cached_property
     def readers(self) -> tuple[int, ...]:
-        """How many inputs read each node."""
+        """How many inputs are connected to each node."""
         counts = [0] * (len(self.nodes) + 1)
         for node in self.nodes:
             for index in node.inputs:
@@ -132,7 +132,7 @@ class Network:
 
     @cached_property
     def depth(self) -> tuple[int, ...]:
-        """Layers that mix numbers on the longest way from the image to each node."""
+        """Number of layers that mix numbers on the longest path from the image to each node."""
         depths = [0]
         for node in self.nodes:
             mixes = not isinstance(node.layer, Activation) and node.layer.mixes
@@ -141,7 +141,7 @@ class Network:
 
     @cached_property
     def scaled(self) -> frozenset[int]:
-        """Nodes whose weights a program may have folded scales into: no activation is between (N2)."""
+        """Nodes into whose weights a program may have folded scales: no activation is between (N2)."""
         groups = list(range(len(self.nodes) + 1))
 
         def group(k: int) -> int:
@@ -159,7 +159,7 @@ class Network:
         return frozenset(k for k in range(1, len(self.nodes) + 1) if plain[k] and group(k) in marked)
 
     def __call__(self, images: Tensor) -> Tensor:
-        """[B, *input_shape] to [B, output_size], in the images' dtype, differentiable."""
+        """Evaluate images [B, *input_shape] to [B, output_size], in the images' type, differentiably."""
         if tuple(images.shape[1:]) != self.input_shape:
             raise ValueError(f"images [B, {', '.join(map(str, self.input_shape))}] expected, got {tuple(images.shape)}")
         values: list[Tensor | None] = [images]
@@ -188,10 +188,10 @@ class Network:
 
 
 def item(shape: Sequence[int]) -> str:
-    """A shape for messages."""
+    """Return a shape as text for messages."""
     return "x".join(map(str, shape)) if shape else "a number"
 
 
 def as_double(array: np.ndarray) -> Tensor:
-    """A constant as a float64 tensor of its own."""
+    """Return a copy of a constant as a float64 tensor."""
     return torch.from_numpy(np.array(array, np.float64))

@@ -50,7 +50,7 @@ class ImageSets:
 
 @dataclass(frozen=True)
 class OutputBounds:
-    """Lower bounds of ``rows @ y + offset``; minus infinity where nothing is known, never NaN.
+    """Lower bounds of ``rows @ y + offset``; minus infinity where none is known, never NaN.
 
     Attributes:
         lower: [m, k] for every p of the cell.

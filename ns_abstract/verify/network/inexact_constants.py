@@ -18,9 +18,9 @@ ConstantIntervals = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class InexactLayer(LinearLayer):
-    """A linear layer with interval constants: charges their width times the input's magnitude.
+    """A linear layer with interval constants: charges their widths times the input's magnitude.
 
-    ``real`` and ``evaluated`` are the layer with the doubts of the exact value and of float32 evaluations as weights.
+    ``real`` and ``evaluated`` are layers whose weights are the errors of the exact value and of float32 evaluations.
     """
 
     real: LinearLayer

@@ -17,25 +17,25 @@ from ns_abstract.verify.network.slope_choices import UnstableNeurons
 
 
 class IntermediateBounds:
-    """Forms and relaxations of the nodes: the forward pass adds to them, the backward pass reads them.
+    """Forms and relaxations of the nodes: the forward pass adds them, the backward pass reads them.
 
     Args:
-        network, image: The network, and what is known of the image.
+        network, image: The network, and the planes of the image.
         middle: [m, n] the images' reference.
         usable: [m] cells that are not given up; changed in place.
         arithmetic: As in `ns_abstract.verify.network.bound_outputs`.
-        coarse: Whether rows are in float32, and charged for it, in real arithmetic, too: they take less than half the
-            time.
+        coarse: Whether coefficients are float32, and charged for it, in real arithmetic, too: that takes less than half
+            the time.
 
     Attributes:
         count, d: Cells m and parameters d.
-        in_float32: Whether the network's evaluation in float32 is bounded.
-        image, columns: The image as planes, and as rows are bounded on it.
-        flush: [m] what flushes to zero may lose on the way of any row.
-        relaxations: What rows take on their way; rows of outputs take the last, the others the first.
-        folded: Nodes whose rounding is in that of their only reader.
-        forms, stops: By node: what is known of it, while other nodes read it; what rows may stop at.
-        unstable: By node: units whose lower lines may have other slopes.
+        in_float32: Whether float32 evaluations of the network are bounded.
+        image, columns: The image as planes, and laid out for concretising.
+        flush: [m] the largest loss of any row by flushing to zero on the way.
+        relaxations: Relaxations for rows of intermediate nodes, and, the last, for rows of outputs.
+        folded: Nodes whose rounding is charged in that of their only reader.
+        forms, stops: By node: its form, while other nodes read it; its planes, where rows may stop.
+        unstable: By node: neurons whose lower lines may have other slopes.
         reused_relaxations: By node: lines with slopes of another cell's rows.
     """
 
@@ -66,17 +66,17 @@ class IntermediateBounds:
         self.reused_relaxations: dict[int, ReusedRelaxation] = {}
 
     def image_form(self) -> NodeForm:
-        """The image as a form."""
+        """Return the image as a form."""
         form = form_of(self.image, self.middle, self.network.input_shape)
         lower, upper = torch.from_numpy(self.image.lower), torch.from_numpy(self.image.upper)
         return self.within(form, lower.reshape(form.c.shape), upper.reshape(form.c.shape))
 
     def rounds(self, source: int) -> bool:
-        """Whether rows are charged on node ``source``."""
+        """Return whether rows are charged for the rounding of node ``source``."""
         return source in self.relaxations[0].noise
 
     def within(self, form: NodeForm, lower: Tensor, upper: Tensor) -> NodeForm:
-        """The form with bounds that are known besides; a cell without values in it is given up."""
+        """Return the form intersected with further bounds; a cell where that is empty is given up."""
         low, high = torch.maximum(form.lower, lower), torch.minimum(form.upper, upper)
         fine = low <= high
         for part in (form.reference, form.c, form.r, form.a):
@@ -97,7 +97,7 @@ class IntermediateBounds:
         return NodeForm(*(clear(getattr(form_within, name)) for name in NodeForm.__dataclass_fields__))
 
     def stop(self, index: int, form: NodeForm) -> NodeColumns:
-        """What is known of node ``index``, for rows that arrive there."""
+        """Return the planes of node ``index``, for rows that stop there."""
         m, d, shape = self.count, self.d, grid(self.network.shape(index))
         room = OWN_LINE * (form.c.abs() + form.r)
         slopes = form.a.movedim(1, -1).reshape(m, 1, *shape, d).expand(m, 2, *shape, d)
@@ -107,7 +107,7 @@ class IntermediateBounds:
         return columns_of(*(t.reshape(size).numpy() for t, size in arrays))
 
     def ready(self, way: BackwardRoute) -> int:
-        """Where rows of a way end, when all is known that they end on."""
+        """Prepare the planes of all nodes where a route ends, and return its cut."""
         for at, _ in way.rests:
             if at and at not in self.stops:
                 form = self.forms[at]

@@ -1,4 +1,4 @@
-"""Matrices that resize one axis of a map."""
+"""Matrices that resize one axis of a map, as ONNX's Resize does."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from ns_abstract.io.errors import InputError
 
 
 class ResizeAxis(NamedTuple):
-    """The interpolation matrix [out, size] along one axis, and what its weights may be off in float32."""
+    """The interpolation matrix [out, size] along one axis, and bounds of its weights' float32 errors."""
 
     weight: np.ndarray
     doubt: np.ndarray
 
 
 def nearest_pixels(size: int, out: int, coordinates: str, nearest: str, ratio: float) -> np.ndarray:
-    """Return [out] the input pixels that onnxruntime picks along one axis; it computes positions in float32."""
+    """Return the input pixels [out] that onnxruntime picks along one axis; it computes positions in float32."""
     half = np.float32(0.5)
     k, scale = np.arange(out, dtype=np.float32), np.float32(ratio)
     if coordinates == "align_corners":
@@ -45,7 +45,7 @@ def nearest_pixels(size: int, out: int, coordinates: str, nearest: str, ratio: f
 def interpolation(
     size: int, out: int, mode: str, coordinates: str, nearest: str, scale: float | None, bend: float = -0.75
 ) -> ResizeAxis:
-    """ONNX's Resize along one axis; ``bend`` is `cubic_coeff_a`."""
+    """Return the matrix of ONNX's Resize along one axis; ``bend`` is `cubic_coeff_a`."""
     k = np.arange(out, dtype=np.float64)
     ratio = out / size if scale is None else scale
     if coordinates == "align_corners":

@@ -1,9 +1,9 @@
-"""Layers: what each computes, and how forms pass it forwards and coefficients backwards (design.md, N3, N4).
+"""Layers: their values, their forms forwards, and their coefficients backwards (docs/dev/design.md, N3, N4).
 
 A layer is linear (`LinearLayer` and the classes built on it) or acts on every number by itself (`Activation`). A linear
-layer has three faces that share one matrix W: the concrete ``W x + bias``, its magnitude ``|W| x`` (for radii and for
-rounding), and its transpose ``coefficients W`` on windows of rows (`coefficients`). An activation has its concrete
-value and lines that enclose it over an interval.
+layer with matrix W computes ``W x + bias``, its magnitude ``|W| x`` (for radii and rounding), and its transpose
+``coefficients W`` on windows of rows (`coefficients`). An activation computes its value, and lines that enclose it over
+an interval.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ Shape = tuple[int, ...]
 
 @dataclass(frozen=True, eq=False)
 class LinearLayer:
-    """A linear layer; the base class passes its input on in another shape.
+    """A linear layer; the base class only changes the shape.
 
     Attributes:
         input_shapes: One item of every input.
         shape: One item of the output.
-        terms: Roundings that one output may suffer in float32 (length of its sum of products, and what
+        terms: Largest number of roundings of one output in float32 (terms of its sum of products, and of layers that
             may be folded into it); 0 if it is exact.
-        row_terms: Length of the longest sum when a row passes backwards.
+        row_terms: Terms of the longest sum when a row passes backwards.
     """
 
     input_shapes: tuple[Shape, ...]
@@ -45,36 +45,36 @@ class LinearLayer:
 
     @property
     def bias(self) -> Tensor | None:
-        """[*shape] or broadcastable to it; None: zero."""
+        """The bias, [*shape] or broadcastable to it; None: zero."""
         return None
 
     @cached_property
     def gain(self) -> float:
-        """The most that a number of the result may be of the largest input, in any grouping of the factors (N21)."""
+        """Upper bound of a result's magnitude over the largest input's, in any grouping of the factors (N21)."""
         return 1.0
 
     def roundings(self, active: Sequence[Tensor]) -> Tensor | int:
-        """`terms` of sums in which inputs that are not ``active`` [B, *input_shapes[i]] are exactly zero (N2)."""
+        """Return `terms` where inputs that are not ``active`` [B, *input_shapes[i]] are exactly zero (N2)."""
         return self.terms
 
     def apply(self, inputs: Sequence[Tensor]) -> Tensor:
-        """``W x`` for inputs [B, *input_shapes[i]]."""
+        """Return ``W x`` for inputs [B, *input_shapes[i]]."""
         return inputs[0].reshape(-1, *self.shape)
 
     def magnitude(self, inputs: Sequence[Tensor]) -> Tensor:
-        """``|W| x``."""
+        """Return ``|W| x``."""
         return self.apply(inputs)
 
     def spare(self, sizes: Sequence[Tensor]) -> Tensor | float:
-        """What a float32 evaluation may be off besides, for inputs of at most ``sizes`` [m, *input_shapes[i]]."""
+        """Return further float32 errors, for inputs of magnitude up to ``sizes`` [m, *input_shapes[i]]."""
         return 0.0
 
     def inexact(self, sizes: Sequence[Tensor]) -> Tensor | float:
-        """What the network is off the layer's numbers in real arithmetic, too, for inputs of at most ``sizes``."""
+        """Return errors of the layer's numbers, which count in real arithmetic, too, for inputs up to ``sizes``."""
         return 0.0
 
     def backward(self, coefficients: Coefficients) -> list[Coefficients]:
-        """Coefficients on every input for coefficients on the output; may reuse their memory."""
+        """Return coefficients on every input for coefficients on the output; may reuse their memory."""
         return [unflatten(coefficients, self.shape, self.input_shapes[0])]
 
     def __call__(self, inputs: Sequence[Tensor]) -> Tensor:
@@ -84,7 +84,7 @@ class LinearLayer:
 
 @dataclass(frozen=True, eq=False)
 class Weighted(LinearLayer):
-    """A layer of sums of products: ``weight`` and ``offset``, float64; None: no offset."""
+    """A layer of sums of products with float64 ``weight`` and ``offset`` (None: no offset)."""
 
     weight: Tensor = field(default_factory=lambda: torch.zeros(0))
     offset: Tensor | None = None
@@ -95,7 +95,7 @@ class Weighted(LinearLayer):
         return self.weight.float()
 
     def weight_for(self, coefficients: Tensor) -> Tensor:
-        """Weights in the coefficients' type."""
+        """Return the weights in the coefficients' type."""
         return self._single if coefficients.dtype == torch.float32 else self.weight
 
     @cached_property
@@ -103,7 +103,7 @@ class Weighted(LinearLayer):
         return max(1, self.terms) * (1.0 + float(self.weight.abs().max()))
 
     def product(self, x: Tensor, weight: Tensor) -> Tensor:
-        """Sums of products of the numbers ``x`` [B, *input_shape] with weights in the layer's shape."""
+        """Return sums of products of ``x`` [B, *input_shape] with weights of the layer's shape."""
         raise AssertionError
 
     def apply(self, inputs: Sequence[Tensor]) -> Tensor:
@@ -114,7 +114,7 @@ class Weighted(LinearLayer):
 
     @property
     def squared(self) -> Weighted:
-        """The layer with the squares of its weights and offset, which keep their signs (N20)."""
+        """Return the layer with its weights and offset squared, signs kept (N20)."""
         offset = None if self.offset is None else self.offset * self.offset.abs()
         return replace(self, weight=self.weight * self.weight.abs(), offset=offset)
 
@@ -133,7 +133,7 @@ class WindowLayer(Weighted):
 
 @dataclass(frozen=True, eq=False)
 class Convolution(WindowLayer):
-    """Two-dimensional convolution with zero padding; average pooling and selections are such, too.
+    """Two-dimensional convolution with zero padding; average pooling and selections are convolutions, too.
 
     Attributes:
         weight: [Cout, Cin / groups, kh, kw] float64.
@@ -146,14 +146,14 @@ class Convolution(WindowLayer):
 
     @cached_property
     def _phases(self) -> dict[torch.dtype, Tensor | None]:
-        """By the rows' type, made when they are first wanted."""
+        """`_parts` by the rows' type, made at first use."""
         return {}
 
     def _parts(self, weight: Tensor) -> Tensor | None:
-        """Weights [s t Cin, Cout, kh', kw'] of the s x t parts of a transposed stride, or None where it has none.
+        """Return weights [s t Cin, Cout, kh', kw'] of the phases of a transposed stride (s, t), or None without stride.
 
-        Row ``s i + a`` of the result is row i of part a: a convolution with every s-th row of the weights, which
-        runs several times as fast as the library's transposed convolution with a stride.
+        Row ``s i + a`` of the result is row i of phase a, a convolution with every s-th row of the weights. This runs
+        several times as fast as the library's transposed convolution with a stride.
         """
         (s, t), (kh, kw) = self.stride, self.weight.shape[2:]
         if (s, t) == (1, 1) or self.groups > 1 or self.dilation != (1, 1):
@@ -164,13 +164,13 @@ class Convolution(WindowLayer):
         return parts.reshape(s * t * into, out, high // s, wide // t).flip(2, 3).contiguous()
 
     def _phases_for(self, value: Tensor) -> Tensor | None:
-        """`_parts` in the type of ``value``."""
+        """Return `_parts` in the type of ``value``."""
         if value.dtype not in self._phases:
             self._phases[value.dtype] = self._parts(self.weight_for(value))
         return self._phases[value.dtype]
 
     def _joined(self, value: Tensor, phases: Tensor, size: tuple[int, int], corner: tuple[int, int]) -> Tensor:
-        """[R, Cout, h, w] back to a window of ``size`` of the transposed convolution's map, from its ``corner`` on."""
+        """Return the window of ``size`` at ``corner`` of the transposed convolution of rows [R, Cout, h, w]."""
         high, wide = phases.shape[2:]
         result = functional.conv2d(value, phases, padding=(high - 1, wide - 1)).numpy()
         window = np.empty((len(value), self.weight.shape[1], *size), result.dtype)
@@ -178,7 +178,7 @@ class Convolution(WindowLayer):
         return torch.from_numpy(window)
 
     def _transposed(self, value: Tensor) -> Tensor:
-        """[R, Cout, h, w] back to [R, Cin, (h - 1) s + kh, (w - 1) t + kw]."""
+        """Return the transposed convolution [R, Cin, (h - 1) s + kh, (w - 1) t + kw] of rows [R, Cout, h, w]."""
         phases = self._phases_for(value)
         if phases is None:
             return functional.conv_transpose2d(
@@ -209,7 +209,7 @@ class Convolution(WindowLayer):
 
     @cached_property
     def _trims(self) -> bool:
-        """Whether a transposed convolution of whole maps is to be cut by the first pads on both sides."""
+        """Whether a transposed convolution of whole maps only has to be cropped by the first pads on both sides."""
         (top, left, _, _), (kh, kw) = self.pads, self.weight.shape[2:]
         (_, height, width), (_, high, wide) = self.input_shapes[0], self.shape
         spread = high + (kh - 1) * self.dilation[0], wide + (kw - 1) * self.dilation[1]
@@ -260,8 +260,7 @@ class Matrix(Weighted):
 class ScaleLayer(LinearLayer):
     """``factor * x + offset`` with constants; both [*shape] float64 (batch normalisation, Mul, Add, ...).
 
-    ``parts``: the product of 1 + |f| over the largest constants that factor and offset are made of, if these are
-    others.
+    ``parts``: if factor and offset are made of other constants, the product of 1 + |f| over the largest of these.
     """
 
     factor: Tensor = field(default_factory=lambda: torch.zeros(0))
@@ -318,7 +317,7 @@ class Sum(LinearLayer):
 
 @dataclass(frozen=True, eq=False)
 class Pad(LinearLayer):
-    """A constant around the map: ``pads`` top, left, bottom, right (negative ones cut), and its ``value``."""
+    """Constant padding: ``pads`` top, left, bottom, right (negative ones crop), and its ``value``."""
 
     pads: tuple[int, int, int, int] = (0, 0, 0, 0)
     value: float = 0.0
@@ -342,7 +341,7 @@ class Pad(LinearLayer):
 
 @dataclass(frozen=True, eq=False)
 class ChannelEmbedding(LinearLayer):
-    """Places the input's channels among channels of zeros, from number ``first`` on."""
+    """Places the input's channels, from number ``first`` on, among channels of zeros."""
 
     first: int = 0
 
@@ -380,7 +379,7 @@ class Gather(LinearLayer):
 
 
 class LinearRelaxation(NamedTuple):
-    """The linear relaxation of an activation over an interval: lines ``slope * z + offset``, float64, shaped as z."""
+    """Lower and upper lines ``slope * z + offset`` of an activation over an interval, float64, shaped as z."""
 
     lower_slope: Tensor
     lower_offset: Tensor
@@ -395,41 +394,41 @@ class Activation:
     shape: Shape
 
     def error(self, lower: Tensor, upper: Tensor) -> Tensor | float:
-        """How far a float32 evaluation may be from the function of a number between."""
+        """Return the largest float32 error of the function over [lower, upper]."""
         return 0.0
 
     def missing(self, lower: Tensor, upper: Tensor) -> Tensor | float:
-        """How far what the network computes, in real numbers, too, may be from `function`."""
+        """Return the largest distance of the network's value, also in real numbers, from `function`."""
         return 0.0
 
     def range(self, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
-        """Least and greatest value; a monotone function's are those of the ends."""
+        """Return the least and greatest value; a monotone function's are at the ends."""
         return self.function(lower), self.function(upper)
 
     def function(self, z: Tensor) -> Tensor:
-        """The concrete value."""
+        """Return the value."""
         raise AssertionError
 
     def unstable(self, lower: Tensor, upper: Tensor) -> Tensor:
-        """Where better bounds of the input would give better lines."""
+        """Return where tighter bounds of the input would give tighter lines."""
         raise AssertionError
 
     def relaxation_gap(self, lower: Tensor, upper: Tensor) -> Tensor | None:
-        """How far the lines of N3 are apart, as a part of the interval; None where `unstable` says all."""
+        """Return the distance of the lines of N3 as a fraction of the interval; None: `unstable` says all."""
         return None
 
     def lines(self, lower: Tensor, upper: Tensor) -> LinearRelaxation:
-        """A lower and an upper line over [lower, upper], each the best by itself (N4)."""
+        """Return a lower and an upper line over [lower, upper], each optimal by itself (N4)."""
         raise AssertionError
 
     def band(self, lower: Tensor, upper: Tensor) -> LinearRelaxation:
-        """Two parallel lines (N3): the same tensor is both slopes."""
+        """Return two parallel lines (N3); both slopes are the same tensor."""
         raise AssertionError
 
     def offsets(self, slope: Tensor, lower: Tensor, upper: Tensor, band: LinearRelaxation) -> tuple[Tensor, Tensor]:
-        """What the function less ``slope * z`` is at least and at most between, but for rounding.
+        """Return bounds of the function less ``slope * z`` over [lower, upper], without rounding.
 
-        ``band``: two parallel lines, of which it is taken.
+        They are derived from ``band``, two parallel lines.
         """
         apart = band.lower_slope - slope
         ends = apart * lower, apart * upper
@@ -465,7 +464,7 @@ class LeakyRelu(Activation):
         return torch.where(self.unstable(lower, upper), least.clamp(max=0.0), least), torch.maximum(*ends)
 
     def _chord(self, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
-        """Slope and offset of an upper line: the chord where open, the function itself elsewhere."""
+        """Return slope and offset of an upper line: the chord where unstable, the function itself elsewhere."""
         ends = self.function(lower), self.function(upper)
         slope = (ends[1] - ends[0]) / (upper - lower)
         low, high = torch.full_like(lower, self.alpha), torch.ones_like(lower)

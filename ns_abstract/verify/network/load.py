@@ -1,4 +1,4 @@
-"""Load a network from a file and compare it with the runtime of that file format."""
+"""Loads a network from a file and compares it with the runtime of that file format."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def load_network(
     whole_numbers: bool = False,
     shown: Callable[[tuple[int, ...]], Iterable[np.ndarray]] | None = None,
 ) -> Network:
-    """The network in an .onnx or .onnx.gz file, compared with onnxruntime.
+    """Return the network in an .onnx or .onnx.gz file, compared with onnxruntime.
 
     Args:
         path: The file.
@@ -44,11 +44,11 @@ def load_network(
         output: Name of the output that is read; None: the only one.
         picture, layout: Height and width of pictures, where the file leaves them free, "NCHW" or "NHWC".
         whole_numbers: Whether the input may be uint8, for whole numbers from 0 to 255.
-        shown: Inputs [1, *input_shape] to compare besides, for an input shape: what the network will be given.
+        shown: Returns further inputs [1, *input_shape] to compare, such as real pictures, for an input shape.
 
     Raises:
-        InputError: The file cannot be read, uses what is not supported, or computes something else elsewhere; or it
-            was replaced meanwhile.
+        InputError: The file cannot be read, uses what is not supported, computes something else elsewhere, or was
+            replaced meanwhile.
     """
     path = Path(path)
     file_size(path, "network")
@@ -95,7 +95,7 @@ def _replaced(path: Path) -> InputError:
 
 
 def read_onnx(path: Path, request: ReadRequest | None = None) -> Network:
-    """The network in an ONNX file, up to the output that is asked for; nothing in it is executed.
+    """Return the network in an ONNX file, up to the requested output; nothing in it is executed.
 
     Raises:
         InputError: The file cannot be read, or uses what is not supported; names node, operator and attribute.
@@ -106,7 +106,7 @@ def read_onnx(path: Path, request: ReadRequest | None = None) -> Network:
 
 
 def _instead(path: Path) -> str:
-    """What to do with a file that is not ONNX."""
+    """Return advice on a file that is not ONNX."""
     target = show(f"{path.stem}.onnx")
     if path.suffix.lower() == ".pt2":
         load = f"program = torch.export.load({show(path.name)})"
@@ -117,7 +117,7 @@ def _instead(path: Path) -> str:
 
 
 def onnx_session(path: Path) -> onnxruntime.InferenceSession:
-    """onnxruntime's session of a model on one thread; InputError if it refuses the file."""
+    """Return an onnxruntime session of a model on one thread; InputError if it refuses the file."""
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 4
     options.intra_op_num_threads = options.inter_op_num_threads = 1
@@ -130,9 +130,9 @@ def onnx_session(path: Path) -> onnxruntime.InferenceSession:
 
 
 def onnx_runner(path: Path, output: str = "", shape: Sequence[int] | None = None) -> Evaluate:
-    """Runs the model in onnxruntime on one image [1, ...] in the type that it wants; returns one output, flattened.
+    """Return a function that runs the model in onnxruntime on one image [1, ...] and returns one output, flattened.
 
-    A model without a batch is given the image alone; one of a fixed batch, as many copies.
+    A model without a batch gets the image alone; one of a fixed batch, as many copies.
 
     Args:
         path, output: The model, and the name of the output; empty: the first.

@@ -27,8 +27,8 @@ class _UncertainWinners(NamedTuple):
     """Pooling windows ``at`` whose largest input is not certain, and planes above them.
 
     Attributes:
-        top: [n] what may be above the winner.
-        candidates, near: Their numbers, and [n, K] how far these may be from their references.
+        top: [n] upper bounds of the inputs' excess over the winner.
+        candidates, near: Numbers of the inputs, and [n, K] their largest distances from their references.
     """
 
     at: tuple[Tensor, ...]
@@ -48,7 +48,7 @@ class MaxPoolPropagation:
         self.schedule, self.sharing = schedule, sharing
 
     def maximum(self, k: int, source: int, layer: MaxPool, x: NodeForm) -> NodeForm:
-        """Maxima over windows (N12); the reference is that of the number which the lower plane follows."""
+        """Return the form of maxima over windows (N12); its reference is that of the input the lower plane follows."""
         m, shape = self.intermediate.count, layer.shape
         interval = x.interval
         lower, upper = (layer.taps(v, -torch.inf) for v in interval)
@@ -127,7 +127,7 @@ class MaxPoolPropagation:
     def _exceeded(
         self, source: int, layer: MaxPool, x: NodeForm, interval: NodeInterval, winner: Tensor, where: Tensor
     ) -> _UncertainWinners | None:
-        """Planes above those windows of ``where`` [n, 3] in which something may be above the ``winner``; None: none."""
+        """Return upper planes of the windows ``where`` [n, 3] in which an input may exceed ``winner``; None: none."""
         cell, channel, window = where.T
         at = cell, channel, window
         places = layer.places[:, window].T
@@ -161,7 +161,7 @@ class MaxPoolPropagation:
         )
 
     def _apart(self, source: int, layer: MaxPool, where: Tensor, candidates: WindowInputs) -> Tensor:
-        """How far numbers of windows may be above one another, by forms and by rows where these help."""
+        """Return upper bounds of differences of windows' inputs, by forms, and by backward passes where these help."""
         apart = candidates.relaxation_gap()
         at, winner = np.arange(len(apart)), candidates.winner.numpy()
 
@@ -196,7 +196,7 @@ class MaxPoolPropagation:
     def _differences(
         self, source: int, layer: MaxPool, where: Int64, candidates: WindowInputs, pairs: Int64, apart: Tensor, cut: int
     ) -> int:
-        """Bound differences of (window, number, number) by rows, in ``apart``; how many second ones are never above."""
+        """Tighten ``apart`` for (window, input, input) pairs; return how many second inputs never exceed the first."""
         channels = self.network.shape(source)[0]
         extent = layer.steps.max(0) + 1
         step = max(1, ROWS_AT_ONCE // (16 * channels * int(np.prod(extent))))

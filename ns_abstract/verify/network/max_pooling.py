@@ -35,12 +35,12 @@ class MaxPool:
 
     @cached_property
     def steps(self) -> np.ndarray:
-        """[K, 2] int64 rows and columns of a window's numbers, from its first."""
+        """[K, 2] int64 rows and columns of a window's inputs, relative to its first."""
         return np.array([[i * self.dilation[0], j * self.dilation[1]] for i, j in np.ndindex(*self.kernel)])
 
     @cached_property
     def places(self) -> Tensor:
-        """[K, windows] int64 positions in a channel's map; -1 in the padding."""
+        """[K, windows] int64 flat positions of the inputs in a channel's map; -1 in the padding."""
         _, height, width = self.input_shapes[0]
         first = np.indices(self.shape[1:]).reshape(2, -1) * np.array(self.stride)[:, None]
         at = self.steps[:, :, None] + first - np.array(self.pads[:2])[:, None]
@@ -49,12 +49,12 @@ class MaxPool:
 
     @property
     def overlaps(self) -> int:
-        """Windows that one number may be in."""
+        """Largest number of windows that one input is in."""
         axes = zip(self.kernel, self.stride, self.dilation, strict=True)
         return int(np.prod([k if d > 1 else -(-k // s) for k, s, d in axes]))
 
     def taps(self, x: Tensor, padding: float) -> Tensor:
-        """[m, C, K, windows] the numbers of every window, for maps [m, C, H, W]."""
+        """Return the inputs [m, C, K, windows] of every window of maps [m, C, H, W]."""
         in_windows = x.flatten(2)[:, :, self.places.clamp(min=0)]
         return torch.where(self.places >= 0, in_windows, torch.full((), padding, dtype=x.dtype))
 
@@ -68,11 +68,11 @@ class WindowInputs(NamedTuple):
     """Bounds of the inputs of B pooling windows, ``z = reference + u``.
 
     Attributes:
-        inside: [B, K] False in the padding; nothing is said of those.
-        reference, middle, radius: [B, K]; u is ``middle + slopes p`` up to ``radius``.
+        inside: [B, K] False in the padding, where the other arrays mean nothing.
+        reference, middle, radius: [B, K]; u is ``middle + slopes p`` within ``radius``.
         slopes: [B, K, d].
         lower, upper: [B, K] of z.
-        winner: [B] the number that the lower plane follows.
+        winner: [B] number of the input that the lower plane follows.
     """
 
     inside: Tensor
@@ -86,12 +86,12 @@ class WindowInputs(NamedTuple):
 
     @property
     def size(self) -> Tensor:
-        """[B, K] at least as large as everything that is computed with a number."""
+        """Upper bounds [B, K] of all magnitudes that are computed with an input."""
         moves = self.middle.abs() + self.radius + self.slopes.abs().sum(2)
         return self.reference.abs() + moves + self.lower.abs() + self.upper.abs()
 
     def relaxation_gap(self) -> Tensor:
-        """[B, K, K]: number j is above number i by at most entry (j, i); 0 on the diagonal, far below in padding."""
+        """Upper bounds [B, K, K] of input j minus input i at (j, i); 0 on the diagonal, very negative in padding."""
 
         def less(v: Tensor) -> Tensor:
             return v[:, :, None] - v[:, None, :]
@@ -117,7 +117,7 @@ class WindowPlanes(NamedTuple):
 
 
 def upper_planes(window: WindowInputs, apart: Tensor) -> WindowPlanes:
-    """Return for every window the tried upper plane that is lowest in the middle (N12)."""
+    """Return for every window the candidate upper plane that is lowest in the middle (N12)."""
     at = torch.arange(len(apart))
     winner = window.winner
     middle = torch.where(window.inside, window.reference + window.middle, torch.zeros_like(window.middle))

@@ -24,14 +24,14 @@ _ROWS_OF_A_THREAD = 128
 
 
 def farther_steps(steps: int) -> int:
-    """Return how many steps the end of an unstable neuron that is farther from zero takes, for the nearer one's."""
+    """Return the optimisation steps for a neuron's end that is farther from zero, given those for the nearer one."""
     return steps // _FEWER_STEPS
 
 
 class NeuronBounds:
-    """Bounds chosen neurons of a node by backward passes of their own.
+    """Bounds chosen neurons of a node by backward passes that start at them.
 
-    ``spared`` counts products that rows have not taken because they ended on the way.
+    ``spared`` counts multiplications that rows saved by stopping early.
     """
 
     def __init__(
@@ -53,10 +53,10 @@ class NeuronBounds:
     def bounded(
         self, index: int, form: NodeForm, where: Int64, goal: NeuronTarget | None, decides: bool, cut: int = 0
     ) -> NodeForm:
-        """The form with bounds by rows of the numbers ``where`` [R, (cell, channel, row, column)] of node ``index``.
+        """Return the form with bounds of the numbers ``where`` [R, (cell, channel, row, column)] of node ``index``.
 
-        ``goal``: rows end where it is reached; ``decides``: the other side is not asked for where a sign is found out;
-        ``cut``: all rows end on the nodes up to it (N18).
+        ``goal``: rows stop where it is reached; ``decides``: no bound is computed on the other side once the sign is
+        known; ``cut``: all rows end at nodes up to it (N18).
         """
         item = self.network.shape(index)
         cell, flat = where[:, 0], np.ravel_multi_index(tuple(where[:, 1:].T), grid(item))
@@ -98,10 +98,10 @@ class NeuronBounds:
     def _climb(
         self, index: int, where: Int64, reference: Float64, bounds: BackwardBounds, decides: bool, farther: bool = False
     ) -> None:
-        """Raise and lower ends of ``bounds`` with lines of their own; planes stay.
+        """Tighten ``bounds`` with slopes optimised for each row; planes stay.
 
-        ``decides``: only of unstable neurons, and of these only the end that is nearer to zero, on which the gap of
-        their lines depends the most, or the ``farther`` one.
+        ``decides``: only unstable neurons, and only their end nearer to zero, on which the gap of their lines depends
+        most, or with ``farther`` the other one.
         """
         shape, ascent = grid(self.network.shape(index)), self.farther if farther else self.ascent
         for side, ends in ((1.0, bounds.lower), (-1.0, bounds.upper)):
@@ -121,7 +121,7 @@ class NeuronBounds:
     def _one_hot(
         self, index: int, where: Int64, sign: Float64, enough: StoppingCriterion | None, cut: int = 0
     ) -> BackwardBounds:
-        """Bounds of ``sign`` [R] times single numbers [R, (cell, channel, row, column)] of node ``index``."""
+        """Return bounds of ``sign`` [R] times single numbers [R, (cell, channel, row, column)] of node ``index``."""
         channels = grid(self.network.shape(index))[0]
         bounds = BackwardBounds.unknown(len(where), self.intermediate.d)
         step = min(self.sharing.most_rows, max(1, ROWS_AT_ONCE // (16 * channels)))

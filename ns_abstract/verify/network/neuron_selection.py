@@ -30,10 +30,10 @@ _STRAIGHT, _BENT = 2.0**-20, 2.0**-5
 
 
 class NeuronSelection:
-    """Chooses the neurons whose bounds are refined; plays no part in soundness.
+    """Chooses the neurons whose bounds are refined; a heuristic, on which soundness does not depend.
 
-    ``used``: by node [*shape], numbers that matter to anybody; None: all. ``unsure``: part of the latest ReLU's inputs
-    whose signs have not been found out.
+    ``used``: by node [*shape], numbers that matter to the outputs; None: all. ``unsure``: fraction of the latest ReLU's
+    inputs whose signs are open.
     """
 
     def __init__(
@@ -52,9 +52,9 @@ class NeuronSelection:
     def better(
         self, index: int, form: NodeForm, unstable: Tensor, apart: Tensor | None, layer: Activation | None = None
     ) -> NodeForm:
-        """The form of node ``index`` with better bounds of what is open before an activation or a product (None).
+        """Return the form of node ``index`` with the unstable neurons before an activation or product (None) refined.
 
-        ``apart``: how far lines or planes are apart, as a part of what is between; None where ``unstable`` says all.
+        ``apart``: the relaxation gap of each neuron; None where ``unstable`` says all.
         """
         form, unstable, apart = self.sharing.reuse_bounds(index, form, unstable, apart, layer)
         if self.network.depth[index] < 2:
@@ -71,9 +71,9 @@ class NeuronSelection:
         return self._tighten(index, form, unstable, isinstance(layer, LeakyRelu))
 
     def _bent(self, index: int, form: NodeForm, unstable: Tensor, apart: Tensor) -> tuple[NodeForm, Tensor]:
-        """The form with some numbers bounded by rows, and what is worth rows by what these have shown (N6).
+        """Refine some neurons of a curved activation; return the form and which others are worth refining (N6).
 
-        Lines that are close beside the form's width may be far apart beside what rows leave of it.
+        Lines that are close beside the form's width may be far apart beside the width after refining.
         """
         usable = torch.from_numpy(self.intermediate.usable).reshape(-1, *[1] * (unstable.ndim - 1))
         likely = (apart > _STRAIGHT) & ~unstable & usable
@@ -94,11 +94,11 @@ class NeuronSelection:
 
     @property
     def _usable(self) -> Tensor:
-        """[m, 1, 1, 1] cells that are not given up."""
+        """Cells [m, 1, 1, 1] that are not given up."""
         return torch.from_numpy(self.intermediate.usable).reshape(-1, 1, 1, 1)
 
     def _tighten(self, index: int, form: NodeForm, unstable: Tensor, decides: bool) -> NodeForm:
-        """Better bounds of the numbers of node ``index`` that are open; a sign may be all that is asked (N6)."""
+        """Return tighter bounds of the unstable numbers of node ``index``; the sign alone may suffice (N6)."""
         item = self.network.shape(index)
         shape = grid(item)
         unstable = unstable.reshape(self.intermediate.count, *shape) & self._usable
@@ -123,11 +123,11 @@ class NeuronSelection:
         return self.neuron_bounds.bounded(index, form, where, NeuronTarget() if decides else None, decides)
 
     def _renew(self, index: int, form: NodeForm, unstable: Tensor, layer: Activation | None) -> NodeForm:
-        """Better bounds of a deep network's node, within the work allowed; of closed numbers, too (N13, N17).
+        """Refine a deep network's node within the allowed work, stable neurons too where that pays (N13, N17).
 
-        Rows for numbers that are open are all that the lines ask for. But forms forget what neighbours share: behind
-        two or three layers they leave nearly everything open. Where they leave much open, rows bound all numbers
-        that matter further on, so that forms start again from there.
+        Relaxations only need the unstable neurons. But forms lose the correlation of neighbouring neurons: after two or
+        three layers nearly all neurons are unstable. There all neurons that matter later are refined, so that forms
+        start afresh.
         """
         shape = grid(self.network.shape(index))
         unstable = unstable.reshape(self.intermediate.count, *shape) & self._usable
@@ -172,7 +172,7 @@ class NeuronSelection:
         return bounds
 
     def _planned(self, index: int, form: NodeForm, unstable: Tensor, layer: Activation | None) -> NodeForm:
-        """Better bounds of all numbers of a node that matter, by rows as long as the network is worth (N18)."""
+        """Refine all numbers of a node that matter, along routes as long as the network is worth (N18)."""
         shape = grid(self.network.shape(index))
         every = torch.ones((self.intermediate.count, *shape), dtype=torch.bool)
         matters = self._usable & every
@@ -198,7 +198,7 @@ class NeuronSelection:
         return self.neuron_bounds.bounded(index, form, chosen, None, True, best.cut)
 
     def _goal(self, form: NodeForm, products: float, layer: Activation | None) -> NeuronTarget | None:
-        """What rows for all numbers of a node, which take so many products to the image, are to find out (N17)."""
+        """Return the target of rows for all numbers of a node, given their multiplications to the image (N17)."""
         part = self.schedule.suffices(products)
         if not part:
             return None

@@ -81,7 +81,7 @@ def _binary(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
 
 
 def intervals_of(constant: EnclosedConstant | None, shape: Shape | None = None) -> ConstantIntervals | None:
-    """Doubts of a constant, spread to an item or given the shape of weights."""
+    """Return the errors of an inexact constant, broadcast to an item or in the shape of weights."""
     if constant is None:
         return None
     intervals = constant.doubts
@@ -98,7 +98,7 @@ def operand(r: OnnxReader, node: onnx.NodeProto, position: int, doubtful: bool =
 
 
 def broadcast(b: CompositeBuilder, value: TensorValue, shape: Sequence[int]) -> tuple[int, Shape]:
-    """The value repeated to what a constant of ``shape`` makes of it."""
+    """Add the value broadcast against a constant of ``shape``; return its node and shape."""
     try:
         whole = np.broadcast_shapes(value.whole, tuple(shape))
     except ValueError:
@@ -107,7 +107,7 @@ def broadcast(b: CompositeBuilder, value: TensorValue, shape: Sequence[int]) -> 
 
 
 def _to(b: CompositeBuilder, value: TensorValue, whole: Shape) -> int:
-    """The value repeated to a shape, as an item of what will have that shape."""
+    """Add the value broadcast to ``whole``; return its node."""
     if value.whole == tuple(whole):
         return value.index
     grown = (1,) * (len(whole) - len(value.whole)) + value.whole
@@ -117,7 +117,7 @@ def _to(b: CompositeBuilder, value: TensorValue, whole: Shape) -> int:
 
 
 def _together(*shapes: Shape) -> Shape:
-    """The shape that tensors are repeated to."""
+    """Return the shape to which tensors broadcast."""
     try:
         return np.broadcast_shapes(*shapes)
     except ValueError:

@@ -1,4 +1,4 @@
-"""Choices in an ONNX graph that are functions without jumps: thresholds and shrinking, as exporters spell these out."""
+"""Rewrites `Where` nodes that are continuous functions: thresholds and shrinking, as exporters spell them out."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ _Number = Callable[[str], float | None]
 
 
 def without_choices(graph: onnx.GraphProto) -> list[onnx.NodeProto]:
-    """The nodes of a graph, with `Where` replaced where it equals a maximum, minimum, ReLU or soft threshold.
+    """Return the nodes of a graph, with `Where` replaced where it equals a maximum, minimum, ReLU or soft threshold.
 
-    The replacement gives the same float32 number for every input: both branches meet at the number that is compared.
+    The replacement returns the same float32 number for every input: both branches meet where the condition changes.
     """
     made = {name: node for node in graph.node for name in node.output if name}
     stored = {tensor.name: tensor for tensor in graph.initializer}
@@ -35,7 +35,7 @@ def without_choices(graph: onnx.GraphProto) -> list[onnx.NodeProto]:
 
 
 def _replaced(node: onnx.NodeProto, made: _Maker, number: _Number) -> list[onnx.NodeProto]:
-    """Nodes that give what a `Where` gives; none if it is none of the known ones."""
+    """Return nodes that are equivalent to a `Where`; none if it is of no known kind."""
     compared = made(node.input[0]) if node.op_type == "Where" and len(node.input) == 3 else None
     if compared is None or compared.op_type not in _COMPARED or len(compared.input) != 2:
         return []
@@ -64,7 +64,7 @@ def _replaced(node: onnx.NodeProto, made: _Maker, number: _Number) -> list[onnx.
 
 
 def _shrunk(x: str, above: str, below: str, limit: float, made: _Maker, number: _Number) -> str | None:
-    """The value v, where ``x`` is |v|, ``above`` is v less the limit with v's sign, and ``below`` is 0."""
+    """Return v, if ``x`` is |v|, ``above`` is v less the limit with v's sign, and ``below`` is 0; else None."""
     size, rest, zero = made(x), made(above), made(below)
     if size is None or size.op_type != "Abs" or limit < 0.0 or rest is None or rest.op_type != "Sub":
         return None
@@ -79,7 +79,7 @@ def _shrunk(x: str, above: str, below: str, limit: float, made: _Maker, number: 
 
 
 def _shifted(name: str, made: _Maker, number: _Number) -> tuple[str, float] | None:
-    """The value and the number whose sum a name stands for."""
+    """Return the value and the number of whose sum a name is the result; else None."""
     node = made(name)
     if node is None or node.op_type not in ("Add", "Sub") or len(node.input) != 2:
         return None

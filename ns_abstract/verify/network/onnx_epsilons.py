@@ -1,4 +1,4 @@
-"""Norms spelled out whose epsilon onnxruntime does not find: it takes 1e-5 for it (N27)."""
+"""Refuses norms whose epsilon onnxruntime would replace by 1e-5 (docs/dev/design.md, N27)."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from ns_abstract.io.errors import InputError
 def refuse_lost_epsilons(graph: onnx.GraphProto, path: Path) -> None:
     """Refuse a root of a mean plus a constant that onnxruntime fuses into a norm with another epsilon (N27).
 
-    It looks for the constant behind the mean, and among the values that no caller may replace.
+    onnxruntime only finds the constant as the second operand, and among the values that no caller may replace.
 
     Raises:
         InputError: The file has such a root.

@@ -1,4 +1,4 @@
-"""Fold constants of an ONNX graph (shapes, masks, indices) with the reference operators of `onnx`."""
+"""Folds constants of an ONNX graph (shapes, masks, indices) with the reference operators of `onnx`."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ _SPREAD = (COMPARES - {"Not"}) | {"Add", "Div", "Expand", "Max", "Min", "Mod", "
 
 
 def _size(kind: str, node: onnx.NodeProto, values: Sequence[np.ndarray]) -> float:
-    """Numbers of the result, at most."""
+    """Return an upper bound of the count of numbers of a node's result."""
     if kind in _SPREAD:
         shapes = [v.shape for v in values]
         if kind == "Expand":
@@ -90,10 +90,10 @@ def _refuse_unlike(node: onnx.NodeProto, values: Sequence[np.ndarray]) -> None:
 
 
 def fold(node: onnx.NodeProto, values: Sequence[np.ndarray | None], opset: int) -> list[np.ndarray]:
-    """The results of a node of constants (None: left out).
+    """Return the results of a node of constants (None: an absent input).
 
     Raises:
-        InputError: They would be too large, or cannot be computed.
+        InputError: The results would be too large, or cannot be computed.
     """
     from onnx.reference import ReferenceEvaluator
 

@@ -1,4 +1,4 @@
-"""The graph in an ONNX file, its constants and its attributes. Nothing in the file is executed."""
+"""Reads the graph in an ONNX file, its constants and its attributes; nothing in the file is executed."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ _BY_ITEM = frozenset(
 
 
 class ReadRequest(NamedTuple):
-    """Which output of a file is read, and how its input is shaped.
+    """The requested output of a file, and the shape of its input.
 
     Attributes:
         output: Name of the output; None: the only one.
@@ -127,24 +127,24 @@ _MOVES = frozenset(("Flatten", "Identity", "Reshape", "Squeeze", "Transpose", "U
 
 
 class TensorValue(NamedTuple):
-    """A tensor of the graph: a node of the network, and the tensor's shape in the file for a batch of 1."""
+    """A tensor of the graph: its node of the network, and its shape in the file for a batch of 1."""
 
     index: int
     whole: Shape
 
     @property
     def item(self) -> Shape:
-        """The shape without a batch; where the file mixed the batch in, all of it."""
+        """The shape without the batch axis; the whole shape where the file has merged the batch axis with others."""
         return self.whole[1:] if len(self.whole) > 1 and self.whole[0] == 1 else self.whole
 
     @property
     def batched(self) -> int:
-        """Axes before those of the item: 1 or 0."""
+        """Number of batch axes: 1, or 0 where the file has merged the batch axis with others."""
         return len(self.whole) - len(self.item)
 
 
 class OnnxReader:
-    """Turns the nodes of one ONNX graph into layers."""
+    """Converts the nodes of one ONNX graph to layers."""
 
     def __init__(
         self, path: Path, graph: onnx.GraphProto, opset: int, rules: dict[str, Rule], request: ReadRequest
@@ -219,7 +219,7 @@ class OnnxReader:
         return value.name, TensorValue(0, (1, *sizes[1:]))
 
     def _check_levels(self, name: str, field: str, request: ReadRequest) -> None:
-        """Refuse a uint8 input that is computed with before it is made a float, or that is given no whole numbers."""
+        """Refuse a uint8 input that is used before it is cast to float, or that is not given whole numbers."""
         if not request.whole_numbers:
             fix = 'for pictures: write "range": [0, 255] alone in preprocess; else export with a float input'
             raise InputError("is a uint8 tensor", file=self.path, field=field, fix=fix)
@@ -233,7 +233,7 @@ class OnnxReader:
             integers.update(node.output)
 
     def network(self) -> Network:
-        """The network up to the chosen output; nodes that it does not depend on are not read."""
+        """Return the network up to the chosen output; nodes that it does not depend on are not read."""
         needed, nodes = {self.output}, without_choices(self.graph)
         for node in reversed(nodes):
             if needed.intersection(node.output):
@@ -263,7 +263,7 @@ class OnnxReader:
         return self.builder.network(self.values[name].index, name, self.whole_numbers, self.stored.files)
 
     def _chosen(self, name: str | None) -> str:
-        """The name of the output that is read: the one asked for, or the only one of scores.
+        """Return the name of the output to read: the requested one, or the only one of scores.
 
         Outputs are never joined: a label would count through all of them. Masks and indices are no scores.
         """
@@ -325,7 +325,7 @@ class OnnxReader:
     # what rules use
 
     def value(self, node: onnx.NodeProto, position: int = 0) -> TensorValue:
-        """What makes input ``position``, which must depend on the image."""
+        """Return the tensor at input ``position``, which must depend on the image."""
         name = node.input[position] if position < len(node.input) else ""
         if name in self.dropped and node.op_type != "Softmax":
             raise InputError("reads what a mask has set to minus infinity", fix="mask right before a Softmax")
@@ -338,18 +338,18 @@ class OnnxReader:
         raise InputError(f"input {position} ({name!r}) is not known", fix="export the network again")
 
     def moves(self, node: onnx.NodeProto, position: int) -> bool:
-        """Whether an input depends on the image."""
+        """Return whether an input depends on the image."""
         return position < len(node.input) and node.input[position] in self.values
 
     def source(self, node: onnx.NodeProto, position: int = 0) -> int:
-        """Index of the node that makes input ``position``, a batch of items."""
+        """Return the network's node at input ``position``, which must be a batch of items."""
         value = self.value(node, position)
         if not value.batched:
             raise InputError(f"input of shape {list(value.whole)} mixes the batch", fix="keep the batch first")
         return value.index
 
     def constant(self, node: onnx.NodeProto, position: int, default: Any = None, doubtful: bool = False) -> Any:
-        """Constant input ``position``; ``default`` if it is absent. ``doubtful``: the caller charges `doubts`."""
+        """Return the constant input ``position``, or ``default``. ``doubtful``: the caller charges `doubts`."""
         name = node.input[position] if position < len(node.input) else ""
         if not name:
             return default
@@ -364,7 +364,7 @@ class OnnxReader:
         return constant
 
     def doubts(self, node: onnx.NodeProto, position: int) -> EnclosedConstant | None:
-        """Enclosures of a constant input that rounding changes."""
+        """Return the enclosures of a constant input that rounding changes; None if it is exact."""
         return self.enclosed.get(node.input[position]) if position < len(node.input) else None
 
     def weight(self, node: onnx.NodeProto, position: int, doubtful: bool = False) -> np.ndarray:
@@ -374,7 +374,7 @@ class OnnxReader:
         return constant
 
     def result(self, node: onnx.NodeProto, index: int, whole: Shape | None = None, output: int = 0) -> None:
-        """Name an output of the node: items of node ``index``, of shape ``whole`` for a batch of 1."""
+        """Set an output of the node to items of network node ``index``, of shape ``whole`` for a batch of 1."""
         if whole is None:
             if any(node.output[1:]):
                 raise InputError("has several outputs", fix="only the first is supported")
@@ -387,13 +387,13 @@ class OnnxReader:
         self.values[node.output[output]] = value
 
     def fold(self, node: onnx.NodeProto, *values: np.ndarray) -> None:
-        """Name the node's constant outputs."""
+        """Set the node's outputs to constants."""
         for name, value in zip((n for n in node.output if n), values, strict=False):
             self.constants[name] = value
 
 
 class Attributes:
-    """A node's attributes; every one must be read or the node is refused."""
+    """A node's attributes; a node with an attribute that was not read is refused."""
 
     def __init__(self, reader: OnnxReader, node: onnx.NodeProto) -> None:
         self.reader, self.node = reader, node
@@ -417,13 +417,13 @@ class Attributes:
         return tuple(int(v) for v in value)
 
     def only(self, name: str, *allowed: Any) -> None:
-        """The attribute may be absent or one of ``allowed``."""
+        """Refuse an attribute that is none of ``allowed``; it may be absent."""
         value = self.get(name)
         if value is not None and value not in allowed:
             raise InputError(f"attribute {name} = {value} is not supported", fix=f"only {allowed[0]} is")
 
     def ignore(self, *names: str) -> None:
-        """Attributes that do not matter."""
+        """Accept attributes that change nothing."""
         self.asked.update(names)
 
     def done(self) -> None:
@@ -438,7 +438,7 @@ def _named(shapes: Mapping[str, Sequence[object]]) -> str:
 
 
 def _outer_names(node: onnx.NodeProto) -> set[str]:
-    """Names that the graphs inside a node may read from around it."""
+    """Return names that the graphs inside a node may read from outside."""
     names: set[str] = set()
     for attribute in node.attribute:
         for graph in (*attribute.graphs, *([attribute.g] if attribute.HasField("g") else [])):

@@ -1,4 +1,4 @@
-"""Quantised ONNX files: weights stored as integers, and values that are rounded to steps on the way (N25)."""
+"""Quantised ONNX files: integer weights, and values that are rounded to steps (docs/dev/design.md, N25)."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ _RANGES = {
 
 
 def dequantize(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
-    """``(q - zero) scale``: of constants a constant, of values what their `quantize` has left."""
+    """Read DequantizeLinear, ``(q - zero) scale``, of constants, and of values that `quantize` has read."""
     axis = int(a.get("axis", 1))
     a.only("block_size", 0)
     a.only("output_dtype", onnx.TensorProto.FLOAT, 0)
@@ -63,7 +63,7 @@ def dequantize(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
 
 
 def _refuse_rounded_constants(r: OnnxReader, node: onnx.NodeProto) -> None:
-    """Refuse a product of steps with float weights or a float bias where its result is rounded to steps, too.
+    """Refuse a product of quantised values with float weights or bias whose result is quantised, too.
 
     onnxruntime then stores such weights in 8 bits, and rounds the bias to multiples of both scales' product (N25).
     """
@@ -99,9 +99,9 @@ def _refuse_rounded_constants(r: OnnxReader, node: onnx.NodeProto) -> None:
 
 
 def _refuse_other_scales(r: OnnxReader, node: onnx.NodeProto, product: onnx.NodeProto, bias: str) -> None:
-    """Refuse a bias of 32 bits whose scale is not that of steps times weights: onnxruntime takes that one (N25).
+    """Refuse a 32-bit bias whose scale is not the product of both scales, which onnxruntime uses (N25).
 
-    It takes alpha for a part of it, too.
+    onnxruntime includes alpha in that product.
     """
     makers = {name: maker for maker in r.graph.node for name in maker.output}
 
@@ -133,10 +133,10 @@ def _refuse_other_scales(r: OnnxReader, node: onnx.NodeProto, product: onnx.Node
 
 
 def _refuse_products(r: OnnxReader, node: onnx.NodeProto) -> None:
-    """Refuse a matrix of stored bytes that multiplies values in float32: onnxruntime rounds these to 8 bits, too.
+    """Refuse a matrix of stored bytes times float32 values: onnxruntime rounds these to 8 bits, too.
 
-    It does so for MatMul, and for Gemm without transB (N25). Where the values are rounded to steps themselves, it
-    multiplies what the file says.
+    It does so for MatMul, and for Gemm without transB (N25). If the values are quantised themselves, it follows the
+    file.
     """
     names, stepped = set(node.output), set[str]()
     for reader in without_choices(r.graph):
@@ -156,7 +156,7 @@ def _refuse_products(r: OnnxReader, node: onnx.NodeProto) -> None:
 
 
 def _refuse_tables(r: OnnxReader, node: onnx.NodeProto) -> None:
-    """Refuse a Softmax between steps of 8 bits: onnxruntime takes its exponentials from a table of integers (N25)."""
+    """Refuse a Softmax between 8-bit values: onnxruntime takes its exponentials from an integer table (N25)."""
     makers = {name: maker for maker in r.graph.node for name in maker.output}
 
     def behind(name: str) -> onnx.NodeProto | None:
@@ -175,7 +175,7 @@ def _refuse_tables(r: OnnxReader, node: onnx.NodeProto) -> None:
 
 
 def quantize(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
-    """A value rounded to steps; what reads it must dequantise it."""
+    """Read QuantizeLinear, which rounds a value to steps; its readers must dequantise it."""
     a.ignore("axis", "saturate")
     a.only("block_size", 0)
     x, scale, zero = r.value(node), r.weight(node, 1), r.constant(node, 2)
@@ -202,7 +202,7 @@ def _scalar(scale: np.ndarray) -> float:
 
 
 def _along(value: np.ndarray, rank: int, axis: int) -> np.ndarray:
-    """A number for each place along an axis, spread to ``rank`` axes; a single one as it is."""
+    """Return one number for each place along an axis, broadcastable to ``rank`` axes; a single number as it is."""
     if value.size == 1:
         return value.reshape(())
     if value.ndim != 1 or not -rank <= axis < rank:

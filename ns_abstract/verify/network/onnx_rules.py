@@ -22,7 +22,7 @@ from ns_abstract.verify.network.scalar_function import ScalarFunction
 
 
 def _unary(make: Callable[[CompositeBuilder, int, Attributes], int]) -> Rule:
-    """A function of every number, whatever the shape."""
+    """Return the rule of an elementwise function."""
 
     def rule(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
         x = r.value(node)

@@ -1,4 +1,4 @@
-"""Rules of ONNX operators that rearrange, choose, repeat or interpolate numbers."""
+"""Rules of ONNX operators that rearrange, select, repeat or interpolate numbers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from ns_abstract.verify.network.onnx_graph import Attributes, OnnxReader, Rule, 
 
 
 def _places(r: OnnxReader, value: TensorValue) -> np.ndarray:
-    """Flat positions in the shape that the file sees."""
+    """Return flat positions of the value's numbers, in its shape in the file."""
     return r.builder.positions(value.index).reshape(value.whole)
 
 
@@ -64,7 +64,7 @@ def _reshape(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
 
 
 def axes_of(r: OnnxReader, node: onnx.NodeProto, a: Attributes, rank: int) -> list[int] | None:
-    """Axes of the shape that the file sees, from an attribute or the second input."""
+    """Return axes of the shape in the file, from an attribute or the second input; None if neither is there."""
     axes = a.get("axes")
     if axes is None:
         axes = r.constant(node, 1)
@@ -176,7 +176,7 @@ def _slice(r: OnnxReader, node: onnx.NodeProto, a: Attributes) -> None:
 
 
 def _part(r: OnnxReader, node: onnx.NodeProto, x: TensorValue, chosen: Sequence[slice], output: int = 0) -> None:
-    """Part of an item."""
+    """Set a node's output to a slice of an item."""
     if not x.batched:
         _gathered(r, node, x, _places(r, x)[tuple(chosen)], output)
         return

@@ -1,4 +1,4 @@
-"""Read an ONNX file's messages and tensors after checking their sizes."""
+"""Reads an ONNX file's messages and tensors after checking their sizes."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ _FOUR_BITS, _OF_FOUR_BITS = (_T.INT4, _T.UINT4), ("DequantizeLinear", "Cast")
 
 
 def parse_model(path: Path) -> onnx.ModelProto:
-    """The messages of an ONNX file, without data that lie in other files.
+    """Return the messages of an ONNX file, without data in other files.
 
     Raises:
-        InputError: The file cannot be read, or is too large for the memory that is free.
+        InputError: The file cannot be read, or is too large for the free memory.
     """
     size = file_size(path, "network")
     if size > _LARGEST_FILE or (size > _LARGE and path.stat().st_blocks * 512 * _HOLES < size):
@@ -83,7 +83,7 @@ def number_type(data_type: int) -> np.dtype:
 
 
 def _check_types(graph: onnx.GraphProto, path: Path) -> None:
-    """Refuse constants of types that numpy does not hold as they are, but for the numbers of four bits."""
+    """Refuse constants of types that numpy does not represent, except numbers of four bits."""
     four = {tensor.name for tensor in graph.initializer if tensor.data_type in _FOUR_BITS}
     for node in graph.node:
         field = f"node {node.name or ', '.join(node.output)} ({node.op_type})"
@@ -96,7 +96,7 @@ def _check_types(graph: onnx.GraphProto, path: Path) -> None:
 
 
 def _check_attributes(model: onnx.ModelProto, path: Path) -> None:
-    """Refuse attributes that are given twice, of which programs take one or the other, or that no function gives."""
+    """Refuse attributes that occur twice, of which programs take either, or that refer to no function's attribute."""
     for body in (model.graph, *model.functions):
         for node in body.node:
             names = Counter(attribute.name for attribute in node.attribute)
@@ -109,10 +109,10 @@ def _check_attributes(model: onnx.ModelProto, path: Path) -> None:
 
 
 def unpacked_model(path: Path) -> bytes:
-    """The contents of an .onnx.gz file.
+    """Return the contents of an .onnx.gz file.
 
     Raises:
-        InputError: It is damaged, or unpacks to more than the format's limit or the memory that is free.
+        InputError: It is damaged, or unpacks to more than the format's limit or the free memory.
     """
     parts, total = [], 0
     for part in unpacked(path, _LARGEST_FILE):
@@ -124,7 +124,7 @@ def unpacked_model(path: Path) -> bytes:
 
 @contextmanager
 def _at(path: Path, field: str) -> Iterator[None]:
-    """Say where an error is."""
+    """Add file and field to an error inside the block."""
     try:
         yield
     except InputError as error:
@@ -132,7 +132,7 @@ def _at(path: Path, field: str) -> Iterator[None]:
 
 
 def _inlined(model: onnx.ModelProto, path: Path) -> onnx.ModelProto:
-    """The model with the nodes of its local functions in place of their calls."""
+    """Return the model with calls of its local functions replaced by their nodes."""
     for function in model.functions:
         # runtimes call their own operator, or the function: the format leaves it to them
         if any(function.domain == own or (own and function.domain.startswith(f"{own}.")) for own in _OWN):
@@ -164,7 +164,7 @@ def _inlined(model: onnx.ModelProto, path: Path) -> onnx.ModelProto:
 
 
 def _give_defaults(model: onnx.ModelProto) -> None:
-    """Write the functions' default attributes to the calls that leave them out: the inliner forgets these."""
+    """Add the functions' default attributes to calls without them: the inliner forgets these."""
     defaults = {(f.domain, f.name, f.overload): f.attribute_proto for f in model.functions}
     for body in (model.graph, *model.functions):
         for node in body.node:
@@ -187,7 +187,7 @@ class StoredTensors:
         return tuple(self._sizes)
 
     def array(self, tensor: onnx.TensorProto, field: str) -> np.ndarray:
-        """A stored constant; InputError if it claims more than is stored, or cannot be used."""
+        """Return a stored constant; InputError if it claims more than is stored, or cannot be used."""
         count = 1
         for size in tensor.dims:
             if size < 0:
@@ -214,7 +214,7 @@ class StoredTensors:
         return array
 
     def _external(self, tensor: onnx.TensorProto, field: str, kind: np.dtype, count: int) -> np.ndarray:
-        """A constant whose data stand in a file that must lie beside the model."""
+        """Return a constant whose data are in a file, which must lie beside the model."""
         where = {entry.key: entry.value for entry in tensor.external_data}
         folder = self.path.resolve().parent
         location = where.get("location", "")

@@ -1,4 +1,4 @@
-"""Rules of ONNX operators on windows: convolutions and pools."""
+"""Rules of ONNX operators on windows: convolution and pooling."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _COUNTED_PADS = 19
 
 
 def _ints(a: Attributes, name: str, line: bool, default: int | None = None, beside: int = 1) -> Any:
-    """Two numbers of a window operator; of one along a line ``beside`` is the other."""
+    """Return two numbers of a window operator; for an operator on a line the second one is ``beside``."""
     values = a.ints(name, 1 if line else 2, default)
     return (*values, beside) if line and values is not None else values
 
@@ -25,7 +25,7 @@ def _ints(a: Attributes, name: str, line: bool, default: int | None = None, besi
 def _pads(
     a: Attributes, size: Sequence[int], kernel: Any, stride: Any, dilation: Any, line: bool
 ) -> tuple[int, int, int, int]:
-    """Pads top, left, bottom, right of a window operator."""
+    """Return the pads top, left, bottom, right of a window operator."""
     auto = a.get("auto_pad", "NOTSET")
     explicit = a.ints("pads", 2 if line else 4, 0)
     assert explicit is not None
@@ -46,7 +46,7 @@ def _pads(
 
 
 def _map(r: OnnxReader, x: int) -> tuple[int, bool]:
-    """An item as a map of rows and columns; one of channels along a line [C, L] is a map [C, L, 1]."""
+    """Return the node as a map of rows and columns, and whether it was a line [C, L], which becomes [C, L, 1]."""
     shape = r.builder.shape(x)
     if len(shape) == 2:
         return r.builder.reshape(x, (*shape, 1)), True
@@ -54,7 +54,7 @@ def _map(r: OnnxReader, x: int) -> tuple[int, bool]:
 
 
 def _mapped(r: OnnxReader, node: onnx.NodeProto, index: int, line: bool) -> None:
-    """Name the result of a window operator."""
+    """Set the output of a window operator, as a line again if its input was one."""
     shape = r.builder.shape(index)
     r.result(node, r.builder.reshape(index, shape[:2]) if line else index)
 

@@ -16,11 +16,11 @@ from ns_abstract.verify.network.row_ascent import RowAscent
 
 
 class ShiftedRows(NamedTuple):
-    """Rows on the outputs' distance from their reference.
+    """Rows on the outputs' distances from their reference.
 
     Attributes:
-        stored: [k, n] of the type of rows.
-        missing, offset: [m, k] what the numbers that are not stored may be, and rounding; the offset.
+        stored: [k, n] in the rows' type.
+        missing, offset: [m, k] errors of numbers that the stored rows round, and the offset.
     """
 
     stored: Floats
@@ -28,19 +28,19 @@ class ShiftedRows(NamedTuple):
     offset: Float64
 
     def room(self, plane: Float64) -> Float64:
-        """[m, k] charged for sums of ``plane`` [m, k, d + 1] and the offset."""
+        """Return the charge [m, k] for sums of ``plane`` [m, k, d + 1] and the offset."""
         return OWN_LINE * (np.abs(plane).sum(-1) + np.abs(self.offset) + self.missing) + self.missing
 
 
 class OutputRows:
-    """Bounds linear functions of the outputs once all intermediate bounds are there."""
+    """Bounds linear functions of the outputs once all intermediate bounds are computed."""
 
     def __init__(self, intermediate: IntermediateBounds, backward: BackwardPass, ascent: RowAscent) -> None:
         self.intermediate, self.network, self.backward = intermediate, intermediate.network, backward
         self.ascent = ascent
 
     def shifted(self, last: NodeForm, rows: Any, offset: Float64) -> ShiftedRows:
-        """``rows @ y + offset`` [k] or [m, k] as rows on the distance from the reference of ``last``."""
+        """Return ``rows @ y + offset`` [k] or [m, k] as rows on the distance from the reference of ``last``."""
         dense = np.asarray(rows.toarray() if hasattr(rows, "toarray") else rows, np.float64)
         stored = dense.astype(self.intermediate.relaxations[-1].number)
         size = last.width.reshape(self.intermediate.count, -1).numpy()
@@ -50,7 +50,7 @@ class OutputRows:
         return ShiftedRows(stored, missing, reference @ dense.T + offset)
 
     def bound(self, last: NodeForm, rows: Any, offset: Float64) -> OutputBounds:
-        """Bounds of ``rows @ y + offset`` in every cell, y as ``last`` says."""
+        """Return bounds of ``rows @ y + offset`` in every cell, with y enclosed by ``last``."""
         index = len(self.network.nodes)
         m, k = self.intermediate.count, offset.shape[-1]
         plane, lower = np.zeros((m, k, self.intermediate.d + 1)), np.zeros((m, k))
@@ -80,7 +80,7 @@ class OutputRows:
 
 
 def windows(rows: np.ndarray) -> list[tuple[int, int, int, int, Int64]]:
-    """Windows (top, left, height, width) of rows [k, C, H, W] that are zero elsewhere, and which rows they hold."""
+    """Return windows (top, left, height, width) outside of which rows [k, C, H, W] are zero, with their rows."""
     used = (rows != 0.0).any(axis=1)
     groups: dict[tuple[int, int, int, int], list[int]] = {}
     for k, mask in enumerate(used):

@@ -24,19 +24,20 @@ Phases = Mapping[int, NDArray[np.int8]]
 
 @dataclass(frozen=True)
 class TreeTuning:
-    """Preferences of branch and bound; they decide about time, and a proof needs a bound.
+    """Preferences of branch and bound; they change its time, and soundness does not depend on them.
 
     Attributes:
-        together: Rows that are bounded together.
-        root_steps, steps, last_steps: Steps towards better slopes and multipliers, of the whole cell, of a branch, and
-            of one without unstable neurons.
-        first: The first step's size.
-        multipliers: That of multipliers, in sizes of coefficients: with steps as for slopes they hardly move in so few.
-        tried: Neurons that cost a row most, of which one is chosen.
-        bounded: Of those whose halves were bounded often before: so many, the best by what they gained, are again.
+        together: Rows that are bounded at a time.
+        root_steps, steps, last_steps: Optimisation steps of slopes and multipliers, for the whole cell, a branch, and a
+            branch without unstable neurons.
+        first: Size of the first step.
+        multipliers: Size of the first step of multipliers, in magnitudes of coefficients: with that of slopes they would
+            hardly move in few steps.
+        tried: Costliest neurons of a row, of which one is split.
+        bounded: Of the neurons that were split often before, the number of best ones whose halves are bounded again.
         often: How often.
-        better_half: What the better half counts beside the worse one.
-        waiting: Part of the memory that branches may take that wait; past it the strongest come first.
+        better_half: Weight of the better half's gain beside the worse one's.
+        waiting: Fraction of the branches' memory that waiting branches may take; beyond it the strongest are next.
     """
 
     together: int = 128
@@ -58,7 +59,7 @@ _OBJECTS, _BESIDE = 4096, 4.0
 
 
 class TreeResult(NamedTuple):
-    """Whether all branches were proved, how many were bounded, and the weakest bound: of what is left, or of all."""
+    """Whether all branches were proved, the number bounded, and the weakest bound, of open branches or of all."""
 
     proved: bool
     branches: int
@@ -70,11 +71,11 @@ class _Branch:
     """A branch.
 
     Attributes:
-        phases: By activation: what is assumed of its unstable neurons [U].
+        phases: By activation: the assumed phases of its unstable neurons [U].
         lower: [g] bounds of the group's rows.
-        parameters: By activation: [g, U] what its rows have chosen.
+        parameters: By activation: [g, U] optimised slopes of its rows.
         multipliers: By activation [g, U].
-        splits: The activation and the number of neurons that may be assumed next; empty: none is unstable.
+        splits: Neurons to split next, as (activation, number); empty: none is unstable.
     """
 
     phases: Phases
@@ -85,12 +86,12 @@ class _Branch:
 
     @property
     def bytes(self) -> int:
-        """About the memory that it takes."""
+        """The estimated bytes that it takes."""
         chosen = [parameter for own in self.parameters.values() for parameter in own]
         return _OBJECTS + sum(v.nbytes for v in (*self.phases.values(), *self.multipliers.values(), *chosen))
 
     def halves(self, split: tuple[int, int]) -> list[_Branch]:
-        """The same with either phase of a neuron assumed besides."""
+        """Return the two branches with either phase of a further neuron assumed."""
         node, at = split
         children = []
         for side in (1, -1):
@@ -101,7 +102,7 @@ class _Branch:
 
 
 class _Half(NamedTuple):
-    """A branch by its number, and a neuron whose phase, 1 or -1, is assumed besides: its activation and its number."""
+    """A branch's number, and a neuron (activation and number) whose phase, 1 or -1, is assumed in addition."""
 
     branch: int
     split: tuple[int, int]
@@ -109,7 +110,7 @@ class _Half(NamedTuple):
 
 
 class SplitGains:
-    """What assuming the phase of a neuron gained in the branches in which both of its halves were bounded.
+    """Records the gains of splitting a neuron, from branches in which both of its halves were bounded.
 
     Args:
         bounded, often: See `TreeTuning`.
@@ -120,12 +121,12 @@ class SplitGains:
         self._noted: dict[tuple[int, int], tuple[float, int]] = {}
 
     def note(self, split: tuple[int, int], gain: float) -> None:
-        """Halves of ``split`` gained so large a part of what their branch missed."""
+        """Record the gain of ``split``, as a fraction of the branch's missing margin."""
         total, count = self._noted.get(split, (0.0, 0))
         self._noted[split] = total + gain, count + 1
 
     def hopeful(self, splits: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-        """Those of ``splits`` that were not noted often, and the best of the others by their mean gain."""
+        """Return the ``splits`` with few records, and the best of the others by their mean gain."""
         means = {}
         for split in splits:
             total, count = self._noted.get(split, (0.0, 0))
@@ -136,12 +137,12 @@ class SplitGains:
 
 
 class PhaseTree:
-    """Proves that some row of a group is positive, by assuming phases of unstable ReLUs.
+    """Proves that some row of a group is positive, by branching on phases of unstable ReLUs.
 
-    Intermediate bounds are those of the cell in every branch: they hold in it, too.
+    Every branch uses the cell's intermediate bounds, which hold in it, too.
 
     Args:
-        cells: Bounds of one cell, made to choose slopes.
+        cells: Bounds of one cell, with slopes to be optimised.
         rows, offset: Of the outputs, as in `ns_abstract.verify.network.bound_outputs`.
         tuning: Preferences.
     """
@@ -161,11 +162,11 @@ class PhaseTree:
         self._least = np.inf
 
     def prove(self, group: Sequence[int], most: int) -> TreeResult:
-        """Try to prove that a row of ``group`` is positive for every image of the cell.
+        """Try to prove that, for every image of the cell, a row of ``group`` is positive.
 
         Args:
             group: Numbers of rows.
-            most: Branches after which it is given up.
+            most: Number of branches after which it gives up.
         """
         if not self.intermediate.usable[0] or not group:
             return TreeResult(False, 0, -np.inf)
@@ -195,7 +196,7 @@ class PhaseTree:
         return TreeResult(True, count, self._least)
 
     def _taken(self, waiting: list[tuple[float, int, _Branch]], size: int) -> list[_Branch]:
-        """Take up to ``size`` branches off the heap: the weakest, or the strongest if there is no room for more."""
+        """Take up to ``size`` branches off the heap: the weakest, or the strongest if there is no memory for more."""
         if len(waiting) * waiting[0][2].bytes <= self.room:
             return [heapq.heappop(waiting)[2] for _ in range(min(size, len(waiting)))]
         # what is sorted is a heap, and so is its beginning
@@ -207,9 +208,9 @@ class PhaseTree:
     def _ascent(
         self, rows: _GroupRows, branches: Sequence[_Branch], halves: Sequence[_Half] = ()
     ) -> tuple[DualAscent, dict[int, tuple[int, Int64]]]:
-        """The rows of all branches, or of ``halves`` of them, ready to choose, from what the branches have chosen.
+        """Return an ascent over the rows of all branches, or of ``halves`` of them, from the branches' slopes.
 
-        Returns `_held`'s places besides.
+        The second result is that of `_held`.
         """
         g = len(rows.offset)
         owner = np.array([half.branch for half in halves]) if halves else np.arange(len(branches))
@@ -231,7 +232,7 @@ class PhaseTree:
         return ascent, places
 
     def _held(self, phases: Phases) -> tuple[dict[int, SplitNeurons], dict[int, tuple[int, Int64]]]:
-        """By source: the neurons of which rows assume phases [R, U], and the activation and their numbers there."""
+        """Return by source the neurons with assumed phases [R, U], and their activation and numbers there."""
         held: dict[int, SplitNeurons] = {}
         places: dict[int, tuple[int, Int64]] = {}
         noise = self.intermediate.relaxations[-1].noise
@@ -248,7 +249,7 @@ class PhaseTree:
         return held, places
 
     def _climbed(self, rows: _GroupRows, branches: Sequence[_Branch], steps: int) -> list[_Branch]:
-        """The branches that are not proved, with better bounds and with what may be assumed next."""
+        """Return the branches that are not proved, with optimised bounds and with neurons to split next."""
         g, left = len(rows.offset), np.arange(len(branches))
         ascent, places = self._ascent(rows, branches)
         best = np.stack([b.lower for b in branches])
@@ -281,7 +282,7 @@ class PhaseTree:
         return climbed
 
     def _candidates(self, chosen: OptimisedSlopes, at: Int64, phases: Sequence[Phases]) -> list[list[tuple[int, int]]]:
-        """By branch: the neurons that cost row ``at`` most because they are unstable."""
+        """Return by branch the unstable neurons whose relaxations cost row ``at`` most."""
         scores, nodes, places = [], [], []
         for k, own in self.relus.items():
             count = len(own.units.flat)
@@ -297,7 +298,7 @@ class PhaseTree:
         return [[(int(node[j]), int(place[j])) for j in row if score[i, j] >= 0.0] for i, row in enumerate(order)]
 
     def _halves(self, rows: _GroupRows, branches: Sequence[_Branch]) -> list[_Branch]:
-        """Both halves of each branch, of the candidates the one whose worse half is bounded best."""
+        """Return both halves of each branch, split at the candidate whose worse half is bounded best."""
         g = len(rows.offset)
         hopeful = [self.gains.hopeful(branch.splits) for branch in branches]
         splits = [(number, split) for number, own in enumerate(hopeful) for split in own]
@@ -343,12 +344,12 @@ class _GroupRows:
         return _GroupRows(part, top, left, shifted.offset[0, group], shifted.missing[0, group])
 
     def start(self, count: int) -> Coefficients:
-        """The rows of so many branches."""
+        """Return the rows of ``count`` branches."""
         value = np.tile(self.value, (count, 1, 1, 1))
         return Coefficients(value, np.full(len(value), self.top), np.full(len(value), self.left))
 
     def lower(self, bounds: BackwardBounds) -> Float64:
-        """[R] bounds of the rows; minus infinity where nothing is known."""
+        """Return bounds [R] of the rows; minus infinity where none is known."""
         count = len(bounds.lower) // len(self.offset)
         offset, missing = np.tile(self.offset, count), np.tile(self.missing, count)
         room = ShiftedRows(self.value, missing, offset).room(bounds.plane[:, 0])

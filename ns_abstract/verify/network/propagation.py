@@ -36,9 +36,10 @@ from ns_abstract.verify.network.sparse_layers import Variance
 
 
 class ForwardPropagation:
-    """Propagates forms through single nodes; rows that pass the nodes find lines and rounding in ``intermediate``.
+    """Propagates forms through single nodes, and stores their relaxations and rounding in ``intermediate``.
 
-    ``sharing``: references, sizes and slopes of other cells. ``chooses``: whether rows of outputs choose slopes (N14).
+    ``sharing``: references, magnitudes and slopes of other cells. ``chooses``: whether rows of outputs optimise slopes
+    (N14).
     """
 
     def __init__(self, intermediate: IntermediateBounds, sharing: CoefficientSource, chooses: bool) -> None:
@@ -47,7 +48,7 @@ class ForwardPropagation:
         self.rounding = Rounding(intermediate.network)
 
     def linear(self, k: int, sources: tuple[int, ...], layer: LinearLayer, inputs: list[NodeForm]) -> NodeForm:
-        """A linear layer (N1, N2)."""
+        """Return the form of linear node ``k`` (N1, N2)."""
         m, d = self.intermediate.count, self.intermediate.d
         reference = self.sharing.reference(k, lambda: layer([f.reference for f in inputs]))
         stacks = [torch.cat([f.c[:, None], f.a], 1).flatten(0, 1) for f in inputs]
@@ -115,7 +116,7 @@ class ForwardPropagation:
         return self.intermediate.within(form, form.lower, form.upper)
 
     def activation(self, k: int, source: int, layer: Activation, z: NodeForm) -> NodeForm:
-        """An activation (N3, N4)."""
+        """Return the form of activation node ``k`` (N3, N4)."""
         lower, upper = z.interval
         size = z.interval.size
         reference = self.sharing.reference(k, lambda: layer.function(z.reference))
@@ -186,12 +187,12 @@ class ForwardPropagation:
         return self.intermediate.within(form, ends[0] - reference - room, ends[1] - reference + room)
 
     def _limit(self, size: Tensor) -> None:
-        """Give up cells in which numbers of at most ``size`` [m, ...] may overflow (N22)."""
+        """Give up cells in which numbers of magnitudes up to ``size`` [m, ...] may overflow (N22)."""
         if not float(size.amax()) < OVERFLOW:
             self.intermediate.usable &= (size.flatten(1).amax(1) < OVERFLOW).numpy()
 
     def product(self, k: int, sources: tuple[int, ...], layer: Product, x: NodeForm, y: NodeForm) -> NodeForm:
-        """A product of two nodes (N9)."""
+        """Return the form of product node ``k`` (N9)."""
         m, first, second = self.intermediate.count, x.interval, y.interval
         size = first.size * second.size
         reference = self.sharing.reference(k, lambda: x.reference * y.reference)
@@ -235,9 +236,9 @@ class ForwardPropagation:
 
 
 def _around_slope(slope: Tensor, z: NodeForm, line: tuple[Tensor, Tensor, Tensor]) -> tuple[Tensor, Tensor, Tensor]:
-    """(low, high, tilt [m, d, *shape]): an activation less ``slope`` times its input is between low and high + tilt p.
+    """Return (low, high, tilt [m, d, *shape]): an activation less ``slope`` times its input is in [low, high] + tilt p.
 
-    ``line``: slope and offsets of lines on both sides of it; the input is followed in between.
+    ``line``: slope and offsets of lines on both sides of the activation, along which the input is followed.
     """
     own, below, above = line
     t = own - slope
@@ -251,7 +252,7 @@ def _unstable_neurons(
     relaxations: Relaxations,
     given: tuple[Tensor, Tensor, Tensor, Tensor, Tensor, Tensor],
 ) -> UnstableNeurons:
-    """Return the neurons [m, *shape] whose lines may be chosen as `UnstableNeurons`."""
+    """Return the neurons [m, *shape] whose slopes may be optimised."""
     lower, upper = given[:2]
     where = (layer.unstable(lower, upper) if isinstance(layer, LeakyRelu) else lower < upper).flatten(1).nonzero()
     at = where[:, 0], where[:, 1]

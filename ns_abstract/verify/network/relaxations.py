@@ -19,11 +19,10 @@ class MaxPoolPlanes(NamedTuple):
     """Planes of pooling windows as the backward pass applies them (N12).
 
     Attributes:
-        winner: [m, C, H, W] int16, the number that the lower plane follows.
-        which: [m, C, H, W] int32, rows of ``slopes``; -1 where the winner is the maximum.
-        slopes: [U, K] of upper planes; of the rows' type, as offsets are.
-        offsets: [4, m, C, H, W]: lower and upper for coefficients that are not negative, upper and lower
-            for negative ones.
+        winner: [m, C, H, W] int16, number of the input that the lower plane follows.
+        which: [m, C, H, W] int32, rows of ``slopes``; -1 where the winner is surely the maximum.
+        slopes: [U, K] of upper planes, in the rows' type, as offsets are.
+        offsets: [4, m, C, H, W]: lower and upper for coefficients >= 0, upper and lower for negative ones.
     """
 
     winner: np.ndarray
@@ -32,7 +31,7 @@ class MaxPoolPlanes(NamedTuple):
     offsets: np.ndarray
 
     def forward(self, layer: MaxPool, cell: int, coefficients: Tensor, inputs: list[Tensor]) -> Tensor:
-        """The planes that ``coefficients`` [R, C, H, W] take, of inputs [R, C, H', W'] of one cell."""
+        """Return the planes that ``coefficients`` [R, C, H, W] apply, at inputs [R, C, H', W'] of one cell."""
         taps = layer.taps(inputs[0], 0.0)
         winner = torch.from_numpy(self.winner[cell].astype(np.int64)).flatten(1)[None, :, None]
         value = taps.gather(2, winner.expand(len(taps), -1, -1, -1))[:, :, 0]
@@ -45,7 +44,7 @@ class MaxPoolPlanes(NamedTuple):
         return value + torch.where(a >= 0.0, offsets[0], offsets[2])
 
     def backward(self, coefficients: Coefficients, layer: MaxPool, cell: Int64, total: Float64) -> Coefficients:
-        """Rows on the input; what they gather on the way goes to ``total`` [R, 2]."""
+        """Return the rows on the input; their constants are added to ``total`` [R, 2]."""
         height, width = coefficients.value.shape[2:]
         (down, right), extent = layer.stride, layer.steps.max(0) + 1
         size = (height - 1) * down + int(extent[0]), (width - 1) * right + int(extent[1])
@@ -59,8 +58,8 @@ class MaxPoolPlanes(NamedTuple):
 class ReusedRelaxation(NamedTuple):
     """The relaxation of an activation around slopes that another cell's coefficients use (N15).
 
-    ``lines`` [6, m, C, H, W] as `pass_activation` takes them; ``tilts`` [2, m, d, n] slopes, in the parameters, of what
-    is between the offsets, for rows of either sign.
+    ``lines`` [6, m, C, H, W] as in `pass_activation`; ``tilts`` [2, m, d, n] are slopes, in the parameters, of the
+    middle between the offsets, for coefficients of either sign.
     """
 
     lines: np.ndarray
@@ -69,14 +68,14 @@ class ReusedRelaxation(NamedTuple):
 
 @dataclass
 class Relaxations:
-    """The relaxations of all nodes for coefficients of one float type, and that type's own rounding (N2).
+    """The relaxations of all nodes for coefficients of one float type, with that type's own rounding (N2).
 
     Attributes:
-        dtype, unit: Of rows, slopes and offsets, and its unit roundoff.
-        sums: What their sums of offsets in float64 lose, relatively.
-        lines: By activation, [6, m, C, H, W] as `pass_activation` takes them.
+        dtype, unit: Type of rows, slopes and offsets, and its unit roundoff.
+        sums: Relative error of rows' float64 sums of offsets.
+        lines: By activation, [6, m, C, H, W] as in `pass_activation`.
         products: By product: the same for its first and its second factor.
-        maxima: By maximum.
+        maxima: By max pooling.
         noise: By linear layer: rounding of the network and of rows, [m, *shape] float64.
     """
 
@@ -90,20 +89,20 @@ class Relaxations:
 
     @property
     def number(self) -> type[np.floating[Any]]:
-        """The type as numpy has it."""
+        """The numpy type."""
         return np.float32 if self.dtype == torch.float32 else np.float64
 
     def takes(self, coefficients: Coefficients) -> bool:
-        """Whether rows are of this type."""
+        """Return whether rows have this type."""
         return coefficients.value.dtype == self.number
 
     @property
     def moved_out(self) -> tuple[float, float]:
-        """By what part of itself, and by how much besides, a float64 offset is moved out before it is stored."""
+        """The relative and the absolute amount by which a float64 offset is moved outward before it is stored."""
         return (OWN_STORED, FLUSH) if self.dtype == torch.float32 else (self.sums, 0.0)
 
     def outward(self, value: Tensor, side: float) -> Tensor:
-        """An offset as rows take it, farther out by what their sums of offsets may lose."""
+        """Return an offset as stored for rows, moved outward by the errors of their sums of offsets."""
         if self.dtype == torch.float32:
             # half a unit of float32 is more than that, up to 2^26 numbers
             return outward(value, side)

@@ -1,4 +1,4 @@
-"""Kernels for lines that rows choose at (leaky) ReLUs, and for values along the lines that they took (N14, N16)."""
+"""Kernels for (leaky) ReLU lines with optimised slopes, and for values along these lines (design.md, N14, N16)."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ def _shifted(slope, low, high, size, unit, outward):
     """Return offsets below and above, relative to the references, of a line with stored ``slope`` (N4).
 
     Args:
-        slope, low, high: The line, and how far the function is from it at least and at most.
-        size: Of the numbers that ``low`` and ``high`` are sums of.
+        slope, low, high: The line's slope, and bounds of the function less the line.
+        size: Magnitude of the terms of which ``low`` and ``high`` are sums.
         unit: As in `write_relu_lines`, of one neuron.
         outward: As in `write_relu_lines`.
     """
@@ -29,17 +29,18 @@ def _shifted(slope, low, high, size, unit, outward):
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def write_relu_lines(parameter, phases, alpha, flat, units, outward, stored, lines):
-    """Write the lines that rows choose at unstable neurons, or the piece of the phase that they assume.
+    """Write the lines of unstable neurons for optimised slopes, or the exact piece where a row assumes the phase.
 
     Args:
-        parameter: [R, U] chosen slopes.
+        parameter: [R, U] optimised slopes of R rows at U neurons.
         phases: [R, U] 1 or -1 where a row assumes the neuron's phase, else 0; [0, U]: no row assumes any.
-        alpha: The slope of the function below zero.
-        flat: [U] where the neurons are in the map.
-        units: [6, U] bounds, reference, that of the result, what is charged for every part of a slope, and besides.
-        outward: By what part of itself, and by how much besides, an offset is moved out before it is stored.
+        alpha: The slope of the (leaky) ReLU below zero.
+        flat: [U] flat positions of the neurons in the map.
+        units: [6, U] lower bound, upper bound, reference of the input, reference of the result, charge per slope, and
+            constant charge.
+        outward: Relative and absolute amount by which an offset is moved outward before it is stored.
         stored: [R, U] of the lines' type: memory for slopes.
-        lines: [6, R, N] as `pass_activation` takes them; written where the neurons are.
+        lines: [6, R, N] as in `pass_activation`; written at the neurons.
     """
     count, width = parameter.shape
     for r in range(count):
@@ -65,9 +66,9 @@ def write_relu_lines(parameter, phases, alpha, flat, units, outward, stored, lin
 
 @njit(cache=True, error_model="numpy", nogil=True)
 def along_lines(coefficients, values, lines, result):
-    """Values [R, N] of an activation's input become ``result`` along the lines that rows [R, N] took there.
+    """Write to ``result`` the outputs [R, N] of the lines that ``coefficients`` [R, N] apply, at inputs ``values``.
 
-    ``lines``: [6, R or 1, N] as `pass_activation` takes them.
+    ``lines``: [6, R or 1, N] as in `pass_activation`.
     """
     count, size = coefficients.shape
     own = lines.shape[1] > 1

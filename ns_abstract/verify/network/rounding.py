@@ -37,10 +37,10 @@ def outward(value: Tensor, side: float) -> Tensor:
 
 
 def partial_sums(count: Tensor | int, peak: Tensor, squares: Tensor, end: Tensor) -> Tensor:
-    """Return an upper bound of the total size of all partial sums, in any order of ``count`` additions (N20).
+    """Return an upper bound of the sum of magnitudes of all partial sums of ``count`` additions, in any order (N20).
 
-    ``peak``: the greater of the positive numbers together and the negative ones, or more; ``squares``: the same of
-    their squares; ``end``: the size of the whole sum, or more.
+    ``peak``: upper bound of the sum of the positive numbers and of that of the negative ones, in magnitude;
+    ``squares``: the same of their squares; ``end``: upper bound of the whole sum's magnitude.
     """
     number = torch.as_tensor(count, dtype=torch.float64)
     root = squares.sqrt() * UP
@@ -57,9 +57,9 @@ def partial_sums(count: Tensor | int, peak: Tensor, squares: Tensor, end: Tensor
 
 
 class Extremes(NamedTuple):
-    """What numbers may grow to where a program groups the scales before a node in another way, [m] or [1] each (N21).
+    """Upper bounds [m] or [1] of numbers in programs that group the scales before a node in another way (N21).
 
-    ``scales``: products of scales alone, since the last layer of sums or activation; ``sums``: with one such layer.
+    ``scales``: of products of scales alone, since the last layer of sums or activation; ``sums``: with one such layer.
     """
 
     scales: Tensor
@@ -79,7 +79,7 @@ class Rounding:
         self.shifts: dict[int, Tensor] = {}
 
     def groupings(self, k: int, sources: tuple[int, ...], layer: LinearLayer, sizes: list[Tensor]) -> Extremes:
-        """`Extremes` of linear node k, for inputs of at most ``sizes`` [m or 1, *input_shapes[i]]; kept for readers."""
+        """Return `Extremes` of linear node k for inputs up to ``sizes`` [m or 1, *input_shapes[i]]; cached."""
         most = [size.flatten(1).amax(1) for size in sizes]
         before = [self._before(i, size) for i, size in zip(sources, most, strict=True)]
         scales = sum(e.scales + size + 1.0 for e, size in zip(before, most, strict=True))
@@ -97,7 +97,7 @@ class Rounding:
         return extremes
 
     def multiplied(self, k: int, sources: tuple[int, ...], sizes: list[Tensor]) -> Extremes:
-        """`Extremes` of product node k: either factor's scales may be the other's (N21)."""
+        """Return `Extremes` of product node k: the scales of either factor may move to the other (N21)."""
         most = [size.flatten(1).amax(1) for size in sizes]
         one, two = (self._before(i, size) for i, size in zip(sources, most, strict=True))
         scales = (one.scales + most[0] + 1.0) * (two.scales + most[1] + 1.0)
@@ -106,7 +106,7 @@ class Rounding:
         return extremes
 
     def _before(self, index: int, like: Tensor) -> Extremes:
-        """`Extremes` of what a node reads; positive scales pass maxima."""
+        """Return `Extremes` of a node's input; positive scales pass through maxima."""
         while index and isinstance(self.network.nodes[index - 1].layer, MaxPool):
             index = self.network.nodes[index - 1].inputs[0]
         zero = torch.zeros_like(like)
@@ -114,17 +114,17 @@ class Rounding:
 
     @staticmethod
     def bounded(extremes: Extremes) -> Tensor:
-        """[m or 1] whether no grouping overflows (N22)."""
+        """Return whether no grouping overflows, [m or 1] (N22)."""
         return extremes.scales + extremes.sums < OVERFLOW
 
     @staticmethod
     def flushed(extremes: Extremes, layer: LinearLayer) -> Tensor:
-        """[m or 1, 1, ...] what flushes to zero may cost in all groupings (N21)."""
+        """Return an upper bound [m or 1, 1, ...] of the error by flushing to zero, over all groupings (N21)."""
         lost = FLUSHES * FLUSH * (extremes.scales + extremes.sums + layer.gain + 1.0) * MAGNITUDES_UP
         return lost.reshape(-1, *[1] * len(layer.shape))
 
     def shifted(self, k: int, sources: tuple[int, ...], layer: LinearLayer) -> Tensor | float:
-        """What folding shifts before node k into its sums costs besides, one item (N21)."""
+        """Return the further error of node k, one item, if shifts before it are folded into its sums (N21)."""
         input_shifts = [self.shifts.get(i) for i in sources]
         if isinstance(layer, ScaleLayer):
             carried = 0.0 if input_shifts[0] is None else input_shifts[0] * layer.factor.abs()
@@ -156,9 +156,9 @@ class Rounding:
         size: Tensor,
         end: Callable[[], Tensor],
     ) -> Tensor:
-        """What a float32 evaluation of a layer may be off, [m, *shape].
+        """Return an upper bound [m, *shape] of the error of a layer's float32 evaluation.
 
-        ``size`` = |W| |x| + |bias|; ``end``: what its values are at most (N2, N20).
+        ``size`` = |W| |x| + |bias|; ``end`` returns upper bounds of its values' magnitudes (N2, N20).
         """
         count = self.terms[k] = self._rounding_count(sources, layer, inputs)
         folding = FOLDING if k in self.network.scaled else 0
@@ -193,7 +193,7 @@ class Rounding:
         return gamma(1) * (together + count * gamma(count + FOLDING + 1) * size) + few
 
     def _rounding_count(self, sources: tuple[int, ...], layer: LinearLayer, inputs: list[NodeForm]) -> Tensor | int:
-        """The largest number of roundings in one sum of the layer (N2).
+        """Return the largest number of roundings in one sum of the layer (N2).
 
         A program may fold a scale or a sum of branches into the sums before it, so these count with it.
         """

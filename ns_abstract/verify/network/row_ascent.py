@@ -1,4 +1,4 @@
-"""Bounds of rows with the lines and multipliers that are best for each (docs/dev/design.md, N14, N16)."""
+"""Bounds of rows with slopes and multipliers optimised for each row (docs/dev/design.md, N14, N16)."""
 
 from __future__ import annotations
 
@@ -26,9 +26,9 @@ _ROWS_OF_A_THREAD = 32
 
 
 class RowAscent:
-    """Bounds rows with lines and multipliers of their own.
+    """Bounds rows with slopes and multipliers optimised for each.
 
-    ``steps`` towards the best lines, the first of size ``first``; rows are of the type that the outputs' are.
+    ``steps`` of optimisation, the first of size ``first``; rows have the type of the outputs' rows.
     """
 
     def __init__(
@@ -38,7 +38,7 @@ class RowAscent:
         self.steps, self.first = steps, first
 
     def climb(self, index: int, coefficients: Coefficients, cell: Int64, best: BackwardBounds) -> None:
-        """Raise ``best.lower`` of rows on node ``index``, and planes with it, where lines of their own give more."""
+        """Raise ``best.lower`` of rows on node ``index``, with their planes, where optimised slopes give more."""
         for k in np.unique(cell):
             choices, own = ascending(self.intermediate.unstable, k), np.flatnonzero(cell == k)
             if not choices or not self.intermediate.usable[k]:
@@ -50,7 +50,7 @@ class RowAscent:
     def _shares(
         self, own: Int64, choices: Mapping[int, Sequence[LineChoice]], itemsize: int
     ) -> tuple[list[Int64], int]:
-        """Rows ``own`` in parts whose lines there is memory for, and the number of threads that share them."""
+        """Return rows ``own`` in parts whose lines fit into memory, and the number of threads that share them."""
         size = sum(6 * itemsize * int(np.prod(self.network.shape(at))) for at in choices)
         step = max(1, _LINES_AT_ONCE // max(1, size))
         threads = torch.get_num_threads() if len(own) >= _ROWS_OF_A_THREAD else 1
@@ -81,7 +81,7 @@ class RowAscent:
     def evaluate(
         self, index: int, start: Coefficients, k: int, ascent: DualAscent
     ) -> tuple[OptimisedSlopes, BackwardBounds]:
-        """What rows of cell ``k`` have chosen by now, and their bounds with it."""
+        """Return the present slopes of rows of cell ``k``, and the rows' bounds with them."""
         count = len(start.value)
         chosen, bounds = ascent.lines(), BackwardBounds.unknown(count, self.intermediate.d)
         # rows are changed in place
@@ -93,12 +93,12 @@ class RowAscent:
         return chosen, bounds
 
     def move(self, index: int, k: int, chosen: OptimisedSlopes, bounds: BackwardBounds, ascent: DualAscent) -> None:
-        """Step from what has been chosen to what is better for the bounds."""
+        """Take one optimisation step from the present slopes."""
         slopes, forces = self._derivatives(index, k, chosen, bounds, ascent)
         ascent.climb(slopes, forces, {at: self._size(chosen, at) for at in ascent.split})
 
     def _size(self, chosen: OptimisedSlopes, source: int) -> float:
-        """What coefficients of rows on the readers of node ``source`` are about."""
+        """Return the typical magnitude of rows' coefficients at the readers of node ``source``."""
         sizes = [
             float(np.abs(chosen.trace[k]).mean())
             for k, node in enumerate(self.network.nodes, 1)
@@ -109,7 +109,7 @@ class RowAscent:
     def _derivatives(
         self, index: int, cell: int, chosen: OptimisedSlopes, found: BackwardBounds, ascent: DualAscent
     ) -> tuple[dict[int, list[Float64]], dict[int, Float64]]:
-        """How the bounds of a cell's rows change with parameters and with multipliers."""
+        """Return the derivatives of a cell's bounds by slopes and by multipliers, by node."""
         planes, relaxations = self.intermediate.image, self.intermediate.relaxations[-1]
         on_image = chosen.trace.get(0)
         if on_image is None:
@@ -133,7 +133,7 @@ class RowAscent:
 
 
 def _product(one: Tensor, two: Tensor, coefficients: Tensor, inputs: list[Tensor]) -> Tensor:
-    """The planes that ``coefficients`` take of a product's factors."""
+    """Return the planes of a product that ``coefficients`` apply, at its factors."""
     x, y = (v.reshape(coefficients.shape) for v in inputs)
     offset = torch.where(coefficients >= 0.0, one[1] + two[1], one[4] + two[4])
     return one[0] * x + two[0] * y + offset

@@ -1,9 +1,9 @@
 """One relaxation for all functions of one number, and their tangents (docs/dev/design.md, N10, N14).
 
-The interval is cut at evenly spaced points and where the function's curvature changes, so that every part has one
-curvature. A line with any slope becomes a sound one by the greatest or least distance of the function
-from it: on a part, the ends are extreme on one side and the two tangents at the ends bound the other.
-The slope is that of the concave (or convex) envelope at the middle, where a line's height is its area.
+The interval is cut at evenly spaced points and where the function's curvature changes, so that every piece has one
+curvature. A line with any slope becomes sound by the extreme distance of the function from it: on a piece, the ends are
+extreme on one side, and the two tangents at the ends bound the other. The slope is that of the concave (or convex)
+envelope at the middle, where a line's height is its area.
 """
 
 from __future__ import annotations
@@ -41,7 +41,8 @@ _POINT = 2.0**-36
 class _SampledFunction(NamedTuple):
     """Samples z, value, slope [K, ...] of a function at ascending points.
 
-    ``bend`` [K - 1, ...] is 1 where it is convex between, 0 straight, -1 concave; ``size`` is for the rounding.
+    ``bend`` [K - 1, ...] is 1 where the function is convex between points, 0 straight, -1 concave; ``size`` is the
+    magnitude for rounding.
     """
 
     z: Tensor
@@ -53,7 +54,7 @@ class _SampledFunction(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class ScalarFunction(Activation):
-    """An activation that is piecewise convex, concave or linear."""
+    """An activation that is convex, concave or linear piece by piece."""
 
     #: Where the curvature changes, growing; kinks and poles are such.
     breaks: ClassVar[tuple[float, ...]] = ()
@@ -63,7 +64,7 @@ class ScalarFunction(Activation):
     slope_scale: ClassVar[float] = 1.0
 
     def slope(self, z: Tensor) -> Tensor:
-        """The derivative on curved parts."""
+        """Return the derivative on curved pieces."""
         raise AssertionError
 
     def _cuts(self, lower: Tensor, upper: Tensor) -> _SampledFunction:
@@ -85,7 +86,7 @@ class ScalarFunction(Activation):
 
     @staticmethod
     def _extreme(cuts: _SampledFunction, line: Tensor, side: float) -> Tensor:
-        """Bound of ``f(z) - line z`` below (``side`` -1) or above (1)."""
+        """Return a bound of ``f(z) - line z`` below (``side`` -1) or above (1)."""
         value = -side * (cuts.value - line * cuts.z)
         slope = -side * (cuts.slope - line)
         a, b = slope[:-1], slope[1:]
@@ -99,7 +100,7 @@ class ScalarFunction(Activation):
         return -side * (least - room)
 
     def _tangent(self, cuts: _SampledFunction, side: float) -> Tensor:
-        """Slope of the envelope above (``side`` 1) or below (-1) at the middle, by Newton's method."""
+        """Return the slope at the middle of the envelope above (``side`` 1) or below (-1), by Newton's method."""
         low, high = cuts.z[0], cuts.z[-1]
         middle = 0.5 * (low + high)
         value, away = side * cuts.value, middle - cuts.z
@@ -120,11 +121,11 @@ class ScalarFunction(Activation):
         return torch.where(torch.isfinite(best), side * best, torch.zeros_like(best))
 
     def _inside(self, lower: Tensor, upper: Tensor) -> tuple[Tensor, Tensor]:
-        """The interval without what is known to be impossible."""
+        """Return the interval intersected with the function's domain."""
         return lower, upper
 
     def straight(self, z: Tensor) -> Tensor:
-        """The slope at ``z`` of a function without curved parts."""
+        """Return the slope at ``z`` of a function without curved pieces."""
         raise AssertionError
 
     #: The greatest slope of a function without curved parts.
@@ -143,7 +144,7 @@ class ScalarFunction(Activation):
     def _by_parts(
         self, work: Callable[[Tensor, Tensor], LinearRelaxation], lower: Tensor, upper: Tensor
     ) -> LinearRelaxation:
-        """Lines of many intervals: as many at a time as a processor's cache holds, straight parts by themselves."""
+        """Return ``work`` of many intervals, computed in cache-sized batches, linear pieces by themselves."""
         low, high = lower.reshape(-1), upper.reshape(-1)
         if any(self.bends):
             parts = [work(*ends) for ends in zip(low.split(_TOGETHER), high.split(_TOGETHER), strict=True)]
@@ -192,7 +193,7 @@ class ScalarFunction(Activation):
         return LinearRelaxation(slope, self._extreme(cuts, slope, -1.0), slope, self._extreme(cuts, slope, 1.0))
 
     def _level(self, lower: Tensor, upper: Tensor) -> LinearRelaxation:
-        """Lines without a slope."""
+        """Return constant lines."""
         cuts = self._cuts(*self._inside(lower, upper))
         flat = torch.zeros_like(lower)
         return LinearRelaxation(flat, self._extreme(cuts, flat, -1.0), flat, self._extreme(cuts, flat, 1.0))
@@ -215,16 +216,17 @@ class LibraryFunction(ScalarFunction):
 
 @dataclass(frozen=True)
 class Tangents:
-    """Tangents of a curve, below (``side`` -1) or above (1), that touch a part of the interval that bends that way.
+    """Tangents of a function below (``side`` -1) or above (1) it, which touch a piece of the interval curved that way.
 
-    A tangent is on its side of the part that it touches. If no other part bends that way, the function less the line
-    is most extreme at an end of those, wherever it touches; its offset is taken from there where that is farther out.
+    A tangent is on its side of the piece that it touches. If no other piece is curved that way, the function less the
+    line is extreme at an end of a piece, wherever the line touches; its offset is taken from there if that is farther
+    out.
 
     Attributes:
-        curve, side: The function, and on which side of it the lines are.
-        first, last: [...] points between which tangents are on that side as they are; ``first > last`` or NaN: none.
+        curve, side: The function, and the side of the lines.
+        first, last: [...] points between which tangents are sound without a shift; ``first > last`` or NaN: none.
         lower, upper: [...] the interval.
-        corners, values: [E, ...] ends of all parts, and the function there.
+        corners, values: [E, ...] ends of all pieces, and the function there.
     """
 
     curve: ScalarFunction
@@ -238,7 +240,7 @@ class Tangents:
 
     @staticmethod
     def of(curve: ScalarFunction, lower: Tensor, upper: Tensor, side: float) -> Tangents:
-        """The tangents over [lower, upper]."""
+        """Return the tangents over [lower, upper]."""
         edges = [lower, *(torch.clamp(lower.new_tensor(b), lower, upper) for b in curve.breaks), upper]
         first, last = torch.full_like(lower, math.nan), torch.full_like(lower, math.nan)
         parts = torch.zeros_like(lower)
@@ -254,7 +256,7 @@ class Tangents:
         return tangents._narrowed() if -side in curve.bends else tangents
 
     def _narrowed(self) -> Tangents:
-        """With first and last points from which the interval's ends are on the right side."""
+        """Return the tangents with first and last points at which the interval's ends are on the right side."""
         points = []
         for start, stop, end, value in (
             (self.first, self.last, self.lower, self.values[0]),
@@ -275,23 +277,23 @@ class Tangents:
         return replace(self, first=points[0], last=points[1])
 
     def _clear(self, t: Tensor, end: Tensor, value: Tensor) -> Tensor:
-        """Whether the tangent at ``t`` is on its side of the function at an end."""
+        """Return whether the tangent at ``t`` is on its side of the function at an end of the interval."""
         return self.side * (self.curve.function(t) + self.curve.slope(t) * (end - t) - value) >= 0.0
 
     @property
     def known(self) -> Tensor:
-        """[...] whether there are tangents."""
+        """Whether there are tangents, [...]."""
         return self.first <= self.last
 
     def __getitem__(self, at: Tensor) -> Tangents:
-        """Those of some intervals, in one row."""
+        """Return the tangents of some intervals, in one row."""
         parts = (self.first[at], self.last[at], self.lower[at], self.upper[at])
         return Tangents(self.curve, self.side, *parts, self.corners[:, at], self.values[:, at])
 
     def line(self, t: Tensor, dtype: torch.dtype = torch.float64) -> tuple[Tensor, Tensor]:
-        """Slope, a number of ``dtype`` in float64, and offset of the line that touches at or near ``t`` [..., *U].
+        """Return slope (a number of ``dtype`` in float64) and offset of the line touching at or near ``t`` [..., *U].
 
-        Sound for any t of the part that bends towards the side.
+        It is sound for any t of the piece that is curved towards the side.
         """
         value, tangent = self.curve.function(t), self.curve.slope(t)
         slope = tangent.to(dtype).double()

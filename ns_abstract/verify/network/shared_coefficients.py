@@ -42,7 +42,7 @@ def reusable_anywhere(network: Network) -> bool:
 
 
 class SharedCoefficients:
-    """Bounds one cell, and other cells with the backward coefficients of that one, in ``memory`` bytes, roughly."""
+    """Bounds one cell, and other cells with that cell's backward coefficients; ``memory``: bytes, approximately."""
 
     @subnormals_kept()
     def __init__(
@@ -56,15 +56,15 @@ class SharedCoefficients:
 
     @subnormals_kept()
     def first(self, rows: Any, offset: Float64) -> OutputBounds:
-        """Lower bounds of ``rows @ y + offset`` over the first cell."""
+        """Return lower bounds of ``rows @ y + offset`` over the first cell."""
         return self._first.cells.outputs(rows, np.asarray(offset, np.float64))
 
     @subnormals_kept()
     def others(self, images: ImageSets, rows: Any, offset: Float64, *, fresh: bool = False) -> OutputBounds:
-        """Lower bounds of ``rows @ y + offset`` over other cells, m sets in parameters of their own.
+        """Return lower bounds of ``rows @ y + offset`` over other cells, m sets in parameters of their own.
 
-        Images must obey those of the first cell as well unless the network `reusable_anywhere`. ``fresh``: all that is
-        open before the last activation or product has rows of the cell's own.
+        Their images must lie in the first cell's set, too, unless the network is `reusable_anywhere`. ``fresh``:
+        unstable neurons before the last activation or product have backward passes of the cell's own.
         """
         offset = np.asarray(offset, np.float64)
         if not self._first.intermediate.usable[0]:
@@ -80,11 +80,11 @@ class SharedCoefficients:
 
 @dataclass
 class _StoredCoefficients:
-    """Stored backward coefficients of one cell for neurons of one node.
+    """Stored backward coefficients of one cell, for neurons of one node.
 
     Attributes:
-        flat: [R] which numbers; a number may have two rows.
-        sign: [R] what the rows are of: 1, or -1 for the numbers' negatives.
+        flat: [R] flat positions of the neurons; one may have two rows.
+        sign: [R] 1, or -1 where the row is of the neuron's negative.
         by_node: By node: [R, n] float32 as in `BackwardTrace`.
         fixed: [R, 2] as in `BackwardTrace`.
     """
@@ -95,7 +95,7 @@ class _StoredCoefficients:
     fixed: Float64
 
     def joined(self, other: _StoredCoefficients) -> _StoredCoefficients:
-        """With those of another."""
+        """Return these and another object's coefficients together."""
         rows = {}
         for at in self.by_node.keys() | other.by_node.keys():
             both = [
@@ -112,7 +112,7 @@ class _StoredCoefficients:
 
 
 class _ReferenceCell(CoefficientSource):
-    """The cell whose coefficients are stored, for neurons that feed activations and products."""
+    """The cell whose coefficients are stored, for neurons before activations and products."""
 
     def __init__(self, network: Network, images: ImageSets, memory: int, arithmetic: NetworkArithmetic) -> None:
         self.network = network
@@ -172,7 +172,7 @@ class _ReferenceCell(CoefficientSource):
 class _ReusedBounds(NamedTuple):
     """Bounds of neurons from stored coefficients: within ``half`` [m, R] of ``slopes p + middle`` about the reference.
 
-    Slopes are [m, R, d]; lower and upper [m, R] are what the numbers are at least and at most.
+    Slopes are [m, R, d]; ``lower`` and ``upper`` [m, R] are bounds over all p.
     """
 
     slopes: Float64
@@ -217,11 +217,12 @@ class _ReusingCells(CoefficientSource):
         return lines[0, 0].reshape(shape), lines[3, 0].reshape(shape)
 
     def _column(self, at: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """What rows on the output of node ``at`` are multiplied by, [n, m k], and what their sizes are, [n, m l + 1].
+        """Return the factors [n, m k] of rows on the output of node ``at``, and those of their magnitudes [n, m l + 1].
 
-        Columns of one kind stand together. Rows: slopes [d], middle, and of intervals alone; sizes: half and that of
-        intervals, on the image. Rows: slopes [d], middle and half; sizes: the same, at activations. Sizes: rounding, at
-        linear layers. The last column of sizes is that of all that is added up, in any cell.
+        Columns of one kind are adjacent. On the image, rows have slopes [d], the middle and the interval's middle;
+        magnitudes have half the distances of planes and of intervals. At activations rows have slopes [d], middle and
+        half; magnitudes the same. At linear layers magnitudes have the rounding. The last column of magnitudes is that
+        of all terms.
         """
         if at not in self._columns:
             intermediate = self.intermediate
@@ -257,7 +258,7 @@ class _ReusingCells(CoefficientSource):
         return self._columns[at]
 
     def _said(self, index: int) -> _ReusedBounds:
-        """What the first cell's rows say of node ``index`` here."""
+        """Return the bounds of node ``index`` in these cells by the first cell's rows."""
         intermediate = self.intermediate
         m, d = intermediate.count, intermediate.d
         stored = self.first.stored[index]
@@ -323,7 +324,7 @@ class _ReusingCells(CoefficientSource):
         return form, unstable, apart
 
     def _borrowed(self, index: int, form: NodeForm) -> NodeForm:
-        """The form with what the first cell's rows say."""
+        """Return the form intersected with the bounds by the first cell's rows."""
         if index not in self.first.stored:
             return form
         flat, sign = self.first.stored[index].flat, self.first.stored[index].sign

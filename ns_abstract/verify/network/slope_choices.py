@@ -1,4 +1,4 @@
-"""Neurons whose lines rows may choose: slopes below ReLUs, points that tangents touch (docs/dev/design.md, N14)."""
+"""Neurons whose relaxation rows may optimise: slopes of ReLUs, points of tangents (docs/dev/design.md, N14)."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ Int64 = NDArray[np.int64]
 
 @dataclass(frozen=True)
 class UnstableNeurons:
-    """The neurons of one node, in all cells, whose lines may be chosen.
+    """The neurons of one node, in all cells, whose lines may be optimised.
 
     Attributes:
-        cell, flat: [U] where they are.
-        lower, upper: [U] what they are at least and at most.
-        reference, image: [U] their reference and that of what they become.
-        loose: [U] charged for every part of a slope: rounding of rows and of the layer before.
-        room: [U] charged besides.
+        cell, flat: [U] their cells and flat positions.
+        lower, upper: [U] their bounds.
+        reference, image: [U] references of their inputs and of their results.
+        loose: [U] charge per slope: rounding of rows and of the layer before.
+        room: [U] constant charge.
         layer: The activation behind them.
-        relaxations: Of rows that choose.
+        relaxations: Those of rows that optimise.
     """
 
     cell: Int64
@@ -52,7 +52,7 @@ class UnstableNeurons:
         return replace(self, **{name: getattr(self, name)[at] for name in names})
 
     def choices(self, cell: int) -> list[LineChoice]:
-        """The lines of one cell's neurons that may be chosen; none where nothing is left to choose."""
+        """Return the lines of one cell's neurons that may be optimised; empty where there are none."""
         units = self[np.flatnonzero(self.cell == cell)]
         if isinstance(self.layer, LeakyRelu):
             return [ReluSlopes(units, self.layer.alpha)] if len(units.flat) else []
@@ -66,7 +66,7 @@ class UnstableNeurons:
         return chosen
 
     def shifted(self, slope: Float64, low: Float64, high: Float64) -> tuple[Floats, Floats]:
-        """Offsets below and above, relative to the references, of lines with stored ``slope`` [R, U] (N4)."""
+        """Return offsets below and above, relative to the references, of lines with stored ``slope`` [R, U] (N4)."""
         base = slope * self.reference - self.image
         own = np.abs(self.reference) + np.abs(self.lower) + np.abs(self.upper)
         give = np.abs(slope) * self.loose + self.room + OWN_SUMS * (np.abs(self.image) + np.abs(low) + np.abs(high))
@@ -77,7 +77,7 @@ class UnstableNeurons:
 
 
 class LineChoice(Protocol):
-    """Lines of some neurons of a node, on one side, that a parameter of every row and neuron chooses."""
+    """Lines of some neurons of a node, on one side, with a parameter for every row and neuron."""
 
     @property
     def units(self) -> UnstableNeurons:
@@ -85,31 +85,31 @@ class LineChoice(Protocol):
         ...
 
     def start(self, lines: Floats) -> Float64:
-        """[U] parameters of the cell's ``lines`` [6, N], or about."""
+        """Return the parameters [U] of the cell's ``lines`` [6, N], approximately."""
         ...
 
     def within(self, parameter: Float64) -> Float64:
-        """The closest parameters that are allowed."""
+        """Return the closest allowed parameters."""
         ...
 
     def put(self, parameter: Float64, lines: Floats) -> None:
-        """Write the lines of parameters [R, U] into ``lines`` [6, R, N]."""
+        """Write the lines of parameters [R, U] to ``lines`` [6, R, N]."""
         ...
 
     def derivative(self, parameter: Float64, coefficient: Float64, value: Float64) -> Float64:
-        """[R, U] how bounds grow with parameters, for rows' coefficients and the neurons' values; scaled at will."""
+        """Return the bounds' derivatives [R, U] by parameters, up to a factor, at the neurons' values."""
         ...
 
 
 @dataclass(frozen=True)
 class ReluSlopes:
-    """Slopes from ``alpha`` to 1 of lines below unstable (leaky) ReLUs."""
+    """Slopes from ``alpha`` to 1 of lower lines of unstable (leaky) ReLUs."""
 
     units: UnstableNeurons
     alpha: float
 
     def losses(self, coefficient: Floats) -> Float64:
-        """[R, U] about what rows with ``coefficient`` on the units lose because these are open."""
+        """Return the estimated loss [R, U] of rows with ``coefficient`` by the neurons' relaxation."""
         lower, upper = self.units.lower, self.units.upper
         gap = (1.0 - self.alpha) * upper * -lower / (upper - lower)
         # a slope below was chosen for the row, the line above could not be
@@ -123,12 +123,12 @@ class ReluSlopes:
 
     @cached_property
     def _units(self) -> Float64:
-        """[6, U] as `write_relu_lines` takes them."""
+        """The [6, U] array of `write_relu_lines`."""
         units = self.units
         return np.stack([units.lower, units.upper, units.reference, units.image, units.loose, units.room])
 
     def put(self, parameter: Float64, lines: Floats, phases: NDArray[np.int8] | None = None) -> None:
-        """`LineChoice.put`; where rows assume the neuron's phase [R, U]: the function's own piece (N16)."""
+        """`LineChoice.put`; where rows assume the neuron's phase [R, U], its exact piece (N16)."""
         relaxations = self.units.relaxations
         stored = np.empty(parameter.shape, relaxations.number)
         phases = np.zeros((0, 0), np.int8) if phases is None else np.ascontiguousarray(phases)
@@ -143,7 +143,7 @@ class ReluSlopes:
 
 @dataclass(frozen=True)
 class TangentPoints:
-    """Points that tangents of curves touch, as parts of the way from the first to the last one."""
+    """Points at which tangents touch, as fractions of the way from the first to the last allowed one."""
 
     units: UnstableNeurons
     tangents: Tangents
@@ -179,6 +179,6 @@ class TangentPoints:
 
 
 def ascending(units: dict[int, UnstableNeurons], cell: int) -> dict[int, Sequence[LineChoice]]:
-    """By node: what rows of a cell may choose."""
+    """Return by node the lines that rows of a cell may optimise."""
     choices_of = {k: neurons.choices(cell) for k, neurons in units.items()}
     return {k: choices for k, choices in choices_of.items() if choices}

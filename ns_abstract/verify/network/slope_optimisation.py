@@ -34,10 +34,10 @@ class SplitNeurons:
     """Neurons of one node of one cell whose activation phases are assumed (N16).
 
     Attributes:
-        flat: [B] where they are.
-        side: [R, B] 1 where a row assumes them not to be negative, -1 where not positive, 0 for neither.
+        flat: [B] their flat positions.
+        side: [R, B] 1 where a row assumes them to be >= 0, -1 where <= 0, 0 for neither.
         reference: [B] their reference.
-        noise: [B] charged for every part of a coefficient: rounding of the node and of rows.
+        noise: [B] charge per coefficient: rounding of the node and of rows.
     """
 
     flat: Int64
@@ -46,13 +46,13 @@ class SplitNeurons:
     noise: Float64
 
     def __getitem__(self, rows: np.ndarray) -> SplitNeurons:
-        """Those of some rows."""
+        """Return the same for some rows."""
         return replace(self, side=self.side[rows])
 
     def pay(self, multiplier: Float32) -> tuple[Float32, Float64]:
-        """What rows gain for ``multiplier`` [R, B], not negative: coefficients [R, B], and [R] the least offset.
+        """Return what multipliers [R, B] >= 0 add to rows: coefficients [R, B], and a lower bound [R] of the offset.
 
-        A row is at least itself less ``multiplier * side * z``, as the latter is not negative.
+        A row is at least itself less ``multiplier * side * z``, as that product is not negative.
         """
         gained = -multiplier * self.side.astype(np.float32)
         size = np.abs(gained.astype(np.float64))
@@ -62,10 +62,10 @@ class SplitNeurons:
 
 @dataclass
 class OptimisedSlopes:
-    """The slopes and multipliers of a cell's coefficients, and these coefficients, by node.
+    """The slopes and multipliers of a cell's rows, and the rows' coefficients, by node.
 
-    ``lines`` are as `pass_activation` wants them, with rows in place of cells; ``paid`` says where, and what
-    `SplitNeurons.pay` gives; ``trace`` [R, C, H, W] has rows on the output, and on the image (0).
+    ``lines`` are as in `pass_activation`, with rows in place of cells; ``paid`` are positions and results of
+    `SplitNeurons.pay`; ``trace`` [R, C, H, W] are coefficients on the output, and on the image (0).
     """
 
     lines: dict[int, Float32]
@@ -73,24 +73,24 @@ class OptimisedSlopes:
     trace: dict[int, Float32] = field(default_factory=dict)
 
     def keep(self, at: int, value: Float32, number: Int64, count: int) -> None:
-        """Remember rows ``number`` of ``count`` on the output of node ``at``."""
+        """Store the coefficients of rows ``number`` of ``count`` on the output of node ``at``."""
         if at not in self.trace:
             self.trace[at] = np.zeros((count, *value.shape[1:]), np.float32)
         self.trace[at][number] = value
 
 
 class _Adam:
-    """Adam's steps of one array of numbers."""
+    """The state of Adam's optimiser for one array."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
         self._mean, self._square, self._count = np.zeros(shape), np.zeros(shape), 0
 
     def keep(self, rows: np.ndarray) -> None:
-        """Go on with these rows alone."""
+        """Drop all rows but these."""
         self._mean, self._square = self._mean[rows], self._square[rows]
 
     def step(self, g: Float64) -> Float64:
-        """Directions, about one long, for derivatives ``g``."""
+        """Return the step's directions, of magnitude about one, for derivatives ``g``."""
         self._count += 1
         self._mean += (1.0 - _FIRST) * (g - self._mean)
         self._square += (1.0 - _SECOND) * (g * g - self._square)
@@ -99,14 +99,14 @@ class _Adam:
 
 
 class DualAscent:
-    """Adam's steps on the lines and multipliers of ``count`` rows of a cell.
+    """Optimises slopes and multipliers of ``count`` rows of a cell by Adam's steps.
 
     Args:
-        choices, lines: What rows may choose, and the cell's lines [6, C, H, W], by node.
-        held: Numbers of the cell whose signs are assumed, by node.
-        phases: By node, what rows assume of the neurons of its first choice [R, U]: 1, -1, or 0 for nothing.
+        choices, lines: By node, the lines that rows may optimise, and the cell's lines [6, C, H, W].
+        held: By node, numbers of the cell whose signs are assumed.
+        phases: By node, phases [R, U] that rows assume for the neurons of its first choice: 1, -1, or 0 for none.
         step: The first step.
-        multiplier_step: The first step of multipliers, in sizes of coefficients; None: that of slopes.
+        multiplier_step: The first step of multipliers, in magnitudes of coefficients; None: that of slopes.
     """
 
     def __init__(
@@ -131,7 +131,7 @@ class DualAscent:
         self._step, self._multiplier_step = step, step if multiplier_step is None else multiplier_step
 
     def keep(self, rows: np.ndarray) -> None:
-        """Go on with these rows alone."""
+        """Drop all rows but these."""
         self._lines = {k: np.ascontiguousarray(v[:, rows]) for k, v in self._lines.items()}
         self.parameters = {k: [v[rows] for v in own] for k, own in self.parameters.items()}
         self.multipliers = {k: v[rows] for k, v in self.multipliers.items()}
@@ -141,7 +141,7 @@ class DualAscent:
             adam.keep(rows)
 
     def lines(self) -> OptimisedSlopes:
-        """Lines of every row: those of the cell, but where it chooses."""
+        """Return the lines of every row: those of the cell, replaced where the row optimises."""
         for k, own in self.choices.items():
             # the others stay as they are
             lines = self._lines[k].reshape(6, len(self.parameters[k][0]), -1)
@@ -157,9 +157,9 @@ class DualAscent:
     def climb(
         self, slopes: Mapping[int, Sequence[Float64]], forces: Mapping[int, Float64], size: Mapping[int, float]
     ) -> None:
-        """Step along derivatives of the bounds, [R, U] by parameters and [R, B] by multipliers, within their limits.
+        """Take one step along the bounds' derivatives, [R, U] by slopes and [R, B] by multipliers, within the limits.
 
-        ``size``: what coefficients of rows on a node are about.
+        ``size``: typical magnitude of rows' coefficients by node.
         """
         for k, own in self.choices.items():
             for number, choice in enumerate(own):
@@ -184,18 +184,18 @@ def slope_derivatives(
 ) -> tuple[dict[int, list[Float64]], dict[int, Float64]]:
     """Return, by node, the derivatives of bounds by parameters [R, U] and by multipliers [R, B].
 
-    A row's bound is a sum of products along the lines that it took; read forwards from the image where it is least,
-    these lines give a value to every node. A slope counts its row's coefficient times how far that value is from where
-    the line touches, a multiplier the value where it has not the sign that is assumed.
+    A row's bound is a sum of products along its lines. Followed forwards from the image where the bound is attained,
+    these lines give a value to every node. The derivative by a slope is the row's coefficient times the distance of
+    that value from where the line touches; that by a multiplier is the value where it violates the assumed sign.
 
     Args:
         network: The network.
-        image: [R, *input_shape] float32 relative to the reference, where each row's bound is least.
-        trace: Rows on the outputs of activations, products and maxima.
-        lines: Of an activation's node: [6, R, C, H, W].
-        ascent: What rows have chosen, and numbers whose signs are assumed.
-        others: Of products' and maxima's nodes: a function of rows and inputs that gives the output.
-        last: The node that the rows begin at.
+        image: [R, *input_shape] float32 relative to the reference, where each row's bound is attained.
+        trace: Coefficients on the outputs of activations, products and maxima.
+        lines: Returns those of an activation's node: [6, R, C, H, W].
+        ascent: The rows' slopes, and neurons whose signs are assumed.
+        others: By product or max pooling node, a function of rows and inputs that returns the output.
+        last: The node at which the rows begin.
     """
     values: list[Tensor | None] = [image]
     held = ascent.split

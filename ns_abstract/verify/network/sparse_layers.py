@@ -63,15 +63,15 @@ class SparseMatrix(LinearLayer):
 
     @cached_property
     def _single(self) -> Tensor:
-        """[in, out] float32, for rows."""
+        """The weights [in, out] in float32, for rows."""
         return self._matrix.t().float().coalesce()
 
     def weight_for(self, coefficients: Tensor) -> Tensor:
-        """[in, out] weights in the coefficients' type."""
+        """Return the weights [in, out] in the coefficients' type."""
         return self._single if coefficients.dtype == torch.float32 else self._matrix.t()
 
     def _rows(self, value: Tensor) -> Tensor:
-        """Rows [R, in] for ``value`` [R, out]."""
+        """Return rows [R, in] for ``value`` [R, out]."""
         return torch.sparse.mm(self.weight_for(value), value.T).T
 
     @cached_property
@@ -94,19 +94,19 @@ class SparseMatrix(LinearLayer):
 
 @dataclass(frozen=True, eq=False)
 class Variance(SparseMatrix):
-    """The variance: means of squares of centred numbers (first input) of the numbers in the second input.
+    """The variance: means of the squared centred numbers (first input) of the numbers in the second input.
 
-    A program may work the variance out as mean of squares minus square of the mean: what that loses is
-    relative to the numbers and not to their spread (N11).
+    A program may compute the variance as mean of squares minus square of the mean: the error is then relative to the
+    numbers, not to their spread (N11).
     """
 
     def spare(self, sizes: Sequence[Tensor]) -> Tensor | float:
         return gamma(VARIANCE_PASSES * self.terms) * self._means(sizes[1].square()) * UP + FLUSHES * FLUSH
 
     def least(self, squares: NodeForm, x: NodeForm, in_float32: bool) -> Tensor:
-        """[m, *shape] what the variance is at least, with its rounding if ``in_float32``, but for flushes (N11).
+        """Return a lower bound [m, *shape] of the variance, with its rounding if ``in_float32``, without flushes (N11).
 
-        Squares are not negative, and one pass loses a part of the variance itself and of the square of the mean.
+        Squares are not negative, and one pass loses a fraction of the variance itself and of the square of the mean.
         """
         low = self._means(squares.interval.lower.clamp(min=0.0)) * (2.0 - MAGNITUDES_UP)
         if not in_float32:
@@ -129,10 +129,10 @@ class Variance(SparseMatrix):
 
 @dataclass(frozen=True, eq=False)
 class ChannelWindows(SparseMatrix):
-    """Weighted sums over windows of neighbouring channels, ``before`` of them before its middle, and an offset.
+    """Weighted sums over windows of neighbouring channels, ``before`` of them before the middle, and an offset.
 
-    A program may go from channel to channel, add the one that enters the window and subtract the one that leaves it:
-    what that loses is relative to all channels that have left, too (N11).
+    A program may go from channel to channel, adding the one that enters the window and subtracting the one that leaves
+    it: the error is then relative to all channels that have left, too (N11).
     """
 
     before: int = 0
@@ -149,7 +149,7 @@ class ChannelWindows(SparseMatrix):
 class Resize(SparseMatrix):
     """A resized map: rows and columns are interpolated; programs compute their positions in float32.
 
-    ``rows``, ``columns`` [2, out, in]: sizes of the weights along an axis, and what they may be off.
+    ``rows``, ``columns`` [2, out, in]: magnitudes of the weights along an axis, and bounds of their errors.
     """
 
     rows: Tensor = field(default_factory=_none)
@@ -166,7 +166,7 @@ class Resize(SparseMatrix):
 
 @dataclass(frozen=True, eq=False)
 class PairwiseDifferences(LinearLayer):
-    """``x_j - x_i`` for all i and j along an axis of the item: j is a new last axis; zero where they are the same."""
+    """``x_j - x_i`` for all i and j along an axis of the item; j is a new last axis. For i = j it is zero."""
 
     axis: int = 0
     mixes: ClassVar[bool] = True
@@ -177,13 +177,13 @@ class PairwiseDifferences(LinearLayer):
 
     @cached_property
     def _apart(self) -> Tensor:
-        """[*shape] 0 where i and j are the same, else 1; a view of few numbers."""
+        """[*shape] 0 where i = j, else 1; a view of few numbers."""
         ones = [1] * len(self.input_shapes[0])
         count = ones[self.axis] = self.shape[-1]
         return (1.0 - torch.eye(count, dtype=torch.float64)).reshape(*ones, count)
 
     def _others(self, x: Tensor) -> Tensor:
-        """x_j at i and j."""
+        """Return x_j at all (i, j)."""
         last = x.movedim(self.axis + 1, -1)
         return last[..., None, :].expand(*last.shape, last.shape[-1]).movedim(-2, self.axis + 1)
 
@@ -204,7 +204,7 @@ class PairwiseDifferences(LinearLayer):
 
 @dataclass(frozen=True, eq=False)
 class TransposedConvolution(WindowLayer):
-    """Two-dimensional transposed convolution with weights [Cin, Cout / groups, kh, kw]; pads top, left are cut off."""
+    """Two-dimensional transposed convolution with weights [Cin, Cout / groups, kh, kw]; pads top, left are cropped."""
 
     pads: tuple[int, int] = (0, 0)
     groups: int = 1

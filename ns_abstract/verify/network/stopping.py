@@ -18,7 +18,7 @@ from ns_abstract.verify.network.coefficients import Coefficients, Float64, Int64
 class BackwardBounds:
     """Concretised bounds [R] of backward coefficients, and their planes below and above [R, 2, d + 1]; NaN if unknown.
 
-    ``ended`` [R] is the node at which they ended; 0 is the image.
+    ``ended`` [R] is the node at which each ended; 0 is the image.
     """
 
     plane: Float64
@@ -36,19 +36,19 @@ class BackwardBounds:
         self.ended[number] = other.ended
 
     def turn(self, mask: np.ndarray) -> None:
-        """Negate the rows of ``mask``."""
+        """Negate the rows in ``mask``."""
         self.plane[mask] = -self.plane[mask][:, ::-1]
         self.lower[mask], self.upper[mask] = -self.upper[mask], -self.lower[mask]
 
     def meet(self, number: Int64, other: BackwardBounds, below: np.ndarray) -> None:
-        """Take in other bounds of the rows ``number``, and their planes below or above."""
+        """Intersect with other bounds of the rows ``number``, taking their planes below or above."""
         side = np.where(below, 0, 1)
         self.plane[number, side] = other.plane[np.arange(len(number)), side]
         self.lower[number] = np.maximum(self.lower[number], other.lower)
         self.upper[number] = np.minimum(self.upper[number], other.upper)
 
     def middle(self) -> tuple[Tensor, Tensor]:
-        """[R, d + 1] the plane between, and [R] how far the others are from it at most."""
+        """Return the middle plane [R, d + 1], and the largest distance [R] of the two planes from it."""
         low, high = self.plane[:, 0], self.plane[:, 1]
         gap = high - low
         radius = 0.5 * (gap[:, -1] + np.abs(gap[:, :-1]).sum(1))
@@ -56,7 +56,7 @@ class BackwardBounds:
         return torch.from_numpy(0.5 * (low + high)), torch.from_numpy(radius)
 
     def improve(self, number: Int64, plane: Float64, box: Float64) -> None:
-        """Planes of the latest node; the best numbers of all: a plane's extremes or what the box says."""
+        """Replace planes by those of a later node, and tighten bounds by the planes' extremes and by the intervals'."""
         slopes = np.abs(plane[:, :, :-1]).sum(-1)
         room = OWN_FEW * (np.abs(plane[:, :, -1]) + slopes)
         self.plane[number] = plane
@@ -67,10 +67,10 @@ class BackwardBounds:
 
 
 class NeuronTarget(NamedTuple):
-    """How tight the bounds of a neuron have to be; plays no part in soundness (N6, N17).
+    """How tight the bounds of a neuron have to be; soundness does not depend on it (N6, N17).
 
-    ``width``: how far apart they may be, None: its sign is all that is asked; ``kink``: whether the sign is asked for;
-    ``cut``: whether a number that is certainly not positive may have any bounds.
+    ``width``: the largest allowed width; None: the sign alone matters. ``kink``: whether the sign has to be known;
+    ``cut``: whether a number that is surely not positive may have any bounds.
     """
 
     width: float | None = None
@@ -80,9 +80,9 @@ class NeuronTarget(NamedTuple):
 
 @dataclass(frozen=True)
 class StoppingCriterion:
-    """The criterion that stops the backward pass of a neuron before it is at the image.
+    """The criterion that stops a neuron's backward pass before it reaches the image.
 
-    ``zero`` [R]: what a row is where its number is zero; ``negative`` [R]: whether a row is its number's negative.
+    ``zero`` [R]: the row's value where its neuron is zero; ``negative`` [R]: whether a row is its neuron's negative.
     """
 
     goal: NeuronTarget
@@ -93,7 +93,7 @@ class StoppingCriterion:
         return replace(self, zero=self.zero[chosen], negative=self.negative[chosen])
 
     def done(self, bounds: BackwardBounds, number: Int64) -> np.ndarray:
-        """Which of the rows ``number`` are done."""
+        """Return which of the rows ``number`` may stop."""
         zero, lower, upper = self.zero[number], bounds.lower[number], bounds.upper[number]
         if self.goal.width is None:
             # the other side is asked for by another row
@@ -106,17 +106,17 @@ class StoppingCriterion:
 
 
 class BackwardTrace:
-    """Coefficients that one call of `BackwardPass.bound` has at the nodes on its way to the image.
+    """Coefficients of one call of `BackwardPass.bound` at the nodes on the way to the image.
 
     Args:
         count: Rows R.
-        short: Whether only what they are on the image is kept.
+        short: Whether only the coefficients on the image are stored.
 
     Attributes:
-        by_node: [R, n] float32 rows on outputs of nodes at which they gather what depends on the cell's ranges, and on
-            the image (0).
-        fixed: [R, 2] what they gather at nodes of which they are not kept, at least and at most.
-        reached: [R] which of them reach the image.
+        by_node: [R, n] float32 coefficients on outputs of nodes whose constants depend on the cell's ranges, and on the
+            image (0).
+        fixed: [R, 2] constants below and above from all other nodes.
+        reached: [R] whether the row reaches the image.
     """
 
     def __init__(self, count: int, short: bool) -> None:
@@ -126,7 +126,7 @@ class BackwardTrace:
         self.reached = np.zeros(count, bool)
 
     def keep(self, at: int, coefficients: Coefficients, shape: tuple[int, ...], number: Int64) -> None:
-        """Remember rows ``number`` on the output of node ``at``."""
+        """Store rows ``number`` on the output of node ``at``."""
         if at not in self.by_node:
             self.by_node[at] = np.zeros((len(self.fixed), int(np.prod(shape))), np.float32)
         whole = full(coefficients, shape, force=True)

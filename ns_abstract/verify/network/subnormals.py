@@ -1,4 +1,4 @@
-"""Subnormal numbers in the package's own arithmetic, whatever the program that calls it does with them (N2, N21)."""
+"""Keeps subnormal numbers in the package's own arithmetic, whatever mode the calling program has set (N2, N21)."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ _BY_THREAD = 1 << 15
 
 
 def _flushed() -> bool:
-    """Whether this thread replaces subnormal numbers by zero, where it writes or where it reads them."""
+    """Return whether this thread flushes subnormal numbers to zero, as results or as operands."""
     tiny = np.float32(FLUSH)
     half = tiny * np.float32(0.5)
     return bool(half + half != tiny)
 
 
 def _flushed_by_workers() -> bool:
-    """Whether any of the threads that torch gives parts of an operation to does."""
+    """Return whether any of torch's worker threads does."""
     count = torch.get_num_threads()
     return count > 1 and bool((torch.full((count * _BY_THREAD,), FLUSH) * 0.5 == 0.0).any())
 
 
 @contextmanager
 def subnormals_kept() -> Iterator[None]:
-    """Keep subnormal numbers in a block or function, as numbers are moved outward to their neighbours.
+    """Keep subnormal numbers in a block or function: numbers are moved outward to their neighbours there.
 
     Raises:
-        InputError: Threads that torch works with flush them.
+        InputError: Torch's worker threads flush them.
     """
     flushed = _flushed()
     if flushed:

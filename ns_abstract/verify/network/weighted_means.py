@@ -1,4 +1,4 @@
-"""Weighted means of positive numbers, written about their value at one input (docs/dev/design.md, N26)."""
+"""Weighted means of positive numbers, rewritten about their value at one input (docs/dev/design.md, N26)."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from ns_abstract.verify.network.sparse_layers import SparseMatrix
 
 
 def centred(network: Network, image: Tensor) -> Network:
-    """Return a network that is equal in real arithmetic, with weighted means written about their values at an image.
+    """Return a network that is equal in real arithmetic, with weighted means rewritten about their values at an image.
 
-    ``W x / sum(x)`` is ``m + (W - m) x / sum(x)`` for any m. Bounds of the quotient grow with the size of what is
-    divided, which is about nothing next to ``image`` [1, *input_shape] if m is the value there. The network is the same
-    object if it has no such means, or a difference of weights is no float32. It must not be bounded in float32, where
-    it computes something else.
+    ``W x / sum(x)`` is ``m + (W - m) x / sum(x)`` for any m. Bounds of the quotient grow with the magnitude of the
+    dividend, which is nearly zero close to ``image`` [1, *input_shape] if m is the value there. The network is returned
+    unchanged if it has no such means, or a difference of weights is no float32. The result must not be bounded in
+    float32, where it computes something else.
     """
     builder = NetworkBuilder(network.source, network.input_shape)
     values, new_number, changed = [image], [0], False
@@ -50,7 +50,7 @@ def centred(network: Network, image: Tensor) -> Network:
 
 
 def _moved(layer: Layer, value: Tensor) -> tuple[np.ndarray, np.ndarray] | None:
-    """Weights less whole numbers next to ``value`` [1, out], and these numbers; None where that is not exact."""
+    """Return the weights less whole numbers near ``value`` [1, out], and these numbers; None if that is inexact."""
     assert isinstance(layer, Matrix)
     mean = np.round(value.numpy()[0])
     if layer.offset is not None or not np.isfinite(mean).all():
@@ -66,7 +66,7 @@ def _moved(layer: Layer, value: Tensor) -> tuple[np.ndarray, np.ndarray] | None:
 
 
 def _mean(network: Network, k: int) -> tuple[int, int] | None:
-    """Nodes x and 1 / sum(x) if node ``k`` is a matrix applied to their product."""
+    """Return nodes x and 1 / sum(x) if node ``k`` is a matrix applied to their product; else None."""
 
     def layer(index: int) -> object:
         return network.nodes[index - 1].layer if index else None

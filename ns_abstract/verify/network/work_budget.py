@@ -1,4 +1,4 @@
-"""The work that bounds of a network may take, and what is left of it."""
+"""The multiplications that bounds of a network may take, and those that are left."""
 
 from __future__ import annotations
 
@@ -44,18 +44,18 @@ class WorkBudget:
 
     @property
     def rests(self) -> set[int]:
-        """Nodes whose bounds rows of later ones may end on."""
+        """Nodes on whose bounds passes from later nodes may end."""
         return self.costs.rests if self.planned else set()
 
     def learns(self, index: int, radius: float, size: float) -> None:
-        """Forms of node ``index``, the next or an earlier one, are so loose (N1), and its numbers of this size."""
+        """Record the width of the forms of node ``index``, the next or an earlier one (N1), and its magnitude."""
         self._spread[index:] = [radius, *self._spread[index + 1 :]]
         self._size = size or self._size
 
     def ways(self, index: int, count: int) -> tuple[list[BackwardRoute], float]:
-        """Ways of rows for ``count`` numbers of node ``index`` that are worth a trial, and what a product costs (N18).
+        """Return routes for ``count`` rows of node ``index`` that are worth a trial, and a multiplication's price (N18).
 
-        There are none if its form is as good, or nothing will be known in the end.
+        There are none if the node's form is as tight, or the outputs' bounds will be useless.
         """
         self._bounded[index] = float(count)
         plan = self.costs.plan(max(self.left, 1.0), self._spread[:index], self._size, self._bounded, self._step)
@@ -69,7 +69,7 @@ class WorkBudget:
         return ways[:_TRIED], plan.rate
 
     def nearest(self, index: int, count: int) -> BackwardRoute | None:
-        """The longest way of ``count`` rows of node ``index``, of those that are cheap; what it takes is taken."""
+        """Return the longest affordable route of ``count`` rows of node ``index``, and spend its multiplications."""
         best = None
         for way in self.costs.ways(index):
             if count * way.price < _CHEAP * self.left:
@@ -79,37 +79,37 @@ class WorkBudget:
         return best
 
     def renews(self, part: float, products: float) -> bool:
-        """Whether all numbers of a node are bounded by rows, for ``products``, if ``part`` of them is open."""
+        """Return whether all numbers of a node are refined for ``products`` if the fraction ``part`` is unstable."""
         return part > _RENEW or products < self._cheap
 
     @property
     def _cheap(self) -> float:
-        """Products that rows of one node may take whatever is open: fewer where not all rows can be afforded."""
+        """Multiplications that are spent on one node in any case: fewer where not all passes are affordable."""
         return _CHEAP * ALLOWED_PRODUCTS * min(1.0, ALLOWED_PRODUCTS / self.costs.total)
 
     def suffices(self, products: float) -> float:
-        """Width, as a part of a node's numbers, at which rows for all of them may end on the way (N17)."""
+        """Return the width, relative to a node's numbers, at which rows for all of them may stop early (N17)."""
         return 0.0 if products < self._cheap else _ENOUGH
 
     def takes(self, products: float) -> bool:
-        """Whether so many products are left; they are taken then."""
+        """Spend ``products`` multiplications and return True if so many are left."""
         if products > self.left:
             return False
         self.left -= products
         return True
 
     def spares(self, products: float) -> None:
-        """So many products were not taken after all."""
+        """Give back ``products`` multiplications that were not used."""
         self.left += products
 
     def gains(self, width_left: float, part: float) -> bool:
-        """Whether rows for all numbers are worth it that leave so large a part of widths, if ``part`` is open."""
+        """Return whether passes pay that leave the fraction ``width_left`` of widths, if ``part`` is unstable."""
         return part > _RENEW or width_left < _WORTH
 
     def vain(self, width_left: float, unstable: float, part: float) -> bool:
-        """Leave a node as it is if rows leave so large a part of widths, or of signs not found out.
+        """Return whether to leave a node as it is, as passes leave too large a fraction of widths or of open signs.
 
-        Where most of it is open, ``part``, the nodes behind it are given up, too.
+        If the fraction ``part`` of its numbers that are unstable is large, later nodes are given up, too.
         """
         hopeless = width_left > _KEPT or unstable > _LOST
         if hopeless and part > _MOST:
