@@ -31,7 +31,7 @@ class TreeTuning:
         root_steps, steps, last_steps: Optimisation steps of slopes and multipliers, for the whole cell, a branch, and a
             branch without unstable neurons.
         first: Size of the first step.
-        multipliers: Size of the first step of multipliers, in magnitudes of coefficients: with that of slopes they would
+        multipliers: Size of the first step of multipliers, in magnitudes of coefficients: with the former they would
             hardly move in few steps.
         tried: Costliest neurons of a row, of which one is split.
         bounded: Of the neurons that were split often before, the number of best ones whose halves are bounded again.

@@ -53,9 +53,9 @@ class WorkBudget:
         self._size = size or self._size
 
     def ways(self, index: int, count: int) -> tuple[list[BackwardRoute], float]:
-        """Return routes for ``count`` rows of node ``index`` that are worth a trial, and a multiplication's price (N18).
+        """Return routes for ``count`` rows of node ``index`` that are worth a trial, and the price of a product (N18).
 
-        There are none if the node's form is as tight, or the outputs' bounds will be useless.
+        There are none if the form of the node is as tight, or the bounds of the outputs will be useless.
         """
         self._bounded[index] = float(count)
         plan = self.costs.plan(max(self.left, 1.0), self._spread[:index], self._size, self._bounded, self._step)
